@@ -1,0 +1,141 @@
+//! The pinhole camera. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel,
+//! pixel centres lie at +0.5.
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// Size, focal lengths and principal point of a pinhole camera.
+///
+/// ```
+/// use glam::{DVec2, DVec3};
+/// use vizflyt_protocol::geometry::Intrinsics;
+/// let k = Intrinsics { width_px: 320, height_px: 240, fx_px: 200.0, fy_px: 200.0, cx_px: 160.0, cy_px: 120.0 };
+/// // 0.5 m right, 0.25 m up, 2 m ahead: (160 + 200 * 0.25, 120 - 200 * 0.125).
+/// assert_eq!(k.project(DVec3::new(0.5, -0.25, 2.0)), Some(DVec2::new(210.0, 95.0)));
+/// assert_eq!(k.unproject(DVec2::new(210.0, 95.0), 2.0), DVec3::new(0.5, -0.25, 2.0));
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Intrinsics {
+    /// Image width. [px]
+    pub width_px: u32,
+    /// Image height. [px]
+    pub height_px: u32,
+    /// Focal length along x. [px]
+    pub fx_px: f64,
+    /// Focal length along y. [px]
+    pub fy_px: f64,
+    /// Principal point, x; the image centre is `width_px / 2`. [px]
+    pub cx_px: f64,
+    /// Principal point, y. [px]
+    pub cy_px: f64,
+}
+
+impl Intrinsics {
+    /// Largest side of an image; 8K. Bounds every buffer sized from a header. [px]
+    pub const MAX_SIDE_PX: u32 = 8192;
+
+    /// Returns square-pixel intrinsics with a centred principal point and the given horizontal
+    /// field of view, measured from the left edge to the right edge. [rad]
+    pub fn from_horizontal_fov(width_px: u32, height_px: u32, fov_rad: f64) -> Self {
+        let f_px = f64::from(width_px) / 2.0 / libm::tan(fov_rad / 2.0);
+        Self {
+            width_px,
+            height_px,
+            fx_px: f_px,
+            fy_px: f_px,
+            cx_px: f64::from(width_px) / 2.0,
+            cy_px: f64::from(height_px) / 2.0,
+        }
+    }
+
+    /// Returns the number of pixels.
+    pub fn pixels(&self) -> usize {
+        self.width_px as usize * self.height_px as usize
+    }
+
+    /// Projects a point [m, cam] to continuous pixel coordinates; `None` unless it is ahead.
+    pub fn project(&self, p_cam: DVec3) -> Option<DVec2> {
+        if !(p_cam.z > 0.0) {
+            return None;
+        }
+        Some(DVec2::new(
+            self.fx_px * p_cam.x / p_cam.z + self.cx_px,
+            self.fy_px * p_cam.y / p_cam.z + self.cy_px,
+        ))
+    }
+
+    /// Returns the point [m, cam] seen at a continuous pixel with the given camera-z depth [m].
+    pub fn unproject(&self, pixel: DVec2, depth_m: f64) -> DVec3 {
+        DVec3::new(
+            (pixel.x - self.cx_px) / self.fx_px * depth_m,
+            (pixel.y - self.cy_px) / self.fy_px * depth_m,
+            depth_m,
+        )
+    }
+
+    /// Checks that every number is one a renderer and a receiver can work with.
+    pub fn validate(&self) -> Result<(), InvalidIntrinsics> {
+        let side = 1..=Self::MAX_SIDE_PX;
+        if !side.contains(&self.width_px) || !side.contains(&self.height_px) {
+            return Err(InvalidIntrinsics::Size(self.width_px, self.height_px));
+        }
+        let focal = 1e-3..=1e6;
+        if !focal.contains(&self.fx_px) || !focal.contains(&self.fy_px) {
+            return Err(InvalidIntrinsics::Focal(self.fx_px, self.fy_px));
+        }
+        let centre = -1e6..=1e6;
+        if !centre.contains(&self.cx_px) || !centre.contains(&self.cy_px) {
+            return Err(InvalidIntrinsics::Centre(self.cx_px, self.cy_px));
+        }
+        Ok(())
+    }
+}
+
+/// Why intrinsics are refused.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum InvalidIntrinsics {
+    /// A side is 0 or too large.
+    #[error("image size {0}x{1} is outside 1x1 to 8192x8192")]
+    Size(u32, u32),
+    /// A focal length is not a sensible positive number.
+    #[error("focal length ({0}, {1}) px is outside 0.001 to 1e6; give fx and fy in pixels")]
+    Focal(f64, f64),
+    /// The principal point is not finite or far outside the image.
+    #[error("principal point ({0}, {1}) px is outside -1e6 to 1e6; give cx and cy in pixels")]
+    Centre(f64, f64),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn unproject_then_project_is_the_same_pixel(
+            u in -100.0..1000.0f64, v in -100.0..1000.0f64, z in 0.05..100.0f64,
+            fov in 0.2..2.8f64, cx in 0.0..640.0f64,
+        ) {
+            let k = Intrinsics { cx_px: cx, ..Intrinsics::from_horizontal_fov(640, 480, fov) };
+            let pixel = DVec2::new(u, v);
+            let back = k.project(k.unproject(pixel, z)).unwrap();
+            prop_assert!((back - pixel).length() < 1e-8);
+        }
+    }
+
+    #[test]
+    fn nothing_behind_the_camera_projects() {
+        let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
+        assert_eq!(k.project(DVec3::new(0.0, 0.0, 0.0)), None);
+        assert_eq!(k.project(DVec3::new(0.0, 0.0, f64::NAN)), None);
+    }
+
+    #[test]
+    fn poison_is_refused() {
+        let good = Intrinsics::from_horizontal_fov(320, 240, 1.2);
+        assert_eq!(good.validate(), Ok(()));
+        assert!(Intrinsics { width_px: 0, ..good }.validate().is_err());
+        assert!(Intrinsics { fx_px: f64::NAN, ..good }.validate().is_err());
+        assert!(Intrinsics { cy_px: f64::INFINITY, ..good }.validate().is_err());
+    }
+}

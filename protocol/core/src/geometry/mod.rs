@@ -1,0 +1,14 @@
+//! Frames, poses, cameras and solids. f64, SI units, no allocation.
+//!
+//! A transform is named `a_from_b` and typed [`Pose<A, B>`]; neighbours match or it does not
+//! compile. Vectors are plain [`glam`] values whose names carry the frame (`p_world`, `v_body`).
+
+mod frame;
+mod intrinsics;
+mod pose;
+mod volume;
+
+pub use frame::{Body, Cam, Frame, Scene, World};
+pub use intrinsics::{Intrinsics, InvalidIntrinsics};
+pub use pose::{Pose, Twist, body_from_forward_cam, wrap_pi, yaw_of};
+pub use volume::Volume;

@@ -1,0 +1,27 @@
+//! The contract of VizFlyt: what the render server, the runtime on the Jetson, a plugin, the
+//! simulated lab and the bridge agree on. `no_std`, no allocation, imports nothing of ours.
+//!
+//! Read in this order:
+//! - [`geometry`]: frames as types, [`geometry::Pose`], [`geometry::Intrinsics`], and
+//!   [`geometry::Volume`], the solids that geofence, truth and tests are made of;
+//! - [`time`]: one stamp type per clock, and the filter that relates two clocks;
+//! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
+//! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
+//!   memory, framing of messages on a stream;
+//! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is.
+//!
+//! Absent on purpose: sockets, clocks, threads, files.
+
+#![no_std]
+
+pub mod geometry;
+pub mod mavlink;
+pub mod messages;
+pub mod packet;
+pub mod time;
+
+/// Version of everything in this crate that crosses a wire or shared memory.
+///
+/// Raise it with any change that an older peer would misread. Peers compare it first
+/// ([`packet::Preamble`]) and refuse a mismatch by name.
+pub const PROTOCOL_VERSION: u16 = 1;

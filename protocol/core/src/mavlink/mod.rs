@@ -1,0 +1,28 @@
+//! Our types to and from MAVLink (ardupilotmega). The only place that knows north-east-down and
+//! forward-right-down axes, wxyz quaternions and type masks.
+//!
+//! Messages are those of the `mavlink` crate, re-exported as [`dialect`], so that the runtime, the
+//! simulator and the bridge agree on one version of it.
+
+mod command;
+mod frames;
+mod setpoint;
+mod state;
+mod stream;
+
+pub use ::mavlink::dialects::ardupilotmega as dialect;
+pub use ::mavlink::{MavHeader, MavlinkVersion, Message};
+
+pub use command::{CopterMode, command_name, result_name};
+pub use frames::{
+    body_from_frd, frd_from_body, ned_from_world, ned_rotation_from_world, world_from_ned,
+    world_rotation_from_ned, yaw_ned_from_world, yaw_world_from_ned,
+};
+pub use setpoint::{
+    GuidedMotion, GuidedSetpoint, UnsupportedSetpoint, guided_from_mavlink, guided_to_mavlink,
+};
+pub use state::{
+    attitude_from_mavlink, attitude_to_mavlink, local_position_from_mavlink,
+    local_position_to_mavlink, vision_from_mavlink, vision_to_mavlink,
+};
+pub use stream::{MAX_PACKET, Packet, StreamDecoder, StreamStats, encode};

@@ -1,0 +1,161 @@
+//! Poses and attitudes to and from MAVLink: VISION_POSITION_ESTIMATE (102), ATTITUDE (30),
+//! LOCAL_POSITION_NED (32).
+
+use glam::{DQuat, DVec3, EulerRot};
+
+use super::dialect::{ATTITUDE_DATA, LOCAL_POSITION_NED_DATA, VISION_POSITION_ESTIMATE_DATA};
+use super::frames::{
+    body_from_frd, frd_from_body, ned_from_world, ned_rotation_from_world, world_from_ned,
+    world_rotation_from_ned,
+};
+use crate::geometry::{Body, Pose, World};
+
+/// Returns (roll, pitch, yaw), FRD in NED, of an attitude. [rad]
+fn euler_ned(world_from_body: DQuat) -> (f64, f64, f64) {
+    let (yaw, pitch, roll) = ned_rotation_from_world(world_from_body).to_euler(EulerRot::ZYX);
+    (roll, pitch, yaw)
+}
+
+/// Returns the attitude of (roll, pitch, yaw), FRD in NED. [rad]
+fn attitude_of_euler(roll: f32, pitch: f32, yaw: f32) -> DQuat {
+    world_rotation_from_ned(DQuat::from_euler(EulerRot::ZYX, yaw.into(), pitch.into(), roll.into()))
+}
+
+/// Makes the external navigation message from a localized pose.
+///
+/// ```
+/// use glam::{DQuat, DVec3};
+/// use vizflyt_protocol::geometry::Pose;
+/// use vizflyt_protocol::mavlink::{vision_from_mavlink, vision_to_mavlink};
+/// // At (1, 2, 3), level, nose east: NED (2, 1, -3), yaw 90 degrees.
+/// let message = vision_to_mavlink(&Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::IDENTITY), 55, 0, 0.01);
+/// assert_eq!((message.x, message.y, message.z), (2.0, 1.0, -3.0));
+/// assert!((message.yaw - 90f32.to_radians()).abs() < 1e-6);
+/// let back = vision_from_mavlink(&message);
+/// assert!((back.translation_m - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-6);
+/// ```
+pub fn vision_to_mavlink(
+    world_from_body: &Pose<World, Body>,
+    usec: u64,
+    reset_counter: u8,
+    sigma_m: f32,
+) -> VISION_POSITION_ESTIMATE_DATA {
+    let p = ned_from_world(world_from_body.translation_m);
+    let (roll, pitch, yaw) = euler_ned(world_from_body.rotation);
+    let mut covariance = [0.0; 21];
+    // Upper triangle, row by row: the diagonal of (x, y, z, roll, pitch, yaw).
+    for diagonal in [0, 6, 11, 15, 18, 20] {
+        covariance[diagonal] = sigma_m * sigma_m;
+    }
+    VISION_POSITION_ESTIMATE_DATA {
+        usec,
+        x: p.x as f32,
+        y: p.y as f32,
+        z: p.z as f32,
+        roll: roll as f32,
+        pitch: pitch as f32,
+        yaw: yaw as f32,
+        covariance,
+        reset_counter,
+    }
+}
+
+/// Reads the external navigation message.
+pub fn vision_from_mavlink(message: &VISION_POSITION_ESTIMATE_DATA) -> Pose<World, Body> {
+    Pose::new(
+        world_from_ned(DVec3::new(message.x.into(), message.y.into(), message.z.into())),
+        attitude_of_euler(message.roll, message.pitch, message.yaw),
+    )
+}
+
+/// Makes ATTITUDE from an attitude and a rate [rad/s, body].
+///
+/// ```
+/// use glam::{DQuat, DVec3};
+/// use vizflyt_protocol::mavlink::{attitude_from_mavlink, attitude_to_mavlink};
+/// // Nose north, rolled 10 degrees to the right: body x rotation is the same in FRD.
+/// let q = DQuat::from_rotation_z(90f64.to_radians()) * DQuat::from_rotation_x(10f64.to_radians());
+/// let message = attitude_to_mavlink(q, DVec3::new(0.1, 0.2, 0.3), 7);
+/// assert!((message.roll - 10f32.to_radians()).abs() < 1e-6 && message.yaw.abs() < 1e-6);
+/// assert_eq!((message.rollspeed, message.pitchspeed, message.yawspeed), (0.1, -0.2, -0.3));
+/// let (back, omega_body) = attitude_from_mavlink(&message);
+/// assert!(back.dot(q).abs() > 1.0 - 1e-9 && (omega_body - DVec3::new(0.1, 0.2, 0.3)).length() < 1e-6);
+/// ```
+pub fn attitude_to_mavlink(
+    world_from_body: DQuat,
+    omega_body_radps: DVec3,
+    time_boot_ms: u32,
+) -> ATTITUDE_DATA {
+    let (roll, pitch, yaw) = euler_ned(world_from_body);
+    let rates = frd_from_body(omega_body_radps);
+    ATTITUDE_DATA {
+        time_boot_ms,
+        roll: roll as f32,
+        pitch: pitch as f32,
+        yaw: yaw as f32,
+        rollspeed: rates.x as f32,
+        pitchspeed: rates.y as f32,
+        yawspeed: rates.z as f32,
+    }
+}
+
+/// Reads ATTITUDE: body to world, and the rate. [rad/s, body]
+pub fn attitude_from_mavlink(message: &ATTITUDE_DATA) -> (DQuat, DVec3) {
+    let rates =
+        DVec3::new(message.rollspeed.into(), message.pitchspeed.into(), message.yawspeed.into());
+    (attitude_of_euler(message.roll, message.pitch, message.yaw), body_from_frd(rates))
+}
+
+/// Makes LOCAL_POSITION_NED from a position [m, world] and a velocity [m/s, world].
+///
+/// ```
+/// use glam::DVec3;
+/// use vizflyt_protocol::mavlink::local_position_to_mavlink;
+/// let m = local_position_to_mavlink(DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.5, 0.0, -1.0), 7);
+/// assert_eq!((m.x, m.y, m.z), (2.0, 1.0, -3.0));
+/// assert_eq!((m.vx, m.vy, m.vz), (0.0, 0.5, 1.0));
+/// ```
+pub fn local_position_to_mavlink(
+    p_world_m: DVec3,
+    v_world_mps: DVec3,
+    time_boot_ms: u32,
+) -> LOCAL_POSITION_NED_DATA {
+    let (p, v) = (ned_from_world(p_world_m), ned_from_world(v_world_mps));
+    LOCAL_POSITION_NED_DATA {
+        time_boot_ms,
+        x: p.x as f32,
+        y: p.y as f32,
+        z: p.z as f32,
+        vx: v.x as f32,
+        vy: v.y as f32,
+        vz: v.z as f32,
+    }
+}
+
+/// Reads LOCAL_POSITION_NED: position [m, world] and velocity [m/s, world].
+pub fn local_position_from_mavlink(message: &LOCAL_POSITION_NED_DATA) -> (DVec3, DVec3) {
+    let vector = |x: f32, y: f32, z: f32| world_from_ned(DVec3::new(x.into(), y.into(), z.into()));
+    (vector(message.x, message.y, message.z), vector(message.vx, message.vy, message.vz))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_pose_survives_the_wire(
+            p in prop::array::uniform3(-50.0..50.0f64),
+            yaw in -3.1..3.1f64, pitch in -1.4..1.4f64, roll in -3.1..3.1f64,
+        ) {
+            let rotation = DQuat::from_euler(EulerRot::ZYX, yaw, pitch, roll);
+            let pose = Pose::new(DVec3::from(p), rotation);
+            let back = vision_from_mavlink(&vision_to_mavlink(&pose, 1, 0, 0.1));
+            prop_assert!((back.translation_m - pose.translation_m).length() < 1e-4);
+            prop_assert!(back.rotation.dot(rotation).abs() > 1.0 - 1e-6);
+            let (attitude, _) = attitude_from_mavlink(&attitude_to_mavlink(rotation, DVec3::ZERO, 0));
+            prop_assert!(attitude.dot(rotation).abs() > 1.0 - 1e-6);
+        }
+    }
+}

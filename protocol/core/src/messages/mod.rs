@@ -1,0 +1,44 @@
+//! Messages: postcard types, one concern per file. Bounded, so that a hostile length costs
+//! nothing.
+//!
+//! Control stream (one ordered, bidirectional QUIC stream, opened by the runtime):
+//! 1. each side sends its [`crate::packet::Preamble`] and checks the other's;
+//! 2. the runtime sends [`ToServer::Hello`]; the server answers [`ToRuntime::Welcome`] or
+//!    [`ToRuntime::Refused`];
+//! 3. then poses, events and clock replies flow down; telemetry, events and clock requests up.
+//!
+//! Each message is framed by [`crate::packet::framing`]. Plugin messages ([`ToPlugin`],
+//! [`FromPlugin`]) use the same encoding over shared-memory queues.
+
+mod event;
+mod plugin;
+mod session;
+mod setpoint;
+mod telemetry;
+
+pub use event::{Event, EventKind};
+pub use plugin::{FromPlugin, ToPlugin};
+pub use session::{
+    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Hello, Limits, PoseSample, ToRuntime, ToServer,
+};
+pub use setpoint::{Axes, Setpoint, YawTarget};
+pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};
+
+/// A short name: of a vehicle, a camera, a stage.
+pub type Name = heapless::String<32>;
+/// A sentence for a person.
+pub type Text = heapless::String<192>;
+
+/// Most cameras of one vehicle.
+pub const MAX_CAMERAS: usize = 8;
+
+/// Returns `text` cut to what a bounded string holds, at a character boundary.
+pub fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
+    let mut out = heapless::String::new();
+    for c in text.chars() {
+        if out.push(c).is_err() {
+            break;
+        }
+    }
+    out
+}

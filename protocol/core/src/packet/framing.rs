@@ -1,0 +1,190 @@
+//! Messages on an ordered byte stream: a little-endian `u16` length, then that many bytes of
+//! postcard.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// Largest encoded message, length prefix included. [bytes]
+pub const MAX_FRAMED: usize = 4096;
+const PREFIX: usize = 2;
+
+/// Why bytes are no message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum FramingError {
+    /// The length prefix exceeds [`MAX_FRAMED`]; the stream cannot be followed further.
+    #[error("message of {0} bytes exceeds the limit of 4094; the peer is faulty or hostile")]
+    TooLong(usize),
+    /// The body is not a message of the expected type; the next one can still be read.
+    #[error("message body of {0} bytes does not decode; the peer is faulty or of another version")]
+    Body(usize),
+}
+
+/// Encodes `message` with its prefix into `buffer`; returns the bytes to send.
+///
+/// # Panics
+/// Never: every message type of this crate is bounded below [`MAX_FRAMED`] (tested).
+pub fn encode<'a, M: Serialize>(message: &M, buffer: &'a mut [u8; MAX_FRAMED]) -> &'a [u8] {
+    let body = postcard::to_slice(message, &mut buffer[PREFIX..])
+        .expect("message types are bounded below MAX_FRAMED")
+        .len();
+    buffer[..PREFIX].copy_from_slice(&(body as u16).to_le_bytes());
+    &buffer[..PREFIX + body]
+}
+
+/// Encodes `message` without prefix, for carriers that keep message boundaries (shared memory).
+///
+/// # Panics
+/// Never, as [`encode`].
+pub fn encode_body<'a, M: Serialize>(message: &M, buffer: &'a mut [u8; MAX_FRAMED]) -> &'a [u8] {
+    postcard::to_slice(message, buffer).expect("message types are bounded below MAX_FRAMED")
+}
+
+/// Decodes a message body that a carrier delivered whole.
+pub fn decode_body<M: DeserializeOwned>(body: &[u8]) -> Result<M, FramingError> {
+    postcard::from_bytes(body).map_err(|_| FramingError::Body(body.len()))
+}
+
+/// Cuts a byte stream into messages.
+///
+/// Give it bytes with [`Self::push`], take messages with [`Self::next`] until `None`, repeat.
+#[derive(Clone)]
+pub struct Deframer {
+    buffer: [u8; MAX_FRAMED],
+    filled: usize,
+}
+
+impl Default for Deframer {
+    fn default() -> Self {
+        Self { buffer: [0; MAX_FRAMED], filled: 0 }
+    }
+}
+
+impl Deframer {
+    /// Takes as many of `bytes` as there is room for; returns how many. Room for at least one
+    /// byte is there whenever [`Self::next`] has returned `None`.
+    pub fn push(&mut self, bytes: &[u8]) -> usize {
+        let taken = bytes.len().min(MAX_FRAMED - self.filled);
+        self.buffer[self.filled..self.filled + taken].copy_from_slice(&bytes[..taken]);
+        self.filled += taken;
+        taken
+    }
+
+    /// Returns the next whole message, an error, or `None` if more bytes are needed.
+    #[allow(clippy::should_implement_trait)] // Why: the item type is chosen per call.
+    pub fn next<M: DeserializeOwned>(&mut self) -> Option<Result<M, FramingError>> {
+        let prefix = self.buffer[..self.filled].first_chunk::<PREFIX>()?;
+        let body = usize::from(u16::from_le_bytes(*prefix));
+        if PREFIX + body > MAX_FRAMED {
+            return Some(Err(FramingError::TooLong(body)));
+        }
+        if self.filled < PREFIX + body {
+            return None;
+        }
+        let message = decode_body(&self.buffer[PREFIX..PREFIX + body]);
+        self.buffer.copy_within(PREFIX + body..self.filled, 0);
+        self.filled -= PREFIX + body;
+        Some(message)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use crate::geometry::{Intrinsics, Pose, Volume, body_from_forward_cam};
+    use crate::messages::*;
+    use crate::time::{HostTime, ServerTime};
+    use glam::{DQuat, DVec3};
+    use std::vec::Vec;
+
+    fn widest_arena() -> ArenaInfo {
+        let camera = CameraInfo {
+            name: bounded("this camera's name is far too long to fit"),
+            intrinsics: Intrinsics::from_horizontal_fov(8192, 8192, 1.2),
+            body_from_cam: body_from_forward_cam(DVec3::splat(0.1), 0.3),
+        };
+        ArenaInfo {
+            name: bounded(&"x".repeat(99)),
+            geofence: Volume::Cuboid {
+                center_m: DVec3::splat(1.1),
+                half_m: DVec3::splat(2.2),
+                rotation: DQuat::from_rotation_x(0.4),
+            },
+            limits: Limits { max_speed_mps: 5.5, max_acceleration_mps2: 6.6 },
+            body_radius_m: 0.12,
+            takeoff_height_m: 1.3,
+            goal_m: Some(DVec3::splat(9.9)),
+            goal_radius_m: 1.0,
+            time_limit_s: 99.0,
+            cameras: core::iter::repeat_n(camera, MAX_CAMERAS).collect(),
+        }
+    }
+
+    fn messages() -> Vec<ToRuntime> {
+        std::vec![
+            ToRuntime::Welcome(widest_arena()),
+            ToRuntime::Refused(bounded(&"why ".repeat(99))),
+            ToRuntime::Clock(ClockReply {
+                sent: HostTime::from_ns(u64::MAX),
+                answered: ServerTime::from_ns(1),
+            }),
+            ToRuntime::Pose(PoseSample {
+                stamp: ServerTime::from_ns(7),
+                world_from_body: Pose::IDENTITY,
+                twist: Default::default(),
+                resets: 3,
+            }),
+            ToRuntime::Event(Event {
+                stamp: ServerTime::from_ns(8),
+                kind: EventKind::Collision { p_world_m: DVec3::ONE, clearance_m: -0.01 },
+                text: bounded("collision"),
+            }),
+        ]
+    }
+
+    #[test]
+    fn a_stream_decodes_at_every_chunk_size() {
+        let mut stream = Vec::new();
+        for message in messages() {
+            stream.extend_from_slice(encode(&message, &mut [0; MAX_FRAMED]));
+        }
+        for chunk in 1..=stream.len() {
+            let (mut deframer, mut found) = (Deframer::default(), Vec::new());
+            for mut bytes in stream.chunks(chunk) {
+                while !bytes.is_empty() {
+                    bytes = &bytes[deframer.push(bytes)..];
+                    while let Some(message) = deframer.next::<ToRuntime>() {
+                        found.push(message.unwrap());
+                    }
+                }
+            }
+            assert_eq!(found, messages(), "chunk size {chunk}");
+        }
+    }
+
+    #[test]
+    fn a_bad_body_is_dropped_and_the_next_message_is_read() {
+        let mut deframer = Deframer::default();
+        deframer.push(&[3, 0, 0xff, 0xff, 0xff]);
+        deframer.push(encode(&messages()[1], &mut [0; MAX_FRAMED]));
+        assert_eq!(deframer.next::<ToRuntime>(), Some(Err(FramingError::Body(3))));
+        assert_eq!(deframer.next::<ToRuntime>(), Some(Ok(messages().remove(1))));
+        assert_eq!(deframer.next::<ToRuntime>(), None);
+    }
+
+    #[test]
+    fn an_absurd_length_is_an_error() {
+        let mut deframer = Deframer::default();
+        deframer.push(&[0xff, 0xff]);
+        assert_eq!(deframer.next::<ToRuntime>(), Some(Err(FramingError::TooLong(0xffff))));
+    }
+
+    #[test]
+    fn the_widest_messages_fit() {
+        let mut buffer = [0; MAX_FRAMED];
+        assert!(encode(&ToRuntime::Welcome(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
+        assert!(encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
+        let telemetry = ToServer::Telemetry(Telemetry::default());
+        assert!(encode(&telemetry, &mut buffer).len() < 1024);
+    }
+}

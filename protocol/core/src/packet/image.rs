@@ -1,0 +1,198 @@
+//! The header in front of every image on its own unidirectional QUIC stream.
+
+use glam::{DQuat, DVec3};
+use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
+
+use crate::PROTOCOL_VERSION;
+use crate::geometry::{Cam, Intrinsics, InvalidIntrinsics, Pose, World};
+use crate::time::ServerTime;
+
+/// Who, when, from where; then `payload_len` bytes of RGB-D bitstream (`vizflyt-rgbd`).
+///
+/// Stamps are on the server's clock. Depth in the payload is camera z in units of
+/// `depth_unit_m`, 0 where there is no return (REP 118).
+#[derive(
+    Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
+)]
+#[repr(C)]
+pub struct ImageHeader {
+    magic: [u8; 4],
+    version: U16,
+    /// Index into [`crate::messages::ArenaInfo::cameras`].
+    pub camera: u8,
+    reserved: u8,
+    /// Counts the server's ticks; equal for all cameras of a tick.
+    pub seq: U64,
+    /// When the pose the image was drawn for was measured. [ns, server]
+    pub pose_ns: U64,
+    /// The instant the image shows. [ns, server]
+    pub exposure_ns: U64,
+    /// Rendering began. [ns, server]
+    pub render_start_ns: U64,
+    /// Rendering ended. [ns, server]
+    pub render_end_ns: U64,
+    /// Encoding ended. [ns, server]
+    pub encode_end_ns: U64,
+    /// Handed to the transport. [ns, server]
+    pub send_ns: U64,
+    /// Camera position. [m, world]
+    pub translation_m: [F64; 3],
+    /// Camera to world rotation, xyzw.
+    pub rotation_xyzw: [F64; 4],
+    /// fx, fy, cx, cy. [px]
+    pub intrinsics_px: [F64; 4],
+    /// Image width. [px]
+    pub width_px: U32,
+    /// Image height. [px]
+    pub height_px: U32,
+    /// Metres per unit of depth; 0.001.
+    pub depth_unit_m: F64,
+    /// Bytes of bitstream that follow.
+    pub payload_len: U32,
+    reserved2: U32,
+}
+
+/// Why bytes are no image header.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum InvalidImageHeader {
+    /// Fewer bytes than a header.
+    #[error("image header is cut short at {0} of {size} bytes", size = ImageHeader::SIZE)]
+    Short(usize),
+    /// Wrong magic or version.
+    #[error("these bytes are no image header of protocol {PROTOCOL_VERSION}")]
+    Foreign,
+    /// Camera that makes no sense.
+    #[error("image header: {0}")]
+    Intrinsics(InvalidIntrinsics),
+    /// Pose or depth unit not finite, or quaternion not unit.
+    #[error("image header: camera pose or depth unit is not a number to work with")]
+    Pose,
+    /// Payload larger than any image of this size can need.
+    #[error("image header: payload of {0} bytes is more than its size can need")]
+    Payload(u32),
+}
+
+impl ImageHeader {
+    /// Bytes on the wire.
+    pub const SIZE: usize = size_of::<Self>();
+    const MAGIC: [u8; 4] = *b"VZIM";
+
+    /// Makes a header with all stamps but the pose's zero.
+    pub fn new(
+        seq: u64,
+        camera: u8,
+        pose: ServerTime,
+        k: &Intrinsics,
+        world_from_cam: &Pose<World, Cam>,
+    ) -> Self {
+        Self {
+            magic: Self::MAGIC,
+            version: PROTOCOL_VERSION.into(),
+            camera,
+            reserved: 0,
+            seq: seq.into(),
+            pose_ns: pose.as_ns().into(),
+            exposure_ns: pose.as_ns().into(),
+            render_start_ns: 0.into(),
+            render_end_ns: 0.into(),
+            encode_end_ns: 0.into(),
+            send_ns: 0.into(),
+            translation_m: world_from_cam.translation_m.to_array().map(F64::new),
+            rotation_xyzw: world_from_cam.rotation.to_array().map(F64::new),
+            intrinsics_px: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(F64::new),
+            width_px: k.width_px.into(),
+            height_px: k.height_px.into(),
+            depth_unit_m: F64::new(0.001),
+            payload_len: 0.into(),
+            reserved2: 0.into(),
+        }
+    }
+
+    /// Reads and validates a header at the start of `bytes`; returns it with what follows.
+    pub fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), InvalidImageHeader> {
+        let (header, rest) =
+            Self::read_from_prefix(bytes).map_err(|_| InvalidImageHeader::Short(bytes.len()))?;
+        if header.magic != Self::MAGIC || header.version.get() != PROTOCOL_VERSION {
+            return Err(InvalidImageHeader::Foreign);
+        }
+        header.intrinsics().validate().map_err(InvalidImageHeader::Intrinsics)?;
+        let unit_m = header.depth_unit_m.get();
+        if !(header.world_from_cam().is_valid() && (1e-6..=1.0).contains(&unit_m)) {
+            return Err(InvalidImageHeader::Pose);
+        }
+        // Eight bytes a pixel and some overhead exceed every mode of the bitstream.
+        let most = 8 * header.intrinsics().pixels() as u64 + 65536;
+        if u64::from(header.payload_len.get()) > most {
+            return Err(InvalidImageHeader::Payload(header.payload_len.get()));
+        }
+        Ok((header, rest))
+    }
+
+    /// Returns the camera's intrinsics.
+    pub fn intrinsics(&self) -> Intrinsics {
+        let [fx_px, fy_px, cx_px, cy_px] = self.intrinsics_px.map(F64::get);
+        Intrinsics {
+            width_px: self.width_px.get(),
+            height_px: self.height_px.get(),
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+        }
+    }
+
+    /// Returns where the camera was.
+    pub fn world_from_cam(&self) -> Pose<World, Cam> {
+        Pose::new(
+            DVec3::from_array(self.translation_m.map(F64::get)),
+            DQuat::from_array(self.rotation_xyzw.map(F64::get)),
+        )
+    }
+
+    /// Returns the pose's stamp.
+    pub fn pose_stamp(&self) -> ServerTime {
+        ServerTime::from_ns(self.pose_ns.get())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn header() -> ImageHeader {
+        let k = Intrinsics::from_horizontal_fov(320, 240, 1.3);
+        ImageHeader::new(9, 1, ServerTime::from_ns(77), &k, &Pose::IDENTITY)
+    }
+
+    #[test]
+    fn a_header_survives_the_wire() {
+        let sent = header();
+        let (found, rest) = ImageHeader::parse(sent.as_bytes()).unwrap();
+        assert_eq!(found, sent);
+        assert!(rest.is_empty());
+        assert_eq!(found.pose_stamp(), ServerTime::from_ns(77));
+    }
+
+    #[test]
+    fn poison_is_refused() {
+        let mut h = header();
+        h.rotation_xyzw = [0.0; 4].map(F64::new);
+        assert_eq!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Pose));
+        let mut h = header();
+        h.payload_len = u32::MAX.into();
+        assert!(matches!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Payload(_))));
+        let mut h = header();
+        h.width_px = 0.into();
+        assert!(matches!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Intrinsics(_))));
+        assert_eq!(ImageHeader::parse(&[0; 20]), Err(InvalidImageHeader::Short(20)));
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_parse_or_fail_cleanly(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+            let _ = ImageHeader::parse(&bytes);
+        }
+    }
+}

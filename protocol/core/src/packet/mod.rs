@@ -1,0 +1,12 @@
+//! Packets: fixed little-endian layouts read in place, and the framing of messages on a stream.
+
+pub mod framing;
+mod image;
+mod observation;
+mod preamble;
+
+pub use image::{ImageHeader, InvalidImageHeader};
+pub use observation::{
+    CameraHeader, InvalidObservation, ObservationHeader, ObservationLayout, PLANE_ALIGN,
+};
+pub use preamble::{Party, Preamble, PreambleError};

@@ -1,0 +1,256 @@
+//! The layout of one observation in shared memory, from the runtime to the plugin.
+//!
+//! `ObservationHeader`, then for each camera its RGB plane (H x W x 3 bytes) and its depth plane
+//! (H x W u16 of millimetres), each at a 64-byte boundary. Little-endian, fixed offsets: the C
+//! header for other languages mirrors this file.
+
+use glam::{DQuat, DVec3};
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use crate::PROTOCOL_VERSION;
+use crate::geometry::{Body, Cam, Intrinsics, Pose, World};
+use crate::messages::MAX_CAMERAS;
+
+/// Alignment of the payload and of each plane in it. [bytes]
+pub const PLANE_ALIGN: usize = 64;
+
+/// One camera of an observation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
+#[repr(C)]
+pub struct CameraHeader {
+    /// When the pose that this image shows was measured. [ns, host]
+    pub pose_ns: u64,
+    /// When the runtime had the decoded image. [ns, host]
+    pub ready_ns: u64,
+    /// Tick of the server that made the image.
+    pub seq: u64,
+    /// fx, fy, cx, cy. [px]
+    pub intrinsics_px: [f64; 4],
+    /// Camera position in the body. [m, body]
+    pub translation_m: [f64; 3],
+    /// Camera to body rotation, xyzw.
+    pub rotation_xyzw: [f64; 4],
+    /// Image width; 0 if this camera has no image yet. [px]
+    pub width_px: u32,
+    /// Image height. [px]
+    pub height_px: u32,
+    /// Start of the RGB plane from the start of the header. [bytes]
+    pub rgb_offset: u32,
+    /// Start of the depth plane. [bytes]
+    pub depth_offset: u32,
+}
+
+/// Head of an observation: the vehicle, and where the cameras' planes lie.
+#[derive(Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
+#[repr(C)]
+pub struct ObservationHeader {
+    magic: [u8; 4],
+    version: u16,
+    /// Cameras in use, from the front of `cameras`.
+    pub camera_count: u8,
+    /// Bit 0: `position`, `velocity` and `rotation` of the vehicle are filled in.
+    pub flags: u8,
+    /// Bytes of header and planes together.
+    pub total_len: u32,
+    reserved: u32,
+    /// Counts observations of this runtime.
+    pub seq: u64,
+    /// When the vehicle's state below was true. [ns, host]
+    pub vehicle_ns: u64,
+    /// Position. [m, world]
+    pub position_m: [f64; 3],
+    /// Velocity. [m/s, world]
+    pub velocity_mps: [f64; 3],
+    /// Body to world rotation, xyzw.
+    pub rotation_xyzw: [f64; 4],
+    /// Angular velocity. [rad/s, body]
+    pub angular_radps: [f64; 3],
+    /// Battery left, 0 to 1; negative if unknown.
+    pub battery_fraction: f64,
+    /// The cameras.
+    pub cameras: [CameraHeader; MAX_CAMERAS],
+}
+
+// The layout is a contract with other languages and processes.
+const _: () = assert!(size_of::<CameraHeader>() == 128);
+const _: () = assert!(size_of::<ObservationHeader>() == 144 + 128 * MAX_CAMERAS);
+
+/// Where the planes of a set of images lie.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ObservationLayout {
+    /// (rgb offset, depth offset) of each camera. [bytes]
+    pub planes: [(usize, usize); MAX_CAMERAS],
+    /// Bytes of header and planes together.
+    pub total_len: usize,
+}
+
+impl ObservationLayout {
+    /// Lays out images of the given (width, height), at most [`MAX_CAMERAS`]. [px]
+    pub fn of(sizes: &[(u32, u32)]) -> Self {
+        let mut planes = [(0, 0); MAX_CAMERAS];
+        let mut end = align(size_of::<ObservationHeader>());
+        for (plane, &(width, height)) in planes.iter_mut().zip(sizes) {
+            let pixels = width as usize * height as usize;
+            let depth = align(end + 3 * pixels);
+            *plane = (end, depth);
+            end = align(depth + 2 * pixels);
+        }
+        Self { planes, total_len: end }
+    }
+}
+
+const fn align(offset: usize) -> usize {
+    offset.next_multiple_of(PLANE_ALIGN)
+}
+
+/// Why shared memory does not hold an observation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidObservation {
+    /// Too short or misaligned.
+    #[error("observation of {0} bytes is cut short or misaligned")]
+    Short(usize),
+    /// Wrong magic or version.
+    #[error(
+        "observation is not of protocol {PROTOCOL_VERSION}: rebuild the plugin with this runtime's SDK"
+    )]
+    Foreign,
+    /// A plane lies outside the memory.
+    #[error("camera {0} of the observation lies outside its memory")]
+    Plane(usize),
+}
+
+impl ObservationHeader {
+    const MAGIC: [u8; 4] = *b"VZOB";
+    /// Bit of `flags`: the vehicle's state is filled in.
+    pub const HAS_VEHICLE: u8 = 1;
+
+    /// Makes an empty header for `camera_count` cameras and `total_len` bytes.
+    pub fn new(seq: u64, camera_count: u8, total_len: u32) -> Self {
+        Self {
+            magic: Self::MAGIC,
+            version: PROTOCOL_VERSION,
+            camera_count,
+            flags: 0,
+            total_len,
+            reserved: 0,
+            seq,
+            vehicle_ns: 0,
+            position_m: [0.0; 3],
+            velocity_mps: [0.0; 3],
+            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+            angular_radps: [0.0; 3],
+            battery_fraction: -1.0,
+            cameras: [CameraHeader::default(); MAX_CAMERAS],
+        }
+    }
+
+    /// Reads and validates the header in place; every plane named in it then lies in `bytes`.
+    pub fn parse(bytes: &[u8]) -> Result<&Self, InvalidObservation> {
+        let (header, _) =
+            Self::ref_from_prefix(bytes).map_err(|_| InvalidObservation::Short(bytes.len()))?;
+        if header.magic != Self::MAGIC || header.version != PROTOCOL_VERSION {
+            return Err(InvalidObservation::Foreign);
+        }
+        if usize::from(header.camera_count) > MAX_CAMERAS {
+            return Err(InvalidObservation::Plane(header.camera_count.into()));
+        }
+        for (index, camera) in header.cameras[..header.camera_count.into()].iter().enumerate() {
+            let pixels = u64::from(camera.width_px) * u64::from(camera.height_px);
+            let fits = |offset: u32, bytes_per_pixel: u64, alignment: u32| {
+                // 3 * 2^64 cannot come up: sides are bounded first.
+                offset.is_multiple_of(alignment)
+                    && u64::from(offset) + bytes_per_pixel * pixels <= bytes.len() as u64
+            };
+            let sides = camera.width_px.max(camera.height_px) <= Intrinsics::MAX_SIDE_PX;
+            if !(sides && fits(camera.rgb_offset, 3, 1) && fits(camera.depth_offset, 2, 2)) {
+                return Err(InvalidObservation::Plane(index));
+            }
+        }
+        Ok(header)
+    }
+
+    /// Returns the vehicle's pose, if the course lets the plugin know it.
+    pub fn world_from_body(&self) -> Option<Pose<World, Body>> {
+        (self.flags & Self::HAS_VEHICLE != 0)
+            .then(|| Pose::new(DVec3::from(self.position_m), DQuat::from_array(self.rotation_xyzw)))
+    }
+}
+
+impl CameraHeader {
+    /// Returns the camera's intrinsics.
+    pub fn intrinsics(&self) -> Intrinsics {
+        let [fx_px, fy_px, cx_px, cy_px] = self.intrinsics_px;
+        Intrinsics {
+            width_px: self.width_px,
+            height_px: self.height_px,
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+        }
+    }
+
+    /// Returns the camera's extrinsics.
+    pub fn body_from_cam(&self) -> Pose<Body, Cam> {
+        Pose::new(DVec3::from(self.translation_m), DQuat::from_array(self.rotation_xyzw))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[repr(align(64))]
+    struct Aligned([u8; 8192]);
+
+    fn memory(header: &ObservationHeader) -> Aligned {
+        let mut memory = Aligned([0; 8192]);
+        memory.0[..size_of::<ObservationHeader>()].copy_from_slice(header.as_bytes());
+        memory
+    }
+
+    fn header(width: u32, height: u32) -> ObservationHeader {
+        let layout = ObservationLayout::of(&[(width, height)]);
+        let mut header = ObservationHeader::new(1, 1, layout.total_len as u32);
+        header.cameras[0].width_px = width;
+        header.cameras[0].height_px = height;
+        header.cameras[0].rgb_offset = layout.planes[0].0 as u32;
+        header.cameras[0].depth_offset = layout.planes[0].1 as u32;
+        header
+    }
+
+    #[test]
+    fn a_laid_out_observation_parses() {
+        let header = header(30, 20);
+        assert_eq!(ObservationHeader::parse(&memory(&header).0), Ok(&header));
+        assert_eq!(header.world_from_body(), None);
+    }
+
+    #[test]
+    fn planes_outside_the_memory_are_refused() {
+        let mut h = header(30, 20);
+        h.cameras[0].depth_offset = 8190;
+        assert_eq!(ObservationHeader::parse(&memory(&h).0), Err(InvalidObservation::Plane(0)));
+        let mut h = header(30, 20);
+        h.cameras[0].width_px = u32::MAX;
+        h.cameras[0].height_px = u32::MAX;
+        assert_eq!(ObservationHeader::parse(&memory(&h).0), Err(InvalidObservation::Plane(0)));
+        assert!(ObservationHeader::parse(&[0; 64]).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn planes_are_aligned_and_apart(sizes in prop::collection::vec((1u32..200, 1u32..200), 1..=MAX_CAMERAS)) {
+            let layout = ObservationLayout::of(&sizes);
+            let mut end = size_of::<ObservationHeader>();
+            for (&(rgb, depth), &(w, h)) in layout.planes.iter().zip(&sizes) {
+                let pixels = (w * h) as usize;
+                prop_assert!(rgb % PLANE_ALIGN == 0 && depth % PLANE_ALIGN == 0);
+                prop_assert!(rgb >= end && depth >= rgb + 3 * pixels);
+                end = depth + 2 * pixels;
+            }
+            prop_assert!(layout.total_len >= end);
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! The first eight bytes each side sends: who speaks, and which version of this crate.
+
+use zerocopy::byteorder::little_endian::U16;
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
+
+use crate::PROTOCOL_VERSION;
+
+/// Who speaks; its name stands in error messages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Party {
+    /// The render server.
+    Server,
+    /// The runtime on the Jetson.
+    Runtime,
+    /// A plugin, through the SDK it was built with.
+    Plugin,
+}
+
+impl Party {
+    fn from_byte(byte: u8) -> Option<Self> {
+        match byte {
+            1 => Some(Self::Server),
+            2 => Some(Self::Runtime),
+            3 => Some(Self::Plugin),
+            _ => None,
+        }
+    }
+
+    /// The party's name in messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Server => "server",
+            Self::Runtime => "runtime",
+            Self::Plugin => "plugin",
+        }
+    }
+}
+
+/// Magic, version, party. Its layout never changes, so that any two versions can tell.
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
+)]
+#[repr(C)]
+pub struct Preamble {
+    magic: [u8; 4],
+    version: U16,
+    party: u8,
+    reserved: u8,
+}
+
+impl Preamble {
+    /// Bytes on the wire.
+    pub const SIZE: usize = size_of::<Self>();
+    const MAGIC: [u8; 4] = *b"VZFL";
+
+    /// Returns what `party` of this build sends.
+    pub fn of(party: Party) -> Self {
+        Self {
+            magic: Self::MAGIC,
+            version: PROTOCOL_VERSION.into(),
+            party: party as u8 + 1,
+            reserved: 0,
+        }
+    }
+
+    /// Checks the other side's preamble against this build, speaking as `me`.
+    ///
+    /// ```
+    /// use vizflyt_protocol::packet::{Party, Preamble};
+    /// let mut bytes = *zerocopy::IntoBytes::as_bytes(&Preamble::of(Party::Server)).first_chunk::<8>().unwrap();
+    /// assert_eq!(Preamble::check(&bytes, Party::Runtime), Ok(Party::Server));
+    /// bytes[4] = 99;
+    /// let error = Preamble::check(&bytes, Party::Runtime).unwrap_err();
+    /// # extern crate std;
+    /// # use std::string::ToString;
+    /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime 1"));
+    /// ```
+    pub fn check(bytes: &[u8; Self::SIZE], me: Party) -> Result<Party, PreambleError> {
+        let Ok(theirs) = Self::read_from_bytes(bytes) else {
+            return Err(PreambleError::NotVizflyt);
+        };
+        let party = Party::from_byte(theirs.party);
+        let (Some(them), Self::MAGIC) = (party, theirs.magic) else {
+            return Err(PreambleError::NotVizflyt);
+        };
+        let version = theirs.version.get();
+        if version == PROTOCOL_VERSION {
+            return Ok(them);
+        }
+        let older = if version < PROTOCOL_VERSION { them } else { me };
+        Err(PreambleError::Version {
+            them: them.name(),
+            theirs: version,
+            me: me.name(),
+            ours: PROTOCOL_VERSION,
+            older: older.name(),
+        })
+    }
+}
+
+/// Why a peer is refused at its first bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PreambleError {
+    /// The bytes are no preamble.
+    #[error("the other side does not speak VizFlyt; check the address and port")]
+    NotVizflyt,
+    /// Another version.
+    #[error("{them} speaks protocol {theirs}, this {me} {ours}: update the {older}")]
+    Version {
+        /// The other party.
+        them: &'static str,
+        /// Its version.
+        theirs: u16,
+        /// This party.
+        me: &'static str,
+        /// This version.
+        ours: u16,
+        /// Which of the two to update.
+        older: &'static str,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use std::string::ToString;
+
+    fn check(bytes: [u8; 8], me: Party, expected: Result<Party, &str>) {
+        let found = Preamble::check(&bytes, me).map_err(|error| error.to_string());
+        assert_eq!(found, expected.map_err(ToString::to_string));
+    }
+
+    #[test]
+    fn the_older_side_is_named() {
+        check(*b"VZFL\x01\x00\x01\x00", Party::Runtime, Ok(Party::Server));
+        check(
+            *b"VZFL\x03\x00\x01\x00",
+            Party::Runtime,
+            Err("server speaks protocol 3, this runtime 1: update the runtime"),
+        );
+        check(
+            *b"VZFL\x00\x00\x02\x00",
+            Party::Server,
+            Err("runtime speaks protocol 0, this server 1: update the runtime"),
+        );
+        let stranger = "the other side does not speak VizFlyt; check the address and port";
+        check(*b"HTTP/1.1", Party::Server, Err(stranger));
+        check(*b"VZFL\x01\x00\x09\x00", Party::Server, Err(stranger));
+    }
+}

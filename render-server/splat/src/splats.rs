@@ -1,0 +1,39 @@
+//! A scene in memory: activated parameters, structure of arrays.
+
+use glam::{Quat, Vec3};
+
+/// 3D Gaussians with spherical-harmonic colour, in metres in the world frame.
+///
+/// All vectors have the same length [`Self::len`]; `sh` has `sh_coefficients() * 3` numbers each.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Splats {
+    /// Centres. [m, world]
+    pub means_m: Vec<Vec3>,
+    /// Standard deviations along the Gaussian's own axes (already exponentiated). [m]
+    pub scales_m: Vec<Vec3>,
+    /// The Gaussian's axes in the world; unit.
+    pub rotations: Vec<Quat>,
+    /// Peak opacity, 0 to 1 (already through the sigmoid).
+    pub opacities: Vec<f32>,
+    /// Degree of the harmonics, 0 to 3.
+    pub sh_degree: u8,
+    /// Coefficients, splat by splat, coefficient by coefficient, RGB within; the constant first.
+    pub sh: Vec<f32>,
+}
+
+impl Splats {
+    /// Returns the number of splats.
+    pub fn len(&self) -> usize {
+        self.means_m.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.means_m.is_empty()
+    }
+
+    /// Returns the number of coefficients per colour channel: 1, 4, 9 or 16.
+    pub fn sh_coefficients(&self) -> usize {
+        (usize::from(self.sh_degree) + 1).pow(2)
+    }
+}
