@@ -1,1 +1,76 @@
-fn main() {}
+//! `vizflyt`: the one command people type. Each subcommand is a library of its own; this file only
+//! reads the command line and starts one.
+
+mod demo;
+mod plugins;
+mod scene;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+use tracing_subscriber::EnvFilter;
+
+/// A drone flies in an empty net while its cameras see a photorealistic world.
+#[derive(Parser, Debug)]
+#[command(version, propagate_version = true)]
+#[command(after_help = "Start here:
+  vizflyt demo        fly a simulated drone through a forest and watch it in the browser")]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// What to log on standard error: error, warn, info, debug, trace; or a filter as
+    /// `vizflyt_runtime=debug`.
+    #[arg(long, global = true, value_name = "LEVEL", default_value = "info,quinn=warn")]
+    log_level: String,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Everything on this machine: generated scene, simulated vehicle, example plugin, page.
+    Demo(demo::DemoArgs),
+    /// The render server: pose in, RGB-D out, page and events.
+    Serve(vizflyt_server::ServeArgs),
+    /// The runtime on the Jetson: flies a plugin.
+    Fly(vizflyt_runtime::FlyArgs),
+    /// The simulated lab: vehicle, autopilot, motion capture.
+    Sim(vizflyt_simulator::SimArgs),
+    /// Makes scenes.
+    Scene(scene::SceneArgs),
+    /// Runs a built-in example plugin; started by `vizflyt fly`.
+    #[command(hide = true)]
+    Plugin(plugins::PluginArgs),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    if let Err(error) = start_log(&cli.log_level) {
+        eprintln!("error: --log-level '{}': {error}", cli.log_level);
+        return ExitCode::from(2);
+    }
+    match run(cli.command) {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(command: Command) -> Result<ExitCode> {
+    match command {
+        Command::Demo(args) => demo::run(&args),
+        Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
+        Command::Fly(args) => plugins::fly(args),
+        Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
+        Command::Scene(args) => scene::run(args),
+        Command::Plugin(args) => Ok(plugins::run(&args)),
+    }
+}
+
+/// Sends logs to standard error; standard output is for results.
+fn start_log(filter: &str) -> Result<()> {
+    let filter = EnvFilter::builder().parse(filter)?;
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    Ok(())
+}

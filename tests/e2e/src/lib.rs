@@ -1,1 +1,151 @@
-//! (in construction)
+//! Black-box tests of the real binaries; what they share.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{self, Receiver};
+use std::time::{Duration, Instant};
+
+/// Returns the `vizflyt` program built beside this test.
+///
+/// # Panics
+/// If it is not built; the message says how.
+pub fn vizflyt() -> PathBuf {
+    // target/PROFILE/deps/this-test
+    let test = std::env::current_exe().expect("a test knows its own path");
+    let program = test.ancestors().nth(2).expect("target/PROFILE").join("vizflyt");
+    assert!(
+        program.exists(),
+        "{} is not built; run `cargo build --release` first (tests/run does)",
+        program.display()
+    );
+    program
+}
+
+/// Returns the root of the repository.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
+}
+
+/// A running `vizflyt demo` whose output can be waited for. Killed when dropped.
+pub struct Demo {
+    child: Child,
+    lines: Receiver<String>,
+    /// What it has printed so far, for failure messages.
+    pub seen: Vec<String>,
+}
+
+impl Demo {
+    /// Starts `vizflyt demo --headless ARGS`.
+    ///
+    /// # Panics
+    /// If the program cannot be started.
+    pub fn start(args: &[&str]) -> Self {
+        let mut child = Command::new(vizflyt())
+            .args(["demo", "--headless"])
+            .args(args)
+            .current_dir(root())
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("vizflyt starts");
+        let stdout = child.stdout.take().expect("stdout is piped");
+        let (sender, lines) = mpsc::channel();
+        std::thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Self { child, lines, seen: Vec::new() }
+    }
+
+    /// Waits until a line contains `text` and returns it.
+    ///
+    /// # Panics
+    /// If none does within `limit`, or the demo ends first.
+    pub fn wait_for(&mut self, text: &str, limit: Duration) -> String {
+        let deadline = Instant::now() + limit;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.lines.recv_timeout(left) {
+                Ok(line) => {
+                    self.seen.push(line.clone());
+                    if line.contains(text) {
+                        return line;
+                    }
+                }
+                Err(error) => panic!("no line with '{text}' ({error}); seen: {:#?}", self.seen),
+            }
+        }
+    }
+
+    /// Waits for the end; returns the exit code, or `None` after a signal.
+    ///
+    /// # Panics
+    /// If it has not ended within `limit`.
+    pub fn wait(&mut self, limit: Duration) -> Option<i32> {
+        let deadline = Instant::now() + limit;
+        loop {
+            self.seen.extend(self.lines.try_iter());
+            if let Some(status) = self.child.try_wait().expect("the child is ours") {
+                self.seen.extend(self.lines.iter());
+                return status.code();
+            }
+            assert!(Instant::now() < deadline, "still running after {limit:?}: {:#?}", self.seen);
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Returns the process id.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Returns the pids of descendants whose command line contains `text`.
+    pub fn descendants(&self, text: &str) -> Vec<u32> {
+        descendants(self.pid())
+            .into_iter()
+            .filter(|pid| {
+                std::fs::read(format!("/proc/{pid}/cmdline")).is_ok_and(|line| {
+                    String::from_utf8_lossy(&line).replace('\0', " ").contains(text)
+                })
+            })
+            .collect()
+    }
+}
+
+impl Drop for Demo {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Returns the pids of all living descendants of `root`.
+pub fn descendants(root: u32) -> Vec<u32> {
+    let Ok(entries) = std::fs::read_dir("/proc") else { return Vec::new() };
+    let parents: Vec<(u32, u32)> = entries
+        .filter_map(|entry| {
+            let pid: u32 = entry.ok()?.file_name().to_str()?.parse().ok()?;
+            let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+            let parent = status.lines().find_map(|line| line.strip_prefix("PPid:"))?;
+            Some((pid, parent.trim().parse().ok()?))
+        })
+        .collect();
+    let mut family = vec![root];
+    let mut next = 0;
+    while next < family.len() {
+        let parent = family[next];
+        family.extend(parents.iter().filter(|&&(_, p)| p == parent).map(|&(pid, _)| pid));
+        next += 1;
+    }
+    family.split_off(1)
+}
+
+/// Whether a process with this id runs (a zombie does not).
+pub fn alive(pid: u32) -> bool {
+    std::fs::read_to_string(format!("/proc/{pid}/stat"))
+        .is_ok_and(|stat| !stat.rsplit(')').next().unwrap_or("").trim_start().starts_with('Z'))
+}

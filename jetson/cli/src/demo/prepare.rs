@@ -1,0 +1,67 @@
+//! Finds or makes what the demo flies in: an arena file, the spawn, and the truth if known.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use tempfile::TempDir;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_scenes::SceneKind;
+
+/// A scene on disk, ready to be served.
+pub(crate) struct Stage {
+    /// The `arena.toml`.
+    pub arena: PathBuf,
+    /// True geometry, where the scene was generated.
+    pub truth: Option<PathBuf>,
+    /// Where the vehicle stands: `x,y,z,yaw_deg`. [m, world; deg]
+    pub spawn: String,
+    /// Holds generated files until the demo ends.
+    _folder: Option<TempDir>,
+}
+
+impl Stage {
+    /// Generates the named scene, or takes the one at a path.
+    pub(crate) fn prepare(scene: &str, seed: u64) -> Result<Self> {
+        if let Ok(kind) = scene.parse::<SceneKind>() {
+            let folder = tempfile::Builder::new()
+                .prefix("vizflyt-demo-")
+                .tempdir()
+                .context("cannot make a folder for the generated scene")?;
+            println!("scene       {kind}, seed {seed}");
+            let written = vizflyt_scenes::generate(kind, seed).write(folder.path())?;
+            return Self::at(written.arena, Some(folder));
+        }
+        let path = Path::new(scene);
+        if !path.exists() {
+            bail!(
+                "--scene '{scene}' is neither forest, race nor room, nor a path that exists; \
+                 give one of the names, a folder with an arena.toml, or a splat .ply"
+            );
+        }
+        println!("scene       {}", path.display());
+        if path.is_dir() {
+            return Self::at(path.join("arena.toml"), None);
+        }
+        if path.extension().is_some_and(|extension| extension == "toml") {
+            return Self::at(path.to_owned(), None);
+        }
+        // A bare scene: write the arena that the server would assume, so that it can be seen.
+        let folder = tempfile::Builder::new().prefix("vizflyt-demo-").tempdir()?;
+        let arena = vizflyt_server::arena_for_scene(path)?;
+        let file = folder.path().join("arena.toml");
+        std::fs::write(&file, arena.to_toml())
+            .with_context(|| format!("cannot write {}", file.display()))?;
+        Self::at(file, Some(folder))
+    }
+
+    fn at(arena: PathBuf, folder: Option<TempDir>) -> Result<Self> {
+        let text = std::fs::read_to_string(&arena)
+            .with_context(|| format!("cannot read {}", arena.display()))?;
+        let config =
+            ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
+        let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
+        let [x, y, z] = config.spawn.position_m;
+        let spawn = format!("{x},{y},{z},{}", config.spawn.yaw_deg);
+        Ok(Self { arena, truth, spawn, _folder: folder })
+    }
+}

@@ -1,0 +1,181 @@
+//! The demo's report: what the runtime, the server and the simulator each measured, in one JSON
+//! object.
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+use serde_json::Value;
+
+/// One flight of the demo. Written by `--report`.
+#[derive(Clone, Debug, Serialize, PartialEq)]
+pub(crate) struct Report {
+    /// `finished`, `collided`, `geofence`, `timeout`, `landed`, `plugin_failed` or `error`.
+    pub outcome: String,
+    /// Why, in a sentence.
+    pub reason: String,
+    /// The seed of scene and simulator.
+    pub seed: u64,
+    /// Take-off to the end of the flight. [s]
+    pub seconds: f64,
+    /// Images the plugin was given.
+    pub images_delivered: u64,
+    /// Images given to the plugin per second of flight. [Hz]
+    pub image_hz: f64,
+    /// Width of the first camera's images. [px]
+    pub image_width: u64,
+    /// Height of the first camera's images. [px]
+    pub image_height: u64,
+    /// Pose stamp to plugin callback, median. [ms]
+    pub age_ms_p50: f64,
+    /// Pose stamp to plugin callback, 99th percentile. [ms]
+    pub age_ms_p99: f64,
+    /// Time to draw all cameras of a tick, median. [ms]
+    pub render_ms_p50: f64,
+    /// Mean speed in flight, by the simulator's truth. [m/s]
+    pub mean_speed_mps: f64,
+    /// Greatest speed, by the simulator's truth. [m/s]
+    pub max_speed_mps: f64,
+    /// Least distance of the body's surface to the true geometry; absent where a scene has none. [m]
+    pub min_clearance_m: Option<f64>,
+    /// Setpoints sent to the autopilot.
+    pub setpoints_sent: u64,
+    /// MAVLink packets sent and received by the runtime.
+    pub mavlink_packets: u64,
+    /// Peak of the summed resident memory of all processes. [MB]
+    pub peak_rss_mb: f64,
+    /// The renderer that drew, such as `cpu avx2`.
+    pub renderer: String,
+    /// Where the flight log is.
+    pub log: String,
+}
+
+/// What the processes reported, as far as they did.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Parts {
+    /// The runtime's report.
+    pub runtime: Value,
+    /// The server's report.
+    pub server: Value,
+    /// The simulator's report: the truth.
+    pub simulator: Value,
+}
+
+impl Parts {
+    /// Joins the parts. A true collision outranks what the referee believed; a missing part is an
+    /// error by name.
+    pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> Report {
+        let number = |part: &Value, key: &str| part[key].as_f64().unwrap_or(0.0);
+        let count = |part: &Value, key: &str| part[key].as_u64().unwrap_or(0);
+        let text = |part: &Value, key: &str| part[key].as_str().map(str::to_owned);
+        let missing = [
+            ("runtime", &self.runtime),
+            ("render server", &self.server),
+            ("simulator", &self.simulator),
+        ]
+        .into_iter()
+        .find(|(_, part)| !part.is_object());
+        let (outcome, reason) = match missing {
+            _ if self.simulator["collided"] == Value::Bool(true) => (
+                "collided".to_owned(),
+                "the body touched the true geometry of the scene".to_owned(),
+            ),
+            Some((name, _)) => ("error".to_owned(), format!("the {name} ended without a report")),
+            None => (
+                text(&self.runtime, "outcome").unwrap_or_else(|| "error".to_owned()),
+                text(&self.runtime, "reason").unwrap_or_default(),
+            ),
+        };
+        Report {
+            outcome,
+            reason,
+            seed,
+            seconds: number(&self.runtime, "seconds"),
+            images_delivered: count(&self.runtime, "images_delivered"),
+            image_hz: number(&self.runtime, "image_hz"),
+            image_width: count(&self.runtime, "image_width"),
+            image_height: count(&self.runtime, "image_height"),
+            age_ms_p50: number(&self.runtime, "age_ms_p50"),
+            age_ms_p99: number(&self.runtime, "age_ms_p99"),
+            render_ms_p50: number(&self.server, "render_ms_p50"),
+            mean_speed_mps: number(&self.simulator, "mean_speed_mps"),
+            max_speed_mps: number(&self.simulator, "max_speed_mps"),
+            min_clearance_m: self.simulator["min_clearance_m"].as_f64(),
+            setpoints_sent: count(&self.runtime, "setpoints_sent"),
+            mavlink_packets: count(&self.runtime, "mavlink_packets"),
+            peak_rss_mb,
+            renderer: text(&self.server, "renderer").unwrap_or_default(),
+            log: log.to_owned(),
+        }
+    }
+}
+
+impl Report {
+    /// Writes the report as indented JSON.
+    pub(crate) fn write(&self, path: &std::path::Path) -> Result<()> {
+        let json = serde_json::to_string_pretty(self)? + "\n";
+        std::fs::write(path, json)
+            .with_context(|| format!("cannot write the report to {}", path.display()))
+    }
+
+    /// Returns the report as a few lines for a person.
+    pub(crate) fn summary(&self) -> String {
+        let clearance = match self.min_clearance_m {
+            Some(clearance_m) => format!("{clearance_m:.2} m"),
+            None => "not known (this scene has no true geometry)".to_owned(),
+        };
+        let reason = if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
+        format!(
+            "{outcome}{reason}\n\
+             \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
+             \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, drawn in {render:.1} ms ({renderer})\n\
+             \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms\n\
+             \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n\
+             \x20 memory      {memory:.0} MB at most, all processes together\n\
+             \x20 log         {log}",
+            outcome = self.outcome,
+            seconds = self.seconds,
+            mean = self.mean_speed_mps,
+            top = self.max_speed_mps,
+            delivered = self.images_delivered,
+            width = self.image_width,
+            height = self.image_height,
+            hz = self.image_hz,
+            render = self.render_ms_p50,
+            renderer = self.renderer,
+            p50 = self.age_ms_p50,
+            p99 = self.age_ms_p99,
+            setpoints = self.setpoints_sent,
+            packets = self.mavlink_packets,
+            memory = self.peak_rss_mb,
+            log = self.log,
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn parts() -> Parts {
+        Parts {
+            runtime: json!({"outcome": "finished", "reason": "", "image_hz": 50.5}),
+            server: json!({"renderer": "cpu"}),
+            simulator: json!({"collided": false, "min_clearance_m": 0.4}),
+        }
+    }
+
+    #[test]
+    fn the_truth_outranks_the_referee() {
+        let mut parts = parts();
+        assert_eq!(parts.join(7, 1.0, "").outcome, "finished");
+        parts.simulator["collided"] = json!(true);
+        assert_eq!(parts.join(7, 1.0, "").outcome, "collided");
+    }
+
+    #[test]
+    fn a_missing_part_is_an_error_by_name() {
+        let report = Parts { server: Value::Null, ..parts() }.join(7, 1.0, "");
+        assert_eq!(report.outcome, "error");
+        assert_eq!(report.reason, "the render server ended without a report");
+    }
+}

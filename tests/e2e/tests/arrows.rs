@@ -1,0 +1,64 @@
+//! The import arrows of docs/ARCHITECTURE.md: who may depend on whom, read from cargo itself.
+
+use std::collections::BTreeSet;
+
+use cargo_metadata::{DependencyKind, MetadataCommand};
+
+/// (crate, what of ours it may import).
+const ARROWS: &[(&str, &[&str])] = &[
+    ("vizflyt-protocol", &[]),
+    ("vizflyt-rgbd", &["vizflyt-protocol"]),
+    ("vizflyt-splat", &["vizflyt-protocol"]),
+    ("vizflyt-arena", &["vizflyt-protocol"]),
+    ("vizflyt-simulator", &["vizflyt-protocol"]),
+    ("vizflyt-sdk", &["vizflyt-protocol"]),
+    ("vizflyt-avoid", &["vizflyt-sdk"]),
+    // The generator knows the truth; the server must never see it, so it does not import scenes.
+    ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
+    (
+        "vizflyt-server",
+        &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-splat", "vizflyt-arena"],
+    ),
+    ("vizflyt-runtime", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-sdk"]),
+    (
+        "vizflyt",
+        &[
+            "vizflyt-protocol",
+            "vizflyt-arena",
+            "vizflyt-scenes",
+            "vizflyt-server",
+            "vizflyt-runtime",
+            "vizflyt-simulator",
+            "vizflyt-sdk",
+            "vizflyt-avoid",
+        ],
+    ),
+    ("vizflyt-e2e", &[]),
+];
+
+#[test]
+fn every_import_is_an_arrow_of_the_architecture() {
+    let metadata = MetadataCommand::new()
+        .manifest_path(vizflyt_e2e::root().join("Cargo.toml"))
+        .no_deps()
+        .exec()
+        .expect("cargo metadata runs");
+    let ours: BTreeSet<&str> =
+        metadata.workspace_packages().iter().map(|package| package.name.as_str()).collect();
+    let listed: BTreeSet<&str> = ARROWS.iter().map(|&(name, _)| name).collect();
+    assert_eq!(ours, listed, "a crate was added or removed: give it its arrows here and in docs/");
+    for package in metadata.workspace_packages() {
+        let (_, allowed) = ARROWS.iter().find(|(name, _)| *name == package.name.as_str()).unwrap();
+        for dependency in &package.dependencies {
+            let test_only = dependency.kind == DependencyKind::Development;
+            if !test_only && ours.contains(dependency.name.as_str()) {
+                assert!(
+                    allowed.contains(&dependency.name.as_str()),
+                    "{} may not import {}; docs/ARCHITECTURE.md says why",
+                    package.name,
+                    dependency.name
+                );
+            }
+        }
+    }
+}
