@@ -1,1 +1,52 @@
-//! (in construction)
+//! What a plugin links: the [`Autonomy`] trait, what it sees ([`Observation`]), what it answers
+//! ([`Setpoint`]), and the shared-memory transport to the runtime.
+//!
+//! A plugin is a program of its own. `vizflyt fly` starts it as a child process, hands it every
+//! image through shared memory, and checks each setpoint it returns. Whatever the plugin does,
+//! crash, stall or loop, the vehicle then holds and lands.
+//!
+//! ```no_run
+//! use vizflyt_sdk::glam::DVec3;
+//! use vizflyt_sdk::{Autonomy, Axes, Observation, Setpoint, YawTarget};
+//!
+//! struct Creep;
+//!
+//! impl Autonomy for Creep {
+//!     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
+//!         let front = obs.camera("front")?;
+//!         let ahead_m = front.depth_m(front.width_px / 2, front.height_px / 2).unwrap_or(9.0);
+//!         let v_mps = DVec3::X * (0.5 * (ahead_m - 1.0)).clamp(0.0, 1.0) as f64;
+//!         Some(Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw: YawTarget::Keep })
+//!     }
+//! }
+//!
+//! fn main() -> std::process::ExitCode {
+//!     vizflyt_sdk::run(Creep)
+//! }
+//! ```
+//!
+//! Read in this order: [`autonomy`](Autonomy), [`observation`](Observation), [`run`], [`ipc`].
+
+mod autonomy;
+mod clock;
+pub mod ipc;
+mod memory;
+mod observation;
+mod run;
+
+pub use glam;
+pub use vizflyt_protocol as protocol;
+
+pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
+pub use vizflyt_protocol::messages::{
+    ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint, YawTarget,
+};
+pub use vizflyt_protocol::time::HostTime;
+
+pub use autonomy::Autonomy;
+pub use clock::host_now;
+pub use memory::{
+    ImageStamps, ObservationBuffer, ObservationTooLarge, ObservationWriter, PlanesMut,
+};
+pub use observation::{CameraImage, Observation, Vehicle};
+pub use run::{attach, run};

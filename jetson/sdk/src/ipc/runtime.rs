@@ -1,0 +1,192 @@
+//! The runtime's end: creates the services, publishes observations, reads answers.
+
+use std::time::Duration;
+
+use iceoryx2::node::Node;
+use iceoryx2::port::BackpressureAction;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::{AttributeSpecifier, PortFactory as _};
+use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use vizflyt_protocol::PROTOCOL_VERSION;
+use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
+use vizflyt_protocol::packet::framing::MAX_FRAMED;
+
+use super::{Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive, send, slices, wait};
+
+/// The runtime's end of the shared memory. All calls return at once, but for [`Self::wait`]; a
+/// plugin that hangs never blocks them.
+#[derive(Debug)]
+pub struct RuntimeEnd {
+    observations: Publisher<Ipc, [u8], ()>,
+    to_plugin: Publisher<Ipc, [u8], ()>,
+    from_plugin: Subscriber<Ipc, [u8], ()>,
+    wake_plugin: Notifier<Ipc>,
+    wake_runtime: Listener<Ipc>,
+    to_plugin_service: PortFactory<Ipc, [u8], ()>,
+    observation_len: usize,
+    // Last, so that ports go before the node they belong to.
+    node: Node<Ipc>,
+}
+
+/// Shared memory for one observation, to be written and then published. Dropped unpublished, it
+/// goes back to the pool.
+#[derive(Debug)]
+pub struct LoanedObservation(SampleMut<Ipc, [u8], ()>);
+
+impl RuntimeEnd {
+    /// Creates the services under `prefix`, with room for observations of `observation_len` bytes.
+    ///
+    /// # Errors
+    /// [`IpcError::Transport`], as when shared memory is full or the prefix is in use.
+    pub fn create(prefix: &str, observation_len: usize) -> Result<Self, IpcError> {
+        let node = node()?;
+        let creating = "creating a service";
+        let port = "creating a port";
+
+        let version = AttributeSpecifier::new()
+            .define(
+                &PROTOCOL_KEY.try_into().map_err(IpcError::transport(creating))?,
+                &PROTOCOL_VERSION
+                    .to_string()
+                    .as_str()
+                    .try_into()
+                    .map_err(IpcError::transport(creating))?,
+            )
+            .map_err(IpcError::transport(creating))?;
+        // Newest wins: a buffer of one that overflows. Two readers at most: the plugin, and its
+        // successor while the slot of the dead one is being reclaimed.
+        let observations = slices(&node, prefix, "observation")?
+            .enable_safe_overflow(true)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(2)
+            .history_size(0)
+            .max_publishers(1)
+            .max_subscribers(2)
+            .max_nodes(4)
+            .create_with_attributes(&version)
+            .map_err(IpcError::transport(creating))?
+            .publisher_builder()
+            .initial_max_slice_len(observation_len)
+            .max_loaned_samples(2)
+            .create()
+            .map_err(IpcError::transport(port))?;
+
+        // Nothing is lost: no overflow, and a full queue is an error at its sender.
+        let queue = |suffix| {
+            slices(&node, prefix, suffix)?
+                .enable_safe_overflow(false)
+                .subscriber_max_buffer_size(QUEUE_DEPTH)
+                .subscriber_max_borrowed_samples(2)
+                .history_size(0)
+                .max_publishers(2)
+                .max_subscribers(2)
+                .max_nodes(4)
+                .create()
+                .map_err(IpcError::transport(creating))
+        };
+        let to_plugin_service = queue("to_plugin")?;
+        let to_plugin = to_plugin_service
+            .publisher_builder()
+            .initial_max_slice_len(MAX_FRAMED)
+            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
+            .create()
+            .map_err(IpcError::transport(port))?;
+        let from_plugin = queue("from_plugin")?
+            .subscriber_builder()
+            .create()
+            .map_err(IpcError::transport(port))?;
+
+        let event = |suffix| {
+            node.service_builder(&name(prefix, suffix)?)
+                .event()
+                .max_nodes(4)
+                .max_listeners(2)
+                .max_notifiers(2)
+                .create()
+                .map_err(IpcError::transport(creating))
+        };
+        let wake_plugin =
+            event("wake_plugin")?.notifier_builder().create().map_err(IpcError::transport(port))?;
+        let wake_runtime = event("wake_runtime")?
+            .listener_builder()
+            .create()
+            .map_err(IpcError::transport(port))?;
+        Ok(Self {
+            observations,
+            to_plugin,
+            from_plugin,
+            wake_plugin,
+            wake_runtime,
+            to_plugin_service,
+            observation_len,
+            node,
+        })
+    }
+
+    /// Whether a plugin has attached: from then on messages reach it.
+    pub fn plugin_attached(&self) -> bool {
+        self.to_plugin_service.dynamic_config().number_of_subscribers() > 0
+    }
+
+    /// Sends a message and wakes the plugin.
+    ///
+    /// # Errors
+    /// [`IpcError::QueueFull`] if the plugin has left so many unread that it must be hung.
+    pub fn send(&self, message: &ToPlugin) -> Result<(), IpcError> {
+        send(&self.to_plugin, message, "plugin")?;
+        self.heartbeat();
+        Ok(())
+    }
+
+    /// Wakes the plugin. At least twice a second, so that it knows the runtime is alive.
+    pub fn heartbeat(&self) {
+        // Nobody listening is no fault: the supervisor tells whether the plugin lives.
+        let _ = self.wake_plugin.notify();
+    }
+
+    /// Lends shared memory for one observation: zeros, aligned to 64.
+    ///
+    /// # Errors
+    /// [`IpcError::Transport`] if two are lent already.
+    pub fn loan(&self) -> Result<LoanedObservation, IpcError> {
+        let sample = self.observations.loan_slice(self.observation_len);
+        Ok(LoanedObservation(sample.map_err(IpcError::transport("lending memory"))?))
+    }
+
+    /// Publishes an observation and wakes the plugin; the one before is replaced if unread.
+    pub fn publish(&self, observation: LoanedObservation) -> Result<(), IpcError> {
+        observation.0.send().map_err(IpcError::transport("publishing"))?;
+        self.heartbeat();
+        Ok(())
+    }
+
+    /// Waits until the plugin sends something, `timeout` at most; returns whether it did.
+    pub fn wait(&self, timeout: Duration) -> Result<bool, IpcError> {
+        wait(&self.wake_runtime, timeout)
+    }
+
+    /// Takes the plugin's next message.
+    ///
+    /// # Errors
+    /// [`IpcError::Message`] for one that does not decode; the next can still be read.
+    pub fn receive(&self) -> Result<Option<FromPlugin>, IpcError> {
+        receive(&self.from_plugin)
+    }
+
+    /// Reclaims what a dead plugin held: its subscriptions and the samples it was reading. Call
+    /// after each exit of a plugin.
+    pub fn clean_up(&self) {
+        self.node.try_cleanup_dead_nodes();
+    }
+}
+
+impl LoanedObservation {
+    /// Returns the memory to write into.
+    pub fn memory(&mut self) -> &mut [u8] {
+        self.0.payload_mut()
+    }
+}

@@ -1,0 +1,228 @@
+//! Writes observations: into shared memory for the runtime, into owned memory for tests and
+//! replays. The mirror of [`observation`](crate::Observation).
+
+use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Name};
+use vizflyt_protocol::packet::{ObservationHeader, ObservationLayout};
+use vizflyt_protocol::time::HostTime;
+use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
+
+use crate::observation::{Observation, Vehicle};
+
+/// When an image's pose was measured, when it was ready, and which tick made it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ImageStamps {
+    /// Tick of the server.
+    pub seq: u64,
+    /// When the pose that the image shows was measured. [host]
+    pub pose: HostTime,
+    /// When the image was decoded. [host]
+    pub ready: HostTime,
+}
+
+/// Writes one observation in place: header, then the planes of each camera.
+#[derive(Debug)]
+pub struct ObservationWriter<'m> {
+    memory: &'m mut [u8],
+    layout: ObservationLayout,
+}
+
+/// The planes of one camera, to be filled in.
+#[derive(Debug)]
+pub struct PlanesMut<'m> {
+    /// H x W x 3.
+    pub rgb: &'m mut [u8],
+    /// H x W, 0 is no return. [mm]
+    pub depth_mm: &'m mut [u16],
+}
+
+/// The cameras' images do not fit in the memory given.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("observation needs {needed} bytes aligned to 8, the memory has {found}")]
+pub struct ObservationTooLarge {
+    /// Bytes the cameras need.
+    pub needed: usize,
+    /// Bytes given.
+    pub found: usize,
+}
+
+impl<'m> ObservationWriter<'m> {
+    /// Returns how many bytes an observation of these cameras takes. [bytes]
+    pub fn len_for(cameras: &[CameraInfo]) -> usize {
+        layout_of(cameras).total_len
+    }
+
+    /// Starts observation `seq` in `memory`, with no image and no vehicle in it yet.
+    ///
+    /// # Errors
+    /// If `memory` is smaller than [`Self::len_for`] or not aligned to 8.
+    pub fn new(
+        memory: &'m mut [u8],
+        seq: u64,
+        cameras: &[CameraInfo],
+    ) -> Result<Self, ObservationTooLarge> {
+        let layout = layout_of(cameras);
+        let found = memory.len();
+        let error = ObservationTooLarge { needed: layout.total_len, found };
+        let total_len = u32::try_from(layout.total_len).map_err(|_| error)?;
+        if found < layout.total_len {
+            return Err(error);
+        }
+        let count = cameras.len().min(MAX_CAMERAS);
+        let mut header = ObservationHeader::new(seq, count as u8, total_len);
+        for ((head, camera), &(rgb, depth)) in
+            header.cameras.iter_mut().zip(cameras).zip(&layout.planes)
+        {
+            let k = &camera.intrinsics;
+            // The size stays 0 until the image is there; see `camera`.
+            head.intrinsics_px = [k.fx_px, k.fy_px, k.cx_px, k.cy_px];
+            head.translation_m = camera.body_from_cam.translation_m.to_array();
+            head.rotation_xyzw = camera.body_from_cam.rotation.to_array();
+            (head.rgb_offset, head.depth_offset) = (rgb as u32, depth as u32);
+        }
+        let (place, _) = ObservationHeader::mut_from_prefix(memory).map_err(|_| error)?;
+        *place = header;
+        Ok(Self { memory, layout })
+    }
+
+    fn header(&mut self) -> &mut ObservationHeader {
+        ObservationHeader::mut_from_prefix(self.memory).expect("checked in `new`").0
+    }
+
+    /// Fills in the vehicle's state.
+    pub fn vehicle(&mut self, vehicle: &Vehicle) {
+        let header = self.header();
+        header.flags |= ObservationHeader::HAS_VEHICLE;
+        header.vehicle_ns = vehicle.stamp.as_ns();
+        header.position_m = vehicle.world_from_body.translation_m.to_array();
+        header.rotation_xyzw = vehicle.world_from_body.rotation.to_array();
+        header.velocity_mps = vehicle.v_world_mps.to_array();
+        header.angular_radps = vehicle.omega_body_radps.to_array();
+        header.battery_fraction = vehicle.battery_fraction.unwrap_or(-1.0);
+    }
+
+    /// Returns the planes of camera `index`, of the size in its [`CameraInfo`], to be decoded
+    /// into; `None` if there is no such camera. Call [`Self::image_ready`] afterwards.
+    pub fn planes(&mut self, index: usize, camera: &CameraInfo) -> Option<PlanesMut<'_>> {
+        let count = usize::from(self.header().camera_count);
+        let &(rgb_at, depth_at) = self.layout.planes[..count].get(index)?;
+        let pixels = camera.intrinsics.pixels();
+        let (front, back) = self.memory.split_at_mut_checked(depth_at)?;
+        let rgb = front.get_mut(rgb_at..rgb_at + 3 * pixels)?;
+        let depth_mm = <[u16]>::mut_from_bytes(back.get_mut(..2 * pixels)?).ok()?;
+        Some(PlanesMut { rgb, depth_mm })
+    }
+
+    /// Declares the planes of camera `index` filled in; only then does a plugin see them.
+    pub fn image_ready(&mut self, index: usize, camera: &CameraInfo, stamps: ImageStamps) {
+        let count = usize::from(self.header().camera_count);
+        let Some(head) = self.header().cameras[..count].get_mut(index) else { return };
+        head.width_px = camera.intrinsics.width_px;
+        head.height_px = camera.intrinsics.height_px;
+        head.seq = stamps.seq;
+        head.pose_ns = stamps.pose.as_ns();
+        head.ready_ns = stamps.ready.as_ns();
+    }
+}
+
+fn layout_of(cameras: &[CameraInfo]) -> ObservationLayout {
+    let mut sizes = [(0, 0); MAX_CAMERAS];
+    for (size, camera) in sizes.iter_mut().zip(cameras) {
+        *size = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+    }
+    ObservationLayout::of(&sizes[..cameras.len().min(MAX_CAMERAS)])
+}
+
+/// One observation in memory of its own: for tests, replays and tools.
+///
+/// ```
+/// use vizflyt_sdk::glam::DVec3;
+/// use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
+/// use vizflyt_sdk::protocol::messages::bounded;
+/// use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, ObservationBuffer};
+/// let front = CameraInfo {
+///     name: bounded("front"),
+///     intrinsics: Intrinsics::from_horizontal_fov(4, 2, 1.5),
+///     body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+/// };
+/// let mut buffer = ObservationBuffer::new(&[front]);
+/// buffer.set_image(0, ImageStamps::default(), |planes| {
+///     planes.rgb.fill(128);
+///     planes.depth_mm.fill(2500);
+/// });
+/// let obs = buffer.observation();
+/// assert_eq!(obs.camera("front").unwrap().depth_m(3, 1), Some(2.5));
+/// assert!(obs.camera("rear").is_none() && obs.vehicle().is_none());
+/// ```
+#[derive(Debug)]
+pub struct ObservationBuffer {
+    blocks: Vec<Block>,
+    cameras: Vec<CameraInfo>,
+    names: Vec<Name>,
+}
+
+/// Memory in units of the alignment the layout promises.
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, KnownLayout, Immutable)]
+#[repr(C, align(64))]
+struct Block([u8; 64]);
+
+impl ObservationBuffer {
+    /// Makes an empty observation number 0 of these cameras (at most 8).
+    ///
+    /// # Panics
+    /// If the cameras together need 4 GiB or more.
+    pub fn new(cameras: &[CameraInfo]) -> Self {
+        let cameras = cameras[..cameras.len().min(MAX_CAMERAS)].to_vec();
+        let names = cameras.iter().map(|camera| camera.name.clone()).collect();
+        let len = ObservationWriter::len_for(&cameras).div_ceil(size_of::<Block>());
+        let mut buffer = Self { blocks: vec![Block::new_zeroed(); len], cameras, names };
+        buffer.clear(0);
+        buffer
+    }
+
+    /// Empties it and numbers it `seq`.
+    ///
+    /// # Panics
+    /// As [`Self::new`].
+    pub fn clear(&mut self, seq: u64) {
+        ObservationWriter::new(self.blocks.as_mut_bytes(), seq, &self.cameras)
+            .expect("sized in `new`; larger than 4 GiB is no observation");
+    }
+
+    fn writer(&mut self) -> ObservationWriter<'_> {
+        let layout = layout_of(&self.cameras);
+        ObservationWriter { memory: self.blocks.as_mut_bytes(), layout }
+    }
+
+    /// Fills in the vehicle's state.
+    pub fn set_vehicle(&mut self, vehicle: &Vehicle) {
+        self.writer().vehicle(vehicle);
+    }
+
+    /// Fills in the image of camera `index` by `fill`; does nothing if there is no such camera.
+    pub fn set_image(
+        &mut self,
+        index: usize,
+        stamps: ImageStamps,
+        fill: impl FnOnce(PlanesMut<'_>),
+    ) {
+        let Some(camera) = self.cameras.get(index).cloned() else { return };
+        let mut writer = self.writer();
+        if let Some(planes) = writer.planes(index, &camera) {
+            fill(planes);
+            writer.image_ready(index, &camera, stamps);
+        }
+    }
+
+    /// Returns the bytes in the layout of [`ObservationHeader`], aligned to 64.
+    pub fn as_bytes(&self) -> &[u8] {
+        self.blocks.as_bytes()
+    }
+
+    /// Returns the view a plugin gets.
+    ///
+    /// # Panics
+    /// Never: the buffer was laid out by this module.
+    pub fn observation(&self) -> Observation<'_> {
+        Observation::from_bytes(self.as_bytes(), &self.names).expect("laid out in `new`")
+    }
+}

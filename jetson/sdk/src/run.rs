@@ -1,0 +1,175 @@
+//! The plugin's main loop: waits for the runtime, calls the plugin, sends its answers.
+
+use std::any::type_name;
+use std::ffi::OsString;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::process::ExitCode;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use vizflyt_protocol::messages::{FromPlugin, Name, ToPlugin, bounded};
+
+use crate::autonomy::Autonomy;
+use crate::clock::host_now;
+use crate::ipc::{IpcError, PluginEnd, SERVICE_OPTION};
+use crate::observation::Observation;
+
+/// Runs a plugin to the end of the flight; call it from `main`.
+///
+/// The runtime passes `--vizflyt-service PREFIX` on the command line; without it this says how to
+/// start the program, and returns 2. Other arguments are left to the plugin.
+///
+/// Returns 0 after a flight, 1 if the runtime vanished, 2 if there was none to attach to, 101
+/// after a panic in the plugin (which the runtime is told).
+pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
+    if let Some(service) = service_argument(std::env::args_os()) {
+        return attach(plugin, &service);
+    }
+    let program = std::env::args().next().unwrap_or_default();
+    eprintln!("{program} is a VizFlyt plugin and is started by `vizflyt fly {program}`");
+    eprintln!("({SERVICE_OPTION} is missing, by which the runtime tells where its images are)");
+    ExitCode::from(NOT_ATTACHED)
+}
+
+/// As [`run`], with the service's prefix given directly.
+pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
+    let end = match PluginEnd::open(service) {
+        Ok(end) => end,
+        Err(error) => {
+            eprintln!("plugin: {error}");
+            return ExitCode::from(NOT_ATTACHED);
+        }
+    };
+    let panic_message = record_panics();
+    match catch_unwind(AssertUnwindSafe(|| serve(&mut plugin, &end))) {
+        Ok(Ok(End::Stopped)) => ExitCode::SUCCESS,
+        Ok(Ok(End::RuntimeGone)) => {
+            eprintln!("plugin: the runtime is gone; ending");
+            ExitCode::FAILURE
+        }
+        Ok(Err(error)) => {
+            eprintln!("plugin: {error}");
+            ExitCode::FAILURE
+        }
+        Err(_) => {
+            let message = panic_message.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let reason = message.unwrap_or_else(|| "the plugin panicked".to_owned());
+            // If even this fails, the runtime still sees the exit status.
+            let _ = end.send(&FromPlugin::Failed { reason: bounded(&reason) });
+            ExitCode::from(PANICKED)
+        }
+    }
+}
+
+/// Exit status: no runtime to attach to.
+const NOT_ATTACHED: u8 = 2;
+/// Exit status after a panic, as Rust's own.
+const PANICKED: u8 = 101;
+/// The runtime wakes its plugin at least twice a second; after this long it is gone.
+const RUNTIME_GONE_AFTER: Duration = Duration::from_secs(2);
+
+/// Why the loop ended.
+enum End {
+    Stopped,
+    RuntimeGone,
+}
+
+fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> {
+    // `None` until the runtime said what the plugin flies in.
+    let mut names: Option<Vec<Name>> = None;
+    let mut heard = Instant::now();
+    loop {
+        if end.wait(RUNTIME_GONE_AFTER / 4)? {
+            heard = Instant::now();
+        } else if heard.elapsed() > RUNTIME_GONE_AFTER {
+            plugin.on_stop();
+            return Ok(End::RuntimeGone);
+        }
+        while let Some(message) = end.receive()? {
+            match message {
+                ToPlugin::Start(info) => {
+                    plugin.on_start(&info);
+                    names = Some(info.cameras.iter().map(|camera| camera.name.clone()).collect());
+                    end.send(&FromPlugin::Ready { name: bounded(short_name::<A>()) })?;
+                }
+                ToPlugin::Event(event) => plugin.on_event(&event),
+                ToPlugin::Stop => {
+                    plugin.on_stop();
+                    return Ok(End::Stopped);
+                }
+            }
+        }
+        let Some(names) = &names else { continue };
+        let Some(sample) = end.observation()? else { continue };
+        // The runtime validated nothing for us: a bad observation is its bug, and skipped.
+        let Ok(observation) = Observation::from_bytes(sample.bytes(), names) else { continue };
+        let entered = host_now();
+        let setpoint = plugin.on_image(&observation);
+        let seq = observation.seq();
+        end.send(&FromPlugin::Answer { seq, entered, returned: host_now(), setpoint })?;
+    }
+}
+
+/// Returns the type's name without its path.
+fn short_name<A>() -> &'static str {
+    let full = type_name::<A>();
+    full.split('<').next().and_then(|path| path.rsplit("::").next()).unwrap_or(full)
+}
+
+/// Keeps the message of a panic on this thread, beside the usual print.
+fn record_panics() -> Arc<Mutex<Option<String>>> {
+    let slot = Arc::new(Mutex::new(None));
+    let (kept, plugin_thread) = (Arc::clone(&slot), thread::current().id());
+    let print = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        if thread::current().id() == plugin_thread {
+            let message = info.payload_as_str().unwrap_or("a panic without a message");
+            let place = info.location().map(|at| format!(" at {}:{}", at.file(), at.line()));
+            let text = format!("panicked{}: {message}", place.unwrap_or_default());
+            *kept.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
+        }
+        print(info);
+    }));
+    slot
+}
+
+/// Returns the value of `--vizflyt-service`, as `--vizflyt-service X` or `--vizflyt-service=X`.
+fn service_argument(arguments: impl Iterator<Item = OsString>) -> Option<String> {
+    let mut arguments = arguments.filter_map(|argument| argument.into_string().ok());
+    while let Some(argument) = arguments.next() {
+        if argument == SERVICE_OPTION {
+            return arguments.next();
+        }
+        if let Some(value) = argument.strip_prefix(SERVICE_OPTION).and_then(|v| v.strip_prefix('='))
+        {
+            return Some(value.to_owned());
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(arguments: &[&str], expected: Option<&str>) {
+        let found = service_argument(arguments.iter().map(OsString::from));
+        assert_eq!(found.as_deref(), expected);
+    }
+
+    #[test]
+    fn the_service_is_found_among_other_arguments() {
+        check(&["me", "--vizflyt-service", "a/b"], Some("a/b"));
+        check(&["me", "avoid", "--gain=2", "--vizflyt-service=a/b"], Some("a/b"));
+        check(&["me", "--vizflyt-service"], None);
+        check(&["me", "--vizflyt-services=x"], None);
+        check(&["me"], None);
+    }
+
+    #[test]
+    fn names_are_short() {
+        struct Avoid<T>(T);
+        assert_eq!(short_name::<Avoid<String>>(), "Avoid");
+    }
+}
