@@ -226,3 +226,94 @@ impl ObservationBuffer {
         Observation::from_bytes(self.as_bytes(), &self.names).expect("laid out in `new`")
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+    use proptest::prelude::*;
+    use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+    use vizflyt_protocol::messages::bounded;
+    use vizflyt_protocol::packet::InvalidObservation;
+
+    fn camera(name: &str, width_px: u32, height_px: u32) -> CameraInfo {
+        CameraInfo {
+            name: bounded(name),
+            intrinsics: Intrinsics::from_horizontal_fov(width_px, height_px, 1.5),
+            body_from_cam: body_from_forward_cam(DVec3::X * 0.06, 0.2),
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let cameras = [camera("front", 5, 3), camera("rear", 7, 4)];
+        let mut buffer = ObservationBuffer::new(&cameras);
+        assert_eq!(buffer.observation().cameras().count(), 0);
+        let vehicle = Vehicle {
+            stamp: HostTime::from_ns(5),
+            world_from_body: Pose::new(DVec3::ONE, DQuat::from_rotation_z(0.5)),
+            v_world_mps: DVec3::Y,
+            omega_body_radps: DVec3::Z,
+            battery_fraction: Some(0.5),
+        };
+        buffer.set_vehicle(&vehicle);
+        let stamps =
+            ImageStamps { seq: 3, pose: HostTime::from_ns(7), ready: HostTime::from_ns(9) };
+        buffer.set_image(1, stamps, |planes| {
+            for (index, depth_mm) in planes.depth_mm.iter_mut().enumerate() {
+                *depth_mm = index as u16;
+            }
+            planes.rgb[3 * 27..].copy_from_slice(&[1, 2, 3]);
+        });
+        buffer.set_image(9, stamps, |_| panic!("there is no camera 9"));
+
+        let observation = buffer.observation();
+        assert_eq!(observation.vehicle(), Some(vehicle));
+        assert_eq!(observation.stamp(), HostTime::from_ns(7));
+        assert!(observation.camera("front").is_none(), "it has no image yet");
+        let rear = observation.camera("rear").unwrap();
+        assert_eq!((rear.seq, rear.stamp, rear.ready), (3, stamps.pose, stamps.ready));
+        assert_eq!(
+            (rear.intrinsics, rear.body_from_cam),
+            (cameras[1].intrinsics, cameras[1].body_from_cam)
+        );
+        assert_eq!(rear.depth_m(0, 0), None, "0 is no return");
+        assert_eq!((rear.depth_m(6, 3), rear.rgb_at(6, 3)), (Some(0.027), Some([1, 2, 3])));
+
+        buffer.clear(8);
+        assert_eq!(buffer.observation().seq(), 8);
+        assert!(
+            buffer.observation().vehicle().is_none()
+                && buffer.observation().cameras().next().is_none()
+        );
+    }
+
+    #[test]
+    fn memory_too_small_is_refused() {
+        let cameras = [camera("front", 64, 48)];
+        let needed = ObservationWriter::len_for(&cameras);
+        let mut memory = vec![0; needed - 1];
+        let error = ObservationWriter::new(&mut memory, 0, &cameras).unwrap_err();
+        assert_eq!(error, ObservationTooLarge { needed, found: needed - 1 });
+        let bytes = ObservationBuffer::new(&cameras);
+        let cut = Observation::from_bytes(&bytes.as_bytes()[..64], &[]);
+        assert!(matches!(cut, Err(InvalidObservation::Short(64))));
+    }
+
+    proptest! {
+        /// Whatever a header says, a view stays within its bytes or is refused.
+        #[test]
+        fn poisoned_headers_never_reach_outside(at in 0usize..1168, value in any::<u8>()) {
+            let mut buffer = ObservationBuffer::new(&[camera("front", 8, 6)]);
+            buffer.set_image(0, ImageStamps::default(), |planes| planes.rgb.fill(9));
+            buffer.blocks.as_mut_bytes()[at] = value;
+            if let Ok(observation) = Observation::from_bytes(buffer.as_bytes(), &[]) {
+                for image in observation.cameras() {
+                    let pixels = image.width_px as usize * image.height_px as usize;
+                    prop_assert_eq!(image.rgb.len(), 3 * pixels);
+                    prop_assert_eq!(image.depth_mm.len(), pixels);
+                }
+            }
+        }
+    }
+}

@@ -146,7 +146,7 @@ impl CameraImage<'_> {
         let index = y_px as usize * self.width_px as usize + x_px as usize;
         match self.depth_mm.get(index) {
             None | Some(0) => None,
-            Some(&depth_mm) => Some(f32::from(depth_mm) * 1e-3),
+            Some(&depth_mm) => Some(f32::from(depth_mm) / 1000.0),
         }
     }
 

@@ -26,7 +26,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
-    Alignment, Config, LogLevel, NodeBuilder, Path, SemanticString, ServiceName,
+    Alignment, Config, FileName, LogLevel, NodeBuilder, Path, SemanticString, ServiceName,
     SignalHandlingMode, ipc_threadsafe, set_log_level,
 };
 use iceoryx2::service::builder::publish_subscribe::Builder as PubSubBuilder;
@@ -86,13 +86,17 @@ const QUEUE_DEPTH: usize = 128;
 /// Attribute of the observation service that carries the protocol version.
 const PROTOCOL_KEY: &str = "vizflyt_protocol";
 
-/// Files of iceoryx2 live under this folder, one per user, so that users never trip over each
-/// other's permissions.
+/// Files of iceoryx2 live under a folder and a prefix of the user's own, so that users never trip
+/// over each other's permissions. All flights of one user share them, so that the next one
+/// reclaims what a killed one left behind.
 fn config() -> Result<Config, IpcError> {
     let mut config = Config::default();
     let root = format!("/tmp/vizflyt-{}/", nix::unistd::geteuid());
     let root = Path::new(root.as_bytes()).map_err(IpcError::transport("naming its folder"))?;
     config.global.set_root_path(&root);
+    let prefix = format!("vizflyt{}_", nix::unistd::geteuid());
+    config.global.prefix =
+        FileName::new(prefix.as_bytes()).map_err(IpcError::transport("naming its files"))?;
     Ok(config)
 }
 
