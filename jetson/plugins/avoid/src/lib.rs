@@ -1,1 +1,163 @@
-//! (in construction)
+//! Flies to the goal through a forest, by a potential field on the depth image.
+//!
+//! What happens at every image, 45 to 100 times a second, in this order:
+//! 1. [`scan`]: depth pixels become obstacle points in the world frame; floor and sky do not;
+//! 2. [`memory`]: points of the last seconds stay, for what the camera no longer sees;
+//! 3. [`field`]: around the vehicle, how near is an obstacle, and how long is the way to the goal;
+//! 4. [`steer`]: of all velocities, the one that gets on best without coming near anything;
+//! 5. here: height, heading and arrival; the velocity goes out as a [`Setpoint`].
+//!
+//! The nose turns to where the vehicle flies, so that the camera sees it. The whole takes less
+//! than a millisecond per image.
+//!
+//! To try an idea, change one of the constants at the foot of a file, or one step, and fly:
+//! `cargo run --release -- demo --plugin PATH`. Each constant says where it comes from.
+
+pub mod field;
+pub mod memory;
+pub mod scan;
+pub mod steer;
+
+use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
+use vizflyt_sdk::{
+    ArenaInfo, Autonomy, CameraImage, Event, EventKind, HostTime, Observation, Pose, Setpoint,
+    Vehicle, World, YawTarget,
+};
+
+use field::{Field, Surroundings};
+use memory::Memory;
+use scan::{Scan, View};
+use steer::Motion;
+
+/// The plugin.
+#[derive(Clone, Debug, Default)]
+pub struct Avoid {
+    arena: Option<ArenaInfo>,
+    scan: Scan,
+    memory: Memory,
+    field: Field,
+    /// Velocity asked for last, and when. [m/s, world]
+    setpoint_mps: DVec2,
+    last: Option<HostTime>,
+    /// When the camera last showed something.
+    seen: Option<HostTime>,
+    finished: bool,
+}
+
+impl Autonomy for Avoid {
+    fn on_start(&mut self, info: &ArenaInfo) {
+        *self = Self { arena: Some(info.clone()), ..Self::default() };
+    }
+
+    fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
+        // Without a pose there is no way to a goal: no answer, and the guard holds, then lands.
+        let vehicle = obs.vehicle()?;
+        let camera = obs.camera("front").or_else(|| obs.cameras().next())?;
+        self.decide(&vehicle, &camera)
+    }
+
+    fn on_event(&mut self, event: &Event) {
+        if matches!(event.kind, EventKind::Finished { .. }) {
+            self.finished = true;
+        }
+    }
+}
+
+impl Avoid {
+    fn decide(&mut self, vehicle: &Vehicle, camera: &CameraImage<'_>) -> Option<Setpoint> {
+        let arena = self.arena.as_ref()?;
+        let Some(goal_m) = arena.goal_m.filter(|_| !self.finished) else {
+            return Some(Setpoint::Hold);
+        };
+        let now = vehicle.stamp;
+        let dt_s = self.last.map_or(0.0, |last| now.seconds_since(last)).clamp(0.0, MAX_DT_S);
+        self.last = Some(now);
+
+        // See.
+        let p_m = vehicle.world_from_body.translation_m;
+        let view = view_of(vehicle, camera);
+        self.scan.update(&view, p_m.z);
+        if !self.scan.is_blind() {
+            self.seen = Some(now);
+        }
+        let now_s = now.as_ns() as f64 * 1e-9;
+        self.memory.update(now_s, &view, &self.scan.points_m);
+
+        // Understand.
+        let around = Surroundings {
+            p_m,
+            goal_m: goal_m.truncate(),
+            geofence: &arena.geofence,
+            body_radius_m: arena.body_radius_m,
+        };
+        self.field.update(&around, self.memory.points_m());
+
+        // Decide.
+        let to_goal_m = (goal_m - p_m).truncate();
+        if to_goal_m.length() < ARRIVED * arena.goal_radius_m {
+            self.setpoint_mps = vehicle.v_world_mps.truncate();
+            return Some(Setpoint::Position { p_world_m: goal_m, yaw: YawTarget::Keep });
+        }
+        let nose = vehicle.world_from_body.rotate(DVec3::X).truncate();
+        let v_mps = vehicle.v_world_mps.truncate();
+        let motion = Motion {
+            p_m: p_m.truncate(),
+            v_mps,
+            // Before take-off nobody follows the setpoint: it must not run away from the vehicle.
+            setpoint_mps: v_mps + (self.setpoint_mps - v_mps).clamp_length_max(MAX_LEAD_MPS),
+            heading_rad: nose.to_angle(),
+        };
+        let sighted = self.seen.is_some_and(|seen| now.seconds_since(seen) < BLIND_S);
+        let wanted_mps = if sighted {
+            let cruise_mps = CRUISE_MPS.min(CRUISE_SHARE * arena.limits.max_speed_mps);
+            let stop_mps = (2.0 * BRAKE_MPS2 * to_goal_m.length()).sqrt();
+            steer::choose_velocity(&self.field, &motion, cruise_mps.min(stop_mps))
+        } else {
+            DVec2::ZERO
+        };
+        self.setpoint_mps = steer::slew(motion.setpoint_mps, wanted_mps, dt_s);
+
+        let climb_mps = (CLIMB_PER_S * (goal_m.z - p_m.z)).clamp(-CLIMB_MPS, CLIMB_MPS);
+        let look = if wanted_mps.length() > LOOK_MPS { wanted_mps } else { to_goal_m };
+        Some(Setpoint::velocity(
+            self.setpoint_mps.extend(climb_mps),
+            YawTarget::Angle(look.to_angle()),
+        ))
+    }
+}
+
+/// Returns the image with the pose its camera had: the vehicle's state is newer (or older) than
+/// the image by some milliseconds, over which it moved and turned at a steady rate.
+fn view_of<'a>(vehicle: &Vehicle, camera: &CameraImage<'a>) -> View<'a> {
+    let ahead_s = camera.stamp.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
+    let then: Pose<World, _> = Pose::new(
+        vehicle.world_from_body.translation_m + vehicle.v_world_mps * ahead_s,
+        vehicle.world_from_body.rotation
+            * DQuat::from_scaled_axis(vehicle.omega_body_radps * ahead_s),
+    );
+    View {
+        depth_mm: camera.depth_mm,
+        intrinsics: camera.intrinsics,
+        world_from_cam: then * camera.body_from_cam,
+    }
+}
+
+/// Fast enough to finish 37 m in ten seconds, slow enough to stop in half of what is seen. [m/s]
+const CRUISE_MPS: f64 = 4.2;
+/// Of the arena's greatest speed: the rest is for overshoot.
+const CRUISE_SHARE: f64 = 0.7;
+/// Deceleration at the goal. [m/s^2]
+const BRAKE_MPS2: f64 = 2.5;
+/// Within this share of the goal's radius the goal itself is the setpoint.
+const ARRIVED: f64 = 0.5;
+/// The setpoint leads the velocity by slew times lag, 1.25 m/s; a little more is allowed. [m/s]
+const MAX_LEAD_MPS: f64 = 1.6;
+/// Images farther apart than this are a gap, not a step. [s]
+const MAX_DT_S: f64 = 0.1;
+/// Without sight for this long, stop. [s]
+const BLIND_S: f64 = 0.3;
+/// Height is corrected with a time constant of 0.7 s, no faster than 1 m/s.
+const CLIMB_PER_S: f64 = 1.5;
+const CLIMB_MPS: f64 = 1.0;
+/// Slower than this the direction of travel means nothing, and the nose turns to the goal. [m/s]
+const LOOK_MPS: f64 = 0.3;

@@ -1,0 +1,221 @@
+//! The potential field: for every place within 8 m, how near is an obstacle, and how far is the
+//! goal.
+//!
+//! A textbook potential field adds a pull to the goal and a push from each obstacle. The vehicle
+//! stops where they cancel: in front of a wall, in a dead end. So the pull here is not the straight
+//! distance to the goal but the length of the shortest way around everything remembered, where a
+//! metre close to an obstacle counts for several. That potential has no minimum but the goal. It
+//! solves the eikonal equation |grad T| = cost by fast sweeping (H. Zhao, "A fast sweeping method
+//! for eikonal equations", Math. Comp. 74, 2005): 80 x 80 cells in 0.3 ms.
+
+use vizflyt_sdk::Volume;
+use vizflyt_sdk::glam::{DVec2, DVec3};
+
+/// What the field is made from.
+#[derive(Clone, Copy, Debug)]
+pub struct Surroundings<'a> {
+    /// The vehicle. [m, world]
+    pub p_m: DVec3,
+    /// Where it wants to go. [m, world]
+    pub goal_m: DVec2,
+    /// Keep-in volume of the body's surface. [world]
+    pub geofence: &'a Volume,
+    /// Radius of the vehicle. [m]
+    pub body_radius_m: f64,
+}
+
+/// Clearance and distance to go on a square grid around the vehicle.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// Corner with the least x and y, at the centre of its cell. [m, world]
+    origin_m: DVec2,
+    /// From the body's surface to the nearest obstacle or to the fence, at most
+    /// [`COMFORT_M`]. [m]
+    clearance_m: Vec<f64>,
+    /// Length of the way to the goal, in metres of free space.
+    to_go_m: Vec<f64>,
+}
+
+impl Default for Field {
+    fn default() -> Self {
+        Self {
+            origin_m: DVec2::ZERO,
+            clearance_m: vec![0.0; SIDE * SIDE],
+            to_go_m: vec![0.0; SIDE * SIDE],
+        }
+    }
+}
+
+impl Field {
+    /// Computes the field anew from obstacle points. [m, world]
+    pub fn update(&mut self, around: &Surroundings<'_>, points_m: impl Iterator<Item = DVec3>) {
+        let half_m = CELL_M * (SIDE as f64 - 1.0) / 2.0;
+        // On whole cells, so that the same obstacle falls on the same cells in every image.
+        let corner_m = (around.p_m.truncate() - DVec2::splat(half_m)) / CELL_M;
+        self.origin_m = corner_m.round() * CELL_M;
+        self.fill_clearance(around, points_m);
+        self.fill_to_go(around.goal_m);
+    }
+
+    /// Returns the distance from the body's surface to the nearest obstacle, from negative inside
+    /// to [`COMFORT_M`] at most, for a vehicle at `p_m` [m, world]. [m]
+    pub fn clearance_m(&self, p_m: DVec2) -> f64 {
+        self.interpolate(&self.clearance_m, p_m)
+    }
+
+    /// Returns the length of the way to the goal from `p_m` [m, world], detours around obstacles
+    /// and the discomfort of passing near them included. [m]
+    pub fn to_go_m(&self, p_m: DVec2) -> f64 {
+        self.interpolate(&self.to_go_m, p_m)
+    }
+
+    fn fill_clearance(&mut self, around: &Surroundings<'_>, points_m: impl Iterator<Item = DVec3>) {
+        for row in 0..SIDE {
+            for column in 0..SIDE {
+                let p_m = self.centre_m(column, row).extend(around.p_m.z);
+                let inside_m = -around.geofence.signed_distance_m(p_m);
+                self.clearance_m[row * SIDE + column] =
+                    (inside_m - around.body_radius_m - FENCE_MARGIN_M).min(COMFORT_M);
+            }
+        }
+        let reach_m = COMFORT_M + around.body_radius_m;
+        for point_m in points_m {
+            let point_m = point_m.truncate();
+            let low = (point_m - DVec2::splat(reach_m) - self.origin_m) / CELL_M;
+            let high = (point_m + DVec2::splat(reach_m) - self.origin_m) / CELL_M;
+            for row in cells(low.y, high.y) {
+                for column in cells(low.x, high.x) {
+                    let distance_m = self.centre_m(column, row).distance(point_m);
+                    let clearance_m = &mut self.clearance_m[row * SIDE + column];
+                    *clearance_m = clearance_m.min(distance_m - around.body_radius_m);
+                }
+            }
+        }
+    }
+
+    fn fill_to_go(&mut self, goal_m: DVec2) {
+        self.to_go_m.fill(UNREACHED_M);
+        let goal_cell = (goal_m - self.origin_m) / CELL_M;
+        let last = SIDE as f64 - 1.0;
+        if goal_cell.min_element() >= 0.0 && goal_cell.max_element() <= last {
+            let (column, row) = (goal_cell.x.round() as usize, goal_cell.y.round() as usize);
+            self.to_go_m[row * SIDE + column] = 0.0;
+        } else {
+            // The goal lies outside: leave over an edge that faces it, then go straight.
+            for index in 0..SIDE {
+                let edges = [
+                    (goal_cell.x < 0.0, 0, index),
+                    (goal_cell.x > last, SIDE - 1, index),
+                    (goal_cell.y < 0.0, index, 0),
+                    (goal_cell.y > last, index, SIDE - 1),
+                ];
+                for (faces_goal, column, row) in edges {
+                    let at = row * SIDE + column;
+                    if faces_goal && self.clearance_m[at] > TOUCH_M {
+                        self.to_go_m[at] = self.centre_m(column, row).distance(goal_m);
+                    }
+                }
+            }
+        }
+        // Each round sweeps in all four diagonal directions; a path that bends once more needs
+        // one round more.
+        for _ in 0..MAX_ROUNDS {
+            let change_m = [(false, false), (true, false), (true, true), (false, true)]
+                .into_iter()
+                .map(|(leftward, downward)| self.sweep(leftward, downward))
+                .fold(0.0, f64::max);
+            if change_m < SETTLED_M {
+                break;
+            }
+        }
+    }
+
+    /// Updates every cell from its neighbours in one order; returns the greatest change. [m]
+    fn sweep(&mut self, leftward: bool, downward: bool) -> f64 {
+        let mut greatest_m = 0.0_f64;
+        for i in 0..SIDE {
+            let row = if downward { SIDE - 1 - i } else { i };
+            for j in 0..SIDE {
+                let column = if leftward { SIDE - 1 - j } else { j };
+                let at = row * SIDE + column;
+                let beside = |there: bool, at: usize| {
+                    if there { self.to_go_m[at] } else { UNREACHED_M }
+                };
+                let x_m =
+                    beside(column > 0, at.wrapping_sub(1)).min(beside(column + 1 < SIDE, at + 1));
+                let y_m =
+                    beside(row > 0, at.wrapping_sub(SIDE)).min(beside(row + 1 < SIDE, at + SIDE));
+                let step_m = CELL_M * cost(self.clearance_m[at]);
+                // Solves (T - x)^2 + (T - y)^2 = step^2, upwind: from the one neighbour if the
+                // other is too far to matter.
+                let new_m = if (x_m - y_m).abs() >= step_m {
+                    x_m.min(y_m) + step_m
+                } else {
+                    let gap_m = x_m - y_m;
+                    0.5 * (x_m + y_m + (2.0 * step_m * step_m - gap_m * gap_m).sqrt())
+                };
+                let old_m = self.to_go_m[at];
+                if new_m < old_m {
+                    self.to_go_m[at] = new_m;
+                    greatest_m = greatest_m.max(old_m - new_m);
+                }
+            }
+        }
+        greatest_m
+    }
+
+    fn centre_m(&self, column: usize, row: usize) -> DVec2 {
+        self.origin_m + DVec2::new(column as f64, row as f64) * CELL_M
+    }
+
+    /// Bilinear, and constant beyond the edges.
+    fn interpolate(&self, values: &[f64], p_m: DVec2) -> f64 {
+        let last = SIDE as f64 - 1.0;
+        let cell = ((p_m - self.origin_m) / CELL_M).clamp(DVec2::ZERO, DVec2::splat(last));
+        let (column, row) = ((cell.x as usize).min(SIDE - 2), (cell.y as usize).min(SIDE - 2));
+        let (fx, fy) = (cell.x - column as f64, cell.y - row as f64);
+        let at = row * SIDE + column;
+        let low = values[at] + fx * (values[at + 1] - values[at]);
+        let high = values[at + SIDE] + fx * (values[at + SIDE + 1] - values[at + SIDE]);
+        low + fy * (high - low)
+    }
+}
+
+/// Returns how many metres one metre counts for at a clearance. [m]
+fn cost(clearance_m: f64) -> f64 {
+    if clearance_m < TOUCH_M {
+        return COST_OF_TOUCH;
+    }
+    let discomfort = (1.0 - clearance_m / COMFORT_M).max(0.0);
+    1.0 + COST_OF_DISCOMFORT * discomfort * discomfort
+}
+
+/// Returns the cells of the grid between two positions on an axis. [cells]
+fn cells(low: f64, high: f64) -> std::ops::Range<usize> {
+    let bound = |cell: f64| cell.clamp(0.0, SIDE as f64) as usize;
+    bound(low.ceil())..bound(high.floor() + 1.0)
+}
+
+/// Cell of the grid. Distance is interpolated between centres; at 0.35 m from a point that is
+/// wrong by cell^2 / (8 * distance) = 1.4 cm, at most. [m]
+const CELL_M: f64 = 0.2;
+/// Cells along a side: 8 m to each side is 1.6 s at 5 m/s, more than it takes to stop.
+const SIDE: usize = 80;
+/// Clearance beyond which more is no better: half of the narrowest gap of the forest (1.4 m),
+/// less the body. [m]
+pub const COMFORT_M: f64 = 0.7;
+/// Nearer to a remembered point than this counts as a hit: 5 cm for the blur of a splat's surface
+/// and 3 cm for the pose. [m]
+pub const TOUCH_M: f64 = 0.08;
+/// The fence is a wall this much nearer than it is, to stay clear of the guard's own limit. [m]
+const FENCE_MARGIN_M: f64 = 0.3;
+/// A metre at touching distance counts for five: a detour of that length is worth more clearance.
+const COST_OF_DISCOMFORT: f64 = 4.0;
+/// A way through an obstacle is no way, but finite: a field that starts inside one leads out.
+const COST_OF_TOUCH: f64 = 60.0;
+/// More than any way through the grid.
+const UNREACHED_M: f64 = 1e6;
+/// Sweeping ends when no cell changes by more. [m]
+const SETTLED_M: f64 = 1e-3;
+/// Bound of the work; forests settle in two to four rounds.
+const MAX_ROUNDS: usize = 8;

@@ -1,0 +1,244 @@
+//! Flies the plugin through solids and measures by the truth.
+
+use std::collections::VecDeque;
+
+use vizflyt_avoid::Avoid;
+use vizflyt_sdk::glam::{DMat3, DQuat, DVec3};
+use vizflyt_sdk::protocol::geometry::{body_from_forward_cam, wrap_pi, yaw_of};
+use vizflyt_sdk::protocol::messages::bounded;
+use vizflyt_sdk::{
+    ArenaInfo, Autonomy, CameraInfo, HostTime, ImageStamps, Intrinsics, Limits, ObservationBuffer,
+    Pose, Setpoint, Vehicle, Volume, YawTarget,
+};
+
+use super::camera::{self, Faults};
+use super::{GOAL_M, Random, START_M};
+
+/// How the vehicle, the camera and the links behave.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Conditions {
+    /// First-order lag of velocity. [s]
+    pub(crate) lag_s: f64,
+    /// Greatest horizontal acceleration. [m/s^2]
+    pub max_acceleration_mps2: f64,
+    /// Greatest rate of turn. [rad/s]
+    pub(crate) max_yaw_rate_radps: f64,
+    /// Age of an image when the plugin gets it. [s]
+    pub(crate) image_age_s: f64,
+    /// Age of the vehicle's state when the plugin gets it. [s]
+    pub(crate) state_age_s: f64,
+    /// From a setpoint's making to its taking effect. [s]
+    pub(crate) setpoint_delay_s: f64,
+    /// Images come this often. [s]
+    pub(crate) image_period_s: f64,
+    /// Of the camera.
+    pub(crate) faults: Faults,
+}
+
+/// A quadrotor under an autopilot that tracks velocities; 50 images a second, 40 ms old.
+pub(crate) const TYPICAL: Conditions = Conditions {
+    lag_s: 0.25,
+    max_acceleration_mps2: 7.0,
+    max_yaw_rate_radps: 2.0,
+    image_age_s: 0.04,
+    state_age_s: 0.015,
+    setpoint_delay_s: 0.02,
+    image_period_s: 0.02,
+    faults: Faults { noise: 0.01, holes: 0.02, blurred_edges: true, sky_mm: 0 },
+};
+
+/// How a flight ended, by the truth.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Outcome {
+    pub(crate) finished: bool,
+    pub(crate) collided: bool,
+    pub(crate) seconds: f64,
+    /// Straight distance from start to goal over time: no credit for detours. [m/s]
+    pub(crate) mean_speed_mps: f64,
+    pub(crate) max_speed_mps: f64,
+    /// Least distance from the body's surface to a solid but the floor. [m]
+    pub(crate) min_clearance_m: f64,
+    /// Least distance from the body's surface to the geofence. [m]
+    pub(crate) min_fence_m: f64,
+    pub(crate) end_m: DVec3,
+}
+
+/// The arena of the forest, with a small camera so that tests are quick.
+pub(crate) fn arena() -> ArenaInfo {
+    let front = CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(104, 78, 90_f64.to_radians()),
+        body_from_cam: body_from_forward_cam(DVec3::new(0.06, 0.0, 0.02), 0.0),
+    };
+    ArenaInfo {
+        name: bounded("forest"),
+        geofence: Volume::Cuboid {
+            center_m: DVec3::new(20.5, 0.0, 1.75),
+            half_m: DVec3::new(21.5, 7.0, 2.25),
+            rotation: DQuat::IDENTITY,
+        },
+        limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
+        body_radius_m: 0.12,
+        takeoff_height_m: 1.2,
+        goal_m: Some(GOAL_M),
+        goal_radius_m: 1.0,
+        time_limit_s: 60.0,
+        cameras: [front].into_iter().collect(),
+    }
+}
+
+/// Flies from start to goal; ends at the goal, at the first collision, or after `limit_s`.
+pub(crate) fn fly(
+    volumes: &[Volume],
+    arena: &ArenaInfo,
+    conditions: Conditions,
+    seed: u64,
+    limit_s: f64,
+    mut watch: impl FnMut(f64, &Body),
+) -> Outcome {
+    let mut random = Random::new(seed ^ 0xcafe);
+    let mut plugin = Avoid::default();
+    plugin.on_start(arena);
+    let mut buffer = ObservationBuffer::new(&arena.cameras);
+    let mut body = Body::default();
+    let mut history: VecDeque<Body> = VecDeque::new();
+    let mut pending: VecDeque<(f64, Setpoint)> = VecDeque::new();
+    let mut setpoint = Setpoint::Hold;
+    let mut outcome = Outcome {
+        finished: false,
+        collided: false,
+        seconds: 0.0,
+        mean_speed_mps: 0.0,
+        max_speed_mps: 0.0,
+        min_clearance_m: f64::INFINITY,
+        min_fence_m: f64::INFINITY,
+        end_m: START_M,
+    };
+    let per_image = (conditions.image_period_s / DT_S).round() as u64;
+    for tick in 0..(limit_s / DT_S) as u64 {
+        let now_s = tick as f64 * DT_S;
+        history.push_front(body);
+        history.truncate(200);
+        let ago = |age_s: f64| history[((age_s / DT_S) as usize).min(history.len() - 1)];
+        if tick % per_image == 0 {
+            let pictured = ago(conditions.image_age_s);
+            let known = ago(conditions.state_age_s);
+            buffer.clear(tick / per_image);
+            buffer.set_vehicle(&known.vehicle());
+            let stamps = ImageStamps { seq: tick, pose: pictured.stamp, ready: body.stamp };
+            let front = &arena.cameras[0];
+            buffer.set_image(0, stamps, |planes| {
+                let world_from_cam = pictured.vehicle().world_from_body * front.body_from_cam;
+                camera::render(
+                    volumes,
+                    &front.intrinsics,
+                    &world_from_cam,
+                    conditions.faults,
+                    &mut random,
+                    planes.depth_mm,
+                );
+            });
+            if let Some(answer) = plugin.on_image(&buffer.observation()) {
+                assert!(answer.is_finite(), "{answer:?}");
+                pending.push_back((now_s + conditions.setpoint_delay_s, answer));
+            }
+        }
+        while pending.front().is_some_and(|&(at_s, _)| at_s <= now_s) {
+            setpoint = pending.pop_front().unwrap().1;
+        }
+        body.advance(&setpoint, conditions, tick);
+        watch(now_s, &body);
+
+        outcome.seconds = now_s;
+        outcome.end_m = body.p_m;
+        outcome.max_speed_mps = outcome.max_speed_mps.max(body.v_mps.length());
+        for volume in volumes {
+            let clearance_m = volume.signed_distance_m(body.p_m) - arena.body_radius_m;
+            outcome.collided |= clearance_m < 0.0;
+            if !matches!(volume, Volume::HalfSpace { .. }) {
+                outcome.min_clearance_m = outcome.min_clearance_m.min(clearance_m);
+            }
+        }
+        let fence_m = -arena.geofence.signed_distance_m(body.p_m) - arena.body_radius_m;
+        outcome.min_fence_m = outcome.min_fence_m.min(fence_m);
+        outcome.finished = body.p_m.distance(GOAL_M) < arena.goal_radius_m;
+        if outcome.finished || outcome.collided {
+            break;
+        }
+    }
+    outcome.mean_speed_mps = START_M.distance(GOAL_M) / outcome.seconds.max(DT_S);
+    outcome
+}
+
+const DT_S: f64 = 0.0025;
+const GRAVITY_MPS2: f64 = 9.81;
+/// Lag of attitude behind the acceleration asked for. [s]
+const TILT_LAG_S: f64 = 0.06;
+
+/// The vehicle's true state.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Body {
+    pub(crate) stamp: HostTime,
+    pub(crate) p_m: DVec3,
+    pub(crate) v_mps: DVec3,
+    pub a_mps2: DVec3,
+    pub(crate) yaw_rad: f64,
+    pub(crate) omega_body_radps: DVec3,
+}
+
+impl Default for Body {
+    fn default() -> Self {
+        Self {
+            stamp: HostTime::from_ns(1_000_000_000),
+            p_m: START_M,
+            v_mps: DVec3::ZERO,
+            a_mps2: DVec3::ZERO,
+            yaw_rad: 0.0,
+            omega_body_radps: DVec3::ZERO,
+        }
+    }
+}
+
+impl Body {
+    /// The thrust points along gravity-compensated acceleration; the nose at the yaw.
+    fn attitude(&self) -> DQuat {
+        let up = (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).normalize();
+        let left = up.cross(DQuat::from_rotation_z(self.yaw_rad) * DVec3::X).normalize();
+        DQuat::from_mat3(&DMat3::from_cols(left.cross(up), left, up))
+    }
+
+    pub(crate) fn vehicle(&self) -> Vehicle {
+        Vehicle {
+            stamp: self.stamp,
+            world_from_body: Pose::new(self.p_m, self.attitude()),
+            v_world_mps: self.v_mps,
+            omega_body_radps: self.omega_body_radps,
+            battery_fraction: None,
+        }
+    }
+
+    fn advance(&mut self, setpoint: &Setpoint, conditions: Conditions, tick: u64) {
+        let (wanted_mps, yaw) = match *setpoint {
+            Setpoint::Velocity { v_mps, yaw, .. } => (v_mps, yaw),
+            Setpoint::Position { p_world_m, yaw } => ((p_world_m - self.p_m) * 1.0, yaw),
+            _ => (DVec3::ZERO, YawTarget::Keep),
+        };
+        let before = self.attitude();
+        let wanted_mps2 = ((wanted_mps - self.v_mps) / conditions.lag_s)
+            .clamp_length_max(conditions.max_acceleration_mps2);
+        self.a_mps2 += (wanted_mps2 - self.a_mps2) * (DT_S / TILT_LAG_S);
+        self.v_mps += self.a_mps2 * DT_S;
+        self.p_m += self.v_mps * DT_S;
+        let rate_radps = match yaw {
+            YawTarget::Keep => 0.0,
+            YawTarget::Rate(rate_radps) => rate_radps,
+            YawTarget::Angle(angle_rad) => 4.0 * wrap_pi(angle_rad - self.yaw_rad),
+        };
+        let limit = conditions.max_yaw_rate_radps;
+        self.yaw_rad = wrap_pi(self.yaw_rad + rate_radps.clamp(-limit, limit) * DT_S);
+        let turned = (before.conjugate() * self.attitude()).normalize();
+        self.omega_body_radps = turned.to_scaled_axis() / DT_S;
+        self.stamp = HostTime::from_ns(1_000_000_000 + ((tick + 1) as f64 * DT_S * 1e9) as u64);
+        debug_assert!(wrap_pi(yaw_of(self.attitude()) - self.yaw_rad).abs() < 0.2);
+    }
+}
