@@ -49,7 +49,7 @@ impl Stage {
         let folder = tempfile::Builder::new().prefix("vizflyt-demo-").tempdir()?;
         let arena = vizflyt_server::arena_for_scene(path)?;
         let file = folder.path().join("arena.toml");
-        std::fs::write(&file, arena.to_toml())
+        std::fs::write(&file, arena.to_toml()?)
             .with_context(|| format!("cannot write {}", file.display()))?;
         Self::at(file, Some(folder))
     }
@@ -60,8 +60,8 @@ impl Stage {
         let config =
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
-        let [x, y, z] = config.spawn.position_m;
-        let spawn = format!("{x},{y},{z},{}", config.spawn.yaw_deg);
+        let p = config.spawn.position_m;
+        let spawn = format!("{},{},{},{}", p.x, p.y, p.z, config.spawn.yaw_deg);
         Ok(Self { arena, truth, spawn, _folder: folder })
     }
 }

@@ -1,0 +1,63 @@
+//! What the command line says when used, and when used wrongly.
+
+use std::process::{Command, Output};
+
+use vizflyt_e2e::vizflyt;
+
+fn run(args: &[&str]) -> Output {
+    Command::new(vizflyt()).args(args).output().unwrap()
+}
+
+/// Runs, expects failure, and a message that contains every given text.
+fn check_refused(args: &[&str], texts: &[&str]) {
+    let output = run(args);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{args:?} succeeded");
+    assert!(!message.contains("panicked"), "{args:?}: {message}");
+    for text in texts {
+        assert!(message.contains(text), "{args:?} does not say '{text}': {message}");
+    }
+}
+
+#[test]
+fn every_command_has_help() {
+    for command in ["demo", "serve", "fly", "sim", "scene"] {
+        let output = run(&[command, "--help"]);
+        assert!(output.status.success(), "{command}");
+        assert!(output.stdout.len() > 200, "{command} --help is a stub");
+    }
+    let help = String::from_utf8(run(&["--help"]).stdout).unwrap();
+    assert!(help.contains("vizflyt demo"));
+}
+
+#[test]
+fn a_scene_is_the_same_for_the_same_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let make = |name: &str, seed: &str| {
+        let path = folder.path().join(name);
+        let text = path.to_str().unwrap();
+        assert!(run(&["scene", "generate", "race", "--seed", seed, "-o", text]).status.success());
+        ["scene.ply", "arena.toml", "truth.json"].map(|f| std::fs::read(path.join(f)).unwrap())
+    };
+    let first = make("a", "5");
+    assert!(first == make("b", "5"), "two generations with one seed differ");
+    assert!(first[0] != make("c", "6")[0], "another seed makes the same scene");
+    // Nothing is overwritten by accident.
+    let again = folder.path().join("a");
+    check_refused(
+        &["scene", "generate", "race", "-o", again.to_str().unwrap()],
+        &["already holds", "--force"],
+    );
+}
+
+#[test]
+fn mistakes_are_explained() {
+    check_refused(&["demo", "--scene", "forrest"], &["forrest", "forest, race nor room"]);
+    check_refused(&["scene", "generate", "swamp", "-o", "x"], &["swamp", "forest"]);
+    check_refused(&["serve", "/nowhere/arena.toml"], &["/nowhere/arena.toml"]);
+    check_refused(&["--log-level", "loud=x=y", "demo"], &["--log-level"]);
+    let folder = tempfile::tempdir().unwrap();
+    let arena = folder.path().join("arena.toml");
+    std::fs::write(&arena, "name = \"x\"\nscene = 5\n").unwrap();
+    check_refused(&["serve", arena.to_str().unwrap()], &["line 2", "scene"]);
+}

@@ -1,0 +1,242 @@
+//! `vizflyt demo`, as a person runs it: the real binary, its real children, loopback, free ports.
+//!
+//! Nothing here fails because the machine is slow: limits are generous, figures are only checked
+//! for being there. `over_many_seeds` is the acceptance test of the example plugin.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::Value;
+use vizflyt_e2e::{Demo, alive, descendants};
+
+/// Loading, baking, arming and climbing, on a loaded machine.
+const AIRBORNE: Duration = Duration::from_secs(90);
+/// A whole flight.
+const FLIGHT: Duration = Duration::from_secs(240);
+/// Printed when the plugin has the vehicle.
+const FLYING: &str = "plugin flies";
+
+/// A report file in a folder that cleans up.
+struct ReportFile(tempfile::TempDir);
+
+impl ReportFile {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+    fn path(&self) -> String {
+        self.0.path().join("report.json").to_str().unwrap().to_owned()
+    }
+    fn log(&self) -> String {
+        self.0.path().join("flights").to_str().unwrap().to_owned()
+    }
+    fn read(&self) -> Value {
+        serde_json::from_str(&std::fs::read_to_string(self.path()).unwrap()).unwrap()
+    }
+    fn demo(&self, args: &[&str]) -> Demo {
+        let (report, log) = (self.path(), self.log());
+        let mut all = vec!["--report", &report, "--log", &log];
+        all.extend(args);
+        Demo::start(&all)
+    }
+}
+
+fn signal(pid: u32, signal: Signal) {
+    kill(Pid::from_raw(pid as i32), signal).unwrap();
+}
+
+/// Sends one HTTP request and returns the whole response.
+fn http(url: &str, request: &str) -> String {
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let mut stream = TcpStream::connect(address).unwrap();
+    let host = format!("Host: {address}\r\nOrigin: http://{address}\r\nConnection: close\r\n");
+    write!(stream, "{request} HTTP/1.1\r\n{host}Content-Length: 0\r\n\r\n").unwrap();
+    let mut response = String::new();
+    stream.read_to_string(&mut response).unwrap();
+    response
+}
+
+fn page_url(demo: &mut Demo) -> String {
+    demo.wait_for("http://", AIRBORNE).split_whitespace().last().unwrap().to_owned()
+}
+
+#[test]
+fn the_forest_is_flown_and_reported() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&["--seed", "7", "--seconds", "90"]);
+    let url = page_url(&mut demo);
+    assert!(http(&url, "GET /").contains("<title>"), "the page is served");
+    let code = demo.wait(FLIGHT);
+    let report = file.read();
+    assert_eq!(report["outcome"], "finished", "{report:#} {:#?}", demo.seen);
+    assert_eq!(code, Some(0));
+    assert_eq!((&report["image_width"], &report["image_height"]), (&320.into(), &240.into()));
+    for figure in [
+        "seconds", "images_delivered", "image_hz", "age_ms_p50", "age_ms_p99", "render_ms_p50",
+        "mean_speed_mps", "max_speed_mps", "min_clearance_m", "setpoints_sent", "mavlink_packets",
+        "peak_rss_mb",
+    ] {
+        assert!(report[figure].as_f64().is_some_and(|value| value > 0.0), "{figure}: {report:#}");
+    }
+    assert!(report["renderer"].as_str().unwrap().starts_with("cpu"));
+    let log = std::fs::metadata(report["log"].as_str().unwrap()).unwrap();
+    assert!(log.len() > 10_000, "the log has {} bytes", log.len());
+}
+
+/// At least 18 of 20 generated forests are flown without touching the true geometry, at 2 m/s or
+/// more on the mean.
+#[test]
+fn over_many_seeds() {
+    let seeds: u64 =
+        std::env::var("VIZFLYT_SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(20);
+    let mut finished = Vec::new();
+    let mut failed = Vec::new();
+    for seed in 1..=seeds {
+        let file = ReportFile::new();
+        let mut demo = file.demo(&["--seed", &seed.to_string()]);
+        demo.wait(FLIGHT);
+        let report = file.read();
+        println!(
+            "seed {seed:2}: {} {:.1} s, {:.2} m/s, clearance {} m",
+            report["outcome"], report["seconds"].as_f64().unwrap(),
+            report["mean_speed_mps"].as_f64().unwrap(), report["min_clearance_m"]
+        );
+        let touched = report["min_clearance_m"].as_f64().unwrap() <= 0.0;
+        if report["outcome"] == "finished" && !touched {
+            finished.push(report["mean_speed_mps"].as_f64().unwrap());
+        } else {
+            failed.push((seed, report["reason"].clone()));
+        }
+    }
+    let allowed = (seeds / 10) as usize;
+    assert!(failed.len() <= allowed, "{} of {seeds} failed: {failed:?}", failed.len());
+    let mean_mps = finished.iter().sum::<f64>() / finished.len() as f64;
+    assert!(mean_mps >= 2.0, "mean speed {mean_mps:.2} m/s");
+}
+
+#[test]
+fn a_killed_plugin_ends_in_a_landing_and_a_reason() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    demo.wait_for(FLYING, AIRBORNE);
+    let plugin = demo.descendants("vizflyt plugin avoid");
+    assert_eq!(plugin.len(), 1, "one plugin process");
+    signal(plugin[0], Signal::SIGKILL);
+    assert_eq!(demo.wait(FLIGHT), Some(1));
+    let report = file.read();
+    assert_eq!(report["outcome"], "plugin_failed", "{report:#}");
+    let reason = report["reason"].as_str().unwrap();
+    assert!(reason.contains("SIGKILL"), "the reason names the signal: {reason}");
+    assert!(demo.seen.iter().any(|line| line.contains("landed")), "{:#?}", demo.seen);
+}
+
+#[test]
+fn a_killed_server_ends_in_a_hold_and_a_landing() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    demo.wait_for(FLYING, AIRBORNE);
+    let server = demo.descendants("vizflyt serve");
+    assert_eq!(server.len(), 1);
+    signal(server[0], Signal::SIGKILL);
+    demo.wait_for("hold", FLIGHT);
+    demo.wait_for("land", FLIGHT);
+    assert_eq!(demo.wait(FLIGHT), Some(1));
+    assert_ne!(file.read()["outcome"], "finished");
+    assert!(demo.seen.iter().any(|line| line.contains("landed")), "{:#?}", demo.seen);
+}
+
+#[test]
+fn the_stop_button_lands_the_vehicle() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    let url = page_url(&mut demo);
+    demo.wait_for(FLYING, AIRBORNE);
+    let response = http(&url, "POST /api/estop");
+    assert!(response.starts_with("HTTP/1.1 2"), "{response}");
+    assert_eq!(demo.wait(FLIGHT), Some(1));
+    let report = file.read();
+    assert_eq!(report["outcome"], "landed", "{report:#}");
+    assert!(report["reason"].as_str().unwrap().contains("stop"), "{report:#}");
+}
+
+#[test]
+fn a_page_of_another_site_cannot_press_the_stop_button() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    let url = page_url(&mut demo);
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let mut stream = TcpStream::connect(address).unwrap();
+    write!(
+        stream,
+        "POST /api/estop HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example\r\n\
+         Connection: close\r\nContent-Length: 0\r\n\r\n"
+    )
+    .unwrap();
+    let mut response = String::new();
+    stream.read_to_string(&mut response).unwrap();
+    assert!(response.starts_with("HTTP/1.1 403"), "{response}");
+}
+
+#[test]
+fn an_interrupt_ends_every_process() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    demo.wait_for(FLYING, AIRBORNE);
+    let family = descendants(demo.pid());
+    assert!(family.len() >= 4, "server, runtime, simulator, plugin: {family:?}");
+    let start = Instant::now();
+    signal(demo.pid(), Signal::SIGINT);
+    demo.wait(Duration::from_secs(20));
+    println!("ended {:.2} s after the interrupt", start.elapsed().as_secs_f64());
+    let left: Vec<_> = family.into_iter().filter(|&pid| alive(pid)).collect();
+    assert!(left.is_empty(), "still alive: {left:?}");
+}
+
+#[test]
+fn no_process_outlives_a_killed_demo() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&[]);
+    demo.wait_for(FLYING, AIRBORNE);
+    let family = descendants(demo.pid());
+    signal(demo.pid(), Signal::SIGKILL);
+    let deadline = Instant::now() + Duration::from_secs(30);
+    while family.iter().any(|&pid| alive(pid)) {
+        assert!(Instant::now() < deadline, "a child outlives the killed demo");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn two_demos_fly_side_by_side() {
+    let (first, second) = (ReportFile::new(), ReportFile::new());
+    let mut one = first.demo(&["--seed", "3", "--seconds", "8"]);
+    let mut two = second.demo(&["--seed", "4", "--seconds", "8"]);
+    let (a, b) = (page_url(&mut one), page_url(&mut two));
+    assert_ne!(a, b);
+    one.wait_for(FLYING, AIRBORNE);
+    two.wait_for(FLYING, AIRBORNE);
+    one.wait(FLIGHT);
+    two.wait(FLIGHT);
+    for file in [first, second] {
+        let report = file.read();
+        let images = report["images_delivered"].as_u64().unwrap();
+        assert!(images > 10, "each demo flies its own plugin: {report:#}");
+    }
+}
+
+#[test]
+fn a_captured_scene_is_rendered() {
+    let scene = vizflyt_e2e::root().join("../shared/scenes/room.ply");
+    if !scene.exists() {
+        println!("skipped: the captured room is not beside the repository");
+        return;
+    }
+    let file = ReportFile::new();
+    let mut demo = file.demo(&["--scene", scene.to_str().unwrap(), "--seconds", "10"]);
+    demo.wait(FLIGHT);
+    let report = file.read();
+    assert!(report["images_delivered"].as_u64().unwrap() > 10, "{report:#}");
+    assert_ne!(report["outcome"], "error", "{report:#}");
+}

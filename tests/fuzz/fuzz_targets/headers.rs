@@ -1,0 +1,22 @@
+//! Image and observation headers from a network and from shared memory.
+#![no_main]
+use libfuzzer_sys::fuzz_target;
+use vizflyt_protocol::packet::{ImageHeader, ObservationHeader};
+
+fuzz_target!(|bytes: &[u8]| {
+    if let Ok((header, _)) = ImageHeader::parse(bytes) {
+        assert!(header.intrinsics().validate().is_ok());
+        assert!(header.world_from_cam().is_valid());
+    }
+    // Shared memory is aligned; the fuzzer's bytes are not.
+    let mut words = vec![0u64; bytes.len().div_ceil(8)];
+    let memory = zerocopy::IntoBytes::as_mut_bytes(words.as_mut_slice());
+    memory[..bytes.len()].copy_from_slice(bytes);
+    if let Ok(header) = ObservationHeader::parse(memory) {
+        for camera in &header.cameras[..header.camera_count.into()] {
+            let pixels = camera.width_px as usize * camera.height_px as usize;
+            assert!(camera.rgb_offset as usize + 3 * pixels <= memory.len());
+            assert!(camera.depth_offset as usize + 2 * pixels <= memory.len());
+        }
+    }
+});
