@@ -1,0 +1,236 @@
+//! `arena.toml`: the room, the vehicle's body, the course and the limits, as validated types.
+//!
+//! Text comes in through [`ArenaConfig::parse`], which refuses unknown keys (with line and
+//! column) and values that cannot work (with key, value and what to do). The scene generator
+//! builds the same struct and writes it with [`ArenaConfig::to_toml`]; the server turns it into
+//! [`ArenaInfo`] for the runtime. Safety limits have no default: absent is an error.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::geometry::{
+    Body, Cam, Intrinsics, Pose, Volume, World, body_from_forward_cam,
+};
+use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, Limits, MAX_CAMERAS, bounded};
+
+mod validate;
+
+pub use validate::ConfigError;
+
+/// The whole of `arena.toml`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArenaConfig {
+    /// The arena's name; at most 32 bytes.
+    pub name: String,
+    /// The splat scene, relative to the folder of `arena.toml`.
+    pub scene: String,
+    /// Radius of the sphere that encloses the vehicle. [m]
+    pub body_radius_m: f64,
+    /// Height above the spawn to which the runtime climbs before the plugin flies. [m]
+    pub takeoff_height_m: f64,
+    /// From take-off; 0 is none. [s]
+    #[serde(default)]
+    pub time_limit_s: f64,
+    /// Where the vehicle stands at the start.
+    pub spawn: Spawn,
+    /// Where the flight shall end; without one it ends with the last stage.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub goal: Option<Goal>,
+    /// Keep-in box for the body's surface.
+    pub geofence: Geofence,
+    /// What the guard enforces.
+    pub limits: Limits,
+    /// How obstacles are baked from the scene.
+    #[serde(default)]
+    pub occupancy: Occupancy,
+    /// The cameras, in the order of their index on the wire; 1 to 8.
+    pub cameras: Vec<CameraConfig>,
+    /// The course's gates in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<StageConfig>,
+}
+
+/// `[spawn]`: where the vehicle stands at the start.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Spawn {
+    /// On the floor. [m, world]
+    pub position_m: DVec3,
+    /// Heading: from x, counter-clockwise. [deg, world]
+    #[serde(default)]
+    pub yaw_deg: f64,
+}
+
+/// `[goal]`: where the flight shall end.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Goal {
+    /// Centre. [m, world]
+    pub position_m: DVec3,
+    /// How near counts as reached. [m]
+    pub radius_m: f64,
+}
+
+/// `[geofence]`: an axis-aligned box that the body's surface must not leave.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Geofence {
+    /// Least corner. [m, world]
+    pub min_m: DVec3,
+    /// Greatest corner. [m, world]
+    pub max_m: DVec3,
+}
+
+/// `[occupancy]`: how obstacles are baked from the scene.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Occupancy {
+    /// Side of a voxel. [m]
+    pub voxel_m: f64,
+    /// Splats fainter than this are no obstacle, 0 to 1.
+    pub min_opacity: f64,
+    /// Height of the floor; below is solid. [m, world]
+    pub floor_z_m: f64,
+}
+
+impl Default for Occupancy {
+    /// 5 cm resolves a thin trunk at 1 byte a voxel; 0.3 is below what trained surfaces have and
+    /// above what trained haze has; the floor is the world's z = 0.
+    fn default() -> Self {
+        Self { voxel_m: 0.05, min_opacity: 0.3, floor_z_m: 0.0 }
+    }
+}
+
+/// `[[cameras]]`: a pinhole camera that looks along the nose.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// What plugins call it; unique, at most 32 bytes.
+    pub name: String,
+    /// Image width. [px]
+    pub width_px: u32,
+    /// Image height. [px]
+    pub height_px: u32,
+    /// From the left edge to the right edge. [deg]
+    pub horizontal_fov_deg: f64,
+    /// Where it sits. [m, body]
+    pub position_m: DVec3,
+    /// Nose-up tilt of the optical axis. [deg]
+    #[serde(default)]
+    pub tilt_deg: f64,
+}
+
+/// `[[stages]]`: a rectangular opening to fly through.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StageConfig {
+    /// Its name; at most 32 bytes.
+    pub name: String,
+    /// Centre of the opening. [m, world]
+    pub center_m: DVec3,
+    /// Direction of passage; any length but 0. [world]
+    pub normal: DVec3,
+    /// Width of the opening, level. [m]
+    pub width_m: f64,
+    /// Height of the opening, across width and normal. [m]
+    pub height_m: f64,
+}
+
+impl ArenaConfig {
+    /// Reads `arena.toml` and checks every value.
+    ///
+    /// ```
+    /// let text = r#"
+    /// name = "room"
+    /// scene = "scene.ply"
+    /// body_radius_m = 0.12
+    /// takeoff_height_m = 1.2
+    /// spawn = { position_m = [1, 2, 0] }
+    /// geofence = { min_m = [0, 0, -0.5], max_m = [11, 4.5, 3.65] }
+    /// limits = { max_speed_mps = 3.0, max_acceleration_mps2 = 6.0 }
+    /// [[cameras]]
+    /// name = "front"
+    /// width_px = 320
+    /// height_px = 240
+    /// horizontal_fov_deg = 90.0
+    /// position_m = [0.06, 0, 0.02]
+    /// "#;
+    /// let arena = vizflyt_arena::ArenaConfig::parse(text).unwrap();
+    /// assert!((arena.cameras[0].intrinsics().fx_px - 160.0).abs() < 1e-9);
+    /// let wrong = text.replace("11, 4.5, 3.65", "-11, 4.5, 3.65");
+    /// let error = vizflyt_arena::ArenaConfig::parse(&wrong).unwrap_err().to_string();
+    /// assert!(error.starts_with("geofence.max_m = [-11, 4.5, 3.65]"), "{error}");
+    /// ```
+    ///
+    /// # Errors
+    /// [`ConfigError::Toml`] with line and column for syntax, types, absent and unknown keys;
+    /// [`ConfigError::Invalid`] for values that cannot work.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let config: Self = toml::from_str(text)?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Returns the text of `arena.toml` that parses to the same value.
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        Ok(toml::to_string(self)?)
+    }
+
+    /// Returns where the scene file lies, given where `arena.toml` lies.
+    pub fn scene_path(&self, arena_toml: &Path) -> PathBuf {
+        arena_toml.parent().unwrap_or(Path::new("")).join(&self.scene)
+    }
+
+    /// Returns the keep-in volume for the body's surface. [world]
+    pub fn geofence(&self) -> Volume {
+        Volume::aabb(self.geofence.min_m, self.geofence.max_m)
+    }
+
+    /// Returns the pose of the vehicle at the start: level on the floor, nose by `yaw_deg`.
+    pub fn world_from_body_at_spawn(&self) -> Pose<World, Body> {
+        let yaw_rad = self.spawn.yaw_deg.to_radians();
+        Pose::new(self.spawn.position_m, DQuat::from_rotation_z(yaw_rad))
+    }
+
+    /// Returns what the runtime must know. Of a validated config nothing is cut.
+    pub fn info(&self) -> ArenaInfo {
+        ArenaInfo {
+            name: bounded(&self.name),
+            geofence: self.geofence(),
+            limits: self.limits,
+            body_radius_m: self.body_radius_m,
+            takeoff_height_m: self.takeoff_height_m,
+            goal_m: self.goal.map(|goal| goal.position_m),
+            goal_radius_m: self.goal.map_or(0.0, |goal| goal.radius_m),
+            time_limit_s: self.time_limit_s,
+            cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
+        }
+    }
+}
+
+impl CameraConfig {
+    /// Returns size, focal lengths and principal point.
+    pub fn intrinsics(&self) -> Intrinsics {
+        let fov_rad = self.horizontal_fov_deg.to_radians();
+        Intrinsics::from_horizontal_fov(self.width_px, self.height_px, fov_rad)
+    }
+
+    /// Returns the extrinsics.
+    pub fn body_from_cam(&self) -> Pose<Body, Cam> {
+        body_from_forward_cam(self.position_m, self.tilt_deg.to_radians())
+    }
+
+    /// Returns what the runtime must know of it.
+    pub fn info(&self) -> CameraInfo {
+        CameraInfo {
+            name: bounded(&self.name),
+            intrinsics: self.intrinsics(),
+            body_from_cam: self.body_from_cam(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

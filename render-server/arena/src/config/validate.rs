@@ -1,0 +1,230 @@
+//! What `arena.toml` may say. Each refusal names the key, the value and what to do.
+
+use std::collections::HashSet;
+use std::fmt::Display;
+use std::ops::RangeInclusive;
+
+use glam::DVec3;
+use vizflyt_protocol::messages::MAX_CAMERAS;
+
+use super::ArenaConfig;
+
+/// Why an `arena.toml` is refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    /// Syntax, type, absent or unknown key; the text points at line and column.
+    #[error("{0}")]
+    Toml(#[from] toml::de::Error),
+    /// The value cannot be written as TOML.
+    #[error("{0}")]
+    Unwritable(#[from] toml::ser::Error),
+    /// A value that cannot work.
+    #[error("{key} = {value}: {advice}")]
+    Invalid {
+        /// Where in the file: `geofence.max_m`, `cameras[1].name`.
+        key: String,
+        /// What it says.
+        value: String,
+        /// What is wrong and what to do.
+        advice: String,
+    },
+}
+
+fn invalid(key: impl Into<String>, value: impl Display, advice: impl Into<String>) -> ConfigError {
+    ConfigError::Invalid { key: key.into(), value: value.to_string(), advice: advice.into() }
+}
+
+/// Positions further out than this are typing errors: f32 splats keep 0.1 mm up to here. [m]
+const MAX_COORDINATE_M: f64 = 1000.0;
+/// Bytes of [`vizflyt_protocol::messages::Name`].
+const MAX_NAME_BYTES: usize = 32;
+/// `EventKind::Stage` counts in u8.
+const MAX_STAGES: usize = 255;
+/// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
+const MAX_VOXELS: f64 = 4e8;
+
+fn check_number(
+    key: &str,
+    value: f64,
+    unit: &str,
+    range: RangeInclusive<f64>,
+) -> Result<(), ConfigError> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    let (low, high) = range.into_inner();
+    Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
+}
+
+fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError> {
+    if value.is_finite() && value.abs().max_element() <= MAX_COORDINATE_M {
+        return Ok(());
+    }
+    let advice = format!("give three finite numbers within {MAX_COORDINATE_M} m of the origin");
+    Err(invalid(key, value, advice))
+}
+
+fn check_name<'a>(
+    key: &str,
+    value: &'a str,
+    taken: &mut HashSet<&'a str>,
+) -> Result<(), ConfigError> {
+    let quoted = format!("{value:?}");
+    if value.trim().is_empty() || value.len() > MAX_NAME_BYTES {
+        return Err(invalid(key, quoted, format!("give a name of 1 to {MAX_NAME_BYTES} bytes")));
+    }
+    if !taken.insert(value) {
+        return Err(invalid(key, quoted, "another has this name; give each its own"));
+    }
+    Ok(())
+}
+
+impl ArenaConfig {
+    /// Checks every value, and the values against each other.
+    ///
+    /// # Errors
+    /// [`ConfigError::Invalid`] for the first value that cannot work.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_name("name", &self.name, &mut HashSet::new())?;
+        if self.scene.trim().is_empty() {
+            return Err(invalid("scene", "\"\"", "give the scene file, relative to this file"));
+        }
+        check_number("body_radius_m", self.body_radius_m, "m", 0.01..=2.0)?;
+        check_number("takeoff_height_m", self.takeoff_height_m, "m", 0.1..=100.0)?;
+        check_number("time_limit_s", self.time_limit_s, "s (0 is none)", 0.0..=86400.0)?;
+        check_number("limits.max_speed_mps", self.limits.max_speed_mps, "m/s", 0.01..=30.0)?;
+        let acceleration = self.limits.max_acceleration_mps2;
+        check_number("limits.max_acceleration_mps2", acceleration, "m/s^2", 0.1..=50.0)?;
+        self.check_fence_and_points()?;
+        self.check_occupancy()?;
+        self.check_cameras()?;
+        self.check_stages()
+    }
+
+    fn check_fence_and_points(&self) -> Result<(), ConfigError> {
+        let fence = &self.geofence;
+        check_position("geofence.min_m", fence.min_m)?;
+        check_position("geofence.max_m", fence.max_m)?;
+        let least_m = 2.0 * self.body_radius_m;
+        if (fence.max_m - fence.min_m).min_element() <= least_m {
+            let advice = format!(
+                "must exceed geofence.min_m = {} by more than the body's {least_m} m on each axis",
+                fence.min_m
+            );
+            return Err(invalid("geofence.max_m", fence.max_m, advice));
+        }
+        check_position("spawn.position_m", self.spawn.position_m)?;
+        check_number("spawn.yaw_deg", self.spawn.yaw_deg, "degrees", -360.0..=360.0)?;
+        self.check_inside("spawn.position_m", self.spawn.position_m)?;
+        let top_m = self.spawn.position_m + DVec3::Z * self.takeoff_height_m;
+        if !self.fits_inside(top_m) {
+            let advice = format!(
+                "the climb ends at {top_m}, where a body of {} m leaves the geofence; climb less \
+                 or raise geofence.max_m",
+                self.body_radius_m
+            );
+            return Err(invalid("takeoff_height_m", self.takeoff_height_m, advice));
+        }
+        if let Some(goal) = &self.goal {
+            check_position("goal.position_m", goal.position_m)?;
+            check_number("goal.radius_m", goal.radius_m, "m", 0.01..=100.0)?;
+            self.check_inside("goal.position_m", goal.position_m)?;
+        }
+        Ok(())
+    }
+
+    fn fits_inside(&self, p_m: DVec3) -> bool {
+        self.geofence().signed_distance_m(p_m) <= -self.body_radius_m
+    }
+
+    fn check_inside(&self, key: &str, p_m: DVec3) -> Result<(), ConfigError> {
+        if self.fits_inside(p_m) {
+            return Ok(());
+        }
+        let advice = format!(
+            "must be inside the geofence {} to {} by the body's radius, {} m",
+            self.geofence.min_m, self.geofence.max_m, self.body_radius_m
+        );
+        Err(invalid(key, p_m, advice))
+    }
+
+    fn check_occupancy(&self) -> Result<(), ConfigError> {
+        let occupancy = &self.occupancy;
+        check_number("occupancy.voxel_m", occupancy.voxel_m, "m", 0.01..=0.5)?;
+        check_number("occupancy.min_opacity", occupancy.min_opacity, "", 0.0..=1.0)?;
+        let limit = -MAX_COORDINATE_M..=MAX_COORDINATE_M;
+        check_number("occupancy.floor_z_m", occupancy.floor_z_m, "m", limit)?;
+        if !(occupancy.floor_z_m < self.geofence.max_m.z) {
+            let advice = "the floor must lie below geofence.max_m";
+            return Err(invalid("occupancy.floor_z_m", occupancy.floor_z_m, advice));
+        }
+        let side_m = self.geofence.max_m - self.geofence.min_m;
+        let voxels = (side_m / occupancy.voxel_m).element_product();
+        if !(voxels <= MAX_VOXELS) {
+            let advice = format!(
+                "the geofence would hold {voxels:.2e} voxels, more than {MAX_VOXELS:.0e}; use \
+                 larger voxels or a smaller geofence"
+            );
+            return Err(invalid("occupancy.voxel_m", occupancy.voxel_m, advice));
+        }
+        Ok(())
+    }
+
+    fn check_cameras(&self) -> Result<(), ConfigError> {
+        if !(1..=MAX_CAMERAS).contains(&self.cameras.len()) {
+            let advice = format!("give 1 to {MAX_CAMERAS} [[cameras]]");
+            return Err(invalid("cameras", format!("{} of them", self.cameras.len()), advice));
+        }
+        let mut taken = HashSet::new();
+        for (index, camera) in self.cameras.iter().enumerate() {
+            let key = |field: &str| format!("cameras[{index}].{field}");
+            check_name(&key("name"), &camera.name, &mut taken)?;
+            let fov_deg = camera.horizontal_fov_deg;
+            check_number(&key("horizontal_fov_deg"), fov_deg, "degrees", 5.0..=170.0)?;
+            camera.intrinsics().validate().map_err(|error| {
+                let size = format!("{}x{}", camera.width_px, camera.height_px);
+                invalid(key("width_px x height_px"), size, error.to_string())
+            })?;
+            check_position(&key("position_m"), camera.position_m)?;
+            if camera.position_m.length() > MAX_LEVER_M {
+                let advice = format!("the camera must be within {MAX_LEVER_M} m of the body");
+                return Err(invalid(key("position_m"), camera.position_m, advice));
+            }
+            check_number(&key("tilt_deg"), camera.tilt_deg, "degrees", -90.0..=90.0)?;
+        }
+        Ok(())
+    }
+
+    fn check_stages(&self) -> Result<(), ConfigError> {
+        if self.stages.len() > MAX_STAGES {
+            let advice = format!("give at most {MAX_STAGES} [[stages]]");
+            return Err(invalid("stages", format!("{} of them", self.stages.len()), advice));
+        }
+        let mut taken = HashSet::new();
+        for (index, stage) in self.stages.iter().enumerate() {
+            let key = |field: &str| format!("stages[{index}].{field}");
+            check_name(&key("name"), &stage.name, &mut taken)?;
+            check_position(&key("center_m"), stage.center_m)?;
+            check_position(&key("normal"), stage.normal)?;
+            if !(stage.normal.length() > 1e-6) {
+                let advice = "give the direction of passage, for example [1.0, 0.0, 0.0]";
+                return Err(invalid(key("normal"), stage.normal, advice));
+            }
+            // An opening narrower than the body cannot be flown.
+            let size_m = 2.0 * self.body_radius_m..=100.0;
+            check_number(&key("width_m"), stage.width_m, "m", size_m.clone())?;
+            check_number(&key("height_m"), stage.height_m, "m", size_m)?;
+            if !(self.geofence().signed_distance_m(stage.center_m) < 0.0) {
+                let advice = format!(
+                    "must be inside the geofence {} to {}",
+                    self.geofence.min_m, self.geofence.max_m
+                );
+                return Err(invalid(key("center_m"), stage.center_m, advice));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A camera further from the body than this is a typing error. [m]
+const MAX_LEVER_M: f64 = 2.0;
