@@ -1,0 +1,68 @@
+//! The forest: 40 m of trunks between start and goal.
+//!
+//! Data flow: [`site`] plans what stands where and its true shapes; [`light`] answers how much
+//! light arrives at a point; [`ground`], [`bark`], [`plants`] and [`backdrop`] lay patches on the
+//! true surfaces, lit by it.
+
+mod backdrop;
+mod bark;
+mod ground;
+mod light;
+mod plants;
+mod site;
+
+use glam::DVec3;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_arena::config::{CameraConfig, Geofence, Goal, Occupancy, Spawn};
+use vizflyt_protocol::messages::Limits;
+
+use crate::Generated;
+use crate::canvas::Canvas;
+use crate::solids::Solids;
+use light::Light;
+use site::{FENCE_Y_M, SPAWN_X_M, Site};
+
+/// Returns the forest of a seed.
+pub(crate) fn build(seed: u64) -> Generated {
+    let site = Site::plan(seed);
+    let solids = Solids::new(site.truth());
+    let mut canvas = Canvas::default();
+    let light = Light::new(&site, &solids);
+    ground::paint_ground(&mut canvas, &site, &light);
+    bark::paint_wood(&mut canvas, &site, &light);
+    plants::paint_plants(&mut canvas, &site, &light);
+    backdrop::paint_backdrop(&mut canvas, &site);
+    Generated { splats: canvas.finish(), arena: arena(&site), truth: solids.into_volumes() }
+}
+
+fn arena(site: &Site) -> ArenaConfig {
+    ArenaConfig {
+        name: "forest".to_owned(),
+        scene: "scene.ply".to_owned(),
+        body_radius_m: 0.12,
+        takeoff_height_m: 1.2,
+        time_limit_s: 60.0,
+        spawn: Spawn { position_m: DVec3::new(SPAWN_X_M, 0.0, 0.0), yaw_deg: 0.0 },
+        goal: Some(Goal { position_m: site.goal_m, radius_m: 1.0 }),
+        geofence: Geofence {
+            min_m: DVec3::new(-1.0, -FENCE_Y_M, -0.5),
+            max_m: DVec3::new(41.0, FENCE_Y_M, 4.0),
+        },
+        limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
+        occupancy: Occupancy::default(),
+        cameras: vec![front_camera()],
+        stages: Vec::new(),
+    }
+}
+
+/// Returns the camera every generated arena has: 320x240, 90 degrees across, in the nose.
+pub(crate) fn front_camera() -> CameraConfig {
+    CameraConfig {
+        name: "front".to_owned(),
+        width_px: 320,
+        height_px: 240,
+        horizontal_fov_deg: 90.0,
+        position_m: DVec3::new(0.06, 0.0, 0.02),
+        tilt_deg: 0.0,
+    }
+}

@@ -1,0 +1,310 @@
+//! Where things stand in the forest, and their true shapes.
+//!
+//! Trees stand so that the straight way to the goal is blocked at least [`BLOCKING_TREES`] times,
+//! a vehicle finds a gap of at least [`GAP_M`] between any two, and start and goal are free.
+
+use glam::{DVec2, DVec3};
+use vizflyt_protocol::geometry::Volume;
+
+use crate::random::{Rng, polar};
+
+/// One kind of tree; sets bark, leaves and shape.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Species {
+    Pine,
+    Beech,
+    Birch,
+}
+
+/// A branch: a straight, tapering limb.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Limb {
+    pub(crate) from_m: DVec3,
+    pub(crate) to_m: DVec3,
+    pub(crate) radius_m: f64,
+}
+
+/// A tree: its axis, and the solids it is made of.
+#[derive(Clone, Debug)]
+pub(crate) struct Tree {
+    pub(crate) species: Species,
+    /// Points of the axis from below the ground to the top, with the radius there. [m, world]
+    pub(crate) axis: Vec<(DVec3, f64)>,
+    pub(crate) roots: Vec<Limb>,
+    pub(crate) branches: Vec<Limb>,
+    /// Trunk and roots, for the bark.
+    pub(crate) trunk: Vec<Volume>,
+    /// Whether it stands within the fence: then it is painted finely, and is true geometry.
+    pub(crate) within: bool,
+    /// Names the tree in noise.
+    pub(crate) key: u64,
+}
+
+impl Tree {
+    /// Returns the axis point and radius at a height; clamped to the ends. [m]
+    pub(crate) fn at_height(&self, z_m: f64) -> (DVec3, f64) {
+        for pair in self.axis.windows(2) {
+            let ((a, radius_a), (b, radius_b)) = (pair[0], pair[1]);
+            if z_m <= b.z {
+                let t = ((z_m - a.z) / (b.z - a.z)).clamp(0.0, 1.0);
+                return (a.lerp(b, t), radius_a + (radius_b - radius_a) * t);
+            }
+        }
+        self.axis[self.axis.len() - 1]
+    }
+
+    /// Returns the height of the tree's top. [m]
+    pub(crate) fn top_m(&self) -> f64 {
+        self.axis[self.axis.len() - 1].0.z
+    }
+
+    /// Returns the clear gap between two trunks up to the height at which vehicles fly. [m]
+    pub(crate) fn gap_m(&self, other: &Self) -> f64 {
+        [0.5, 1.2, 2.0, 3.0]
+            .into_iter()
+            .map(|z_m| {
+                let ((a, radius_a), (b, radius_b)) = (self.at_height(z_m), other.at_height(z_m));
+                (a - b).truncate().length() - radius_a - radius_b
+            })
+            .fold(f64::MAX, f64::min)
+    }
+}
+
+/// A boulder; a sphere that is partly in the ground.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Rock {
+    pub(crate) center_m: DVec3,
+    pub(crate) radius_m: f64,
+}
+
+/// Everything that stands in the forest, and where the sun is.
+#[derive(Debug)]
+pub(crate) struct Site {
+    pub(crate) seed: u64,
+    pub(crate) trees: Vec<Tree>,
+    pub(crate) rocks: Vec<Rock>,
+    pub(crate) logs: Vec<Limb>,
+    /// Unit direction towards the sun. [world]
+    pub(crate) sun: DVec3,
+    pub(crate) goal_m: DVec3,
+}
+
+impl Site {
+    /// Plans the forest of a seed.
+    pub(crate) fn plan(seed: u64) -> Self {
+        let mut rng = Rng::new(seed, 1);
+        // From the left or the right, high enough that light reaches the ground in streaks.
+        let side = if rng.chance(0.5) { 1.0 } else { -1.0 };
+        let azimuth_rad = side * rng.range(55f64.to_radians(), 100f64.to_radians());
+        let elevation_rad = rng.range(34f64.to_radians(), 44f64.to_radians());
+        let sun = (polar(azimuth_rad) * libm::cos(elevation_rad)).extend(libm::sin(elevation_rad));
+        let goal_m = DVec3::new(GOAL_X_M, 0.0, 1.2);
+        let mut site =
+            Self { seed, trees: Vec::new(), rocks: Vec::new(), logs: Vec::new(), sun, goal_m };
+        site.block_the_straight_way(&mut rng);
+        site.fill_the_arena(&mut rng);
+        site.surround(&mut rng);
+        site.lay_rocks_and_logs(&mut rng);
+        site
+    }
+
+    /// Returns the true obstacles and the floor.
+    pub(crate) fn truth(&self) -> Vec<Volume> {
+        let mut volumes = vec![Volume::HalfSpace { normal: DVec3::Z, offset_m: 0.0 }];
+        for tree in &self.trees {
+            volumes.extend(&tree.trunk);
+            if tree.within {
+                volumes.extend(tree.branches.iter().map(capsule));
+            }
+        }
+        volumes.extend(
+            self.rocks
+                .iter()
+                .map(|rock| Volume::Sphere { center_m: rock.center_m, radius_m: rock.radius_m }),
+        );
+        volumes.extend(self.logs.iter().map(capsule));
+        volumes
+    }
+
+    fn block_the_straight_way(&mut self, rng: &mut Rng) {
+        let count = BLOCKING_TREES + 1 + rng.below(2);
+        let (first_m, last_m) = (5.5, GOAL_X_M - 4.0);
+        let span_m = (last_m - first_m) / count as f64;
+        for n in 0..count {
+            let x = first_m + span_m * (n as f64 + rng.range(0.2, 0.8));
+            let base = DVec2::new(x, rng.spread(0.2));
+            let radius_m = slender_radius_m(rng).max(0.17);
+            let tree = grow(rng, base, radius_m, true);
+            self.trees.push(tree);
+        }
+    }
+
+    fn fill_the_arena(&mut self, rng: &mut Rng) {
+        let mut misses = 0;
+        while self.trees.len() < TREES_WITHIN && misses < 4000 {
+            let base = DVec2::new(rng.range(-0.4, 40.4), rng.spread(6.2));
+            let radius_m = slender_radius_m(rng);
+            let tree = grow(rng, base, radius_m, true);
+            let clear = [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()]
+                .iter()
+                .all(|centre| (base - *centre).length() > CLEAR_M + 0.9);
+            if clear && self.trees.iter().all(|other| tree.gap_m(other) >= GAP_M) {
+                self.trees.push(tree);
+            } else {
+                misses += 1;
+            }
+        }
+    }
+
+    fn surround(&mut self, rng: &mut Rng) {
+        let mut misses = 0;
+        let goal = TREES_WITHIN + TREES_AROUND;
+        while self.trees.len() < goal && misses < 4000 {
+            let base = DVec2::new(rng.range(-13.0, 54.0), rng.spread(17.0));
+            let out_m = (base.y.abs() - FENCE_Y_M).max(-1.0 - base.x).max(base.x - 41.0);
+            let radius_m = rng.range(0.12, 0.32);
+            let tree = grow(rng, base, radius_m, false);
+            // Nothing leans over the fence below the crowns.
+            if out_m > 0.9 && self.trees.iter().all(|other| tree.gap_m(other) >= 1.1) {
+                self.trees.push(tree);
+            } else {
+                misses += 1;
+            }
+        }
+    }
+
+    fn lay_rocks_and_logs(&mut self, rng: &mut Rng) {
+        let ends = [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()];
+        let clear = |p: DVec2, reach_m: f64| {
+            ends.iter().all(|centre| (p - *centre).length() > CLEAR_M + reach_m)
+        };
+        for _ in 0..60 {
+            if self.rocks.len() >= 9 {
+                break;
+            }
+            let radius_m = rng.range(0.22, 0.6);
+            let p = DVec2::new(rng.range(3.0, 39.0), rng.spread(6.0));
+            let center_m = p.extend(-radius_m * rng.range(0.25, 0.5));
+            let apart = self.trees.iter().all(|tree| {
+                (tree.at_height(0.2).0.truncate() - p).length() > radius_m + tree.axis[0].1 + 0.25
+            });
+            if clear(p, radius_m) && apart {
+                self.rocks.push(Rock { center_m, radius_m });
+            }
+        }
+        for _ in 0..400 {
+            if self.logs.len() >= 4 {
+                break;
+            }
+            let radius_m = rng.range(0.09, 0.16);
+            let middle = DVec2::new(rng.range(5.0, 35.0), rng.spread(5.5));
+            let half = polar(rng.angle()) * rng.range(0.9, 1.8);
+            let log = Limb {
+                from_m: (middle - half).extend(radius_m * 0.75),
+                to_m: (middle + half).extend(radius_m * 0.7),
+                radius_m,
+            };
+            let apart = (0..=8).all(|n| {
+                let p = log.from_m.lerp(log.to_m, f64::from(n) / 8.0);
+                self.trees.iter().all(|tree| {
+                    (tree.at_height(0.2).0 - p).truncate().length() > tree.axis[0].1 + 0.45
+                }) && self
+                    .rocks
+                    .iter()
+                    .all(|rock| (rock.center_m - p).length() > rock.radius_m + 0.3)
+            });
+            if clear(middle, half.length() + radius_m) && apart {
+                self.logs.push(log);
+            }
+        }
+    }
+}
+
+/// Returns a limb's solid.
+pub(crate) fn capsule(limb: &Limb) -> Volume {
+    Volume::Capsule { a_m: limb.from_m, b_m: limb.to_m, radius_m: limb.radius_m }
+}
+
+fn slender_radius_m(rng: &mut Rng) -> f64 {
+    // Many slender trees, some stout.
+    let t = rng.unit();
+    0.125 + 0.15 * t * t + rng.range(0.0, 0.03)
+}
+
+fn grow(rng: &mut Rng, base: DVec2, radius_m: f64, within: bool) -> Tree {
+    let species = match rng.below(10) {
+        0..=4 => Species::Pine,
+        5..=7 => Species::Beech,
+        _ => Species::Birch,
+    };
+    let top_m = rng.range(8.5, 11.5);
+    let tilt = polar(rng.angle()) * rng.range(0.0, 0.045);
+    let bend = polar(rng.angle()) * rng.range(0.02, 0.09);
+    let phase = rng.angle();
+    let point = |z: f64| {
+        let sway = libm::sin(0.8 * z + phase) - libm::sin(phase);
+        (base + tilt * z + bend * sway).extend(z)
+    };
+    let axis: Vec<(DVec3, f64)> = HEIGHTS_M
+        .iter()
+        .map(|&z| if z < 8.0 { z } else { top_m })
+        .map(|z| (point(z), radius_m * (1.06 - 0.62 * (z / top_m).max(0.0))))
+        .collect();
+    let mut trunk: Vec<Volume> = axis
+        .windows(2)
+        .map(|pair| {
+            let radius_m = (pair[0].1 + pair[1].1) / 2.0;
+            Volume::Capsule { a_m: pair[0].0, b_m: pair[1].0, radius_m }
+        })
+        .collect();
+
+    let mut roots = Vec::new();
+    let turn = rng.angle();
+    let count = 4 + rng.below(3);
+    for n in 0..count {
+        let out = polar(turn + core::f64::consts::TAU * n as f64 / count as f64 + rng.spread(0.3));
+        let z_m = rng.range(0.12, 0.26);
+        let from_m = point(z_m) + (out * radius_m * 0.62).extend(0.0);
+        let to_m = (base + out * (radius_m + rng.range(0.14, 0.34))).extend(-rng.range(0.03, 0.06));
+        roots.push(Limb { from_m, to_m, radius_m: radius_m * rng.range(0.26, 0.36) });
+    }
+    trunk.extend(roots.iter().map(capsule));
+
+    let mut branches = Vec::new();
+    let mut turn = rng.angle();
+    let mut z_m = rng.range(3.25, 3.7);
+    while z_m < top_m - 0.6 {
+        turn += 2.4 + rng.spread(0.5);
+        let t = z_m / top_m;
+        let reach_m = (1.0 - 0.62 * t) * rng.range(1.5, 2.7);
+        let rise = match species {
+            Species::Pine => rng.range(0.0, 0.25),
+            Species::Beech => rng.range(0.25, 0.7),
+            Species::Birch => rng.range(0.35, 0.9),
+        };
+        let from_m = point(z_m);
+        let to_m = from_m + polar(turn).extend(rise) * reach_m;
+        branches.push(Limb { from_m, to_m, radius_m: (radius_m * 0.24 * (1.2 - t)).max(0.02) });
+        z_m += rng.range(0.55, 1.0);
+    }
+    Tree { species, axis, roots, branches, trunk, within, key: (rng.unit() * 1e9) as u64 }
+}
+
+/// Trees that stand across the straight line from start to goal, at least.
+pub(crate) const BLOCKING_TREES: usize = 3;
+/// Clear gap between any two trunks within the fence, at least. [m]
+pub(crate) const GAP_M: f64 = 1.6;
+/// Radius about start and goal that holds nothing solid. [m]
+pub(crate) const CLEAR_M: f64 = 2.5;
+/// Where the vehicle starts. [m, world]
+pub(crate) const SPAWN_X_M: f64 = 1.0;
+/// Where it shall go. [m, world]
+pub(crate) const GOAL_X_M: f64 = 37.5;
+/// Half width of the fence. [m, world]
+pub(crate) const FENCE_Y_M: f64 = 7.0;
+
+const TREES_WITHIN: usize = 44;
+const TREES_AROUND: usize = 92;
+/// Heights of the axis points; short steps where vehicles fly, so that a stack of capsules tapers
+/// within a centimetre. The last stands for the top.
+const HEIGHTS_M: [f64; 11] = [-0.4, 0.5, 1.0, 1.6, 2.3, 3.1, 4.0, 5.0, 6.2, 7.5, 9.0];

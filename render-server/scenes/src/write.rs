@@ -1,0 +1,70 @@
+//! Stores a generated scene in a folder.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use vizflyt_arena::ConfigError;
+use vizflyt_splat::ply;
+
+use crate::Generated;
+
+/// Where a scene was stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Written {
+    /// The splats, in the standard 3DGS PLY layout.
+    pub scene: PathBuf,
+    /// The arena, which names the scene.
+    pub arena: PathBuf,
+    /// The true solids: a JSON array of `Volume`.
+    pub truth: PathBuf,
+}
+
+/// Why a scene could not be stored.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// The folder or a text file could not be written.
+    #[error("cannot write {}: {cause}; give a folder on a disk with room", path.display())]
+    Io {
+        /// What was to be written.
+        path: PathBuf,
+        /// What the system said.
+        cause: io::Error,
+    },
+    /// The splats could not be written.
+    #[error(transparent)]
+    Splats(#[from] ply::PlyError),
+    /// The arena has no text form.
+    #[error("cannot write the arena: {0}")]
+    Arena(#[from] ConfigError),
+    /// The truth has no text form.
+    #[error("cannot write the truth: {0}")]
+    Truth(#[from] serde_json::Error),
+}
+
+impl Generated {
+    /// Writes `scene.ply`, `arena.toml` and `truth.json` into a folder, which is made if absent;
+    /// replaces what has these names.
+    ///
+    /// # Errors
+    /// [`WriteError::Io`] and [`WriteError::Splats`] name the file that could not be written.
+    pub fn write(&self, dir: &Path) -> Result<Written, WriteError> {
+        let io_error = |path: &Path| {
+            let path = path.to_owned();
+            move |cause| WriteError::Io { path, cause }
+        };
+        fs::create_dir_all(dir).map_err(io_error(dir))?;
+        let written = Written {
+            scene: dir.join(&self.arena.scene),
+            arena: dir.join("arena.toml"),
+            truth: dir.join("truth.json"),
+        };
+        ply::write(&written.scene, &self.splats)?;
+        let truth = serde_json::to_string(&self.truth)?;
+        fs::write(&written.truth, truth).map_err(io_error(&written.truth))?;
+        // The arena last: where it stands, the rest is complete.
+        let arena = self.arena.to_toml()?;
+        fs::write(&written.arena, arena).map_err(io_error(&written.arena))?;
+        Ok(written)
+    }
+}
