@@ -1,1 +1,3 @@
-//! (in construction)
+//! The runtime (in construction).
+#![allow(missing_docs)]
+pub mod guard;

@@ -1,0 +1,101 @@
+//! The geofence with stopping distance: how fast the vehicle may approach each face.
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::Volume;
+
+/// The keep-in volume, shrunk by the body and a margin.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Fence {
+    volume: Volume,
+    body_radius_m: f64,
+    /// Acceleration that the stopping distance counts on, per face. [m/s^2]
+    stopping_mps2: f64,
+}
+
+/// Part of the acceleration limit counted on for stopping before one face. Three faces at once
+/// (a corner) then need sqrt(3)/2 = 0.87 of the limit.
+const STOPPING_SHARE: f64 = 0.5;
+/// From a command to the vehicle's answer: link 20 ms, tick 20 ms, attitude and velocity loops
+/// about 0.2 s. The vehicle flies on at its speed for that long. [s]
+const REACTION_S: f64 = 0.3;
+/// Kept free beyond the stopping distance, for localization and tracking errors. [m]
+const MARGIN_M: f64 = 0.1;
+/// Along a curved face, the part of the distance left that one stopping path may not use up.
+const KEPT_SHARE: f64 = 0.9;
+/// Fastest way back from beyond the margin. [m/s]
+const BACK_MPS: f64 = 0.5;
+
+impl Fence {
+    pub(super) fn new(volume: Volume, body_radius_m: f64, max_acceleration_mps2: f64) -> Self {
+        Self { volume, body_radius_m, stopping_mps2: STOPPING_SHARE * max_acceleration_mps2 }
+    }
+
+    /// Returns how far the body's surface is outside; negative inside. [m]
+    pub(super) fn outside_m(&self, p_m: DVec3) -> f64 {
+        self.volume.signed_distance_m(p_m) + self.body_radius_m
+    }
+
+    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence. Motion
+    /// along a face is left as it is. [m/s, world]
+    pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+        match self.volume {
+            // Each face on its own, so that the vehicle can slide along two into a corner.
+            Volume::Cuboid { center_m, half_m, rotation } => {
+                let q = rotation.conjugate() * (p_m - center_m);
+                let free_m = half_m - DVec3::splat(self.body_radius_m + MARGIN_M);
+                let mut v = rotation.conjugate() * v_mps;
+                for axis in 0..3 {
+                    let most = self.approach_mps(free_m[axis] - q[axis]);
+                    let least = -self.approach_mps(free_m[axis] + q[axis]);
+                    // A room narrower than its margins leaves no speed that suits both faces.
+                    v[axis] = if least > most { 0.0 } else { v[axis].clamp(least, most) };
+                }
+                rotation * v
+            }
+            // One face: the nearest. Then the whole stopping path, as faces may curve.
+            volume => {
+                let outward = volume.outward_normal(p_m);
+                let free_m = -self.outside_m(p_m) - MARGIN_M;
+                let most = self.approach_mps(free_m);
+                let v = v_mps + outward * (most - v_mps.dot(outward)).min(0.0);
+                self.shorten(p_m, v)
+            }
+        }
+    }
+
+    /// Returns the greatest speed towards a face that is `free_m` away from which the vehicle
+    /// stops before it: v t + v^2 / 2a = d. Negative (back) if the distance is. [m/s]
+    fn approach_mps(&self, free_m: f64) -> f64 {
+        if !(free_m > 0.0) {
+            return free_m.max(-BACK_MPS);
+        }
+        let a = self.stopping_mps2;
+        let lag_mps = a * REACTION_S;
+        (lag_mps * lag_mps + 2.0 * a * free_m).sqrt() - lag_mps
+    }
+
+    /// Scales `v_mps` down until its stopping path ends inside; the volumes are convex, so the
+    /// path is then inside too. Nearer than the margin, the path must not come nearer still.
+    fn shorten(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+        let speed_mps = v_mps.length();
+        let keep_m = (-KEPT_SHARE * self.outside_m(p_m)).clamp(0.0, MARGIN_M);
+        let stays = |scale: f64| {
+            let path_s = REACTION_S + scale * speed_mps / (2.0 * self.stopping_mps2);
+            self.outside_m(p_m + v_mps * scale * path_s) + keep_m <= 0.0
+        };
+        if stays(1.0) {
+            return v_mps;
+        }
+        let (mut good, mut bad) = (0.0, 1.0);
+        // 2^-20 of the speed is finer than any actuator.
+        for _ in 0..20 {
+            let middle = 0.5 * (good + bad);
+            if stays(middle) {
+                good = middle;
+            } else {
+                bad = middle;
+            }
+        }
+        v_mps * good
+    }
+}

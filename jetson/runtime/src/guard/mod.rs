@@ -1,0 +1,367 @@
+//! The last word on every setpoint. Pure: state, `now` and what is known in; one command out.
+//!
+//! Called at 50 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
+//! 1. a landing, once begun, is never taken back;
+//! 2. deadlines: a pose older than 0.5 s or no setpoint for 0.5 s holds, 2 s lands;
+//! 3. what the plugin asks becomes a velocity in world axes (positions by a braking profile,
+//!    accelerations by integration); numbers that are not finite were refused at [`Guard::ask`];
+//! 4. speed limit, acceleration limit, then the geofence: never faster towards a face than the
+//!    vehicle can stop before it.
+//!
+//! Everything leaves as a velocity, so that one slew limit and one fence rule bound all motion.
+
+mod fence;
+#[cfg(test)]
+mod tests;
+
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Volume, wrap_pi, yaw_of};
+use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
+use vizflyt_protocol::messages::{ArenaInfo, Axes, PoseSample, Setpoint, YawTarget};
+use vizflyt_protocol::time::HostTime;
+
+use fence::Fence;
+
+/// Where the vehicle is, as the guard needs it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fix {
+    /// When this was true. [host]
+    pub stamp: HostTime,
+    /// Position of the body's centre. [m, world]
+    pub p_world_m: DVec3,
+    /// Velocity. [m/s, world]
+    pub v_world_mps: DVec3,
+    /// Heading from world x, counter-clockwise. [rad]
+    pub yaw_rad: f64,
+}
+
+/// What the guard sends on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Passed {
+    /// To be flown.
+    Guided(GuidedSetpoint),
+    /// Come down, now.
+    Land,
+}
+
+/// Why the vehicle is held in place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum HoldReason {
+    /// The plugin asked for it.
+    Asked,
+    /// No setpoint has come for [`SETPOINT_HOLD_S`].
+    NoSetpoint,
+    /// The newest pose is older than [`POSE_HOLD_S`].
+    PoseStale,
+    /// The flight is over; it brakes before it lands.
+    Ending,
+}
+
+/// Why the guard lands by itself.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum LandReason {
+    /// The plugin asked for it.
+    Asked,
+    /// No setpoint has come for so long. [s]
+    NoSetpoint(f64),
+    /// The newest pose is so old. [s]
+    PoseLost(f64),
+    /// The body is outside the fence by so much. [m]
+    OutsideFence(f64),
+    /// Whoever called [`Guard::land`] knows why.
+    Ordered,
+}
+
+/// What the guard is doing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Stance {
+    /// Flies what the plugin asks, within the limits.
+    Passing,
+    /// Stops and stays.
+    Holding(HoldReason),
+    /// Comes down; final.
+    Landing(LandReason),
+}
+
+/// No setpoint for this long: hold. A plugin at 10 Hz may miss four images. [s]
+pub const SETPOINT_HOLD_S: f64 = 0.5;
+/// No setpoint for this long: land. [s]
+pub const SETPOINT_LAND_S: f64 = 2.0;
+/// Newest pose this old: hold. At 6 m/s that is 3 m flown blind. [s]
+pub const POSE_HOLD_S: f64 = 0.5;
+/// Newest pose this old: land. ArduCopter's own estimate lasts 7 s without external navigation
+/// (measured), so it still lands in place. [s]
+pub const POSE_LAND_S: f64 = 2.0;
+
+/// A speed below which the vehicle counts as stopped. [m/s]
+const STOPPED_MPS: f64 = 0.3;
+/// Braking before an orderly landing takes this long at most. [s]
+const BRAKE_AT_MOST_S: f64 = 2.0;
+/// Fastest turn passed on. A racing turn of 180 degrees a second; ArduCopter's default limit is
+/// 202 (`ATC_RATE_Y_MAX`, `ATC_SLEW_YAW`). [rad/s]
+const MAX_YAW_RATE_RADPS: f64 = std::f64::consts::PI;
+/// Gain from distance to speed when flying to a point. Slower than ArduCopter's own position
+/// loop (`PSC_NE_POS_P` = 1), so that the two do not fight. [1/s]
+const POSITION_GAIN_PER_S: f64 = 0.8;
+/// Speed at which a held vehicle returns to its point. [m/s]
+const RETURN_MPS: f64 = 0.5;
+/// Longest time between two ticks that counts; after a stall the slew limit must not open. [s]
+const LONGEST_TICK_S: f64 = 0.1;
+
+/// The guard of one flight.
+#[derive(Clone, Debug)]
+pub struct Guard {
+    fence: Fence,
+    max_speed_mps: f64,
+    max_acceleration_mps2: f64,
+    /// What was commanded last; the slew limit counts from it. [m/s, world]
+    v_command_mps: DVec3,
+    /// Heading to send: an angle or a rate.
+    yaw: YawTarget,
+    /// The heading that [`YawTarget::Keep`] keeps, from when it was first asked for. [rad]
+    kept_yaw_rad: Option<f64>,
+    hold_point_m: Option<DVec3>,
+    asked: Option<Setpoint>,
+    /// When the newest setpoint came, or the plugin took over.
+    asked_at: HostTime,
+    ticked_at: HostTime,
+    /// Set when the flight shall end in order: brake first, until then.
+    ending_until: Option<HostTime>,
+    landing: Option<LandReason>,
+}
+
+impl Guard {
+    /// Makes the guard of a flight in `arena` that takes over from `fix` at `now`.
+    pub fn new(arena: &ArenaInfo, fix: &Fix, now: HostTime) -> Self {
+        Self {
+            fence: Fence::new(
+                arena.geofence,
+                arena.body_radius_m,
+                arena.limits.max_acceleration_mps2,
+            ),
+            max_speed_mps: arena.limits.max_speed_mps,
+            max_acceleration_mps2: arena.limits.max_acceleration_mps2,
+            v_command_mps: fix.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
+            yaw: YawTarget::Angle(fix.yaw_rad),
+            kept_yaw_rad: Some(fix.yaw_rad),
+            hold_point_m: None,
+            asked: None,
+            asked_at: now,
+            ticked_at: now,
+            ending_until: None,
+            landing: None,
+        }
+    }
+
+    /// Takes what the plugin asks for at `now`. Returns whether it was taken: a setpoint with a
+    /// number that is not finite is refused, and does not count against the deadline.
+    pub fn ask(&mut self, now: HostTime, setpoint: Setpoint) -> bool {
+        if !setpoint.is_finite() {
+            return false;
+        }
+        self.asked = Some(bounded(setpoint));
+        self.asked_at = now;
+        true
+    }
+
+    /// Lands now. Final.
+    pub fn land(&mut self) {
+        self.landing.get_or_insert(LandReason::Ordered);
+    }
+
+    /// Brakes, then lands. Final; [`Self::land`] still cuts the braking short.
+    pub fn brake_and_land(&mut self, now: HostTime) {
+        self.ending_until.get_or_insert(now.plus_seconds(BRAKE_AT_MOST_S));
+    }
+
+    /// Decides what to send at `now`, with the newest `fix`.
+    pub fn tick(&mut self, now: HostTime, fix: &Fix) -> (Passed, Stance) {
+        let dt_s = now.seconds_since(self.ticked_at).clamp(0.0, LONGEST_TICK_S);
+        self.ticked_at = now;
+        let stance = self.stance(now, fix);
+        let v_target = match stance {
+            Stance::Landing(reason) => {
+                self.landing = Some(reason);
+                return (Passed::Land, stance);
+            }
+            Stance::Holding(reason) => self.hold(fix, reason),
+            Stance::Passing => {
+                self.hold_point_m = None;
+                self.wanted(fix, dt_s)
+            }
+        };
+        let slew_mps = self.max_acceleration_mps2 * dt_s;
+        let v_target = v_target.clamp_length_max(self.max_speed_mps);
+        let change = (v_target - self.v_command_mps).clamp_length_max(slew_mps);
+        let v_slewed = self.v_command_mps + change;
+        // Where the vehicle is now, not when the pose was measured.
+        let age_s = now.seconds_since(fix.stamp).clamp(0.0, POSE_HOLD_S);
+        let p_now = fix.p_world_m + fix.v_world_mps * age_s;
+        // The fence comes last: where it and the slew limit disagree, it wins.
+        self.v_command_mps =
+            self.fence.limit(p_now, v_slewed).clamp_length_max(self.max_speed_mps);
+        let motion = GuidedMotion::Velocity(self.v_command_mps);
+        (Passed::Guided(GuidedSetpoint { motion, yaw: self.yaw }), stance)
+    }
+
+    fn stance(&self, now: HostTime, fix: &Fix) -> Stance {
+        if let Some(reason) = self.landing {
+            return Stance::Landing(reason);
+        }
+        let pose_age_s = now.seconds_since(fix.stamp);
+        if pose_age_s > POSE_LAND_S {
+            return Stance::Landing(LandReason::PoseLost(pose_age_s));
+        }
+        let outside_m = self.fence.outside_m(fix.p_world_m);
+        if outside_m > 0.0 {
+            return Stance::Landing(LandReason::OutsideFence(outside_m));
+        }
+        if let Some(until) = self.ending_until {
+            if now >= until || fix.v_world_mps.length() < STOPPED_MPS {
+                return Stance::Landing(LandReason::Ordered);
+            }
+            return Stance::Holding(HoldReason::Ending);
+        }
+        let silent_s = now.seconds_since(self.asked_at);
+        if silent_s > SETPOINT_LAND_S {
+            return Stance::Landing(LandReason::NoSetpoint(silent_s));
+        }
+        if pose_age_s > POSE_HOLD_S {
+            return Stance::Holding(HoldReason::PoseStale);
+        }
+        if silent_s > SETPOINT_HOLD_S {
+            return Stance::Holding(HoldReason::NoSetpoint);
+        }
+        match self.asked {
+            None | Some(Setpoint::Hold) => Stance::Holding(HoldReason::Asked),
+            Some(Setpoint::Land) => Stance::Landing(LandReason::Asked),
+            Some(_) => Stance::Passing,
+        }
+    }
+
+    /// Returns the velocity that stops the vehicle and keeps it where it stopped. [m/s, world]
+    fn hold(&mut self, fix: &Fix, reason: HoldReason) -> DVec3 {
+        self.turn(fix, YawTarget::Keep);
+        if reason == HoldReason::PoseStale {
+            // Blind: zero velocity is held by the autopilot's own estimate.
+            self.hold_point_m = None;
+            return DVec3::ZERO;
+        }
+        let stopped = self.v_command_mps.length() < STOPPED_MPS
+            && fix.v_world_mps.length() < STOPPED_MPS;
+        if self.hold_point_m.is_none() && stopped {
+            self.hold_point_m = Some(fix.p_world_m);
+        }
+        match self.hold_point_m {
+            Some(p_m) => {
+                (POSITION_GAIN_PER_S * (p_m - fix.p_world_m)).clamp_length_max(RETURN_MPS)
+            }
+            None => DVec3::ZERO,
+        }
+    }
+
+    /// Returns the velocity that the plugin's setpoint amounts to, before the limits, and sets
+    /// the heading. [m/s, world]
+    fn wanted(&mut self, fix: &Fix, dt_s: f64) -> DVec3 {
+        let in_world = |v: DVec3, axes: Axes| match axes {
+            Axes::World => v,
+            Axes::Heading => DQuat::from_rotation_z(fix.yaw_rad) * v,
+        };
+        let (v_target, yaw) = match self.asked.unwrap_or_default() {
+            Setpoint::Hold | Setpoint::Land => (DVec3::ZERO, YawTarget::Keep),
+            Setpoint::Velocity { v_mps, axes, yaw } => (in_world(v_mps, axes), yaw),
+            Setpoint::Position { p_world_m, yaw } => (self.towards(fix, p_world_m), yaw),
+            Setpoint::Acceleration { a_mps2, axes, yaw } => {
+                let a = in_world(a_mps2, axes).clamp_length_max(self.max_acceleration_mps2);
+                (self.v_command_mps + a * dt_s, yaw)
+            }
+        };
+        self.turn(fix, yaw);
+        v_target
+    }
+
+    /// Sets the heading to send; it is never left open, as ArduCopter would then turn the nose
+    /// into the direction of travel.
+    fn turn(&mut self, fix: &Fix, yaw: YawTarget) {
+        let kept_yaw_rad = self.kept_yaw_rad.take();
+        self.yaw = match yaw {
+            YawTarget::Angle(yaw_rad) => YawTarget::Angle(wrap_pi(yaw_rad)),
+            YawTarget::Rate(rate_radps) => {
+                YawTarget::Rate(rate_radps.clamp(-MAX_YAW_RATE_RADPS, MAX_YAW_RATE_RADPS))
+            }
+            YawTarget::Keep => {
+                let yaw_rad = kept_yaw_rad.unwrap_or(fix.yaw_rad);
+                self.kept_yaw_rad = Some(yaw_rad);
+                YawTarget::Angle(yaw_rad)
+            }
+        };
+    }
+
+    /// Returns the velocity towards a point, slow enough to stop there with half the
+    /// acceleration. [m/s, world]
+    fn towards(&self, fix: &Fix, p_world_m: DVec3) -> DVec3 {
+        let way_m = p_world_m - fix.p_world_m;
+        let distance_m = way_m.length();
+        if !(distance_m > 1e-6) {
+            return DVec3::ZERO;
+        }
+        let braking_mps = (self.max_acceleration_mps2 * distance_m).sqrt();
+        way_m / distance_m * braking_mps.min(POSITION_GAIN_PER_S * distance_m)
+    }
+}
+
+impl Fix {
+    /// Returns the fix of a localized pose whose stamp is `stamp` on this computer's clock.
+    pub fn of(sample: &PoseSample, stamp: HostTime) -> Self {
+        Self {
+            stamp,
+            p_world_m: sample.world_from_body.translation_m,
+            v_world_mps: sample.twist.linear_mps,
+            yaw_rad: yaw_of(sample.world_from_body.rotation),
+        }
+    }
+}
+
+/// Bounds every component, so that no product of two overflows to infinity. A million metres is
+/// beyond any fence, a million metres a second beyond any limit.
+fn bounded(setpoint: Setpoint) -> Setpoint {
+    let bound = |v: DVec3| v.clamp(DVec3::splat(-1e6), DVec3::splat(1e6));
+    match setpoint {
+        Setpoint::Hold | Setpoint::Land => setpoint,
+        Setpoint::Position { p_world_m, yaw } => {
+            Setpoint::Position { p_world_m: bound(p_world_m), yaw }
+        }
+        Setpoint::Velocity { v_mps, axes, yaw } => {
+            Setpoint::Velocity { v_mps: bound(v_mps), axes, yaw }
+        }
+        Setpoint::Acceleration { a_mps2, axes, yaw } => {
+            Setpoint::Acceleration { a_mps2: bound(a_mps2), axes, yaw }
+        }
+    }
+}
+
+/// Checks that limits and fence are such that the guard can keep them.
+///
+/// # Errors
+/// One sentence that names the setting.
+pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
+    let positive = |value: f64| value.is_finite() && value > 0.0;
+    if !arena.geofence.is_valid() {
+        return Err("arena: geofence is not a volume".into());
+    }
+    if !positive(arena.limits.max_speed_mps) || !positive(arena.limits.max_acceleration_mps2) {
+        return Err("arena: limits must be positive numbers".into());
+    }
+    if !(arena.body_radius_m.is_finite() && arena.body_radius_m >= 0.0) {
+        return Err("arena: body_radius_m must be a number, 0 or more".into());
+    }
+    if !positive(arena.takeoff_height_m) {
+        return Err("arena: takeoff_height_m must be a positive number".into());
+    }
+    if let Volume::Cuboid { half_m, .. } = arena.geofence
+        && half_m.min_element() <= arena.body_radius_m
+    {
+        return Err("arena: geofence is too small for the body".into());
+    }
+    Ok(())
+}

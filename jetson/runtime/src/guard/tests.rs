@@ -1,0 +1,356 @@
+use glam::{DQuat, DVec3};
+use proptest::prelude::*;
+use vizflyt_protocol::messages::{ArenaInfo, Limits, bounded};
+
+use super::*;
+
+const TICK_S: f64 = 0.02;
+
+fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> ArenaInfo {
+    ArenaInfo {
+        name: bounded("test"),
+        geofence,
+        limits: Limits { max_speed_mps, max_acceleration_mps2 },
+        body_radius_m: 0.12,
+        takeoff_height_m: 1.0,
+        goal_m: None,
+        goal_radius_m: 1.0,
+        time_limit_s: 0.0,
+        cameras: heapless::Vec::new(),
+    }
+}
+
+fn room() -> Volume {
+    Volume::aabb(DVec3::new(-5.0, -3.0, 0.0), DVec3::new(5.0, 3.0, 4.0))
+}
+
+/// A vehicle that follows velocity commands: delay, first-order lag, bounded acceleration.
+struct Vehicle {
+    p_m: DVec3,
+    v_mps: DVec3,
+    yaw_rad: f64,
+    max_acceleration_mps2: f64,
+    delayed: std::collections::VecDeque<DVec3>,
+}
+
+/// Ticks from command to the vehicle's first answer.
+const DELAY_TICKS: usize = 2;
+/// Time constant of the velocity loop. [s]
+const LAG_S: f64 = 0.12;
+
+impl Vehicle {
+    fn new(p_m: DVec3, max_acceleration_mps2: f64) -> Self {
+        let delayed = [DVec3::ZERO; DELAY_TICKS].into();
+        Self { p_m, v_mps: DVec3::ZERO, yaw_rad: 0.3, max_acceleration_mps2, delayed }
+    }
+
+    fn fly(&mut self, v_command_mps: DVec3) {
+        self.delayed.push_back(v_command_mps);
+        let v_command_mps = self.delayed.pop_front().unwrap();
+        let a = ((v_command_mps - self.v_mps) / LAG_S).clamp_length_max(self.max_acceleration_mps2);
+        self.p_m += self.v_mps * TICK_S + 0.5 * a * TICK_S * TICK_S;
+        self.v_mps += a * TICK_S;
+    }
+
+    fn fix(&self, stamp: HostTime) -> Fix {
+        Fix { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, yaw_rad: self.yaw_rad }
+    }
+}
+
+fn time(tick: usize) -> HostTime {
+    HostTime::from_ns(1_000_000_000 + tick as u64 * 20_000_000)
+}
+
+fn number() -> impl Strategy<Value = f64> {
+    prop_oneof![
+        8 => -12.0..12.0f64,
+        1 => prop::num::f64::ANY,
+        1 => Just(f64::NAN),
+    ]
+}
+
+fn vector() -> impl Strategy<Value = DVec3> {
+    (number(), number(), number()).prop_map(|(x, y, z)| DVec3::new(x, y, z))
+}
+
+fn setpoint() -> impl Strategy<Value = Setpoint> {
+    let yaw = || {
+        prop_oneof![
+            Just(YawTarget::Keep),
+            number().prop_map(YawTarget::Angle),
+            number().prop_map(YawTarget::Rate),
+        ]
+    };
+    let axes = || prop_oneof![Just(Axes::World), Just(Axes::Heading)];
+    prop_oneof![
+        1 => Just(Setpoint::Hold),
+        2 => (vector(), yaw()).prop_map(|(p_world_m, yaw)| Setpoint::Position { p_world_m, yaw }),
+        4 => (vector(), axes(), yaw())
+            .prop_map(|(v_mps, axes, yaw)| Setpoint::Velocity { v_mps, axes, yaw }),
+        2 => (vector(), axes(), yaw())
+            .prop_map(|(a_mps2, axes, yaw)| Setpoint::Acceleration { a_mps2, axes, yaw }),
+    ]
+}
+
+fn volume() -> impl Strategy<Value = Volume> {
+    prop_oneof![
+        3 => Just(room()),
+        1 => Just(Volume::Cuboid {
+            center_m: DVec3::new(0.0, 0.0, 2.0),
+            half_m: DVec3::new(6.0, 3.0, 2.0),
+            rotation: DQuat::from_rotation_z(0.6),
+        }),
+        1 => Just(Volume::Sphere { center_m: DVec3::Z * 2.0, radius_m: 4.0 }),
+        1 => Just(Volume::Capsule {
+            a_m: DVec3::new(-4.0, 0.0, 2.0),
+            b_m: DVec3::new(4.0, 1.0, 2.0),
+            radius_m: 2.5,
+        }),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 10_000, ..ProptestConfig::default() })]
+
+    /// Whatever a plugin asks, the vehicle stays inside, the limits hold and no NaN gets through.
+    #[test]
+    fn whatever_is_asked_the_vehicle_stays_inside_and_within_limits(
+        geofence in volume(),
+        max_speed_mps in 0.5..8.0f64,
+        max_acceleration_mps2 in 2.0..10.0f64,
+        asked in prop::collection::vec((setpoint(), 1usize..60), 1..10),
+    ) {
+        let arena = arena(geofence, max_speed_mps, max_acceleration_mps2);
+        let mut vehicle = Vehicle::new(DVec3::Z * 2.0, max_acceleration_mps2);
+        let mut guard = Guard::new(&arena, &vehicle.fix(time(0)), time(0));
+        let mut v_before = DVec3::ZERO;
+        let mut tick = 0;
+        for (setpoint, ticks) in asked {
+            for _ in 0..ticks {
+                tick += 1;
+                guard.ask(time(tick), setpoint);
+                // The pose is 20 ms old, as over a network.
+                let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick - 1)));
+                let Passed::Guided(guided) = passed else {
+                    // Two seconds of NaN are two seconds without a setpoint.
+                    let silent = matches!(stance, Stance::Landing(LandReason::NoSetpoint(_)));
+                    prop_assert!(silent, "{stance:?}");
+                    return Ok(());
+                };
+                let GuidedMotion::Velocity(v) = guided.motion else { panic!("not a velocity") };
+                prop_assert!(v.is_finite());
+                let turns = match guided.yaw {
+                    YawTarget::Angle(yaw) => yaw.abs() <= 3.1416,
+                    YawTarget::Rate(rate) => rate.abs() <= MAX_YAW_RATE_RADPS,
+                    YawTarget::Keep => false,
+                };
+                prop_assert!(turns, "{guided:?}");
+                prop_assert!(v.length() <= max_speed_mps + 1e-9);
+                let change_mps2 = (v - v_before).length() / TICK_S;
+                // Where slew limit and fence disagree the fence wins: at flat faces by a little,
+                // at curved ones by as much as it takes.
+                let flat = matches!(geofence, Volume::Cuboid { .. });
+                prop_assert!(!flat || change_mps2 <= 1.2 * max_acceleration_mps2, "{change_mps2}");
+                v_before = v;
+                vehicle.fly(v);
+                let outside_m = geofence.signed_distance_m(vehicle.p_m) + arena.body_radius_m;
+                prop_assert!(outside_m <= 0.0, "{outside_m} m outside at {}", vehicle.p_m);
+            }
+        }
+        // Holding is reachable from anywhere, and it stops.
+        for _ in 0..300 {
+            tick += 1;
+            guard.ask(time(tick), Setpoint::Hold);
+            let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick)));
+            prop_assert!(matches!(stance, Stance::Holding(HoldReason::Asked)), "{stance:?}");
+            let Passed::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) = passed
+            else { panic!("not a velocity") };
+            vehicle.fly(v);
+        }
+        prop_assert!(vehicle.v_mps.length() < 0.1, "{}", vehicle.v_mps);
+        // So is landing.
+        guard.ask(time(tick), Setpoint::Land);
+        let (passed, _) = guard.tick(time(tick + 1), &vehicle.fix(time(tick + 1)));
+        prop_assert_eq!(passed, Passed::Land);
+    }
+}
+
+/// A vehicle at rest in the middle of the room.
+fn at_rest(tick: usize) -> Fix {
+    Vehicle::new(DVec3::Z * 2.0, 4.0).fix(time(tick))
+}
+
+fn guard() -> Guard {
+    Guard::new(&arena(room(), 3.0, 4.0), &at_rest(0), time(0))
+}
+
+fn velocity(v_mps: DVec3) -> Setpoint {
+    Setpoint::velocity(v_mps, YawTarget::Keep)
+}
+
+fn passed_velocity(passed: Passed) -> DVec3 {
+    match passed {
+        Passed::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) => v,
+        other => panic!("{other:?} is no velocity"),
+    }
+}
+
+#[test]
+fn silence_holds_then_lands() {
+    let mut guard = guard();
+    guard.ask(time(1), velocity(DVec3::X));
+    let stance = |guard: &mut Guard, tick| guard.tick(time(tick), &at_rest(tick)).1;
+    assert_eq!(stance(&mut guard, 2), Stance::Passing);
+    assert_eq!(stance(&mut guard, 26), Stance::Passing, "0.5 s");
+    assert_eq!(stance(&mut guard, 27), Stance::Holding(HoldReason::NoSetpoint));
+    assert_eq!(stance(&mut guard, 101), Stance::Holding(HoldReason::NoSetpoint), "2 s");
+    assert!(matches!(stance(&mut guard, 102), Stance::Landing(LandReason::NoSetpoint(_))));
+    // Latched: a plugin that comes back is not obeyed any more.
+    guard.ask(time(103), velocity(DVec3::X));
+    assert_eq!(guard.tick(time(103), &at_rest(103)).0, Passed::Land);
+}
+
+#[test]
+fn a_plugin_that_never_answers_is_landed() {
+    let mut guard = guard();
+    let (passed, stance) = guard.tick(time(101), &at_rest(101));
+    assert!(matches!(stance, Stance::Landing(LandReason::NoSetpoint(s)) if s > 2.0));
+    assert_eq!(passed, Passed::Land);
+}
+
+#[test]
+fn numbers_that_are_not_finite_do_not_count() {
+    let mut guard = guard();
+    for tick in 1..=27 {
+        assert!(!guard.ask(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))));
+        assert!(!guard.ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0))));
+    }
+    assert_eq!(guard.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
+}
+
+#[test]
+fn a_stale_pose_holds_then_lands() {
+    let mut guard = guard();
+    for tick in 1..=102 {
+        guard.ask(time(tick), velocity(DVec3::X));
+        let (passed, stance) = guard.tick(time(tick), &at_rest(1));
+        match tick {
+            1..=26 => assert_eq!(stance, Stance::Passing),
+            27..=101 => assert_eq!(stance, Stance::Holding(HoldReason::PoseStale)),
+            _ => assert!(matches!(stance, Stance::Landing(LandReason::PoseLost(_)))),
+        }
+        if tick == 101 {
+            assert_eq!(passed_velocity(passed), DVec3::ZERO);
+        }
+    }
+}
+
+#[test]
+fn outside_the_fence_it_lands() {
+    let mut guard = guard();
+    guard.ask(time(1), velocity(DVec3::X));
+    let out = Fix { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
+    let (_, stance) = guard.tick(time(1), &out);
+    assert!(matches!(stance, Stance::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9));
+}
+
+#[test]
+fn heading_axes_turn_with_the_nose() {
+    let mut guard = guard();
+    let mut v = DVec3::ZERO;
+    for tick in 1..100 {
+        let north = Fix { yaw_rad: std::f64::consts::FRAC_PI_2, ..at_rest(tick) };
+        guard.ask(
+            time(tick),
+            Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::Heading, yaw: YawTarget::Keep },
+        );
+        v = passed_velocity(guard.tick(time(tick), &north).0);
+    }
+    assert!((v - DVec3::Y).length() < 1e-9, "{v}");
+}
+
+#[test]
+fn keep_keeps_the_heading_of_the_moment() {
+    let mut guard = guard();
+    let yaw_after = |guard: &mut Guard, tick, yaw, yaw_rad| {
+        guard.ask(time(tick), Setpoint::velocity(DVec3::X, yaw));
+        match guard.tick(time(tick), &Fix { yaw_rad, ..at_rest(tick) }).0 {
+            Passed::Guided(guided) => guided.yaw,
+            Passed::Land => panic!("landed"),
+        }
+    };
+    assert_eq!(yaw_after(&mut guard, 1, YawTarget::Keep, 0.5), YawTarget::Angle(0.3), "at start");
+    assert_eq!(yaw_after(&mut guard, 2, YawTarget::Rate(9.0), 0.5), YawTarget::Rate(MAX_YAW_RATE_RADPS));
+    assert_eq!(yaw_after(&mut guard, 3, YawTarget::Keep, 0.7), YawTarget::Angle(0.7));
+    assert_eq!(yaw_after(&mut guard, 4, YawTarget::Keep, 0.9), YawTarget::Angle(0.7));
+    let YawTarget::Angle(yaw) = yaw_after(&mut guard, 5, YawTarget::Angle(4.0), 0.9) else { panic!() };
+    assert!((yaw - (4.0 - 2.0 * std::f64::consts::PI)).abs() < 1e-12);
+    assert_eq!(yaw_after(&mut guard, 6, YawTarget::Keep, 1.1), YawTarget::Angle(1.1));
+}
+
+#[test]
+fn a_point_is_reached_and_held() {
+    let mut guard = guard();
+    let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
+    let p_world_m = DVec3::new(3.0, -1.5, 1.0);
+    for tick in 1..800 {
+        guard.ask(time(tick), Setpoint::Position { p_world_m, yaw: YawTarget::Keep });
+        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        vehicle.fly(v);
+    }
+    assert!((vehicle.p_m - p_world_m).length() < 0.01, "{}", vehicle.p_m);
+}
+
+#[test]
+fn it_slides_along_a_wall_rather_than_stopping() {
+    let mut guard = guard();
+    let mut vehicle = Vehicle::new(DVec3::new(-4.0, 0.0, 2.0), 4.0);
+    for tick in 1..200 {
+        guard.ask(time(tick), velocity(DVec3::new(1.0, 3.0, 0.0)));
+        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        vehicle.fly(v);
+    }
+    assert!(vehicle.p_m.y > 2.5 && vehicle.p_m.y < 2.88, "{}", vehicle.p_m);
+    assert!(vehicle.v_mps.x > 0.8, "{}", vehicle.v_mps);
+}
+
+#[test]
+fn an_orderly_end_brakes_before_it_lands() {
+    let mut guard = guard();
+    let moving = |tick, v| Fix { v_world_mps: DVec3::X * v, ..at_rest(tick) };
+    guard.ask(time(1), velocity(DVec3::X * 2.0));
+    guard.tick(time(1), &moving(1, 2.0));
+    guard.brake_and_land(time(2));
+    let (passed, stance) = guard.tick(time(2), &moving(2, 2.0));
+    assert_eq!(stance, Stance::Holding(HoldReason::Ending));
+    assert!(passed_velocity(passed).length() < 0.1);
+    assert_eq!(guard.tick(time(3), &moving(3, 0.2)).0, Passed::Land);
+
+    // A vehicle that does not stop is landed all the same.
+    let mut other = self::guard();
+    other.brake_and_land(time(2));
+    assert_ne!(other.tick(time(101), &moving(101, 2.0)).0, Passed::Land);
+    assert_eq!(other.tick(time(102), &moving(102, 2.0)).0, Passed::Land);
+}
+
+#[test]
+fn landing_is_final() {
+    let mut guard = guard();
+    guard.land();
+    for tick in 1..50 {
+        guard.ask(time(tick), velocity(DVec3::X));
+        let (passed, stance) = guard.tick(time(tick), &at_rest(tick));
+        assert_eq!((passed, stance), (Passed::Land, Stance::Landing(LandReason::Ordered)));
+    }
+}
+
+#[test]
+fn arenas_the_guard_cannot_keep_are_refused() {
+    assert_eq!(check_arena(&arena(room(), 3.0, 4.0)), Ok(()));
+    assert!(check_arena(&arena(room(), f64::NAN, 4.0)).unwrap_err().contains("limits"));
+    assert!(check_arena(&arena(room(), 3.0, 0.0)).unwrap_err().contains("limits"));
+    let tiny = Volume::aabb(DVec3::ZERO, DVec3::splat(0.2));
+    assert!(check_arena(&arena(tiny, 3.0, 4.0)).unwrap_err().contains("too small"));
+    let bad = Volume::Sphere { center_m: DVec3::ZERO, radius_m: -1.0 };
+    assert!(check_arena(&arena(bad, 3.0, 4.0)).unwrap_err().contains("geofence"));
+}
