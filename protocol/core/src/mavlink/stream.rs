@@ -100,6 +100,7 @@ const STX_V1: u8 = 0xFE;
 const STX_V2: u8 = 0xFD;
 const SIGNED: u8 = 0x01;
 
+#[allow(clippy::large_enum_variant)] // Why: short-lived, and there is no heap to box it on.
 enum Candidate {
     Incomplete,
     Bad,

@@ -91,7 +91,7 @@ impl Deframer {
 mod tests {
     extern crate std;
     use super::*;
-    use crate::geometry::{Intrinsics, Pose, Volume, body_from_forward_cam};
+    use crate::geometry::{Intrinsics, Pose, Twist, Volume, body_from_forward_cam};
     use crate::messages::*;
     use crate::time::{HostTime, ServerTime};
     use glam::{DQuat, DVec3};
@@ -131,7 +131,7 @@ mod tests {
             ToRuntime::Pose(PoseSample {
                 stamp: ServerTime::from_ns(7),
                 world_from_body: Pose::IDENTITY,
-                twist: Default::default(),
+                twist: Twist::default(),
                 resets: 3,
             }),
             ToRuntime::Event(Event {
