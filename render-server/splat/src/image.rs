@@ -1,4 +1,4 @@
-//! What a renderer writes.
+//! What a renderer writes, and its integer forms for encoders.
 
 /// Colour, depth and alpha of one camera; row-major, reused from image to image.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -16,4 +16,89 @@ pub struct RgbdImage {
     /// H x W median camera-z depth: z of the splat at which transmittance falls to one half; 0
     /// where it never does. [m, cam]
     pub depth_median_m: Vec<f32>,
+}
+
+/// Which of the two depths of an image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DepthKind {
+    /// Where transmittance falls to one half: sharp at edges, never between two surfaces.
+    #[default]
+    Median,
+    /// The mean over everything the pixel sees: smooth, between the surfaces at edges.
+    Expected,
+}
+
+impl RgbdImage {
+    /// Alpha from which an expected depth counts as a return: below, more than half of the light
+    /// comes from the background, and the median says "no return" too.
+    pub const MIN_DEPTH_ALPHA: f32 = 0.5;
+
+    /// Gives every buffer the length of a `width_px` x `height_px` image. Contents are
+    /// unspecified; allocates only when the image grows.
+    pub fn resize(&mut self, width_px: u32, height_px: u32) {
+        let pixels = width_px as usize * height_px as usize;
+        self.width_px = width_px;
+        self.height_px = height_px;
+        self.rgb.resize(pixels * 3, 0.0);
+        self.alpha.resize(pixels, 0.0);
+        self.depth_expected_m.resize(pixels, 0.0);
+        self.depth_median_m.resize(pixels, 0.0);
+    }
+
+    /// Writes H x W x 3 bytes of RGB, clamped and rounded, to `out`, whose length and contents are
+    /// replaced. Splats are trained on sRGB values, so these *are* sRGB values: no gamma is applied.
+    pub fn write_rgb8(&self, out: &mut Vec<u8>) {
+        out.resize(self.rgb.len(), 0);
+        for (byte, &value) in out.iter_mut().zip(&self.rgb) {
+            // Clamped before the cast, in an order that vectorises; NaN becomes 0.
+            *byte = (value.max(0.0) * 255.0 + 0.5).min(255.0) as u8;
+        }
+    }
+
+    /// Writes H x W depths in whole millimetres to `out`, whose length and contents are replaced:
+    /// 0 where there is no return, that is where alpha is below [`Self::MIN_DEPTH_ALPHA`], where
+    /// nothing was hit, or beyond 65.535 m, as REP 118 has it. [mm, cam]
+    pub fn write_depth_mm(&self, kind: DepthKind, out: &mut Vec<u16>) {
+        let depth_m = match kind {
+            DepthKind::Median => &self.depth_median_m,
+            DepthKind::Expected => &self.depth_expected_m,
+        };
+        out.resize(depth_m.len(), 0);
+        for ((mm, &depth_m), &alpha) in out.iter_mut().zip(depth_m).zip(&self.alpha) {
+            let rounded = depth_m * 1000.0 + 0.5;
+            let returned = (alpha >= Self::MIN_DEPTH_ALPHA) & (rounded < 65536.0);
+            *mm = if returned { rounded as u16 } else { 0 };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rgb_is_clamped_and_rounded() {
+        let image = RgbdImage {
+            rgb: vec![-1.0, 0.0, 0.001, 0.5, 1.0, 7.0, f32::NAN, f32::INFINITY, 254.6 / 255.0],
+            ..RgbdImage::default()
+        };
+        let mut bytes = vec![9; 50];
+        image.write_rgb8(&mut bytes);
+        assert_eq!(bytes, [0, 0, 0, 128, 255, 255, 0, 255, 255]);
+    }
+
+    #[test]
+    fn depth_is_millimetres_or_no_return() {
+        let image = RgbdImage {
+            alpha: vec![1.0, 0.49, 0.5, 1.0, 1.0, 1.0, 1.0],
+            depth_median_m: vec![1.2344, 2.0, 2.0006, 65.535, 65.5356, f32::NAN, 0.0],
+            depth_expected_m: vec![3.0; 7],
+            ..RgbdImage::default()
+        };
+        let mut mm = Vec::new();
+        image.write_depth_mm(DepthKind::Median, &mut mm);
+        assert_eq!(mm, [1234, 0, 2001, 65535, 0, 0, 0]);
+        image.write_depth_mm(DepthKind::Expected, &mut mm);
+        assert_eq!(mm, [3000, 0, 3000, 3000, 3000, 3000, 3000]);
+    }
 }

@@ -1,11 +1,20 @@
 //! (scene, cameras) -> RGB, metric depth and alpha of 3D Gaussian splats.
 //!
+//! A scene comes from a file ([`ply`]) as [`Splats`]; a renderer takes it once and then draws any
+//! number of [`Camera`]s per call into [`RgbdImage`]s that the caller keeps. [`render_reference`]
+//! is the plain truth every fast renderer is compared with.
+//!
 //! No network, no tokio, no clock: a function of its arguments.
 
 mod camera;
+mod harmonics;
 mod image;
+mod limits;
+pub mod ply;
+mod reference;
 mod splats;
 
-pub use camera::Camera;
-pub use image::RgbdImage;
+pub use camera::{Camera, InvalidCamera};
+pub use image::{DepthKind, RgbdImage};
+pub use reference::render_reference;
 pub use splats::Splats;

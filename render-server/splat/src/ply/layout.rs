@@ -1,0 +1,100 @@
+//! Which properties of a vertex make a splat, and where they lie in its row.
+
+use super::PlyError;
+use super::header::{Element, Header, Kind, Scalar};
+
+/// Properties every splat has, in the order in which [`Layout::slots`] lists them.
+pub(super) const REQUIRED: [&str; 14] = [
+    "x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity",
+    "f_dc_0", "f_dc_1", "f_dc_2",
+];
+
+/// Where in [`Layout::slots`] each group starts.
+pub(super) mod slot {
+    pub(in crate::ply) const MEAN: usize = 0;
+    pub(in crate::ply) const LOG_SCALE: usize = 3;
+    pub(in crate::ply) const ROTATION_WXYZ: usize = 6;
+    pub(in crate::ply) const OPACITY_LOGIT: usize = 10;
+    pub(in crate::ply) const SH_DC: usize = 11;
+    pub(in crate::ply) const SH_REST: usize = 14;
+}
+
+/// One number of a splat: the column it stands in.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Slot {
+    /// Index among the vertex element's properties.
+    pub(super) column: usize,
+    pub(super) scalar: Scalar,
+}
+
+/// The columns that make a splat.
+#[derive(Clone, Debug)]
+pub(super) struct Layout {
+    /// [`REQUIRED`], then `f_rest_0..`, which are channel-major: all of red, green, blue.
+    pub(super) slots: Vec<Slot>,
+    pub(super) sh_degree: u8,
+}
+
+impl Layout {
+    /// Finds the columns of a splat in a header.
+    pub(super) fn find(header: &Header) -> Result<Self, PlyError> {
+        let vertex = header.vertex();
+        let missing: Vec<&str> =
+            REQUIRED.into_iter().filter(|name| column(vertex, name).is_none()).collect();
+        if !missing.is_empty() {
+            return Err(PlyError::NotSplats { reason: describe(header, &missing) });
+        }
+        let rest = vertex.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
+        let sh_degree = match rest {
+            0 => 0,
+            9 => 1,
+            24 => 2,
+            45 => 3,
+            found => return Err(PlyError::HarmonicsCount { found }),
+        };
+        let rest_names: Vec<String> = (0..rest).map(|i| format!("f_rest_{i}")).collect();
+        let slots = REQUIRED
+            .into_iter()
+            .chain(rest_names.iter().map(String::as_str))
+            .map(|name| {
+                let column = column(vertex, name).ok_or_else(|| PlyError::NotSplats {
+                    reason: format!("{rest} f_rest properties, but `{name}` is not among them"),
+                })?;
+                match vertex.properties[column].kind {
+                    Kind::Scalar(scalar) => Ok(Slot { column, scalar }),
+                    Kind::List { .. } => Err(PlyError::NotSplats {
+                        reason: format!("property `{name}` is a list, not one number"),
+                    }),
+                }
+            })
+            .collect::<Result<_, _>>()?;
+        Ok(Self { slots, sh_degree })
+    }
+
+    /// Returns the names of the vertex's columns that no splat needs.
+    pub(super) fn skipped(&self, header: &Header) -> Vec<String> {
+        let used = |column| self.slots.iter().any(|slot| slot.column == column);
+        let properties = header.vertex().properties.iter().enumerate();
+        properties.filter(|&(i, _)| !used(i)).map(|(_, p)| p.name.clone()).collect()
+    }
+}
+
+fn column(vertex: &Element, name: &str) -> Option<usize> {
+    vertex.properties.iter().position(|property| property.name == name)
+}
+
+/// Says what a PLY without splats seems to be.
+fn describe(header: &Header, missing: &[&str]) -> String {
+    let vertex = header.vertex();
+    let names = missing.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+    let kind = if vertex.properties.iter().any(|p| p.name == "packed_position") {
+        "this is SuperSplat's compressed PLY; export it as plain PLY"
+    } else if header.elements.iter().any(|e| e.name == "face") {
+        "this is a mesh; export Gaussian splats"
+    } else if missing.len() > 8 {
+        "this is a point cloud; train and export Gaussian splats"
+    } else {
+        "export Gaussian splats in INRIA's layout"
+    };
+    format!("the vertices lack {names}: {kind}")
+}

@@ -1,0 +1,274 @@
+//! Rows of numbers, binary or ascii, to splats.
+//!
+//! Nothing is allocated before the file is known to be long enough for it.
+
+use rayon::prelude::*;
+
+use super::decode::{Block, Builder};
+use super::header::{Element, Header, Kind, Scalar, VERTEX};
+use super::layout::Layout;
+use super::{DropCounts, PlyError};
+use crate::Splats;
+
+/// Rows decoded by one task: some 100 kB, so that tasks outnumber threads and cost nothing.
+const ROWS_PER_TASK: usize = 2048;
+
+/// Decodes the vertex element of a binary little-endian file.
+pub(super) fn read_binary(
+    bytes: &[u8],
+    header: &Header,
+    layout: &Layout,
+) -> Result<(Splats, DropCounts), PlyError> {
+    let mut offset = header.body;
+    for element in header.elements.iter().take_while(|element| element.name != VERTEX) {
+        offset = match element.fixed_row_bytes() {
+            Some(row) => offset + fixed_length(bytes, offset, element, row)?,
+            None => variable_rows(bytes, offset, element, |_, _| {})?,
+        };
+    }
+    let vertex = header.vertex();
+    // Where each column lies, in bytes from the row's start, if no list moves it.
+    if let Some(row_bytes) = vertex.fixed_row_bytes() {
+        let length = fixed_length(bytes, offset, vertex, row_bytes)?;
+        let mut starts = Vec::with_capacity(vertex.properties.len());
+        let mut start = 0;
+        for property in &vertex.properties {
+            starts.push(start);
+            if let Kind::Scalar(scalar) = property.kind {
+                start += scalar.bytes();
+            }
+        }
+        let slots: Vec<(usize, Scalar)> =
+            layout.slots.iter().map(|slot| (starts[slot.column], slot.scalar)).collect();
+        let data = &bytes[offset..offset + length];
+        return Ok(decode_all(layout, vertex.count, |first, block| {
+            let rows = data[first * row_bytes..].chunks_exact(row_bytes).take(block.len());
+            for (i, row) in rows.enumerate() {
+                // Nearly every file is all f32: one well-predicted branch per number.
+                block.put(i, |slot| match slots[slot] {
+                    (at, Scalar::F32) => {
+                        f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]])
+                    }
+                    (at, scalar) => scalar.read(&row[at..]) as f32,
+                });
+            }
+        }));
+    }
+    // A list among the columns: walk once for the offsets of every number, row by row.
+    minimum_length(bytes, offset, vertex)?;
+    let columns = vertex.properties.len();
+    let mut starts: Vec<usize> = Vec::with_capacity(vertex.count.saturating_mul(columns));
+    variable_rows(bytes, offset, vertex, |_, at| starts.push(at))?;
+    Ok(decode_all(layout, vertex.count, |first, block| {
+        for i in 0..block.len() {
+            let row = &starts[(first + i) * columns..][..columns];
+            block.put(i, |slot| {
+                let slot = layout.slots[slot];
+                slot.scalar.read(&bytes[row[slot.column]..]) as f32
+            });
+        }
+    }))
+}
+
+/// Decodes the vertex element of an ascii file. Rows are told apart by counting numbers, so line
+/// ends carry no meaning.
+pub(super) fn read_ascii(
+    bytes: &[u8],
+    header: &Header,
+    layout: &Layout,
+) -> Result<(Splats, DropCounts), PlyError> {
+    let mut tokens = Tokens { bytes, offset: header.body };
+    for element in header.elements.iter().take_while(|element| element.name != VERTEX) {
+        if element.properties.is_empty() {
+            continue;
+        }
+        for row in 0..element.count {
+            for property in &element.properties {
+                tokens.skip(element, row, property.kind)?;
+            }
+        }
+    }
+    let vertex = header.vertex();
+    // Each number takes a digit and a separator, but for the last separator.
+    let needed = vertex.count as u128 * vertex.properties.len() as u128 * 2;
+    let available = bytes.len() - tokens.offset;
+    if needed > available as u128 + 1 {
+        return Err(truncated(vertex, tokens.offset, needed, available));
+    }
+    let mut slot_of_column = vec![usize::MAX; vertex.properties.len()];
+    for (i, slot) in layout.slots.iter().enumerate() {
+        slot_of_column[slot.column] = i;
+    }
+    let mut builder = Builder::new(layout, vertex.count);
+    let mut values = vec![0f32; layout.slots.len()];
+    let mut dropped = DropCounts::default();
+    for (first, block) in builder.blocks(ROWS_PER_TASK).enumerate() {
+        let mut block = block;
+        for i in 0..block.len() {
+            let row = first * ROWS_PER_TASK + i;
+            for (property, &slot) in vertex.properties.iter().zip(&slot_of_column) {
+                match property.kind {
+                    Kind::Scalar(_) if slot != usize::MAX => {
+                        values[slot] = tokens.number(vertex, row, &property.name)? as f32;
+                    }
+                    kind => tokens.skip(vertex, row, kind)?,
+                }
+            }
+            block.put(i, |slot| values[slot]);
+        }
+        dropped = add(dropped, block.dropped());
+    }
+    Ok((builder.finish(dropped), dropped))
+}
+
+/// Runs `fill(first row, block)` over all rows in parallel.
+fn decode_all(
+    layout: &Layout,
+    count: usize,
+    fill: impl Fn(usize, &mut Block) + Sync,
+) -> (Splats, DropCounts) {
+    let mut builder = Builder::new(layout, count);
+    let dropped = builder
+        .blocks(ROWS_PER_TASK)
+        .collect::<Vec<_>>()
+        .into_par_iter()
+        .enumerate()
+        .map(|(task, mut block)| {
+            fill(task * ROWS_PER_TASK, &mut block);
+            block.dropped()
+        })
+        .reduce(DropCounts::default, add);
+    (builder.finish(dropped), dropped)
+}
+
+fn add(a: DropCounts, b: DropCounts) -> DropCounts {
+    DropCounts {
+        non_finite: a.non_finite + b.non_finite,
+        zero_rotation: a.zero_rotation + b.zero_rotation,
+        scale_overflow: a.scale_overflow + b.scale_overflow,
+    }
+}
+
+/// Returns the bytes of an element of fixed rows, which are all there.
+fn fixed_length(
+    bytes: &[u8],
+    offset: usize,
+    element: &Element,
+    row: usize,
+) -> Result<usize, PlyError> {
+    let needed = element.count as u128 * row as u128;
+    let available = bytes.len() - offset;
+    if needed > available as u128 {
+        return Err(truncated(element, offset, needed, available));
+    }
+    Ok(needed as usize)
+}
+
+fn minimum_length(bytes: &[u8], offset: usize, element: &Element) -> Result<(), PlyError> {
+    fixed_length(bytes, offset, element, element.min_row_bytes()).map(|_| ())
+}
+
+/// Walks the rows of an element with lists; tells `visit` (column, byte) of every property and
+/// returns where the element ends. Every row takes a byte or more, so the file bounds the time.
+fn variable_rows(
+    bytes: &[u8],
+    start: usize,
+    element: &Element,
+    mut visit: impl FnMut(usize, usize),
+) -> Result<usize, PlyError> {
+    minimum_length(bytes, start, element)?;
+    let mut offset = start;
+    for row in 0..element.count {
+        for (column, property) in element.properties.iter().enumerate() {
+            visit(column, offset);
+            let (head, item) = match property.kind {
+                Kind::Scalar(scalar) => (scalar.bytes(), None),
+                Kind::List { count, item } => (count.bytes(), Some((count, item))),
+            };
+            let available = bytes.len() - offset;
+            if head > available {
+                return Err(truncated(element, offset, head as u128, available));
+            }
+            let mut length = head as u128;
+            if let Some((count, item)) = item {
+                let items = count.read(&bytes[offset..]);
+                if !(items >= 0.0 && items.fract() == 0.0) {
+                    return Err(PlyError::Value {
+                        offset,
+                        element: element.name.clone(),
+                        row,
+                        reason: format!("list `{}` has length {items}", property.name),
+                    });
+                }
+                // `as` saturates, so a huge float cannot wrap.
+                length += u128::from(items as u64) * item.bytes() as u128;
+            }
+            if length > available as u128 {
+                return Err(truncated(element, offset, length, available));
+            }
+            offset += length as usize;
+        }
+    }
+    Ok(offset)
+}
+
+fn truncated(element: &Element, offset: usize, needed: u128, available: usize) -> PlyError {
+    PlyError::Truncated {
+        element: element.name.clone(),
+        declared: element.count,
+        offset,
+        needed,
+        available,
+    }
+}
+
+/// Words of an ascii body.
+struct Tokens<'a> {
+    bytes: &'a [u8],
+    offset: usize,
+}
+
+impl Tokens<'_> {
+    /// Returns the next number of a property.
+    fn number(&mut self, element: &Element, row: usize, property: &str) -> Result<f64, PlyError> {
+        let rest = &self.bytes[self.offset..];
+        let blank = rest.iter().take_while(|byte| byte.is_ascii_whitespace()).count();
+        let length = rest[blank..].iter().take_while(|byte| !byte.is_ascii_whitespace()).count();
+        let offset = self.offset + blank;
+        let fail =
+            |reason| Err(PlyError::Value { offset, element: element.name.clone(), row, reason });
+        let word = &rest[blank..blank + length];
+        if word.is_empty() {
+            return fail(format!("the file ends where `{property}` should stand"));
+        }
+        self.offset = offset + length;
+        // Cut at the shown length, not at the parsed one: the word may be the whole file.
+        match str::from_utf8(word).ok().and_then(|word| word.parse().ok()) {
+            Some(number) => Ok(number),
+            None => fail(format!(
+                "`{property}` is {:?}, not a number",
+                String::from_utf8_lossy(&word[..word.len().min(32)])
+            )),
+        }
+    }
+
+    /// Passes over one property.
+    fn skip(&mut self, element: &Element, row: usize, kind: Kind) -> Result<(), PlyError> {
+        let offset = self.offset;
+        let first = self.number(element, row, "a skipped property")?;
+        if let Kind::List { .. } = kind {
+            if !(first >= 0.0 && first.fract() == 0.0) {
+                return Err(PlyError::Value {
+                    offset,
+                    element: element.name.clone(),
+                    row,
+                    reason: format!("a list has length {first}"),
+                });
+            }
+            for _ in 0..first as u64 {
+                self.number(element, row, "a list's item")?;
+            }
+        }
+        Ok(())
+    }
+}

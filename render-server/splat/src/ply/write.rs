@@ -1,0 +1,87 @@
+//! Splats to the standard binary PLY.
+
+use std::fs::File;
+use std::io::Write as _;
+use std::path::Path;
+
+use super::PlyError;
+use crate::Splats;
+
+/// Logits beyond which the sigmoid is exactly 1 and exactly 0 in f32; finite, because many
+/// readers refuse infinities.
+const OPAQUE_LOGIT: f32 = 18.0;
+const TRANSPARENT_LOGIT: f32 = -104.0;
+/// The log scale whose exponential is exactly 0 in f32.
+const ZERO_LOG_SCALE: f32 = -104.0;
+
+/// Writes a scene as binary little-endian PLY in INRIA's layout; [`super::read`] returns the same
+/// scene up to the rounding of logarithms. Written beside its place and then renamed, so that a
+/// reader never sees half a file.
+///
+/// # Errors
+/// [`PlyError::Io`] with the path.
+///
+/// # Panics
+/// If the vectors of `splats` differ in length.
+pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
+    let path = path.as_ref();
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".part");
+    let written = File::create(&partial)
+        .and_then(|mut file| file.write_all(&encode(splats)))
+        .and_then(|()| std::fs::rename(&partial, path));
+    written.map_err(|source| PlyError::Io { path: path.to_owned(), verb: "write", source })
+}
+
+/// Returns the bytes [`write()`] writes.
+///
+/// # Panics
+/// If the vectors of `splats` differ in length.
+pub fn encode(splats: &Splats) -> Vec<u8> {
+    let coefficients = splats.sh_coefficients();
+    let count = splats.len();
+    assert_eq!(splats.scales_m.len(), count, "one scale per splat");
+    assert_eq!(splats.rotations.len(), count, "one rotation per splat");
+    assert_eq!(splats.opacities.len(), count, "one opacity per splat");
+    assert_eq!(splats.sh.len(), count * coefficients * 3, "harmonics for every splat");
+
+    let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(Into::into).into();
+    names.extend((0..3).map(|i| format!("f_dc_{i}")));
+    names.extend((0..(coefficients - 1) * 3).map(|i| format!("f_rest_{i}")));
+    names.push("opacity".into());
+    names.extend((0..3).map(|i| format!("scale_{i}")));
+    names.extend((0..4).map(|i| format!("rot_{i}")));
+    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n");
+    for name in &names {
+        header += &format!("property float {name}\n");
+    }
+    header += "end_header\n";
+
+    let mut bytes = Vec::with_capacity(header.len() + count * names.len() * 4);
+    bytes.extend_from_slice(header.as_bytes());
+    let mut put = |value: f32| bytes.extend_from_slice(&value.to_le_bytes());
+    for i in 0..count {
+        splats.means_m[i].to_array().into_iter().for_each(&mut put);
+        // Normals: part of the layout, without a meaning for splats.
+        [0.0; 3].into_iter().for_each(&mut put);
+        let sh = &splats.sh[i * coefficients * 3..][..coefficients * 3];
+        sh[..3].iter().copied().for_each(&mut put);
+        for channel in 0..3 {
+            (1..coefficients).for_each(|k| put(sh[k * 3 + channel]));
+        }
+        put(logit(splats.opacities[i]));
+        for scale_m in splats.scales_m[i].to_array() {
+            put(scale_m.ln().max(ZERO_LOG_SCALE));
+        }
+        let [x, y, z, w] = splats.rotations[i].to_array();
+        [w, x, y, z].into_iter().for_each(&mut put);
+    }
+    bytes
+}
+
+/// Returns the inverse of the sigmoid, finite for 0 and 1.
+fn logit(opacity: f32) -> f32 {
+    // In f64: near 1 an f32 difference from 1 keeps no digits.
+    let opacity = f64::from(opacity);
+    ((opacity / (1.0 - opacity)).ln() as f32).clamp(TRANSPARENT_LOGIT, OPAQUE_LOGIT)
+}

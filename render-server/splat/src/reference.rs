@@ -1,0 +1,160 @@
+//! The plain renderer: what every fast one must equal. Kept simple and in f64, on purpose slow.
+//!
+//! "Classic" 3D Gaussian splatting (Kerbl et al. 2023, section 4 and appendix A): each Gaussian is
+//! linearised at its centre, `J W Sigma W^T J^T + 0.3 I`; the nearest is blended first, by camera
+//! z; a pixel takes a splat where `alpha = min(0.99, o exp(-sigma)) >= 1/255`, and ends *before*
+//! the splat that would bring its transmittance to 1e-4 or below.
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use crate::camera::InvalidCamera;
+use crate::harmonics;
+use crate::limits::{
+    ALPHA_MAX, ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, MAX_SCALE_M, TRANSMITTANCE_MIN,
+};
+use crate::{Camera, RgbdImage, Splats};
+
+/// Returns the image of `splats` seen by `camera`: RGB on the background, alpha, expected and
+/// median camera-z depth. [m, cam]
+///
+/// # Errors
+/// [`InvalidCamera`] names what is wrong with the camera.
+pub fn render_reference(splats: &Splats, camera: &Camera) -> Result<RgbdImage, InvalidCamera> {
+    camera.validate()?;
+    let mut projected: Vec<Projected> =
+        (0..splats.len()).filter_map(|i| project(splats, i, camera)).collect();
+    projected.sort_by(|a, b| a.z_m.total_cmp(&b.z_m));
+    Ok(blend(&projected, camera))
+}
+
+/// A Gaussian on the image plane.
+struct Projected {
+    mean_px: DVec2,
+    /// Inverse covariance: xx, xy, yy. [1/px^2]
+    conic: [f64; 3],
+    /// Half of the bounding box of `alpha >= 1/255`. [px]
+    extent_px: DVec2,
+    z_m: f64,
+    opacity: f64,
+    rgb: DVec3,
+}
+
+/// Projects one splat; `None` if it cannot touch the image.
+fn project(splats: &Splats, i: usize, camera: &Camera) -> Option<Projected> {
+    let k = &camera.intrinsics;
+    let cam_from_world = camera.world_from_cam.inverse();
+    let rotation = DMat3::from_quat(cam_from_world.rotation);
+    let mean_world = splats.means_m[i].as_dvec3();
+    let p_cam = cam_from_world.transform_point(mean_world);
+    // Positive, so that NaN is refused.
+    if !(p_cam.z > f64::from(camera.near_m)) {
+        return None;
+    }
+    let (tx, ty) = (p_cam.x / p_cam.z, p_cam.y / p_cam.z);
+    let mean_px = DVec2::new(k.fx_px * tx + k.cx_px, k.fy_px * ty + k.cy_px);
+
+    // The linearisation blows up outside the image: take it at the nearest point just outside.
+    let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
+    let margin_x = JACOBIAN_MARGIN * 0.5 * w / k.fx_px;
+    let margin_y = JACOBIAN_MARGIN * 0.5 * h / k.fy_px;
+    let clamp = |t: f64, low: f64, high: f64| t.max(low.min(high)).min(high.max(low));
+    let jx = clamp(tx, -(k.cx_px / k.fx_px) - margin_x, (w - k.cx_px) / k.fx_px + margin_x);
+    let jy = clamp(ty, -(k.cy_px / k.fy_px) - margin_y, (h - k.cy_px) / k.fy_px + margin_y);
+    let (ax, ay) = (k.fx_px / p_cam.z, k.fy_px / p_cam.z);
+
+    let scale_m = splats.scales_m[i].as_dvec3().min(DVec3::splat(f64::from(MAX_SCALE_M)));
+    let q = splats.rotations[i].as_dquat();
+    let axes = DMat3::from_quat(DQuat::normalize(q)) * DMat3::from_diagonal(scale_m);
+    // Rows of J W M: covariance = B B^T.
+    let in_cam = (rotation * axes).transpose();
+    let row_x = ax * (in_cam.x_axis - jx * in_cam.z_axis);
+    let row_y = ay * (in_cam.y_axis - jy * in_cam.z_axis);
+    let a = row_x.dot(row_x) + BLUR_PX2;
+    let b = row_x.dot(row_y);
+    let c = row_y.dot(row_y) + BLUR_PX2;
+    let determinant = a * c - b * b;
+
+    // alpha >= 1/255 where sigma <= ln(255 o); the bounding box of that ellipse.
+    let opacity = f64::from(splats.opacities[i]);
+    let reach = 2.0 * (opacity / ALPHA_MIN).ln();
+    if !(determinant > 0.0 && reach >= 0.0) {
+        return None;
+    }
+    let extent_px = DVec2::new((reach * a).sqrt(), (reach * c).sqrt());
+    let touches = mean_px.x + extent_px.x > 0.0
+        && mean_px.x - extent_px.x < w
+        && mean_px.y + extent_px.y > 0.0
+        && mean_px.y - extent_px.y < h;
+    if !touches {
+        return None;
+    }
+    let direction = (mean_world - camera.world_from_cam.translation_m).normalize_or(DVec3::Z);
+    let numbers = splats.sh_coefficients() * 3;
+    let sh = &splats.sh[i * numbers..(i + 1) * numbers];
+    let rgb = harmonics::colour(sh, direction.to_array());
+    Some(Projected {
+        mean_px,
+        conic: [c / determinant, -b / determinant, a / determinant],
+        extent_px,
+        z_m: p_cam.z,
+        opacity,
+        rgb: DVec3::from(rgb),
+    })
+}
+
+/// Blends splats, nearest first.
+fn blend(projected: &[Projected], camera: &Camera) -> RgbdImage {
+    let k = &camera.intrinsics;
+    let (width, height) = (k.width_px as usize, k.height_px as usize);
+    let pixels = k.pixels();
+    let mut rgb = vec![DVec3::ZERO; pixels];
+    let mut transmittance = vec![1f64; pixels];
+    let mut weighted_z = vec![0f64; pixels];
+    let mut median_m = vec![0f64; pixels];
+    let mut ended = vec![false; pixels];
+    for splat in projected {
+        let range = |centre: f64, extent: f64, size: usize| {
+            let first = (centre - extent).floor().clamp(0.0, size as f64) as usize;
+            first..((centre + extent).ceil() + 1.0).clamp(0.0, size as f64) as usize
+        };
+        for y in range(splat.mean_px.y, splat.extent_px.y, height) {
+            for x in range(splat.mean_px.x, splat.extent_px.x, width) {
+                let i = y * width + x;
+                if ended[i] {
+                    continue;
+                }
+                let d = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - splat.mean_px;
+                let [xx, xy, yy] = splat.conic;
+                let sigma = 0.5 * (xx * d.x * d.x + yy * d.y * d.y) + xy * d.x * d.y;
+                let alpha = (splat.opacity * (-sigma).exp()).min(ALPHA_MAX);
+                if !(alpha >= ALPHA_MIN && sigma >= 0.0) {
+                    continue;
+                }
+                let before = transmittance[i];
+                let after = before * (1.0 - alpha);
+                if after <= TRANSMITTANCE_MIN {
+                    ended[i] = true;
+                    continue;
+                }
+                rgb[i] += splat.rgb * (alpha * before);
+                weighted_z[i] += splat.z_m * alpha * before;
+                if before > 0.5 && after <= 0.5 {
+                    median_m[i] = splat.z_m;
+                }
+                transmittance[i] = after;
+            }
+        }
+    }
+    let background = DVec3::from_array(camera.background.map(f64::from));
+    let mut image = RgbdImage::default();
+    image.resize(k.width_px, k.height_px);
+    for i in 0..pixels {
+        let colour = rgb[i] + transmittance[i] * background;
+        let alpha = 1.0 - transmittance[i];
+        image.rgb[i * 3..i * 3 + 3].copy_from_slice(&colour.as_vec3().to_array());
+        image.alpha[i] = alpha as f32;
+        image.depth_expected_m[i] = if alpha > 0.0 { (weighted_z[i] / alpha) as f32 } else { 0.0 };
+        image.depth_median_m[i] = median_m[i] as f32;
+    }
+    image
+}
