@@ -15,10 +15,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-avoid", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
-    (
-        "vizflyt-server",
-        &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-splat", "vizflyt-arena"],
-    ),
+    ("vizflyt-server", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-splat", "vizflyt-arena"]),
     ("vizflyt-runtime", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-sdk"]),
     (
         "vizflyt",

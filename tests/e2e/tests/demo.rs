@@ -15,7 +15,7 @@ use vizflyt_e2e::{Demo, alive, descendants};
 /// Loading, baking, arming and climbing, on a loaded machine.
 const AIRBORNE: Duration = Duration::from_secs(90);
 /// A whole flight.
-const FLIGHT: Duration = Duration::from_secs(240);
+const FLIGHT: Duration = Duration::from_mins(4);
 /// Printed when the plugin has the vehicle.
 const FLYING: &str = "plugin flies";
 
@@ -74,8 +74,17 @@ fn the_forest_is_flown_and_reported() {
     assert_eq!(code, Some(0));
     assert_eq!((&report["image_width"], &report["image_height"]), (&320.into(), &240.into()));
     for figure in [
-        "seconds", "images_delivered", "image_hz", "age_ms_p50", "age_ms_p99", "render_ms_p50",
-        "mean_speed_mps", "max_speed_mps", "min_clearance_m", "setpoints_sent", "mavlink_packets",
+        "seconds",
+        "images_delivered",
+        "image_hz",
+        "age_ms_p50",
+        "age_ms_p99",
+        "render_ms_p50",
+        "mean_speed_mps",
+        "max_speed_mps",
+        "min_clearance_m",
+        "setpoints_sent",
+        "mavlink_packets",
         "peak_rss_mb",
     ] {
         assert!(report[figure].as_f64().is_some_and(|value| value > 0.0), "{figure}: {report:#}");
@@ -100,8 +109,10 @@ fn over_many_seeds() {
         let report = file.read();
         println!(
             "seed {seed:2}: {} {:.1} s, {:.2} m/s, clearance {} m",
-            report["outcome"], report["seconds"].as_f64().unwrap(),
-            report["mean_speed_mps"].as_f64().unwrap(), report["min_clearance_m"]
+            report["outcome"],
+            report["seconds"].as_f64().unwrap(),
+            report["mean_speed_mps"].as_f64().unwrap(),
+            report["min_clearance_m"]
         );
         let touched = report["min_clearance_m"].as_f64().unwrap() <= 0.0;
         if report["outcome"] == "finished" && !touched {
