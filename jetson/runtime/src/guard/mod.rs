@@ -198,8 +198,7 @@ impl Guard {
         let age_s = now.seconds_since(fix.stamp).clamp(0.0, POSE_HOLD_S);
         let p_now = fix.p_world_m + fix.v_world_mps * age_s;
         // The fence comes last: where it and the slew limit disagree, it wins.
-        self.v_command_mps =
-            self.fence.limit(p_now, v_slewed).clamp_length_max(self.max_speed_mps);
+        self.v_command_mps = self.fence.limit(p_now, v_slewed).clamp_length_max(self.max_speed_mps);
         let motion = GuidedMotion::Velocity(self.v_command_mps);
         (Passed::Guided(GuidedSetpoint { motion, yaw: self.yaw }), stance)
     }
@@ -247,15 +246,13 @@ impl Guard {
             self.hold_point_m = None;
             return DVec3::ZERO;
         }
-        let stopped = self.v_command_mps.length() < STOPPED_MPS
-            && fix.v_world_mps.length() < STOPPED_MPS;
+        let stopped =
+            self.v_command_mps.length() < STOPPED_MPS && fix.v_world_mps.length() < STOPPED_MPS;
         if self.hold_point_m.is_none() && stopped {
             self.hold_point_m = Some(fix.p_world_m);
         }
         match self.hold_point_m {
-            Some(p_m) => {
-                (POSITION_GAIN_PER_S * (p_m - fix.p_world_m)).clamp_length_max(RETURN_MPS)
-            }
+            Some(p_m) => (POSITION_GAIN_PER_S * (p_m - fix.p_world_m)).clamp_length_max(RETURN_MPS),
             None => DVec3::ZERO,
         }
     }

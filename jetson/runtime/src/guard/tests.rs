@@ -223,7 +223,9 @@ fn numbers_that_are_not_finite_do_not_count() {
     let mut guard = guard();
     for tick in 1..=27 {
         assert!(!guard.ask(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))));
-        assert!(!guard.ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0))));
+        assert!(
+            !guard.ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0)))
+        );
     }
     assert_eq!(guard.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
 }
@@ -251,7 +253,9 @@ fn outside_the_fence_it_lands() {
     guard.ask(time(1), velocity(DVec3::X));
     let out = Fix { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
     let (_, stance) = guard.tick(time(1), &out);
-    assert!(matches!(stance, Stance::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9));
+    assert!(
+        matches!(stance, Stance::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9)
+    );
 }
 
 #[test]
@@ -280,10 +284,15 @@ fn keep_keeps_the_heading_of_the_moment() {
         }
     };
     assert_eq!(yaw_after(&mut guard, 1, YawTarget::Keep, 0.5), YawTarget::Angle(0.3), "at start");
-    assert_eq!(yaw_after(&mut guard, 2, YawTarget::Rate(9.0), 0.5), YawTarget::Rate(MAX_YAW_RATE_RADPS));
+    assert_eq!(
+        yaw_after(&mut guard, 2, YawTarget::Rate(9.0), 0.5),
+        YawTarget::Rate(MAX_YAW_RATE_RADPS)
+    );
     assert_eq!(yaw_after(&mut guard, 3, YawTarget::Keep, 0.7), YawTarget::Angle(0.7));
     assert_eq!(yaw_after(&mut guard, 4, YawTarget::Keep, 0.9), YawTarget::Angle(0.7));
-    let YawTarget::Angle(yaw) = yaw_after(&mut guard, 5, YawTarget::Angle(4.0), 0.9) else { panic!() };
+    let YawTarget::Angle(yaw) = yaw_after(&mut guard, 5, YawTarget::Angle(4.0), 0.9) else {
+        panic!()
+    };
     assert!((yaw - (4.0 - 2.0 * std::f64::consts::PI)).abs() < 1e-12);
     assert_eq!(yaw_after(&mut guard, 6, YawTarget::Keep, 1.1), YawTarget::Angle(1.1));
 }

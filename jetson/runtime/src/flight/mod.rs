@@ -1,0 +1,591 @@
+//! The flight from first contact to disarming: a sans-IO state machine that ties guard, link and
+//! plugin together. [`control`](crate::control) drives it at 50 Hz.
+//!
+//! ```text
+//! Connecting ──▶ Preparing ──▶ TakingOff ──▶ Flying ◀──▶ Holding
+//!  server,        origin,       GUIDED, arm,    │  guard     │
+//!  autopilot,     pre-arm,      take-off        └─────┬──────┘
+//!  plugin         pose, image      │                  ▼
+//!                                  └────────────▶ Landing ──▶ Landed
+//! ```
+//! The first cause of a landing is the flight's [`Outcome`]; landing is never taken back.
+
+mod outcome;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+
+use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
+use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint};
+use vizflyt_protocol::time::HostTime;
+
+use crate::guard::{Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, Stance};
+use crate::link::{Goal, LinkEvent};
+pub use outcome::{Outcome, OutcomeKind};
+
+/// What a person may set.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FlightSettings {
+    /// Give up if not in the air after this long; 0 waits for ever. [s]
+    pub ready_within_s: f64,
+    /// Land this long after take-off, whatever the arena allows; 0 leaves it to the arena. [s]
+    pub time_limit_s: f64,
+}
+
+/// What happens around the flight.
+#[derive(Clone, Debug)]
+pub enum Input {
+    /// The server said what we fly in.
+    Arena(Box<ArenaInfo>),
+    /// The vehicle was localized.
+    Pose(Fix),
+    /// The server tells of something.
+    Server(Event),
+    /// The autopilot's side.
+    Link(LinkEvent),
+    /// The plugin waits for images.
+    PluginReady,
+    /// An image was handed to the plugin.
+    ImagePublished {
+        /// Its number.
+        seq: u64,
+    },
+    /// The plugin answered an image.
+    Answered {
+        /// Its number.
+        seq: u64,
+        /// What it asks for.
+        setpoint: Option<Setpoint>,
+    },
+    /// The plugin is no more; why, in a sentence.
+    PluginFailed(String),
+    /// A person ends the flight.
+    Interrupt,
+}
+
+/// What the link knows at a tick.
+#[derive(Clone, Copy, Debug)]
+pub struct LinkView {
+    /// Heartbeats come.
+    pub connected: bool,
+    /// Motors may turn.
+    pub armed: bool,
+    /// ArduCopter's mode number.
+    pub mode: u32,
+    /// The take-off was accepted.
+    pub took_off: bool,
+    /// What arming still waits for.
+    pub ready_to_arm: Result<(), &'static str>,
+}
+
+/// What is to be done now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Orders {
+    /// What the link shall bring about.
+    pub goal: Goal,
+    /// What to send to the autopilot.
+    pub setpoint: Option<GuidedSetpoint>,
+}
+
+/// Something to tell the server, the plugin, the log and the person.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Notice {
+    /// What.
+    pub kind: EventKind,
+    /// One sentence.
+    pub text: String,
+}
+
+/// Share of the take-off height that counts as reached: ArduCopter hands over at 90 cm of a metre
+/// as it eases into the height.
+const REACHED: f64 = 0.9;
+/// From the accepted take-off to the height. ArduCopter climbs at 0.5 m/s or more. [s]
+const CLIMB_WITHIN_S: f64 = 20.0;
+/// Disarmed for this long: landed. Longer than packets take to overtake each other. [s]
+const DISARMED_S: f64 = 0.5;
+/// A landing that takes longer than this ends the flight all the same. From 4 m at ArduCopter's
+/// 0.3 to 0.5 m/s, plus the wait for touch-down. [s]
+const LAND_WITHIN_S: f64 = 60.0;
+/// Without a link, whether the vehicle has landed cannot be known; wait this long. [s]
+const LOST_WHILE_LANDING_S: f64 = 10.0;
+/// After an interrupt: time for LAND to be confirmed. [s]
+const INTERRUPT_S: f64 = 1.5;
+/// How often to say what is being waited for. [s]
+const REMIND_S: f64 = 5.0;
+/// How often to say that setpoints are refused. [s]
+const REFUSED_S: f64 = 1.0;
+
+/// One flight. See the module.
+#[derive(Debug)]
+pub struct Flight {
+    settings: FlightSettings,
+    phase: FlightPhase,
+    phase_at: HostTime,
+    started_at: HostTime,
+    arena: Option<Box<ArenaInfo>>,
+    fix: Option<Fix>,
+    start_z_m: f64,
+    took_off_at: Option<HostTime>,
+    plugin_ready: bool,
+    image_answered: bool,
+    /// Oldest image that the plugin has not answered: its number, and when it got it.
+    unanswered: Option<(u64, HostTime)>,
+    guard: Option<Guard>,
+    stance: Option<Stance>,
+    outcome: Option<Outcome>,
+    /// A pilot flies: nothing is sent any more.
+    hands_off: bool,
+    interrupted_at: Option<HostTime>,
+    disarmed_at: Option<HostTime>,
+    connected_at: HostTime,
+    reminded_at: Option<HostTime>,
+    refused_at: Option<HostTime>,
+    notices: VecDeque<Notice>,
+}
+
+impl Flight {
+    /// Makes a flight that begins at `now`.
+    pub fn new(settings: FlightSettings, now: HostTime) -> Self {
+        Self {
+            settings,
+            phase: FlightPhase::Connecting,
+            phase_at: now,
+            started_at: now,
+            arena: None,
+            fix: None,
+            start_z_m: 0.0,
+            took_off_at: None,
+            plugin_ready: false,
+            image_answered: false,
+            unanswered: None,
+            guard: None,
+            stance: None,
+            outcome: None,
+            hands_off: false,
+            interrupted_at: None,
+            disarmed_at: None,
+            connected_at: now,
+            reminded_at: None,
+            refused_at: None,
+            notices: VecDeque::new(),
+        }
+    }
+
+    /// Returns the phase of flight.
+    pub fn phase(&self) -> FlightPhase {
+        self.phase
+    }
+
+    /// Returns the outcome once the flight is over.
+    pub fn outcome(&self) -> Option<&Outcome> {
+        if self.phase == FlightPhase::Landed { self.outcome.as_ref() } else { None }
+    }
+
+    /// Returns the newest fix.
+    pub fn fix(&self) -> Option<&Fix> {
+        self.fix.as_ref()
+    }
+
+    /// Returns seconds since take-off; 0 before. [s]
+    pub fn seconds(&self, now: HostTime) -> f64 {
+        self.took_off_at.map_or(0.0, |at| now.seconds_since(at))
+    }
+
+    /// Returns the next thing to tell.
+    pub fn poll_notice(&mut self) -> Option<Notice> {
+        self.notices.pop_front()
+    }
+
+    /// Takes note of something that happened.
+    pub fn handle(&mut self, now: HostTime, input: Input) {
+        match input {
+            Input::Arena(arena) => self.handle_arena(now, arena),
+            Input::Pose(fix) => {
+                if fix.p_world_m.is_finite()
+                    && fix.v_world_mps.is_finite()
+                    && fix.yaw_rad.is_finite()
+                {
+                    self.fix = Some(fix);
+                }
+            }
+            Input::Server(event) => self.handle_server(now, &event),
+            Input::Link(event) => self.handle_link(now, event),
+            Input::PluginReady => self.plugin_ready = true,
+            Input::ImagePublished { seq } => {
+                self.unanswered.get_or_insert((seq, now));
+            }
+            Input::Answered { seq, setpoint } => self.handle_answer(now, seq, setpoint),
+            Input::PluginFailed(reason) => {
+                if self.outcome.is_none() {
+                    self.notice(EventKind::PluginFailed, reason.clone());
+                }
+                self.end_in_order(now, OutcomeKind::PluginFailed, reason);
+            }
+            Input::Interrupt => {
+                self.interrupted_at.get_or_insert(now);
+                self.end_now(now, OutcomeKind::Landed, "stopped by a person".into());
+            }
+        }
+    }
+
+    /// Does what is due at `now`; 50 Hz.
+    pub fn tick(&mut self, now: HostTime, link: &LinkView) -> Orders {
+        if link.connected {
+            self.connected_at = now;
+        }
+        match self.phase {
+            FlightPhase::Connecting => self.connecting(now, link),
+            FlightPhase::Preparing => self.preparing(now, link),
+            FlightPhase::TakingOff => self.taking_off(now, link),
+            FlightPhase::Flying | FlightPhase::Holding => return self.flying(now, link),
+            FlightPhase::Landing => self.landing(now, link),
+            FlightPhase::Landed => {}
+        }
+        Orders { goal: self.goal(), setpoint: None }
+    }
+
+    fn goal(&self) -> Goal {
+        match self.phase {
+            _ if self.hands_off => Goal::Prepare,
+            FlightPhase::Connecting | FlightPhase::Preparing => Goal::Prepare,
+            FlightPhase::TakingOff => {
+                Goal::TakeOff(self.arena.as_ref().map_or(0.0, |a| a.takeoff_height_m as f32))
+            }
+            FlightPhase::Flying | FlightPhase::Holding => Goal::Fly,
+            FlightPhase::Landing | FlightPhase::Landed => Goal::Land,
+        }
+    }
+
+    // ---- inputs ----
+
+    fn handle_arena(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
+        if let Err(why) = crate::guard::check_arena(&arena) {
+            return self.end_now(now, OutcomeKind::Error, why);
+        }
+        match &self.arena {
+            Some(known) if **known != *arena => {
+                // The guard must not keep a fence that is no longer the room's.
+                let why = format!("the server came back with another arena, {}", arena.name);
+                self.end_now(now, OutcomeKind::Error, why);
+            }
+            _ => self.arena = Some(arena),
+        }
+    }
+
+    fn handle_server(&mut self, now: HostTime, event: &Event) {
+        let text = event.text.as_str().to_owned();
+        match event.kind {
+            EventKind::Collision { .. } if self.is_airborne() => {
+                self.end_now(now, OutcomeKind::Collided, text);
+            }
+            EventKind::Geofence { .. } if self.is_airborne() => {
+                self.end_now(now, OutcomeKind::Geofence, text);
+            }
+            EventKind::EmergencyStop => {
+                self.end_now(now, OutcomeKind::Landed, "the stop button was pressed".into());
+            }
+            EventKind::Finished { .. } if self.is_airborne() => {
+                self.end_in_order(now, OutcomeKind::Finished, text);
+            }
+            EventKind::TimeLimit if self.is_airborne() => {
+                self.end_in_order(now, OutcomeKind::Timeout, text);
+            }
+            _ => {}
+        }
+    }
+
+    fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
+        match event {
+            LinkEvent::Refused(why) => self.end_now(now, OutcomeKind::Error, why),
+            LinkEvent::Lost if self.is_airborne() => {
+                let why = "the autopilot has been silent for 3 s".to_owned();
+                self.end_now(now, OutcomeKind::Error, why);
+            }
+            LinkEvent::Rebooted if self.is_airborne() => {
+                self.end_now(now, OutcomeKind::Error, "the autopilot restarted in flight".into());
+            }
+            LinkEvent::Text { severity, text } if severity <= SEVERITY_WARNING => {
+                self.notice(EventKind::Note, format!("autopilot: {text}"));
+            }
+            _ => {}
+        }
+    }
+
+    fn handle_answer(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
+        self.image_answered = true;
+        if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
+            self.unanswered = None;
+        }
+        let (Some(guard), Some(setpoint)) = (&mut self.guard, setpoint) else { return };
+        if !guard.ask(now, setpoint)
+            && self.refused_at.is_none_or(|at| now.seconds_since(at) >= REFUSED_S)
+        {
+            self.refused_at = Some(now);
+            let text = format!("setpoint refused: a number in it is not finite: {setpoint:?}");
+            self.notice(EventKind::Note, text);
+        }
+    }
+
+    // ---- phases ----
+
+    fn connecting(&mut self, now: HostTime, link: &LinkView) {
+        let missing = if self.arena.is_none() {
+            Some("no answer from the server; check --server and --fingerprint")
+        } else if !self.plugin_ready {
+            Some("the plugin is not ready yet (`on_start` runs)")
+        } else if !link.connected {
+            Some("no heartbeat from an autopilot; check power, link and --mavlink")
+        } else {
+            None
+        };
+        match missing {
+            Some(missing) => self.wait_for(now, missing),
+            None => self.enter(now, FlightPhase::Preparing, "all are here; preparing"),
+        }
+    }
+
+    fn preparing(&mut self, now: HostTime, link: &LinkView) {
+        let pose_age_s = self.fix.map(|fix| now.seconds_since(fix.stamp));
+        let missing = if link.armed {
+            Some("the vehicle is armed already; disarm it first")
+        } else if pose_age_s.is_none_or(|age_s| age_s > POSE_HOLD_S) {
+            Some("the server has no pose of the vehicle; check the localization and --vehicle")
+        } else if !self.image_answered {
+            Some("the plugin has not answered an image yet")
+        } else {
+            link.ready_to_arm.err()
+        };
+        match (missing, self.fix) {
+            (None, Some(fix)) => {
+                self.start_z_m = fix.p_world_m.z;
+                self.enter(now, FlightPhase::TakingOff, "pre-arm checks passed; taking off");
+            }
+            (missing, _) => self.wait_for(now, missing.unwrap_or("waiting for a pose")),
+        }
+    }
+
+    fn taking_off(&mut self, now: HostTime, link: &LinkView) {
+        let (Some(arena), Some(fix)) = (&self.arena, &self.fix) else { return };
+        if link.took_off && self.took_off_at.is_none() {
+            self.took_off_at = Some(now);
+        }
+        let pose_age_s = now.seconds_since(fix.stamp);
+        if pose_age_s > POSE_LAND_S {
+            let why = format!("pose lost for {pose_age_s:.1} s during take-off");
+            return self.end_now(now, OutcomeKind::Error, why);
+        }
+        let Some(took_off_at) = self.took_off_at else { return };
+        let risen_m = fix.p_world_m.z - self.start_z_m;
+        if risen_m >= REACHED * arena.takeoff_height_m {
+            self.guard = Some(Guard::new(arena, fix, now));
+            self.unanswered = None;
+            self.enter(now, FlightPhase::Flying, "the plugin flies");
+        } else if now.seconds_since(took_off_at) > CLIMB_WITHIN_S {
+            let why =
+                format!("take-off rose {risen_m:.2} m in {CLIMB_WITHIN_S} s, not the height asked");
+            self.end_now(now, OutcomeKind::Error, why);
+        }
+    }
+
+    fn flying(&mut self, now: HostTime, link: &LinkView) -> Orders {
+        let limit_s = self.time_limit_s();
+        if limit_s > 0.0 && self.seconds(now) > limit_s {
+            self.end_in_order(
+                now,
+                OutcomeKind::Timeout,
+                format!("time limit of {limit_s} s reached"),
+            );
+        }
+        if link.connected && !link.armed {
+            self.end_now(now, OutcomeKind::Error, "the vehicle disarmed in flight".into());
+        } else if link.connected && link.mode != CopterMode::Guided as u32 {
+            self.taken_over(now, link.mode);
+        }
+        let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, self.phase_flies())
+        else {
+            return Orders { goal: self.goal(), setpoint: None };
+        };
+        let (passed, stance) = guard.tick(now, fix);
+        self.take_stance(now, stance);
+        match passed {
+            Passed::Guided(setpoint) => Orders { goal: self.goal(), setpoint: Some(setpoint) },
+            Passed::Land => Orders { goal: self.goal(), setpoint: None },
+        }
+    }
+
+    fn landing(&mut self, now: HostTime, link: &LinkView) {
+        if link.armed || !link.connected {
+            self.disarmed_at = None;
+        } else {
+            self.disarmed_at.get_or_insert(now);
+        }
+        let landed = self.disarmed_at.is_some_and(|at| now.seconds_since(at) >= DISARMED_S);
+        let in_land = link.mode == CopterMode::Land as u32;
+        let released = self
+            .interrupted_at
+            .is_some_and(|at| (link.connected && in_land) || now.seconds_since(at) > INTERRUPT_S);
+        let landing_s = now.seconds_since(self.phase_at);
+        let silent = !link.connected && now.seconds_since(self.connected_at) > LOST_WHILE_LANDING_S;
+        if landed {
+            self.enter(now, FlightPhase::Landed, "on the ground, disarmed");
+        } else if released {
+            self.enter(now, FlightPhase::Landed, "leaving; the autopilot lands by itself");
+        } else if landing_s > LAND_WITHIN_S {
+            self.enter(now, FlightPhase::Landed, "still armed a minute after landing began");
+        } else if silent {
+            self.enter(now, FlightPhase::Landed, "the autopilot stays silent; its failsafe lands");
+        }
+    }
+
+    // ---- transitions ----
+
+    fn phase_flies(&self) -> bool {
+        matches!(self.phase, FlightPhase::Flying | FlightPhase::Holding)
+    }
+
+    fn is_airborne(&self) -> bool {
+        self.phase_flies() || self.phase == FlightPhase::TakingOff
+    }
+
+    fn time_limit_s(&self) -> f64 {
+        let arena_s = self.arena.as_ref().map_or(0.0, |arena| arena.time_limit_s);
+        match (self.settings.time_limit_s, arena_s) {
+            (ours, arena) if ours > 0.0 && arena > 0.0 => ours.min(arena),
+            (ours, arena) => ours.max(arena),
+        }
+    }
+
+    fn enter(&mut self, now: HostTime, phase: FlightPhase, why: &str) {
+        self.phase = phase;
+        self.phase_at = now;
+        self.reminded_at = None;
+        self.notice(EventKind::Phase(phase), why.to_owned());
+    }
+
+    fn notice(&mut self, kind: EventKind, text: String) {
+        self.notices.push_back(Notice { kind, text });
+    }
+
+    /// Says now and then what is being waited for, and gives up in the end.
+    fn wait_for(&mut self, now: HostTime, missing: &str) {
+        let limit_s = self.settings.ready_within_s;
+        if limit_s > 0.0 && now.seconds_since(self.started_at) > limit_s {
+            let why = format!("not in the air after {limit_s:.0} s: {missing}");
+            return self.end_now(now, OutcomeKind::Error, why);
+        }
+        let due = self.reminded_at.unwrap_or(self.phase_at).plus_seconds(REMIND_S);
+        if now >= due {
+            self.reminded_at = Some(now);
+            self.notice(EventKind::Note, format!("waiting: {missing}"));
+        }
+    }
+
+    /// Ends the flight: at once on the ground, by LAND in the air.
+    fn end_now(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
+        let reason = self.outcome.get_or_insert(Outcome { kind, reason }).reason.clone();
+        match self.phase {
+            FlightPhase::Connecting | FlightPhase::Preparing => {
+                self.enter(now, FlightPhase::Landed, &reason);
+            }
+            FlightPhase::TakingOff | FlightPhase::Flying | FlightPhase::Holding => {
+                if let Some(guard) = &mut self.guard {
+                    guard.land();
+                }
+                self.enter(now, FlightPhase::Landing, &reason);
+            }
+            FlightPhase::Landing | FlightPhase::Landed => {}
+        }
+    }
+
+    /// Ends the flight: brakes first if the guard flies.
+    fn end_in_order(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
+        match &mut self.guard {
+            Some(guard) if self.outcome.is_none() && self.phase != FlightPhase::Landing => {
+                guard.brake_and_land(now);
+                self.outcome = Some(Outcome { kind, reason });
+            }
+            Some(_) => {}
+            None => self.end_now(now, kind, reason),
+        }
+    }
+
+    /// Someone else changed the mode: a failsafe of the autopilot, or a pilot.
+    fn taken_over(&mut self, now: HostTime, mode: u32) {
+        let mode = CopterMode::from_number(mode);
+        if mode != Some(CopterMode::Land) {
+            // The pilot's will goes before ours.
+            self.hands_off = true;
+        }
+        let name = mode.map_or("another mode".to_owned(), |mode| format!("{mode:?}"));
+        let why = format!("the autopilot was switched to {name}, not by this runtime");
+        self.end_now(now, OutcomeKind::Error, why);
+    }
+
+    /// Follows the guard: its holds and landings are the flight's.
+    fn take_stance(&mut self, now: HostTime, stance: Stance) {
+        let former = self.stance.replace(stance);
+        match stance {
+            Stance::Landing(reason) => {
+                let (kind, why) = self.verdict(now, reason);
+                self.end_now(now, kind, why);
+            }
+            Stance::Holding(HoldReason::Asked) | Stance::Passing => {
+                if self.phase == FlightPhase::Holding {
+                    self.enter(now, FlightPhase::Flying, "the plugin flies again");
+                }
+            }
+            Stance::Holding(reason) => {
+                if former != Some(stance) {
+                    let why = match reason {
+                        HoldReason::Asked => "the plugin asks to hold".to_owned(),
+                        HoldReason::NoSetpoint => self.why_silent(now),
+                        HoldReason::PoseStale => "the pose is older than 0.5 s".to_owned(),
+                        HoldReason::Ending => {
+                            self.outcome.as_ref().map_or(String::new(), |o| o.reason.clone())
+                        }
+                    };
+                    self.enter(now, FlightPhase::Holding, &format!("holding: {why}"));
+                }
+            }
+        }
+    }
+
+    fn verdict(&self, now: HostTime, reason: LandReason) -> (OutcomeKind, String) {
+        match reason {
+            LandReason::Asked => (OutcomeKind::Landed, "the plugin asked to land".into()),
+            LandReason::NoSetpoint(_) => {
+                let kind = if self.unanswered.is_some() {
+                    OutcomeKind::PluginFailed
+                } else {
+                    OutcomeKind::Error
+                };
+                (kind, self.why_silent(now))
+            }
+            LandReason::PoseLost(age_s) => {
+                (OutcomeKind::Error, format!("pose lost for {age_s:.1} s"))
+            }
+            LandReason::OutsideFence(outside_m) => {
+                (OutcomeKind::Geofence, format!("{outside_m:.2} m outside the geofence"))
+            }
+            LandReason::Ordered => (OutcomeKind::Landed, "landing was ordered".into()),
+        }
+    }
+
+    /// Why no setpoint comes: the plugin, or nothing for it to see.
+    fn why_silent(&self, now: HostTime) -> String {
+        match self.unanswered {
+            Some((seq, at)) => {
+                let silent_s = now.seconds_since(at);
+                format!("the plugin has not answered image {seq} for {silent_s:.1} s")
+            }
+            None if self.image_answered => {
+                "no setpoint comes: no new image, or the plugin answers without one".into()
+            }
+            None => "no image has come".into(),
+        }
+    }
+}
+
+/// STATUSTEXT of this severity or worse is worth a person's attention.
+const SEVERITY_WARNING: u8 = 4;

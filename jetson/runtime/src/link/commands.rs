@@ -1,0 +1,182 @@
+//! One command at a time: sent, repeated with a growing confirmation count until acknowledged,
+//! tried again after a refusal, given up in the end.
+
+use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
+use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
+use vizflyt_protocol::time::HostTime;
+
+/// A command to the autopilot.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Command {
+    Mode(CopterMode),
+    Arm,
+    /// Height above the ground. [m]
+    TakeOff(f32),
+    Land,
+    /// Message id and its period. [us]
+    Interval(u32, f32),
+}
+
+impl Command {
+    pub(super) fn name(self) -> &'static str {
+        command_name(self.mavlink())
+    }
+}
+
+/// How long to go on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Patience {
+    Bounded,
+    Endless,
+}
+
+/// What an acknowledgement or the passing of time led to.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Answer {
+    Nothing,
+    Accepted(Command),
+    GivenUp { command: Command, why: String },
+}
+
+/// No acknowledgement for this long: send again. ArduCopter answers within 20 ms; a Wi-Fi bridge
+/// may add 100. [s]
+const REPEAT_S: f64 = 0.4;
+/// Unanswered this many times: given up. 2 s.
+const REPEATS: u8 = 5;
+/// Refused: try again after this long. [s]
+const RETRY_S: f64 = 1.0;
+/// Refused this many times: given up. Pre-arm checks may still settle for some seconds.
+const REFUSALS: u8 = 8;
+
+/// The command under way.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Commands {
+    pending: Option<Pending>,
+    /// Commands started since the last acceptance.
+    tries: u32,
+}
+
+#[derive(Clone, Debug)]
+struct Pending {
+    command: Command,
+    patience: Patience,
+    /// Counts transmissions of one attempt, from 0.
+    confirmation: u8,
+    refusals: u8,
+    last_result: Option<MavResult>,
+    due_at: HostTime,
+    /// Whether `due_at` is for an acknowledgement (else for the next attempt).
+    waits: bool,
+    /// Given up already: reported once, not sent again until the goal changes.
+    dead: bool,
+}
+
+impl Commands {
+    /// Forgets the command under way.
+    pub(super) fn abandon(&mut self) {
+        *self = Self::default();
+    }
+
+    /// Whether the next attempt is the second, fourth, ...
+    pub(super) fn is_odd_try(&self) -> bool {
+        self.tries % 2 == 1
+    }
+
+    pub(super) fn due_at(&self) -> Option<HostTime> {
+        self.pending.as_ref().filter(|pending| !pending.dead).map(|pending| pending.due_at)
+    }
+
+    /// Wants `command` brought about. Returns the confirmation count if it is to be sent now.
+    pub(super) fn start(
+        &mut self,
+        now: HostTime,
+        command: Command,
+        patience: Patience,
+    ) -> Option<u8> {
+        match &mut self.pending {
+            Some(pending) if pending.command == command => {
+                if pending.dead || now < pending.due_at {
+                    return None;
+                }
+                if pending.waits {
+                    pending.confirmation = pending.confirmation.saturating_add(1);
+                } else {
+                    pending.confirmation = 0;
+                }
+                pending.waits = true;
+                pending.due_at = now.plus_seconds(REPEAT_S);
+                Some(pending.confirmation)
+            }
+            // An endless one alternates between two commands: each gets its time.
+            Some(pending) if patience == Patience::Endless && now < pending.due_at => None,
+            _ => {
+                self.tries += 1;
+                self.pending = Some(Pending {
+                    command,
+                    patience,
+                    confirmation: 0,
+                    refusals: 0,
+                    last_result: None,
+                    due_at: now.plus_seconds(REPEAT_S),
+                    waits: true,
+                    dead: false,
+                });
+                Some(0)
+            }
+        }
+    }
+
+    pub(super) fn handle_ack(&mut self, now: HostTime, id: MavCmd, result: MavResult) -> Answer {
+        let Some(pending) = &mut self.pending else { return Answer::Nothing };
+        if pending.command.mavlink() != id || pending.dead || !pending.waits {
+            return Answer::Nothing;
+        }
+        let command = pending.command;
+        match result {
+            MavResult::MAV_RESULT_ACCEPTED => {
+                self.abandon();
+                Answer::Accepted(command)
+            }
+            MavResult::MAV_RESULT_IN_PROGRESS => {
+                pending.due_at = now.plus_seconds(REPEAT_S);
+                Answer::Nothing
+            }
+            refusal => {
+                pending.last_result = Some(refusal);
+                pending.refusals = pending.refusals.saturating_add(1);
+                pending.waits = false;
+                pending.due_at = now.plus_seconds(RETRY_S);
+                let final_word = matches!(refusal, MavResult::MAV_RESULT_UNSUPPORTED)
+                    || pending.refusals >= REFUSALS;
+                if pending.patience == Patience::Bounded && final_word {
+                    return self.give_up();
+                }
+                Answer::Nothing
+            }
+        }
+    }
+
+    pub(super) fn handle_timeout(&mut self, now: HostTime) -> Answer {
+        let Some(pending) = &self.pending else { return Answer::Nothing };
+        let exhausted = pending.patience == Patience::Bounded
+            && pending.waits
+            && pending.confirmation + 1 >= REPEATS
+            && now >= pending.due_at;
+        if exhausted && !pending.dead { self.give_up() } else { Answer::Nothing }
+    }
+
+    fn give_up(&mut self) -> Answer {
+        let Some(pending) = &mut self.pending else { return Answer::Nothing };
+        pending.dead = true;
+        let command = pending.command;
+        let why = match pending.last_result {
+            Some(result) => result_name(result).to_owned(),
+            None => format!("not answered ({REPEATS} times)"),
+        };
+        if let Command::Interval(..) = command {
+            // Of no weight: the next one may go out at once.
+            self.pending = None;
+        }
+        Answer::GivenUp { command, why }
+    }
+}

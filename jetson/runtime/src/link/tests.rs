@@ -1,0 +1,519 @@
+//! The link against a scripted autopilot on a virtual clock.
+
+use glam::{DQuat, DVec3};
+use proptest::prelude::*;
+use vizflyt_protocol::mavlink::dialect::{
+    EKF_STATUS_REPORT_DATA, GPS_GLOBAL_ORIGIN_DATA, LOCAL_POSITION_NED_DATA, MavResult, MavSeverity,
+};
+use vizflyt_protocol::mavlink::{GuidedMotion, local_position_to_mavlink};
+use vizflyt_protocol::messages::YawTarget;
+
+use super::*;
+
+/// What the other end says and hears.
+struct Script {
+    link: Link,
+    now: HostTime,
+    decoder: StreamDecoder,
+    sequence: u8,
+    sent: Vec<MavMessage>,
+    events: Vec<LinkEvent>,
+    mode: u32,
+    armed: bool,
+    /// How commands are answered; `None` is silence.
+    answer: fn(MavCmd) -> Option<MavResult>,
+    chunk: usize,
+}
+
+const AUTOPILOT: (u8, u8) = (1, 1);
+
+fn accept(_: MavCmd) -> Option<MavResult> {
+    Some(MavResult::MAV_RESULT_ACCEPTED)
+}
+
+impl Script {
+    fn new() -> Self {
+        let now = HostTime::from_ns(5_000_000_000);
+        Self {
+            link: Link::new(now),
+            now,
+            decoder: StreamDecoder::default(),
+            sequence: 0,
+            sent: Vec::new(),
+            events: Vec::new(),
+            mode: 0,
+            armed: false,
+            answer: accept,
+            chunk: 1000,
+        }
+    }
+
+    /// One that is connected and may be armed.
+    fn ready() -> Self {
+        let mut script = Self::new();
+        script.heartbeat();
+        script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+        script.estimator(EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_POS_HORIZ_REL);
+        script.prearm(true);
+        script.run(1.0);
+        script
+    }
+
+    fn bytes_of(&mut self, from: (u8, u8), message: &MavMessage) -> Vec<u8> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let header =
+            MavHeader { system_id: from.0.into(), component_id: from.1, sequence: self.sequence };
+        encode(header, message, &mut [0; MAX_PACKET]).to_vec()
+    }
+
+    fn say_from(&mut self, from: (u8, u8), message: &MavMessage) {
+        let bytes = self.bytes_of(from, message);
+        for part in bytes.chunks(self.chunk) {
+            self.link.handle_input(self.now, part);
+        }
+        self.drain();
+    }
+
+    fn say(&mut self, message: &MavMessage) {
+        self.say_from(AUTOPILOT, message);
+    }
+
+    fn heartbeat(&mut self) {
+        let mut base_mode = MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED;
+        base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, self.armed);
+        self.say(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: self.mode,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base_mode,
+            system_status: MavState::MAV_STATE_STANDBY,
+            mavlink_version: 3,
+        }));
+    }
+
+    fn estimator(&mut self, flags: EkfStatusFlags) {
+        self.say(&MavMessage::EKF_STATUS_REPORT(EKF_STATUS_REPORT_DATA {
+            flags,
+            ..Default::default()
+        }));
+    }
+
+    fn prearm(&mut self, good: bool) {
+        let mut health = MavSysStatusSensor::empty();
+        health.set(MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK, good);
+        self.say(&MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+            onboard_control_sensors_health: health,
+            voltage_battery: 15_200,
+            battery_remaining: 80,
+            ..Default::default()
+        }));
+    }
+
+    fn text(&mut self, text: &str) {
+        self.say(&MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+            severity: MavSeverity::MAV_SEVERITY_CRITICAL,
+            text: text.into(),
+            ..Default::default()
+        }));
+    }
+
+    /// Takes what the link sent, answers its commands.
+    fn drain(&mut self) {
+        loop {
+            let mut heard = Vec::new();
+            while let Some(datagram) = self.link.poll_transmit() {
+                self.decoder.push(&datagram, |packet| {
+                    assert_eq!((packet.header.system_id, packet.header.component_id), (255, 191));
+                    heard.push(packet.message);
+                });
+            }
+            while let Some(event) = self.link.poll_event() {
+                self.events.push(event);
+            }
+            if heard.is_empty() {
+                return;
+            }
+            for message in heard {
+                if let MavMessage::COMMAND_LONG(command) = &message
+                    && let Some(result) = (self.answer)(command.command)
+                {
+                    if result == MavResult::MAV_RESULT_ACCEPTED {
+                        self.obey(command);
+                    }
+                    let ack = COMMAND_ACK_DATA {
+                        command: command.command,
+                        result,
+                        target_system: 255,
+                        target_component: 191,
+                        ..Default::default()
+                    };
+                    let bytes = self.bytes_of(AUTOPILOT, &MavMessage::COMMAND_ACK(ack));
+                    self.link.handle_input(self.now, &bytes);
+                }
+                self.sent.push(message);
+            }
+        }
+    }
+
+    fn obey(&mut self, command: &COMMAND_LONG_DATA) {
+        match command.command {
+            MavCmd::MAV_CMD_DO_SET_MODE => self.mode = command.param2 as u32,
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => self.armed = command.param1 == 1.0,
+            MavCmd::MAV_CMD_NAV_LAND => self.mode = 9,
+            _ => {}
+        }
+    }
+
+    /// Lets time pass in ticks of 20 ms, with a heartbeat a second.
+    fn run(&mut self, seconds: f64) {
+        for tick in 0..(seconds * 50.0) as usize {
+            self.now = self.now.plus_ns(20_000_000);
+            if tick % 50 == 49 {
+                self.heartbeat();
+            }
+            self.link.handle_timeout(self.now);
+            self.drain();
+        }
+    }
+
+    /// Lets time pass in silence.
+    fn run_silently(&mut self, seconds: f64) {
+        for _ in 0..(seconds * 50.0) as usize {
+            self.now = self.now.plus_ns(20_000_000);
+            self.link.handle_timeout(self.now);
+            self.drain();
+        }
+    }
+
+    fn commands(&self) -> Vec<(MavCmd, u8)> {
+        let command = |message: &MavMessage| match message {
+            MavMessage::COMMAND_LONG(c) if c.command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
+                Some((c.command, c.confirmation))
+            }
+            _ => None,
+        };
+        self.sent.iter().filter_map(command).collect()
+    }
+
+    fn count(&self, wanted: impl Fn(&MavMessage) -> bool) -> usize {
+        self.sent.iter().filter(|message| wanted(message)).count()
+    }
+}
+
+#[test]
+fn it_flies_the_sequence_a_real_arducopter_accepted() {
+    let mut script = Script::ready();
+    assert_eq!(script.link.ready_to_arm(), Ok(()));
+    let intervals = script.count(|m| {
+        matches!(m, MavMessage::COMMAND_LONG(c) if c.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL)
+    });
+    assert_eq!(intervals, INTERVALS.len());
+    assert!(script.commands().is_empty(), "nothing but telemetry before the goal");
+
+    script.link.set_goal(script.now, Goal::TakeOff(1.2));
+    script.run(1.0);
+    assert_eq!(
+        script.commands(),
+        [
+            (MavCmd::MAV_CMD_DO_SET_MODE, 0),
+            (MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, 0),
+            (MavCmd::MAV_CMD_NAV_TAKEOFF, 0)
+        ]
+    );
+    let takeoff = script.sent.iter().find_map(|message| match message {
+        MavMessage::COMMAND_LONG(c) if c.command == MavCmd::MAV_CMD_NAV_TAKEOFF => Some(c.param7),
+        _ => None,
+    });
+    assert_eq!(takeoff, Some(1.2));
+    assert!(script.link.took_off() && script.link.state().armed && script.link.state().mode == 4);
+
+    script.link.set_goal(script.now, Goal::Land);
+    script.run(0.5);
+    assert_eq!(script.commands().last(), Some(&(MavCmd::MAV_CMD_NAV_LAND, 0)));
+    assert_eq!(script.link.state().mode, 9);
+    script.armed = false;
+    script.run(1.0);
+    assert!(script.events.ends_with(&[LinkEvent::Disarmed]));
+    assert_eq!(script.commands().len(), 4);
+}
+
+#[test]
+fn what_is_missing_is_said_in_words() {
+    let mut script = Script::new();
+    let missing = |script: &Script| script.link.ready_to_arm().unwrap_err();
+    assert!(missing(&script).contains("heartbeat"));
+    script.heartbeat();
+    assert!(missing(&script).contains("origin"));
+    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    assert!(missing(&script).contains("position"));
+    script.estimator(EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_CONST_POS_MODE);
+    assert!(missing(&script).contains("position"));
+    script.estimator(EkfStatusFlags::EKF_POS_HORIZ_ABS);
+    assert!(missing(&script).contains("not reported"));
+    script.prearm(false);
+    assert!(missing(&script).contains("pre-arm checks fail"));
+    script.prearm(true);
+    assert_eq!(script.link.ready_to_arm(), Ok(()));
+}
+
+#[test]
+fn the_origin_is_sent_every_second_until_confirmed() {
+    let mut script = Script::new();
+    script.heartbeat();
+    let origins = |script: &Script| {
+        script.count(|message| matches!(message, MavMessage::SET_GPS_GLOBAL_ORIGIN(_)))
+    };
+    script.run(3.5);
+    assert_eq!(origins(&script), 4);
+    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.run(3.0);
+    assert_eq!(origins(&script), 4);
+    assert_eq!(script.count(|message| matches!(message, MavMessage::HEARTBEAT(_))), 7);
+}
+
+#[test]
+fn an_unanswered_command_is_repeated_with_a_count_and_given_up() {
+    let mut script = Script::ready();
+    script.answer = |_| None;
+    script.link.set_goal(script.now, Goal::TakeOff(1.0));
+    script.run(10.0);
+    let mode = MavCmd::MAV_CMD_DO_SET_MODE;
+    assert_eq!(script.commands(), [(mode, 0), (mode, 1), (mode, 2), (mode, 3), (mode, 4)]);
+    let refused: Vec<_> =
+        script.events.iter().filter(|event| matches!(event, LinkEvent::Refused(_))).collect();
+    assert_eq!(refused, [&LinkEvent::Refused("mode change not answered (5 times)".into())]);
+}
+
+#[test]
+fn a_refusal_is_retried_then_told_with_the_autopilots_words_and_advice() {
+    let mut script = Script::ready();
+    script.answer = |command| match command {
+        MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => Some(MavResult::MAV_RESULT_FAILED),
+        _ => Some(MavResult::MAV_RESULT_ACCEPTED),
+    };
+    script.link.set_goal(script.now, Goal::TakeOff(1.0));
+    for _ in 0..9 {
+        script.run(1.0);
+        script.text("Arm: RC not found");
+    }
+    script.run(3.0);
+    let arm = |(command, _): &&(MavCmd, u8)| *command == MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
+    assert_eq!(script.commands().iter().filter(arm).count(), 8);
+    let Some(LinkEvent::Refused(text)) =
+        script.events.iter().find(|event| matches!(event, LinkEvent::Refused(_)))
+    else {
+        panic!("no refusal in {:?}", script.events)
+    };
+    assert!(text.starts_with("arming failed; the autopilot says \"Arm: RC not found\""), "{text}");
+    assert!(text.ends_with("set FS_THR_ENABLE=0 to fly without one"), "{text}");
+}
+
+#[test]
+fn a_refusal_that_passes_does_no_harm() {
+    let mut script = Script::ready();
+    script.answer = |command| match command {
+        MavCmd::MAV_CMD_NAV_TAKEOFF => Some(MavResult::MAV_RESULT_TEMPORARILY_REJECTED),
+        _ => Some(MavResult::MAV_RESULT_ACCEPTED),
+    };
+    script.link.set_goal(script.now, Goal::TakeOff(1.0));
+    script.run(2.5);
+    script.answer = accept;
+    script.run(1.5);
+    assert!(script.link.took_off());
+    assert!(!script.events.iter().any(|event| matches!(event, LinkEvent::Refused(_))));
+}
+
+#[test]
+fn landing_is_never_given_up_and_tries_both_ways() {
+    let mut script = Script::ready();
+    script.link.set_goal(script.now, Goal::TakeOff(1.0));
+    script.run(1.0);
+    script.answer = |_| None;
+    script.sent.clear();
+    script.link.set_goal(script.now, Goal::Land);
+    script.run(60.0);
+    let commands = script.commands();
+    assert!(commands.len() > 100, "{}", commands.len());
+    for command in [MavCmd::MAV_CMD_NAV_LAND, MavCmd::MAV_CMD_DO_SET_MODE] {
+        assert!(commands.iter().filter(|(sent, _)| *sent == command).count() > 50);
+    }
+    assert!(!script.events.iter().any(|event| matches!(event, LinkEvent::Refused(_))));
+    script.answer = accept;
+    script.run(1.0);
+    assert_eq!(script.link.state().mode, 9);
+}
+
+#[test]
+fn arming_under_way_is_dropped_when_the_goal_becomes_landing() {
+    let mut script = Script::ready();
+    script.answer = |command| match command {
+        MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => None,
+        _ => Some(MavResult::MAV_RESULT_ACCEPTED),
+    };
+    script.link.set_goal(script.now, Goal::TakeOff(1.0));
+    script.run(1.0);
+    script.sent.clear();
+    script.link.set_goal(script.now, Goal::Land);
+    script.run(3.0);
+    assert_eq!(script.commands(), [], "disarmed: there is nothing to land");
+}
+
+#[test]
+fn silence_is_reported_and_the_autopilot_taken_up_again() {
+    let mut script = Script::ready();
+    script.run_silently(3.2);
+    assert!(script.events.ends_with(&[LinkEvent::Lost]));
+    assert!(!script.link.setpoint(script.now, &hover()));
+    script.heartbeat();
+    assert!(script.events.ends_with(&[LinkEvent::Connected { system: 1 }]));
+    assert!(script.link.ready_to_arm().is_err(), "it may have restarted meanwhile");
+}
+
+#[test]
+fn a_restart_is_noticed_by_its_boot_clock() {
+    let mut script = Script::ready();
+    let at = |time_boot_ms| {
+        MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+            time_boot_ms,
+            ..Default::default()
+        })
+    };
+    script.say(&at(90_000));
+    script.say(&at(89_990));
+    assert_eq!(script.link.ready_to_arm(), Ok(()), "packets out of order are no restart");
+    script.say(&at(500));
+    assert!(script.events.ends_with(&[LinkEvent::Rebooted]));
+    assert!(script.link.ready_to_arm().unwrap_err().contains("origin"));
+}
+
+#[test]
+fn others_on_the_network_are_not_listened_to() {
+    let mut script = Script::new();
+    let gcs = HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_GCS,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+        ..Default::default()
+    };
+    script.say_from((254, 190), &MavMessage::HEARTBEAT(gcs));
+    assert!(!script.link.is_connected());
+    script.heartbeat();
+    let armed = HEARTBEAT_DATA {
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+        ..Default::default()
+    };
+    script.say_from((2, 1), &MavMessage::HEARTBEAT(armed));
+    assert!(!script.link.state().armed, "that was another vehicle");
+    script.say_from((2, 1), &MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    assert!(script.link.ready_to_arm().unwrap_err().contains("origin"));
+}
+
+fn hover() -> GuidedSetpoint {
+    GuidedSetpoint { motion: GuidedMotion::Velocity(DVec3::ZERO), yaw: YawTarget::Angle(0.0) }
+}
+
+#[test]
+fn poses_are_passed_on_at_fifty_a_second() {
+    let mut script = Script::ready();
+    let pose = Pose::new(DVec3::new(1.0, 2.0, 0.05), DQuat::IDENTITY);
+    for _ in 0..200 {
+        script.now = script.now.plus_ns(10_000_000);
+        script.link.vision(script.now, &pose, script.now.plus_ns(-5_000_000), 3);
+        script.drain();
+    }
+    let bad = Pose::new(DVec3::NAN, DQuat::IDENTITY);
+    script.link.vision(script.now.plus_seconds(1.0), &bad, script.now, 3);
+    script.drain();
+    let sent: Vec<_> = script
+        .sent
+        .iter()
+        .filter_map(|message| match message {
+            MavMessage::VISION_POSITION_ESTIMATE(m) => Some(m),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(sent.len(), 100);
+    let last = sent[99];
+    assert_eq!((last.x, last.y, last.z, last.reset_counter), (2.0, 1.0, -0.05, 3));
+    assert!(last.usec + 5_000 <= script.now.as_ns() / 1000);
+}
+
+#[test]
+fn clocks_are_related_both_ways() {
+    let mut script = Script::ready();
+    let ahead_ns = 77_000_000_000i64;
+    let request = script
+        .sent
+        .iter()
+        .rev()
+        .find_map(|message| match message {
+            MavMessage::TIMESYNC(m) if m.tc1 == 0 => Some(m.ts1),
+            _ => None,
+        })
+        .unwrap();
+    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA {
+        tc1: request + ahead_ns,
+        ts1: request,
+        ..Default::default()
+    }));
+    let offset = |script: &Script| {
+        let theirs = script.link.clock().to_remote(script.now).unwrap();
+        theirs.as_ns() as i64 - script.now.as_ns() as i64
+    };
+    // The answer came when the clock stood within 1.1 s of the request.
+    assert!((offset(&script) - ahead_ns).abs() < 1_100_000_000, "{}", offset(&script));
+    // Its own request is answered.
+    script.sent.clear();
+    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 0, ts1: 4711, ..Default::default() }));
+    assert!(matches!(script.sent[..], [MavMessage::TIMESYNC(ref m)]
+        if m.ts1 == 4711 && m.tc1 == script.now.as_ns() as i64));
+}
+
+/// A flight's worth of telemetry, in bytes.
+fn telemetry(script: &mut Script) -> Vec<u8> {
+    let messages = [
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: 4,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+            ..Default::default()
+        }),
+        MavMessage::LOCAL_POSITION_NED(local_position_to_mavlink(DVec3::ONE, DVec3::X, 7)),
+        MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+            text: "EKF3 active".into(),
+            ..Default::default()
+        }),
+        MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()),
+    ];
+    messages.iter().flat_map(|message| script.bytes_of(AUTOPILOT, message)).collect()
+}
+
+#[test]
+fn telemetry_is_read_at_every_chunk_size() {
+    let bytes = telemetry(&mut Script::new());
+    for chunk in 1..=bytes.len() {
+        let mut link = Link::new(HostTime::ZERO);
+        for part in bytes.chunks(chunk) {
+            link.handle_input(HostTime::ZERO, part);
+        }
+        assert!(link.state().armed && link.state().mode == 4 && link.origin_set, "chunk {chunk}");
+        assert!((link.state().p_world_m - DVec3::ONE).length() < 1e-6);
+        let events: Vec<_> = std::iter::from_fn(|| link.poll_event()).collect();
+        assert_eq!(events.len(), 4, "{events:?}");
+    }
+}
+
+proptest! {
+    /// No bytes make the link panic, and none make it arm by itself.
+    #[test]
+    fn garbage_is_harmless(garbage in prop::collection::vec(any::<u8>(), 0..600), chunk in 1usize..99) {
+        let mut script = Script::ready();
+        script.sent.clear();
+        script.chunk = chunk;
+        for part in garbage.chunks(chunk) {
+            script.link.handle_input(script.now, part);
+        }
+        script.run(0.5);
+        prop_assert_eq!(script.commands(), []);
+    }
+}
