@@ -1,1 +1,34 @@
-//! (in construction)
+//! The lab in software: what the rest of VizFlyt sees of it are two protocols, MAVLink 2 of an
+//! ArduCopter and Vicon's UDP object stream, exactly as in a room.
+//!
+//! ```text
+//! motors -> airframe (RK4, 800 Hz) -> imu (400 Hz) -> autopilot: estimator -> control -> motors
+//!                 |                                       ^  |
+//!                 +-> mocap (200 Hz) -> UDP               MAVLink
+//!                 +-> truth: clearance, speed, path
+//! ```
+//!
+//! Everything but [`driver`], `link` and `stop` is sans-IO: bytes, samples and `dt` in, bytes and
+//! commands out, so that a test flies minutes in milliseconds and the same seed gives the same
+//! flight. [`simulation`] holds the parts together on one virtual clock.
+
+pub mod airframe;
+pub mod battery;
+pub mod imu;
+pub mod motor;
+mod noise;
+
+pub mod autopilot;
+pub mod control;
+pub mod estimator;
+
+pub mod mocap;
+pub mod simulation;
+pub mod truth;
+
+mod args;
+pub mod driver;
+pub mod link;
+mod stop;
+
+pub use args::{SimArgs, run};

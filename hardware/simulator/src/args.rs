@@ -1,0 +1,261 @@
+//! The command line: `vizflyt sim`, and this crate's own binary.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use glam::DVec3;
+use vizflyt_protocol::geometry::Volume;
+
+use crate::driver::Driver;
+use crate::link::{Endpoint, resolve};
+use crate::mocap::{MAX_NAME, MocapConfig};
+use crate::simulation::{Simulation, SimulationConfig};
+use crate::stop::stop_flag;
+
+/// The simulated lab: vehicle, autopilot and motion capture.
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Example: vizflyt sim --mavlink udpout:127.0.0.1:14550 --vicon 127.0.0.1:51001 --spawn 1,0,0,90"
+)]
+pub struct SimArgs {
+    /// Where MAVLink goes: udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait.
+    #[arg(long, value_name = "ENDPOINT", default_value = "udpout:127.0.0.1:14550")]
+    pub mavlink: Endpoint,
+    /// Where the motion capture sends its UDP object stream; nowhere if absent.
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
+    pub vicon: Option<SocketAddr>,
+    /// Name of the vehicle in the motion capture.
+    #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
+    pub object: String,
+    /// Where the vehicle stands (metres, on the floor) and which way it looks (degrees from east).
+    #[arg(long, value_name = "X,Y,Z,YAW", default_value = "0,0,0,0", value_parser = parse_numbers::<4>, allow_hyphen_values = true)]
+    pub spawn: [f64; 4],
+    /// Seed of all noise.
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// True geometry of the scene (JSON list of volumes), to measure the flight against.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+    /// Radius of the vehicle's body in metres, to measure the flight with.
+    #[arg(long, value_name = "METRES", default_value_t = 0.12)]
+    pub body_radius: f64,
+    /// Changes a parameter of the autopilot at boot; may be given several times.
+    #[arg(long = "param", value_name = "NAME=VALUE", value_parser = parse_param)]
+    pub params: Vec<(String, f32)>,
+    /// Steady wind in metres per second, world axes.
+    #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = parse_numbers::<3>, allow_hyphen_values = true)]
+    pub wind: [f64; 3],
+    /// Simulated seconds per second.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
+    pub realtime_factor: f64,
+    /// The motion capture falls silent after this many seconds.
+    #[arg(long, value_name = "SECONDS")]
+    pub mocap_stop_after: Option<f64>,
+    /// Latency added to the motion capture, in milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 0.0)]
+    pub mocap_delay_ms: f64,
+    /// Share of the motion capture's datagrams that are lost, in percent.
+    #[arg(long, value_name = "PERCENT", default_value_t = 0.0)]
+    pub mocap_drop_percent: f64,
+    /// Prints JSON lines on stdout: one when ready, one report at the end.
+    #[arg(long)]
+    pub json: bool,
+    /// Ends when stdin ends.
+    #[arg(long, hide = true)]
+    pub lifeline: bool,
+}
+
+fn parse_address(text: &str) -> Result<SocketAddr, String> {
+    resolve(text).ok_or_else(|| format!("'{text}' is not HOST:PORT"))
+}
+
+fn parse_object(text: &str) -> Result<String, String> {
+    if (1..=MAX_NAME).contains(&text.len()) && text.is_ascii() {
+        Ok(text.to_owned())
+    } else {
+        Err(format!("an object name has 1 to {MAX_NAME} ASCII characters"))
+    }
+}
+
+fn parse_numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| part.trim().parse::<f64>().ok().filter(|v| v.is_finite() && v.abs() <= 1e4))
+        .collect::<Option<_>>()
+        .ok_or_else(|| format!("'{text}': give {N} numbers separated by commas"))?;
+    let count = numbers.len();
+    numbers.try_into().map_err(|_| format!("'{text}' has {count} numbers; give {N}"))
+}
+
+fn parse_param(text: &str) -> Result<(String, f32), String> {
+    text.split_once('=')
+        .and_then(|(name, value)| Some((name.to_owned(), value.parse::<f32>().ok()?)))
+        .filter(|(_, value)| value.is_finite())
+        .ok_or_else(|| format!("'{text}': write NAME=VALUE, for example FS_GCS_ENABLE=0"))
+}
+
+impl SimArgs {
+    /// Returns the lab these arguments describe; reads the file of true geometry.
+    ///
+    /// # Errors
+    /// Fails if that file cannot be read, or an argument is out of range.
+    pub fn config(&self) -> anyhow::Result<SimulationConfig> {
+        let in_range = |name: &str, value: f64, range: std::ops::RangeInclusive<f64>| {
+            let (least, most) = (*range.start(), *range.end());
+            anyhow::ensure!(
+                range.contains(&value),
+                "simulator: --{name} {value} is outside {least} to {most}"
+            );
+            Ok(())
+        };
+        in_range("body-radius", self.body_radius, 0.0..=10.0)?;
+        in_range("realtime-factor", self.realtime_factor, 0.01..=20.0)?;
+        in_range("mocap-delay-ms", self.mocap_delay_ms, 0.0..=10_000.0)?;
+        in_range("mocap-drop-percent", self.mocap_drop_percent, 0.0..=100.0)?;
+        in_range("mocap-stop-after", self.mocap_stop_after.unwrap_or(0.0), 0.0..=1e9)?;
+        let [x, y, z, yaw_deg] = self.spawn;
+        Ok(SimulationConfig {
+            spawn_m: DVec3::new(x, y, z),
+            spawn_yaw_rad: yaw_deg.to_radians(),
+            seed: self.seed,
+            obstacles: self.obstacles()?,
+            body_radius_m: self.body_radius,
+            mocap: MocapConfig {
+                object: self.object.clone(),
+                seed: self.seed,
+                stop_after_s: self.mocap_stop_after,
+                latency_s: self.mocap_delay_ms / 1000.0,
+                loss: self.mocap_drop_percent / 100.0,
+            },
+            params: self.params.clone(),
+            wind_world_mps: DVec3::from(self.wind),
+        })
+    }
+
+    fn obstacles(&self) -> anyhow::Result<Vec<Volume>> {
+        let Some(path) = &self.truth else { return Ok(Vec::new()) };
+        let text = std::fs::read_to_string(path).with_context(|| {
+            format!("simulator: cannot read the true geometry {}", path.display())
+        })?;
+        let volumes: Vec<Volume> = serde_json::from_str(&text)
+            .with_context(|| format!("simulator: {} is no list of volumes", path.display()))?;
+        if let Some(index) = volumes.iter().position(|volume| !volume.is_valid()) {
+            anyhow::bail!(
+                "simulator: {}: volume {index} has a size, direction or number that is not valid",
+                path.display()
+            );
+        }
+        Ok(volumes)
+    }
+}
+
+/// Runs the simulated lab until SIGINT, SIGTERM, or with `lifeline` the end of stdin. Prints the
+/// ready line and the report on stdout.
+///
+/// # Errors
+/// Fails on arguments out of range, unreadable files, and sockets that cannot be opened.
+pub fn run(args: SimArgs) -> anyhow::Result<()> {
+    let stop = stop_flag(args.lifeline)?;
+    let simulation = Simulation::new(args.config()?)?;
+    let driver = Driver::open(simulation, args.mavlink, args.vicon, args.realtime_factor)?;
+    let address = driver.mavlink_address()?.to_string();
+    if args.json {
+        println!("{}", serde_json::json!({ "ready": "simulator", "mavlink": address }));
+    } else {
+        println!(
+            "simulator ready: MAVLink {} (our address {address}); Ctrl-C ends it",
+            args.mavlink
+        );
+    }
+    // The loop has a thread of its own, whatever the caller's thread is busy with.
+    let (simulation, lost_s) = std::thread::Builder::new()
+        .name("simulator".into())
+        .spawn(move || driver.run(&stop))
+        .context("simulator: cannot start its thread")?
+        .join()
+        .map_err(|_| anyhow::anyhow!("simulator: its thread ended by a panic"))?;
+    let report = simulation.report();
+    if args.json {
+        let mut report = serde_json::to_value(&report).context("simulator: report")?;
+        report["seconds_given_up"] = lost_s.into();
+        println!("{}", serde_json::json!({ "report": report }));
+    } else {
+        let truth = &report.truth;
+        println!(
+            "flew {:.1} s, {:.1} m, at {:.1} m/s on average and {:.1} m/s at most; {}{}",
+            truth.flight_seconds,
+            truth.path_m,
+            truth.mean_speed_mps,
+            truth.max_speed_mps,
+            truth
+                .min_clearance_m
+                .map_or("no obstacles".into(), |m| format!("least clearance {m:.2} m")),
+            if truth.collided { ", collided" } else { "" },
+        );
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Command {
+        #[command(flatten)]
+        args: SimArgs,
+    }
+
+    fn parse(arguments: &[&str]) -> Result<SimArgs, String> {
+        Command::try_parse_from(std::iter::once(&"sim").chain(arguments))
+            .map(|command| command.args)
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn the_demo_s_arguments_are_understood() {
+        let args = parse(&[
+            "--json",
+            "--lifeline",
+            "--mavlink",
+            "udpout:127.0.0.1:4000",
+            "--vicon",
+            "127.0.0.1:4001",
+            "--object",
+            "vizflyt",
+            "--spawn",
+            "-1,0.5,0,90",
+            "--seed",
+            "7",
+            "--param",
+            "WP_SPD=2",
+        ])
+        .unwrap();
+        let config = args.config().unwrap();
+        assert_eq!(config.spawn_m, DVec3::new(-1.0, 0.5, 0.0));
+        assert!((config.spawn_yaw_rad - 90f64.to_radians()).abs() < 1e-12);
+        assert_eq!(config.params, [("WP_SPD".to_owned(), 2.0)]);
+        Simulation::new(config).unwrap();
+    }
+
+    #[test]
+    fn bad_arguments_are_named() {
+        let check = |arguments: &[&str], expected: &str| {
+            let error = parse(arguments)
+                .map_err(anyhow::Error::msg)
+                .and_then(|args| Simulation::new(args.config()?).map_err(anyhow::Error::from));
+            let error = error.err().map(|e: anyhow::Error| format!("{e:#}")).unwrap_or_default();
+            assert!(error.contains(expected), "{arguments:?}: {error}");
+        };
+        check(&["--spawn", "1,2,3"], "has 3 numbers; give 4");
+        check(&["--spawn", "1,2,x,4"], "give 4 numbers");
+        check(&["--mavlink", "serial:1"], "udpout:HOST:PORT");
+        check(&["--object", "a name of more than twenty-four"], "1 to 24");
+        check(&["--realtime-factor", "0"], "outside 0.01 to 20");
+        check(&["--param", "NO_SUCH=1"], "no parameter NO_SUCH");
+        check(&["--truth", "/does/not/exist.json"], "cannot read the true geometry");
+    }
+}

@@ -1,0 +1,361 @@
+//! Messages of the link: commands with their acknowledgements, setpoints, vision, parameters.
+
+use vizflyt_protocol::mavlink::{
+    CopterMode, GuidedMotion, Packet, dialect, guided_from_mavlink, vision_from_mavlink,
+    world_from_ned, world_rotation_from_ned,
+};
+use vizflyt_protocol::time::AutopilotTime;
+
+use super::dialect::{MavCmd, MavMessage, MavResult, MavSeverity};
+use super::failsafe::needs_position;
+use super::flight::FlightState;
+use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE};
+use crate::estimator::VisionMeasurement;
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::messages::YawTarget;
+
+/// Passed as param2 to arm or disarm against all checks (ArduPilot's magic numbers).
+const FORCE_ARM: f32 = 2989.0;
+const FORCE_DISARM: f32 = 21196.0;
+
+/// One command, whichever message carried it.
+struct Command {
+    command: MavCmd,
+    params: [f32; 7],
+    sender: (u8, u8),
+}
+
+impl Autopilot {
+    pub(super) fn handle_packet(&mut self, now: AutopilotTime, packet: &Packet) {
+        let sender = (packet.header.system_id as u8, packet.header.component_id);
+        match &packet.message {
+            MavMessage::HEARTBEAT(_) => {
+                if f64::from(sender.0) == self.params.value(Param::GcsSystemId) {
+                    self.last_ground_station = Some(now);
+                }
+            }
+            MavMessage::COMMAND_LONG(m) if self.is_for_us(m.target_system, m.target_component) => {
+                let params = [m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7];
+                self.handle_command(now, &Command { command: m.command, params, sender });
+            }
+            MavMessage::COMMAND_INT(m) if self.is_for_us(m.target_system, m.target_component) => {
+                let params = [m.param1, m.param2, m.param3, m.param4, m.x as f32, m.y as f32, m.z];
+                self.handle_command(now, &Command { command: m.command, params, sender });
+            }
+            MavMessage::SET_MODE(m) if m.target_system == self.system_id() => {
+                self.change_mode(now, m.custom_mode);
+            }
+            MavMessage::SET_POSITION_TARGET_LOCAL_NED(m)
+                if self.is_for_us(m.target_system, m.target_component) =>
+            {
+                self.handle_setpoint(now, m);
+            }
+            MavMessage::VISION_POSITION_ESTIMATE(m) => {
+                let variance = m.covariance[0];
+                let pose = vision_from_mavlink(m);
+                self.handle_vision(now, pose, m.usec, m.reset_counter, variance);
+            }
+            MavMessage::ODOMETRY(m) => {
+                // Positions in a local north-east-down (or forward-right-down) frame.
+                let p = DVec3::new(m.x.into(), m.y.into(), m.z.into());
+                let [w, x, y, z] = m.q.map(f64::from);
+                let q = DQuat::from_xyzw(x, y, z, w);
+                if q.is_finite() && q.length_squared() > 0.5 {
+                    let pose = Pose::new(world_from_ned(p), world_rotation_from_ned(q.normalize()));
+                    let variance = m.pose_covariance[0];
+                    self.handle_vision(now, pose, m.time_usec, m.reset_counter, variance);
+                }
+            }
+            MavMessage::SET_GPS_GLOBAL_ORIGIN(m) if m.target_system == self.system_id() => {
+                self.handle_origin(now, (m.latitude, m.longitude, m.altitude));
+            }
+            // tc1 = 0 asks; anything else is an answer to somebody.
+            MavMessage::TIMESYNC(m)
+                if m.tc1 == 0 && self.is_for_us(m.target_system, m.target_component) =>
+            {
+                self.send(MavMessage::TIMESYNC(dialect::TIMESYNC_DATA {
+                    tc1: now.as_ns().cast_signed(),
+                    ts1: m.ts1,
+                    target_system: sender.0,
+                    target_component: sender.1,
+                }));
+            }
+            MavMessage::PARAM_REQUEST_LIST(m)
+                if self.is_for_us(m.target_system, m.target_component) =>
+            {
+                for index in 0..TABLE.len() {
+                    self.send_param(index);
+                }
+            }
+            MavMessage::PARAM_REQUEST_READ(m)
+                if self.is_for_us(m.target_system, m.target_component) =>
+            {
+                let index = match usize::try_from(m.param_index) {
+                    Ok(index) => Some(index),
+                    Err(_) => m.param_id.to_str().ok().and_then(Params::index_of),
+                };
+                if let Some(index) = index {
+                    self.send_param(index);
+                }
+            }
+            MavMessage::PARAM_SET(m) if self.is_for_us(m.target_system, m.target_component) => {
+                if let Some(index) = m.param_id.to_str().ok().and_then(Params::index_of) {
+                    self.params.set(index, m.param_value);
+                    self.send_param(index);
+                }
+            }
+            MavMessage::REQUEST_DATA_STREAM(m)
+                if self.is_for_us(m.target_system, m.target_component) =>
+            {
+                let rate_hz = if m.start_stop == 0 { 0 } else { m.req_message_rate };
+                self.streams.request_group(m.req_stream_id, rate_hz);
+            }
+            _ => {}
+        }
+    }
+
+    fn is_for_us(&self, system: u8, component: u8) -> bool {
+        (system == 0 || system == self.system_id())
+            && (component == 0 || component == AUTOPILOT_COMPONENT)
+    }
+
+    fn handle_command(&mut self, now: AutopilotTime, c: &Command) {
+        let [p1, p2, ..] = c.params;
+        let result = match c.command {
+            MavCmd::MAV_CMD_DO_SET_MODE => self.change_mode(now, p2 as u32),
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 1.0 => self.arm(now, p2 == FORCE_ARM),
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 0.0 => {
+                if self.armed && !self.landed && p2 != FORCE_DISARM {
+                    self.say(MavSeverity::MAV_SEVERITY_CRITICAL, "Disarm: not landed");
+                    MavResult::MAV_RESULT_FAILED
+                } else {
+                    self.disarm();
+                    MavResult::MAV_RESULT_ACCEPTED
+                }
+            }
+            MavCmd::MAV_CMD_NAV_TAKEOFF => self.take_off(now, f64::from(c.params[6])),
+            MavCmd::MAV_CMD_NAV_LAND => self.change_mode(now, CopterMode::Land as u32),
+            MavCmd::MAV_CMD_NAV_RETURN_TO_LAUNCH => self.change_mode(now, CopterMode::Rtl as u32),
+            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
+                if self.streams.set_interval(p1 as u32, p2) {
+                    MavResult::MAV_RESULT_ACCEPTED
+                } else {
+                    MavResult::MAV_RESULT_FAILED
+                }
+            }
+            MavCmd::MAV_CMD_GET_MESSAGE_INTERVAL => {
+                let id = p1 as u16;
+                let interval_us = self.streams.interval_us(u32::from(id)).unwrap_or(0);
+                self.send(MavMessage::MESSAGE_INTERVAL(dialect::MESSAGE_INTERVAL_DATA {
+                    interval_us,
+                    message_id: id,
+                }));
+                MavResult::MAV_RESULT_ACCEPTED
+            }
+            MavCmd::MAV_CMD_REQUEST_MESSAGE => match self.message(now, p1 as u32) {
+                Some(message) => {
+                    self.send(message);
+                    MavResult::MAV_RESULT_ACCEPTED
+                }
+                None => MavResult::MAV_RESULT_FAILED,
+            },
+            MavCmd::MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES => {
+                let version = self.autopilot_version();
+                self.send(version);
+                MavResult::MAV_RESULT_ACCEPTED
+            }
+            _ => MavResult::MAV_RESULT_UNSUPPORTED,
+        };
+        self.send(MavMessage::COMMAND_ACK(dialect::COMMAND_ACK_DATA {
+            command: c.command,
+            result,
+            target_system: c.sender.0,
+            target_component: c.sender.1,
+            ..Default::default()
+        }));
+    }
+
+    fn change_mode(&mut self, now: AutopilotTime, number: u32) -> MavResult {
+        let Some(mode) = CopterMode::from_number(number) else {
+            let text = format!("Mode change failed: no mode {number}");
+            self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            return MavResult::MAV_RESULT_FAILED;
+        };
+        // A disarmed vehicle may choose any mode; the arming checks judge it later.
+        if self.armed && needs_position(mode) && !self.estimator.health(now).position {
+            let text = format!("Mode change to {} failed: requires position", name_of(mode));
+            self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            return MavResult::MAV_RESULT_FAILED;
+        }
+        self.enter(mode);
+        MavResult::MAV_RESULT_ACCEPTED
+    }
+
+    /// Changes the mode; entering the mode of the moment again changes nothing.
+    pub(super) fn enter(&mut self, mode: CopterMode) {
+        if mode != self.mode {
+            tracing::info!(target: "autopilot", "mode {}", name_of(mode));
+            self.mode = mode;
+            self.guided = Guided::Hold;
+            self.returning = Return::Climb;
+            self.flight.yaw = YawTarget::Keep;
+            self.streams.heartbeat_now();
+        }
+    }
+
+    /// Why the vehicle may not be armed; `None` if it may.
+    pub(super) fn arming_refusal(&self, now: AutopilotTime) -> Option<&'static str> {
+        let health = self.estimator.health(now);
+        if !health.attitude {
+            Some("PreArm: AHRS: not healthy")
+        } else if self.params.value(Param::FsThrEnable) != 0.0 {
+            Some("PreArm: RC not found")
+        } else if self.params.value(Param::VisoType) != 0.0 && !health.vision {
+            Some("PreArm: VisOdom: not healthy")
+        } else if needs_position(self.mode) && health.origin && !health.position {
+            // Without an origin a real ArduCopter arms all the same and refuses the take-off.
+            Some("PreArm: Need Position Estimate")
+        } else {
+            None
+        }
+    }
+
+    fn arm(&mut self, now: AutopilotTime, force: bool) -> MavResult {
+        if self.armed {
+            return MavResult::MAV_RESULT_ACCEPTED;
+        }
+        if matches!(self.mode, CopterMode::Land | CopterMode::Rtl | CopterMode::Brake) {
+            let text = format!("Arm: {} mode not armable", name_of(self.mode));
+            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
+            return MavResult::MAV_RESULT_FAILED;
+        }
+        if let Some(reason) = self.arming_refusal(now)
+            && !(force && self.estimator.health(now).attitude)
+        {
+            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, reason);
+            return MavResult::MAV_RESULT_FAILED;
+        }
+        self.armed = true;
+        self.landed = true;
+        self.home = Some(self.estimator.estimate().p_world_m);
+        self.flight = FlightState::default();
+        self.say(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
+        self.streams.heartbeat_now();
+        MavResult::MAV_RESULT_ACCEPTED
+    }
+
+    fn take_off(&mut self, now: AutopilotTime, height_m: f64) -> MavResult {
+        let health = self.estimator.health(now);
+        let refusal = if self.mode != CopterMode::Guided {
+            Some("Takeoff refused: not in GUIDED")
+        } else if !self.armed {
+            Some("Takeoff refused: not armed")
+        } else if !self.landed {
+            Some("Takeoff refused: already flying")
+        } else if !health.origin || !health.position {
+            Some("Takeoff refused: no EKF origin")
+        } else if !(height_m > 0.0 && height_m < 1000.0) {
+            Some("Takeoff refused: height out of range")
+        } else {
+            None
+        };
+        if let Some(text) = refusal {
+            self.say(MavSeverity::MAV_SEVERITY_WARNING, text);
+            return MavResult::MAV_RESULT_FAILED;
+        }
+        let ground_m = self.home.map_or(0.0, |home| home.z);
+        self.guided = Guided::TakeOff { z_m: ground_m + height_m };
+        self.landed = false;
+        MavResult::MAV_RESULT_ACCEPTED
+    }
+
+    fn handle_setpoint(
+        &mut self,
+        now: AutopilotTime,
+        m: &dialect::SET_POSITION_TARGET_LOCAL_NED_DATA,
+    ) {
+        // Outside GUIDED, and on the ground, ArduCopter drops setpoints without a word.
+        if self.mode != CopterMode::Guided || !self.armed || self.landed {
+            return;
+        }
+        // A mask that GUIDED knows no motion for means: stop.
+        let Ok(setpoint) = guided_from_mavlink(m) else {
+            let finite = [m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate];
+            if finite.iter().all(|value| value.is_finite()) {
+                self.guided = Guided::Hold;
+            }
+            return;
+        };
+        let p_world_m = match setpoint.motion {
+            GuidedMotion::Position(p) | GuidedMotion::PositionVelocity(p, _) => p,
+            GuidedMotion::Velocity(_) | GuidedMotion::Acceleration(_) => DVec3::ZERO,
+        };
+        self.flight.yaw = setpoint.yaw;
+        self.guided = Guided::Setpoint { setpoint, since: now, p_world_m };
+    }
+
+    fn handle_vision(
+        &mut self,
+        now: AutopilotTime,
+        world_from_body: Pose<World, Body>,
+        usec: u64,
+        reset_counter: u8,
+        variance_m2: f32,
+    ) {
+        if self.params.value(Param::VisoType) == 0.0 {
+            return;
+        }
+        let least_m = self.params.value(Param::VisoPosNoise);
+        // A sender that does not know its covariance says NaN.
+        let sigma_m = f64::from(variance_m2).max(0.0).sqrt().clamp(least_m, 100.0);
+        let measurement = VisionMeasurement {
+            world_from_body,
+            usec,
+            reset_counter,
+            sigma_m: if sigma_m.is_finite() { sigma_m } else { least_m },
+            sigma_rad: self.params.value(Param::VisoYawNoise),
+            latency_s: self.params.value(Param::VisoDelayMs) / 1000.0,
+        };
+        self.estimator.handle_vision(now, &measurement);
+    }
+
+    fn handle_origin(&mut self, now: AutopilotTime, origin: (i32, i32, i32)) {
+        let (latitude, longitude, _) = origin;
+        let on_earth = (-900_000_000..=900_000_000).contains(&latitude)
+            && (-1_800_000_000..=1_800_000_000).contains(&longitude);
+        if on_earth && self.estimator.set_origin() {
+            self.origin = Some(origin);
+            self.say(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
+        }
+        // Answered even if it was set before: the first answer may have been lost.
+        if let Some(message) = self.message(now, super::telemetry::GPS_GLOBAL_ORIGIN) {
+            self.send(message);
+        }
+    }
+
+    fn send_param(&mut self, index: usize) {
+        if let Some((spec, value)) = self.params.at(index) {
+            self.send(MavMessage::PARAM_VALUE(dialect::PARAM_VALUE_DATA {
+                param_value: value,
+                param_count: TABLE.len() as u16,
+                param_index: index as u16,
+                param_id: spec.name.into(),
+                param_type: spec.kind,
+            }));
+        }
+    }
+}
+
+/// ArduCopter's name of a mode.
+fn name_of(mode: CopterMode) -> &'static str {
+    match mode {
+        CopterMode::Stabilize => "STABILIZE",
+        CopterMode::AltHold => "ALT_HOLD",
+        CopterMode::Guided => "GUIDED",
+        CopterMode::Loiter => "LOITER",
+        CopterMode::Rtl => "RTL",
+        CopterMode::Land => "LAND",
+        CopterMode::Brake => "BRAKE",
+    }
+}

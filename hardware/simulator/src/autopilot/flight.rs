@@ -1,0 +1,322 @@
+//! What the vehicle does in each mode, and whether it stands on the ground.
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
+use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion};
+use vizflyt_protocol::messages::YawTarget;
+use vizflyt_protocol::time::AutopilotTime;
+
+use super::dialect::MavSeverity;
+use super::{Autopilot, Guided, Param, Return};
+use crate::airframe::{GRAVITY_MPS2, MASS_KG};
+use crate::control::Limits;
+use crate::control::attitude::Heading;
+use crate::control::mixer::{IDLE_SPEED, mix};
+use crate::control::position::{Horizontal, Vertical};
+use crate::motor::THRUST_TO_WEIGHT;
+
+/// Less thrust than this share of the weight means that something else carries the vehicle.
+const CARRIED: f64 = 0.35;
+/// It must hold this long. [s]
+const LANDED_S: f64 = 1.0;
+/// A vehicle on the ground moves less than this. [m/s]
+const LANDED_MPS: f64 = 0.3;
+/// And is shaken less than this, filtered at [`SHAKE_CUTOFF`]. [m/s^2]
+const LANDED_MPS2: f64 = 1.5;
+const SHAKE_CUTOFF: f64 = 12.0; // [rad/s]
+/// A take-off is over this close to its height. [m]
+const REACHED_M: f64 = 0.05;
+/// A nose that follows travel does so above this share of WP_SPD.
+const LOOK_AHEAD_SHARE: f64 = 0.05;
+
+/// What [`Autopilot::fly`] keeps between ticks.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct FlightState {
+    /// Thrust commanded over weight.
+    lift: f64,
+    /// Acceleration, filtered. [m/s^2, world]
+    shake: DVec3,
+    carried_s: f64,
+    /// Time armed on the ground. [s]
+    idle_s: f64,
+    /// Where the nose shall point.
+    pub(super) yaw: YawTarget,
+    /// Tilt beyond what is asked for, and for how long. [s]
+    pub(super) toppled_s: f64,
+    /// Time since arming; motors spool up first. [s]
+    pub(super) armed_s: f64,
+}
+
+impl Default for FlightState {
+    fn default() -> Self {
+        Self {
+            lift: 0.0,
+            shake: DVec3::ZERO,
+            carried_s: 0.0,
+            idle_s: 0.0,
+            yaw: YawTarget::Keep,
+            toppled_s: 0.0,
+            armed_s: 0.0,
+        }
+    }
+}
+
+/// What a mode asks for.
+enum Demand {
+    /// Motors idle.
+    Idle,
+    /// Motion.
+    Motion(Horizontal, Vertical),
+}
+
+impl Autopilot {
+    /// One tick of flight: returns the motor commands.
+    pub(super) fn fly(&mut self, now: AutopilotTime, dt_s: f64) -> [f64; 4] {
+        let yaw_rad = yaw_of(self.estimator.estimate().world_from_body);
+        if !self.armed {
+            self.stand(yaw_rad);
+            return [0.0; 4];
+        }
+        self.flight.armed_s += dt_s;
+        let demand = if self.landed { Demand::Idle } else { self.demand(now, dt_s) };
+        let motors = match demand {
+            Demand::Idle => {
+                self.stand(yaw_rad);
+                [IDLE_SPEED; 4]
+            }
+            Demand::Motion(horizontal, vertical) => {
+                self.steer(now, horizontal, dt_s);
+                let limits = self.limits();
+                let estimate = *self.estimator.estimate();
+                let acceleration = self.position.update(
+                    &estimate,
+                    horizontal,
+                    vertical,
+                    &limits,
+                    self.saturated,
+                    dt_s,
+                );
+                let wrench =
+                    self.attitude.update(&estimate, acceleration, self.heading, &limits, dt_s);
+                self.saturated = wrench.saturated;
+                self.flight.lift = wrench.thrust_n / (MASS_KG * GRAVITY_MPS2);
+                mix(&wrench)
+            }
+        };
+        self.detect_landing(dt_s);
+        motors
+    }
+
+    /// Keeps controllers fresh while nothing is flown.
+    fn stand(&mut self, yaw_rad: f64) {
+        let estimate = *self.estimator.estimate();
+        self.position.reset(&estimate);
+        self.attitude.reset();
+        self.heading = Heading { yaw_rad, rate_radps: 0.0 };
+        self.flight.yaw = YawTarget::Keep;
+        self.flight.lift = 0.0;
+        self.saturated = false;
+    }
+
+    fn limits(&self) -> Limits {
+        let value = |param| self.params.value(param);
+        Limits {
+            horizontal_mps2: value(Param::WpAcceleration),
+            vertical_mps2: value(Param::WpAccelerationZ),
+            horizontal_mps3: value(Param::JerkHorizontal),
+            vertical_mps3: value(Param::JerkVertical),
+            tilt_rad: value(Param::AngleMax).to_radians(),
+        }
+    }
+
+    /// What the mode asks for, in flight.
+    fn demand(&mut self, now: AutopilotTime, dt_s: f64) -> Demand {
+        let stay = Horizontal::Velocity(DVec3::ZERO);
+        let stay_z = Vertical::Velocity(0.0);
+        match self.mode {
+            // Nobody holds the sticks: throttle is at its lowest.
+            CopterMode::Stabilize => Demand::Idle,
+            CopterMode::AltHold => Demand::Motion(Horizontal::Level, stay_z),
+            CopterMode::Loiter | CopterMode::Brake => {
+                Demand::Motion(self.or_level(now, stay), stay_z)
+            }
+            CopterMode::Guided => self.guided_demand(now, dt_s),
+            CopterMode::Land => Demand::Motion(self.or_level(now, stay), self.descent()),
+            CopterMode::Rtl => self.return_demand(now),
+        }
+    }
+
+    /// Without a position nothing can be held: stay level instead.
+    fn or_level(&self, now: AutopilotTime, wanted: Horizontal) -> Horizontal {
+        if self.estimator.health(now).position { wanted } else { Horizontal::Level }
+    }
+
+    fn descent(&self) -> Vertical {
+        let value = |param| self.params.value(param);
+        let height_m = self.estimator.estimate().p_world_m.z - self.home.map_or(0.0, |home| home.z);
+        let fast = match value(Param::LandSpeedHigh) {
+            0.0 => value(Param::WpSpeedDown),
+            speed => speed,
+        };
+        let slow = value(Param::LandSpeed);
+        Vertical::Descend(if height_m > value(Param::LandAltLow) { fast } else { slow })
+    }
+
+    fn towards(&self, p: DVec3, v: DVec3) -> Demand {
+        let value = |param| self.params.value(param);
+        Demand::Motion(
+            Horizontal::Position { p, v, speed_mps: value(Param::WpSpeed) },
+            Vertical::Position {
+                z: p.z,
+                v: v.z,
+                up_mps: value(Param::WpSpeedUp),
+                down_mps: value(Param::WpSpeedDown),
+            },
+        )
+    }
+
+    fn guided_demand(&mut self, now: AutopilotTime, dt_s: f64) -> Demand {
+        let stop = Demand::Motion(Horizontal::Velocity(DVec3::ZERO), Vertical::Velocity(0.0));
+        match self.guided {
+            Guided::Hold => stop,
+            Guided::TakeOff { z_m } => {
+                let z = self.estimator.estimate().p_world_m.z;
+                if (z - z_m).abs() < REACHED_M {
+                    self.guided = Guided::Hold;
+                }
+                let Demand::Motion(_, vertical) = self.towards(DVec3::Z * z_m, DVec3::ZERO) else {
+                    return stop;
+                };
+                Demand::Motion(Horizontal::Velocity(DVec3::ZERO), vertical)
+            }
+            Guided::Setpoint { setpoint, since, p_world_m } => {
+                let timed_out = now.seconds_since(since) > self.params.value(Param::GuidTimeout);
+                match setpoint.motion {
+                    // A position is held without resending.
+                    GuidedMotion::Position(p) => self.towards(p, DVec3::ZERO),
+                    _ if timed_out => {
+                        self.guided = Guided::Hold;
+                        self.flight.yaw = YawTarget::Angle(self.heading.yaw_rad);
+                        stop
+                    }
+                    GuidedMotion::PositionVelocity(_, v) => {
+                        let p_world_m = p_world_m + v * dt_s;
+                        self.guided = Guided::Setpoint { setpoint, since, p_world_m };
+                        self.towards(p_world_m, v)
+                    }
+                    GuidedMotion::Velocity(v) => {
+                        Demand::Motion(Horizontal::Velocity(v), Vertical::Velocity(v.z))
+                    }
+                    GuidedMotion::Acceleration(a) => {
+                        Demand::Motion(Horizontal::Acceleration(a), Vertical::Acceleration(a.z))
+                    }
+                }
+            }
+        }
+    }
+
+    fn return_demand(&mut self, now: AutopilotTime) -> Demand {
+        let Some(home) = self.home else {
+            return Demand::Motion(Horizontal::Level, self.descent());
+        };
+        let p = self.estimator.estimate().p_world_m;
+        let cruise_z = p.z.max(home.z + self.params.value(Param::RtlAlt));
+        let away_m = (p - home).truncate().length();
+        match self.returning {
+            Return::Climb if cruise_z - p.z < 0.2 => self.returning = Return::Travel,
+            Return::Travel if away_m < 0.2 => self.returning = Return::Land,
+            _ => {}
+        }
+        match self.returning {
+            Return::Climb => {
+                let Demand::Motion(_, vertical) = self.towards(DVec3::Z * cruise_z, DVec3::ZERO)
+                else {
+                    return Demand::Idle;
+                };
+                let stay = Horizontal::Velocity(DVec3::ZERO);
+                Demand::Motion(self.or_level(now, stay), vertical)
+            }
+            Return::Travel => self.towards(home.truncate().extend(cruise_z), DVec3::ZERO),
+            Return::Land => {
+                let stay = Horizontal::Velocity(DVec3::ZERO);
+                Demand::Motion(self.or_level(now, stay), self.descent())
+            }
+        }
+    }
+
+    /// Moves the heading towards what is asked for.
+    fn steer(&mut self, now: AutopilotTime, horizontal: Horizontal, dt_s: f64) {
+        let slew = (self.params.value(Param::SlewYaw) / 100.0).to_radians();
+        let in_guided = self.mode == CopterMode::Guided;
+        let target = match self.flight.yaw {
+            YawTarget::Angle(yaw_rad) if in_guided => Some(yaw_rad),
+            YawTarget::Rate(rate) if in_guided => {
+                let rate_radps = rate.clamp(-slew, slew);
+                self.heading.yaw_rad = wrap_pi(self.heading.yaw_rad + rate_radps * dt_s);
+                self.heading.rate_radps = rate_radps;
+                return;
+            }
+            _ => self.travel_heading(now, horizontal),
+        };
+        let Some(target) = target else {
+            self.heading.rate_radps = 0.0;
+            return;
+        };
+        let step = wrap_pi(target - self.heading.yaw_rad).clamp(-slew * dt_s, slew * dt_s);
+        self.heading.yaw_rad = wrap_pi(self.heading.yaw_rad + step);
+        self.heading.rate_radps = step / dt_s;
+    }
+
+    /// The direction of travel, if an ignored yaw makes the nose follow it.
+    fn travel_heading(&self, now: AutopilotTime, horizontal: Horizontal) -> Option<f64> {
+        let follows = self.params.value(Param::WpYawBehavior) != 0.0
+            && self.mode == CopterMode::Guided
+            && matches!(self.guided, Guided::Setpoint { .. })
+            && self.estimator.health(now).position
+            && horizontal != Horizontal::Level;
+        let v = self.position.velocity_target_mps().truncate();
+        let least_mps = LOOK_AHEAD_SHARE * self.params.value(Param::WpSpeed);
+        (follows && v.length() > least_mps).then(|| v.y.atan2(v.x))
+    }
+
+    fn detect_landing(&mut self, dt_s: f64) {
+        let estimate = self.estimator.estimate();
+        let share = 1.0 - (-SHAKE_CUTOFF * dt_s).exp();
+        self.flight.shake += (estimate.a_world_mps2 - self.flight.shake) * share;
+        if self.landed {
+            self.flight.carried_s = 0.0;
+            self.flight.idle_s += dt_s;
+            let delay_s = self.params.value(Param::DisarmDelay);
+            let landing = matches!(self.mode, CopterMode::Land | CopterMode::Rtl);
+            if landing || (delay_s > 0.0 && self.flight.idle_s > delay_s) {
+                self.disarm();
+            }
+            return;
+        }
+        self.flight.idle_s = 0.0;
+        let still =
+            estimate.v_world_mps.length() < LANDED_MPS && self.flight.shake.length() < LANDED_MPS2;
+        let carried = self.flight.lift < CARRIED && still;
+        self.flight.carried_s = if carried { self.flight.carried_s + dt_s } else { 0.0 };
+        if self.flight.carried_s > LANDED_S {
+            self.landed = true;
+            self.guided = Guided::Hold;
+        }
+    }
+
+    /// Returns the throttle of the moment. [%]
+    pub(super) fn throttle_percent(&self) -> u16 {
+        (self.flight.lift / THRUST_TO_WEIGHT * 100.0).clamp(0.0, 100.0) as u16
+    }
+
+    /// Stops the motors.
+    pub(super) fn disarm(&mut self) {
+        if self.armed {
+            self.armed = false;
+            self.landed = true;
+            self.guided = Guided::Hold;
+            self.flight = FlightState::default();
+            self.say(MavSeverity::MAV_SEVERITY_INFO, "Disarming motors");
+        }
+    }
+}

@@ -1,0 +1,193 @@
+//! The parameters of ArduCopter that this autopilot honours, by the names of 4.8.
+//!
+//! Defaults are a lab's (`docs` of ArduCopter: external navigation, no GPS, no compass), not
+//! ArduCopter's own, wherever the comment says so.
+
+use super::dialect::MavParamType;
+
+/// One parameter: name on the wire, default, range, type.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ParamSpec {
+    /// Name, at most 16 characters.
+    pub name: &'static str,
+    /// Value at boot.
+    pub default: f32,
+    /// Least value taken.
+    pub least: f32,
+    /// Largest value taken.
+    pub most: f32,
+    /// Type on the wire; values travel as floats whatever it is.
+    pub kind: MavParamType,
+}
+
+macro_rules! params {
+    ($($(#[$doc:meta])* $variant:ident = $name:literal, $default:literal, $least:literal..$most:literal, $kind:ident;)*) => {
+        /// A parameter by what it does.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum Param { $($(#[$doc])* $variant,)* }
+
+        /// All parameters in the order of [`Param`].
+        pub const TABLE: &[ParamSpec] = &[$(ParamSpec {
+            name: $name,
+            default: $default,
+            least: $least,
+            most: $most,
+            kind: MavParamType::$kind,
+        },)*];
+    };
+}
+
+params! {
+    /// Our system id.
+    SystemId = "MAV_SYSID", 1.0, 1.0..255.0, MAV_PARAM_TYPE_INT16;
+    /// System id whose heartbeats count for the ground station failsafe.
+    GcsSystemId = "MAV_GCS_SYSID", 255.0, 1.0..255.0, MAV_PARAM_TYPE_INT16;
+    /// Frame: 1 is quad.
+    FrameClass = "FRAME_CLASS", 1.0, 0.0..20.0, MAV_PARAM_TYPE_INT8;
+    /// Frame type: 1 is X.
+    FrameType = "FRAME_TYPE", 1.0, 0.0..20.0, MAV_PARAM_TYPE_INT8;
+    /// Estimator: 3 is EKF3.
+    AhrsEkfType = "AHRS_EKF_TYPE", 3.0, 0.0..11.0, MAV_PARAM_TYPE_INT8;
+    /// EKF3 on.
+    Ek3Enable = "EK3_ENABLE", 1.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
+    /// Source of horizontal position; 6 is external navigation (lab).
+    Ek3PosXy = "EK3_SRC1_POSXY", 6.0, 0.0..6.0, MAV_PARAM_TYPE_INT8;
+    /// Source of horizontal velocity (lab).
+    Ek3VelXy = "EK3_SRC1_VELXY", 6.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
+    /// Source of height (lab).
+    Ek3PosZ = "EK3_SRC1_POSZ", 6.0, 0.0..6.0, MAV_PARAM_TYPE_INT8;
+    /// Source of vertical velocity (lab).
+    Ek3VelZ = "EK3_SRC1_VELZ", 6.0, 0.0..6.0, MAV_PARAM_TYPE_INT8;
+    /// Source of heading (lab).
+    Ek3Yaw = "EK3_SRC1_YAW", 6.0, 0.0..8.0, MAV_PARAM_TYPE_INT8;
+    /// No compass indoors (lab).
+    CompassEnable = "COMPASS_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
+    /// No GPS indoors (lab).
+    GpsType = "GPS1_TYPE", 0.0, 0.0..25.0, MAV_PARAM_TYPE_INT8;
+    /// Vision over MAVLink (lab).
+    VisoType = "VISO_TYPE", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
+    /// Constant latency of vision. [ms]
+    VisoDelayMs = "VISO_DELAY_MS", 10.0, 0.0..250.0, MAV_PARAM_TYPE_INT16;
+    /// Least standard deviation given to vision positions (lab). [m]
+    VisoPosNoise = "VISO_POS_M_NSE", 0.1, 0.05..10.0, MAV_PARAM_TYPE_REAL32;
+    /// Least standard deviation given to vision velocities (lab). [m/s]
+    VisoVelNoise = "VISO_VEL_M_NSE", 0.1, 0.05..5.0, MAV_PARAM_TYPE_REAL32;
+    /// Least standard deviation given to vision headings (lab). [rad]
+    VisoYawNoise = "VISO_YAW_M_NSE", 0.1, 0.05..1.0, MAV_PARAM_TYPE_REAL32;
+    /// Speed towards position targets (lab). [m/s]
+    WpSpeed = "WP_SPD", 1.0, 0.1..20.0, MAV_PARAM_TYPE_REAL32;
+    /// Climb rate towards position targets (lab). [m/s]
+    WpSpeedUp = "WP_SPD_UP", 0.5, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
+    /// Sink rate towards position targets (lab). [m/s]
+    WpSpeedDown = "WP_SPD_DN", 0.5, 0.1..5.0, MAV_PARAM_TYPE_REAL32;
+    /// Horizontal acceleration of all guided motion (lab). [m/s^2]
+    WpAcceleration = "WP_ACC", 8.0, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
+    /// Vertical acceleration of all guided motion (lab). [m/s^2]
+    WpAccelerationZ = "WP_ACC_Z", 4.0, 0.5..8.0, MAV_PARAM_TYPE_REAL32;
+    /// Nose when a setpoint ignores yaw: 0 keeps it, else it turns into the direction of travel.
+    WpYawBehavior = "WP_YAW_BEHAVIOR", 2.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
+    /// Horizontal jerk (lab). [m/s^3]
+    JerkHorizontal = "PSC_JERK_NE", 80.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
+    /// Vertical jerk (lab). [m/s^3]
+    JerkVertical = "PSC_JERK_D", 50.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
+    /// Largest tilt (lab). [deg]
+    AngleMax = "ATC_ANGLE_MAX", 45.0, 10.0..60.0, MAV_PARAM_TYPE_REAL32;
+    /// Fastest turn of the nose to an angle (lab). [cdeg/s]
+    SlewYaw = "ATC_SLEW_YAW", 12000.0, 500.0..24000.0, MAV_PARAM_TYPE_REAL32;
+    /// Velocity and acceleration setpoints die after this. [s]
+    GuidTimeout = "GUID_TIMEOUT", 3.0, 0.1..5.0, MAV_PARAM_TYPE_REAL32;
+    /// Sink rate near the ground. [m/s]
+    LandSpeed = "LAND_SPD_MS", 0.5, 0.3..2.0, MAV_PARAM_TYPE_REAL32;
+    /// Sink rate above LAND_ALT_LOW_M; 0 takes WP_SPD_DN (lab). [m/s]
+    LandSpeedHigh = "LAND_SPD_HIGH_MS", 1.0, 0.0..5.0, MAV_PARAM_TYPE_REAL32;
+    /// Height below which the slow sink rate applies (lab). [m]
+    LandAltLow = "LAND_ALT_LOW_M", 1.0, 0.5..100.0, MAV_PARAM_TYPE_REAL32;
+    /// Height that RTL climbs to first; ArduCopter's default, dangerous in a room. [m]
+    RtlAlt = "RTL_ALT_M", 15.0, 0.3..3000.0, MAV_PARAM_TYPE_REAL32;
+    /// An armed vehicle that stays on the ground disarms after this; 0 never. [s]
+    DisarmDelay = "DISARM_DELAY", 10.0, 0.0..127.0, MAV_PARAM_TYPE_INT8;
+    /// What a lost ground station causes: 0 nothing, 1 RTL, 5 LAND (lab).
+    FsGcsEnable = "FS_GCS_ENABLE", 5.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
+    /// Silence that counts as lost. [s]
+    FsGcsTimeout = "FS_GCS_TIMEOUT", 5.0, 2.0..120.0, MAV_PARAM_TYPE_REAL32;
+    /// Lost radio control: 0 lets the vehicle arm without a receiver (lab).
+    FsThrEnable = "FS_THR_ENABLE", 0.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
+    /// Lost estimate: 1 lands.
+    FsEkfAction = "FS_EKF_ACTION", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
+    /// Crash detection disarms.
+    FsCrashCheck = "FS_CRASH_CHECK", 1.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
+    /// The autopilot's own fence; reported, not flown.
+    FenceEnable = "FENCE_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
+    /// Battery monitor: 4 measures voltage and current (lab).
+    BattMonitor = "BATT_MONITOR", 4.0, 0.0..30.0, MAV_PARAM_TYPE_INT8;
+    /// Battery capacity. [mAh]
+    BattCapacity = "BATT_CAPACITY", 850.0, 0.0..100000.0, MAV_PARAM_TYPE_INT32;
+    /// Throttle at hover; reported from the airframe's thrust-to-weight.
+    MotHover = "MOT_THST_HOVER", 0.16, 0.05..0.8, MAV_PARAM_TYPE_REAL32;
+}
+
+/// The values of the moment.
+#[derive(Clone, Debug)]
+pub struct Params {
+    values: Vec<f32>,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { values: TABLE.iter().map(|spec| spec.default).collect() }
+    }
+}
+
+impl Params {
+    /// Returns a value.
+    pub fn value(&self, param: Param) -> f64 {
+        f64::from(self.values[param as usize])
+    }
+
+    /// Returns what stands at an index, if there is something.
+    pub fn at(&self, index: usize) -> Option<(&'static ParamSpec, f32)> {
+        Some((TABLE.get(index)?, *self.values.get(index)?))
+    }
+
+    /// Returns the index of a name.
+    pub fn index_of(name: &str) -> Option<usize> {
+        TABLE.iter().position(|spec| spec.name == name)
+    }
+
+    /// Sets a value, held within its range and rounded if it is a whole number; poison changes
+    /// nothing.
+    pub fn set(&mut self, index: usize, value: f32) {
+        if let (Some(spec), Some(slot)) = (TABLE.get(index), self.values.get_mut(index))
+            && value.is_finite()
+        {
+            let whole = spec.kind != MavParamType::MAV_PARAM_TYPE_REAL32;
+            *slot = if whole { value.round() } else { value }.clamp(spec.least, spec.most);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_sound() {
+        for (i, spec) in TABLE.iter().enumerate() {
+            assert!(spec.name.len() <= 16, "{}", spec.name);
+            assert!((spec.least..=spec.most).contains(&spec.default), "{}", spec.name);
+            assert_eq!(Params::index_of(spec.name), Some(i), "{} appears twice", spec.name);
+        }
+    }
+
+    #[test]
+    fn values_stay_in_range() {
+        let mut params = Params::default();
+        let index = Param::GuidTimeout as usize;
+        for (given, expected) in [(99.0, 5.0), (f32::NAN, 5.0), (-1.0, 0.1), (2.0, 2.0)] {
+            params.set(index, given);
+            assert_eq!(params.at(index).unwrap().1, expected);
+        }
+        params.set(TABLE.len(), 1.0);
+        assert!(params.at(TABLE.len()).is_none());
+    }
+}

@@ -1,0 +1,410 @@
+//! What the autopilot reports by itself and on request, and how often.
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::yaw_of;
+use vizflyt_protocol::mavlink::{
+    CopterMode, attitude_to_mavlink, dialect, frd_from_body, local_position_to_mavlink,
+    ned_from_world, ned_rotation_from_world, yaw_ned_from_world,
+};
+use vizflyt_protocol::time::AutopilotTime;
+
+use super::dialect::{
+    EkfStatusFlags, MavAutopilot, MavDataStream, MavLandedState, MavMessage, MavModeFlag,
+    MavProtocolCapability, MavState, MavSysStatusSensor, MavType, MavVtolState,
+};
+use super::{Autopilot, Guided};
+use crate::airframe::GRAVITY_MPS2;
+use crate::battery::fraction_of;
+
+const HEARTBEAT: u32 = 0;
+const SYS_STATUS: u32 = 1;
+const SYSTEM_TIME: u32 = 2;
+const SCALED_IMU: u32 = 26;
+const RAW_IMU: u32 = 27;
+const ATTITUDE: u32 = 30;
+const ATTITUDE_QUATERNION: u32 = 31;
+const LOCAL_POSITION_NED: u32 = 32;
+pub(super) const GPS_GLOBAL_ORIGIN: u32 = 49;
+const VFR_HUD: u32 = 74;
+const BATTERY_STATUS: u32 = 147;
+const AUTOPILOT_VERSION: u32 = 148;
+const EKF_STATUS_REPORT: u32 = 193;
+const HOME_POSITION: u32 = 242;
+const EXTENDED_SYS_STATE: u32 = 245;
+
+/// Everything that can be streamed, with its interval at boot; 0 is off. [us]
+const DEFAULTS: [(u32, i32); 14] = [
+    (HEARTBEAT, 1_000_000),
+    (SYS_STATUS, 250_000),
+    (SYSTEM_TIME, 1_000_000),
+    (SCALED_IMU, 0),
+    (RAW_IMU, 250_000),
+    (ATTITUDE, 250_000),
+    (ATTITUDE_QUATERNION, 0),
+    (LOCAL_POSITION_NED, 250_000),
+    (GPS_GLOBAL_ORIGIN, 0),
+    (VFR_HUD, 250_000),
+    (BATTERY_STATUS, 1_000_000),
+    (EKF_STATUS_REPORT, 250_000),
+    (HOME_POSITION, 0),
+    (EXTENDED_SYS_STATE, 500_000),
+];
+
+/// Fastest stream: the main loop's rate. [us]
+const LEAST_INTERVAL_US: i32 = 2_500;
+
+/// When each message is due.
+#[derive(Clone, Debug)]
+pub(super) struct Streams {
+    rows: [Stream; DEFAULTS.len()],
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Stream {
+    id: u32,
+    /// 0 is off. [us]
+    interval_us: i32,
+    due: AutopilotTime,
+}
+
+impl Default for Streams {
+    fn default() -> Self {
+        let rows =
+            DEFAULTS.map(|(id, interval_us)| Stream { id, interval_us, due: AutopilotTime::ZERO });
+        Self { rows }
+    }
+}
+
+impl Streams {
+    /// Sets an interval as SET_MESSAGE_INTERVAL does: 0 is the default, -1 is off. [us]
+    pub(super) fn set_interval(&mut self, id: u32, interval_us: f32) -> bool {
+        let Some(index) = self.rows.iter().position(|row| row.id == id) else { return false };
+        if !interval_us.is_finite() {
+            return false;
+        }
+        let row = &mut self.rows[index];
+        row.interval_us = if interval_us < 0.0 {
+            0
+        } else if interval_us == 0.0 {
+            DEFAULTS[index].1
+        } else {
+            (interval_us as i32).max(LEAST_INTERVAL_US)
+        };
+        true
+    }
+
+    /// Returns an interval as MESSAGE_INTERVAL reports it: -1 is off; `None` if unknown. [us]
+    pub(super) fn interval_us(&self, id: u32) -> Option<i32> {
+        let row = self.rows.iter().find(|row| row.id == id)?;
+        Some(if row.interval_us == 0 { -1 } else { row.interval_us })
+    }
+
+    /// Sets the rate of one of the old stream groups; 0 is off. [Hz]
+    pub(super) fn request_group(&mut self, group: MavDataStream, rate_hz: u16) {
+        let ids: &[u32] = match group {
+            MavDataStream::MAV_DATA_STREAM_ALL => &[
+                SYS_STATUS,
+                SYSTEM_TIME,
+                RAW_IMU,
+                ATTITUDE,
+                LOCAL_POSITION_NED,
+                VFR_HUD,
+                BATTERY_STATUS,
+                EKF_STATUS_REPORT,
+                EXTENDED_SYS_STATE,
+            ],
+            MavDataStream::MAV_DATA_STREAM_RAW_SENSORS => &[RAW_IMU],
+            MavDataStream::MAV_DATA_STREAM_EXTENDED_STATUS => &[SYS_STATUS],
+            MavDataStream::MAV_DATA_STREAM_POSITION => &[LOCAL_POSITION_NED],
+            MavDataStream::MAV_DATA_STREAM_EXTRA1 => &[ATTITUDE],
+            MavDataStream::MAV_DATA_STREAM_EXTRA2 => &[VFR_HUD],
+            MavDataStream::MAV_DATA_STREAM_EXTRA3 => {
+                &[SYSTEM_TIME, BATTERY_STATUS, EKF_STATUS_REPORT]
+            }
+            _ => &[],
+        };
+        let interval_us = if rate_hz == 0 { -1.0 } else { 1e6 / f32::from(rate_hz) };
+        for &id in ids {
+            self.set_interval(id, interval_us);
+        }
+    }
+
+    /// Makes the next heartbeat due at once: a change of mode or arming should not wait.
+    pub(super) fn heartbeat_now(&mut self) {
+        self.rows[0].due = AutopilotTime::ZERO;
+    }
+}
+
+impl Autopilot {
+    /// Sends what is due.
+    pub(super) fn stream(&mut self, now: AutopilotTime) {
+        for index in 0..self.streams.rows.len() {
+            let row = self.streams.rows[index];
+            if row.interval_us == 0 || now < row.due {
+                continue;
+            }
+            // On the grid of its interval, unless it has fallen behind a whole one.
+            let step_ns = i64::from(row.interval_us) * 1000;
+            let on_grid = row.due.plus_ns(step_ns);
+            self.streams.rows[index].due =
+                if on_grid > now { on_grid } else { now.plus_ns(step_ns) };
+            if let Some(message) = self.message(now, row.id) {
+                self.send(message);
+            }
+        }
+    }
+
+    /// Makes a message by its id; `None` if unknown, or if there is nothing to report.
+    pub(super) fn message(&self, now: AutopilotTime, id: u32) -> Option<MavMessage> {
+        let boot_ms = (now.as_ns() / 1_000_000) as u32;
+        let estimate = self.estimator.estimate();
+        Some(match id {
+            HEARTBEAT => self.heartbeat(),
+            SYS_STATUS => self.sys_status(now),
+            SYSTEM_TIME => MavMessage::SYSTEM_TIME(dialect::SYSTEM_TIME_DATA {
+                // No battery-backed clock on board.
+                time_unix_usec: 0,
+                time_boot_ms: boot_ms,
+            }),
+            SCALED_IMU => {
+                let (a, g) = self.imu_numbers();
+                MavMessage::SCALED_IMU(dialect::SCALED_IMU_DATA {
+                    time_boot_ms: boot_ms,
+                    xacc: a[0],
+                    yacc: a[1],
+                    zacc: a[2],
+                    xgyro: g[0],
+                    ygyro: g[1],
+                    zgyro: g[2],
+                    ..Default::default()
+                })
+            }
+            RAW_IMU => {
+                let (a, g) = self.imu_numbers();
+                MavMessage::RAW_IMU(dialect::RAW_IMU_DATA {
+                    time_usec: now.as_ns() / 1000,
+                    xacc: a[0],
+                    yacc: a[1],
+                    zacc: a[2],
+                    xgyro: g[0],
+                    ygyro: g[1],
+                    zgyro: g[2],
+                    ..Default::default()
+                })
+            }
+            ATTITUDE => MavMessage::ATTITUDE(attitude_to_mavlink(
+                estimate.world_from_body,
+                estimate.omega_body_radps,
+                boot_ms,
+            )),
+            ATTITUDE_QUATERNION => {
+                let q = ned_rotation_from_world(estimate.world_from_body);
+                let rates = frd_from_body(estimate.omega_body_radps);
+                MavMessage::ATTITUDE_QUATERNION(dialect::ATTITUDE_QUATERNION_DATA {
+                    time_boot_ms: boot_ms,
+                    q1: q.w as f32,
+                    q2: q.x as f32,
+                    q3: q.y as f32,
+                    q4: q.z as f32,
+                    rollspeed: rates.x as f32,
+                    pitchspeed: rates.y as f32,
+                    yawspeed: rates.z as f32,
+                    ..Default::default()
+                })
+            }
+            LOCAL_POSITION_NED => {
+                // Not reported before there is a position, nor once it is lost.
+                if !self.estimator.health(now).position {
+                    return None;
+                }
+                MavMessage::LOCAL_POSITION_NED(local_position_to_mavlink(
+                    estimate.p_world_m,
+                    estimate.v_world_mps,
+                    boot_ms,
+                ))
+            }
+            GPS_GLOBAL_ORIGIN => {
+                let (latitude, longitude, altitude) = self.origin?;
+                MavMessage::GPS_GLOBAL_ORIGIN(dialect::GPS_GLOBAL_ORIGIN_DATA {
+                    latitude,
+                    longitude,
+                    altitude,
+                    time_usec: now.as_ns() / 1000,
+                })
+            }
+            VFR_HUD => MavMessage::VFR_HUD(dialect::VFR_HUD_DATA {
+                airspeed: 0.0,
+                groundspeed: estimate.v_world_mps.truncate().length() as f32,
+                alt: estimate.p_world_m.z as f32,
+                climb: estimate.v_world_mps.z as f32,
+                heading: yaw_ned_from_world(yaw_of(estimate.world_from_body))
+                    .to_degrees()
+                    .rem_euclid(360.0) as i16,
+                throttle: self.throttle_percent(),
+            }),
+            BATTERY_STATUS => self.battery_status(),
+            AUTOPILOT_VERSION => self.autopilot_version(),
+            EKF_STATUS_REPORT => self.ekf_status(now),
+            HOME_POSITION => self.home_position(now)?,
+            EXTENDED_SYS_STATE => {
+                MavMessage::EXTENDED_SYS_STATE(dialect::EXTENDED_SYS_STATE_DATA {
+                    vtol_state: MavVtolState::MAV_VTOL_STATE_UNDEFINED,
+                    landed_state: self.landed_state(),
+                })
+            }
+            _ => return None,
+        })
+    }
+
+    fn heartbeat(&self) -> MavMessage {
+        let mut base_mode = MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            | MavModeFlag::MAV_MODE_FLAG_STABILIZE_ENABLED;
+        base_mode |= match self.mode {
+            CopterMode::Guided | CopterMode::Loiter | CopterMode::Rtl | CopterMode::Brake => {
+                MavModeFlag::MAV_MODE_FLAG_GUIDED_ENABLED
+            }
+            CopterMode::Stabilize | CopterMode::AltHold | CopterMode::Land => {
+                MavModeFlag::MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+            }
+        };
+        if self.armed {
+            base_mode |= MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED;
+        }
+        let system_status = if self.failsafe.ekf || self.failsafe.gcs && self.armed {
+            MavState::MAV_STATE_CRITICAL
+        } else if self.armed && !self.landed {
+            MavState::MAV_STATE_ACTIVE
+        } else {
+            MavState::MAV_STATE_STANDBY
+        };
+        MavMessage::HEARTBEAT(dialect::HEARTBEAT_DATA {
+            custom_mode: self.mode as u32,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base_mode,
+            system_status,
+            mavlink_version: 3,
+        })
+    }
+
+    fn sys_status(&self, now: AutopilotTime) -> MavMessage {
+        let present = MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_GYRO
+            | MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_ACCEL
+            | MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+            | MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_VISION_POSITION
+            | MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+            | MavSysStatusSensor::MAV_SYS_STATUS_AHRS
+            | MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_BATTERY
+            | MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
+        let estimator = self.estimator.health(now);
+        let mut health = present;
+        health.set(MavSysStatusSensor::MAV_SYS_STATUS_AHRS, estimator.attitude);
+        health.set(MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_VISION_POSITION, estimator.vision);
+        let ready = self.armed || self.arming_refusal(now).is_none();
+        health.set(MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK, ready);
+        MavMessage::SYS_STATUS(dialect::SYS_STATUS_DATA {
+            onboard_control_sensors_present: present,
+            onboard_control_sensors_enabled: present,
+            onboard_control_sensors_health: health,
+            load: 100,
+            voltage_battery: (self.sample.battery_v * 1000.0) as u16,
+            current_battery: (self.sample.battery_a * 100.0) as i16,
+            battery_remaining: self.battery_percent(),
+            ..Default::default()
+        })
+    }
+
+    fn battery_percent(&self) -> i8 {
+        (fraction_of(self.sample.battery_v) * 100.0) as i8
+    }
+
+    fn battery_status(&self) -> MavMessage {
+        // Cells that are not there read 65535.
+        let mut voltages = [u16::MAX; 10];
+        voltages[0] = (self.sample.battery_v * 1000.0) as u16;
+        MavMessage::BATTERY_STATUS(dialect::BATTERY_STATUS_DATA {
+            current_consumed: -1,
+            energy_consumed: -1,
+            temperature: i16::MAX,
+            voltages,
+            current_battery: (self.sample.battery_a * 100.0) as i16,
+            battery_remaining: self.battery_percent(),
+            ..Default::default()
+        })
+    }
+
+    fn ekf_status(&self, now: AutopilotTime) -> MavMessage {
+        let health = self.estimator.health(now);
+        let mut flags = EkfStatusFlags::empty();
+        flags.set(EkfStatusFlags::EKF_ATTITUDE, health.attitude);
+        flags.set(EkfStatusFlags::EKF_UNINITIALIZED, !health.attitude);
+        let known = EkfStatusFlags::EKF_VELOCITY_HORIZ
+            | EkfStatusFlags::EKF_VELOCITY_VERT
+            | EkfStatusFlags::EKF_POS_HORIZ_REL
+            | EkfStatusFlags::EKF_POS_HORIZ_ABS
+            | EkfStatusFlags::EKF_POS_VERT_ABS
+            | EkfStatusFlags::EKF_PRED_POS_HORIZ_REL
+            | EkfStatusFlags::EKF_PRED_POS_HORIZ_ABS;
+        flags.set(known, health.position);
+        flags.set(EkfStatusFlags::EKF_CONST_POS_MODE, health.attitude && !health.position);
+        let (p, v, yaw) = self.estimator.sigmas();
+        MavMessage::EKF_STATUS_REPORT(dialect::EKF_STATUS_REPORT_DATA {
+            velocity_variance: v as f32,
+            pos_horiz_variance: p as f32,
+            pos_vert_variance: p as f32,
+            compass_variance: yaw as f32,
+            terrain_alt_variance: 0.0,
+            flags,
+            airspeed_variance: 0.0,
+        })
+    }
+
+    /// Accelerations [mg, FRD] and rates [mrad/s, FRD].
+    fn imu_numbers(&self) -> ([i16; 3], [i16; 3]) {
+        let whole = |v: DVec3| v.to_array().map(|x| x as i16);
+        (
+            whole(frd_from_body(self.sample.accel_body_mps2) * (1000.0 / GRAVITY_MPS2)),
+            whole(frd_from_body(self.sample.gyro_body_radps) * 1000.0),
+        )
+    }
+
+    fn home_position(&self, now: AutopilotTime) -> Option<MavMessage> {
+        let (latitude, longitude, altitude) = self.origin?;
+        let p = ned_from_world(self.home?);
+        Some(MavMessage::HOME_POSITION(dialect::HOME_POSITION_DATA {
+            latitude,
+            longitude,
+            altitude,
+            x: p.x as f32,
+            y: p.y as f32,
+            z: p.z as f32,
+            q: [1.0, 0.0, 0.0, 0.0],
+            time_usec: now.as_ns() / 1000,
+            ..Default::default()
+        }))
+    }
+
+    fn landed_state(&self) -> MavLandedState {
+        if self.landed {
+            MavLandedState::MAV_LANDED_STATE_ON_GROUND
+        } else if matches!(self.guided, Guided::TakeOff { .. }) {
+            MavLandedState::MAV_LANDED_STATE_TAKEOFF
+        } else if self.mode == CopterMode::Land {
+            MavLandedState::MAV_LANDED_STATE_LANDING
+        } else {
+            MavLandedState::MAV_LANDED_STATE_IN_AIR
+        }
+    }
+
+    pub(super) fn autopilot_version(&self) -> MavMessage {
+        MavMessage::AUTOPILOT_VERSION(dialect::AUTOPILOT_VERSION_DATA {
+            capabilities: MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_MAVLINK2,
+            // The ArduCopter whose behaviour this follows: 4.8.0, development version.
+            flight_sw_version: 4 << 24 | 8 << 16,
+            ..Default::default()
+        })
+    }
+}

@@ -1,0 +1,71 @@
+//! Turns a step of the velocity target into a velocity that a vehicle can follow: acceleration
+//! and jerk stay within limits, and the end is reached without overshoot.
+
+use glam::DVec3;
+
+/// How hard the end of a change is approached, as a first-order rate. [1/s]
+const APPROACH: f64 = 8.0;
+
+/// Returns the rate at which an error may be closed: proportional when small, and along the square
+/// root curve of constant deceleration `limit` when large (ArduPilot's `sqrt_controller`).
+pub fn sqrt_rate(error: f64, gain: f64, limit: f64) -> f64 {
+    let linear = limit / (gain * gain);
+    if error.abs() <= linear {
+        gain * error
+    } else {
+        (2.0 * limit * (error.abs() - linear / 2.0)).sqrt().copysign(error)
+    }
+}
+
+/// Applies [`sqrt_rate`] to a vector's length.
+pub fn sqrt_rate_vector(error: DVec3, gain: f64, limit: f64) -> DVec3 {
+    error.normalize_or_zero() * sqrt_rate(error.length(), gain, limit)
+}
+
+/// A velocity on its way to a target.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ShapedVelocity {
+    /// Velocity. [m/s]
+    pub v: DVec3,
+    /// Acceleration. [m/s^2]
+    pub a: DVec3,
+}
+
+impl ShapedVelocity {
+    /// Moves on by `dt_s` towards `target` within an acceleration and a jerk limit.
+    pub fn approach(&mut self, target: DVec3, a_limit: f64, j_limit: f64, dt_s: f64) {
+        // Half of the jerk is planned for the end, the rest is there to follow the plan.
+        let wanted =
+            sqrt_rate_vector(target - self.v, APPROACH, j_limit / 2.0).clamp_length_max(a_limit);
+        self.a += (wanted - self.a).clamp_length_max(j_limit * dt_s);
+        self.v += self.a * dt_s;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn limits_hold_and_the_target_is_met_without_overshoot(
+            target in prop::array::uniform3(-6.0..6.0f64),
+            start in prop::array::uniform3(-6.0..6.0f64),
+            a_limit in 1.0..10.0f64, j_limit in 20.0..100.0f64,
+        ) {
+            let (target, start, dt_s) = (DVec3::from(target), DVec3::from(start), 0.0025);
+            let mut shaped = ShapedVelocity { v: start, a: DVec3::ZERO };
+            let step = (target - start).length();
+            for _ in 0..6000 {
+                let before = shaped;
+                shaped.approach(target, a_limit, j_limit, dt_s);
+                prop_assert!(shaped.a.length() <= a_limit + 1e-9);
+                prop_assert!((shaped.a - before.a).length() <= j_limit * dt_s + 1e-9);
+                let done = (shaped.v - start).dot((target - start).normalize_or_zero());
+                prop_assert!(done <= step * 1.02 + 0.05, "overshoot {done} of {step}");
+            }
+            prop_assert!((shaped.v - target).length() < 0.02);
+        }
+    }
+}

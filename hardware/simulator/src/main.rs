@@ -1,0 +1,18 @@
+//! The simulated lab as a program of its own; `vizflyt sim` is the same.
+
+use clap::Parser;
+use vizflyt_simulator::{SimArgs, run};
+
+#[derive(Parser)]
+#[command(name = "vizflyt-simulator", version, about)]
+struct Command {
+    #[command(flatten)]
+    args: SimArgs,
+}
+
+fn main() -> anyhow::Result<()> {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    run(Command::parse().args)
+}

@@ -1,0 +1,219 @@
+//! The whole lab on one virtual clock: airframe, sensors, autopilot, mocap, referee. Sans-IO: the
+//! caller turns the crank with [`Simulation::tick`] and carries bytes.
+//!
+//! One tick is 2.5 ms: two physics steps, one sensor sample, one turn of the autopilot, and every
+//! second time a mocap pose.
+
+use glam::DVec3;
+use serde::Serialize;
+use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET};
+use vizflyt_protocol::time::AutopilotTime;
+
+use crate::airframe::{Airframe, AirframeState};
+use crate::autopilot::{Autopilot, UnknownParam};
+use crate::battery::Battery;
+use crate::imu::Imu;
+use crate::mocap::{DATAGRAM, Mocap, MocapConfig};
+use crate::truth::{Truth, TruthReport};
+
+/// Ticks a second: the rate of ArduCopter's main loop. [Hz]
+pub const TICK_HZ: u64 = 400;
+const TICK_NS: i64 = 1_000_000_000 / TICK_HZ.cast_signed();
+const TICK_S: f64 = 1.0 / TICK_HZ as f64;
+/// Physics steps a tick: 800 Hz.
+const STEPS: u32 = 2;
+
+/// The lab as it stands at the start.
+#[derive(Clone, Debug)]
+pub struct SimulationConfig {
+    /// Where the vehicle stands; z is the floor. [m, world]
+    pub spawn_m: DVec3,
+    /// Which way it looks. [rad, world]
+    pub spawn_yaw_rad: f64,
+    /// Seed of all noise.
+    pub seed: u64,
+    /// Obstacles of the virtual scene, for the referee only: the vehicle flies through them.
+    pub obstacles: Vec<Volume>,
+    /// Radius of the vehicle's body, for the referee. [m]
+    pub body_radius_m: f64,
+    /// The motion capture; its seed is replaced by `seed`.
+    pub mocap: MocapConfig,
+    /// Autopilot parameters that differ from the defaults.
+    pub params: Vec<(String, f32)>,
+    /// Wind. [m/s, world]
+    pub wind_world_mps: DVec3,
+}
+
+impl Default for SimulationConfig {
+    fn default() -> Self {
+        Self {
+            spawn_m: DVec3::ZERO,
+            spawn_yaw_rad: 0.0,
+            seed: 0,
+            obstacles: Vec::new(),
+            body_radius_m: 0.12,
+            mocap: MocapConfig::default(),
+            params: Vec::new(),
+            wind_world_mps: DVec3::ZERO,
+        }
+    }
+}
+
+/// What the simulation reports at its end.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SimulationReport {
+    /// The referee's figures.
+    #[serde(flatten)]
+    pub truth: TruthReport,
+    /// Horizontal error of the autopilot's estimate in flight, root mean square. [m]
+    pub estimate_error_m_rms: f64,
+    /// Motors may turn.
+    pub armed: bool,
+    /// ArduCopter's mode number.
+    pub mode: u32,
+    /// Simulated time since the start. [s]
+    pub seconds: f64,
+    /// MAVLink packets received.
+    pub mavlink_packets_in: u64,
+    /// MAVLink packets sent.
+    pub mavlink_packets_out: u64,
+    /// Mocap poses sent.
+    pub mocap_poses: u64,
+}
+
+/// The lab.
+pub struct Simulation {
+    now: AutopilotTime,
+    airframe: Airframe,
+    imu: Imu,
+    battery: Battery,
+    autopilot: Autopilot,
+    mocap: Mocap,
+    truth: Truth,
+    motors: [f64; 4],
+    packets_out: u64,
+    mocap_poses: u64,
+    error_square_sum: f64,
+    error_samples: u64,
+}
+
+impl Simulation {
+    /// Puts the vehicle down and boots the autopilot.
+    ///
+    /// # Errors
+    /// Returns the first parameter name that the autopilot does not have.
+    pub fn new(config: SimulationConfig) -> Result<Self, UnknownParam> {
+        let mut airframe = Airframe::standing(config.spawn_m, config.spawn_yaw_rad);
+        airframe.set_wind(config.wind_world_mps);
+        Ok(Self {
+            now: AutopilotTime::ZERO,
+            airframe,
+            imu: Imu::new(config.seed),
+            battery: Battery::default(),
+            autopilot: Autopilot::with_params(&config.params)?,
+            mocap: Mocap::new(MocapConfig { seed: config.seed, ..config.mocap }),
+            truth: Truth::new(&config.obstacles, config.body_radius_m, config.spawn_m.z),
+            motors: [0.0; 4],
+            packets_out: 0,
+            mocap_poses: 0,
+            error_square_sum: 0.0,
+            error_samples: 0,
+        })
+    }
+
+    /// Returns the time since boot.
+    pub fn now(&self) -> AutopilotTime {
+        self.now
+    }
+
+    /// Returns the true state of the vehicle.
+    pub fn state(&self) -> &AirframeState {
+        self.airframe.state()
+    }
+
+    /// Returns the autopilot.
+    pub fn autopilot(&self) -> &Autopilot {
+        &self.autopilot
+    }
+
+    /// Sets the wind. [m/s, world]
+    pub fn set_wind(&mut self, wind_world_mps: DVec3) {
+        self.airframe.set_wind(wind_world_mps);
+    }
+
+    /// Takes bytes of the MAVLink link.
+    pub fn handle_mavlink(&mut self, bytes: &[u8]) {
+        self.autopilot.handle_input(self.now, bytes);
+    }
+
+    /// Returns the next MAVLink packet to send.
+    pub fn poll_mavlink<'a>(&mut self, buffer: &'a mut [u8; MAX_PACKET]) -> Option<&'a [u8]> {
+        let packet = self.autopilot.poll_transmit(buffer)?;
+        self.packets_out += 1;
+        Some(packet)
+    }
+
+    /// Returns the next mocap datagram to send.
+    pub fn poll_mocap(&mut self) -> Option<[u8; DATAGRAM]> {
+        let datagram = self.mocap.poll_transmit(self.now)?;
+        self.mocap_poses += 1;
+        Some(datagram)
+    }
+
+    /// Goes on by one tick of 2.5 ms.
+    pub fn tick(&mut self) {
+        let dt_s = TICK_S / f64::from(STEPS);
+        let mut felt_body = DVec3::ZERO;
+        let mut omega_body = DVec3::ZERO;
+        for _ in 0..STEPS {
+            omega_body += self.airframe.state().omega_body_radps / 2.0;
+            self.airframe.tick(self.motors, dt_s);
+            felt_body += self.airframe.specific_force_body_mps2();
+            omega_body += self.airframe.state().omega_body_radps / 2.0;
+            let (armed, mode) = (self.autopilot.is_armed(), self.autopilot.mode());
+            self.truth.tick(self.airframe.state(), armed, mode, dt_s);
+        }
+        self.now = self.now.plus_ns(TICK_NS);
+        let state = *self.airframe.state();
+        self.battery.tick(state.rotor_speed, TICK_S);
+
+        let steps = f64::from(STEPS);
+        let mut sample =
+            self.imu.sample(felt_body / steps, omega_body / steps, state.p_world_m.z, TICK_S);
+        sample.battery_v = self.battery.voltage_v();
+        sample.battery_a = self.battery.current_a();
+        self.motors = self.autopilot.handle_sensors(self.now, &sample, TICK_S);
+        self.autopilot.handle_timeout(self.now);
+        self.mocap.handle_truth(self.now, &state.pose());
+
+        if self.autopilot.is_armed() && !self.autopilot.is_landed() {
+            let error = self.autopilot.estimator().estimate().p_world_m - state.p_world_m;
+            self.error_square_sum += error.truncate().length_squared();
+            self.error_samples += 1;
+        }
+    }
+
+    /// Returns the figures so far.
+    pub fn report(&self) -> SimulationReport {
+        SimulationReport {
+            truth: self.truth.report(),
+            estimate_error_m_rms: (self.error_square_sum / (self.error_samples.max(1)) as f64)
+                .sqrt(),
+            armed: self.autopilot.is_armed(),
+            mode: self.autopilot.mode() as u32,
+            seconds: self.now.seconds_since(AutopilotTime::ZERO),
+            mavlink_packets_in: self.autopilot.link_stats().packets,
+            mavlink_packets_out: self.packets_out,
+            mocap_poses: self.mocap_poses,
+        }
+    }
+
+    /// Whether the flight is over: flown, landed and disarmed.
+    pub fn is_over(&self) -> bool {
+        self.truth.report().landed && self.autopilot.mode() == CopterMode::Land
+    }
+}
+
+#[cfg(test)]
+mod tests;
