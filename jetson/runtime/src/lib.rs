@@ -3,3 +3,7 @@
 pub mod flight;
 pub mod guard;
 pub mod link;
+pub mod log;
+pub mod report;
+pub mod stats;
+pub mod supervisor;

@@ -84,6 +84,22 @@ impl<'m> ObservationWriter<'m> {
         Ok(Self { memory, layout })
     }
 
+    /// Goes on writing an observation of these cameras that [`Self::new`] started in `memory`.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn resume(
+        memory: &'m mut [u8],
+        cameras: &[CameraInfo],
+    ) -> Result<Self, ObservationTooLarge> {
+        let layout = layout_of(cameras);
+        let found = memory.len();
+        if found < layout.total_len || ObservationHeader::mut_from_prefix(memory).is_err() {
+            return Err(ObservationTooLarge { needed: layout.total_len, found });
+        }
+        Ok(Self { memory, layout })
+    }
+
     fn header(&mut self) -> &mut ObservationHeader {
         ObservationHeader::mut_from_prefix(self.memory).expect("checked in `new`").0
     }

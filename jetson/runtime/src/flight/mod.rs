@@ -20,7 +20,7 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint};
 use vizflyt_protocol::time::HostTime;
 
-use crate::guard::{Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, Stance};
+use crate::guard::{Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, SETPOINT_HOLD_S, Stance};
 use crate::link::{Goal, LinkEvent};
 pub use outcome::{Outcome, OutcomeKind};
 
@@ -58,6 +58,8 @@ pub enum Input {
         /// What it asks for.
         setpoint: Option<Setpoint>,
     },
+    /// The server will not have us, and trying again will not help; why, in a sentence.
+    ServerRefused(String),
     /// The plugin is no more; why, in a sentence.
     PluginFailed(String),
     /// A person ends the flight.
@@ -110,7 +112,7 @@ const LAND_WITHIN_S: f64 = 60.0;
 /// Without a link, whether the vehicle has landed cannot be known; wait this long. [s]
 const LOST_WHILE_LANDING_S: f64 = 10.0;
 /// After an interrupt: time for LAND to be confirmed. [s]
-const INTERRUPT_S: f64 = 1.5;
+const INTERRUPT_S: f64 = 1.0;
 /// How often to say what is being waited for. [s]
 const REMIND_S: f64 = 5.0;
 /// How often to say that setpoints are refused. [s]
@@ -128,7 +130,7 @@ pub struct Flight {
     start_z_m: f64,
     took_off_at: Option<HostTime>,
     plugin_ready: bool,
-    image_answered: bool,
+    answered_at: Option<HostTime>,
     /// Oldest image that the plugin has not answered: its number, and when it got it.
     unanswered: Option<(u64, HostTime)>,
     guard: Option<Guard>,
@@ -157,7 +159,7 @@ impl Flight {
             start_z_m: 0.0,
             took_off_at: None,
             plugin_ready: false,
-            image_answered: false,
+            answered_at: None,
             unanswered: None,
             guard: None,
             stance: None,
@@ -211,6 +213,7 @@ impl Flight {
             }
             Input::Server(event) => self.handle_server(now, &event),
             Input::Link(event) => self.handle_link(now, event),
+            Input::ServerRefused(why) => self.end_now(now, OutcomeKind::Error, why),
             Input::PluginReady => self.plugin_ready = true,
             Input::ImagePublished { seq } => {
                 self.unanswered.get_or_insert((seq, now));
@@ -313,7 +316,7 @@ impl Flight {
     }
 
     fn handle_answer(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
-        self.image_answered = true;
+        self.answered_at = Some(now);
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
             self.unanswered = None;
         }
@@ -351,7 +354,7 @@ impl Flight {
             Some("the vehicle is armed already; disarm it first")
         } else if pose_age_s.is_none_or(|age_s| age_s > POSE_HOLD_S) {
             Some("the server has no pose of the vehicle; check the localization and --vehicle")
-        } else if !self.image_answered {
+        } else if self.answered_at.is_none() {
             Some("the plugin has not answered an image yet")
         } else {
             link.ready_to_arm.err()
@@ -402,7 +405,8 @@ impl Flight {
         } else if link.connected && link.mode != CopterMode::Guided as u32 {
             self.taken_over(now, link.mode);
         }
-        let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, self.phase_flies())
+        let flies = self.phase_flies();
+        let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, flies)
         else {
             return Orders { goal: self.goal(), setpoint: None };
         };
@@ -554,14 +558,10 @@ impl Flight {
     fn verdict(&self, now: HostTime, reason: LandReason) -> (OutcomeKind, String) {
         match reason {
             LandReason::Asked => (OutcomeKind::Landed, "the plugin asked to land".into()),
-            LandReason::NoSetpoint(_) => {
-                let kind = if self.unanswered.is_some() {
-                    OutcomeKind::PluginFailed
-                } else {
-                    OutcomeKind::Error
-                };
-                (kind, self.why_silent(now))
+            LandReason::NoSetpoint(_) if self.sees_nothing(now) => {
+                (OutcomeKind::Error, self.why_silent(now))
             }
+            LandReason::NoSetpoint(_) => (OutcomeKind::PluginFailed, self.why_silent(now)),
             LandReason::PoseLost(age_s) => {
                 (OutcomeKind::Error, format!("pose lost for {age_s:.1} s"))
             }
@@ -572,6 +572,12 @@ impl Flight {
         }
     }
 
+    /// Whether the plugin is idle because no image comes.
+    fn sees_nothing(&self, now: HostTime) -> bool {
+        self.unanswered.is_none()
+            && self.answered_at.is_none_or(|at| now.seconds_since(at) >= SETPOINT_HOLD_S)
+    }
+
     /// Why no setpoint comes: the plugin, or nothing for it to see.
     fn why_silent(&self, now: HostTime) -> String {
         match self.unanswered {
@@ -579,10 +585,8 @@ impl Flight {
                 let silent_s = now.seconds_since(at);
                 format!("the plugin has not answered image {seq} for {silent_s:.1} s")
             }
-            None if self.image_answered => {
-                "no setpoint comes: no new image, or the plugin answers without one".into()
-            }
-            None => "no image has come".into(),
+            None if self.sees_nothing(now) => "no image has come from the server".into(),
+            None => "the plugin answers images without a setpoint".into(),
         }
     }
 }

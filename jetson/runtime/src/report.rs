@@ -1,0 +1,107 @@
+//! The report at the end of a flight: figures in one JSON object.
+
+use std::fs;
+
+use serde::{Deserialize, Serialize};
+
+use crate::flight::{Outcome, OutcomeKind};
+use crate::stats::ImageTimes;
+
+/// The report. Field names carry their units.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// How the flight ended.
+    pub outcome: OutcomeKind,
+    /// Why, in one sentence.
+    pub reason: String,
+    /// From take-off to the end. [s]
+    pub seconds: f64,
+    /// Images that reached the plugin.
+    pub images_delivered: u64,
+    /// Images that reached the plugin per second. [Hz]
+    pub image_hz: f64,
+    /// Width of the first camera's images. [px]
+    pub image_width: u32,
+    /// Height of the first camera's images. [px]
+    pub image_height: u32,
+    /// Pose stamp to plugin callback, median. [ms]
+    pub age_ms_p50: f64,
+    /// Pose stamp to plugin callback, 99th percentile. [ms]
+    pub age_ms_p99: f64,
+    /// Time inside the plugin's `on_image`, median. [ms]
+    pub plugin_ms_p50: f64,
+    /// Setpoints sent to the autopilot.
+    pub setpoints_sent: u64,
+    /// MAVLink packets sent and received.
+    pub mavlink_packets: u64,
+    /// Most memory this process has held. [MB]
+    pub peak_rss_mb: f64,
+    /// The flight log, if one was written.
+    pub log: Option<String>,
+}
+
+/// Counters that the report adds to the outcome.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Counters {
+    /// From take-off to the end. [s]
+    pub seconds: f64,
+    /// Width and height of the first camera's images. [px]
+    pub image_size_px: (u32, u32),
+    /// Setpoints sent to the autopilot.
+    pub setpoints_sent: u64,
+    /// MAVLink packets sent and received.
+    pub mavlink_packets: u64,
+}
+
+impl Report {
+    /// Makes the report.
+    pub fn new(outcome: &Outcome, times: &ImageTimes, counters: &Counters) -> Self {
+        Self {
+            outcome: outcome.kind,
+            reason: outcome.reason.clone(),
+            seconds: counters.seconds,
+            images_delivered: times.delivered(),
+            image_hz: times.rate_hz(),
+            image_width: counters.image_size_px.0,
+            image_height: counters.image_size_px.1,
+            age_ms_p50: times.ages().quantile_ms(0.5),
+            age_ms_p99: times.ages().quantile_ms(0.99),
+            plugin_ms_p50: times.plugin().quantile_ms(0.5),
+            setpoints_sent: counters.setpoints_sent,
+            mavlink_packets: counters.mavlink_packets,
+            peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
+            log: None,
+        }
+    }
+}
+
+/// Returns the most memory this process has held (`VmHWM`); `None` where the system does not
+/// tell. [MB]
+pub fn peak_rss_mb() -> Option<f64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024.0 / 1e6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn peak_memory_is_told() {
+        let mb = peak_rss_mb().unwrap();
+        assert!(mb > 0.5 && mb < 100_000.0, "{mb}");
+    }
+
+    #[test]
+    fn names_are_those_agreed_on() {
+        let outcome = Outcome { kind: OutcomeKind::PluginFailed, reason: "why".into() };
+        let report = Report::new(&outcome, &ImageTimes::default(), &Counters::default());
+        let json = serde_json::to_value(&report).unwrap();
+        assert_eq!(json["outcome"], "plugin_failed");
+        for key in ["age_ms_p99", "image_hz", "setpoints_sent", "mavlink_packets", "peak_rss_mb"] {
+            assert!(json[key].is_number(), "{key}");
+        }
+    }
+}
