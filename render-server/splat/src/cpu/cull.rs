@@ -1,0 +1,113 @@
+//! Pass 1: which blocks of splats can touch the image.
+//!
+//! Budget: 5 planes per block of 256 splats, 20 us per million splats.
+
+use glam::{DMat3, Vec3};
+
+use super::scene::{Block, Scene};
+use crate::Camera;
+use crate::limits::{BLUR_PX2, JACOBIAN_MARGIN};
+
+/// A camera in the numbers the passes use; f32, but for what is computed once per image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct View {
+    pub(super) width_px: u32,
+    pub(super) height_px: u32,
+    /// Rows of the rotation to the camera's axes.
+    pub(super) rows: [Vec3; 3],
+    /// The camera's centre. [m, world]
+    pub(super) center_m: Vec3,
+    pub(super) near_m: f32,
+    pub(super) fx_px: f32,
+    pub(super) fy_px: f32,
+    pub(super) cx_px: f32,
+    pub(super) cy_px: f32,
+    /// Where `x/z` is clamped for the linearisation: least, greatest.
+    pub(super) slope_x: [f32; 2],
+    /// Where `y/z` is.
+    pub(super) slope_y: [f32; 2],
+    pub(super) background: [f32; 3],
+    planes: [Plane; 5],
+}
+
+/// `normal . (p - camera) + reach * weight >= offset` where a splat at `p` may touch the image.
+#[derive(Clone, Copy, Debug)]
+struct Plane {
+    normal: Vec3,
+    offset: f32,
+    weight: f32,
+}
+
+impl View {
+    /// Prepares a validated camera.
+    pub(super) fn new(camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        let rotation = DMat3::from_quat(camera.world_from_cam.rotation.normalize()).transpose();
+        let [x, y, z] = [rotation.row(0), rotation.row(1), rotation.row(2)];
+        let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
+        let slopes = |f: f64, c: f64, size: f64| {
+            let margin = JACOBIAN_MARGIN * 0.5 * size / f;
+            let (a, b) = (-c / f - margin, (size - c) / f + margin);
+            [a.min(b), a.max(b)]
+        };
+        let slope_x = slopes(k.fx_px, k.cx_px, w);
+        let slope_y = slopes(k.fy_px, k.cy_px, h);
+
+        // A splat's mean is at u = fx x/z + cx; its extent is at most
+        //   sqrt(reach^2 fx^2 (1 + jx^2) / z^2 + 2 ln(255) 0.3),
+        // with jx the clamped slope. Both sides times z > 0 are linear in the position: u + extent
+        // >= 0 becomes fx x + (cx + blur) z + reach fx sqrt(1 + jx^2) >= 0, and so on.
+        let blur = (2.0 * 255f64.ln() * BLUR_PX2).sqrt();
+        let steep = |f: f64, [a, b]: [f64; 2]| f * (1.0 + (a * a).max(b * b)).sqrt();
+        let (steep_x, steep_y) = (steep(k.fx_px, slope_x), steep(k.fy_px, slope_y));
+        let plane = |normal: glam::DVec3, weight: f64| {
+            let length = normal.length();
+            Plane {
+                normal: (normal / length).as_vec3(),
+                offset: 0.0,
+                weight: (weight / length) as f32,
+            }
+        };
+        let planes = [
+            Plane { normal: z.as_vec3(), offset: camera.near_m, weight: 0.0 },
+            plane(x * k.fx_px + z * (k.cx_px + blur), steep_x),
+            plane(-x * k.fx_px + z * (w - k.cx_px + blur), steep_x),
+            plane(y * k.fy_px + z * (k.cy_px + blur), steep_y),
+            plane(-y * k.fy_px + z * (h - k.cy_px + blur), steep_y),
+        ];
+        Self {
+            width_px: k.width_px,
+            height_px: k.height_px,
+            rows: [x.as_vec3(), y.as_vec3(), z.as_vec3()],
+            center_m: camera.world_from_cam.translation_m.as_vec3(),
+            near_m: camera.near_m,
+            fx_px: k.fx_px as f32,
+            fy_px: k.fy_px as f32,
+            cx_px: k.cx_px as f32,
+            cy_px: k.cy_px as f32,
+            slope_x: slope_x.map(|v| v as f32),
+            slope_y: slope_y.map(|v| v as f32),
+            background: camera.background,
+            planes,
+        }
+    }
+
+    /// Whether a splat of the block may touch the image.
+    fn sees(&self, block: &Block) -> bool {
+        let center = block.center_m - self.center_m;
+        self.planes.iter().all(|plane| {
+            let slack = plane.normal.abs().dot(block.half_m) + block.reach_m * plane.weight;
+            // The rounding of the sums, so that nothing is lost at the very edge.
+            let rounding = 1e-5 * (center.abs().max_element() + slack);
+            // Negated, so that an overflow to NaN keeps the block.
+            !(plane.normal.dot(center) + slack + rounding < plane.offset)
+        })
+    }
+}
+
+/// Lists the blocks that may touch the image.
+pub(super) fn cull(scene: &Scene, view: &View, visible: &mut Vec<u32>) {
+    visible.clear();
+    let blocks = scene.blocks.iter().enumerate();
+    visible.extend(blocks.filter(|(_, block)| view.sees(block)).map(|(i, _)| i as u32));
+}

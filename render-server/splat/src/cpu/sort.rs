@@ -1,0 +1,199 @@
+//! Pass 3: slots of projected splats, nearest first.
+//!
+//! A parallel radix sort, least significant digit first: two stable passes of 11 bits. Depths are
+//! f32 bits less the nearest's, shifted so that the range fits 22 bits: a scene from 0.2 to 50 m is
+//! ordered to 2e-6 relative, finer than one f32 projection differs from another.
+//!
+//! Each slice counts its digits, the counts give every slice its places, and all slices scatter at
+//! once. The places are disjoint, but no borrow can say so: the arrays are relaxed atomics, which
+//! compile to plain moves.
+//!
+//! Budget: 16 bytes moved per splat and pass, 2-4 ns per splat and thread.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+use rayon::prelude::*;
+
+use super::project::Projected;
+use super::scene::BLOCK;
+
+const DIGIT_BITS: u32 = 11;
+const BINS: usize = 1 << DIGIT_BITS;
+/// Below this a second slice costs more than it saves.
+const MIN_SLICE: usize = 4096;
+
+/// Buffers of the sort, and its result.
+#[derive(Debug, Default)]
+pub(super) struct Sorter {
+    /// Key in the upper half, slot in the lower, by the first digit.
+    half_sorted: Vec<AtomicU64>,
+    /// Slots, nearest first; the first `len`.
+    order: Vec<AtomicU32>,
+    len: usize,
+    /// Per slice.
+    histograms: Vec<Vec<u32>>,
+    /// First regions of the slices, and one past the last.
+    bounds: Vec<usize>,
+}
+
+impl Sorter {
+    /// Returns the slots, nearest first.
+    pub(super) fn order(&self) -> &[AtomicU32] {
+        &self.order[..self.len]
+    }
+
+    /// Sorts all projected splats by depth.
+    pub(super) fn sort(&mut self, projected: &Projected) {
+        let len: usize = projected.counts.iter().map(|&count| count as usize).sum();
+        self.len = len;
+        if self.order.len() < len {
+            self.half_sorted.resize_with(len, AtomicU64::default);
+            self.order.resize_with(len, AtomicU32::default);
+        }
+        let slices = (len / MIN_SLICE).clamp(1, rayon::current_num_threads());
+        self.histograms.resize_with(slices, || vec![0; BINS]);
+        self.split_regions(&projected.counts, len, slices);
+
+        let (least, shift) = key_range(projected);
+        let regions = |slice: usize| self.bounds[slice]..self.bounds[slice + 1];
+        let keys = |region: usize| {
+            projected.keys[region * BLOCK..][..projected.counts[region] as usize].iter()
+        };
+        // 22 bits, so that the upper digit needs no mask.
+        let compact = |key: u32| (key - least) >> shift;
+        let low = |key: u32| key as usize % BINS;
+        let high = |key: u32| (key >> DIGIT_BITS) as usize % BINS;
+
+        self.histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
+            histogram.fill(0);
+            for key in regions(slice).flat_map(keys) {
+                histogram[low(compact(*key))] += 1;
+            }
+        });
+        to_places(&mut self.histograms);
+        let half_sorted = &self.half_sorted;
+        self.histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
+            for region in regions(slice) {
+                for (i, &key) in keys(region).enumerate() {
+                    let key = compact(key);
+                    let place = &mut places[low(key)];
+                    let slot = (region * BLOCK + i) as u64;
+                    half_sorted[*place as usize].store(u64::from(key) << 32 | slot, Relaxed);
+                    *place += 1;
+                }
+            }
+        });
+
+        let half_sorted = &self.half_sorted[..len];
+        let part = |slice: usize| &half_sorted[len * slice / slices..len * (slice + 1) / slices];
+        self.histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
+            histogram.fill(0);
+            for pair in part(slice) {
+                histogram[high((pair.load(Relaxed) >> 32) as u32)] += 1;
+            }
+        });
+        to_places(&mut self.histograms);
+        let order = &self.order;
+        self.histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
+            for pair in part(slice) {
+                let pair = pair.load(Relaxed);
+                let place = &mut places[high((pair >> 32) as u32)];
+                order[*place as usize].store(pair as u32, Relaxed);
+                *place += 1;
+            }
+        });
+    }
+
+    /// Splits the regions into slices of about as many splats.
+    fn split_regions(&mut self, counts: &[u32], len: usize, slices: usize) {
+        self.bounds.clear();
+        self.bounds.push(0);
+        let mut before = 0;
+        for (region, &count) in counts.iter().enumerate() {
+            before += count as usize;
+            if before * slices >= len * self.bounds.len() && self.bounds.len() < slices {
+                self.bounds.push(region + 1);
+            }
+        }
+        self.bounds.resize(slices + 1, counts.len());
+    }
+}
+
+/// Returns the least key, and the shift that brings every key less it into two digits.
+fn key_range(projected: &Projected) -> (u32, u32) {
+    let (least, greatest) = projected
+        .counts
+        .par_iter()
+        .zip(projected.keys.par_chunks(BLOCK))
+        .with_min_len(64)
+        .map(|(&count, keys)| {
+            let keys = &keys[..count as usize];
+            keys.iter()
+                .fold((u32::MAX, 0), |(least, greatest), &key| (key.min(least), key.max(greatest)))
+        })
+        .reduce(|| (u32::MAX, 0), |a, b| (a.0.min(b.0), a.1.max(b.1)));
+    let bits = u32::BITS - greatest.saturating_sub(least).leading_zeros();
+    (least, bits.saturating_sub(2 * DIGIT_BITS))
+}
+
+/// Turns counts per slice and digit into the place of each slice's first entry of each digit.
+fn to_places(histograms: &mut [Vec<u32>]) {
+    let mut place = 0;
+    for bin in 0..BINS {
+        for histogram in &mut *histograms {
+            let count = histogram[bin];
+            histogram[bin] = place;
+            place += count;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn sorted_slots(regions: &[Vec<f32>]) -> Vec<u32> {
+        let mut projected = Projected {
+            keys: vec![0; regions.len() * BLOCK],
+            counts: regions.iter().map(|region| region.len() as u32).collect(),
+            ..Projected::default()
+        };
+        for (i, region) in regions.iter().enumerate() {
+            for (j, z) in region.iter().enumerate() {
+                projected.keys[i * BLOCK + j] = z.to_bits();
+            }
+        }
+        let mut sorter = Sorter::default();
+        // Twice: what the first run leaves behind must not matter.
+        sorter.sort(&projected);
+        sorter.sort(&projected);
+        sorter.order().iter().map(|slot| slot.load(Relaxed)).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn every_slot_comes_once_and_in_order(
+            regions in prop::collection::vec(prop::collection::vec(0.2..50.0f32, 0..=BLOCK), 0..60),
+        ) {
+            let order = sorted_slots(&regions);
+            let depth = |slot: u32| regions[slot as usize / BLOCK][slot as usize % BLOCK];
+            for pair in order.windows(2) {
+                let (a, b) = (depth(pair[0]), depth(pair[1]));
+                prop_assert!(a <= b * (1.0 + 4e-6), "{} before {}", a, b);
+            }
+            let mut slots = order;
+            slots.sort_unstable();
+            let expected = regions.iter().enumerate().flat_map(|(i, region)| {
+                (0..region.len()).map(move |j| (i * BLOCK + j) as u32)
+            });
+            prop_assert!(slots.into_iter().eq(expected));
+        }
+    }
+
+    #[test]
+    fn equal_depths_keep_their_order() {
+        let order = sorted_slots(&vec![vec![3.5; BLOCK]; 100]);
+        assert!(order.is_sorted() && order.len() == 100 * BLOCK);
+    }
+}
