@@ -66,7 +66,7 @@ impl RgbdImage {
         out.resize(depth_m.len(), 0);
         for ((mm, &depth_m), &alpha) in out.iter_mut().zip(depth_m).zip(&self.alpha) {
             let rounded = depth_m * 1000.0 + 0.5;
-            let returned = (alpha >= Self::MIN_DEPTH_ALPHA) & (rounded < 65536.0);
+            let returned = alpha >= Self::MIN_DEPTH_ALPHA && rounded < 65536.0;
             *mm = if returned { rounded as u16 } else { 0 };
         }
     }

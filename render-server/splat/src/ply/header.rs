@@ -138,12 +138,9 @@ impl Header {
     /// Parses the header of a PLY file.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, PlyError> {
         let mut lines = Lines { bytes: &bytes[..bytes.len().min(MAX_HEADER_BYTES)], offset: 0 };
-        match lines.next() {
-            Some((_, "ply")) => {}
-            _ => {
-                let start = &bytes[..bytes.len().min(16)];
-                return Err(PlyError::NotPly { found: String::from_utf8_lossy(start).into() });
-            }
+        if !matches!(lines.next(), Some((_, "ply"))) {
+            let start = &bytes[..bytes.len().min(16)];
+            return Err(PlyError::NotPly { found: String::from_utf8_lossy(start).into() });
         }
         let mut format = None;
         let mut elements: Vec<Element> = Vec::new();

@@ -51,11 +51,11 @@ pub fn encode(splats: &Splats) -> Vec<u8> {
     names.push("opacity".into());
     names.extend((0..3).map(|i| format!("scale_{i}")));
     names.extend((0..4).map(|i| format!("rot_{i}")));
-    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n");
-    for name in &names {
-        header += &format!("property float {name}\n");
-    }
-    header += "end_header\n";
+    let properties: String =
+        names.iter().flat_map(|name| ["property float ", name, "\n"]).collect();
+    let header = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+    );
 
     let mut bytes = Vec::with_capacity(header.len() + count * names.len() * 4);
     bytes.extend_from_slice(header.as_bytes());

@@ -1,5 +1,6 @@
 //! AVX-512: sixteen lanes and real mask registers.
 
+#[allow(clippy::wildcard_imports, reason = "two dozen intrinsics, each named once below")]
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 

@@ -1,0 +1,70 @@
+#!/usr/bin/env python3
+"""Makes the small scenes of this folder and what the float64 numpy oracle draws of them.
+
+    python3 make_references.py ORACLE.py
+
+ORACLE.py is a module with `load_ply(path)` and `render(splats, camera)` as tests/images/oracle.rs
+describes them; numpy is all it needs. Writes sh0 to sh3: .ply (INRIA layout), .json (camera),
+.npz (rgb, alpha, depth, depth_median; float32). The same numbers on every machine.
+"""
+import importlib.util, json, pathlib, sys
+import numpy as np
+
+SIZE = dict(w=48, h=36)
+
+
+def scene(rng, degree, count):
+    """Some large flat splats behind, many small ones before them, all sorts of opacity."""
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    large = count // 5
+    xyz = np.concatenate([rng.uniform([-3, -2, 4], [3, 2, 7], (large, 3)),
+                          rng.uniform([-1.5, -1.1, 0.6], [1.5, 1.1, 4], (count - large, 3))])
+    log_scale = np.log(np.concatenate([rng.uniform(0.05, 1.2, (large, 3)),
+                                       np.exp(rng.uniform(np.log(0.004), np.log(0.25), (count - large, 3)))]))
+    quat = rng.normal(size=(count, 4)) * rng.uniform(0.5, 2, (count, 1))
+    logit = rng.uniform(-6, 7, (count, 1))
+    dc = rng.uniform(-1.7, 1.7, (count, 3))
+    sh = rng.normal(size=(count, rest)) * 0.25
+    return np.concatenate([xyz, np.zeros((count, 3)), dc, sh, logit, log_scale, quat], 1).astype('<f4')
+
+
+def write_ply(path, rows, degree):
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ['x', 'y', 'z', 'nx', 'ny', 'nz'] + [f'f_dc_{i}' for i in range(3)] + [f'f_rest_{i}' for i in range(rest)]
+    names += ['opacity'] + [f'scale_{i}' for i in range(3)] + [f'rot_{i}' for i in range(4)]
+    head = f'ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n'
+    head += ''.join(f'property float {n}\n' for n in names) + 'end_header\n'
+    path.write_bytes(head.encode() + rows.tobytes())
+
+
+def camera(degree):
+    """Off-centre, unequal focal lengths, turned about all axes, on a background."""
+    a, b, c = 0.05 + 0.07 * degree, -0.12 + 0.08 * degree, 0.1 * degree
+    rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    rz = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    w2c = np.eye(4)
+    w2c[:3, :3] = rz @ ry @ rx
+    w2c[:3, 3] = [0.1 * degree, -0.05, 0.3 - 0.2 * degree]
+    return dict(fx=34.0 + 2 * degree, fy=36.0, cx=24.0 + 3.25 * degree, cy=18.0 - 1.5 * degree, **SIZE,
+                bg=[0.1, 0.2, 0.3], w2c=w2c.tolist())
+
+
+def main():
+    spec = importlib.util.spec_from_file_location('oracle', sys.argv[1])
+    oracle = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(oracle)
+    here = pathlib.Path(__file__).parent
+    for degree, count in enumerate([400, 250, 150, 100]):
+        name = here / f'sh{degree}'
+        write_ply(name.with_suffix('.ply'), scene(np.random.default_rng(100 + degree), degree, count), degree)
+        cam = camera(degree)
+        name.with_suffix('.json').write_text(json.dumps(cam) + '\n')
+        image = oracle.render(oracle.load_ply(str(name.with_suffix('.ply'))), cam)
+        np.savez_compressed(name.with_suffix('.npz'),
+                            **{k: image[k].astype('<f4') for k in ('rgb', 'alpha', 'depth', 'depth_median')})
+        print(name.name, 'visible', image['n_visible'], 'mean alpha %.3f' % image['alpha'].mean(),
+              'splats per pixel %.1f' % image['n_contrib'].mean())
+
+
+main()

@@ -1,0 +1,7 @@
+//! What renderers draw: against an independent oracle, against each other, and of poisoned input.
+
+mod agreement;
+mod compare;
+mod npz;
+mod oracle;
+mod poison;
