@@ -216,4 +216,6 @@ impl Simulation {
 }
 
 #[cfg(test)]
+pub(crate) mod companion;
+#[cfg(test)]
 mod tests;

@@ -14,9 +14,9 @@ use crate::estimator::Estimate;
 /// Position feedback, horizontal and vertical. [1/s]
 const POSITION_GAIN: f64 = 1.3;
 /// Velocity feedback, horizontal: a third of what the attitude loop can follow. [1/s]
-const VELOCITY_GAIN: f64 = 3.0;
+const VELOCITY_GAIN: f64 = 4.5;
 /// Integral of the horizontal velocity error: takes drag and wind away in about 1.5 s. [1/s^2]
-const VELOCITY_INTEGRAL: f64 = 1.5;
+const VELOCITY_INTEGRAL: f64 = 5.0;
 /// Velocity feedback, vertical: thrust lags only by the motors. [1/s]
 const CLIMB_GAIN: f64 = 5.0;
 /// Integral of the vertical velocity error. [1/s^2]

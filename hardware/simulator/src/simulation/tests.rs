@@ -1,218 +1,10 @@
-// Why: the messages a real ground station sends are deprecated in the dialect, not on the wire.
-#![allow(deprecated)]
-
+use super::companion::Companion;
 use super::*;
-use glam::{DQuat, EulerRot};
-use std::collections::BTreeMap;
-use vizflyt_protocol::geometry::{Pose, wrap_pi, yaw_of};
-use vizflyt_protocol::mavlink::dialect::{
-    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavCmd, MavMessage, MavResult, SET_GPS_GLOBAL_ORIGIN_DATA,
-};
-use vizflyt_protocol::mavlink::{
-    GuidedMotion, GuidedSetpoint, MavHeader, StreamDecoder, encode, guided_to_mavlink,
-    vision_to_mavlink,
-};
+use proptest::prelude::*;
+use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
+use vizflyt_protocol::mavlink::dialect::MavResult;
+use vizflyt_protocol::mavlink::{GuidedMotion, encode};
 use vizflyt_protocol::messages::YawTarget;
-
-/// A companion computer on the virtual clock: feeds vision from the mocap, sends heartbeats, and
-/// remembers what the autopilot says.
-pub(crate) struct Companion {
-    pub(crate) lab: Simulation,
-    decoder: StreamDecoder,
-    pub(crate) vision: bool,
-    pub(crate) heartbeats: bool,
-    /// Sender's clock minus the autopilot's. [us]
-    clock_offset_us: u64,
-    pub(crate) texts: Vec<String>,
-    pub(crate) acks: Vec<(MavCmd, MavResult)>,
-    pub(crate) newest: BTreeMap<u32, MavMessage>,
-    pub(crate) counts: BTreeMap<u32, u32>,
-    vision_due_ns: u64,
-    heartbeat_due_ns: u64,
-    /// Setpoint resent at 20 Hz.
-    pub(crate) setpoint: Option<GuidedSetpoint>,
-    setpoint_due_ns: u64,
-    /// Runs after every tick.
-    pub(crate) worst_speed_mps: f64,
-}
-
-impl Companion {
-    pub(crate) fn new(config: SimulationConfig) -> Self {
-        Self {
-            lab: Simulation::new(config).unwrap(),
-            decoder: StreamDecoder::default(),
-            vision: true,
-            heartbeats: true,
-            clock_offset_us: 77_000_000,
-            texts: Vec::new(),
-            acks: Vec::new(),
-            newest: BTreeMap::new(),
-            counts: BTreeMap::new(),
-            vision_due_ns: 0,
-            heartbeat_due_ns: 0,
-            setpoint: None,
-            setpoint_due_ns: 0,
-            worst_speed_mps: 0.0,
-        }
-    }
-
-    pub(crate) fn send(&mut self, message: &MavMessage) {
-        let header = MavHeader { system_id: 255, component_id: 190, sequence: 0 };
-        self.lab.handle_mavlink(encode(header, message, &mut [0; MAX_PACKET]));
-    }
-
-    pub(crate) fn command(&mut self, command: MavCmd, params: [f32; 7]) -> MavResult {
-        let [param1, param2, param3, param4, param5, param6, param7] = params;
-        self.send(&MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
-            param1,
-            param2,
-            param3,
-            param4,
-            param5,
-            param6,
-            param7,
-            command,
-            target_system: 1,
-            target_component: 1,
-            confirmation: 0,
-        }));
-        self.tick();
-        let (acknowledged, result) = *self.acks.last().expect("every command is acknowledged");
-        assert_eq!(acknowledged, command);
-        result
-    }
-
-    pub(crate) fn tick(&mut self) {
-        self.lab.tick();
-        let now_ns = self.lab.now().as_ns();
-        let mut pose = None;
-        while let Some(datagram) = self.lab.poll_mocap() {
-            let value =
-                |i: usize| f64::from_le_bytes(datagram[32 + 8 * i..40 + 8 * i].try_into().unwrap());
-            let rotation = DQuat::from_euler(EulerRot::ZYX, value(5), value(4), value(3));
-            let p = DVec3::new(value(0), value(1), value(2)) / 1000.0;
-            pose = Some(Pose::new(p, rotation));
-        }
-        if let Some(pose) = pose
-            && self.vision
-            && now_ns >= self.vision_due_ns
-        {
-            self.vision_due_ns = now_ns + 20_000_000;
-            let usec = now_ns / 1000 + self.clock_offset_us;
-            let message = vision_to_mavlink(&pose, usec, 0, 0.01);
-            self.send(&MavMessage::VISION_POSITION_ESTIMATE(message));
-        }
-        if self.heartbeats && now_ns >= self.heartbeat_due_ns {
-            self.heartbeat_due_ns = now_ns + 1_000_000_000;
-            self.send(&MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
-        }
-        if let Some(setpoint) = self.setpoint
-            && now_ns >= self.setpoint_due_ns
-        {
-            self.setpoint_due_ns = now_ns + 50_000_000;
-            self.set_once(setpoint.motion, setpoint.yaw);
-        }
-        let mut buffer = [0; MAX_PACKET];
-        while let Some(packet) = self.lab.poll_mavlink(&mut buffer) {
-            let (texts, acks, newest, counts) =
-                (&mut self.texts, &mut self.acks, &mut self.newest, &mut self.counts);
-            self.decoder.push(packet, |packet| {
-                use vizflyt_protocol::mavlink::Message as _;
-                match &packet.message {
-                    MavMessage::STATUSTEXT(m) => texts.push(m.text.to_str().unwrap().to_owned()),
-                    MavMessage::COMMAND_ACK(m) => acks.push((m.command, m.result)),
-                    _ => {}
-                }
-                *counts.entry(packet.message.message_id()).or_default() += 1;
-                newest.insert(packet.message.message_id(), packet.message);
-            });
-        }
-        let state = self.lab.state();
-        assert!(state.p_world_m.is_finite() && state.world_from_body.is_normalized());
-        self.worst_speed_mps = self.worst_speed_mps.max(state.v_world_mps.length());
-    }
-
-    pub(crate) fn set_once(&mut self, motion: GuidedMotion, yaw: YawTarget) {
-        let message = guided_to_mavlink(&GuidedSetpoint { motion, yaw }, (1, 1), 0);
-        self.send(&MavMessage::SET_POSITION_TARGET_LOCAL_NED(message));
-    }
-
-    pub(crate) fn wait(&mut self, seconds: f64) {
-        for _ in 0..(seconds * TICK_HZ as f64).round() as u64 {
-            self.tick();
-        }
-    }
-
-    /// Runs until `done` or for `seconds`; returns the time it took.
-    pub(crate) fn until(&mut self, seconds: f64, what: &str, done: impl Fn(&Self) -> bool) -> f64 {
-        for tick in 0..(seconds * TICK_HZ as f64) as u64 {
-            if done(self) {
-                return tick as f64 * TICK_S;
-            }
-            self.tick();
-        }
-        panic!("{what} did not come within {seconds} s; said {:?}", self.texts);
-    }
-
-    pub(crate) fn set_origin(&mut self) {
-        self.send(&MavMessage::SET_GPS_GLOBAL_ORIGIN(SET_GPS_GLOBAL_ORIGIN_DATA {
-            latitude: 423_000_000,
-            longitude: -718_000_000,
-            altitude: 100_000,
-            target_system: 1,
-            time_usec: 0,
-        }));
-    }
-
-    pub(crate) fn set_mode(&mut self, mode: CopterMode) -> MavResult {
-        let params = [1.0, mode as u32 as f32, 0.0, 0.0, 0.0, 0.0, 0.0];
-        self.command(MavCmd::MAV_CMD_DO_SET_MODE, params)
-    }
-
-    pub(crate) fn arm(&mut self) -> MavResult {
-        let params = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-        self.command(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, params)
-    }
-
-    pub(crate) fn take_off(&mut self, height_m: f32) -> MavResult {
-        let params = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m];
-        self.command(MavCmd::MAV_CMD_NAV_TAKEOFF, params)
-    }
-
-    /// Boots, sets the origin, and waits until the position is known.
-    pub(crate) fn prepare(&mut self) {
-        self.wait(2.5);
-        self.set_origin();
-        self.until(5.0, "a position", |c| {
-            c.lab.autopilot().estimator().health(c.lab.now()).position
-        });
-        self.wait(1.5);
-    }
-
-    /// A vehicle hovering at `height_m`.
-    pub(crate) fn hovering(config: SimulationConfig, height_m: f64) -> Self {
-        let mut companion = Self::new(config);
-        companion.prepare();
-        assert_eq!(companion.set_mode(CopterMode::Guided), MavResult::MAV_RESULT_ACCEPTED);
-        assert_eq!(companion.arm(), MavResult::MAV_RESULT_ACCEPTED);
-        assert_eq!(companion.take_off(height_m as f32), MavResult::MAV_RESULT_ACCEPTED);
-        companion.until(30.0, "the height", |c| (c.p().z - height_m).abs() < 0.1);
-        companion.wait(3.0);
-        companion
-    }
-
-    pub(crate) fn p(&self) -> DVec3 {
-        self.lab.state().p_world_m
-    }
-
-    pub(crate) fn v(&self) -> DVec3 {
-        self.lab.state().v_world_mps
-    }
-
-    pub(crate) fn fly(&mut self, motion: GuidedMotion, yaw: YawTarget) {
-        self.setpoint = Some(GuidedSetpoint { motion, yaw });
-    }
-}
 
 #[test]
 fn takes_off_hovers_and_lands_by_itself() {
@@ -272,5 +64,273 @@ fn velocity_steps_are_followed_with_little_overshoot() {
             trough = trough.min(c.v().x);
         }
         assert!(trough > -1.15 * speed && (c.v() + v).length() < 0.15, "{trough} {:?}", c.v());
+    }
+}
+
+#[test]
+fn position_steps_arrive_and_stay() {
+    let config = SimulationConfig {
+        params: vec![("WP_SPD".into(), 3.0), ("WP_SPD_UP".into(), 1.5)],
+        ..Default::default()
+    };
+    let mut c = Companion::hovering(config, 1.0);
+    let target = DVec3::new(4.0, -3.0, 2.0);
+    // Sent once: a position needs no resending.
+    c.set_once(GuidedMotion::Position(target), YawTarget::Angle(1.0));
+    let (mut beyond, mut fastest) = (0f64, 0f64);
+    let way = target - c.p();
+    for _ in 0..4000 {
+        c.tick();
+        beyond = beyond.max((c.p() - target).dot(way.normalize()));
+        fastest = fastest.max(c.v().truncate().length());
+    }
+    println!(
+        "position step: beyond {beyond:.3} m, fastest {fastest:.2} m/s, left {:.3} m",
+        (c.p() - target).length()
+    );
+    assert!(beyond < 0.15 * way.length());
+    assert!((c.p() - target).length() < 0.08, "{:?}", c.p());
+    assert!(fastest < 3.3, "WP_SPD holds for positions: {fastest}");
+    assert!(wrap_pi(yaw_of(c.lab.state().world_from_body) - 1.0).abs() < 0.05);
+}
+
+#[test]
+fn a_moving_point_is_followed() {
+    let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
+    let (start, v) = (c.p(), DVec3::new(0.0, 1.5, 0.0));
+    // Resent at 10 Hz, as a trajectory follower does.
+    for i in 0..60 {
+        let p = start + v * (f64::from(i) * 0.1);
+        c.set_once(GuidedMotion::PositionVelocity(p, v), YawTarget::Angle(0.0));
+        c.wait(0.1);
+    }
+    let wanted = start + v * 6.0;
+    assert!((c.p() - wanted).length() < 0.35, "{:?} wanted {wanted:?}", c.p());
+    assert!((c.v() - v).length() < 0.2);
+}
+
+#[test]
+fn accelerations_are_flown_and_zero_keeps_the_velocity() {
+    let mut c = Companion::hovering(SimulationConfig::default(), 1.5);
+    c.fly(GuidedMotion::Acceleration(DVec3::new(2.0, 0.0, 0.0)), YawTarget::Angle(0.0));
+    c.wait(1.0);
+    assert!((1.2..2.3).contains(&c.v().x), "{:?}", c.v());
+    c.fly(GuidedMotion::Acceleration(DVec3::ZERO), YawTarget::Angle(0.0));
+    c.wait(1.0);
+    let kept = c.v().x;
+    assert!((1.7..2.5).contains(&kept), "{kept}");
+    c.wait(1.0);
+    assert!((c.v().x - kept).abs() < 0.35 && (c.p().z - 1.5).abs() < 0.3, "{:?}", c.v());
+}
+
+/// Zig-zag at 5 m/s with the hardest turns: the estimate must stay on the truth.
+#[test]
+fn the_estimate_holds_in_aggressive_flight() {
+    let check = |latency_s: f64, told_ms: f32, most_m: f64| {
+        let params = vec![("VISO_DELAY_MS".into(), told_ms)];
+        let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.5);
+        c.vision_latency_s = latency_s;
+        let mut errors = Vec::new();
+        for i in 0..12 {
+            let side = if i % 2 == 0 { 5.0 } else { -5.0 };
+            c.fly(GuidedMotion::Velocity(DVec3::new(2.0, side, 0.0)), YawTarget::Angle(0.3));
+            for _ in 0..400 {
+                c.tick();
+                let estimate = c.lab.autopilot().estimator().estimate();
+                errors.push((estimate.p_world_m - c.p()).truncate().length());
+            }
+        }
+        errors.sort_by(f64::total_cmp);
+        let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+        println!(
+            "latency {latency_s} s, told {told_ms} ms: median {median:.3} m, worst {worst:.3} m"
+        );
+        assert!(median < most_m, "{median}");
+        assert!(worst < 8.0 * most_m, "{worst}");
+    };
+    // The companion here sends at once: nothing to compensate.
+    check(0.0, 0.0, 0.03);
+    // The parameter's default of 10 ms is then 5 cm too much at 5 m/s.
+    check(0.0, 10.0, 0.08);
+    check(0.06, 60.0, 0.06);
+}
+
+#[test]
+fn a_velocity_setpoint_dies_after_three_seconds_and_a_position_is_held() {
+    let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
+    let start = c.p();
+    c.set_once(GuidedMotion::Velocity(DVec3::new(0.5, 0.0, 0.0)), YawTarget::Angle(0.0));
+    c.wait(2.9);
+    assert!((c.v().x - 0.5).abs() < 0.1);
+    // A real ArduCopter stood after 3.7 s and 1.4 m.
+    c.wait(1.1);
+    let stopped = c.p();
+    assert!(c.v().length() < 0.1, "{:?}", c.v());
+    assert!((1.2..1.7).contains(&(stopped - start).length()), "{:?}", stopped - start);
+    c.wait(10.0);
+    assert!((c.p() - stopped).length() < 0.15);
+    c.set_once(GuidedMotion::Position(start), YawTarget::Angle(0.0));
+    c.wait(20.0);
+    assert!((c.p() - start).length() < 0.1);
+}
+
+#[test]
+fn an_ignored_yaw_turns_the_nose_into_travel() {
+    let turned_by = |behavior: f32, yaw: YawTarget| {
+        let params = vec![("WP_YAW_BEHAVIOR".into(), behavior)];
+        let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.2);
+        c.fly(GuidedMotion::Velocity(DVec3::new(-1.0, 0.0, 0.0)), yaw);
+        c.wait(4.0);
+        wrap_pi(yaw_of(c.lab.state().world_from_body)).abs()
+    };
+    assert!(turned_by(2.0, YawTarget::Keep) > 3.0, "the pitfall");
+    assert!(turned_by(0.0, YawTarget::Keep) < 0.1);
+    assert!(turned_by(2.0, YawTarget::Angle(0.0)) < 0.1);
+    // 0.5 rad/s for 4 s.
+    let rate = turned_by(2.0, YawTarget::Rate(0.5));
+    assert!((1.7..2.2).contains(&rate), "{rate}");
+}
+
+#[test]
+fn wind_moves_nothing_for_long() {
+    let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
+    let start = c.p();
+    c.lab.set_wind(DVec3::new(2.0, -1.0, 0.0));
+    c.wait(8.0);
+    assert!((c.p() - start).length() < 0.2, "{:?}", c.p() - start);
+}
+
+#[test]
+fn the_same_seed_sends_the_same_bytes() {
+    let run = |seed| {
+        let mut lab = Simulation::new(SimulationConfig { seed, ..Default::default() }).unwrap();
+        let mut sent = Vec::new();
+        for _ in 0..2000 {
+            lab.tick();
+            while let Some(packet) = lab.poll_mavlink(&mut [0; MAX_PACKET]) {
+                sent.extend_from_slice(packet);
+            }
+            while let Some(datagram) = lab.poll_mocap() {
+                sent.extend_from_slice(&datagram);
+            }
+        }
+        sent
+    };
+    assert_eq!(run(4), run(4));
+    assert_ne!(run(4), run(5));
+}
+
+/// One thing somebody could do to a flying vehicle.
+#[derive(Clone, Debug)]
+enum Operation {
+    Setpoint(u16, [f32; 11]),
+    Mode(u32),
+    Vision(bool),
+    Arm,
+    TakeOff(f32),
+    Garbage(Vec<u8>),
+    Wait(f64),
+    Wind([f64; 3]),
+}
+
+fn number() -> impl Strategy<Value = f32> {
+    prop_oneof![
+        12 => -10.0..10.0f32,
+        1 => prop::num::f32::ANY,
+        1 => Just(f32::NAN),
+        1 => Just(1e30f32),
+    ]
+}
+
+fn operation() -> impl Strategy<Value = Operation> {
+    let masks = prop_oneof![
+        Just(0xDF8u16),
+        Just(0x9F8),
+        Just(0x9C7),
+        Just(0x5C7),
+        Just(0x9C0),
+        Just(0x83F),
+        Just(0xDC7),
+        0..4096u16,
+    ];
+    prop_oneof![
+        6 => (masks, prop::array::uniform11(number())).prop_map(|(m, v)| Operation::Setpoint(m, v)),
+        1 => prop_oneof![Just(0u32), Just(4), Just(6), Just(9), Just(17), 0..30u32].prop_map(Operation::Mode),
+        1 => any::<bool>().prop_map(Operation::Vision),
+        1 => Just(Operation::Arm),
+        1 => number().prop_map(Operation::TakeOff),
+        1 => prop::collection::vec(any::<u8>(), 0..400).prop_map(Operation::Garbage),
+        5 => (0.01..2.0f64).prop_map(Operation::Wait),
+        1 => prop::array::uniform3(-3.0..3.0f64).prop_map(Operation::Wind),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..Default::default() })]
+    /// `Companion::tick` asserts after every tick that the state is finite and the attitude unit;
+    /// here also the estimate, and that bytes sent are always whole packets.
+    #[test]
+    fn nothing_that_is_sent_makes_the_flight_anything_but_finite(
+        operations in prop::collection::vec(operation(), 1..40), seed in 0..1000u64,
+    ) {
+        let mut c = Companion::hovering(SimulationConfig { seed, ..Default::default() }, 1.0);
+        for operation in operations {
+            match operation {
+                Operation::Setpoint(mask, v) => {
+                    let message = vizflyt_protocol::mavlink::dialect::SET_POSITION_TARGET_LOCAL_NED_DATA {
+                        x: v[0], y: v[1], z: v[2], vx: v[3], vy: v[4], vz: v[5],
+                        afx: v[6], afy: v[7], afz: v[8], yaw: v[9], yaw_rate: v[10],
+                        type_mask: vizflyt_protocol::mavlink::dialect::PositionTargetTypemask::from_bits_retain(mask),
+                        target_system: 1, target_component: 1,
+                        coordinate_frame: vizflyt_protocol::mavlink::dialect::MavFrame::MAV_FRAME_LOCAL_NED,
+                        time_boot_ms: 0,
+                    };
+                    c.send(&vizflyt_protocol::mavlink::dialect::MavMessage::SET_POSITION_TARGET_LOCAL_NED(message));
+                }
+                Operation::Mode(number) => {
+                    c.command(vizflyt_protocol::mavlink::dialect::MavCmd::MAV_CMD_DO_SET_MODE, [1.0, number as f32, 0.0, 0.0, 0.0, 0.0, 0.0]);
+                }
+                Operation::Vision(on) => c.vision = on,
+                Operation::Arm => { c.arm(); }
+                Operation::TakeOff(height) => { c.take_off(height); }
+                Operation::Garbage(bytes) => c.lab.handle_mavlink(&bytes),
+                Operation::Wait(seconds) => c.wait(seconds),
+                Operation::Wind(wind) => c.lab.set_wind(DVec3::from(wind)),
+            }
+            c.tick();
+            let estimate = c.lab.autopilot().estimator().estimate();
+            prop_assert!(estimate.p_world_m.is_finite() && estimate.v_world_mps.is_finite());
+            prop_assert!(estimate.world_from_body.is_normalized());
+            prop_assert!(c.v().length() < 80.0, "{:?}", c.v());
+        }
+        // And it can still be brought down, unless it was lost far away or high up.
+        c.lab.set_wind(DVec3::ZERO);
+        c.vision = true;
+        // What garbage left waiting in the decoder is flushed by a few good packets.
+        c.wait(2.0);
+        if c.lab.autopilot().is_armed() && c.p().z < 20.0 && c.v().length() < 3.0 {
+            c.set_mode(CopterMode::Land);
+            c.until(60.0, "a landing", |c| !c.lab.autopilot().is_armed());
+        }
+    }
+
+    #[test]
+    fn packets_survive_garbage_around_them(garbage in prop::collection::vec(any::<u8>(), 0..600)) {
+        let mut lab = Simulation::new(SimulationConfig::default()).unwrap();
+        lab.tick();
+        lab.handle_mavlink(&garbage);
+        // Flushes whatever the garbage pretended to be the start of.
+        lab.handle_mavlink(&[0; 600]);
+        while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {}
+        let request = vizflyt_protocol::mavlink::dialect::MavMessage::PARAM_REQUEST_LIST(
+            vizflyt_protocol::mavlink::dialect::PARAM_REQUEST_LIST_DATA { target_system: 1, target_component: 1 },
+        );
+        let header = vizflyt_protocol::mavlink::MavHeader { system_id: 255, component_id: 1, sequence: 0 };
+        lab.handle_mavlink(encode(header, &request, &mut [0; MAX_PACKET]));
+        let mut answers = 0;
+        while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {
+            answers += 1;
+        }
+        prop_assert_eq!(answers, crate::autopilot::TABLE.len());
     }
 }
