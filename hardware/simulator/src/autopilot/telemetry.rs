@@ -83,6 +83,8 @@ impl Streams {
             return false;
         }
         let row = &mut self.rows[index];
+        // Starts at once, not when the old interval would have ended.
+        row.due = AutopilotTime::ZERO;
         row.interval_us = if interval_us < 0.0 {
             0
         } else if interval_us == 0.0 {

@@ -2,8 +2,11 @@ use super::companion::Companion;
 use super::*;
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
-use vizflyt_protocol::mavlink::dialect::MavResult;
-use vizflyt_protocol::mavlink::{GuidedMotion, encode};
+use vizflyt_protocol::mavlink::dialect::{
+    MavCmd, MavFrame, MavMessage, PARAM_REQUEST_LIST_DATA, PositionTargetTypemask,
+    SET_POSITION_TARGET_LOCAL_NED_DATA,
+};
+use vizflyt_protocol::mavlink::{GuidedMotion, MavHeader, encode};
 use vizflyt_protocol::messages::YawTarget;
 
 #[test]
@@ -277,23 +280,27 @@ proptest! {
         for operation in operations {
             match operation {
                 Operation::Setpoint(mask, v) => {
-                    let message = vizflyt_protocol::mavlink::dialect::SET_POSITION_TARGET_LOCAL_NED_DATA {
+                    let message = SET_POSITION_TARGET_LOCAL_NED_DATA {
                         x: v[0], y: v[1], z: v[2], vx: v[3], vy: v[4], vz: v[5],
                         afx: v[6], afy: v[7], afz: v[8], yaw: v[9], yaw_rate: v[10],
-                        type_mask: vizflyt_protocol::mavlink::dialect::PositionTargetTypemask::from_bits_retain(mask),
+                        type_mask: PositionTargetTypemask::from_bits_retain(mask),
                         target_system: 1, target_component: 1,
-                        coordinate_frame: vizflyt_protocol::mavlink::dialect::MavFrame::MAV_FRAME_LOCAL_NED,
+                        coordinate_frame: MavFrame::MAV_FRAME_LOCAL_NED,
                         time_boot_ms: 0,
                     };
-                    c.send(&vizflyt_protocol::mavlink::dialect::MavMessage::SET_POSITION_TARGET_LOCAL_NED(message));
+                    c.send(&MavMessage::SET_POSITION_TARGET_LOCAL_NED(message));
                 }
                 Operation::Mode(number) => {
-                    c.command(vizflyt_protocol::mavlink::dialect::MavCmd::MAV_CMD_DO_SET_MODE, [1.0, number as f32, 0.0, 0.0, 0.0, 0.0, 0.0]);
+                    c.command(MavCmd::MAV_CMD_DO_SET_MODE, [1.0, number as f32, 0.0, 0.0, 0.0, 0.0, 0.0]);
                 }
                 Operation::Vision(on) => c.vision = on,
                 Operation::Arm => { c.arm(); }
                 Operation::TakeOff(height) => { c.take_off(height); }
-                Operation::Garbage(bytes) => c.lab.handle_mavlink(&bytes),
+                Operation::Garbage(bytes) => {
+                    c.lab.handle_mavlink(&bytes);
+                    // Ends whatever packet the garbage pretended to begin.
+                    c.lab.handle_mavlink(&[0; 600]);
+                }
                 Operation::Wait(seconds) => c.wait(seconds),
                 Operation::Wind(wind) => c.lab.set_wind(DVec3::from(wind)),
             }
@@ -322,10 +329,10 @@ proptest! {
         // Flushes whatever the garbage pretended to be the start of.
         lab.handle_mavlink(&[0; 600]);
         while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {}
-        let request = vizflyt_protocol::mavlink::dialect::MavMessage::PARAM_REQUEST_LIST(
-            vizflyt_protocol::mavlink::dialect::PARAM_REQUEST_LIST_DATA { target_system: 1, target_component: 1 },
+        let request = MavMessage::PARAM_REQUEST_LIST(
+            PARAM_REQUEST_LIST_DATA { target_system: 1, target_component: 1 },
         );
-        let header = vizflyt_protocol::mavlink::MavHeader { system_id: 255, component_id: 1, sequence: 0 };
+        let header = MavHeader { system_id: 255, component_id: 1, sequence: 0 };
         lab.handle_mavlink(encode(header, &request, &mut [0; MAX_PACKET]));
         let mut answers = 0;
         while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {
