@@ -61,7 +61,7 @@ fn run(command: Command) -> Result<ExitCode> {
     match command {
         Command::Demo(args) => demo::run(&args),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
-        Command::Fly(args) => plugins::fly(args),
+        Command::Fly(args) => plugins::fly(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
         Command::Plugin(args) => Ok(plugins::run(&args)),

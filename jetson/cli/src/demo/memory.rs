@@ -67,13 +67,7 @@ fn family_rss_kb(root: u32) -> u64 {
 
 /// Returns the number after `name` in the text of `/proc/PID/status`.
 fn field(status: &str, name: &str) -> Option<u64> {
-    status
-        .lines()
-        .find_map(|line| line.strip_prefix(name))?
-        .split_whitespace()
-        .next()?
-        .parse()
-        .ok()
+    status.lines().find_map(|line| line.strip_prefix(name))?.split_whitespace().next()?.parse().ok()
 }
 
 #[cfg(test)]

@@ -29,7 +29,7 @@ use serde_json::Value;
 use self::child::{Child, Notice, Role};
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
-use self::report::{Parts, Report};
+use self::report::Parts;
 
 /// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
 #[derive(Args, Debug)]

@@ -6,10 +6,11 @@ use anyhow::{Context, Result, bail};
 use tempfile::TempDir;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_scenes::SceneKind;
+use vizflyt_server::scene::Up;
 
 /// A scene on disk, ready to be served.
 pub(crate) struct Stage {
-    /// The `arena.toml`.
+    /// What `vizflyt serve` is given: an `arena.toml`, or a bare scene.
     pub arena: PathBuf,
     /// True geometry, where the scene was generated.
     pub truth: Option<PathBuf>,
@@ -45,13 +46,9 @@ impl Stage {
         if path.extension().is_some_and(|extension| extension == "toml") {
             return Self::at(path.to_owned(), None);
         }
-        // A bare scene: write the arena that the server would assume, so that it can be seen.
-        let folder = tempfile::Builder::new().prefix("vizflyt-demo-").tempdir()?;
-        let arena = vizflyt_server::arena_for_scene(path)?;
-        let file = folder.path().join("arena.toml");
-        std::fs::write(&file, arena.to_toml()?)
-            .with_context(|| format!("cannot write {}", file.display()))?;
-        Self::at(file, Some(folder))
+        // A bare scene: the server turns it upright and assumes an arena around it.
+        let arena = vizflyt_server::scene::load(path, Up::default(), None)?.arena;
+        Ok(Self { arena: path.to_owned(), truth: None, spawn: spawn(&arena), _folder: None })
     }
 
     fn at(arena: PathBuf, folder: Option<TempDir>) -> Result<Self> {
@@ -60,8 +57,12 @@ impl Stage {
         let config =
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
-        let p = config.spawn.position_m;
-        let spawn = format!("{},{},{},{}", p.x, p.y, p.z, config.spawn.yaw_deg);
-        Ok(Self { arena, truth, spawn, _folder: folder })
+        Ok(Self { arena, truth, spawn: spawn(&config), _folder: folder })
     }
+}
+
+/// Returns where the vehicle stands, as `vizflyt sim --spawn` reads it.
+fn spawn(arena: &ArenaConfig) -> String {
+    let p = arena.spawn.position_m;
+    format!("{},{},{},{}", p.x, p.y, p.z, arena.spawn.yaw_deg)
 }

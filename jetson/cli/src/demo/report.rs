@@ -122,7 +122,8 @@ impl Report {
             Some(clearance_m) => format!("{clearance_m:.2} m"),
             None => "not known (this scene has no true geometry)".to_owned(),
         };
-        let reason = if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
+        let reason =
+            if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
         format!(
             "{outcome}{reason}\n\
              \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
