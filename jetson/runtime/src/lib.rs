@@ -1,9 +1,31 @@
-//! The runtime (in construction).
-#![allow(missing_docs)]
+//! The runtime on the vehicle's computer: images to the plugin, setpoints through the guard,
+//! MAVLink to the autopilot.
+//!
+//! ```text
+//! server ══QUIC══▶ stream ─▶ images ══shared memory══▶ plugin process
+//!                    │                                     │ answers
+//!                    ▼ poses, events                       ▼
+//!                  control (50 Hz): flight ─▶ guard ─▶ link ══MAVLink══▶ autopilot
+//!                    └─▶ log (MCAP), report, telemetry to the server
+//! ```
+//! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
+//! [`supervisor`] (the plugin's process), [`control`] (the loop that owns the rest), [`flight`]
+//! (phases and outcome, pure), [`guard`] (the last word, pure), [`link`] (MAVLink, sans-IO),
+//! [`stats`], [`log`], [`report`]. [`fly()`] starts it all.
+
+pub mod args;
+pub mod control;
 pub mod flight;
+pub mod fly;
 pub mod guard;
+pub mod images;
 pub mod link;
 pub mod log;
 pub mod report;
 pub mod stats;
+pub mod stream;
 pub mod supervisor;
+
+pub use args::FlyArgs;
+pub use flight::{Outcome, OutcomeKind};
+pub use fly::{fly, fly_command};

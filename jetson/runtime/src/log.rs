@@ -8,9 +8,9 @@ use std::collections::BTreeMap;
 use std::fs::{File, create_dir_all};
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -75,7 +75,9 @@ impl Channel {
                 "v_world_mps": vector, "omega_body_radps": vector, "age_ms": number
             }),
             Self::Asked => json!({"seq": number, "setpoint": {}}),
-            Self::Sent => json!({"v_world_mps": vector, "yaw_rad": number, "yaw_rate_radps": number}),
+            Self::Sent => {
+                json!({"v_world_mps": vector, "yaw_rad": number, "yaw_rate_radps": number})
+            }
             Self::Event => json!({"stamp": number, "kind": {}, "text": text}),
             Self::Telemetry => json!({"phase": text, "vehicle": {"type": "object"},
                 "images": {"type": "object"}, "setpoint": {}}),

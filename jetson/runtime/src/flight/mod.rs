@@ -20,7 +20,9 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint};
 use vizflyt_protocol::time::HostTime;
 
-use crate::guard::{Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, SETPOINT_HOLD_S, Stance};
+use crate::guard::{
+    Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, SETPOINT_HOLD_S, Stance,
+};
 use crate::link::{Goal, LinkEvent};
 pub use outcome::{Outcome, OutcomeKind};
 
@@ -406,8 +408,7 @@ impl Flight {
             self.taken_over(now, link.mode);
         }
         let flies = self.phase_flies();
-        let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, flies)
-        else {
+        let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, flies) else {
             return Orders { goal: self.goal(), setpoint: None };
         };
         let (passed, stance) = guard.tick(now, fix);

@@ -35,10 +35,10 @@ pub enum LinkEvent {
 pub(super) fn refusal(command: &str, why: &str, said: &[&str]) -> String {
     let mut text = format!("{command} {why}");
     if !said.is_empty() {
-        text += &format!("; the autopilot says \"{}\"", said.join("\", \""));
+        text = format!("{text}; the autopilot says \"{}\"", said.join("\", \""));
     }
     if let Some(advice) = said.iter().rev().find_map(|said| advice(said)) {
-        text += &format!("; {advice}");
+        text = format!("{text}; {advice}");
     }
     text
 }

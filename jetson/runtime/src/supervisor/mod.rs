@@ -208,7 +208,7 @@ fn describe(status: ExitStatus, last_error: &str) -> String {
         (None, None) => "the plugin ended".to_owned(),
     };
     if !status.success() && !last_error.is_empty() {
-        text += &format!("; it last said: {last_error}");
+        text = format!("{text}; it last said: {last_error}");
     }
     text
 }

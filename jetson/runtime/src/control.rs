@@ -1,0 +1,534 @@
+//! The control loop: one thread that owns link, flight and plugin, ticks at 50 Hz, and otherwise
+//! waits for what the other threads send. All safety decisions are made here, one at a time.
+//!
+//! ```text
+//! stream (tokio) ─┐                             ┌─▶ MAVLink socket
+//! MAVLink socket ─┤                             ├─▶ plugin (events, stop)
+//! images ─────────┼─▶ Happening queue ─▶ loop ──┼─▶ server (telemetry 10 Hz, events)
+//! plugin answers ─┤                             ├─▶ log
+//! supervisor ─────┤                             └─▶ standard output
+//! signals ────────┘
+//! ```
+
+use std::ffi::OsString;
+use std::io::Write;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+use tokio::sync::mpsc;
+use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, Setpoint, Telemetry,
+    ToPlugin, ToServer, YawTarget, bounded,
+};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::{ObservationWriter, Vehicle, host_now};
+
+use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
+use crate::guard::Fix;
+use crate::images::{ImagePublisher, Published, SharedVehicle};
+use crate::link::udp::{Partner, UdpPort};
+use crate::link::{Link, LinkEvent};
+use crate::log::{Channel, FlightLog};
+use crate::report::Counters;
+use crate::stats::ImageTimes;
+use crate::stream::{Shared, StreamEvent};
+use crate::supervisor::{PluginEvent, Stream, Supervisor};
+
+/// Something another thread tells the control loop.
+#[derive(Debug)]
+pub enum Happening {
+    /// Bytes from the MAVLink socket.
+    Mavlink(Vec<u8>, SocketAddr),
+    /// The server's side.
+    Stream(StreamEvent),
+    /// An observation is about to reach the plugin.
+    Published(Published),
+    /// The plugin says something.
+    FromPlugin(FromPlugin),
+    /// The plugin's process.
+    Plugin(PluginEvent),
+    /// A person wants it to end.
+    Interrupt,
+}
+
+/// Control ticks: setpoints go out at this rate.
+const TICK: Duration = Duration::from_millis(20);
+/// Reports to the server every so many ticks: 10 Hz.
+const TELEMETRY_TICKS: u64 = 5;
+/// The plugin hears of us at least this often.
+const HEARTBEAT_TICKS: u64 = 20;
+/// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
+/// within a tick.
+pub const QUEUE: usize = 1024;
+
+/// What the loop works with.
+pub struct Control {
+    /// The command that starts the plugin.
+    pub plugin_command: Vec<OsString>,
+    /// Limits of the flight as a whole.
+    pub settings: FlightSettings,
+    /// The MAVLink socket.
+    pub port: Arc<UdpPort>,
+    /// Whom to answer on it.
+    pub partner: Partner,
+    /// Clock and mailbox of the stream.
+    pub shared: Shared,
+    /// To the server.
+    pub to_server: mpsc::Sender<ToServer>,
+    /// The log.
+    pub log: FlightLog,
+    /// Prints events as JSON.
+    pub json: bool,
+}
+
+/// What a flight leaves behind.
+#[derive(Debug)]
+pub struct Flown {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// The images.
+    pub times: ImageTimes,
+    /// The counters.
+    pub counters: Counters,
+    /// The log, still open.
+    pub log: FlightLog,
+}
+
+/// The plugin's side, from the moment the arena is known.
+struct PluginSide {
+    ipc: Arc<RuntimeEnd>,
+    supervisor: Option<Supervisor>,
+    arena: Box<ArenaInfo>,
+    started: bool,
+    /// Ends its threads.
+    stop: Arc<AtomicBool>,
+}
+
+struct Loop {
+    control: Control,
+    sender: SyncSender<Happening>,
+    link: Link,
+    flight: Flight,
+    plugin: Option<PluginSide>,
+    vehicle: SharedVehicle,
+    times: ImageTimes,
+    published: u64,
+    image_seq: u64,
+    image_size_px: (u32, u32),
+    setpoints_sent: u64,
+    last_setpoint: Setpoint,
+    ticks: u64,
+}
+
+impl Control {
+    /// Flies to the end. Call it on a thread that lives as long: the plugin dies with it.
+    pub fn run(self, sender: SyncSender<Happening>, happenings: &Receiver<Happening>) -> Flown {
+        let now = host_now();
+        let settings = self.settings;
+        let mut state = Loop {
+            control: self,
+            sender,
+            link: Link::new(now),
+            flight: Flight::new(settings, now),
+            plugin: None,
+            vehicle: SharedVehicle::default(),
+            times: ImageTimes::default(),
+            published: 0,
+            image_seq: 0,
+            image_size_px: (0, 0),
+            setpoints_sent: 0,
+            last_setpoint: Setpoint::Hold,
+            ticks: 0,
+        };
+        let outcome = state.fly(happenings);
+        state.finish(outcome)
+    }
+}
+
+impl Loop {
+    fn fly(&mut self, happenings: &Receiver<Happening>) -> Outcome {
+        let mut next = Instant::now();
+        loop {
+            match happenings.recv_timeout(next.saturating_duration_since(Instant::now())) {
+                Ok(happening) => {
+                    self.take(happening);
+                    self.transmit();
+                    if Instant::now() < next {
+                        continue;
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => thread::sleep(TICK),
+            }
+            next += TICK;
+            if next < Instant::now() {
+                // The machine stalled: do not make up for lost ticks.
+                next = Instant::now() + TICK;
+            }
+            self.tick(host_now());
+            if let Some(outcome) = self.flight.outcome() {
+                return outcome.clone();
+            }
+        }
+    }
+
+    fn tick(&mut self, now: HostTime) {
+        self.ticks += 1;
+        self.link.handle_timeout(now);
+        let state = self.link.state();
+        let view = LinkView {
+            connected: self.link.is_connected(),
+            armed: state.armed,
+            mode: state.mode,
+            took_off: self.link.took_off(),
+            ready_to_arm: self.link.ready_to_arm(),
+        };
+        let orders = self.flight.tick(now, &view);
+        self.link.set_goal(now, orders.goal);
+        if let Some(setpoint) = orders.setpoint
+            && self.link.setpoint(now, &setpoint)
+        {
+            self.setpoints_sent += 1;
+            self.log_sent(now, &setpoint);
+        }
+        self.transmit();
+        self.tend_plugin();
+        self.tell_notices(now);
+        if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
+            self.report(now);
+        }
+    }
+
+    fn transmit(&mut self) {
+        let to = self.control.partner.address();
+        while let Some(datagram) = self.link.poll_transmit() {
+            if let Some(to) = to {
+                self.control.port.send(&datagram, to);
+            }
+        }
+        let now = host_now();
+        while let Some(event) = self.link.poll_event() {
+            match &event {
+                LinkEvent::Text { text, .. } => tracing::info!("autopilot: {text}"),
+                event => tracing::info!("link: {event:?}"),
+            }
+            self.flight.handle(now, Input::Link(event));
+        }
+    }
+
+    // ---- what others tell ----
+
+    fn take(&mut self, happening: Happening) {
+        let now = host_now();
+        match happening {
+            Happening::Mavlink(bytes, from) => {
+                if self.control.partner.heard(from, Instant::now()) {
+                    self.link.handle_input(now, &bytes);
+                }
+            }
+            Happening::Stream(event) => self.take_stream(now, event),
+            Happening::Published(published) => {
+                self.published += 1;
+                self.image_seq = published.seq;
+                self.times.published(published.seq, published.pose);
+                self.flight.handle(now, Input::ImagePublished { seq: published.seq });
+                self.control.log.write(
+                    Channel::Image,
+                    published.ready,
+                    &json!({
+                        "seq": published.seq, "pose_ns": published.pose.as_ns(),
+                        "received_ns": published.received.as_ns(),
+                        "ready_ns": published.ready.as_ns()
+                    }),
+                );
+            }
+            Happening::FromPlugin(message) => self.take_plugin(now, message),
+            Happening::Plugin(PluginEvent::Line(stream, line)) => {
+                self.take_line(now, stream, &line);
+            }
+            Happening::Plugin(PluginEvent::Exited(sentence)) => {
+                if let Some(side) = &self.plugin {
+                    side.ipc.clean_up();
+                }
+                self.flight.handle(now, Input::PluginFailed(sentence));
+            }
+            Happening::Interrupt => self.flight.handle(now, Input::Interrupt),
+        }
+    }
+
+    fn take_stream(&mut self, now: HostTime, event: StreamEvent) {
+        match event {
+            StreamEvent::Welcome(arena) => {
+                tracing::info!("server: arena {}", arena.name);
+                self.flight.handle(now, Input::Arena(arena.clone()));
+                if self.plugin.is_none() && self.flight.outcome().is_none() {
+                    self.start_plugin(now, arena);
+                }
+            }
+            StreamEvent::Refused(why) => self.flight.handle(now, Input::ServerRefused(why)),
+            StreamEvent::Down(why) => tracing::warn!("{why}; trying again"),
+            StreamEvent::Pose(sample, stamp) => self.take_pose(now, &sample, stamp),
+            StreamEvent::Event(event) => {
+                self.publish_event(now, &event);
+                self.flight.handle(now, Input::Server(event));
+            }
+        }
+    }
+
+    fn take_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
+        self.link.vision(now, &sample.world_from_body, stamp, sample.resets);
+        self.flight.handle(now, Input::Pose(Fix::of(sample, stamp)));
+        let battery = f64::from(self.link.state().battery_fraction);
+        let vehicle = Vehicle {
+            stamp,
+            world_from_body: sample.world_from_body,
+            v_world_mps: sample.twist.linear_mps,
+            omega_body_radps: sample.twist.angular_radps,
+            battery_fraction: (battery >= 0.0).then_some(battery),
+        };
+        *self.vehicle.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(vehicle);
+        self.control.log.write(
+            Channel::Pose,
+            stamp,
+            &json!({
+                "stamp_ns": stamp.as_ns(),
+                "p_world_m": sample.world_from_body.translation_m.to_array(),
+                "q_world_from_body_xyzw": sample.world_from_body.rotation.to_array(),
+                "v_world_mps": sample.twist.linear_mps.to_array(),
+                "omega_body_radps": sample.twist.angular_radps.to_array(),
+                "age_ms": now.seconds_since(stamp) * 1e3
+            }),
+        );
+    }
+
+    fn take_plugin(&mut self, now: HostTime, message: FromPlugin) {
+        match message {
+            FromPlugin::Ready { name } => {
+                tracing::info!("plugin {name} is ready");
+                self.flight.handle(now, Input::PluginReady);
+            }
+            FromPlugin::Answer { seq, entered, returned, setpoint } => {
+                let age_ms = self.times.answered(seq, entered, returned);
+                self.flight.handle(now, Input::Answered { seq, setpoint });
+                if let Some(setpoint) = setpoint {
+                    self.last_setpoint = setpoint;
+                }
+                let asked = json!({"seq": seq, "setpoint": setpoint});
+                self.control.log.write(Channel::Asked, returned, &asked);
+                self.control.log.write(
+                    Channel::Image,
+                    returned,
+                    &json!({
+                        "seq": seq, "entered_ns": entered.as_ns(),
+                        "returned_ns": returned.as_ns(), "age_ms": age_ms
+                    }),
+                );
+            }
+            FromPlugin::Failed { reason } => {
+                let sentence = format!("the plugin failed: {reason}");
+                self.flight.handle(now, Input::PluginFailed(sentence));
+            }
+        }
+    }
+
+    fn take_line(&mut self, now: HostTime, stream: Stream, line: &str) {
+        let stream = match stream {
+            Stream::Stdout => "stdout",
+            Stream::Stderr => "stderr",
+        };
+        tracing::info!(target: "plugin", image = self.image_seq, "{line}");
+        let record = json!({"stream": stream, "line": line, "image_seq": self.image_seq});
+        self.control.log.write(Channel::PluginOutput, now, &record);
+        let stamp = self.control.shared.clock.to_server(now);
+        let event = Event { stamp, kind: EventKind::PluginOutput, text: bounded(line) };
+        self.send(ToServer::Event(event));
+    }
+
+    // ---- the plugin ----
+
+    fn start_plugin(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
+        if let Some(camera) = arena.cameras.first() {
+            self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+        }
+        let service = unique_service();
+        let len = ObservationWriter::len_for(&arena.cameras);
+        let ipc = match RuntimeEnd::create(&service, len) {
+            Ok(ipc) => Arc::new(ipc),
+            Err(error) => {
+                return self.flight.handle(now, Input::ServerRefused(error.to_string()));
+            }
+        };
+        let stop = Arc::new(AtomicBool::new(false));
+        self.start_threads(&ipc, &arena, &stop);
+        let mut command = self.control.plugin_command.clone();
+        command.push(format!("{SERVICE_OPTION}={service}").into());
+        let sender = self.sender.clone();
+        // Lines and the end are never dropped: the loop always reads.
+        let tell = move |event| {
+            let _ = sender.send(Happening::Plugin(event));
+        };
+        let supervisor = match Supervisor::start(&command, tell) {
+            Ok(supervisor) => Some(supervisor),
+            Err(error) => {
+                let program = command[0].to_string_lossy();
+                let sentence = format!("the plugin {program} cannot be started: {error}");
+                self.flight.handle(now, Input::PluginFailed(sentence));
+                None
+            }
+        };
+        self.plugin = Some(PluginSide { ipc, supervisor, arena, started: false, stop });
+    }
+
+    fn start_threads(&self, ipc: &Arc<RuntimeEnd>, arena: &ArenaInfo, stop: &Arc<AtomicBool>) {
+        let cameras = arena.cameras.to_vec();
+        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.vehicle));
+        let mailbox = Arc::clone(&self.control.shared.mailbox);
+        let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
+        spawn("images", move || {
+            publisher.run(
+                &mailbox,
+                || stopped.load(Ordering::Relaxed),
+                |published| {
+                    let _ = sender.send(Happening::Published(published));
+                },
+            );
+        });
+        let (ipc, sender, stopped) = (Arc::clone(ipc), self.sender.clone(), Arc::clone(stop));
+        spawn("answers", move || {
+            while !stopped.load(Ordering::Relaxed) {
+                if ipc.wait(Duration::from_millis(100)).is_err() {
+                    // No event comes any more; poll instead.
+                    thread::sleep(Duration::from_millis(1));
+                }
+                while let Ok(Some(message)) = ipc.receive() {
+                    let _ = sender.send(Happening::FromPlugin(message));
+                }
+            }
+        });
+    }
+
+    /// Greets the plugin once it has attached; shows it that we live.
+    fn tend_plugin(&mut self) {
+        let Some(side) = &mut self.plugin else { return };
+        if !side.started && side.ipc.plugin_attached() {
+            side.started = true;
+            if let Err(error) = side.ipc.send(&ToPlugin::Start((*side.arena).clone())) {
+                tracing::warn!("plugin: {error}");
+            }
+        } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
+            side.ipc.heartbeat();
+        }
+    }
+
+    // ---- telling others ----
+
+    fn tell_notices(&mut self, now: HostTime) {
+        while let Some(notice) = self.flight.poll_notice() {
+            let stamp = self.control.shared.clock.to_server(now);
+            let text = bounded(&notice.text);
+            let event = Event { stamp, kind: notice.kind, text };
+            tracing::info!(target: "flight", "{}", notice.text);
+            self.publish_event(now, &event);
+            self.send(ToServer::Event(event));
+        }
+    }
+
+    /// Log, plugin and standard output hear of every event but the plugin's own lines.
+    fn publish_event(&mut self, now: HostTime, event: &Event) {
+        self.control.log.write(Channel::Event, now, event);
+        if self.control.json {
+            print_line(&json!({"event": event}).to_string());
+        } else {
+            print_line(&event.text);
+        }
+        if let Some(side) = &self.plugin
+            && side.started
+            && side.ipc.plugin_attached()
+            && let Err(error) = side.ipc.send(&ToPlugin::Event(event.clone()))
+        {
+            tracing::debug!("plugin: {error}");
+        }
+    }
+
+    fn send(&self, message: ToServer) {
+        // Full: the server is away. Reports are stale by the time it is back.
+        let _ = self.control.to_server.try_send(message);
+    }
+
+    fn report(&mut self, now: HostTime) {
+        let replaced = self.control.shared.mailbox.replaced();
+        let telemetry = Telemetry {
+            phase: self.flight.phase(),
+            vehicle: *self.link.state(),
+            images: self.times.last_second(now, self.published, replaced),
+            setpoint: self.last_setpoint,
+            setpoints_sent: self.setpoints_sent,
+            mavlink_packets: self.link.packets(),
+        };
+        self.control.log.write(Channel::Telemetry, now, &telemetry);
+        self.send(ToServer::Telemetry(telemetry));
+    }
+
+    fn log_sent(&mut self, now: HostTime, setpoint: &GuidedSetpoint) {
+        let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return };
+        self.last_setpoint = Setpoint::velocity(v_mps, setpoint.yaw);
+        let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
+            YawTarget::Angle(yaw_rad) => (Some(yaw_rad), None),
+            YawTarget::Rate(rate_radps) => (None, Some(rate_radps)),
+            YawTarget::Keep => (None, None),
+        };
+        self.control.log.write(
+            Channel::Sent,
+            now,
+            &json!({
+                "v_world_mps": v_mps.to_array(), "yaw_rad": yaw_rad,
+                "yaw_rate_radps": yaw_rate_radps
+            }),
+        );
+    }
+
+    // ---- the end ----
+
+    fn finish(mut self, outcome: Outcome) -> Flown {
+        let now = host_now();
+        self.tell_notices(now);
+        self.report(now);
+        debug_assert_eq!(self.flight.phase(), FlightPhase::Landed);
+        if let Some(side) = self.plugin.take() {
+            if side.ipc.plugin_attached() {
+                let _ = side.ipc.send(&ToPlugin::Stop);
+            }
+            if let Some(supervisor) = &side.supervisor {
+                supervisor.end();
+            }
+            side.stop.store(true, Ordering::Relaxed);
+            side.ipc.clean_up();
+        }
+        let counters = Counters {
+            seconds: self.flight.seconds(now),
+            image_size_px: self.image_size_px,
+            setpoints_sent: self.setpoints_sent,
+            mavlink_packets: self.link.packets(),
+        };
+        Flown { outcome, times: self.times, counters, log: self.control.log }
+    }
+}
+
+fn spawn(name: &str, run: impl FnOnce() + Send + 'static) {
+    if let Err(error) = thread::Builder::new().name(name.into()).spawn(run) {
+        tracing::error!("thread {name}: {error}");
+    }
+}
+
+/// Prints a line for a program that may have stopped listening.
+pub fn print_line(line: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}

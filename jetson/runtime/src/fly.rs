@@ -1,0 +1,203 @@
+//! Starts everything, flies, reports.
+
+use std::fs;
+use std::io::Read;
+use std::net::SocketAddr;
+use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::thread;
+use std::time::Instant;
+
+use anyhow::Context;
+use serde_json::json;
+use tokio::runtime::{Builder, Runtime};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
+use vizflyt_protocol::messages::bounded;
+
+use crate::args::FlyArgs;
+use crate::control::{Control, Happening, QUEUE, print_line};
+use crate::flight::{FlightSettings, Outcome};
+use crate::link::udp::{Partner, UdpPort};
+use crate::log::FlightLog;
+use crate::report::Report;
+use crate::stream::{self, Mailbox, ServerClock, Shared, StreamEvent, StreamSettings};
+
+/// Messages to the server that wait at most: some seconds of telemetry and a burst of output.
+const TO_SERVER: usize = 256;
+/// Exit status when a second signal cuts the landing short: 128 + SIGINT, as shells have it.
+const CUT_SHORT: i32 = 130;
+
+/// Flies one flight to its end; returns how it ended. Blocks; call it on a thread that lives as
+/// long as the flight, as the plugin dies with it.
+///
+/// # Errors
+/// If sockets or threads cannot be made, or the report cannot be written. Everything that goes
+/// wrong later is an [`Outcome`].
+#[allow(clippy::needless_pass_by_value)] // Why: an entry point; its arguments are spent.
+pub fn fly(args: FlyArgs) -> anyhow::Result<Outcome> {
+    let command = args.plugin_command();
+    fly_command(&args, command)
+}
+
+/// As [`fly`], with the plugin's command given as a list; [`FlyArgs::plugin`] only names it.
+///
+/// # Errors
+/// As [`fly`].
+pub fn fly_command(
+    args: &FlyArgs,
+    plugin_command: Vec<std::ffi::OsString>,
+) -> anyhow::Result<Outcome> {
+    let port = Arc::new(
+        UdpPort::open(args.mavlink)
+            .with_context(|| format!("{}: cannot open the socket", args.mavlink))?,
+    );
+    let log = FlightLog::open(&args.log);
+    let (sender, happenings) = sync_channel(QUEUE);
+    let stop = Arc::new(AtomicBool::new(false));
+    receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
+    if args.lifeline {
+        watch_stdin(sender.clone())?;
+    }
+
+    let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let shared = Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
+    let (to_server, outbox) = mpsc::channel(TO_SERVER);
+    watch_signals(&tokio, sender.clone())?;
+    let settings = StreamSettings {
+        server: args.server,
+        fingerprint: args.fingerprint,
+        vehicle: bounded(&args.vehicle),
+    };
+    tokio.spawn(stream::run(settings, shared.clone(), outbox, tell_stream(sender.clone())));
+    print_ready(args, port.local_addr()?, &log);
+
+    let control = Control {
+        plugin_command,
+        settings: FlightSettings { ready_within_s: args.ready_within, time_limit_s: args.seconds },
+        port,
+        partner: Partner::new(args.mavlink, Instant::now()),
+        shared,
+        to_server,
+        log,
+        json: args.json,
+    };
+    let flown = control.run(sender, &happenings);
+    stop.store(true, Ordering::Relaxed);
+
+    let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
+    report.log = flown.log.path().map(|path| path.display().to_string());
+    drop(flown.log);
+    // The stream task says goodbye to the server on its way out.
+    tokio.shutdown_timeout(std::time::Duration::from_millis(300));
+    print_outcome(args, &report);
+    if let Some(file) = &args.report {
+        let text = serde_json::to_string_pretty(&report)?;
+        fs::write(file, text + "\n")
+            .with_context(|| format!("report {} cannot be written", file.display()))?;
+    }
+    Ok(flown.outcome)
+}
+
+fn receive_mavlink(
+    port: Arc<UdpPort>,
+    sender: SyncSender<Happening>,
+    stop: Arc<AtomicBool>,
+) -> std::io::Result<()> {
+    let receive = move || {
+        // Larger than any datagram of MAVLink packets on an Ethernet.
+        let mut buffer = [0; 2048];
+        while !stop.load(Ordering::Relaxed) {
+            match port.receive(&mut buffer) {
+                Ok(Some((len, from))) => {
+                    // A full queue drops telemetry, as the network might.
+                    let _ = sender.try_send(Happening::Mavlink(buffer[..len].to_vec(), from));
+                }
+                Ok(None) => {}
+                Err(error) => {
+                    tracing::warn!("mavlink socket: {error}");
+                    thread::sleep(std::time::Duration::from_millis(100));
+                }
+            }
+        }
+    };
+    thread::Builder::new().name("mavlink".into()).spawn(receive)?;
+    Ok(())
+}
+
+/// The first signal lands and ends; the second ends at once.
+fn watch_signals(tokio: &Runtime, sender: SyncSender<Happening>) -> std::io::Result<()> {
+    let _context = tokio.enter();
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    tokio.spawn(async move {
+        let mut count = 0;
+        loop {
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => {}
+            }
+            count += 1;
+            if count > 1 {
+                process::exit(CUT_SHORT);
+            }
+            tracing::info!("landing, then leaving; once more to leave at once");
+            let _ = sender.try_send(Happening::Interrupt);
+        }
+    });
+    Ok(())
+}
+
+/// Ends the flight when the parent is gone.
+fn watch_stdin(sender: SyncSender<Happening>) -> std::io::Result<()> {
+    let watch = move || {
+        let mut buffer = [0; 256];
+        while matches!(std::io::stdin().read(&mut buffer), Ok(len) if len > 0) {}
+        let _ = sender.send(Happening::Interrupt);
+    };
+    thread::Builder::new().name("lifeline".into()).spawn(watch)?;
+    Ok(())
+}
+
+fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) + Send + Sync {
+    move |event| {
+        let is_pose = matches!(event, StreamEvent::Pose(..));
+        // Poses are many and stale soon. The rest must arrive; the queue is long enough for a
+        // stalled loop to take it before the network's own buffers fill.
+        if sender.try_send(Happening::Stream(event)).is_err() && !is_pose {
+            tracing::error!("control loop stalled; an event of the server was lost");
+        }
+    }
+}
+
+fn print_ready(args: &FlyArgs, mavlink: SocketAddr, log: &FlightLog) {
+    let log = log.path().map(|path| path.display().to_string());
+    if args.json {
+        let mavlink = mavlink.to_string();
+        print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
+    } else {
+        print_line(&format!("waiting for server {} and an autopilot on {mavlink}", args.server));
+    }
+}
+
+fn print_outcome(args: &FlyArgs, report: &Report) {
+    if args.json {
+        print_line(&json!({"report": report}).to_string());
+        return;
+    }
+    print_line(&format!("{}: {}", report.outcome.name(), report.reason));
+    print_line(&format!(
+        "{:.1} s in the air, {} images at {:.1} Hz, age {:.1} ms (p99 {:.1}), {} setpoints",
+        report.seconds,
+        report.images_delivered,
+        report.image_hz,
+        report.age_ms_p50,
+        report.age_ms_p99,
+        report.setpoints_sent
+    ));
+    if let Some(log) = &report.log {
+        print_line(&format!("log: {log}"));
+    }
+}
