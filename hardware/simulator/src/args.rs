@@ -156,6 +156,8 @@ impl SimArgs {
 ///
 /// # Errors
 /// Fails on arguments out of range, unreadable files, and sockets that cannot be opened.
+// Why: by value, as every run function of the command line.
+#[allow(clippy::needless_pass_by_value)]
 pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let simulation = Simulation::new(args.config()?)?;

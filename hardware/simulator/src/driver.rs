@@ -78,11 +78,12 @@ impl Driver {
             let now = Instant::now();
             let behind = now.saturating_duration_since(next);
             if behind > most_behind {
-                let given_up = behind - most_behind;
+                let given_up = behind.saturating_sub(most_behind);
                 lost += given_up;
                 next += given_up;
                 if warned.is_none_or(|(at, _)| at.elapsed() > WARN_EVERY) {
-                    let since = lost - warned.map_or(Duration::ZERO, |(_, lost)| lost);
+                    let since =
+                        lost.saturating_sub(warned.map_or(Duration::ZERO, |(_, lost)| lost));
                     tracing::warn!(
                         "simulator: {:.0} ms of simulated time given up; the machine is too busy for real time",
                         since.as_secs_f64() * 1e3,

@@ -9,6 +9,7 @@ use vizflyt_protocol::time::AutopilotTime;
 use super::dialect::{MavCmd, MavMessage, MavResult, MavSeverity};
 use super::failsafe::needs_position;
 use super::flight::FlightState;
+use super::telemetry::autopilot_version;
 use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE};
 use crate::estimator::VisionMeasurement;
 use glam::{DQuat, DVec3};
@@ -21,7 +22,7 @@ const FORCE_DISARM: f32 = 21196.0;
 
 /// One command, whichever message carried it.
 struct Command {
-    command: MavCmd,
+    kind: MavCmd,
     params: [f32; 7],
     sender: (u8, u8),
 }
@@ -30,18 +31,18 @@ impl Autopilot {
     pub(super) fn handle_packet(&mut self, now: AutopilotTime, packet: &Packet) {
         let sender = (packet.header.system_id as u8, packet.header.component_id);
         match &packet.message {
-            MavMessage::HEARTBEAT(_) => {
-                if f64::from(sender.0) == self.params.value(Param::GcsSystemId) {
-                    self.last_ground_station = Some(now);
-                }
+            MavMessage::HEARTBEAT(_)
+                if f64::from(sender.0) == self.params.value(Param::GcsSystemId) =>
+            {
+                self.last_ground_station = Some(now);
             }
             MavMessage::COMMAND_LONG(m) if self.is_for_us(m.target_system, m.target_component) => {
                 let params = [m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7];
-                self.handle_command(now, &Command { command: m.command, params, sender });
+                self.handle_command(now, &Command { kind: m.command, params, sender });
             }
             MavMessage::COMMAND_INT(m) if self.is_for_us(m.target_system, m.target_component) => {
                 let params = [m.param1, m.param2, m.param3, m.param4, m.x as f32, m.y as f32, m.z];
-                self.handle_command(now, &Command { command: m.command, params, sender });
+                self.handle_command(now, &Command { kind: m.command, params, sender });
             }
             MavMessage::SET_MODE(m) if m.target_system == self.system_id() => {
                 self.change_mode(now, m.custom_mode);
@@ -122,7 +123,7 @@ impl Autopilot {
 
     fn handle_command(&mut self, now: AutopilotTime, c: &Command) {
         let [p1, p2, ..] = c.params;
-        let result = match c.command {
+        let result = match c.kind {
             MavCmd::MAV_CMD_DO_SET_MODE => self.change_mode(now, p2 as u32),
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 1.0 => self.arm(now, p2 == FORCE_ARM),
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 0.0 => {
@@ -161,14 +162,13 @@ impl Autopilot {
                 None => MavResult::MAV_RESULT_FAILED,
             },
             MavCmd::MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES => {
-                let version = self.autopilot_version();
-                self.send(version);
+                self.send(autopilot_version());
                 MavResult::MAV_RESULT_ACCEPTED
             }
             _ => MavResult::MAV_RESULT_UNSUPPORTED,
         };
         self.send(MavMessage::COMMAND_ACK(dialect::COMMAND_ACK_DATA {
-            command: c.command,
+            command: c.kind,
             result,
             target_system: c.sender.0,
             target_component: c.sender.1,

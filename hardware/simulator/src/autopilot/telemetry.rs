@@ -245,7 +245,7 @@ impl Autopilot {
                 throttle: self.throttle_percent(),
             }),
             BATTERY_STATUS => self.battery_status(),
-            AUTOPILOT_VERSION => self.autopilot_version(),
+            AUTOPILOT_VERSION => autopilot_version(),
             EKF_STATUS_REPORT => self.ekf_status(now),
             HOME_POSITION => self.home_position(now)?,
             EXTENDED_SYS_STATE => {
@@ -397,16 +397,17 @@ impl Autopilot {
             MavLandedState::MAV_LANDED_STATE_IN_AIR
         }
     }
+}
 
-    pub(super) fn autopilot_version(&self) -> MavMessage {
-        MavMessage::AUTOPILOT_VERSION(dialect::AUTOPILOT_VERSION_DATA {
-            capabilities: MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
-                | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_MAVLINK2,
-            // The ArduCopter whose behaviour this follows: 4.8.0, development version.
-            flight_sw_version: 4 << 24 | 8 << 16,
-            ..Default::default()
-        })
-    }
+/// What the autopilot is: ArduCopter 4.8 in what it does.
+pub(super) fn autopilot_version() -> MavMessage {
+    MavMessage::AUTOPILOT_VERSION(dialect::AUTOPILOT_VERSION_DATA {
+        capabilities: MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+            | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+            | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+            | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_MAVLINK2,
+        // The ArduCopter whose behaviour this follows: 4.8.0, development version.
+        flight_sw_version: 4 << 24 | 8 << 16,
+        ..Default::default()
+    })
 }

@@ -40,7 +40,7 @@ impl Bench {
             self.ticks += 1;
             let now = self.now();
             self.estimator.handle_sensors(now, &standing(), DT_S, true);
-            if let (Some(vision), true) = (&vision, self.ticks % 8 == 0) {
+            if let (Some(vision), true) = (&vision, self.ticks.is_multiple_of(8)) {
                 self.estimator.handle_vision(now, vision);
             }
         }
