@@ -1,6 +1,8 @@
 //! Where scenes are painted: flat Gaussians laid on surfaces, in linear light, turned into the
 //! display colours that splats carry.
 
+use std::sync::OnceLock;
+
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_splat::Splats;
 
@@ -51,10 +53,15 @@ impl Canvas {
 
 /// Returns linear light of a display colour written as in a paint program, `0xRRGGBB`.
 pub(crate) fn paint(rgb: u32) -> DVec3 {
-    let channel = |shift: u32| {
-        let v = f64::from((rgb >> shift) & 0xff) / 255.0;
-        if v <= 0.04045 { v / 12.92 } else { libm::pow((v + 0.055) / 1.055, 2.4) }
-    };
+    // Textures ask a million times: a table of the inverse sRGB transfer.
+    static LINEAR: OnceLock<[f64; 256]> = OnceLock::new();
+    let linear = LINEAR.get_or_init(|| {
+        core::array::from_fn(|n| {
+            let v = n as f64 / 255.0;
+            if v <= 0.04045 { v / 12.92 } else { libm::pow((v + 0.055) / 1.055, 2.4) }
+        })
+    });
+    let channel = |shift: u32| linear[((rgb >> shift) & 0xff) as usize];
     DVec3::new(channel(16), channel(8), channel(0))
 }
 

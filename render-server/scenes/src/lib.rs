@@ -10,6 +10,7 @@
 
 mod canvas;
 mod forest;
+mod hall;
 mod random;
 mod solids;
 mod write;
@@ -28,16 +29,22 @@ pub use write::{WriteError, Written};
 pub enum SceneKind {
     /// 40 m of trees between start and goal.
     Forest,
+    /// Three racing windows, a wall with a gap, and a window for a rotating hand, in the net.
+    Race,
+    /// The 11 x 4.5 x 3.65 m netted lab, empty.
+    Room,
 }
 
 impl SceneKind {
     /// Every kind.
-    pub const ALL: [Self; 1] = [Self::Forest];
+    pub const ALL: [Self; 3] = [Self::Forest, Self::Race, Self::Room];
 
     /// Returns the kind's name as the command line takes it.
     pub fn name(self) -> &'static str {
         match self {
             Self::Forest => "forest",
+            Self::Race => "race",
+            Self::Room => "room",
         }
     }
 }
@@ -90,5 +97,10 @@ pub struct Generated {
 pub fn generate(kind: SceneKind, seed: u64) -> Generated {
     match kind {
         SceneKind::Forest => forest::build(seed),
+        SceneKind::Race => hall::build_race(seed),
+        SceneKind::Room => hall::build_room(seed),
     }
 }
+
+#[cfg(test)]
+mod tests;

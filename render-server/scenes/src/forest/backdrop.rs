@@ -26,7 +26,7 @@ fn sky(site: &Site, direction: DVec3) -> DVec3 {
     let near = direction.dot(site.sun).max(0.0);
     let glow = DVec3::new(1.5, 1.15, 0.7) * (0.35 * libm::pow(near, 5.0) + libm::pow(near, 40.0));
     let cloud =
-        fractal2(site.seed ^ 71, DVec2::new(direction.x, direction.y) * 2.6 / (0.35 + up), 4);
+        fractal2(site.seed ^ 0x47, DVec2::new(direction.x, direction.y) * 2.6 / (0.35 + up), 4);
     let white = smoothstep(0.5, 0.75, cloud) * smoothstep(0.02, 0.3, up);
     (blue * 0.95 + HAZE * (0.35 * (1.0 - up) * (1.0 - up))).lerp(DVec3::splat(1.05), 0.6 * white)
         + glow
@@ -90,7 +90,7 @@ fn paint_belt(
         while z_m < top_m {
             let jitter = polar(rng.angle()) * rng.range(0.0, 1.3);
             let green = paint(0x2e4420).lerp(paint(0x6f8a3c), rng.unit());
-            let clump = fractal2(key ^ 1, DVec2::new(angle * 9.0, z_m / 2.2), 3);
+            let clump = fractal2(key ^ 0x1, DVec2::new(angle * 9.0, z_m / 2.2), 3);
             let light = 0.10
                 + 0.45 * smoothstep(0.0, top_m, z_m)
                 + 0.55 * smoothstep(0.35, 0.7, clump)

@@ -35,12 +35,12 @@ fn bark(species: Species, key: u64, around: DVec3, radius_m: f64, z_m: f64) -> (
     let on = |across_m: f64, along_m: f64| {
         DVec3::new(around.x * radius_m / across_m, around.y * radius_m / across_m, z_m / along_m)
     };
-    let large = noise(key ^ 1, on(0.5, 1.3));
+    let large = noise(key ^ 0x1, on(0.5, 1.3));
     match species {
         Species::Pine => {
-            let sway = noise(key ^ 2, on(0.12, 0.22)) - 0.5;
-            let ridge = noise(key ^ 3, on(0.05, 0.42) + DVec3::splat(1.4 * sway));
-            let plate = noise(key ^ 4, on(0.06, 0.09));
+            let sway = noise(key ^ 0x2, on(0.12, 0.22)) - 0.5;
+            let ridge = noise(key ^ 0x3, on(0.05, 0.42) + DVec3::splat(1.4 * sway));
+            let plate = noise(key ^ 0x4, on(0.06, 0.09));
             let height = smoothstep(0.33, 0.62, ridge);
             // Redder towards the crown.
             let red = smoothstep(1.5, 6.0, z_m + 3.0 * (large - 0.5));
@@ -48,22 +48,22 @@ fn bark(species: Species, key: u64, around: DVec3, radius_m: f64, z_m: f64) -> (
             (paint(0x2b2019).lerp(face, height), 0.012 * (1.0 - height))
         }
         Species::Beech => {
-            let blotch = noise(key ^ 5, on(0.17, 0.2));
-            let fine = noise(key ^ 6, on(0.05, 0.035));
+            let blotch = noise(key ^ 0x5, on(0.17, 0.2));
+            let fine = noise(key ^ 0x6, on(0.05, 0.035));
             let grey = paint(0x77756a).lerp(paint(0xa5a393), smoothstep(0.3, 0.75, blotch));
-            let lichen = smoothstep(0.66, 0.74, noise(key ^ 7, on(0.11, 0.13)));
-            let crack = smoothstep(0.72, 0.8, noise(key ^ 8, on(0.3, 0.05)));
+            let lichen = smoothstep(0.66, 0.74, noise(key ^ 0x7, on(0.11, 0.13)));
+            let crack = smoothstep(0.72, 0.8, noise(key ^ 0x8, on(0.3, 0.05)));
             let albedo = grey.lerp(paint(0xb9c4a8), 0.7 * lichen) * (0.75 + 0.4 * fine);
             (albedo.lerp(paint(0x3c3a34), 0.65 * crack), 0.003 * crack)
         }
         Species::Birch => {
-            let fine = noise(key ^ 9, on(0.09, 0.05));
+            let fine = noise(key ^ 0x9, on(0.09, 0.05));
             let white = paint(0xcfc8ba).lerp(paint(0xe9e4d8), fine);
             // Short dark dashes across, and black rough bark at the foot.
-            let dash = smoothstep(0.66, 0.73, noise(key ^ 10, on(0.20, 0.032)));
-            let rough = noise(key ^ 11, on(0.06, 0.16));
+            let dash = smoothstep(0.66, 0.73, noise(key ^ 0xa, on(0.20, 0.032)));
+            let rough = noise(key ^ 0xb, on(0.06, 0.16));
             let foot = smoothstep(0.75, 0.1, z_m + 0.9 * (rough - 0.5));
-            let diamond = smoothstep(0.73, 0.78, noise(key ^ 12, on(0.14, 0.22)));
+            let diamond = smoothstep(0.73, 0.78, noise(key ^ 0xc, on(0.14, 0.22)));
             let dark = dash.max(foot * smoothstep(0.25, 0.6, rough)).max(diamond);
             (white.lerp(paint(0x25211d), 0.88 * dark), 0.006 * foot)
         }
@@ -73,7 +73,7 @@ fn bark(species: Species, key: u64, around: DVec3, radius_m: f64, z_m: f64) -> (
 /// Adds moss: on the side away from the sun and at the feet.
 fn moss(key: u64, light: &Light, p_m: DVec3, normal: DVec3, albedo: DVec3, rng: &mut Rng) -> DVec3 {
     let away = -normal.truncate().dot(light.sun.truncate().normalize_or_zero());
-    let patch = noise(key ^ 20, p_m / 0.3) + 0.4 * noise(key ^ 21, p_m / 0.08) - 0.2;
+    let patch = noise(key ^ 0x14, p_m / 0.3) + 0.4 * noise(key ^ 0x15, p_m / 0.08) - 0.2;
     let low = smoothstep(1.5, 0.0, p_m.z);
     let cover = smoothstep(0.62, 0.8, patch + 0.22 * away + 0.32 * low + 0.25 * normal.z.max(0.0));
     let green = paint(0x4c5f22).lerp(paint(0x7c8a35), rng.unit());
@@ -208,7 +208,7 @@ fn paint_limb(
             if hidden || p_m.z < 0.004 {
                 continue;
             }
-            let (albedo, _) = bark(tree.species, tree.key ^ 77, normal, limb.radius_m, t);
+            let (albedo, _) = bark(tree.species, tree.key ^ 0x4d, normal, limb.radius_m, t);
             let albedo = moss(tree.key, light, p_m, normal, albedo, rng);
             canvas.add(Patch {
                 center_m: p_m - normal * 0.004,
@@ -230,7 +230,7 @@ fn paint_branch(canvas: &mut Canvas, rng: &mut Rng, tree: &Tree, branch: &Limb, 
         let t = (n as f64 + 0.5) / pieces;
         let p_m = branch.from_m + axis * t;
         let radius_m = branch.radius_m * (1.1 - 0.75 * t);
-        let (albedo, _) = bark(tree.species, tree.key ^ 99, DVec3::X, 0.1, t * 3.0);
+        let (albedo, _) = bark(tree.species, tree.key ^ 0x63, DVec3::X, 0.1, t * 3.0);
         let sun = light.sunlight(p_m);
         let radiance =
             albedo * 0.7 * (light.ambient(DVec3::Z * 0.2) + super::light::SUN * (0.35 * sun));

@@ -1,7 +1,7 @@
 //! The forest floor: a trodden path, soil, moss and leaf litter, boulders and twigs.
 //!
-//! The true floor is the plane z = 0; patches lie within a centimetre of it, and litter on it
-//! stands up at most two.
+//! The true floor is the plane z = 0; patches lie one to three centimetres below it, and litter
+//! stands up at most two above.
 
 use glam::{DVec2, DVec3};
 
@@ -23,12 +23,12 @@ pub(crate) struct Cover {
 
 /// Returns what covers the ground at a point. [m, world]
 pub(crate) fn cover(seed: u64, p: DVec2) -> Cover {
-    let centre_m = 1.5 * (noise2(seed ^ 41, DVec2::new(p.x / 9.0, 0.0)) - 0.5)
-        + 0.5 * (noise2(seed ^ 42, DVec2::new(p.x / 3.0, 4.0)) - 0.5);
-    let off_m = (p.y - centre_m).abs() + 0.5 * (fractal2(seed ^ 43, p / 0.8, 2) - 0.5);
+    let centre_m = 1.5 * (noise2(seed ^ 0x29, DVec2::new(p.x / 9.0, 0.0)) - 0.5)
+        + 0.5 * (noise2(seed ^ 0x2a, DVec2::new(p.x / 3.0, 4.0)) - 0.5);
+    let off_m = (p.y - centre_m).abs() + 0.5 * (fractal2(seed ^ 0x2b, p / 0.8, 2) - 0.5);
     let path = smoothstep(1.0, 0.35, off_m) * smoothstep(45.0, 40.0, p.x);
-    let green = smoothstep(0.46, 0.64, fractal2(seed ^ 44, p / 2.3, 4)) * (1.0 - 0.85 * path);
-    let litter = smoothstep(0.36, 0.6, fractal2(seed ^ 45, p / 1.7, 3)) * (1.0 - 0.55 * path);
+    let green = smoothstep(0.46, 0.64, fractal2(seed ^ 0x2c, p / 2.3, 4)) * (1.0 - 0.85 * path);
+    let litter = smoothstep(0.36, 0.6, fractal2(seed ^ 0x2d, p / 1.7, 3)) * (1.0 - 0.55 * path);
     Cover { path, green, litter }
 }
 
@@ -46,7 +46,7 @@ pub(crate) fn paint_ground(canvas: &mut Canvas, site: &Site, light: &Light) {
 
 fn albedo(seed: u64, p: DVec2, rng: &mut Rng) -> DVec3 {
     let cover = cover(seed, p);
-    let fine = fractal2(seed ^ 46, p / 0.28, 3);
+    let fine = fractal2(seed ^ 0x2e, p / 0.28, 3);
     let soil = paint(0x4a3826).lerp(paint(0x7b6145), fine);
     let path = paint(0x75604a).lerp(paint(0xa58d6c), fine);
     let mut colour = soil.lerp(path, cover.path);
@@ -72,7 +72,7 @@ fn add_ground(
     p: DVec2,
     size_m: f64,
 ) {
-    let bump = |q: DVec2| fractal2(site.seed ^ 47, q / 0.22, 2);
+    let bump = |q: DVec2| fractal2(site.seed ^ 0x2f, q / 0.22, 2);
     let step_m = 0.03;
     let slope = DVec2::new(
         bump(p + DVec2::X * step_m) - bump(p - DVec2::X * step_m),
@@ -83,7 +83,9 @@ fn add_ground(
     let stretch = rng.range(1.0, 1.35);
     let surface_m = p.extend(0.0);
     canvas.add(Patch {
-        center_m: p.extend(-rng.range(0.002, 0.010)),
+        // At a grazing angle a pixel takes the depth of the nearest patch that covers it: two
+        // centimetres down, the floor is seen where it is.
+        center_m: p.extend(-rng.range(0.022, 0.032)),
         normal,
         along: polar(rng.angle()).extend(0.0),
         sigma_m: DVec3::new(0.53 * size_m * stretch, 0.53 * size_m / stretch.sqrt(), 0.003),
@@ -95,7 +97,7 @@ fn add_ground(
 /// Large patches well below the floor, which close the seams between the fine ones. They lie so
 /// deep that on any line of sight from above they come after the floor, and never blur it.
 fn paint_bed(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
-    let side_m = 0.5;
+    let side_m = 0.42;
     let columns = ((FAR_X_M - NEAR_X_M) / side_m) as usize;
     let rows = (2.0 * NEAR_Y_M / side_m) as usize;
     for row in 0..rows {
@@ -108,10 +110,10 @@ fn paint_bed(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
             let colour =
                 paint(0x5d4731).lerp(paint(0x8a7456), here.path).lerp(paint(0x5f6e2a), here.green);
             canvas.add(Patch {
-                center_m: p.extend(-0.25),
+                center_m: p.extend(-0.45),
                 normal: DVec3::Z,
                 along: polar(rng.angle()).extend(0.0),
-                sigma_m: DVec3::new(0.6 * side_m, 0.6 * side_m, 0.003),
+                sigma_m: DVec3::new(0.55 * side_m, 0.55 * side_m, 0.003),
                 opacity: 0.99,
                 radiance: light.matt(p.extend(0.0), DVec3::Z, colour),
             });
@@ -221,16 +223,17 @@ fn paint_rock(canvas: &mut Canvas, rng: &mut Rng, rock: &Rock, key: u64, light: 
             continue;
         }
         let vein = noise(key, p_m / 0.11);
-        let grain = noise(key ^ 1, p_m / 0.035);
+        let grain = noise(key ^ 0x1, p_m / 0.035);
         let stone = paint(0x5d5b55).lerp(paint(0xa29c8e), 0.6 * vein + 0.4 * grain);
-        let crack = smoothstep(0.08, 0.0, (noise(key ^ 2, p_m / 0.24) - 0.5).abs());
+        let crack = smoothstep(0.08, 0.0, (noise(key ^ 0x2, p_m / 0.24) - 0.5).abs());
         let lump = DVec3::new(
-            noise(key ^ 3, p_m / 0.15) - 0.5,
-            noise(key ^ 4, p_m / 0.15) - 0.5,
-            noise(key ^ 5, p_m / 0.15) - 0.5,
+            noise(key ^ 0x3, p_m / 0.15) - 0.5,
+            noise(key ^ 0x4, p_m / 0.15) - 0.5,
+            noise(key ^ 0x5, p_m / 0.15) - 0.5,
         );
         let lit = (normal + lump * 1.1).normalize();
-        let mossy = smoothstep(0.55, 0.8, 0.5 * normal.z + 0.75 * noise(key ^ 6, p_m / 0.2) - 0.05);
+        let mossy =
+            smoothstep(0.55, 0.8, 0.5 * normal.z + 0.75 * noise(key ^ 0x6, p_m / 0.2) - 0.05);
         let green = paint(0x46591f).lerp(paint(0x8a9a40), rng.unit());
         let colour = stone.lerp(paint(0x35332f), 0.6 * crack).lerp(green, 0.9 * mossy);
         canvas.add(Patch {

@@ -24,13 +24,23 @@ use site::{FENCE_Y_M, SPAWN_X_M, Site};
 
 /// Returns the forest of a seed.
 pub(crate) fn build(seed: u64) -> Generated {
+    build_layers(seed, &[ground::paint_ground, bark::paint_wood, plants::paint_plants])
+}
+
+/// Returns the forest without leaves, ferns and grass: what is solid only.
+#[cfg(test)]
+pub(crate) fn build_bare(seed: u64) -> Generated {
+    build_layers(seed, &[ground::paint_ground, bark::paint_wood])
+}
+
+fn build_layers(seed: u64, layers: &[fn(&mut Canvas, &Site, &Light)]) -> Generated {
     let site = Site::plan(seed);
     let solids = Solids::new(site.truth());
     let mut canvas = Canvas::default();
     let light = Light::new(&site, &solids);
-    ground::paint_ground(&mut canvas, &site, &light);
-    bark::paint_wood(&mut canvas, &site, &light);
-    plants::paint_plants(&mut canvas, &site, &light);
+    for layer in layers {
+        layer(&mut canvas, &site, &light);
+    }
     backdrop::paint_backdrop(&mut canvas, &site);
     Generated { splats: canvas.finish(), arena: arena(&site), truth: solids.into_volumes() }
 }

@@ -105,7 +105,7 @@ fn paint_bushes(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
             continue;
         }
         // In groups, with views between them; a thicket farther out.
-        let group = noise2(site.seed ^ 61, p / 3.0);
+        let group = noise2(site.seed ^ 0x3d, p / 3.0);
         if group < 0.56 - 0.04 * out_m {
             continue;
         }

@@ -17,6 +17,8 @@ pub(crate) enum Species {
 }
 
 /// A branch: a straight, tapering limb.
+// Why: each is a length or a place in metres, and says so.
+#[expect(clippy::struct_field_names)]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limb {
     pub(crate) from_m: DVec3,
@@ -98,7 +100,7 @@ impl Site {
         let azimuth_rad = side * rng.range(55f64.to_radians(), 100f64.to_radians());
         let elevation_rad = rng.range(34f64.to_radians(), 44f64.to_radians());
         let sun = (polar(azimuth_rad) * libm::cos(elevation_rad)).extend(libm::sin(elevation_rad));
-        let goal_m = DVec3::new(GOAL_X_M, 0.0, 1.2);
+        let goal_m = DVec3::new(GOAL_X_M, 0.0, FLIGHT_Z_M);
         let mut site =
             Self { seed, trees: Vec::new(), rocks: Vec::new(), logs: Vec::new(), sun, goal_m };
         site.block_the_straight_way(&mut rng);
@@ -126,15 +128,22 @@ impl Site {
         volumes
     }
 
+    /// Whether something of this reach leaves the surroundings of start and goal free.
+    fn is_clear_of_ends(&self, p: DVec2, reach_m: f64) -> bool {
+        [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()]
+            .iter()
+            .all(|end| (p - *end).length() > CLEAR_M + reach_m)
+    }
+
     fn block_the_straight_way(&mut self, rng: &mut Rng) {
         let count = BLOCKING_TREES + 1 + rng.below(2);
         let (first_m, last_m) = (5.5, GOAL_X_M - 4.0);
         let span_m = (last_m - first_m) / count as f64;
         for n in 0..count {
-            let x = first_m + span_m * (n as f64 + rng.range(0.2, 0.8));
-            let base = DVec2::new(x, rng.spread(0.2));
+            let x = first_m + span_m * (n as f64 + rng.range(0.3, 0.7));
+            let at = DVec2::new(x, rng.spread(0.17));
             let radius_m = slender_radius_m(rng).max(0.17);
-            let tree = grow(rng, base, radius_m, true);
+            let tree = grow(rng, at, radius_m, true);
             self.trees.push(tree);
         }
     }
@@ -145,10 +154,9 @@ impl Site {
             let base = DVec2::new(rng.range(-0.4, 40.4), rng.spread(6.2));
             let radius_m = slender_radius_m(rng);
             let tree = grow(rng, base, radius_m, true);
-            let clear = [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()]
-                .iter()
-                .all(|centre| (base - *centre).length() > CLEAR_M + 0.9);
-            if clear && self.trees.iter().all(|other| tree.gap_m(other) >= GAP_M) {
+            if self.is_clear_of_ends(base, 0.9)
+                && self.trees.iter().all(|other| tree.gap_m(other) >= GAP_M)
+            {
                 self.trees.push(tree);
             } else {
                 misses += 1;
@@ -165,7 +173,10 @@ impl Site {
             let radius_m = rng.range(0.12, 0.32);
             let tree = grow(rng, base, radius_m, false);
             // Nothing leans over the fence below the crowns.
-            if out_m > 0.9 && self.trees.iter().all(|other| tree.gap_m(other) >= 1.1) {
+            if out_m > 0.9
+                && self.is_clear_of_ends(base, 1.0)
+                && self.trees.iter().all(|other| tree.gap_m(other) >= 1.1)
+            {
                 self.trees.push(tree);
             } else {
                 misses += 1;
@@ -174,10 +185,6 @@ impl Site {
     }
 
     fn lay_rocks_and_logs(&mut self, rng: &mut Rng) {
-        let ends = [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()];
-        let clear = |p: DVec2, reach_m: f64| {
-            ends.iter().all(|centre| (p - *centre).length() > CLEAR_M + reach_m)
-        };
         for _ in 0..60 {
             if self.rocks.len() >= 9 {
                 break;
@@ -188,7 +195,7 @@ impl Site {
             let apart = self.trees.iter().all(|tree| {
                 (tree.at_height(0.2).0.truncate() - p).length() > radius_m + tree.axis[0].1 + 0.25
             });
-            if clear(p, radius_m) && apart {
+            if self.is_clear_of_ends(p, radius_m) && apart {
                 self.rocks.push(Rock { center_m, radius_m });
             }
         }
@@ -213,7 +220,7 @@ impl Site {
                     .iter()
                     .all(|rock| (rock.center_m - p).length() > rock.radius_m + 0.3)
             });
-            if clear(middle, half.length() + radius_m) && apart {
+            if self.is_clear_of_ends(middle, half.length() + radius_m) && apart {
                 self.logs.push(log);
             }
         }
@@ -231,7 +238,8 @@ fn slender_radius_m(rng: &mut Rng) -> f64 {
     0.125 + 0.15 * t * t + rng.range(0.0, 0.03)
 }
 
-fn grow(rng: &mut Rng, base: DVec2, radius_m: f64, within: bool) -> Tree {
+/// Grows a tree whose axis passes `at` where vehicles fly.
+fn grow(rng: &mut Rng, at: DVec2, radius_m: f64, within: bool) -> Tree {
     let species = match rng.below(10) {
         0..=4 => Species::Pine,
         5..=7 => Species::Beech,
@@ -242,9 +250,11 @@ fn grow(rng: &mut Rng, base: DVec2, radius_m: f64, within: bool) -> Tree {
     let bend = polar(rng.angle()) * rng.range(0.02, 0.09);
     let phase = rng.angle();
     let point = |z: f64| {
-        let sway = libm::sin(0.8 * z + phase) - libm::sin(phase);
-        (base + tilt * z + bend * sway).extend(z)
+        let above_m = z - FLIGHT_Z_M;
+        let sway = libm::sin(0.8 * above_m + phase) - libm::sin(phase);
+        (at + tilt * above_m + bend * sway).extend(z)
     };
+    let base = point(0.0).truncate();
     let axis: Vec<(DVec3, f64)> = HEIGHTS_M
         .iter()
         .map(|&z| if z < 8.0 { z } else { top_m })
@@ -253,7 +263,7 @@ fn grow(rng: &mut Rng, base: DVec2, radius_m: f64, within: bool) -> Tree {
     let mut trunk: Vec<Volume> = axis
         .windows(2)
         .map(|pair| {
-            let radius_m = (pair[0].1 + pair[1].1) / 2.0;
+            let radius_m = f64::midpoint(pair[0].1, pair[1].1);
             Volume::Capsule { a_m: pair[0].0, b_m: pair[1].0, radius_m }
         })
         .collect();
@@ -272,7 +282,7 @@ fn grow(rng: &mut Rng, base: DVec2, radius_m: f64, within: bool) -> Tree {
 
     let mut branches = Vec::new();
     let mut turn = rng.angle();
-    let mut z_m = rng.range(3.25, 3.7);
+    let mut z_m = rng.range(CROWN_BASE_M + 0.2, CROWN_BASE_M + 0.65);
     while z_m < top_m - 0.6 {
         turn += 2.4 + rng.spread(0.5);
         let t = z_m / top_m;
@@ -300,11 +310,87 @@ pub(crate) const CLEAR_M: f64 = 2.5;
 pub(crate) const SPAWN_X_M: f64 = 1.0;
 /// Where it shall go. [m, world]
 pub(crate) const GOAL_X_M: f64 = 37.5;
+/// Height at which vehicles take off, and of the goal. [m, world]
+pub(crate) const FLIGHT_Z_M: f64 = 1.2;
 /// Half width of the fence. [m, world]
 pub(crate) const FENCE_Y_M: f64 = 7.0;
 
+/// Branches within the fence start above this. [m, world]
+const CROWN_BASE_M: f64 = 3.05;
 const TREES_WITHIN: usize = 44;
 const TREES_AROUND: usize = 92;
 /// Heights of the axis points; short steps where vehicles fly, so that a stack of capsules tapers
 /// within a centimetre. The last stands for the top.
 const HEIGHTS_M: [f64; 11] = [-0.4, 0.5, 1.0, 1.6, 2.3, 3.1, 4.0, 5.0, 6.2, 7.5, 9.0];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fifty_forests_keep_their_promises() {
+        for seed in 0..50 {
+            let site = Site::plan(seed);
+            let within: Vec<&Tree> = site.trees.iter().filter(|tree| tree.within).collect();
+            assert!((34..=TREES_WITHIN).contains(&within.len()), "seed {seed}: {}", within.len());
+
+            let start_m = DVec3::new(SPAWN_X_M, 0.0, FLIGHT_Z_M);
+            let blocking = within
+                .iter()
+                .filter(|tree| {
+                    // A trunk that the line itself runs into.
+                    tree.trunk.iter().any(|part| {
+                        (0..=4000).any(|n| {
+                            let p_m = start_m.lerp(site.goal_m, f64::from(n) / 4000.0);
+                            part.signed_distance_m(p_m) < 0.0
+                        })
+                    })
+                })
+                .count();
+            assert!(blocking >= BLOCKING_TREES, "seed {seed}: {blocking} trees in the way");
+
+            for (n, tree) in within.iter().enumerate() {
+                for other in &within[..n] {
+                    let gap_m = tree.gap_m(other);
+                    assert!(gap_m >= GAP_M, "seed {seed}: a gap of {gap_m} m");
+                }
+            }
+            for centre in [start_m, site.goal_m] {
+                for volume in site.truth().iter().skip(1) {
+                    // The zone is a disc on the floor, up to where crowns begin.
+                    for z_m in [0.0, 0.6, 1.2, 2.0, 2.9] {
+                        let p_m = centre.truncate().extend(z_m);
+                        let free_m = volume.signed_distance_m(p_m);
+                        let wanted_m = CLEAR_M.min(CROWN_BASE_M - z_m);
+                        assert!(free_m >= wanted_m, "seed {seed}: {volume:?} at {free_m} m");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_hangs_where_vehicles_fly() {
+        for seed in 0..10 {
+            for tree in Site::plan(seed).trees.iter().filter(|tree| tree.within) {
+                for branch in &tree.branches {
+                    let lowest_m = branch.from_m.z.min(branch.to_m.z) - branch.radius_m;
+                    assert!(lowest_m >= 3.0, "seed {seed}: a branch at {lowest_m} m");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn capsules_follow_the_axis_within_a_centimetre() {
+        for tree in Site::plan(3).trees.iter().filter(|tree| tree.within) {
+            for n in 0..100 {
+                let z_m = 0.6 + 0.024 * f64::from(n);
+                let (p_m, radius_m) = tree.at_height(z_m);
+                let inside = tree.trunk.iter().map(|part| -part.signed_distance_m(p_m));
+                let thick_m = inside.fold(f64::MIN, f64::max);
+                assert!((thick_m - radius_m).abs() < 0.015, "{thick_m} m thick, not {radius_m}");
+            }
+        }
+    }
+}
