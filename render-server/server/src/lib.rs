@@ -1,1 +1,33 @@
-//! (in construction)
+//! The render server: poses in, RGB-D out; referee's events, page, report.
+//!
+//! ```text
+//! drivers (Vicon UDP) -> tick::poses (track: gate, referee) -> hub: newest pose, events
+//!                        tick::draw  (renderer)             -> mailbox: newest drawn tick
+//!                        encode      (room in the outlet?)  -> outlet -> transport (QUIC)
+//!                                                           -> previews -> dashboard (WebSocket)
+//! ```
+//! Three threads (poses, render, encode) and a tokio runtime for sockets meet in [`hub::Hub`].
+//! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
+
+pub mod args;
+pub mod clock;
+pub mod dashboard;
+pub mod drivers;
+pub mod encode;
+pub mod events;
+pub mod hub;
+pub mod mailbox;
+pub mod map;
+pub mod outlet;
+pub mod render;
+pub mod scene;
+mod serve;
+pub mod stats;
+pub mod stop;
+pub mod tick;
+pub mod track;
+pub mod transport;
+
+pub use args::ServeArgs;
+pub use scene::default_arena;
+pub use serve::serve;

@@ -1,0 +1,114 @@
+//! The command line of the render server.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::scene::Up;
+use crate::transport::Congestion;
+
+/// Draws what the vehicle's cameras would see in the twin, and referees the flight.
+///
+/// Example: vizflyt serve forest/arena.toml --vicon 0.0.0.0:51001 --http 127.0.0.1:8080
+#[derive(Args, Clone, Debug)]
+pub struct ServeArgs {
+    /// arena.toml, or a bare scene (.ply), for which an arena is made up
+    pub arena: PathBuf,
+
+    /// Where runtimes connect (UDP)
+    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4450")]
+    pub quic: SocketAddr,
+
+    /// Where the page is served; port 0 takes a free one
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
+    pub http: SocketAddr,
+
+    /// Where Vicon Tracker's UDP object stream arrives
+    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:51001")]
+    pub vicon: SocketAddr,
+
+    /// The vehicle: its object's name in the localization system
+    #[arg(long, value_name = "NAME", default_value = "vizflyt")]
+    pub vehicle: String,
+
+    /// Draw at most this often [Hz]
+    #[arg(long, value_name = "HZ", default_value_t = 120.0, value_parser = rate)]
+    pub max_rate: f64,
+
+    /// JPEG quality of the colour images, 1 to 100
+    #[arg(long, value_name = "Q", default_value_t = 93, value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub quality: u8,
+
+    /// Congestion control of the image stream
+    #[arg(long, value_enum, default_value_t)]
+    pub congestion: Congestion,
+
+    /// Bare scene only: the scene's axis that points up
+    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
+    pub up: Up,
+
+    /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
+    #[arg(long, value_name = "METRES", value_parser = scale)]
+    pub scale: Option<f64>,
+
+    /// Print JSON lines on standard output: ready, events, report
+    #[arg(long)]
+    pub json: bool,
+
+    /// End when standard input ends
+    #[arg(long, hide = true)]
+    pub lifeline: bool,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    number(text, 1.0, 1000.0)
+}
+
+fn scale(text: &str) -> Result<f64, String> {
+    number(text, 1e-4, 1e4)
+}
+
+fn number(text: &str, least: f64, most: f64) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
+    if (least..=most).contains(&value) {
+        Ok(value)
+    } else {
+        Err(format!("{value} is outside {least} to {most}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Cli {
+        #[command(flatten)]
+        serve: ServeArgs,
+    }
+
+    fn parse(words: &str) -> Result<ServeArgs, String> {
+        let words = std::iter::once("x").chain(words.split_whitespace());
+        Cli::try_parse_from(words).map(|cli| cli.serve).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn options_are_read_and_checked() {
+        let args =
+            parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
+        assert_eq!((args.up, args.scale), (Up::NegY, Some(0.2)));
+        assert_eq!(args.congestion, Congestion::Bbr);
+        assert_eq!(parse("a.toml --up z").unwrap().up, Up::Z);
+        for wrong in [
+            "a.toml --max-rate nan",
+            "a.toml --max-rate 0",
+            "a.toml --quality 0",
+            "a.toml --scale -1",
+        ] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+        assert!(parse("a.toml --max-rate 0").unwrap_err().contains("outside 1 to 1000"));
+    }
+}

@@ -1,0 +1,204 @@
+//! What the page is told: JSON, one type per message, tagged by `type`.
+
+use std::sync::atomic::Ordering;
+
+use serde::Serialize;
+use vizflyt_arena::config::StageConfig;
+use vizflyt_protocol::geometry::{Volume, yaw_of};
+use vizflyt_protocol::messages::{Event, Telemetry};
+use vizflyt_protocol::time::ServerTime;
+
+use super::Page;
+use crate::clock;
+use crate::drivers::SourceCounters;
+use crate::events::{Entry, Origin};
+use crate::hub::lock;
+use crate::map::Obstacles;
+use crate::stats::{Percentiles, Rate};
+
+/// Server to page.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(super) enum Message<'a> {
+    Arena(Arena<'a>),
+    /// (x, y, z [m, world], speed [m/s]), oldest first.
+    Trail {
+        points: &'a [[f32; 4]],
+    },
+    Events {
+        events: Vec<Line>,
+    },
+    State(Box<State>),
+}
+
+/// The room; sent once.
+#[derive(Debug, Serialize)]
+pub(super) struct Arena<'a> {
+    boot: String,
+    name: &'a str,
+    vehicle: &'a str,
+    renderer: &'a str,
+    fence: &'a Volume,
+    goal_m: Option<[f64; 3]>,
+    goal_radius_m: f64,
+    body_radius_m: f64,
+    max_speed_mps: f64,
+    time_limit_s: f64,
+    cameras: Vec<CameraLine<'a>>,
+    /// Corners of the top view's picture. [m, world]
+    map_min_m: [f64; 2],
+    map_max_m: [f64; 2],
+    obstacles: &'a Obstacles,
+    stages: &'a [StageConfig],
+}
+
+#[derive(Debug, Serialize)]
+struct CameraLine<'a> {
+    name: &'a str,
+    width_px: u32,
+    height_px: u32,
+}
+
+/// One event of the feed.
+#[derive(Debug, Serialize)]
+pub(super) struct Line {
+    index: u64,
+    origin: &'static str,
+    #[serde(flatten)]
+    event: Event,
+    /// Seconds since the server started. [s]
+    at_s: f64,
+}
+
+/// The moment; twenty times a second.
+#[derive(Debug, Serialize)]
+pub(super) struct State {
+    pose: Option<PoseLine>,
+    runtime: Option<RuntimeLine>,
+    report: Option<Telemetry>,
+    render: Percentiles,
+    encode: Percentiles,
+    send: Percentiles,
+    render_hz: f64,
+    stream_hz: f64,
+    stream_mbit_s: f64,
+    images_late: u64,
+    source: SourceCounters,
+    source_hz: f64,
+    flight_s: Option<f64>,
+    landed: bool,
+    outcome: Option<OutcomeLine>,
+}
+
+#[derive(Debug, Serialize)]
+struct OutcomeLine {
+    #[serde(flatten)]
+    event: Event,
+    at_s: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct PoseLine {
+    p_world_m: [f64; 3],
+    yaw_rad: f64,
+    v_world_mps: [f64; 3],
+    age_s: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct RuntimeLine {
+    address: String,
+    program: String,
+}
+
+/// Rates that all viewers share.
+#[derive(Debug, Default)]
+pub(crate) struct Rates {
+    ticks: Rate,
+    images: Rate,
+    bytes: Rate,
+    poses: Rate,
+}
+
+pub(super) fn arena(page: &Page) -> Message<'_> {
+    let info = &page.hub.arena;
+    Message::Arena(Arena {
+        boot: page.boot.as_ns().to_string(),
+        name: &info.name,
+        vehicle: &page.hub.vehicle,
+        renderer: &page.hub.renderer,
+        fence: &info.geofence,
+        goal_m: info.goal_m.map(|goal| goal.to_array()),
+        goal_radius_m: info.goal_radius_m,
+        body_radius_m: info.body_radius_m,
+        max_speed_mps: info.limits.max_speed_mps,
+        time_limit_s: info.time_limit_s,
+        cameras: info
+            .cameras
+            .iter()
+            .map(|camera| CameraLine {
+                name: &camera.name,
+                width_px: camera.intrinsics.width_px,
+                height_px: camera.intrinsics.height_px,
+            })
+            .collect(),
+        map_min_m: page.map.min_m,
+        map_max_m: page.map.max_m,
+        obstacles: &page.map.obstacles,
+        stages: &page.stages,
+    })
+}
+
+pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
+    let line = |entry: Entry| Line {
+        index: entry.index,
+        origin: match entry.origin {
+            Origin::Server => "server",
+            Origin::Page => "runtime",
+        },
+        at_s: since_start_s(page, entry.event.stamp),
+        event: entry.event,
+    };
+    Message::Events { events: entries.into_iter().map(line).collect() }
+}
+
+pub(super) fn state(page: &Page) -> Message<'static> {
+    let hub = &page.hub;
+    let now = clock::now();
+    let flight = hub.flight();
+    let source = *lock(&hub.source);
+    let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
+    let stats = &hub.stats;
+    Message::State(Box::new(State {
+        pose: (*hub.pose.borrow()).map(|sample| PoseLine {
+            p_world_m: sample.world_from_body.translation_m.to_array(),
+            yaw_rad: yaw_of(sample.world_from_body.rotation),
+            v_world_mps: sample.twist.linear_mps.to_array(),
+            age_s: now.seconds_since(sample.stamp),
+        }),
+        runtime: hub.runtime().map(|runtime| RuntimeLine {
+            address: runtime.address.to_string(),
+            program: runtime.program.as_str().to_owned(),
+        }),
+        report: hub.telemetry.borrow().clone(),
+        render: stats.render.recent(),
+        encode: stats.encode.recent(),
+        send: stats.send.recent(),
+        render_hz: page.rates.ticks.of(total(&stats.ticks), now),
+        stream_hz: page.rates.images.of(total(&stats.images_sent), now),
+        stream_mbit_s: page.rates.bytes.of(total(&stats.bytes_sent), now) * 8e-6,
+        images_late: total(&stats.images_late),
+        source,
+        source_hz: page.rates.poses.of(source.poses, now),
+        flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
+        landed: flight.landed.is_some(),
+        outcome: flight
+            .outcome
+            .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
+    }))
+}
+
+/// The runtime may stamp zero before it knows our clock: that reads as the start.
+fn since_start_s(page: &Page, stamp: ServerTime) -> f64 {
+    stamp.seconds_since(page.boot).max(0.0)
+}

@@ -1,0 +1,164 @@
+//! The page: static files from the binary, one WebSocket per viewer, and the stop button.
+//!
+//! ```text
+//! GET /            the page (no framework, nothing fetched from elsewhere)
+//! GET /ws          WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
+//!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins
+//! GET /api/map     the top view: a JPEG drawn at the start
+//! POST /api/estop  EmergencyStop to the runtime
+//! ```
+//! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
+//! nobody. Only pages of the same origin may watch or stop ([`origin`]).
+
+mod messages;
+mod origin;
+mod viewer;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use axum::Router;
+use axum::extract::{State, WebSocketUpgrade};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use tokio::net::TcpListener;
+use tracing::warn;
+use vizflyt_arena::config::StageConfig;
+use vizflyt_protocol::time::ServerTime;
+
+use crate::hub::Hub;
+use crate::map::Map;
+
+/// What the page's handlers share.
+#[derive(Debug)]
+pub(crate) struct Page {
+    pub(crate) hub: Arc<Hub>,
+    pub(crate) map: Map,
+    /// The course's gates, for the top view.
+    pub(crate) stages: Vec<StageConfig>,
+    /// When the server started; differs from start to start, so that a page notices a new server.
+    pub(crate) boot: ServerTime,
+    pub(crate) rates: messages::Rates,
+}
+
+/// Binds the page's address.
+pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
+    let listener = TcpListener::bind(address).await.with_context(|| {
+        format!("cannot listen on {address} (page); is the port taken? try --http 127.0.0.1:0")
+    })?;
+    if !address.ip().is_loopback() {
+        warn!(
+            "the page is open to everyone who reaches {address}, stop button included; \
+             use --http 127.0.0.1:8080 to keep it to this computer"
+        );
+    }
+    Ok(listener)
+}
+
+/// Serves the page until the server stops.
+pub async fn serve(
+    hub: Arc<Hub>,
+    map: Map,
+    stages: Vec<StageConfig>,
+    listener: TcpListener,
+) -> Result<()> {
+    let stop = hub.stop.clone();
+    let (boot, rates) = (crate::clock::now(), messages::Rates::default());
+    let page = Arc::new(Page { hub, map, stages, boot, rates });
+    // Dropped at the stop rather than drained: WebSockets would drain for ever.
+    tokio::select! {
+        served = axum::serve(listener, router(page)) => served.context("the page's server failed"),
+        () = stop.wait() => Ok(()),
+    }
+}
+
+fn router(page: Arc<Page>) -> Router {
+    Router::new()
+        .route("/", get(async || file("text/html; charset=utf-8", INDEX)))
+        .route("/style.css", get(async || file("text/css; charset=utf-8", STYLE)))
+        .route("/app.js", get(async || file("text/javascript; charset=utf-8", APP)))
+        .route("/map.js", get(async || file("text/javascript; charset=utf-8", MAP)))
+        .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
+        .route("/api/map", get(map))
+        .route("/api/estop", post(estop))
+        .route("/ws", get(watch))
+        .with_state(page)
+}
+
+fn file(kind: &'static str, text: &'static str) -> Response {
+    let mut response = text.into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    for (name, value) in GUARDS {
+        headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn map(State(page): State<Arc<Page>>) -> Response {
+    let mut response = page.map.jpeg.clone().into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("image/jpeg"));
+    for (name, value) in GUARDS {
+        headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn estop(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    if page.hub.emergency_stop("the page") {
+        (StatusCode::ACCEPTED, "the runtime lands the vehicle").into_response()
+    } else {
+        (StatusCode::CONFLICT, "no runtime is connected: nobody to land the vehicle")
+            .into_response()
+    }
+}
+
+async fn watch(
+    State(page): State<Arc<Page>>,
+    headers: HeaderMap,
+    upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    match upgrade {
+        // Viewers have nothing to say: a byte limit keeps a hostile one small.
+        Ok(upgrade) => upgrade
+            .max_message_size(1024)
+            .on_upgrade(async move |socket| viewer::run(page, socket).await),
+        Err(rejection) => rejection.into_response(),
+    }
+}
+
+fn refuse(refusal: &origin::Refusal) -> Response {
+    warn!("page: {refusal}");
+    (StatusCode::FORBIDDEN, refusal.to_string()).into_response()
+}
+
+const INDEX: &str = include_str!("page/index.html");
+const STYLE: &str = include_str!("page/style.css");
+const APP: &str = include_str!("page/app.js");
+const MAP: &str = include_str!("page/map.js");
+const ICON: &str = include_str!("page/icon.svg");
+
+/// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.
+const GUARDS: [(&str, &str); 5] = [
+    (
+        "content-security-policy",
+        "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; \
+         form-action 'none'",
+    ),
+    ("x-frame-options", "DENY"),
+    ("x-content-type-options", "nosniff"),
+    ("referrer-policy", "no-referrer"),
+    ("cache-control", "no-cache"),
+];
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,117 @@
+//! Only a page that this server served may open the WebSocket or press the button.
+//!
+//! A browser sends `Origin` with both; it must name the host and port the request was sent to.
+//! That alone falls to DNS rebinding (a stranger's name that resolves to our address), so the host
+//! must also be an address, `localhost`, or this computer's own name.
+
+use std::net::IpAddr;
+
+use axum::http::{HeaderMap, HeaderName, header};
+
+/// Why a request is refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Refusal {
+    /// A header is absent, twice there, or not text.
+    #[error("the {0} header is missing or malformed; open the page itself, or send the header")]
+    Missing(&'static str),
+    /// The request comes from another page.
+    #[error("a page of '{origin}' may not act on '{host}'")]
+    Foreign {
+        /// Where the page came from.
+        origin: String,
+        /// Whom it addressed.
+        host: String,
+    },
+    /// A name that is not this computer's.
+    #[error("'{0}' is not a name of this computer; open the page by address or as localhost")]
+    Name(String),
+}
+
+/// Checks the headers of a request that acts or watches.
+pub(crate) fn check(headers: &HeaderMap) -> Result<(), Refusal> {
+    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    check_as(headers, name.trim())
+}
+
+fn check_as(headers: &HeaderMap, own_name: &str) -> Result<(), Refusal> {
+    let host = only(headers, &header::HOST).ok_or(Refusal::Missing("Host"))?;
+    let origin = only(headers, &header::ORIGIN).ok_or(Refusal::Missing("Origin"))?;
+    let from = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+    if from.is_none_or(|from| !from.eq_ignore_ascii_case(host)) {
+        return Err(Refusal::Foreign { origin: origin.to_owned(), host: host.to_owned() });
+    }
+    let name = without_port(host);
+    let bare = name.trim_start_matches('[').trim_end_matches(']');
+    let own = |candidate: &str| {
+        !own_name.is_empty()
+            && (candidate.eq_ignore_ascii_case(own_name)
+                || candidate
+                    .to_ascii_lowercase()
+                    .strip_suffix(".local")
+                    .is_some_and(|short| short.eq_ignore_ascii_case(own_name)))
+    };
+    if bare.parse::<IpAddr>().is_ok() || name.eq_ignore_ascii_case("localhost") || own(name) {
+        Ok(())
+    } else {
+        Err(Refusal::Name(name.to_owned()))
+    }
+}
+
+fn only<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Option<&'a str> {
+    let mut values = headers.get_all(name).iter();
+    match (values.next(), values.next()) {
+        (Some(value), None) => value.to_str().ok(),
+        _ => None,
+    }
+}
+
+fn without_port(host: &str) -> &str {
+    match host.rsplit_once(':') {
+        Some((name, port)) if !port.is_empty() && port.bytes().all(|b| b.is_ascii_digit()) => name,
+        _ => host,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(host: &str, origin: &str, expected: bool) {
+        let mut headers = HeaderMap::new();
+        if !host.is_empty() {
+            headers.insert(header::HOST, host.parse().unwrap());
+        }
+        if !origin.is_empty() {
+            headers.insert(header::ORIGIN, origin.parse().unwrap());
+        }
+        let found = check_as(&headers, "lab-pc");
+        assert_eq!(found.is_ok(), expected, "{host} from {origin}: {found:?}");
+    }
+
+    #[test]
+    fn only_our_own_pages_act() {
+        check("127.0.0.1:8080", "http://127.0.0.1:8080", true);
+        check("localhost:8080", "http://localhost:8080", true);
+        check("[::1]:8080", "http://[::1]:8080", true);
+        check("LAB-PC:8080", "http://lab-pc:8080", true);
+        check("lab-pc.local:8080", "http://lab-pc.local:8080", true);
+        check("192.168.1.4", "https://192.168.1.4", true);
+        // Another page, another port, no header at all, an opaque origin.
+        check("127.0.0.1:8080", "http://evil.example", false);
+        check("127.0.0.1:8080", "http://127.0.0.1:8081", false);
+        check("127.0.0.1:8080", "", false);
+        check("127.0.0.1:8080", "null", false);
+        check("", "http://127.0.0.1:8080", false);
+        // DNS rebinding: the stranger's name resolves to us.
+        check("evil.example:8080", "http://evil.example:8080", false);
+    }
+
+    #[test]
+    fn a_header_given_twice_is_refused() {
+        let mut headers = HeaderMap::new();
+        headers.insert(header::HOST, "127.0.0.1".parse().unwrap());
+        headers.append(header::ORIGIN, "http://127.0.0.1".parse().unwrap());
+        headers.append(header::ORIGIN, "http://evil.example".parse().unwrap());
+        assert_eq!(check_as(&headers, ""), Err(Refusal::Missing("Origin")));
+    }
+}

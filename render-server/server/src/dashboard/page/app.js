@@ -1,0 +1,299 @@
+// The page: one WebSocket in, the stop button out. Everything shown is the newest; a lost
+// connection comes back by itself, and what was last known stays on the screen.
+
+import { TopView } from "/map.js";
+
+const $ = (id) => document.getElementById(id);
+const view = new TopView($("map"));
+const shown = { pose: null, state: null, camera: 0, boot: null, events: new Set(), outcome: null };
+
+// ---- theme -------------------------------------------------------------------------------
+const wantsLight = matchMedia("(prefers-color-scheme: light)");
+function applyTheme() {
+  const theme = localStorage.getItem("theme") ?? (wantsLight.matches ? "light" : "dark");
+  document.documentElement.dataset.theme = theme;
+  view.restyle();
+}
+wantsLight.addEventListener("change", applyTheme);
+$("theme").addEventListener("click", () => {
+  localStorage.setItem("theme", document.documentElement.dataset.theme === "light" ? "dark" : "light");
+  applyTheme();
+});
+applyTheme();
+
+// ---- stop --------------------------------------------------------------------------------
+async function stop() {
+  $("estop").dataset.pressed = "";
+  say("stopping");
+  try {
+    const answer = await fetch("/api/estop", { method: "POST" });
+    say(await answer.text());
+    if (!answer.ok) banner("warn", "Not stopped", await Promise.resolve($("said").textContent));
+  } catch {
+    banner("bad", "Not stopped", "the server cannot be reached: use the pilot's transmitter");
+  }
+  setTimeout(() => delete $("estop").dataset.pressed, 400);
+}
+$("estop").addEventListener("click", stop);
+addEventListener("keydown", (event) => {
+  if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+  // Space on another focused button is that button's own.
+  const elsewhere = event.target instanceof HTMLButtonElement && event.target !== $("estop");
+  if (event.code === "Escape" || (event.code === "Space" && !elsewhere)) {
+    event.preventDefault();
+    stop();
+  }
+});
+function say(text) {
+  $("said").textContent = text;
+}
+
+// ---- the connection ----------------------------------------------------------------------
+let wait_ms = 250;
+function connect() {
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => {
+    wait_ms = 250;
+    link("good", "live");
+    delete document.body.dataset.stale;
+  };
+  socket.onmessage = ({ data }) => (typeof data === "string" ? hear(JSON.parse(data)) : look(data));
+  socket.onclose = () => {
+    link("bad", "server gone, reconnecting");
+    document.body.dataset.stale = "";
+    setTimeout(connect, wait_ms);
+    wait_ms = Math.min(3000, wait_ms * 1.6);
+  };
+}
+function link(tone, text) {
+  $("link").dataset.tone = tone;
+  $("link-text").textContent = text;
+}
+
+function hear(message) {
+  ({ arena: hearArena, trail: hearTrail, events: hearEvents, state: hearState })[message.type]?.(message);
+}
+
+function hearArena(arena) {
+  if (shown.boot !== arena.boot) {
+    shown.boot = arena.boot;
+    shown.events.clear();
+    shown.outcome = null;
+    shown.flown = 0;
+    $("events").replaceChildren();
+    $("outcome").hidden = true;
+  }
+  document.title = `${arena.name} · VizFlyt`;
+  $("arena").textContent = arena.name;
+  $("vehicle").textContent = arena.vehicle;
+  $("renderer").textContent = `renderer: ${arena.renderer}`;
+  $("speed-top").textContent = `${Math.max(1, arena.max_speed_mps)} m/s`;
+  view.setArena(arena);
+  const tabs = arena.cameras.map((camera, index) => {
+    const tab = document.createElement("button");
+    tab.type = "button";
+    tab.textContent = camera.name;
+    tab.onclick = () => pick(index);
+    return tab;
+  });
+  $("camera-tabs").replaceChildren(...tabs);
+  $("camera-tabs").hidden = tabs.length < 2;
+  pick(Math.min(shown.camera, tabs.length - 1));
+  function pick(index) {
+    shown.camera = index;
+    tabs.forEach((tab, k) => tab.setAttribute("aria-pressed", k === index));
+    const camera = arena.cameras[index];
+    $("camera-name").textContent = camera ? `${camera.name} · ${camera.width_px} × ${camera.height_px}` : "";
+  }
+}
+
+function hearTrail({ points }) {
+  view.trail = points;
+}
+
+// ---- pictures ----------------------------------------------------------------------------
+const busy = [false, false];
+async function look(data) {
+  const [kind, camera] = new Uint8Array(data, 0, 2);
+  if (camera !== shown.camera || busy[kind]) return;
+  busy[kind] = true;
+  try {
+    const image = await createImageBitmap(new Blob([new Uint8Array(data, 2)], { type: "image/jpeg" }));
+    const canvas = $(kind === 0 ? "colour" : "depth");
+    if (canvas.width !== image.width || canvas.height !== image.height)
+      [canvas.width, canvas.height] = [image.width, image.height];
+    canvas.getContext("2d").drawImage(image, 0, 0);
+    image.close();
+  } catch {
+    // A picture that does not decode is followed by the next one.
+  }
+  busy[kind] = false;
+}
+
+// ---- events ------------------------------------------------------------------------------
+const TONES = {
+  collision: "bad", geofence: "bad", emergency_stop: "bad", plugin_failed: "bad", pose_lost: "bad",
+  finished: "good", stage: "good", pose_regained: "good", time_limit: "warn", phase: "go",
+  plugin_output: "code", note: "",
+};
+const TITLES = {
+  collision: "Collision", geofence: "Left the geofence", emergency_stop: "Stopped by hand",
+  plugin_failed: "Plugin failed", pose_lost: "Pose lost", finished: "Finished", time_limit: "Time is up",
+};
+const kindOf = (kind) => (typeof kind === "string" ? kind : Object.keys(kind)[0]);
+const clock = (s) => `${Math.floor(s / 60)}:${(s % 60).toFixed(1).padStart(4, "0")}`;
+
+function hearEvents({ events }) {
+  const list = $("events");
+  const atEnd = list.scrollTop + list.clientHeight >= list.scrollHeight - 30;
+  for (const event of events) {
+    if (shown.events.has(event.index)) continue;
+    shown.events.add(event.index);
+    const line = document.createElement("li");
+    const time = document.createElement("time"), text = document.createElement("span");
+    time.textContent = clock(event.at_s);
+    text.textContent = event.text || kindOf(event.kind).replaceAll("_", " ");
+    line.dataset.tone = TONES[kindOf(event.kind)] ?? "";
+    line.append(time, text);
+    list.append(line);
+    if (kindOf(event.kind) === "stage" && view.arena?.stages[event.kind.stage.index])
+      view.arena.stages[event.kind.stage.index].passed = true;
+  }
+  while (list.childElementCount > 400) list.firstChild.remove();
+  if (atEnd) list.scrollTop = list.scrollHeight;
+}
+
+function banner(tone, title, text) {
+  const box = $("outcome");
+  box.hidden = false;
+  box.dataset.tone = tone;
+  if ($("outcome-title").textContent !== title) $("outcome-title").textContent = title;
+  if ($("outcome-text").textContent !== text) $("outcome-text").textContent = text;
+}
+
+// ---- the state ---------------------------------------------------------------------------
+const PHASES = {
+  connecting: ["idle", "connecting"], preparing: ["warn", "preparing"], taking_off: ["go", "taking off"],
+  flying: ["good", "flying"], holding: ["warn", "holding"], landing: ["warn", "landing"], landed: ["idle", "landed"],
+};
+const lines = { altitude: [], speed: [], age: [] };
+const fixed = (value, digits) => (Number.isFinite(value) ? value.toFixed(digits) : "–");
+const put = (id, text) => {
+  const node = $(id);
+  if (node.textContent !== text) node.textContent = text;
+};
+const tone = (id, value) => ($(id).closest("div").dataset.tone = value);
+
+function hearState(state) {
+  shown.state = state;
+  const now = performance.now();
+  const { pose, report } = state;
+  const live = pose && pose.age_s < 0.5;
+  if (state.flight_s == null && shown.flown) {
+    // A new flight on the same server: its trail starts afresh.
+    view.trail = [];
+    $("outcome").hidden = true;
+  }
+  shown.flown = state.flight_s != null;
+  if (pose) {
+    shown.pose = { ...pose, received: live ? now : -1e9 };
+    const speed = Math.hypot(...pose.v_world_mps);
+    if (live) view.addPoint(pose.p_world_m, speed);
+    put("altitude", fixed(pose.p_world_m[2], 2));
+    put("speed", fixed(speed, 2));
+    push("altitude", pose.p_world_m[2], now);
+    push("speed", speed, now);
+  }
+  const [phaseTone, phaseText] = state.runtime
+    ? PHASES[report?.phase ?? "connecting"] ?? PHASES.connecting
+    : ["idle", state.landed ? "landed" : "no runtime"];
+  $("phase").dataset.tone = phaseTone;
+  put("phase-text", phaseText);
+  put("clock", clock(state.flight_s ?? 0));
+
+  const images = report?.images;
+  put("age", images?.delivered ? fixed(images.age_ms_p50, 1) : "–");
+  put("age99", images?.delivered ? `p99 ${fixed(images.age_ms_p99, 1)}` : "");
+  tone("age", images?.age_ms_p99 > 80 ? "warn" : "");
+  if (images?.delivered) push("age", images.age_ms_p50, now);
+  put("rate", fixed(images?.delivered ? images.rate_hz : state.stream_hz, 0));
+  put("mbit", state.stream_mbit_s > 0.05 ? `${fixed(state.stream_mbit_s, 1)} Mbit/s` : "");
+  put("render", state.render.p50 ? fixed(state.render.p50, 1) : "–");
+  put("render99", state.render.p99 ? `p99 ${fixed(state.render.p99, 1)}` : "");
+
+  const vehicle = report?.vehicle;
+  const knows = vehicle && vehicle.battery_fraction >= 0 && vehicle.battery_v > 0;
+  put("battery", knows ? fixed(vehicle.battery_fraction * 100, 0) : vehicle?.battery_v > 0 ? fixed(vehicle.battery_v, 1) : "–");
+  put("battery-unit", knows || !(vehicle?.battery_v > 0) ? "%" : "V");
+  put("volts", knows ? `${fixed(vehicle.battery_v, 1)} V` : "");
+  tone("battery", knows && vehicle.battery_fraction < 0.15 ? "bad" : knows && vehicle.battery_fraction < 0.3 ? "warn" : "");
+
+  put("poses", fixed(state.source_hz, 0));
+  tone("poses", live ? "" : "bad");
+  const { bad_packets, lost_frames, occluded } = state.source;
+  put("pose-note", !pose ? "no pose yet" : !live ? `lost ${fixed(pose.age_s, 1)} s`
+    : bad_packets ? `${bad_packets} bad` : lost_frames ? `${lost_frames} lost` : occluded ? `${occluded} unseen` : "");
+  put("runtime", state.runtime ? `${state.runtime.program} at ${state.runtime.address}` : "no runtime connected");
+
+  const hint = !pose ? "waiting for the first pose of the vehicle" : !state.runtime && !state.landed ? "waiting for a runtime: vizflyt fly PLUGIN --server …" : "";
+  $("hint").hidden = !hint;
+  put("hint", hint);
+
+  if (state.outcome) {
+    const kind = kindOf(state.outcome.kind);
+    const ended = state.landed ? "; the vehicle has landed" : "";
+    banner(TONES[kind] || "warn", TITLES[kind] ?? kind, state.outcome.text + ended);
+  }
+  shown.outcome = state.outcome;
+}
+
+// ---- drawing -----------------------------------------------------------------------------
+const SPAN_MS = 30000;
+function push(name, value, now) {
+  const line = lines[name];
+  line.push([now, value]);
+  while (line.length && line[0][0] < now - SPAN_MS) line.shift();
+}
+
+function drawLine(name, now, colour) {
+  const canvas = $(`${name}-line`), line = lines[name];
+  const ratio = Math.min(2, devicePixelRatio || 1);
+  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+  if (canvas.width !== Math.round(w * ratio)) [canvas.width, canvas.height] = [Math.round(w * ratio), Math.round(h * ratio)];
+  const g = canvas.getContext("2d");
+  g.setTransform(ratio, 0, 0, ratio, 0, 0);
+  g.clearRect(0, 0, w, h);
+  if (line.length < 2) return;
+  const top = Math.max(...line.map((p) => p[1]), 1e-3) * 1.15;
+  const at = ([t, v]) => [w - ((now - t) / SPAN_MS) * w, h - 3 - (Math.max(0, v) / top) * (h - 12)];
+  const fade = g.createLinearGradient(0, 0, w, 0);
+  fade.addColorStop(0, "transparent");
+  fade.addColorStop(0.5, colour);
+  g.beginPath();
+  line.forEach((p, k) => (k ? g.lineTo(...at(p)) : g.moveTo(...at(p))));
+  g.strokeStyle = fade;
+  g.lineWidth = 1.6;
+  g.stroke();
+  g.lineTo(w, h);
+  g.lineTo(at(line[0])[0], h);
+  g.closePath();
+  g.globalAlpha = 0.14;
+  g.fillStyle = fade;
+  g.fill();
+  g.globalAlpha = 1;
+}
+
+let lines_at = 0;
+function frame(now) {
+  const crashed = ["collision", "geofence"].includes(shown.outcome && kindOf(shown.outcome.kind));
+  view.draw(shown.pose, now, crashed);
+  if (now - lines_at > 100 && view.style) {
+    lines_at = now;
+    for (const name of Object.keys(lines)) drawLine(name, now, view.style.accent);
+  }
+  requestAnimationFrame(frame);
+}
+
+connect();
+requestAnimationFrame(frame);

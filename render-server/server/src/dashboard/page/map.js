@@ -1,0 +1,255 @@
+// The top view: fence, obstacles at flight height, goal, gates, trail, vehicle. World x is right,
+// y is up; [m, world] throughout.
+
+const SPEED_STOPS = [[75, 123, 255], [47, 214, 200], [216, 226, 74], [255, 154, 60], [255, 77, 94]];
+
+export function speedColour(share) {
+  const at = Math.max(0, Math.min(0.9999, share || 0)) * (SPEED_STOPS.length - 1);
+  const k = Math.floor(at), t = at - k, [a, b] = [SPEED_STOPS[k], SPEED_STOPS[k + 1]];
+  return `rgb(${a.map((v, c) => Math.round(v + (b[c] - v) * t)).join(" ")})`;
+}
+
+/** Returns the corners of the fence's bounding box, or of the map's picture if it is no box. */
+function bounds(arena) {
+  const box = arena.fence.cuboid;
+  if (!box) return [arena.map_min_m, arena.map_max_m];
+  const [c, h] = [box.center_m, box.half_m];
+  return [[c[0] - h[0], c[1] - h[1]], [c[0] + h[0], c[1] + h[1]]];
+}
+
+/** Returns a canvas with one pixel per cell of the obstacles: filled, with brighter edges. */
+function obstacleCanvas({ width, height, bits }, style) {
+  const bytes = Uint8Array.from(atob(bits), (c) => c.charCodeAt(0));
+  const solid = (x, y) =>
+    x >= 0 && y >= 0 && x < width && y < height && (bytes[(y * width + x) >> 3] >> ((y * width + x) & 7)) & 1;
+  const canvas = document.createElement("canvas");
+  canvas.width = Math.max(1, width);
+  canvas.height = Math.max(1, height);
+  const g = canvas.getContext("2d");
+  for (let y = 0; y < height; y++)
+    for (let x = 0; x < width; x++) {
+      if (!solid(x, y)) continue;
+      const inner = solid(x - 1, y) && solid(x + 1, y) && solid(x, y - 1) && solid(x, y + 1);
+      g.fillStyle = inner ? style.obstacle : style.edge;
+      g.fillRect(x, height - 1 - y, 1, 1);
+    }
+  return canvas;
+}
+
+export class TopView {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.g = canvas.getContext("2d");
+    this.trail = [];
+    this.arena = null;
+    this.pose = null;
+    this.style = null;
+    this.picture = null;
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+  }
+
+  setArena(arena) {
+    this.arena = arena;
+    this.trail = [];
+    this.picture = null;
+    const image = new Image();
+    image.onload = () => (this.picture = image);
+    image.src = `/api/map?${arena.boot}`;
+    this.restyle();
+    this.resize();
+  }
+
+  restyle() {
+    const css = getComputedStyle(document.documentElement);
+    const read = (name) => css.getPropertyValue(name).trim();
+    this.style = {
+      text: read("--text"), muted: read("--muted"), accent: read("--accent"), good: read("--good"),
+      warn: read("--warn"), bad: read("--bad"), bg: read("--map-bg"), shade: read("--shade"),
+      obstacle: read("--obstacle"), edge: read("--obstacle-edge"),
+    };
+    if (this.arena) this.obstacles = obstacleCanvas(this.arena.obstacles, this.style);
+  }
+
+  resize() {
+    const { clientWidth: w, clientHeight: h } = this.canvas.parentElement;
+    const ratio = Math.min(2, window.devicePixelRatio || 1);
+    this.canvas.width = Math.round(w * ratio);
+    this.canvas.height = Math.round(h * ratio);
+    this.ratio = ratio;
+    if (!this.arena) return;
+    const [lo, hi] = bounds(this.arena);
+    const pad = Math.min(34, w * 0.05);
+    const [dx, dy] = [Math.max(0.1, hi[0] - lo[0]), Math.max(0.1, hi[1] - lo[1])];
+    this.scale = Math.min((w - 2 * pad) / dx, (h - 2 * pad - 14) / dy);
+    this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, (h - 10) / 2 + ((lo[1] + hi[1]) / 2) * this.scale];
+  }
+
+  at(p) {
+    return [this.origin[0] + p[0] * this.scale, this.origin[1] - p[1] * this.scale];
+  }
+
+  addPoint(p, speed) {
+    const last = this.trail.at(-1);
+    if (last && Math.hypot(p[0] - last[0], p[1] - last[1]) < 0.04) return;
+    this.trail.push([p[0], p[1], p[2], speed]);
+    // Thinned as on the server, so that an hour's flight draws as fast as a minute's.
+    if (this.trail.length > 3000) this.trail = this.trail.filter((_, k) => k % 2 === 0);
+  }
+
+  draw(pose, now, crashed) {
+    const { g, style, arena, ratio } = this;
+    if (!arena || !this.scale) return;
+    g.setTransform(ratio, 0, 0, ratio, 0, 0);
+    g.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.drawGround();
+    this.drawFence(crashed);
+    for (const stage of arena.stages) this.drawStage(stage);
+    if (arena.goal_m) this.drawGoal(now);
+    this.drawTrail();
+    if (pose) this.drawVehicle(pose, now);
+    this.drawScaleBar();
+  }
+
+  rect(lo, hi) {
+    const [x0, y1] = this.at(lo), [x1, y0] = this.at(hi);
+    return [x0, y0, x1 - x0, y1 - y0];
+  }
+
+  drawGround() {
+    const { g, arena, style } = this;
+    const [lo, hi] = bounds(arena);
+    g.save();
+    g.beginPath();
+    g.roundRect(...this.rect(lo, hi), 4);
+    g.clip();
+    if (this.picture) {
+      g.imageSmoothingEnabled = true;
+      g.drawImage(this.picture, ...this.rect(arena.map_min_m, arena.map_max_m));
+      g.fillStyle = style.shade;
+      g.fillRect(...this.rect(lo, hi));
+    }
+    const o = arena.obstacles;
+    if (this.obstacles && o.width) {
+      g.imageSmoothingEnabled = false;
+      const end = [o.origin_m[0] + o.width * o.cell_m, o.origin_m[1] + o.height * o.cell_m];
+      g.drawImage(this.obstacles, ...this.rect(o.origin_m, end));
+    }
+    g.restore();
+  }
+
+  drawFence(crashed) {
+    const { g, arena, style } = this;
+    const [lo, hi] = bounds(arena);
+    g.lineWidth = crashed ? 4 : 1.5;
+    g.strokeStyle = crashed ? style.bad : style.warn;
+    g.setLineDash(crashed ? [] : [7, 5]);
+    g.beginPath();
+    g.roundRect(...this.rect(lo, hi), 4);
+    g.stroke();
+    g.setLineDash([]);
+  }
+
+  drawStage(stage) {
+    const { g, style } = this;
+    const n = Math.hypot(stage.normal[0], stage.normal[1]);
+    if (!n) return;
+    const across = [(-stage.normal[1] / n) * (stage.width_m / 2), (stage.normal[0] / n) * (stage.width_m / 2)];
+    const c = stage.center_m;
+    const a = this.at([c[0] + across[0], c[1] + across[1]]), b = this.at([c[0] - across[0], c[1] - across[1]]);
+    g.strokeStyle = stage.passed ? style.good : style.accent;
+    g.lineWidth = 5;
+    g.lineCap = "round";
+    g.beginPath();
+    g.moveTo(...a);
+    g.lineTo(...b);
+    g.stroke();
+    g.lineCap = "butt";
+  }
+
+  drawGoal(now) {
+    const { g, arena, style } = this;
+    const [x, y] = this.at(arena.goal_m);
+    const r = Math.max(6, arena.goal_radius_m * this.scale);
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const beat = still ? 0.5 : (Math.sin(now / 600) + 1) / 2;
+    g.strokeStyle = style.good;
+    g.fillStyle = style.good;
+    g.globalAlpha = 0.12 + 0.12 * beat;
+    g.beginPath();
+    g.arc(x, y, r, 0, 7);
+    g.fill();
+    g.globalAlpha = 1;
+    g.lineWidth = 2;
+    g.stroke();
+    g.beginPath();
+    g.arc(x, y, 3, 0, 7);
+    g.fill();
+  }
+
+  drawTrail() {
+    const { g, arena, trail } = this;
+    g.lineWidth = 3;
+    g.lineJoin = g.lineCap = "round";
+    for (let k = 1; k < trail.length; k++) {
+      g.strokeStyle = speedColour(trail[k][3] / this.topSpeed);
+      g.beginPath();
+      g.moveTo(...this.at(trail[k - 1]));
+      g.lineTo(...this.at(trail[k]));
+      g.stroke();
+    }
+    g.lineCap = "butt";
+  }
+
+  get topSpeed() {
+    return Math.max(1, this.arena.max_speed_mps);
+  }
+
+  drawVehicle(pose, now) {
+    const { g, style, arena } = this;
+    // Between two messages the vehicle goes on at its speed: smooth at any screen rate.
+    const dt = Math.min(0.1, Math.max(0, (now - pose.received) / 1000));
+    const p = [pose.p_world_m[0] + pose.v_world_mps[0] * dt, pose.p_world_m[1] + pose.v_world_mps[1] * dt];
+    const [x, y] = this.at(p);
+    const v = this.at([p[0] + pose.v_world_mps[0] * 0.5, p[1] + pose.v_world_mps[1] * 0.5]);
+    g.strokeStyle = style.text;
+    g.globalAlpha = 0.55;
+    g.lineWidth = 2;
+    g.beginPath();
+    g.moveTo(x, y);
+    g.lineTo(...v);
+    g.stroke();
+    g.globalAlpha = 1;
+    const r = Math.max(9, arena.body_radius_m * this.scale);
+    g.save();
+    g.translate(x, y);
+    g.rotate(-pose.yaw_rad);
+    g.fillStyle = style.accent;
+    g.strokeStyle = style.bg;
+    g.lineWidth = 2;
+    g.beginPath();
+    g.moveTo(r * 1.35, 0);
+    g.lineTo(-r * 0.85, r * 0.85);
+    g.lineTo(-r * 0.4, 0);
+    g.lineTo(-r * 0.85, -r * 0.85);
+    g.closePath();
+    g.fill();
+    g.stroke();
+    g.restore();
+  }
+
+  drawScaleBar() {
+    const { g, style } = this;
+    const metres = [0.5, 1, 2, 5, 10, 20, 50].find((m) => m * this.scale >= 50) ?? 100;
+    const [x, y] = [16, this.canvas.height / this.ratio - 16];
+    g.strokeStyle = g.fillStyle = style.muted;
+    g.lineWidth = 1.5;
+    g.beginPath();
+    g.moveTo(x, y - 4);
+    g.lineTo(x, y);
+    g.lineTo(x + metres * this.scale, y);
+    g.lineTo(x + metres * this.scale, y - 4);
+    g.stroke();
+    g.font = "12px system-ui, sans-serif";
+    g.fillText(`${metres} m`, x + metres * this.scale + 7, y + 1);
+  }
+}

@@ -1,0 +1,57 @@
+//! Sources of poses. A driver owns its socket; the parser beside it is sans-IO.
+//!
+//! ```text
+//! Vicon UDP -> vicon_udp (socket, arrival stamp) -> vicon (bytes -> objects -> one pose)
+//!           -> frame_clock (stamp without the network's jitter) -> Measurement -> tick
+//! ```
+//! 100 to 300 Hz. The pose thread of [`crate::tick`] owns the driver and calls
+//! [`PoseSource::receive`].
+
+pub mod frame_clock;
+pub mod vicon;
+mod vicon_udp;
+
+pub use vicon_udp::ViconUdp;
+
+use std::time::Duration;
+
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::time::ServerTime;
+
+/// One raw pose of the vehicle, as its localization system gave it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measurement {
+    /// When the pose was true, as well as the source lets one tell.
+    pub stamp: ServerTime,
+    /// When it reached this computer.
+    pub arrival: ServerTime,
+    /// Where the vehicle was.
+    pub world_from_body: Pose<World, Body>,
+}
+
+/// Yields poses; owns its I/O.
+pub trait PoseSource: Send {
+    /// Waits at most `timeout` for the next pose of the vehicle; `None` if none came.
+    fn receive(&mut self, timeout: Duration) -> Option<Measurement>;
+
+    /// Returns what a person should know by now, once per occurrence.
+    fn next_warning(&mut self) -> Option<String>;
+
+    /// Returns the counters, for the page and the report.
+    fn counters(&self) -> SourceCounters;
+}
+
+/// What came in, since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct SourceCounters {
+    /// Poses of the vehicle used.
+    pub poses: u64,
+    /// Packets that did not parse.
+    pub bad_packets: u64,
+    /// Packets that came twice or out of order.
+    pub stale_packets: u64,
+    /// Frames that never came, by the frame counter.
+    pub lost_frames: u64,
+    /// Frames in which the vehicle was not seen.
+    pub occluded: u64,
+}

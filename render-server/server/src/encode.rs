@@ -1,0 +1,235 @@
+//! The encode thread: drawn ticks in, image packets and previews out.
+//!
+//! Waits for room in the [`Outlet`](crate::outlet), then takes the newest drawn tick: what was
+//! drawn meanwhile is skipped unencoded. Per image of 320x240: quantise 0.1 ms, encode about
+//! 2 ms; buffers circulate, nothing of ours is allocated in the steady state. Previews cost about as
+//! much again, at most [`PREVIEW_HZ`] times a second, and only while a page is open.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use tracing::{trace_span, warn};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, encode_jpeg};
+use vizflyt_splat::{DepthKind, RgbdImage};
+
+use crate::clock;
+use crate::hub::Hub;
+use crate::mailbox::Mailbox;
+use crate::outlet::Outgoing;
+
+/// All cameras' images of one tick, as drawn; reused from tick to tick.
+#[derive(Debug, Default)]
+pub struct DrawnTick {
+    /// Counts ticks from 1.
+    pub seq: u64,
+    /// When the pose was measured.
+    pub pose: ServerTime,
+    /// The pose drawn from.
+    pub world_from_body: Option<Pose<World, Body>>,
+    /// Rendering began.
+    pub render_start: ServerTime,
+    /// Rendering ended.
+    pub render_end: ServerTime,
+    /// One image per camera of the arena.
+    pub images: Vec<RgbdImage>,
+}
+
+/// Two small pictures for the page.
+#[derive(Debug)]
+pub struct Preview {
+    /// JPEG of the colour image.
+    pub colour: Vec<u8>,
+    /// JPEG of the depth image, coloured by [`depth_colour`].
+    pub depth: Vec<u8>,
+}
+
+/// Encodes until the server stops.
+pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, quality: u8) {
+    let mut stage = Stage::new(quality);
+    let mut preview_due = Instant::now();
+    while !hub.stop.is_set() {
+        let wanted = hub.outlet.wait_for_room(preview_due, PATIENCE);
+        if !wanted.preview && !wanted.stream.contains(&true) {
+            continue;
+        }
+        let Some(tick) = drawn.take(PATIENCE) else { continue };
+        let preview = wanted.preview && Instant::now() >= preview_due;
+        if preview {
+            preview_due = Instant::now() + Duration::from_secs(1) / PREVIEW_HZ;
+        }
+        for camera in 0..tick.images.len() {
+            if !(wanted.stream[camera] || preview) {
+                continue;
+            }
+            let encoded = stage.encode(hub, &tick, camera, wanted.stream[camera], preview);
+            if let Err(error) = encoded {
+                warn!("camera {camera}: {error:#}; image {} is skipped", tick.seq);
+            }
+        }
+        drawn.recycle(tick);
+    }
+}
+
+/// Encoder and scratch memory.
+struct Stage {
+    encoder: Encoder,
+    rgb: Vec<u8>,
+    depth_mm: Vec<u16>,
+    coloured: Vec<u8>,
+    palette: Vec<[u8; 3]>,
+}
+
+impl Stage {
+    fn new(quality: u8) -> Self {
+        Self {
+            encoder: Encoder::new(EncodeOptions {
+                jpeg_quality: quality,
+                ..EncodeOptions::default()
+            }),
+            rgb: Vec::new(),
+            depth_mm: Vec::new(),
+            coloured: Vec::new(),
+            palette: (0..PALETTE_SIZE).map(|k| depth_colour(palette_depth_mm(k))).collect(),
+        }
+    }
+
+    fn encode(
+        &mut self,
+        hub: &Hub,
+        tick: &DrawnTick,
+        camera: usize,
+        stream: bool,
+        preview: bool,
+    ) -> Result<()> {
+        let (Some(info), Some(world_from_body)) =
+            (hub.arena.cameras.get(camera), tick.world_from_body)
+        else {
+            return Ok(());
+        };
+        let image = &tick.images[camera];
+        image.write_rgb8(&mut self.rgb);
+        image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
+        if stream {
+            let _span = trace_span!("encode", seq = tick.seq, camera).entered();
+            let start = clock::now();
+            let world_from_cam = world_from_body * info.body_from_cam;
+            let mut header = ImageHeader::new(
+                tick.seq,
+                camera as u8,
+                tick.pose,
+                &info.intrinsics,
+                &world_from_cam,
+            );
+            header.render_start_ns = tick.render_start.as_ns().into();
+            header.render_end_ns = tick.render_end.as_ns().into();
+            let mut payload = hub.outlet.buffer();
+            let view = RgbdView {
+                width: image.width_px,
+                height: image.height_px,
+                rgb: &self.rgb,
+                depth_mm: &self.depth_mm,
+            };
+            self.encoder.encode(&view, &mut payload).context("cannot encode")?;
+            let end = clock::now();
+            header.payload_len = (payload.len() as u32).into();
+            header.encode_end_ns = end.as_ns().into();
+            hub.stats.encode.add(start, end);
+            hub.outlet.send(Outgoing { camera, header, payload });
+        }
+        if preview {
+            self.preview(hub, image, camera)?;
+        }
+        Ok(())
+    }
+
+    fn preview(&mut self, hub: &Hub, image: &RgbdImage, camera: usize) -> Result<()> {
+        let (width, height) = (image.width_px, image.height_px);
+        self.coloured.clear();
+        for &mm in &self.depth_mm {
+            self.coloured.extend_from_slice(&self.palette[palette_index(mm)]);
+        }
+        let jpeg = |rgb: &[u8]| -> Result<Vec<u8>> {
+            let mut out = Vec::new();
+            encode_jpeg(rgb, width, height, PREVIEW_QUALITY, &mut out).context("no preview")?;
+            Ok(out)
+        };
+        let preview = Preview { colour: jpeg(&self.rgb)?, depth: jpeg(&self.coloured)? };
+        if let Some(slot) = hub.previews.get(camera) {
+            slot.send_replace(Some(Arc::new(preview)));
+        }
+        Ok(())
+    }
+}
+
+/// Returns the colour of a depth on the page: pale near, dark far by the logarithm from 0.3 to
+/// 20 m; black where there is no return. The page's legend shows the same stops.
+pub fn depth_colour(depth_mm: u16) -> [u8; 3] {
+    if depth_mm == 0 {
+        return [0; 3];
+    }
+    let share = (f32::from(depth_mm) / NEAR_MM).ln() / (FAR_MM / NEAR_MM).ln();
+    let at = share.clamp(0.0, 1.0) * (STOPS.len() - 1) as f32;
+    let index = (at as usize).min(STOPS.len() - 2);
+    let t = at - index as f32;
+    let mix = |a: u8, b: u8| (f32::from(a) + (f32::from(b) - f32::from(a)) * t).round() as u8;
+    let (a, b) = (STOPS[index], STOPS[index + 1]);
+    [mix(a[0], b[0]), mix(a[1], b[1]), mix(a[2], b[2])]
+}
+
+/// The palette is indexed by depth in steps of 16 mm, no return apart.
+fn palette_index(mm: u16) -> usize {
+    if mm == 0 { 0 } else { 1 + usize::from(mm >> 4) }
+}
+
+fn palette_depth_mm(index: usize) -> u16 {
+    if index == 0 { 0 } else { (((index - 1) << 4) + 8) as u16 }
+}
+
+const PALETTE_SIZE: usize = 1 + (1 << 12);
+const STOPS: [[u8; 3]; 5] =
+    [[255, 244, 191], [255, 173, 79], [232, 72, 108], [125, 47, 147], [31, 24, 80]];
+const NEAR_MM: f32 = 300.0;
+const FAR_MM: f32 = 20_000.0;
+/// Smooth enough to watch; half of the cost of a stream at 30 Hz. [Hz]
+pub const PREVIEW_HZ: u32 = 15;
+const PREVIEW_QUALITY: u8 = 80;
+/// How long a stop may go unnoticed.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// Counts a drawn tick; `skipped` says that it replaced one that nobody took.
+pub(crate) fn count(hub: &Hub, skipped: bool) {
+    hub.stats.ticks.fetch_add(1, Ordering::Relaxed);
+    hub.stats.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depth_colours_run_from_pale_to_dark_and_no_return_is_black() {
+        assert_eq!(depth_colour(0), [0; 3]);
+        assert_eq!(depth_colour(300), STOPS[0]);
+        assert_eq!(depth_colour(1), STOPS[0]);
+        assert_eq!(depth_colour(u16::MAX), STOPS[4]);
+        let light = |mm| depth_colour(mm).iter().map(|&c| u32::from(c)).sum::<u32>();
+        let depths = [300u16, 600, 1200, 2400, 5000, 10_000, 20_000];
+        assert!(depths.is_sorted_by_key(|&mm| std::cmp::Reverse(light(mm))));
+    }
+
+    #[test]
+    fn the_palette_agrees_with_the_colours() {
+        let palette: Vec<_> =
+            (0..PALETTE_SIZE).map(|k| depth_colour(palette_depth_mm(k))).collect();
+        for mm in 0..=u16::MAX {
+            let (found, expected) = (palette[palette_index(mm)], depth_colour(mm));
+            let off = found.iter().zip(expected).map(|(a, b)| a.abs_diff(b)).max();
+            assert!(off.is_some_and(|off| off <= 8), "{mm} mm: {found:?} for {expected:?}");
+        }
+    }
+}

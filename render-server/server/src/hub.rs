@@ -1,0 +1,419 @@
+//! What the threads and tasks of the server share: the newest of everything, and the seats.
+//!
+//! ```text
+//! pose thread ----> pose (watch), trail, events ----> session, page
+//! render, encode -> stats, previews (watch) --------> page
+//! session --------> telemetry (watch), events ------> page, pose thread (phase of flight)
+//! page -----------> events (stop button) -----------> session
+//! ```
+//! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::{Notify, watch};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, bounded,
+};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::clock;
+use crate::drivers::SourceCounters;
+use crate::encode::Preview;
+use crate::events::{EventLog, Origin};
+use crate::outlet::Outlet;
+use crate::stats::Stats;
+use crate::stop::Stop;
+
+/// Shared state of one vehicle's flight in one arena.
+#[derive(Debug)]
+pub struct Hub {
+    /// The object in the localization system, and the only vehicle served.
+    pub vehicle: Name,
+    /// What the runtime gets to know.
+    pub arena: ArenaInfo,
+    /// Which renderer draws.
+    pub renderer: String,
+    /// The end of the program.
+    pub stop: Stop,
+    /// What happened.
+    pub events: EventLog,
+    /// What was measured.
+    pub stats: Stats,
+    /// Who wants images.
+    pub outlet: Outlet,
+    /// The newest pose.
+    pub pose: watch::Sender<Option<PoseSample>>,
+    /// The runtime's newest report.
+    pub telemetry: watch::Sender<Option<Telemetry>>,
+    /// The newest previews, by camera.
+    pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
+    /// Where the vehicle was.
+    pub trail: Mutex<Trail>,
+    /// What the localization delivered.
+    pub source: Mutex<SourceCounters>,
+    seat: Mutex<SeatState>,
+    flight: Mutex<Flight>,
+}
+
+/// How the present flight goes.
+#[derive(Clone, Debug, Default)]
+pub struct Flight {
+    /// When the runtime first reported taking off.
+    pub took_off: Option<ServerTime>,
+    /// When it first reported having landed.
+    pub landed: Option<ServerTime>,
+    /// The event that decided it: the first that makes the guard land.
+    pub outcome: Option<Event>,
+}
+
+#[derive(Debug, Default)]
+struct SeatState {
+    sessions: u64,
+    taken: Option<RuntimeInfo>,
+    /// Index of the first event of the present flight.
+    flight_start: u64,
+    /// How many flights have begun; the pose thread starts its referee anew with each.
+    flights: u64,
+}
+
+/// The runtime that flies.
+#[derive(Clone, Debug)]
+pub struct RuntimeInfo {
+    /// Session number.
+    pub id: u64,
+    /// Where it is.
+    pub address: SocketAddr,
+    /// Which program.
+    pub program: Text,
+    heard_ns: Arc<AtomicU64>,
+    evicted: Arc<Notify>,
+}
+
+impl Hub {
+    /// Makes the state of a server that has seen nothing yet.
+    pub fn new(vehicle: &str, arena: ArenaInfo, renderer: String, stop: Stop) -> Self {
+        let cameras = arena.cameras.len();
+        Self {
+            vehicle: bounded(vehicle),
+            arena,
+            renderer,
+            stop,
+            events: EventLog::default(),
+            stats: Stats::default(),
+            outlet: Outlet::new(cameras),
+            pose: watch::Sender::new(None),
+            telemetry: watch::Sender::new(None),
+            previews: (0..cameras).map(|_| watch::Sender::new(None)).collect(),
+            trail: Mutex::default(),
+            source: Mutex::default(),
+            seat: Mutex::default(),
+            flight: Mutex::default(),
+        }
+    }
+
+    /// Appends to the log what the server or the runtime noticed.
+    pub fn log(&self, origin: Origin, event: Event) {
+        if self.decides(&event.kind) {
+            lock(&self.flight).outcome.get_or_insert_with(|| event.clone());
+        }
+        self.events.push(origin, event);
+    }
+
+    fn decides(&self, kind: &EventKind) -> bool {
+        match kind {
+            EventKind::Collision { .. }
+            | EventKind::Geofence { .. }
+            | EventKind::Finished { .. }
+            | EventKind::TimeLimit
+            | EventKind::EmergencyStop
+            | EventKind::PluginFailed => true,
+            // On the ground a pose may come and go.
+            EventKind::PoseLost { .. } => self.under_way(),
+            _ => false,
+        }
+    }
+
+    /// Takes the runtime's report.
+    pub fn report(&self, report: Telemetry) {
+        let now = clock::now();
+        let phase = report.phase;
+        self.telemetry.send_replace(Some(report));
+        let mut flight = lock(&self.flight);
+        if self.under_way() {
+            flight.took_off.get_or_insert(now);
+        } else if phase == FlightPhase::Landed && flight.took_off.is_some() {
+            flight.landed.get_or_insert(now);
+        }
+    }
+
+    /// Returns how the present flight goes.
+    pub fn flight(&self) -> Flight {
+        lock(&self.flight).clone()
+    }
+
+    /// Logs something this server noticed; it goes to the runtime, the page and standard output.
+    pub fn tell(&self, kind: EventKind, text: &str) {
+        let event = Event { stamp: clock::now(), kind, text: bounded(text) };
+        self.log(Origin::Server, event);
+    }
+
+    /// Logs something for the page alone; the runtime has no use for it.
+    pub fn note(&self, text: &str) {
+        let event = Event { stamp: clock::now(), kind: EventKind::Note, text: bounded(text) };
+        self.log(Origin::Page, event);
+    }
+
+    /// Returns the phase of flight by the runtime's newest report.
+    pub fn phase(&self) -> FlightPhase {
+        self.telemetry.borrow().as_ref().map_or(FlightPhase::Connecting, |report| report.phase)
+    }
+
+    /// Returns the runtime that holds the seat.
+    pub fn runtime(&self) -> Option<RuntimeInfo> {
+        self.lock_seat().taken.clone()
+    }
+
+    /// Returns how many flights have begun: rises when a runtime takes the seat on the ground.
+    pub fn flights(&self) -> u64 {
+        self.lock_seat().flights
+    }
+
+    /// Presses the stop button; returns whether a runtime is there to obey.
+    pub fn emergency_stop(&self, by: &str) -> bool {
+        self.tell(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
+        self.runtime().is_some()
+    }
+
+    /// Gives the seat of the vehicle to a runtime.
+    ///
+    /// A runtime that has been silent for [`SILENT_S`] loses it to the newcomer: it is the same
+    /// one after an outage, or it is dead. If the former flight was under way, the newcomer is
+    /// told everything since that flight's start, so that no collision is lost with a connection.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn sit(self: &Arc<Self>, hello: &Hello, address: SocketAddr) -> Result<Seat, String> {
+        if hello.vehicle != self.vehicle {
+            return Err(format!(
+                "no vehicle '{}' here, only '{}'; start the runtime with --vehicle {}",
+                hello.vehicle, self.vehicle, self.vehicle
+            ));
+        }
+        let now = clock::now();
+        let mut state = self.lock_seat();
+        if let Some(first) = &state.taken {
+            let heard = ServerTime::from_ns(first.heard_ns.load(Ordering::Relaxed));
+            if !(now.seconds_since(heard) > SILENT_S) {
+                return Err(format!(
+                    "vehicle '{}' is flown by {} at {}; stop that runtime first",
+                    self.vehicle, first.program, first.address
+                ));
+            }
+            first.evicted.notify_one();
+        }
+        state.sessions += 1;
+        let resumed = self.under_way();
+        if !resumed {
+            state.flights += 1;
+            state.flight_start = self.events.next_index();
+            self.telemetry.send_replace(None);
+            lock(&self.trail).clear();
+            *lock(&self.flight) = Flight::default();
+        }
+        let info = RuntimeInfo {
+            id: state.sessions,
+            address,
+            program: hello.program.clone(),
+            heard_ns: Arc::new(AtomicU64::new(now.as_ns())),
+            evicted: Arc::new(Notify::new()),
+        };
+        state.taken = Some(info.clone());
+        Ok(Seat { hub: self.clone(), info, resumed, first_event: state.flight_start })
+    }
+
+    /// Whether a flight had begun and not ended when its runtime was last heard.
+    fn under_way(&self) -> bool {
+        use FlightPhase::{Flying, Holding, Landing, TakingOff};
+        matches!(self.phase(), TakingOff | Flying | Holding | Landing)
+    }
+
+    fn lock_seat(&self) -> MutexGuard<'_, SeatState> {
+        lock(&self.seat)
+    }
+}
+
+/// Locks, also where a thread has panicked: every value kept here is valid at any time.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The right to fly the vehicle; given back when dropped.
+#[derive(Debug)]
+pub struct Seat {
+    hub: Arc<Hub>,
+    /// Who sits.
+    pub info: RuntimeInfo,
+    /// Whether the flight goes on after an outage.
+    pub resumed: bool,
+    /// The first event to tell.
+    pub first_event: u64,
+}
+
+impl Seat {
+    /// Notes that the runtime has been heard at `now`.
+    pub fn heard(&self, now: ServerTime) {
+        self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
+    }
+
+    /// Completes when a newcomer has taken the seat.
+    pub async fn evicted(&self) {
+        self.info.evicted.notified().await;
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        let mut state = self.hub.lock_seat();
+        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
+            state.taken = None;
+        }
+    }
+}
+
+/// The path of the vehicle since the flight began, thinned so that it stays small for ever.
+#[derive(Debug)]
+pub struct Trail {
+    /// (x, y, z [m, world], speed [m/s]), oldest first.
+    pub points: Vec<[f32; 4]>,
+    spacing_m: f32,
+}
+
+impl Default for Trail {
+    fn default() -> Self {
+        Self { points: Vec::new(), spacing_m: LEAST_SPACING_M }
+    }
+}
+
+impl Trail {
+    /// Adds where the vehicle is, if it has moved enough.
+    pub fn add(&mut self, sample: &PoseSample) {
+        let p = sample.world_from_body.translation_m.as_vec3();
+        let far = self
+            .points
+            .last()
+            .is_none_or(|&[x, y, z, _]| p.distance(glam::Vec3::new(x, y, z)) >= self.spacing_m);
+        if !far {
+            return;
+        }
+        if self.points.len() >= MOST_POINTS {
+            let mut keep = false;
+            self.points.retain(|_| {
+                keep = !keep;
+                keep
+            });
+            self.spacing_m *= 2.0;
+        }
+        self.points.push([p.x, p.y, p.z, sample.twist.linear_mps.length() as f32]);
+    }
+
+    fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+/// Runtimes report ten times a second; ten reports missed are an outage. [s]
+const SILENT_S: f64 = 1.0;
+/// About the vehicle's radius. [m]
+const LEAST_SPACING_M: f32 = 0.05;
+/// 32 KB; 100 m of path at the finest spacing.
+const MOST_POINTS: usize = 2048;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+    use vizflyt_protocol::geometry::{Pose, Twist, Volume};
+    use vizflyt_protocol::messages::Limits;
+
+    fn hub() -> Arc<Hub> {
+        let arena = ArenaInfo {
+            name: bounded("test"),
+            geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
+            limits: Limits { max_speed_mps: 1.0, max_acceleration_mps2: 1.0 },
+            body_radius_m: 0.1,
+            takeoff_height_m: 1.0,
+            goal_m: None,
+            goal_radius_m: 1.0,
+            time_limit_s: 0.0,
+            cameras: Default::default(),
+        };
+        Arc::new(Hub::new("vizflyt", arena, "test".to_owned(), Stop::default()))
+    }
+
+    fn hello(vehicle: &str) -> Hello {
+        Hello { vehicle: bounded(vehicle), program: bounded("runtime 0.1") }
+    }
+
+    fn address() -> SocketAddr {
+        "127.0.0.1:9".parse().unwrap()
+    }
+
+    #[test]
+    fn one_vehicle_has_one_runtime() {
+        let hub = hub();
+        let refusal = hub.sit(&hello("wasp"), address()).unwrap_err();
+        assert!(refusal.starts_with("no vehicle 'wasp' here, only 'vizflyt'"), "{refusal}");
+        let first = hub.sit(&hello("vizflyt"), address()).unwrap();
+        let refusal = hub.sit(&hello("vizflyt"), address()).unwrap_err();
+        assert_eq!(
+            refusal,
+            "vehicle 'vizflyt' is flown by runtime 0.1 at 127.0.0.1:9; stop that runtime first"
+        );
+        drop(first);
+        assert!(hub.runtime().is_none());
+        assert!(hub.sit(&hello("vizflyt"), address()).is_ok());
+    }
+
+    #[tokio::test]
+    async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
+        let hub = hub();
+        hub.tell(EventKind::Note, "before the flight");
+        let first = hub.sit(&hello("vizflyt"), address()).unwrap();
+        assert_eq!((first.first_event, first.resumed, hub.flights()), (1, false, 1));
+        hub.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
+        hub.tell(EventKind::EmergencyStop, "stop");
+        // As if it had last been heard two seconds ago.
+        first.heard(clock::now().plus_seconds(-2.0));
+        let second = hub.sit(&hello("vizflyt"), address()).unwrap();
+        first.evicted().await;
+        assert_eq!((second.first_event, second.resumed, hub.flights()), (1, true, 1));
+        drop(first);
+        assert_eq!(hub.runtime().map(|runtime| runtime.id), Some(second.info.id));
+        drop(second);
+        // After the landing the next runtime begins a new flight.
+        assert!(hub.flight().outcome.is_some_and(|event| event.text == "stop"));
+        hub.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
+        let third = hub.sit(&hello("vizflyt"), address()).unwrap();
+        assert_eq!((third.first_event, third.resumed, hub.flights()), (2, false, 2));
+        assert!(hub.flight().outcome.is_none() && hub.telemetry.borrow().is_none());
+    }
+
+    #[test]
+    fn a_trail_keeps_its_ends_and_stays_small() {
+        let mut trail = Trail::default();
+        for k in 0..20_000 {
+            trail.add(&PoseSample {
+                stamp: ServerTime::ZERO,
+                world_from_body: Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY),
+                twist: Twist::default(),
+                resets: 0,
+            });
+        }
+        assert!(trail.points.len() <= MOST_POINTS);
+        assert_eq!(trail.points[0][0], 0.0);
+        assert!(trail.points.last().unwrap()[0] > 398.0);
+        assert!(trail.points.is_sorted_by(|a, b| a[0] < b[0]));
+    }
+}

@@ -1,0 +1,156 @@
+//! A place for one item, where the newest wins, and old buffers come back to be filled again.
+//!
+//! Writer: [`Mailbox::spare`], fill, [`Mailbox::put`]. Reader: [`Mailbox::take`], use,
+//! [`Mailbox::recycle`]. With one writer and one reader three buffers circulate for ever, so the
+//! steady state allocates nothing. The lock is held for the swap of a few words only.
+
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// A newest-wins slot for items of type `T`.
+#[derive(Debug, Default)]
+pub struct Mailbox<T> {
+    inner: Mutex<Inner<T>>,
+    filled: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Inner<T> {
+    slot: Option<T>,
+    spares: Vec<T>,
+    replaced: u64,
+    closed: bool,
+}
+
+impl<T: Default> Mailbox<T> {
+    /// Returns a buffer to fill: a used one, or a fresh one as long as too few circulate.
+    pub fn spare(&self) -> T {
+        self.lock().spares.pop().unwrap_or_default()
+    }
+
+    /// Puts `item` in, in place of one that nobody took; returns whether it replaced one.
+    pub fn put(&self, item: T) -> bool {
+        let mut inner = self.lock();
+        let old = inner.slot.replace(item);
+        let replaced = old.is_some();
+        inner.replaced += u64::from(replaced);
+        keep(&mut inner.spares, old);
+        self.filled.notify_one();
+        replaced
+    }
+
+    /// Waits at most `timeout` for an item; `None` if none came or the mailbox was closed.
+    pub fn take(&self, timeout: Duration) -> Option<T> {
+        let deadline = Instant::now() + timeout;
+        let mut inner = self.lock();
+        loop {
+            if let Some(item) = inner.slot.take() {
+                return Some(item);
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if inner.closed || left.is_zero() {
+                return None;
+            }
+            inner = self.filled.wait_timeout(inner, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Gives a buffer back.
+    pub fn recycle(&self, item: T) {
+        keep(&mut self.lock().spares, Some(item));
+    }
+
+    /// Makes every present and future [`Self::take`] return at once.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.filled.notify_all();
+    }
+
+    /// Returns how many items were replaced unread.
+    pub fn replaced(&self) -> u64 {
+        self.lock().replaced
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner<T>> {
+        // Why: nothing panics while the lock is held; a poisoned mailbox is still a valid one.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn keep<T>(spares: &mut Vec<T>, item: Option<T>) {
+    if spares.len() < MOST_SPARES {
+        spares.extend(item);
+    }
+}
+
+/// One being written, one in the slot, one being read.
+const MOST_SPARES: usize = 3;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+
+    const LONG: Duration = Duration::from_secs(30);
+
+    #[test]
+    fn the_newest_wins_and_the_replaced_are_counted() {
+        let mailbox = Mailbox::default();
+        assert!(!mailbox.put(1));
+        assert!(mailbox.put(2));
+        assert!(mailbox.put(3));
+        assert_eq!(mailbox.take(LONG), Some(3));
+        assert_eq!(mailbox.take(Duration::ZERO), None);
+        assert_eq!(mailbox.replaced(), 2);
+    }
+
+    #[test]
+    fn buffers_circulate() {
+        let mailbox = Mailbox::<Vec<u8>>::default();
+        let mut seen = std::collections::BTreeSet::new();
+        for round in 0..100usize {
+            let mut buffer = mailbox.spare();
+            buffer.clear();
+            buffer.resize(1000, 0);
+            seen.insert(buffer.as_ptr() as usize);
+            mailbox.put(buffer);
+            // The reader is slower than the writer: every third is read.
+            if round % 3 == 0 {
+                let taken = mailbox.take(LONG).unwrap();
+                mailbox.recycle(taken);
+            }
+        }
+        assert!(seen.len() <= 3, "{} buffers", seen.len());
+    }
+
+    #[test]
+    fn a_reader_on_another_thread_sees_rising_items_and_the_last_one() {
+        let mailbox = Arc::new(Mailbox::<u32>::default());
+        let reader = {
+            let mailbox = mailbox.clone();
+            std::thread::spawn(move || {
+                let mut last = 0;
+                while last < 10_000 {
+                    let item = mailbox.take(LONG).unwrap();
+                    assert!(item > last);
+                    last = item;
+                }
+            })
+        };
+        for item in 1..=10_000 {
+            mailbox.put(item);
+        }
+        reader.join().unwrap();
+    }
+
+    #[test]
+    fn closing_wakes_the_reader() {
+        let mailbox = Arc::new(Mailbox::<u32>::default());
+        let reader = {
+            let mailbox = mailbox.clone();
+            std::thread::spawn(move || mailbox.take(LONG))
+        };
+        mailbox.close();
+        assert_eq!(reader.join().unwrap(), None);
+    }
+}

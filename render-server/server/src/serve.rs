@@ -1,0 +1,241 @@
+//! Starts everything, says when it is ready, and ends it in order.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use glam::DVec2;
+use serde::Serialize;
+use tracing::info;
+use vizflyt_splat::Splats;
+
+use crate::args::ServeArgs;
+use crate::drivers::{PoseSource, ViconUdp};
+use crate::events::Origin;
+use crate::hub::{Hub, lock};
+use crate::mailbox::Mailbox;
+use crate::map::{self, Map, Obstacles};
+use crate::render::{Renderer, best};
+use crate::scene::{self, Scene};
+use crate::stats::Report;
+use crate::stop::Stop;
+use crate::track::{Solid, Track};
+use crate::transport::{self, Identity};
+use crate::{dashboard, encode, tick};
+
+/// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
+///
+/// With `--json` standard output carries one JSON line when ready, one per event of the server and
+/// one report at the end; without, the same for people.
+///
+/// # Errors
+/// Scene or arena that cannot be used, an address that cannot be bound.
+pub fn serve(args: ServeArgs) -> Result<()> {
+    let stop = Stop::default();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("net")
+        .enable_all()
+        .build()
+        .context("cannot start tokio")?;
+    let result = runtime.block_on(run(&args, &stop));
+    stop.set();
+    // Not awaited: a task stuck in a system call must not hold up the end.
+    runtime.shutdown_background();
+    result
+}
+
+/// What is printed when the server is ready.
+#[derive(Debug, Serialize)]
+struct Ready<'a> {
+    ready: &'static str,
+    quic: SocketAddr,
+    http: String,
+    vicon: SocketAddr,
+    fingerprint: &'a str,
+    /// Where the vehicle is expected to start: x, y, z [m, world], yaw [deg].
+    spawn: [f64; 4],
+    arena: &'a str,
+}
+
+async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
+    stop.on_signals(args.lifeline)?;
+    // Sockets first: a taken port is told before the scene is loaded.
+    let identity = Arc::new(Identity::generate()?);
+    let endpoint = transport::bind(args.quic, &identity, args.congestion)?;
+    let quic = endpoint.local_addr().context("QUIC has no address")?;
+    let listener = dashboard::bind(args.http).await?;
+    let http = format!("http://{}", listener.local_addr().context("the page has no address")?);
+    let vicon = ViconUdp::bind(args.vicon, &args.vehicle)?;
+    let vicon_address = vicon.address();
+
+    let loading = args.clone();
+    let load = tokio::task::spawn_blocking(move || prepare(&loading));
+    let twin = tokio::select! {
+        twin = load => twin.context("loading the scene failed")??,
+        () = stop.wait() => return Ok(()),
+    };
+    let renderer_name = twin.renderer.name();
+    let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), renderer_name, stop.clone()));
+    let threads = start_threads(args, &hub, twin.renderer, twin.track, vicon)?;
+
+    let fingerprint = identity.fingerprint();
+    let spawn = twin.arena.spawn;
+    let [x, y, z] = spawn.position_m.to_array();
+    announce(
+        args.json,
+        &Ready {
+            ready: "server",
+            quic,
+            http,
+            vicon: vicon_address,
+            fingerprint: &fingerprint,
+            spawn: [x, y, z, spawn.yaw_deg],
+            arena: &twin.arena.name,
+        },
+    );
+
+    let page = tokio::spawn(dashboard::serve(hub.clone(), twin.map, twin.arena.stages, listener));
+    let printer = tokio::spawn(print_events(hub.clone(), args.json));
+    transport::serve(hub.clone(), endpoint, identity, args.congestion).await;
+    hub.outlet.shut();
+    page.abort();
+    printer.abort();
+    for thread in threads {
+        // A thread that panicked has said so on stderr; the report still comes.
+        let _ = tokio::task::spawn_blocking(move || thread.join()).await;
+    }
+    report(args.json, &hub.stats.report(*lock(&hub.source), &hub.renderer));
+    Ok(())
+}
+
+/// Everything made from the scene.
+struct Twin {
+    arena: vizflyt_arena::ArenaConfig,
+    renderer: Box<dyn Renderer>,
+    track: Track,
+    map: Map,
+}
+
+fn prepare(args: &ServeArgs) -> Result<Twin> {
+    let Scene { arena, splats } = scene::load(&args.arena, args.up, args.scale)?;
+    let start = Instant::now();
+    let solid = Solid::bake(&splats, &arena)?;
+    info!("obstacles baked in {:.0} ms: {solid}", start.elapsed().as_secs_f64() * 1e3);
+    let map = draw_map(&splats, &arena, &solid);
+    let renderer = best(&splats);
+    // The renderer holds its own form of the scene; the file's form is no longer needed.
+    drop(splats);
+    let track = Track::new(&arena, solid);
+    Ok(Twin { arena, renderer, track, map })
+}
+
+fn draw_map(splats: &Splats, arena: &vizflyt_arena::ArenaConfig, solid: &Solid) -> Map {
+    let (min, max) = (arena.geofence.min_m.truncate(), arena.geofence.max_m.truncate());
+    let flight_m = arena.spawn.position_m.z + arena.takeoff_height_m;
+    let obstacles =
+        Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| solid.at(p.extend(flight_m)));
+    let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M, best);
+    Map { jpeg: jpeg.unwrap_or_default(), min_m: min.to_array(), max_m: max.to_array(), obstacles }
+}
+
+fn start_threads(
+    args: &ServeArgs,
+    hub: &Arc<Hub>,
+    mut renderer: Box<dyn Renderer>,
+    track: Track,
+    mut source: impl PoseSource + 'static,
+) -> Result<Vec<JoinHandle<()>>> {
+    let newest = Arc::new(Mailbox::default());
+    let drawn = Arc::new(Mailbox::default());
+    let start = |name: &str, run: Box<dyn FnOnce() + Send>| {
+        std::thread::Builder::new()
+            .name(name.to_owned())
+            .spawn(run)
+            .with_context(|| format!("cannot start the {name} thread"))
+    };
+    let (pose_hub, pose_newest) = (hub.clone(), newest.clone());
+    let (draw_hub, draw_drawn, max_rate) = (hub.clone(), drawn.clone(), args.max_rate);
+    let (encode_hub, quality) = (hub.clone(), args.quality);
+    Ok(vec![
+        start("pose", Box::new(move || tick::poses(&pose_hub, &mut source, track, &pose_newest)))?,
+        start(
+            "render",
+            Box::new(move || {
+                tick::draw(&draw_hub, &mut *renderer, &newest, &draw_drawn, max_rate);
+            }),
+        )?,
+        start("encode", Box::new(move || encode::run(&encode_hub, &drawn, quality)))?,
+    ])
+}
+
+async fn print_events(hub: Arc<Hub>, json: bool) {
+    let mut log = hub.events.subscribe();
+    log.mark_changed();
+    let mut cursor = 0;
+    while log.changed().await.is_ok() {
+        log.mark_unchanged();
+        let entries = match hub.events.read(&mut cursor) {
+            Ok(entries) => entries,
+            Err(lagged) => {
+                cursor = lagged.oldest;
+                continue;
+            }
+        };
+        for entry in entries.into_iter().filter(|entry| entry.origin == Origin::Server) {
+            if json {
+                line(&serde_json::json!({ "event": entry.event }));
+            } else {
+                say(&entry.event.text);
+            }
+        }
+    }
+}
+
+fn announce(json: bool, ready: &Ready<'_>) {
+    if json {
+        return line(ready);
+    }
+    say(&format!("arena        {}", ready.arena));
+    say(&format!("page         {}", ready.http));
+    say(&format!("vicon        {} (UDP object stream)", ready.vicon));
+    say(&format!(
+        "runtime      vizflyt fly PLUGIN --server {} --fingerprint {}",
+        ready.quic, ready.fingerprint
+    ));
+}
+
+fn report(json: bool, report: &Report) {
+    if json {
+        return line(&serde_json::json!({ "report": report }));
+    }
+    say(&format!(
+        "{} images sent, {} ticks drawn ({} skipped); render {:.1} ms, p99 {:.1}; peak memory {:.0} MB; {}",
+        report.images_sent,
+        report.ticks,
+        report.ticks_skipped,
+        report.render_ms_p50,
+        report.render_ms_p99,
+        report.peak_rss_mb,
+        report.renderer
+    ));
+}
+
+fn line(value: &impl Serialize) {
+    match serde_json::to_string(value) {
+        Ok(text) => say(&text),
+        Err(error) => tracing::warn!("a line was not printed: {error}"),
+    }
+}
+
+/// Prints a line; unlike `println!` it does not panic when the reader has gone.
+fn say(text: &str) {
+    use std::io::Write;
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
+}
+
+/// What hangs this far above the flight is still drawn on the map. [m]
+const MAP_HEADROOM_M: f64 = 0.4;

@@ -1,0 +1,214 @@
+//! QUIC to the runtime: one endpoint, one session per connection.
+//!
+//! ```text
+//! accept -> session: preambles, Hello -> Welcome | Refused
+//!        -> control stream: poses, events, clock down; telemetry, events, clock up
+//!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
+//! ```
+//! Settings and figures: docs/BENCHMARKS.md.
+
+mod certificate;
+mod images;
+mod lan;
+mod session;
+
+pub use certificate::{Identity, fingerprint};
+pub use lan::{Lan, LanConfig};
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use quinn::congestion::{BbrConfig, ControllerFactory, CubicConfig};
+use quinn::crypto::rustls::QuicServerConfig;
+use quinn::{
+    AckFrequencyConfig, Endpoint, EndpointConfig, MtuDiscoveryConfig, ServerConfig,
+    TransportConfig, VarInt,
+};
+use socket2::{Domain, Protocol, Socket, Type};
+use tracing::{debug, warn};
+
+use crate::hub::Hub;
+
+/// Who decides how fast to send.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Congestion {
+    /// `lan` to private and loopback addresses, `cubic` to all others.
+    #[default]
+    Auto,
+    /// A constant window that ignores loss; for a cable of our own.
+    Lan,
+    /// Fair to others (RFC 9438).
+    Cubic,
+    /// Fair to others, less bothered by loss (experimental in quinn).
+    Bbr,
+}
+
+impl Congestion {
+    /// Returns what suits a peer at `address`.
+    fn toward(self, address: IpAddr) -> Self {
+        let near = match address.to_canonical() {
+            IpAddr::V4(v4) => v4.is_loopback() || v4.is_private() || v4.is_link_local(),
+            IpAddr::V6(v6) => {
+                v6.is_loopback() || v6.is_unique_local() || v6.is_unicast_link_local()
+            }
+        };
+        match self {
+            Self::Auto if near => Self::Lan,
+            Self::Auto => Self::Cubic,
+            chosen => chosen,
+        }
+    }
+
+    fn factory(self) -> Arc<dyn ControllerFactory + Send + Sync> {
+        match self {
+            Self::Auto | Self::Lan => Arc::new(LanConfig::default()),
+            Self::Cubic => Arc::new(CubicConfig::default()),
+            Self::Bbr => Arc::new(BbrConfig::default()),
+        }
+    }
+}
+
+/// Opens the endpoint. Must run within a tokio runtime.
+pub fn bind(address: SocketAddr, identity: &Identity, congestion: Congestion) -> Result<Endpoint> {
+    let open = || -> std::io::Result<std::net::UdpSocket> {
+        let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+        // The kernel may grant less (net.core.wmem_max); more than 212 KB already helps.
+        socket.set_send_buffer_size(SOCKET_BUFFER)?;
+        socket.set_recv_buffer_size(SOCKET_BUFFER)?;
+        socket.bind(&address.into())?;
+        socket.set_nonblocking(true)?;
+        Ok(socket.into())
+    };
+    let socket = open().with_context(|| {
+        format!(
+            "cannot listen on {address} (QUIC); is another server running? try --quic 0.0.0.0:0"
+        )
+    })?;
+    let config = server_config(identity, congestion)?;
+    let mut endpoint = EndpointConfig::default();
+    // Jumbo packets from a peer whose network carries them.
+    endpoint.max_udp_payload_size(MOST_MTU).context("cannot set the packet size")?;
+    Endpoint::new(endpoint, Some(config), socket, Arc::new(quinn::TokioRuntime))
+        .context("cannot start QUIC")
+}
+
+/// Accepts runtimes until the server stops.
+pub async fn serve(
+    hub: Arc<Hub>,
+    endpoint: Endpoint,
+    identity: Arc<Identity>,
+    congestion: Congestion,
+) {
+    let mut sessions = tokio::task::JoinSet::new();
+    loop {
+        let incoming = tokio::select! {
+            incoming = endpoint.accept() => incoming,
+            _ = sessions.join_next(), if !sessions.is_empty() => continue,
+            () = hub.stop.wait() => None,
+        };
+        let Some(incoming) = incoming else { break };
+        if sessions.len() >= MOST_CONNECTIONS {
+            warn!("{} connections already: refused {}", sessions.len(), incoming.remote_address());
+            incoming.refuse();
+            continue;
+        }
+        let chosen = congestion.toward(incoming.remote_address().ip());
+        let config = match server_config(&identity, chosen) {
+            Ok(config) => Arc::new(config),
+            Err(error) => {
+                warn!("{error:#}");
+                continue;
+            }
+        };
+        let hub = hub.clone();
+        sessions.spawn(async move {
+            let address = incoming.remote_address();
+            let connection = match incoming.accept_with(config) {
+                Ok(connecting) => connecting.await,
+                Err(error) => Err(error),
+            };
+            match connection {
+                Ok(connection) => session::run(hub, connection).await,
+                Err(error) => debug!("{address}: no connection: {error}"),
+            }
+        });
+    }
+    sessions.shutdown().await;
+    endpoint.close(END, b"the server ends");
+    // Long enough for the close to reach a runtime on the LAN; nothing depends on it.
+    let _ = tokio::time::timeout(Duration::from_millis(300), endpoint.wait_idle()).await;
+}
+
+fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let mut tls = rustls::ServerConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .context("TLS 1.3 is not available")?
+        .with_no_client_auth()
+        .with_single_cert(vec![identity.certificate.clone()], identity.key.clone_key())
+        .context("cannot use the server's certificate")?;
+    tls.alpn_protocols = vec![ALPN.to_vec()];
+    let quic = QuicServerConfig::try_from(tls).context("cannot use TLS for QUIC")?;
+    let mut config = ServerConfig::with_crypto(Arc::new(quic));
+    config.transport_config(Arc::new(transport_config(congestion)));
+    Ok(config)
+}
+
+fn transport_config(congestion: Congestion) -> TransportConfig {
+    let mut ack = AckFrequencyConfig::default();
+    ack.ack_eliciting_threshold(VarInt::from_u32(10)).max_ack_delay(Some(Duration::from_millis(2)));
+    let mut mtu = MtuDiscoveryConfig::default();
+    mtu.upper_bound(MOST_MTU - 48); // less the IPv6 and UDP headers
+    let mut config = TransportConfig::default();
+    config
+        .max_concurrent_bidi_streams(VarInt::from_u32(1)) // the control stream
+        .max_concurrent_uni_streams(VarInt::from_u32(0)) // a runtime sends no images
+        .stream_receive_window(VarInt::from_u32(256 << 10)) // telemetry is small
+        .receive_window(VarInt::from_u32(256 << 10))
+        .send_window(3 << 20) // the default of 10 MB would queue stale images
+        .datagram_receive_buffer_size(None)
+        .max_idle_timeout(Some(VarInt::from_u32(5_000).into()))
+        .keep_alive_interval(Some(Duration::from_secs(1)))
+        .ack_frequency_config(Some(ack))
+        .mtu_discovery_config(Some(mtu))
+        .enable_segmentation_offload(true)
+        .congestion_controller_factory(congestion.factory());
+    config
+}
+
+/// The protocol's name in the TLS handshake.
+pub const ALPN: &[u8] = b"vizflyt";
+/// Close codes; the reason in words goes with them.
+const END: VarInt = VarInt::from_u32(0);
+const FOREIGN: VarInt = VarInt::from_u32(1);
+const REFUSED: VarInt = VarInt::from_u32(2);
+const SLOW: VarInt = VarInt::from_u32(3);
+const REPLACED: VarInt = VarInt::from_u32(4);
+/// Measured: 600 KB images from 2.7 to 1.8 ms, no packets lost in the socket.
+const SOCKET_BUFFER: usize = 4 << 20;
+/// Jumbo frames. [bytes]
+const MOST_MTU: u16 = 9000;
+/// A vehicle needs one; strangers must not exhaust memory.
+const MOST_CONNECTIONS: usize = 32;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(address: &str, expected: Congestion) {
+        assert_eq!(Congestion::Auto.toward(address.parse().unwrap()), expected, "{address}");
+    }
+
+    #[test]
+    fn the_lab_gets_the_lan_window_and_the_internet_a_fair_one() {
+        check("127.0.0.1", Congestion::Lan);
+        check("192.168.10.7", Congestion::Lan);
+        check("::ffff:10.0.0.1", Congestion::Lan);
+        check("fe80::1", Congestion::Lan);
+        check("8.8.8.8", Congestion::Cubic);
+        check("2001:db8::1", Congestion::Cubic);
+        assert_eq!(Congestion::Bbr.toward("127.0.0.1".parse().unwrap()), Congestion::Bbr);
+    }
+}

@@ -1,0 +1,272 @@
+//! The real binary, a Vicon emitter and a runtime's client over loopback.
+
+mod support;
+
+use std::sync::atomic::Ordering;
+
+use quinn::{TransportConfig, VarInt};
+use support::{Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, write_arena};
+use vizflyt_protocol::messages::{
+    ClockRequest, EventKind, FlightPhase, Telemetry, ToRuntime, ToServer,
+};
+use vizflyt_protocol::packet::Preamble;
+use vizflyt_protocol::time::HostTime;
+use vizflyt_rgbd::{Decoder, peek};
+
+fn usual() -> TransportConfig {
+    TransportConfig::default()
+}
+
+#[tokio::test]
+async fn images_follow_the_poses() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let emitter = Emitter::start(server.vicon, "vizflyt");
+    let (mut client, arena) = Client::welcomed(&server, usual()).await;
+    assert_eq!((arena.name.as_str(), arena.cameras.len()), ("wall", 1));
+
+    let (mut seq, mut pose_ns) = (0, 0);
+    for _ in 0..20 {
+        let (header, payload) = client.image().await;
+        // Streams may finish out of order, but the stamps within an image never do.
+        let stamps = [
+            header.pose_ns,
+            header.render_start_ns,
+            header.render_end_ns,
+            header.encode_end_ns,
+            header.send_ns,
+        ]
+        .map(|stamp| stamp.get());
+        assert!(stamps.is_sorted(), "{stamps:?}");
+        assert!(header.seq.get() > seq || header.pose_ns.get() < pose_ns);
+        (seq, pose_ns) = (header.seq.get(), header.pose_ns.get());
+        // Drawn from a pose that was sent, through the camera's extrinsics.
+        let p = header.world_from_cam().translation_m;
+        let frame = (0.06 - p.x) / STEP_M;
+        assert!((frame - frame.round()).abs() < 1e-6, "x = {}", p.x);
+        assert!(frame <= f64::from(emitter.sent.load(Ordering::Relaxed)) + 1.0);
+        assert!((p.y, p.z) == (0.0, HEIGHT_M + 0.02), "{p}");
+        // The wall is seen where it is: camera z of its middle.
+        let info = peek(&payload).unwrap();
+        assert_eq!((info.width, info.height), (160, 120));
+        let (mut rgb, mut depth_mm) = (vec![0; 160 * 120 * 3], vec![0u16; 160 * 120]);
+        Decoder::new().decode(&payload, &mut rgb, &mut depth_mm).unwrap();
+        let middle = 60 * 160 + 80;
+        let expected_mm = (5.0 - p.x) * 1e3;
+        assert!((f64::from(depth_mm[middle]) - expected_mm).abs() < 40.0, "{}", depth_mm[middle]);
+        assert!(rgb[middle * 3] > 200, "the wall is red");
+    }
+
+    let sent = HostTime::from_ns(77);
+    client.say(&ToServer::Clock(ClockRequest { sent })).await;
+    let reply = client
+        .until(|message| match message {
+            ToRuntime::Clock(reply) => Some(reply),
+            _ => None,
+        })
+        .await;
+    assert_eq!(reply.sent, sent);
+    assert!(reply.answered.as_ns() > pose_ns);
+    let mut last_ns = 0;
+    for _ in 0..20 {
+        let pose = client
+            .until(|message| match message {
+                ToRuntime::Pose(pose) => Some(pose),
+                _ => None,
+            })
+            .await;
+        assert!(pose.stamp.as_ns() > last_ns);
+        last_ns = pose.stamp.as_ns();
+    }
+    client.close().await;
+    let report = server.finish();
+    assert!(report["images_sent"].as_u64().unwrap() >= 20, "{report}");
+    assert!(report["render_ms_p50"].as_f64().unwrap() > 0.0);
+    assert!(report["peak_rss_mb"].as_f64().unwrap() > 1.0);
+    assert!(!report["renderer"].as_str().unwrap().is_empty());
+}
+
+#[tokio::test]
+async fn strangers_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let refusal = |message| match message {
+        ToRuntime::Refused(text) => Some(text),
+        _ => None,
+    };
+
+    // Another version.
+    let connection = connect(&server, usual()).await.unwrap();
+    let (mut send, mut recv) = connection.open_bi().await.unwrap();
+    send.write_all(b"VZFL\x63\x00\x02\x00").await.unwrap();
+    let mut theirs = [0; Preamble::SIZE];
+    recv.read_exact(&mut theirs).await.unwrap();
+    assert_eq!(&theirs[..4], b"VZFL");
+    let closed = tokio::time::timeout(PATIENCE, connection.closed()).await.unwrap().to_string();
+    assert!(
+        closed.contains("runtime speaks protocol 99, this server 1: update the server"),
+        "{closed}"
+    );
+
+    // No VizFlyt at all.
+    let connection = connect(&server, usual()).await.unwrap();
+    let (mut send, _recv) = connection.open_bi().await.unwrap();
+    send.write_all(b"GET / HT").await.unwrap();
+    let closed = tokio::time::timeout(PATIENCE, connection.closed()).await.unwrap().to_string();
+    assert!(closed.contains("does not speak VizFlyt"), "{closed}");
+
+    // Another vehicle.
+    let mut other = Client::hello(&server, "wasp", usual()).await;
+    let text = other.until(refusal).await;
+    assert!(text.starts_with("no vehicle 'wasp' here, only 'vizflyt'"), "{text}");
+
+    // A second runtime while the first lives.
+    let (mut first, _) = Client::welcomed(&server, usual()).await;
+    let mut second = Client::hello(&server, "vizflyt", usual()).await;
+    // The first keeps reporting, so it is alive whatever the machine's load.
+    first.say(&ToServer::Telemetry(Telemetry::default())).await;
+    let text = second.until(refusal).await;
+    assert!(text.starts_with("vehicle 'vizflyt' is flown by test 1 at 127.0.0.1:"), "{text}");
+
+    // It starts again once the first has gone.
+    first.close().await;
+    loop {
+        let mut again = Client::hello(&server, "vizflyt", usual()).await;
+        if let ToRuntime::Welcome(_) = again.next().await {
+            break;
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_runtime_that_reads_no_images_stalls_nobody_and_then_gets_the_newest() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    // One stream at a time, and none accepted: images cannot leave.
+    let mut transport = usual();
+    transport.max_concurrent_uni_streams(VarInt::from_u32(1));
+    let (mut client, _) = Client::welcomed(&server, transport).await;
+    let pose = |message| match message {
+        ToRuntime::Pose(pose) => Some(pose),
+        _ => None,
+    };
+    let mut stalled_until_ns = 0;
+    for _ in 0..100 {
+        stalled_until_ns = client.until(pose).await.stamp.as_ns();
+    }
+    // The first stream was filled at the start; whatever comes after it is fresh.
+    let mut stream = client.connection.accept_uni().await.unwrap();
+    let _ = stream.read_to_end(1 << 22).await;
+    drop(stream);
+    let mut headers = Vec::new();
+    for _ in 0..12 {
+        headers.push(client.image().await.0);
+    }
+    let fresh = headers.iter().filter(|h| h.pose_ns.get() > stalled_until_ns).count();
+    // At most K waited for a stream when the stall ended, and one each was drawn and being drawn.
+    assert!(fresh >= 6, "{fresh} of 12 are newer than the stall");
+    drop(client);
+    let report = server.finish();
+    assert!(report["ticks_skipped"].as_u64().unwrap() > 10, "{report}");
+}
+
+#[tokio::test]
+async fn at_most_k_images_are_in_flight_until_the_deadline() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    // A header fits into the window, an image never does: every image stays in flight.
+    let mut transport = usual();
+    transport.stream_receive_window(VarInt::from_u32(512));
+    let (client, _) = Client::welcomed(&server, transport).await;
+    let mut sent_ns = Vec::new();
+    let mut streams = Vec::new();
+    while sent_ns.len() < 8 {
+        let mut stream = tokio::time::timeout(PATIENCE, client.connection.accept_uni())
+            .await
+            .expect("another image after the deadline of the last")
+            .unwrap();
+        let mut bytes = [0; vizflyt_protocol::packet::ImageHeader::SIZE];
+        // Reset before its header was read: as good as not seen.
+        if stream.read_exact(&mut bytes).await.is_ok() {
+            let (header, _) = vizflyt_protocol::packet::ImageHeader::parse(&bytes).unwrap();
+            sent_ns.push(header.send_ns.get());
+        }
+        streams.push(stream);
+    }
+    sent_ns.sort_unstable();
+    // K is 2 on loopback: the third image leaves only when the first is reset, after 150 ms.
+    for pair in sent_ns.windows(3) {
+        assert!(pair[2] - pair[0] >= 150_000_000, "{sent_ns:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_restarted_runtime_gets_images_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    let mut seq = 0;
+    for _ in 0..3 {
+        let mut client = loop {
+            let mut client = Client::hello(&server, "vizflyt", usual()).await;
+            // Refused only until the server has noticed the former one's end.
+            if matches!(client.next().await, ToRuntime::Welcome(_)) {
+                break client;
+            }
+        };
+        let (header, _) = client.image().await;
+        assert!(header.seq.get() > seq);
+        seq = header.seq.get();
+        client.say(&ToServer::Telemetry(Telemetry::default())).await;
+        client.close().await;
+    }
+}
+
+#[tokio::test]
+async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let emitter = Emitter::start(server.vicon, "vizflyt");
+    let (mut client, _) = Client::welcomed(&server, usual()).await;
+    client.image().await;
+    let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
+    client.say(&ToServer::Telemetry(flying)).await;
+    emitter.pause(true);
+    let lost = |message| match message {
+        ToRuntime::Event(event) => {
+            matches!(event.kind, EventKind::PoseLost { .. }).then_some(event)
+        }
+        _ => None,
+    };
+    let event = client.until(lost).await;
+    let printed = server.line(|line| line.get("event").cloned());
+    assert_eq!(printed["text"], event.text.as_str());
+    // The connection is lost in flight; the next one is told what happened since take-off.
+    client.close().await;
+    let mut again = loop {
+        let mut client = Client::hello(&server, "vizflyt", usual()).await;
+        if matches!(client.next().await, ToRuntime::Welcome(_)) {
+            break client;
+        }
+    };
+    assert_eq!(again.until(lost).await, event);
+    emitter.pause(false);
+    again
+        .until(|message| match message {
+            ToRuntime::Event(event) => (event.kind == EventKind::PoseRegained).then_some(()),
+            _ => None,
+        })
+        .await;
+}
+
+#[test]
+fn a_signal_ends_the_server_with_its_report() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    server.terminate();
+    let report = server.line(|line| line.get("report").cloned());
+    assert_eq!(report["images_sent"], 0);
+    assert!(server.wait().success());
+}

@@ -1,0 +1,452 @@
+//! The other ends of the server, for tests: a scene, a Vicon emitter, a runtime, a browser.
+//!
+//! Everything waits on conditions; [`PATIENCE`] only bounds a test that fails.
+
+#![allow(dead_code)] // Why: every test file uses another part.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream, UdpSocket};
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::mpsc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use glam::{Quat, Vec3};
+use quinn::{ClientConfig, Connection, Endpoint, RecvStream, SendStream, TransportConfig, VarInt};
+use serde_json::Value;
+use vizflyt_protocol::messages::{ArenaInfo, Hello, ToRuntime, ToServer, bounded};
+use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
+use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
+use vizflyt_splat::{Splats, ply};
+use zerocopy::IntoBytes;
+
+/// Bounds a test that fails; never part of a passing one's outcome.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Writes an arena whose scene is a wall of splats at x = 5 m, and returns the path of its
+/// arena.toml.
+pub fn write_arena(folder: &Path, more: &str) -> std::path::PathBuf {
+    let mut means = Vec::new();
+    for y in -30..=30 {
+        for z in 0..=30 {
+            means.push(Vec3::new(5.0, y as f32 * 0.1, z as f32 * 0.1));
+        }
+    }
+    let count = means.len();
+    let splats = Splats {
+        means_m: means,
+        scales_m: vec![Vec3::new(0.02, 0.08, 0.08); count],
+        rotations: vec![Quat::IDENTITY; count],
+        opacities: vec![0.98; count],
+        sh_degree: 0,
+        sh: (0..count * 3).map(|k| if k % 3 == 0 { 1.2 } else { 0.1 }).collect(),
+    };
+    ply::write(folder.join("scene.ply"), &splats).unwrap();
+    let path = folder.join("arena.toml");
+    let text = format!(
+        r#"
+name = "wall"
+scene = "scene.ply"
+body_radius_m = 0.12
+takeoff_height_m = 1.2
+spawn = {{ position_m = [0, 0, 0] }}
+geofence = {{ min_m = [-20, -6, -0.5], max_m = [42, 6, 4] }}
+limits = {{ max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }}
+[[cameras]]
+name = "front"
+width_px = 160
+height_px = 120
+horizontal_fov_deg = 90.0
+position_m = [0.06, 0, 0.02]
+{more}
+"#
+    );
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+/// The server's binary, running.
+pub struct Server {
+    child: Child,
+    stdin: Option<ChildStdin>,
+    lines: mpsc::Receiver<Value>,
+    pub quic: SocketAddr,
+    pub http: SocketAddr,
+    pub vicon: SocketAddr,
+    pub fingerprint: String,
+}
+
+impl Server {
+    /// Starts it on free ports and waits until it is ready.
+    pub fn start(arena: &Path, more: &[&str]) -> Self {
+        let free = "127.0.0.1:0";
+        let mut child = Command::new(env!("CARGO_BIN_EXE_vizflyt-server"))
+            .arg(arena)
+            .args(["--json", "--lifeline", "--quic", free, "--http", free, "--vicon", free])
+            .args(more)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let (sender, lines) = mpsc::channel();
+        let stdout = BufReader::new(child.stdout.take().unwrap());
+        std::thread::spawn(move || {
+            for line in stdout.lines().map_while(Result::ok) {
+                let value: Value = serde_json::from_str(&line).expect("every line is JSON");
+                if sender.send(value).is_err() {
+                    break;
+                }
+            }
+        });
+        let ready = lines.recv_timeout(PATIENCE).expect("the server is ready");
+        let at = |key: &str| ready[key].as_str().unwrap().to_owned();
+        assert_eq!(at("ready"), "server");
+        Self {
+            stdin: child.stdin.take(),
+            child,
+            lines,
+            quic: at("quic").parse().unwrap(),
+            http: at("http").strip_prefix("http://").unwrap().parse().unwrap(),
+            vicon: at("vicon").parse().unwrap(),
+            fingerprint: at("fingerprint"),
+        }
+    }
+
+    /// Returns the next line of standard output for which `wanted` yields something.
+    pub fn line<T>(&self, mut wanted: impl FnMut(&Value) -> Option<T>) -> T {
+        loop {
+            let line = self.lines.recv_timeout(PATIENCE).expect("a line of standard output");
+            if let Some(found) = wanted(&line) {
+                return found;
+            }
+        }
+    }
+
+    /// Closes standard input (the lifeline) and returns the report; the server must then end.
+    pub fn finish(mut self) -> Value {
+        drop(self.stdin.take());
+        let report = self.line(|line| line.get("report").cloned());
+        assert!(self.child.wait().unwrap().success());
+        report
+    }
+
+    /// Sends SIGTERM.
+    pub fn terminate(&self) {
+        let done = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
+        assert!(done.success());
+    }
+
+    /// Waits for the end and returns the exit status.
+    pub fn wait(mut self) -> std::process::ExitStatus {
+        self.child.wait().unwrap()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Sends poses at about 200 Hz: frame n is at x = -n * STEP_M, level, nose along x.
+pub struct Emitter {
+    stop: Arc<AtomicBool>,
+    paused: Arc<AtomicBool>,
+    pub sent: Arc<AtomicU32>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// How far the emitter's vehicle backs off per frame. [m]
+pub const STEP_M: f64 = 0.001;
+/// Height of the emitter's vehicle. [m]
+pub const HEIGHT_M: f64 = 1.5;
+
+impl Emitter {
+    pub fn start(to: SocketAddr, object: &'static str) -> Self {
+        let (stop, paused) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+        let sent = Arc::new(AtomicU32::new(0));
+        let (stop2, paused2, sent2) = (stop.clone(), paused.clone(), sent.clone());
+        let thread = std::thread::spawn(move || {
+            let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+            let mut frame = 0u32;
+            while !stop2.load(Ordering::Relaxed) {
+                if !paused2.load(Ordering::Relaxed) {
+                    frame += 1;
+                    let x_mm = -f64::from(frame) * STEP_M * 1e3;
+                    let values = [x_mm, 0.0, HEIGHT_M * 1e3, 0.0, 0.0, 0.0];
+                    let _ = socket.send_to(&vicon_packet(frame, object, values), to);
+                    sent2.store(frame, Ordering::Relaxed);
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        });
+        Self { stop, paused, sent, thread: Some(thread) }
+    }
+
+    pub fn pause(&self, paused: bool) {
+        self.paused.store(paused, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Emitter {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Returns a packet of Vicon Tracker's UDP object stream with one object. [mm, rad]
+pub fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
+    let mut bytes = frame.to_le_bytes().to_vec();
+    bytes.extend_from_slice(&[1, 0, 72, 0]);
+    let mut name = [0u8; 24];
+    name[..object.len()].copy_from_slice(object.as_bytes());
+    bytes.extend_from_slice(&name);
+    values.iter().for_each(|value| bytes.extend_from_slice(&value.to_le_bytes()));
+    bytes
+}
+
+/// Accepts the one certificate whose fingerprint was printed.
+#[derive(Debug)]
+struct Pinned {
+    fingerprint: String,
+    provider: rustls::crypto::CryptoProvider,
+}
+
+impl rustls::client::danger::ServerCertVerifier for Pinned {
+    fn verify_server_cert(
+        &self,
+        certificate: &rustls::pki_types::CertificateDer<'_>,
+        _: &[rustls::pki_types::CertificateDer<'_>],
+        _: &rustls::pki_types::ServerName<'_>,
+        _: &[u8],
+        _: rustls::pki_types::UnixTime,
+    ) -> Result<rustls::client::danger::ServerCertVerified, rustls::Error> {
+        if vizflyt_server::transport::fingerprint(certificate) == self.fingerprint {
+            Ok(rustls::client::danger::ServerCertVerified::assertion())
+        } else {
+            Err(rustls::Error::General("not the pinned certificate".to_owned()))
+        }
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &rustls::pki_types::CertificateDer<'_>,
+        _: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        Err(rustls::Error::General("TLS 1.2 is not spoken".to_owned()))
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &rustls::pki_types::CertificateDer<'_>,
+        signature: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        let schemes = &self.provider.signature_verification_algorithms;
+        rustls::crypto::verify_tls13_signature(message, certificate, signature, schemes)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
+        self.provider.signature_verification_algorithms.supported_schemes()
+    }
+}
+
+/// A runtime's connection.
+pub struct Client {
+    pub connection: Connection,
+    pub send: SendStream,
+    pub recv: RecvStream,
+    deframer: Deframer,
+    endpoint: Endpoint,
+}
+
+/// Connects, without a word said yet.
+pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
+    connect_pinned(server.quic, &server.fingerprint, transport).await.map(|(_, c)| c)
+}
+
+async fn connect_pinned(
+    address: SocketAddr,
+    fingerprint: &str,
+    transport: TransportConfig,
+) -> Result<(Endpoint, Connection), String> {
+    let provider = rustls::crypto::ring::default_provider();
+    let verifier = Pinned { fingerprint: fingerprint.to_owned(), provider: provider.clone() };
+    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::new(provider))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(verifier))
+        .with_no_client_auth();
+    tls.alpn_protocols = vec![vizflyt_server::transport::ALPN.to_vec()];
+    let quic = quinn::crypto::rustls::QuicClientConfig::try_from(tls).unwrap();
+    let mut config = ClientConfig::new(Arc::new(quic));
+    config.transport_config(Arc::new(transport));
+    let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+    let connecting = endpoint.connect_with(config, address, "vizflyt").unwrap();
+    let connection = connecting.await.map_err(|error| error.to_string())?;
+    Ok((endpoint, connection))
+}
+
+impl Client {
+    /// Connects, exchanges preambles and says hello for `vehicle`.
+    pub async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
+        let (endpoint, connection) =
+            connect_pinned(server.quic, &server.fingerprint, transport).await.unwrap();
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.unwrap();
+        let mut theirs = [0; Preamble::SIZE];
+        recv.read_exact(&mut theirs).await.unwrap();
+        assert_eq!(Preamble::check(&theirs, Party::Runtime), Ok(Party::Server));
+        let mut client = Self { connection, send, recv, deframer: Deframer::default(), endpoint };
+        let hello = Hello { vehicle: bounded(vehicle), program: bounded("test 1") };
+        client.say(&ToServer::Hello(hello)).await;
+        client
+    }
+
+    /// Connects and is welcomed.
+    pub async fn welcomed(server: &Server, transport: TransportConfig) -> (Self, ArenaInfo) {
+        let mut client = Self::hello(server, "vizflyt", transport).await;
+        match client.next().await {
+            ToRuntime::Welcome(arena) => (client, arena),
+            other => panic!("not welcomed: {other:?}"),
+        }
+    }
+
+    pub async fn say(&mut self, message: &ToServer) {
+        self.send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
+    }
+
+    /// Returns the next message of the control stream.
+    pub async fn next(&mut self) -> ToRuntime {
+        tokio::time::timeout(PATIENCE, async {
+            loop {
+                if let Some(message) = self.deframer.next::<ToRuntime>() {
+                    return message.unwrap();
+                }
+                // One byte at a time never overruns the deframer.
+                let mut byte = [0; 1];
+                self.recv.read_exact(&mut byte).await.expect("the control stream goes on");
+                self.deframer.push(&byte);
+            }
+        })
+        .await
+        .expect("a message")
+    }
+
+    /// Returns the first message for which `wanted` yields something.
+    pub async fn until<T>(&mut self, mut wanted: impl FnMut(ToRuntime) -> Option<T>) -> T {
+        loop {
+            if let Some(found) = wanted(self.next().await) {
+                return found;
+            }
+        }
+    }
+
+    /// Returns the next image stream that was not reset, whole.
+    pub async fn image(&self) -> (ImageHeader, Vec<u8>) {
+        tokio::time::timeout(PATIENCE, async {
+            loop {
+                let mut stream = self.connection.accept_uni().await.expect("an image stream");
+                let Ok(bytes) = stream.read_to_end(1 << 22).await else { continue };
+                let (header, payload) = ImageHeader::parse(&bytes).unwrap();
+                assert_eq!(payload.len(), header.payload_len.get() as usize);
+                return (header, payload.to_vec());
+            }
+        })
+        .await
+        .expect("an image")
+    }
+
+    /// Ends the conversation and waits until the server knows.
+    pub async fn close(self) {
+        self.connection.close(VarInt::from_u32(0), b"bye");
+        self.endpoint.wait_idle().await;
+    }
+}
+
+/// Sends one HTTP request and returns the status and the rest of the answer.
+pub fn http(address: SocketAddr, head: &str) -> (u16, String) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let answer = String::from_utf8_lossy(&answer).into_owned();
+    (status(&answer), answer)
+}
+
+fn status(answer: &str) -> u16 {
+    answer.split(' ').nth(1).and_then(|code| code.parse().ok()).expect("a status line")
+}
+
+/// A browser's WebSocket.
+pub struct Socket(TcpStream);
+
+impl Socket {
+    /// Opens it as a page of `origin` would; the status if the server declines.
+    pub fn open(address: SocketAddr, origin: &str) -> Result<Self, u16> {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        write!(
+            stream,
+            "GET /ws HTTP/1.1\r\nHost: {address}\r\nOrigin: {origin}\r\nConnection: Upgrade\r\n\
+             Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        .unwrap();
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).unwrap();
+            head.push(byte[0]);
+        }
+        match status(&String::from_utf8_lossy(&head)) {
+            101 => Ok(Self(stream)),
+            other => Err(other),
+        }
+    }
+
+    /// Returns the next message: opcode (1 text, 2 binary) and payload.
+    pub fn next(&mut self) -> (u8, Vec<u8>) {
+        let mut head = [0; 2];
+        self.0.read_exact(&mut head).unwrap();
+        let length = match head[1] & 0x7f {
+            126 => {
+                let mut bytes = [0; 2];
+                self.0.read_exact(&mut bytes).unwrap();
+                u64::from(u16::from_be_bytes(bytes))
+            }
+            127 => {
+                let mut bytes = [0; 8];
+                self.0.read_exact(&mut bytes).unwrap();
+                u64::from_be_bytes(bytes)
+            }
+            short => u64::from(short),
+        };
+        let mut payload = vec![0; length as usize];
+        self.0.read_exact(&mut payload).unwrap();
+        (head[0] & 0x0f, payload)
+    }
+
+    /// Returns the next JSON message of a type.
+    pub fn message(&mut self, kind: &str) -> Value {
+        loop {
+            let (opcode, payload) = self.next();
+            if opcode == 1 {
+                let value: Value = serde_json::from_slice(&payload).unwrap();
+                if value["type"] == kind {
+                    return value;
+                }
+            }
+        }
+    }
+}
