@@ -20,9 +20,9 @@ struct Cli {
     #[command(subcommand)]
     command: Command,
     /// What to log on standard error: error, warn, info, debug, trace; or a filter as
-    /// `vizflyt_runtime=debug`.
-    #[arg(long, global = true, value_name = "LEVEL", default_value = "info,quinn=warn")]
-    log_level: String,
+    /// `vizflyt_runtime=debug`. Without it: info, and warn in `demo`.
+    #[arg(long, global = true, value_name = "LEVEL")]
+    log_level: Option<String>,
 }
 
 #[derive(Subcommand, Debug)]
@@ -44,11 +44,16 @@ enum Command {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    if let Err(error) = start_log(&cli.log_level) {
-        eprintln!("error: --log-level '{}': {error}", cli.log_level);
+    let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
+        // The demo tells its own story; its children's logs would drown it.
+        Command::Demo(_) => "warn".to_owned(),
+        _ => "info,quinn=warn".to_owned(),
+    });
+    if let Err(error) = start_log(&log_level) {
+        eprintln!("error: --log-level '{log_level}': {error}");
         return ExitCode::from(2);
     }
-    match run(cli.command) {
+    match run(cli.command, &log_level) {
         Ok(code) => code,
         Err(error) => {
             eprintln!("error: {error:#}");
@@ -57,9 +62,9 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(command: Command) -> Result<ExitCode> {
+fn run(command: Command, log_level: &str) -> Result<ExitCode> {
     match command {
-        Command::Demo(args) => demo::run(&args),
+        Command::Demo(args) => demo::run(&args, log_level),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => plugins::fly(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),

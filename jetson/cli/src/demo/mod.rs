@@ -71,12 +71,18 @@ const READY_LIMIT: Duration = Duration::from_secs(120);
 const END_LIMIT: Duration = Duration::from_millis(1500);
 
 /// Runs the demo; success only if the flight finished.
-pub(crate) fn run(args: &DemoArgs) -> Result<ExitCode> {
+pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     let memory = MemoryWatch::start();
     let (notices, inbox) = mpsc::channel();
     interrupt_notices(notices.clone())?;
     let stage = Stage::prepare(&args.scene, args.seed)?;
-    let mut show = Show { notices, inbox, children: Vec::new(), parts: Parts::default() };
+    let mut show = Show {
+        log_level: format!("--log-level={log_level}").into(),
+        notices,
+        inbox,
+        children: Vec::new(),
+        parts: Parts::default(),
+    };
     let result = show.fly(args, &stage);
     show.end();
     let log = match result {
@@ -105,6 +111,8 @@ enum Flown {
 
 /// The running children and what they have said.
 struct Show {
+    /// The option that gives the children our log level.
+    log_level: OsString,
     notices: Sender<Notice>,
     inbox: Receiver<Notice>,
     children: Vec<(Role, Child)>,
@@ -174,7 +182,8 @@ impl Show {
 
     /// Starts a child and returns its `ready` line; `None` if a person ends the demo meanwhile.
     fn start(&mut self, role: Role, args: &[OsString]) -> Result<Option<Value>> {
-        let child = Child::start(role, args, &self.notices)?;
+        let args: Vec<_> = args.iter().chain([&self.log_level]).cloned().collect();
+        let child = Child::start(role, &args, &self.notices)?;
         self.children.push((role, child));
         let deadline = Instant::now() + READY_LIMIT;
         loop {
