@@ -9,15 +9,18 @@ use vizflyt_splat::{Camera, CpuRenderer, RgbdImage, Splats, ply};
 use super::*;
 use crate::solids::{REACH_M, Solids};
 
-/// FNV-1a over everything that is stored.
+/// FNV-1a over every number of the splats and the truth.
 fn fingerprint(scene: &Generated) -> u64 {
-    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+    let Splats { means_m, scales_m, rotations, opacities, sh_degree: _, sh } = &scene.splats;
+    let vectors = means_m.iter().chain(scales_m).flat_map(glam::Vec3::to_array);
+    let numbers = vectors
+        .chain(rotations.iter().flat_map(glam::Quat::to_array))
+        .chain(opacities.iter().copied())
+        .chain(sh.iter().copied());
     let truth = serde_json::to_vec(&scene.truth).unwrap();
-    let arena = scene.arena.to_toml().unwrap();
-    for byte in ply::encode(&scene.splats).iter().chain(&truth).chain(arena.as_bytes()) {
-        hash = (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);
-    }
-    hash
+    numbers.flat_map(f32::to_le_bytes).chain(truth).fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+    })
 }
 
 #[test]
@@ -25,6 +28,14 @@ fn a_seed_gives_the_same_scene_and_another_a_different_one() {
     for kind in SceneKind::ALL {
         let first = fingerprint(&generate(kind, 7));
         assert_eq!(first, fingerprint(&generate(kind, 7)), "{kind}");
+        // Pinned: another machine, compiler or library that changes a bit changes every grade
+        // flown here. A deliberate change of a scene changes its number, too.
+        let pinned: u64 = match kind {
+            SceneKind::Forest => 0x178a3ce16d9310de,
+            SceneKind::Race => 0x4027d60201e98869,
+            SceneKind::Room => 0x5b38330facfd1bad,
+        };
+        assert_eq!(first, pinned, "{kind}: {first:#018x}");
         assert_ne!(first, fingerprint(&generate(kind, 8)), "{kind}");
     }
 }

@@ -14,7 +14,7 @@ pub(crate) fn paint_backdrop(canvas: &mut Canvas, site: &Site) {
     let mut rng = Rng::new(site.seed, 5);
     paint_sky(canvas, &mut rng, site);
     // (distance beyond the middle ellipse, haze, splat size)
-    for (away_m, haze, size_m) in [(11.0, 0.2, 0.95), (17.0, 0.45, 1.5)] {
+    for (away_m, haze, size_m) in [(11.0, 0.16, 0.9), (17.0, 0.5, 1.4)] {
         paint_belt(canvas, &mut rng, site, away_m, haze, size_m);
     }
 }
@@ -93,7 +93,7 @@ fn paint_belt(
             let clump = fractal2(key ^ 0x1, DVec2::new(angle * 9.0, z_m / 2.2), 3);
             let light = 0.10
                 + 0.45 * smoothstep(0.0, top_m, z_m)
-                + 0.55 * smoothstep(0.35, 0.7, clump)
+                + 0.8 * smoothstep(0.4, 0.62, clump)
                 + 0.3 * rng.unit();
             canvas.add(Patch {
                 center_m: (p + jitter).extend(z_m),
@@ -101,7 +101,7 @@ fn paint_belt(
                 along: rng.direction(),
                 sigma_m: DVec3::new(0.8 * size_m, 0.5 * size_m, 0.4 * size_m),
                 opacity: 0.93,
-                radiance: (green * light * 1.3).lerp(lit(p) * (0.5 + 0.5 * haze), haze),
+                radiance: (green * light * 1.3).lerp(lit(p) * (0.6 + 0.5 * haze), haze),
             });
             z_m += 0.85 * size_m * rng.range(0.8, 1.2);
         }
@@ -110,7 +110,8 @@ fn paint_belt(
     for _ in 0..(perimeter_m / 1.3) as usize {
         let p = place(rng.angle()) + polar(rng.angle()) * 1.2;
         let p = p + (MIDDLE_M.truncate() - p).normalize_or_zero() * 1.6;
-        let height_m = rng.range(6.0, 10.0);
+        // Their tops end within the foliage.
+        let height_m = 3.0 + 0.28 * away_m + 4.0 * fractal2(key, p / 7.0, 2);
         let radius_m = rng.range(0.12, 0.26);
         let wood = paint(0x4a3e32).lerp(paint(0x8a7c6a), rng.unit());
         let shade = rng.range(0.2, 0.9);
@@ -120,9 +121,9 @@ fn paint_belt(
                 center_m: p.extend(z_m),
                 normal: DVec3::X,
                 along: DVec3::Z,
-                sigma_m: DVec3::new(0.14 * height_m, radius_m * 0.7, radius_m * 0.7),
+                sigma_m: DVec3::new(0.13 * height_m, radius_m * 0.7, radius_m * 0.7),
                 opacity: 0.96,
-                radiance: (wood * shade).lerp(lit(p) * (0.5 + 0.5 * haze), haze * 0.8),
+                radiance: (wood * shade).lerp(lit(p) * (0.6 + 0.5 * haze), haze * 0.8),
             });
         }
     }

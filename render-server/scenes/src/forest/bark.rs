@@ -286,6 +286,6 @@ fn paint_log(canvas: &mut Canvas, rng: &mut Rng, log: &Limb, light: &Light) {
 }
 
 /// Strokes per square metre of bark: the budget of splats over some thirty near trees.
-const STROKES_PER_M2: f64 = 160.0;
+const STROKES_PER_M2: f64 = 130.0;
 /// Strokes are laid up to this height. [m, world]
 const STROKES_TOP_M: f64 = 3.0;

@@ -97,7 +97,7 @@ fn add_ground(
 /// Large patches well below the floor, which close the seams between the fine ones. They lie so
 /// deep that on any line of sight from above they come after the floor, and never blur it.
 fn paint_bed(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
-    let side_m = 0.42;
+    let side_m = 0.46;
     let columns = ((FAR_X_M - NEAR_X_M) / side_m) as usize;
     let rows = (2.0 * NEAR_Y_M / side_m) as usize;
     for row in 0..rows {
@@ -126,7 +126,7 @@ fn paint_near(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     for side in [-1.0, 1.0] {
         let mut y = 0.0;
         while y < NEAR_Y_M {
-            let size_m = 0.096 + 0.036 * (y - 1.3f64).max(0.0);
+            let size_m = 0.099 + 0.037 * (y - 1.3f64).max(0.0);
             let count = ((FAR_X_M - NEAR_X_M) / size_m) as usize;
             let shift = rng.unit();
             for n in 0..count {
@@ -172,7 +172,11 @@ fn paint_litter(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
     let mut leaves = 0;
     while leaves < 5200 {
         let p = DVec2::new(rng.range(-2.0, 42.0), 2.1 * rng.normal());
-        if p.y.abs() > 7.0 || !rng.chance(0.12 + 0.88 * cover(site.seed, p).litter) {
+        // Where the vehicle stands and lands the floor is bare.
+        if p.y.abs() > 7.0
+            || site.is_near_ends(p, 0.7)
+            || !rng.chance(0.12 + 0.88 * cover(site.seed, p).litter)
+        {
             continue;
         }
         leaves += 1;

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 
 use super::ground::cover;
 use super::light::Light;
-use super::site::{CLEAR_M, FENCE_Y_M, SPAWN_X_M, Site, Species};
+use super::site::{CLEAR_M, FENCE_Y_M, Site, Species};
 use crate::canvas::{Canvas, Patch, paint};
 use crate::random::{Rng, noise2, polar, smoothstep};
 
@@ -66,7 +66,7 @@ fn paint_crowns(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
             (Species::Birch, false) => (paint(0x55702a), paint(0xa3b548)),
             (_, true) => (paint(0x8a6a20), paint(0xd0a23a)),
         };
-        let (leaves, leaf_m) = if tree.within { (14, 0.13) } else { (4, 0.30) };
+        let (leaves, leaf_m) = if tree.within { (13, 0.135) } else { (4, 0.30) };
         let floor_m = if tree.within { CROWN_FLOOR_M } else { 2.2 };
         let mut clumps: Vec<(DVec3, f64)> = Vec::new();
         for branch in &tree.branches {
@@ -130,17 +130,13 @@ fn paint_bushes(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) 
     }
 }
 
-fn near_ends(site: &Site, p: DVec2, reach_m: f64) -> bool {
-    (p - DVec2::new(SPAWN_X_M, 0.0)).length() < reach_m
-        || (p - site.goal_m.truncate()).length() < reach_m
-}
-
 fn paint_ferns(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     let mut placed = 0;
     while placed < 135 {
         let p = DVec2::new(rng.range(-2.5, 42.5), rng.spread(7.8));
         let here = cover(site.seed, p);
-        if here.path > 0.15 || near_ends(site, p, CLEAR_M) || rng.chance(0.75 - 0.6 * here.green) {
+        if here.path > 0.15 || site.is_near_ends(p, CLEAR_M) || rng.chance(0.75 - 0.6 * here.green)
+        {
             continue;
         }
         placed += 1;
@@ -178,7 +174,7 @@ fn paint_grass(canvas: &mut Canvas, rng: &mut Rng, site: &Site, light: &Light) {
     while placed < 300 {
         let p = DVec2::new(rng.range(-2.5, 42.5), rng.spread(7.6));
         let here = cover(site.seed, p);
-        if here.path > 0.5 || near_ends(site, p, 1.2) || rng.chance(0.85 - 0.8 * here.green) {
+        if here.path > 0.5 || site.is_near_ends(p, 1.2) || rng.chance(0.85 - 0.8 * here.green) {
             continue;
         }
         placed += 1;

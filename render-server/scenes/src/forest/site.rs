@@ -128,11 +128,16 @@ impl Site {
         volumes
     }
 
-    /// Whether something of this reach leaves the surroundings of start and goal free.
-    fn is_clear_of_ends(&self, p: DVec2, reach_m: f64) -> bool {
+    /// Whether a point of the floor is this near to start or goal.
+    pub(crate) fn is_near_ends(&self, p: DVec2, reach_m: f64) -> bool {
         [DVec2::new(SPAWN_X_M, 0.0), self.goal_m.truncate()]
             .iter()
-            .all(|end| (p - *end).length() > CLEAR_M + reach_m)
+            .any(|end| (p - *end).length() <= reach_m)
+    }
+
+    /// Whether something of this reach leaves the surroundings of start and goal free.
+    fn is_clear_of_ends(&self, p: DVec2, reach_m: f64) -> bool {
+        !self.is_near_ends(p, CLEAR_M + reach_m)
     }
 
     fn block_the_straight_way(&mut self, rng: &mut Rng) {

@@ -46,7 +46,8 @@ impl GapWall {
         wall
     }
 
-    /// Returns the gap as a stage of the course, as wide and high as its bounding box.
+    /// Returns the gap as a stage of the course: a rectangle about its middle, as high as the gap
+    /// and as wide as its narrower side reaches, twice.
     pub(crate) fn stage(&self, name: &str) -> StageConfig {
         let [right, left] = self.reach_m.map(|side| side.into_iter().fold(0.0, f64::max));
         StageConfig {

@@ -4,6 +4,7 @@
 //! boxes; [`light`] answers how much light arrives at a point; [`panel`] covers every face with
 //! Gaussians as fine as its [`texture`] needs.
 
+mod furniture;
 mod gap;
 mod gate;
 mod light;
@@ -166,4 +167,51 @@ fn mats(seed: u64, at: DVec2, pads_m: &[DVec3]) -> DVec3 {
         }
     }
     if seam { base * 0.45 } else { base * (tone * (0.72 + 0.3 * grain + 0.3 * scuff)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fifty_courses_can_be_flown() {
+        for seed in 0..50 {
+            let course = Course::draw(seed);
+            let volumes: Vec<Volume> = course.blocks().iter().map(Block::volume).collect();
+            let clearance_m = |p_m: DVec3| {
+                volumes.iter().map(|v| v.signed_distance_m(p_m)).fold(f64::MAX, f64::min)
+            };
+            let stages = course.stages();
+            assert_eq!(stages.len(), 5);
+            for stage in &stages {
+                let free_m = clearance_m(stage.center_m);
+                assert!(free_m >= 0.35, "seed {seed}: {free_m} m in {}", stage.name);
+            }
+            // Between two stages there is a way: straight from half a metre behind one to half
+            // a metre before the next.
+            for pair in stages.windows(2) {
+                let from_m = pair[0].center_m + pair[0].normal * 0.5;
+                let to_m = pair[1].center_m - pair[1].normal * 0.5;
+                for n in 0..=20 {
+                    let p_m = from_m.lerp(to_m, f64::from(n) / 20.0);
+                    let free_m = clearance_m(p_m);
+                    assert!(free_m >= 0.2, "seed {seed}: {free_m} m before {}", pair[1].name);
+                }
+            }
+            // Nothing reaches through the net or into another piece.
+            for gate in course.gates() {
+                for block in gate.blocks() {
+                    let (low, high) = crate::solids::bounds(&block.volume()).unwrap();
+                    assert!(low.y > NET_MIN_M.y && high.y < NET_MAX_M.y, "seed {seed}");
+                    assert!(low.z > -1e-9 && high.z < NET_MAX_M.z, "seed {seed}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn courses_differ_by_seed() {
+        assert_ne!(Course::draw(1).stages(), Course::draw(2).stages());
+        assert_eq!(Course::draw(1).stages(), Course::draw(1).stages());
+    }
 }
