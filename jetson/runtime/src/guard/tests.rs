@@ -140,7 +140,7 @@ proptest! {
                 let GuidedMotion::Velocity(v) = guided.motion else { panic!("not a velocity") };
                 prop_assert!(v.is_finite());
                 let turns = match guided.yaw {
-                    YawTarget::Angle(yaw) => yaw.abs() <= 3.1416,
+                    YawTarget::Angle(yaw) => yaw.abs() <= std::f64::consts::PI + 1e-9,
                     YawTarget::Rate(rate) => rate.abs() <= MAX_YAW_RATE_RADPS,
                     YawTarget::Keep => false,
                 };

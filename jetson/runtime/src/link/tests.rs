@@ -27,6 +27,7 @@ struct Script {
 
 const AUTOPILOT: (u8, u8) = (1, 1);
 
+#[allow(clippy::unnecessary_wraps)] // Why: one of the answers a script may give.
 fn accept(_: MavCmd) -> Option<MavResult> {
     Some(MavResult::MAV_RESULT_ACCEPTED)
 }

@@ -1,1 +1,288 @@
+//! Real child processes: the shell, and the example plugin over real shared memory.
 
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Instant;
+
+use vizflyt_protocol::geometry::{Intrinsics, Volume, body_from_forward_cam};
+use vizflyt_protocol::messages::{
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, Limits, Setpoint, ToPlugin,
+    bounded,
+};
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::{ImageStamps, ObservationWriter};
+
+use super::*;
+
+/// Far beyond anything a loaded machine needs; tests end when the awaited thing happens.
+const WAIT: Duration = Duration::from_secs(60);
+
+fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
+    let (sender, receiver) = channel();
+    let command: Vec<OsString> = command.iter().map(OsString::from).collect();
+    let tell = move |event| {
+        let _ = sender.send(event);
+    };
+    (Supervisor::start(&command, tell).unwrap(), receiver)
+}
+
+/// Returns the lines and the last sentence of a child that ends by itself.
+fn to_the_end(command: &[&str]) -> (Vec<(Stream, String)>, String) {
+    let (_supervisor, receiver) = start(command);
+    let (mut lines, mut sentence) = (Vec::new(), String::new());
+    // Until all threads of the supervisor have dropped their sender.
+    while let Ok(event) = receiver.recv_timeout(WAIT) {
+        match event {
+            PluginEvent::Line(stream, line) => lines.push((stream, line)),
+            PluginEvent::Exited(how) => sentence = how,
+        }
+    }
+    (lines, sentence)
+}
+
+fn check_sentence(script: &str, expected: &str) {
+    let (_, sentence) = to_the_end(&["sh", "-c", script]);
+    assert!(sentence.starts_with(expected), "{script}: {sentence}");
+}
+
+#[test]
+fn each_way_to_end_has_its_sentence() {
+    check_sentence("exit 0", "the plugin ended by itself (exit status 0)");
+    check_sentence("exit 7", "the plugin ended with exit status 7");
+    check_sentence("kill -SEGV $$", "the plugin was killed by SIGSEGV: it touched memory");
+    check_sentence("kill -ABRT $$", "the plugin was killed by SIGABRT: it aborted");
+    check_sentence("kill -KILL $$", "the plugin was killed by SIGKILL: someone");
+    check_sentence("kill -TERM $$", "the plugin was killed by SIGTERM");
+}
+
+#[test]
+fn a_program_that_is_not_there_is_an_error() {
+    let command = [OsString::from("/nonexistent/plugin")];
+    let error = Supervisor::start(&command, |_| {}).unwrap_err();
+    assert_eq!(error.kind(), io::ErrorKind::NotFound);
+    assert!(Supervisor::start(&[], |_| {}).is_err());
+}
+
+#[test]
+fn output_comes_line_by_line_and_long_lines_are_cut() {
+    let (lines, _) = to_the_end(&[
+        "sh",
+        "-c",
+        "echo one; echo two >&2; printf '%5000s\\nlast' x; printf '\\377\\n' >&2",
+    ]);
+    let of = |stream| -> Vec<&str> {
+        lines.iter().filter(|(s, _)| *s == stream).map(|(_, line)| line.as_str()).collect()
+    };
+    let out = of(Stream::Stdout);
+    assert_eq!((out[0], out[1].len(), out[2]), ("one", LINE_BYTES, "last"));
+    assert_eq!(of(Stream::Stderr), ["two", "\u{fffd}"]);
+}
+
+#[test]
+fn a_flood_of_output_is_dropped_and_counted() {
+    let (lines, _) = to_the_end(&["sh", "-c", "yes | head -n 100000"]);
+    assert!(lines.len() < 20_000, "{}", lines.len());
+    assert!(lines.iter().any(|(_, line)| line.contains("more lines in that second")));
+}
+
+#[test]
+fn a_plugin_that_does_not_end_is_ended_with_all_it_started() {
+    let (supervisor, receiver) =
+        start(&["sh", "-c", "trap '' TERM; sleep 1000 & echo $!; while :; do wait; done"]);
+    let Ok(PluginEvent::Line(_, grandchild)) = receiver.recv_timeout(WAIT) else { panic!() };
+    assert!(supervisor.is_running());
+    supervisor.end();
+    assert!(!supervisor.is_running());
+    // Signal 0 only asks; a zombie still to be reaped by init is gone for our purposes.
+    let grandchild: i32 = grandchild.trim().parse().unwrap();
+    let stat = || std::fs::read_to_string(format!("/proc/{grandchild}/stat")).unwrap_or_default();
+    let gone = || !stat().contains(") S ") && !stat().contains(") R ");
+    let until = Instant::now() + WAIT;
+    while !gone() && Instant::now() < until {
+        thread::yield_now();
+    }
+    assert!(gone(), "{}", stat());
+}
+
+#[test]
+fn the_child_dies_with_the_thread_that_started_it() {
+    let (sender, receiver) = channel();
+    let starter = thread::spawn(move || {
+        let command = ["sh", "-c", "echo up; sleep 1000"].map(OsString::from);
+        let tell = move |event| {
+            let _ = sender.send(event);
+        };
+        // Forgotten, as by a runtime that is killed.
+        std::mem::forget(Supervisor::start(&command, tell).unwrap());
+    });
+    starter.join().unwrap();
+    let end = std::iter::from_fn(|| receiver.recv_timeout(WAIT).ok())
+        .find(|event| matches!(event, PluginEvent::Exited(_)));
+    let Some(PluginEvent::Exited(sentence)) = end else { panic!("it lives on") };
+    assert!(sentence.contains("SIGKILL"), "{sentence}");
+}
+
+// ---- the example plugin over real shared memory ----
+
+fn cameras() -> Vec<CameraInfo> {
+    vec![CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.5),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    }]
+}
+
+fn arena() -> ArenaInfo {
+    ArenaInfo {
+        name: bounded("test"),
+        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        limits: Limits { max_speed_mps: 3.0, max_acceleration_mps2: 4.0 },
+        body_radius_m: 0.1,
+        takeoff_height_m: 1.0,
+        goal_m: None,
+        goal_radius_m: 1.0,
+        time_limit_s: 0.0,
+        cameras: cameras().into_iter().collect(),
+    }
+}
+
+/// The example, built beside the tests by `cargo test`.
+fn example() -> PathBuf {
+    let tests = std::env::current_exe().unwrap();
+    tests.parent().unwrap().parent().unwrap().join("examples/misbehave")
+}
+
+struct Rig {
+    ipc: RuntimeEnd,
+    supervisor: Supervisor,
+    events: Receiver<PluginEvent>,
+    seq: u64,
+}
+
+impl Rig {
+    fn start(how: &str) -> Self {
+        let service = unique_service();
+        let ipc = RuntimeEnd::create(&service, ObservationWriter::len_for(&cameras())).unwrap();
+        let program = example();
+        let option = format!("{SERVICE_OPTION}={service}");
+        let (supervisor, events) = start(&[program.to_str().unwrap(), how, &option]);
+        let mut rig = Self { ipc, supervisor, events, seq: 0 };
+        rig.until(|rig| rig.ipc.plugin_attached());
+        rig.ipc.send(&ToPlugin::Start(arena())).unwrap();
+        assert!(matches!(rig.next(), Some(FromPlugin::Ready { name }) if name == "Misbehave"));
+        rig
+    }
+
+    fn until(&mut self, done: impl Fn(&Self) -> bool) {
+        let until = Instant::now() + WAIT;
+        while !done(self) {
+            assert!(Instant::now() < until, "nothing came");
+            thread::yield_now();
+        }
+    }
+
+    /// Returns the plugin's next message; `None` if the plugin ends instead.
+    fn next(&mut self) -> Option<FromPlugin> {
+        loop {
+            // Looked at first: what a plugin said before it ended is still read.
+            let running = self.supervisor.is_running();
+            if let Some(message) = self.ipc.receive().unwrap() {
+                return Some(message);
+            }
+            if !running {
+                return None;
+            }
+            self.ipc.wait(Duration::from_millis(20)).unwrap();
+        }
+    }
+
+    fn publish(&mut self) {
+        self.seq += 1;
+        let (cameras, mut loan) = (cameras(), self.ipc.loan().unwrap());
+        let mut writer = ObservationWriter::new(loan.memory(), self.seq, &cameras).unwrap();
+        writer.planes(0, &cameras[0]).unwrap().depth_mm.fill(1500);
+        writer.image_ready(0, &cameras[0], ImageStamps::default());
+        self.ipc.publish(loan).unwrap();
+    }
+
+    fn end(&self) -> String {
+        let exited =
+            std::iter::from_fn(|| self.events.recv_timeout(WAIT).ok()).find_map(
+                |event| match event {
+                    PluginEvent::Exited(sentence) => Some(sentence),
+                    PluginEvent::Line(..) => None,
+                },
+            );
+        exited.expect("the plugin ends")
+    }
+}
+
+#[test]
+fn a_good_plugin_answers_each_image_and_stops_when_told() {
+    let mut rig = Rig::start("hover");
+    for _ in 0..50 {
+        rig.publish();
+        let Some(FromPlugin::Answer { seq, entered, returned, setpoint }) = rig.next() else {
+            panic!("no answer")
+        };
+        assert_eq!((seq, setpoint), (rig.seq, Some(Setpoint::Hold)));
+        assert!(returned >= entered && vizflyt_sdk::host_now() >= returned);
+    }
+    rig.ipc.send(&ToPlugin::Stop).unwrap();
+    let lines: Vec<_> = std::iter::from_fn(|| rig.events.recv_timeout(WAIT).ok()).collect();
+    let line = |text: &str| PluginEvent::Line(Stream::Stdout, text.into());
+    assert!(lines.contains(&line("flying in test as hover")), "{lines:?}");
+    assert!(lines.contains(&line("stopped after 50 images")), "{lines:?}");
+    let sentence = "the plugin ended by itself (exit status 0)".to_owned();
+    assert!(lines.contains(&PluginEvent::Exited(sentence)), "{lines:?}");
+}
+
+#[test]
+fn a_panic_is_told_with_its_message() {
+    let mut rig = Rig::start("panic");
+    rig.publish();
+    let Some(FromPlugin::Failed { reason }) = rig.next() else { panic!("no failure") };
+    assert!(reason.contains("misbehave.rs") && reason.contains("index 1 out of range"), "{reason}");
+    assert!(rig.end().contains("exit status 101"));
+}
+
+#[test]
+fn dying_in_the_middle_of_an_image_leaves_the_runtime_undisturbed() {
+    for (how, expected) in
+        [("exit", "exit status 0"), ("exit-3", "exit status 3"), ("abort", "SIGABRT")]
+    {
+        let mut rig = Rig::start(how);
+        rig.publish();
+        assert_eq!(rig.next(), None, "{how} answers nothing");
+        let sentence = rig.end();
+        assert!(sentence.contains(expected), "{how}: {sentence}");
+        // The dead reader's slot is reclaimed and publishing goes on.
+        rig.ipc.clean_up();
+        assert!(!rig.ipc.plugin_attached());
+        for _ in 0..20 {
+            rig.publish();
+        }
+    }
+}
+
+#[test]
+fn a_hung_plugin_is_killed_and_blocks_nobody() {
+    let mut rig = Rig::start("hang");
+    rig.publish();
+    for _ in 0..500 {
+        rig.publish();
+        let event = Event {
+            stamp: ServerTime::ZERO,
+            kind: EventKind::Phase(FlightPhase::Flying),
+            text: bounded("flying"),
+        };
+        // Full after a while: an error, not a wait.
+        let _ = rig.ipc.send(&ToPlugin::Event(event));
+    }
+    rig.supervisor.end();
+    assert!(!rig.supervisor.is_running());
+    rig.ipc.clean_up();
+    assert!(!rig.ipc.plugin_attached());
+}
