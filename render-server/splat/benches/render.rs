@@ -2,9 +2,10 @@
 //! reference; then where they go, pass by pass.
 //!
 //! ```text
-//! cargo bench -p vizflyt-splat --bench render [-- [FILTER] [SCENE.ply]...]
+//! cargo bench -p vizflyt-splat --bench render [-- [passes] [SCENE.ply]... [FILTER]]
 //! ```
 //!
+//! `passes` leaves out criterion's part, FILTER keeps the cases whose `scene/view` contains it.
 //! Scenes are synthetic (100 k and 1 M splats), the captured ones of a neighbouring `../shared`
 //! where present, and any PLY named on the command line (seen from the middle of its splats).
 //! Times are of the whole machine's cores, so compare figures of one run with each other; where
@@ -38,16 +39,23 @@ fn main() {
         .warm_up_time(Duration::from_millis(500))
         .measurement_time(Duration::from_secs(3));
     let mut cases = captured();
-    for argument in arguments.iter().filter(|argument| !argument.starts_with("--")) {
-        if Path::new(argument).extension().is_some_and(|extension| extension == "ply") {
-            cases.push(from_file(Path::new(argument)));
+    let (mut only_passes, mut filter) = (false, String::new());
+    for argument in arguments.into_iter().filter(|argument| !argument.starts_with("--")) {
+        if Path::new(&argument).extension().is_some_and(|extension| extension == "ply") {
+            cases.push(from_file(Path::new(&argument)));
+        } else if argument == "passes" {
+            only_passes = true;
         } else {
-            criterion = criterion.with_filter(argument);
+            filter = argument;
         }
     }
     cases.extend([100_000, 1_000_000].map(synthetic));
+    for case in &mut cases {
+        case.cameras.retain(|(view, _)| format!("{}/{view}", case.name).contains(&filter));
+    }
+    cases.retain(|case| !case.cameras.is_empty());
 
-    for case in &cases {
+    for case in cases.iter().filter(|_| !only_passes) {
         for (view, camera) in &case.cameras {
             let mut group = criterion.benchmark_group(format!("{}/{view}", case.name));
             for mut renderer in CpuRenderer::every(&case.splats) {

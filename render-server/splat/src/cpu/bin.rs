@@ -71,11 +71,10 @@ impl Bins {
         self.slices.resize_with(count, Slice::default);
         let tiles_x = self.tiles_x;
         self.slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
-            slice.pairs.clear();
             slice.places.clear();
             slice.places.resize(tiles, 0);
             let order = &order[order.len() * i / count..order.len() * (i + 1) / count];
-            simd.run(BinSlice { view, tiles_x, splats: &projected.splats, order, slice });
+            simd.run(BinSlice { view, tiles_x, projected, order, slice });
         });
 
         self.starts.clear();
@@ -108,7 +107,7 @@ impl Bins {
 struct BinSlice<'a> {
     view: &'a View,
     tiles_x: usize,
-    splats: &'a [Splat2d],
+    projected: &'a Projected,
     order: &'a [AtomicU32],
     slice: &'a mut Slice,
 }
@@ -118,34 +117,54 @@ impl Kernel for BinSlice<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let (width, height) = (self.view.width_px as f32, self.view.height_px as f32);
-        for (i, slot) in self.order.iter().enumerate() {
-            if let Some(ahead) = self.order.get(i + PREFETCH) {
-                s.prefetch(&self.splats[ahead.load(Relaxed) as usize]);
+        let Self { view, tiles_x, projected, order, slice } = self;
+        let width = view.width_px as f32;
+        let mut len = 0;
+        for (i, slot) in order.iter().enumerate() {
+            if let Some(ahead) = order.get(i + PREFETCH) {
+                s.prefetch(&projected.boxes[ahead.load(Relaxed) as usize]);
             }
             let slot = slot.load(Relaxed);
-            let splat = &self.splats[slot as usize];
-            let rows =
-                centres(splat.mean_y - splat.extent_y, splat.mean_y + splat.extent_y, height);
-            if rows.is_empty() {
+            let tiles = projected.boxes[slot as usize];
+            let (left, right) = (usize::from(tiles.left), usize::from(tiles.right));
+            let (top, bottom) = (usize::from(tiles.top), usize::from(tiles.bottom));
+            if top == bottom || left == right {
+                // In one row or column of tiles an ellipse touches all that its box does.
+                for tile_y in top..=bottom {
+                    note(slice, &mut len, tile_y * tiles_x, left, right, slot);
+                }
                 continue;
             }
-            for tile_y in rows.start / TILE..=(rows.end - 1) / TILE {
-                let first = rows.start.max(tile_y * TILE);
-                let last = (rows.end - 1).min(tile_y * TILE + TILE - 1);
-                let (left, right) = splat.span(first as f32 + 0.5, last as f32 + 0.5);
-                let columns = centres(left, right, width);
-                if columns.is_empty() {
-                    continue;
-                }
-                for tile_x in columns.start / TILE..=(columns.end - 1) / TILE {
-                    let tile = tile_y * self.tiles_x + tile_x;
-                    self.slice.places[tile] += 1;
-                    self.slice.pairs.push((tile as u64) << 32 | u64::from(slot));
+            let splat = &projected.splats[slot as usize];
+            for tile_y in top..=bottom {
+                let first = (tile_y * TILE) as f32 + 0.5;
+                let last = first + (TILE - 1) as f32;
+                let (low, high) = splat.span(first, last);
+                let columns = centres(low, high, width);
+                if !columns.is_empty() {
+                    let (left, right) = (columns.start / TILE, (columns.end - 1) / TILE);
+                    note(slice, &mut len, tile_y * tiles_x, left, right, slot);
                 }
             }
         }
+        slice.pairs.truncate(len);
     }
+}
+
+/// Notes a pair for each tile from `left` to `right` of a row of tiles.
+#[inline(always)]
+fn note(slice: &mut Slice, len: &mut usize, row: usize, left: usize, right: usize, slot: u32) {
+    // At least one: where rounding leaves none, the pair is of a tile next to the splat.
+    let count = right.saturating_sub(left) + 1;
+    if slice.pairs.len() < *len + count {
+        slice.pairs.resize((*len + count) * 2, 0);
+    }
+    let tiles = row + left..row + left + count;
+    for (pair, tile) in slice.pairs[*len..*len + count].iter_mut().zip(tiles) {
+        *pair = (tile as u64) << 32 | u64::from(slot);
+        slice.places[tile] += 1;
+    }
+    *len += count;
 }
 
 /// Returns the pixels of a row (or column) of `size` whose centres lie from `low` to `high`.
@@ -165,11 +184,16 @@ impl Splat2d {
     fn span(&self, top: f32, bottom: f32) -> (f32, f32) {
         let (top, bottom) = (top - self.mean_y, bottom - self.mean_y);
         // The outermost points are the ellipse's tips, or where it leaves the band next to them.
-        let edge = |tip: f32, sign: f32| {
-            let dy = tip.max(top).min(bottom);
-            let left = (self.level - MIN_LEVEL - self.falloff_y * dy * dy).max(0.0);
-            self.mean_x + self.shear * dy + sign * (left / self.falloff_x).sqrt()
-        };
-        (edge(-self.tip_y, -1.0), edge(self.tip_y, 1.0))
+        (
+            self.edge((-self.tip_y).max(top).min(bottom), -1.0),
+            self.edge(self.tip_y.max(top).min(bottom), 1.0),
+        )
+    }
+
+    /// Returns the x of the ellipse's left (-1) or right (1) edge at a height. [px]
+    #[inline(always)]
+    fn edge(&self, dy: f32, side: f32) -> f32 {
+        let left = (self.level - MIN_LEVEL - self.falloff_y * dy * dy).max(0.0);
+        self.mean_x + self.shear * dy + side * (left / self.falloff_x).sqrt()
     }
 }

@@ -136,10 +136,7 @@ impl Kernel for BlendTile<'_> {
             lane_x[lane] = (lane % BLOCK_WIDTH) as f32 + 0.5;
             lane_y[lane] = (lane / BLOCK_WIDTH) as f32 + 0.5;
         }
-        let centres = |block: usize| {
-            let (x, y) = block_origin(block, block_height);
-            (s.load(&lane_x) + s.splat(x as f32), s.load(&lane_y) + s.splat(y as f32))
-        };
+        let (lane_x, lane_y) = (s.load(&lane_x), s.load(&lane_y));
 
         // Pixels beyond the image's edge have ended before they start.
         let room_x = (view.width_px as usize - origin[0]).min(TILE) as f32;
@@ -147,7 +144,8 @@ impl Kernel for BlendTile<'_> {
         let mut live = 0u32;
         pixels.fill(0.0);
         for block in 0..blocks {
-            let (x, y) = centres(block);
+            let (x, y) = block_origin(block, block_height);
+            let (x, y) = (lane_x + s.splat(x), lane_y + s.splat(y));
             let exists = s.lt(x, s.splat(room_x)) & s.lt(y, s.splat(room_y));
             live |= u32::from(s.any(exists)) << block;
             let transmittance = s.select(exists, s.splat(1.0), s.splat(-1.0));
@@ -166,7 +164,8 @@ impl Kernel for BlendTile<'_> {
                 if lengths[block] == 0 {
                     continue;
                 }
-                let (x, y) = centres(block);
+                let (x, y) = block_origin(block, block_height);
+                let (x, y) = (lane_x + s.splat(x), lane_y + s.splat(y));
                 let list = &scratch.lists[block][..lengths[block]];
                 let state = &mut pixels[block * CHANNELS * S::LANES..][..CHANNELS * S::LANES];
                 if !blend_block(s, &scratch.batch, list, x, y, state) {
@@ -183,9 +182,9 @@ impl Kernel for BlendTile<'_> {
 
 /// Returns the first pixel of a block within its tile.
 #[inline(always)]
-fn block_origin(block: usize, block_height: usize) -> (usize, usize) {
+fn block_origin(block: usize, block_height: usize) -> (f32, f32) {
     let across = TILE / BLOCK_WIDTH;
-    (block % across * BLOCK_WIDTH, block / across * block_height)
+    ((block % across * BLOCK_WIDTH) as f32, (block / across * block_height) as f32)
 }
 
 /// Copies the records of a batch next to each other, column by column.
@@ -198,7 +197,7 @@ fn load_batch<S: Simd>(
     origin: [usize; 2],
     batch: &mut Batch,
 ) {
-    let [x, y] = origin.map(|v| v as f32);
+    let (x, y) = (origin[0] as f32, origin[1] as f32);
     for (i, slot) in slots.iter().enumerate().take(BATCH) {
         if let Some(later) = ahead.get(i + PREFETCH) {
             s.prefetch(&splats[later.load(Relaxed) as usize]);
@@ -236,13 +235,14 @@ fn list_blocks<S: Simd>(
     let across = TILE / BLOCK_WIDTH;
     let block_height = S::LANES / BLOCK_WIDTH;
     for first in (0..len).step_by(S::LANES) {
-        let load = |column: &[f32; 256]| s.load(&column[first..]);
-        let (mean_x, mean_y) = (load(&batch.mean_x), load(&batch.mean_y));
-        let (shear, tip_y) = (load(&batch.shear), load(&batch.tip_y));
-        let (falloff_y, extent_y) = (load(&batch.falloff_y), load(&batch.extent_y));
-        let reach = load(&batch.level) - s.splat(MIN_LEVEL);
+        let (mean_x, mean_y) = (s.load(&batch.mean_x[first..]), s.load(&batch.mean_y[first..]));
+        let (shear, tip_y) = (s.load(&batch.shear[first..]), s.load(&batch.tip_y[first..]));
+        let falloff_x = s.load(&batch.falloff_x[first..]);
+        let falloff_y = s.load(&batch.falloff_y[first..]);
+        let extent_y = s.load(&batch.extent_y[first..]);
+        let reach = s.load(&batch.level[first..]) - s.splat(MIN_LEVEL);
         // Infinite where a splat covers everything evenly: bounded, so that 0 times it is 0.
-        let width2 = s.min(s.splat(1.0) / load(&batch.falloff_x), s.splat(1e30));
+        let width2 = s.min(s.splat(1.0) / falloff_x, s.splat(1e30));
         let zero = s.splat(0.0);
         for band in 0..TILE / block_height {
             let in_band = (1 << across) - 1;
@@ -257,15 +257,12 @@ fn list_blocks<S: Simd>(
                 continue;
             }
             // As `Splat2d::span`.
-            let edge = |tip: S::F| {
-                let dy = s.min(s.max(tip, top), bottom);
-                let left = s.max(s.neg_mul_add(falloff_y * dy, dy, reach), zero);
-                (s.mul_add(shear, dy, mean_x), s.sqrt(left * width2))
-            };
-            let (centre, half) = edge(zero - tip_y);
-            let left = centre - half;
-            let (centre, half) = edge(tip_y);
-            let right = centre + half;
+            let dy = s.min(s.max(zero - tip_y, top), bottom);
+            let rest = s.max(s.neg_mul_add(falloff_y * dy, dy, reach), zero);
+            let left = s.mul_add(shear, dy, mean_x) - s.sqrt(rest * width2);
+            let dy = s.min(s.max(tip_y, top), bottom);
+            let rest = s.max(s.neg_mul_add(falloff_y * dy, dy, reach), zero);
+            let right = s.mul_add(shear, dy, mean_x) + s.sqrt(rest * width2);
             for column in 0..across {
                 let block = band * across + column;
                 let x = (column * BLOCK_WIDTH) as f32;
@@ -322,31 +319,34 @@ fn blend_block<S: Simd>(
     y: S::F,
     state: &mut [f32],
 ) -> bool {
-    let load = |channel: usize| s.load(&state[channel * S::LANES..]);
-    let (mut red, mut green, mut blue) = (load(0), load(1), load(2));
-    let (mut depth, mut median, mut transmittance) = (load(3), load(4), load(5));
+    let mut red = s.load(&state[..]);
+    let mut green = s.load(&state[S::LANES..]);
+    let mut blue = s.load(&state[2 * S::LANES..]);
+    let mut depth = s.load(&state[3 * S::LANES..]);
+    let mut median = s.load(&state[4 * S::LANES..]);
+    let mut transmittance = s.load(&state[5 * S::LANES..]);
     let mut goes_on = true;
     for &i in list {
         let i = usize::from(i);
-        let f = |column: &[f32; 256]| s.splat(column[i]);
-        let dy = y - f(&batch.mean_y);
-        let dx = s.neg_mul_add(dy, f(&batch.shear), x - f(&batch.mean_x));
-        let level = s.neg_mul_add(dy * f(&batch.falloff_y), dy, f(&batch.level));
-        let level = s.neg_mul_add(dx * f(&batch.falloff_x), dx, level);
+        let dy = y - s.splat(batch.mean_y[i]);
+        let dx = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
+        let level = s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
+        let level = s.neg_mul_add(dx * s.splat(batch.falloff_x[i]), dx, level);
         let hit = s.lt(s.splat(MIN_LEVEL), level);
         let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
         let weight = alpha * transmittance;
-        let after = transmittance - weight;
+        // Not `transmittance - weight`: one latency less from splat to splat.
+        let after = s.neg_mul_add(alpha, transmittance, transmittance);
         let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
         let weight = s.keep(live, weight);
-        red = s.mul_add(weight, f(&batch.red), red);
-        green = s.mul_add(weight, f(&batch.green), green);
-        blue = s.mul_add(weight, f(&batch.blue), blue);
-        depth = s.mul_add(weight, f(&batch.z_m), depth);
+        red = s.mul_add(weight, s.splat(batch.red[i]), red);
+        green = s.mul_add(weight, s.splat(batch.green[i]), green);
+        blue = s.mul_add(weight, s.splat(batch.blue[i]), blue);
+        depth = s.mul_add(weight, s.splat(batch.z_m[i]), depth);
         // The last splat drawn while more than half of the light passed; `finish` checks that it
         // brought the pixel to half.
         let before_half = hit & s.lt(s.splat(0.5), transmittance);
-        median = s.select(before_half, f(&batch.z_m), median);
+        median = s.select(before_half, s.splat(batch.z_m[i]), median);
         transmittance = s.select(live, after, s.negative(transmittance));
         if !s.any(live) {
             goes_on = false;
@@ -354,8 +354,8 @@ fn blend_block<S: Simd>(
         }
     }
     let channels = [red, green, blue, depth, median, transmittance];
-    for (channel, value) in channels.into_iter().enumerate() {
-        s.store(value, &mut state[channel * S::LANES..]);
+    for channel in 0..CHANNELS {
+        s.store(channels[channel], &mut state[channel * S::LANES..]);
     }
     goes_on
 }

@@ -9,8 +9,10 @@
 //! two squares, so never negative, where the usual conic cancels. `det` itself comes from the
 //! minors of the 2x3 square root (Cauchy-Binet), so it cannot cancel either.
 
+use glam::Vec3;
 use rayon::prelude::*;
 
+use super::bin::TILE;
 use super::cull::View;
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Scene, column};
 use super::simd::{Kernel, Simd};
@@ -47,12 +49,24 @@ pub(super) struct Splat2d {
     pub(super) rgb: [f32; 3],
 }
 
+/// The tiles that the box around the ellipse alpha = 1/255 touches, both ends included.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C)]
+pub(super) struct TileBox {
+    pub(super) left: u16,
+    pub(super) right: u16,
+    pub(super) top: u16,
+    pub(super) bottom: u16,
+}
+
 /// What the pass leaves behind: per visible block a region of [`BLOCK`] slots, filled from its
 /// start.
 #[derive(Debug, Default)]
 pub(super) struct Projected {
     /// Indexed by slot.
     pub(super) splats: Vec<Splat2d>,
+    /// Apart from the splats, because binning most of them needs no more. Indexed by slot.
+    pub(super) boxes: Vec<TileBox>,
     /// Camera z as bits, which order as the positive numbers do. Indexed by slot.
     pub(super) keys: Vec<u32>,
     /// Filled slots of each region.
@@ -70,18 +84,21 @@ pub(super) fn project<S: Simd>(
     let slots = visible.len() * BLOCK;
     if out.splats.len() < slots {
         out.splats.resize(slots, Splat2d::default());
+        out.boxes.resize(slots, TileBox::default());
         out.keys.resize(slots, 0);
     }
     out.counts.resize(visible.len(), 0);
     out.splats
         .par_chunks_mut(BLOCK)
+        .zip(out.boxes.par_chunks_mut(BLOCK))
         .zip(out.keys.par_chunks_mut(BLOCK))
         .zip(&mut out.counts)
         .zip(visible)
         // Four blocks are some 5 us of work.
         .with_min_len(4)
-        .for_each(|(((splats, keys), count), &block)| {
-            let task = ProjectBlock { scene, view, block: block as usize, splats, keys };
+        .for_each(|((((splats, boxes), keys), count), &block)| {
+            let out = Region { splats, boxes, keys };
+            let task = ProjectBlock { scene, view, block: block as usize, out };
             *count = simd.run(task) as u32;
         });
 }
@@ -91,7 +108,13 @@ struct ProjectBlock<'a> {
     scene: &'a Scene,
     view: &'a View,
     block: usize,
+    out: Region<'a>,
+}
+
+/// Slots of one block.
+struct Region<'a> {
     splats: &'a mut [Splat2d],
+    boxes: &'a mut [TileBox],
     keys: &'a mut [u32],
 }
 
@@ -99,7 +122,7 @@ impl Kernel for ProjectBlock<'_> {
     type Output = usize;
 
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) -> usize {
+    fn run<S: Simd>(mut self, s: S) -> usize {
         let groups = BLOCK / GROUP;
         let sh_numbers = self.scene.coefficients * 3 * GROUP;
         let geometry = &self.scene.geometry[self.block * groups * GROUP_NUMBERS..];
@@ -109,7 +132,7 @@ impl Kernel for ProjectBlock<'_> {
             let geometry = &geometry[group * GROUP_NUMBERS..][..GROUP_NUMBERS];
             let sh = &sh[group * sh_numbers..][..sh_numbers];
             for first in (0..GROUP).step_by(S::LANES) {
-                count = vector(s, self.view, geometry, sh, first, self.splats, self.keys, count);
+                count = vector(s, self.view, geometry, sh, first, &mut self.out, count);
             }
         }
         count
@@ -119,89 +142,77 @@ impl Kernel for ProjectBlock<'_> {
 /// Projects the lanes from `first` of a group, appends survivors from slot `count` on, and returns
 /// the new count.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "one loop body, split for reading only")]
 fn vector<S: Simd>(
     s: S,
     view: &View,
     geometry: &[f32],
     sh: &[u16],
     first: usize,
-    splats: &mut [Splat2d],
-    keys: &mut [u32],
+    out: &mut Region,
     mut count: usize,
 ) -> usize {
-    let f = |v: f32| s.splat(v);
-    let load = |column: usize| s.load(&geometry[column * GROUP + first..]);
+    let columns = Columns { s, geometry, first };
+    let mean = columns.vector(column::MEAN);
     // Relative to the camera before anything else: large coordinates cancel while still exact.
-    let d: [S::F; 3] = std::array::from_fn(|k| load(column::MEAN + k) - f(view.center_m[k]));
-    let rotate = |row: usize| {
-        let r = view.rows[row];
-        s.mul_add(d[0], f(r.x), s.mul_add(d[1], f(r.y), d[2] * f(r.z)))
-    };
-    let z = rotate(2);
+    let centre = view.center_m;
+    let d = [mean[0] - s.splat(centre.x), mean[1] - s.splat(centre.y), mean[2] - s.splat(centre.z)];
+    let rows = [broadcast(s, view.rows[0]), broadcast(s, view.rows[1]), broadcast(s, view.rows[2])];
+    let z = dot(s, rows[2], d);
     // NaN, of padding too, fails here.
-    let ahead = s.lt(f(view.near_m), z);
+    let ahead = s.lt(s.splat(view.near_m), z);
     if !s.any(ahead) {
         return count;
     }
-    let inverse_z = f(1.0) / z;
-    let (tx, ty) = (rotate(0) * inverse_z, rotate(1) * inverse_z);
-    let mean_x = s.mul_add(tx, f(view.fx_px), f(view.cx_px));
-    let mean_y = s.mul_add(ty, f(view.fy_px), f(view.cy_px));
+    let inverse_z = s.splat(1.0) / z;
+    let (tx, ty) = (dot(s, rows[0], d) * inverse_z, dot(s, rows[1], d) * inverse_z);
+    let mean_x = s.mul_add(tx, s.splat(view.fx_px), s.splat(view.cx_px));
+    let mean_y = s.mul_add(ty, s.splat(view.fy_px), s.splat(view.cy_px));
 
     // Rows of J W M, M the square root of the covariance.
-    let jx = s.max(s.min(tx, f(view.slope_x[1])), f(view.slope_x[0]));
-    let jy = s.max(s.min(ty, f(view.slope_y[1])), f(view.slope_y[0]));
-    let (ax, ay) = (inverse_z * f(view.fx_px), inverse_z * f(view.fy_px));
-    let gradient = |a: S::F, j: S::F, row: usize| -> [S::F; 3] {
-        std::array::from_fn(|k| a * s.neg_mul_add(j, f(view.rows[2][k]), f(view.rows[row][k])))
-    };
-    let (gx, gy) = (gradient(ax, jx, 0), gradient(ay, jy, 1));
-    let times_axes = |g: [S::F; 3]| -> [S::F; 3] {
-        std::array::from_fn(|k| {
-            let axis = |row: usize| load(column::AXES + 3 * k + row);
-            s.mul_add(g[0], axis(0), s.mul_add(g[1], axis(1), g[2] * axis(2)))
-        })
-    };
-    let (u, v) = (times_axes(gx), times_axes(gy));
-    let dot =
-        |p: &[S::F; 3], q: &[S::F; 3]| s.mul_add(p[0], q[0], s.mul_add(p[1], q[1], p[2] * q[2]));
-    let blur = f(BLUR_PX2 as f32);
-    let (uu, b, vv) = (dot(&u, &u), dot(&u, &v), dot(&v, &v));
+    let jx = clamp(s, tx, view.slope_x);
+    let jy = clamp(s, ty, view.slope_y);
+    let gx = gradient(s, inverse_z * s.splat(view.fx_px), jx, rows[0], rows[2]);
+    let gy = gradient(s, inverse_z * s.splat(view.fy_px), jy, rows[1], rows[2]);
+    let axes = [
+        columns.vector(column::AXES),
+        columns.vector(column::AXES + 3),
+        columns.vector(column::AXES + 6),
+    ];
+    let u = [dot(s, gx, axes[0]), dot(s, gx, axes[1]), dot(s, gx, axes[2])];
+    let v = [dot(s, gy, axes[0]), dot(s, gy, axes[1]), dot(s, gy, axes[2])];
+    let blur = s.splat(BLUR_PX2 as f32);
+    let (uu, b, vv) = (dot(s, u, u), dot(s, u, v), dot(s, v, v));
     let (a, c) = (uu + blur, vv + blur);
-    let minor = |i: usize, j: usize| s.neg_mul_add(u[j], v[i], u[i] * v[j]);
-    let minors = [minor(0, 1), minor(1, 2), minor(2, 0)];
-    let blur2 = f((BLUR_PX2 * BLUR_PX2) as f32);
-    let determinant = s.mul_add(blur, uu + vv, dot(&minors, &minors) + blur2);
+    let minors = [
+        s.neg_mul_add(u[1], v[0], u[0] * v[1]),
+        s.neg_mul_add(u[2], v[1], u[1] * v[2]),
+        s.neg_mul_add(u[0], v[2], u[2] * v[0]),
+    ];
+    let blur2 = s.splat((BLUR_PX2 * BLUR_PX2) as f32);
+    let determinant = s.mul_add(blur, uu + vv, dot(s, minors, minors) + blur2);
 
-    let level = load(column::LEVEL);
-    let reach2 = (level - f(MIN_LEVEL)) * f(EXTENT2);
+    let level = columns.load(column::LEVEL);
+    let reach2 = (level - s.splat(MIN_LEVEL)) * s.splat(EXTENT2);
     let extent_x = s.sqrt(reach2 * a);
     let extent_y = s.sqrt(reach2 * c);
-    // Some pixel centre lies within the bounding box's rows and columns of the image. NaN and
-    // overflow fail.
-    let inside = |mean: S::F, extent: S::F, size: u32| {
-        s.lt(f(0.5), mean + extent)
-            & s.lt(mean - extent, f(size as f32 - 0.5))
-            & s.lt(extent, f(MAX_EXTENT_PX))
-    };
-    let seen =
-        ahead & inside(mean_x, extent_x, view.width_px) & inside(mean_y, extent_y, view.height_px);
+    let seen = ahead
+        & inside(s, mean_x, extent_x, view.width_px)
+        & inside(s, mean_y, extent_y, view.height_px);
     let mut bits = s.bits(seen);
     if bits == 0 {
         return count;
     }
 
-    let inverse_c = f(1.0) / c;
-    let inverse_length = f(1.0) / s.sqrt(dot(&d, &d));
-    let direction = d.map(|v| v * inverse_length);
+    let inverse_c = s.splat(1.0) / c;
+    let inverse_length = s.splat(1.0) / s.sqrt(dot(s, d, d));
+    let direction = [d[0] * inverse_length, d[1] * inverse_length, d[2] * inverse_length];
     let rgb = colour(s, &sh[first..], direction);
     let fields = [
         mean_x,
         mean_y,
         b * inverse_c,
-        f(HALF_LOG2_E) * c / determinant,
-        f(HALF_LOG2_E) * inverse_c,
+        s.splat(HALF_LOG2_E) * c / determinant,
+        s.splat(HALF_LOG2_E) * inverse_c,
         level,
         b * extent_x / a,
         extent_y,
@@ -209,71 +220,164 @@ fn vector<S: Simd>(
         rgb[0],
         rgb[1],
         rgb[2],
+        // The tiles of the first and last pixel centres in the box: `ceil` is written as adding a
+        // little less than 1, because the conversion to whole numbers rounds down.
+        first_tile(s, mean_x - extent_x, view.width_px),
+        last_tile(s, mean_x + extent_x, view.width_px),
+        first_tile(s, mean_y - extent_y, view.height_px),
+        last_tile(s, mean_y + extent_y, view.height_px),
     ];
-    let mut lanes = [[0f32; GROUP]; 12];
+    let mut lanes = [[0f32; GROUP]; 16];
     for (lanes, field) in lanes.iter_mut().zip(fields) {
         s.store(field, lanes);
     }
     while bits != 0 {
         let lane = bits.trailing_zeros() as usize % GROUP;
         bits &= bits - 1;
-        let field = |k: usize| lanes[k][lane];
-        splats[count] = Splat2d {
-            mean_x: field(0),
-            mean_y: field(1),
-            shear: field(2),
-            falloff_x: field(3),
-            falloff_y: field(4),
-            level: field(5),
-            tip_y: field(6),
-            extent_y: field(7),
-            z_m: field(8),
-            rgb: [field(9), field(10), field(11)],
+        out.splats[count] = Splat2d {
+            mean_x: lanes[0][lane],
+            mean_y: lanes[1][lane],
+            shear: lanes[2][lane],
+            falloff_x: lanes[3][lane],
+            falloff_y: lanes[4][lane],
+            level: lanes[5][lane],
+            tip_y: lanes[6][lane],
+            extent_y: lanes[7][lane],
+            z_m: lanes[8][lane],
+            rgb: [lanes[9][lane], lanes[10][lane], lanes[11][lane]],
         };
-        keys[count] = field(8).to_bits();
+        out.boxes[count] = TileBox {
+            left: lanes[12][lane] as u16,
+            right: lanes[13][lane] as u16,
+            top: lanes[14][lane] as u16,
+            bottom: lanes[15][lane] as u16,
+        };
+        out.keys[count] = lanes[8][lane].to_bits();
         count += 1;
     }
     count
+}
+
+// Closures are no substitute for the functions below: they are not always inlined, and then run
+// without the kernel's instructions.
+
+/// Columns of some lanes of a group.
+struct Columns<'a, S> {
+    s: S,
+    geometry: &'a [f32],
+    first: usize,
+}
+
+impl<S: Simd> Columns<'_, S> {
+    #[inline(always)]
+    fn load(&self, column: usize) -> S::F {
+        self.s.load(&self.geometry[column * GROUP + self.first..])
+    }
+
+    /// Loads three consecutive columns.
+    #[inline(always)]
+    fn vector(&self, column: usize) -> [S::F; 3] {
+        [self.load(column), self.load(column + 1), self.load(column + 2)]
+    }
+}
+
+#[inline(always)]
+fn broadcast<S: Simd>(s: S, v: Vec3) -> [S::F; 3] {
+    [s.splat(v.x), s.splat(v.y), s.splat(v.z)]
+}
+
+#[inline(always)]
+fn dot<S: Simd>(s: S, a: [S::F; 3], b: [S::F; 3]) -> S::F {
+    s.mul_add(a[0], b[0], s.mul_add(a[1], b[1], a[2] * b[2]))
+}
+
+#[inline(always)]
+fn clamp<S: Simd>(s: S, v: S::F, [low, high]: [f32; 2]) -> S::F {
+    s.max(s.min(v, s.splat(high)), s.splat(low))
+}
+
+/// Returns a row of the projection's Jacobian in world axes: `scale (row - slope forward)`.
+#[inline(always)]
+fn gradient<S: Simd>(
+    s: S,
+    scale: S::F,
+    slope: S::F,
+    row: [S::F; 3],
+    forward: [S::F; 3],
+) -> [S::F; 3] {
+    [
+        scale * s.neg_mul_add(slope, forward[0], row[0]),
+        scale * s.neg_mul_add(slope, forward[1], row[1]),
+        scale * s.neg_mul_add(slope, forward[2], row[2]),
+    ]
+}
+
+/// Whether some pixel centre lies between `mean - extent` and `mean + extent`. NaN and overflow do
+/// not.
+#[inline(always)]
+fn inside<S: Simd>(s: S, mean: S::F, extent: S::F, size: u32) -> S::M {
+    s.lt(s.splat(0.5), mean + extent)
+        & s.lt(mean - extent, s.splat(size as f32 - 0.5))
+        & s.lt(extent, s.splat(MAX_EXTENT_PX))
+}
+
+/// Returns the tile of the first pixel centre at or after `low`; rounded down, a whole number.
+#[inline(always)]
+fn first_tile<S: Simd>(s: S, low: S::F, size: u32) -> S::F {
+    let pixel = s.max(low + s.splat(0.999_99 - 0.5), s.splat(0.0));
+    let pixel = s.min(pixel, s.splat(size as f32 - 1.0));
+    pixel * s.splat(1.0 / TILE as f32)
+}
+
+/// Returns the tile of the last pixel centre at or before `high`; rounded down, a whole number.
+#[inline(always)]
+fn last_tile<S: Simd>(s: S, high: S::F, size: u32) -> S::F {
+    let pixel = s.min(high - s.splat(0.5), s.splat(size as f32 - 1.0));
+    pixel * s.splat(1.0 / TILE as f32)
 }
 
 /// Returns the colour of a vector of splats seen along unit directions; the vector form of
 /// [`crate::harmonics::colour`].
 #[inline(always)]
 fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
-    let f = |v: f64| s.splat(v as f32);
-    let weight = |k: usize, channel: usize| s.load_f16(&sh[(k * 3 + channel) * GROUP..]);
-    let degree = sh.len() / (3 * GROUP);
-    let mut rgb: [S::F; 3] =
-        std::array::from_fn(|channel| s.mul_add(weight(0, channel), f(C0), f(0.5)));
-    let mut add = |k: usize, basis: S::F| {
-        for (channel, sum) in rgb.iter_mut().enumerate() {
-            *sum = s.mul_add(weight(k, channel), basis, *sum);
-        }
-    };
-    // The slice starts at a lane, so whole coefficients are counted rounding up.
-    if degree >= 3 {
-        add(1, y * f(-C1));
-        add(2, z * f(C1));
-        add(3, x * f(-C1));
+    // The slice starts at a lane: its last coefficient may be cut, so whole ones are rounded up.
+    let coefficients = sh.len().div_ceil(3 * GROUP);
+    let half = s.splat(0.5);
+    let mut rgb = [half; 3];
+    add(s, &mut rgb, sh, 0, s.splat(C0 as f32));
+    if coefficients >= 4 {
+        add(s, &mut rgb, sh, 1, y * s.splat(-C1 as f32));
+        add(s, &mut rgb, sh, 2, z * s.splat(C1 as f32));
+        add(s, &mut rgb, sh, 3, x * s.splat(-C1 as f32));
     }
-    if degree >= 8 {
+    if coefficients >= 9 {
         let (xx, yy, zz, xy, yz, xz) = (x * x, y * y, z * z, x * y, y * z, x * z);
-        let two = f(2.0);
-        add(4, xy * f(C2[0]));
-        add(5, yz * f(C2[1]));
-        add(6, (two * zz - xx - yy) * f(C2[2]));
-        add(7, xz * f(C2[3]));
-        add(8, (xx - yy) * f(C2[4]));
-        if degree >= 15 {
-            let (three, four) = (f(3.0), f(4.0));
-            add(9, y * (three * xx - yy) * f(C3[0]));
-            add(10, xy * z * f(C3[1]));
-            add(11, y * (four * zz - xx - yy) * f(C3[2]));
-            add(12, z * (two * zz - three * xx - three * yy) * f(C3[3]));
-            add(13, x * (four * zz - xx - yy) * f(C3[4]));
-            add(14, z * (xx - yy) * f(C3[5]));
-            add(15, x * (xx - three * yy) * f(C3[6]));
+        let (two, three, four) = (s.splat(2.0), s.splat(3.0), s.splat(4.0));
+        add(s, &mut rgb, sh, 4, xy * s.splat(C2[0] as f32));
+        add(s, &mut rgb, sh, 5, yz * s.splat(C2[1] as f32));
+        add(s, &mut rgb, sh, 6, (two * zz - xx - yy) * s.splat(C2[2] as f32));
+        add(s, &mut rgb, sh, 7, xz * s.splat(C2[3] as f32));
+        add(s, &mut rgb, sh, 8, (xx - yy) * s.splat(C2[4] as f32));
+        if coefficients >= 16 {
+            add(s, &mut rgb, sh, 9, y * (three * xx - yy) * s.splat(C3[0] as f32));
+            add(s, &mut rgb, sh, 10, xy * z * s.splat(C3[1] as f32));
+            add(s, &mut rgb, sh, 11, y * (four * zz - xx - yy) * s.splat(C3[2] as f32));
+            let upright = two * zz - three * xx - three * yy;
+            add(s, &mut rgb, sh, 12, z * upright * s.splat(C3[3] as f32));
+            add(s, &mut rgb, sh, 13, x * (four * zz - xx - yy) * s.splat(C3[4] as f32));
+            add(s, &mut rgb, sh, 14, z * (xx - yy) * s.splat(C3[5] as f32));
+            add(s, &mut rgb, sh, 15, x * (xx - three * yy) * s.splat(C3[6] as f32));
         }
     }
-    rgb.map(|v| s.max(v, s.splat(0.0)))
+    let zero = s.splat(0.0);
+    [s.max(rgb[0], zero), s.max(rgb[1], zero), s.max(rgb[2], zero)]
+}
+
+/// Adds coefficient `k` times its basis function.
+#[inline(always)]
+fn add<S: Simd>(s: S, rgb: &mut [S::F; 3], sh: &[u16], k: usize, basis: S::F) {
+    for channel in 0..3 {
+        let weight = s.load_f16(&sh[(k * 3 + channel) * GROUP..]);
+        rgb[channel] = s.mul_add(weight, basis, rgb[channel]);
+    }
 }

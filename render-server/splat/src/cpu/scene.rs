@@ -35,6 +35,7 @@ pub(super) mod column {
 pub(super) const GROUP_NUMBERS: usize = column::COUNT * GROUP;
 
 /// Bounds of [`BLOCK`] consecutive splats.
+#[allow(clippy::struct_field_names, reason = "metres, all of them")]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block {
     /// Middle of the box around the centres. [m, world]

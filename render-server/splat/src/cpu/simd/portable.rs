@@ -14,8 +14,9 @@ const LANES: usize = 8;
 #[derive(Clone, Copy)]
 pub(in crate::cpu) struct F32x8([f32; LANES]);
 
+/// All bits of a lane set or none: what vector comparisons give.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct Mask8([bool; LANES]);
+pub(in crate::cpu) struct Mask8([u32; LANES]);
 
 #[inline(always)]
 fn map2(a: F32x8, b: F32x8, f: impl Fn(f32, f32) -> f32) -> F32x8 {
@@ -142,27 +143,29 @@ impl Simd for Portable {
 
     #[inline(always)]
     fn lt(self, a: F32x8, b: F32x8) -> Mask8 {
-        Mask8(array::from_fn(|i| a.0[i] < b.0[i]))
+        Mask8(array::from_fn(|i| if a.0[i] < b.0[i] { u32::MAX } else { 0 }))
     }
 
     #[inline(always)]
     fn select(self, m: Mask8, a: F32x8, b: F32x8) -> F32x8 {
-        F32x8(array::from_fn(|i| if m.0[i] { a.0[i] } else { b.0[i] }))
+        F32x8(array::from_fn(|i| {
+            f32::from_bits(a.0[i].to_bits() & m.0[i] | b.0[i].to_bits() & !m.0[i])
+        }))
     }
 
     #[inline(always)]
     fn keep(self, m: Mask8, a: F32x8) -> F32x8 {
-        F32x8(array::from_fn(|i| if m.0[i] { a.0[i] } else { 0.0 }))
+        F32x8(array::from_fn(|i| f32::from_bits(a.0[i].to_bits() & m.0[i])))
     }
 
     #[inline(always)]
     fn bits(self, m: Mask8) -> u32 {
-        (0..LANES).fold(0, |bits, i| bits | u32::from(m.0[i]) << i)
+        (0..LANES).fold(0, |bits, i| bits | m.0[i] & 1 << i)
     }
 
     #[inline(always)]
     fn any(self, m: Mask8) -> bool {
-        m.0.iter().fold(false, |any, &flag| any | flag)
+        m.0.iter().fold(0, |any, &flag| any | flag) != 0
     }
 
     #[inline(always)]
