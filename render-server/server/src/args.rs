@@ -17,7 +17,7 @@ pub struct ServeArgs {
     pub arena: PathBuf,
 
     /// Where runtimes connect (UDP)
-    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4450")]
+    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4433")]
     pub quic: SocketAddr,
 
     /// Where the page is served; port 0 takes a free one

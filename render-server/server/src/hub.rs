@@ -347,7 +347,7 @@ mod tests {
             goal_m: None,
             goal_radius_m: 1.0,
             time_limit_s: 0.0,
-            cameras: Default::default(),
+            cameras: [].into_iter().collect(),
         };
         Arc::new(Hub::new("vizflyt", arena, "test".to_owned(), Stop::default()))
     }

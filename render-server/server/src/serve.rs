@@ -32,6 +32,7 @@ use crate::{dashboard, encode, tick};
 ///
 /// # Errors
 /// Scene or arena that cannot be used, an address that cannot be bound.
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn serve(args: ServeArgs) -> Result<()> {
     let stop = Stop::default();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -49,6 +50,7 @@ pub fn serve(args: ServeArgs) -> Result<()> {
 
 /// What is printed when the server is ready.
 #[derive(Debug, Serialize)]
+#[allow(clippy::struct_field_names)] // Why: the key that every program's first line begins with.
 struct Ready<'a> {
     ready: &'static str,
     quic: SocketAddr,

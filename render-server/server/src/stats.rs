@@ -9,6 +9,8 @@ use std::sync::{Mutex, PoisonError};
 use serde::Serialize;
 use vizflyt_protocol::time::ServerTime;
 
+use crate::drivers::SourceCounters;
+
 /// Everything measured; shared by all threads.
 #[derive(Debug, Default)]
 pub struct Stats {
@@ -167,10 +169,8 @@ pub struct Report {
     pub images_late: u64,
     /// Megabytes of images acknowledged. [MB]
     pub sent_mb: f64,
-    /// Poses received.
-    pub poses: u64,
-    /// Packets of the localization that did not parse.
-    pub bad_packets: u64,
+    /// What the localization delivered.
+    pub source: SourceCounters,
     /// Peak resident memory of this process. [MB]
     pub peak_rss_mb: f64,
     /// Which renderer drew.
@@ -179,7 +179,7 @@ pub struct Report {
 
 impl Stats {
     /// Returns the report over the whole run.
-    pub fn report(&self, source: crate::drivers::SourceCounters, renderer: &str) -> Report {
+    pub fn report(&self, source: SourceCounters, renderer: &str) -> Report {
         let (render, encode, send) =
             (self.render.overall(), self.encode.overall(), self.send.overall());
         Report {
@@ -194,8 +194,7 @@ impl Stats {
             images_sent: self.images_sent.load(Ordering::Relaxed),
             images_late: self.images_late.load(Ordering::Relaxed),
             sent_mb: self.bytes_sent.load(Ordering::Relaxed) as f64 / 1e6,
-            poses: source.poses,
-            bad_packets: source.bad_packets,
+            source,
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
             renderer: renderer.to_owned(),
         }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use axum::body::Bytes;
 use axum::extract::ws::{Message as Frame, WebSocket};
 use serde::Serialize;
+use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::debug;
 
@@ -37,7 +38,7 @@ pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
     }
     let presence = Presence::new(&page);
     tokio::select! {
-        _ = watch(&page, &mut socket) => {}
+        _ = tell(&page, &mut socket) => {}
         () = page.hub.stop.wait() => {}
     }
     drop(presence);
@@ -45,7 +46,7 @@ pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
 }
 
 /// Returns `None` when the viewer is gone.
-async fn watch(page: &Page, socket: &mut WebSocket) -> Option<()> {
+async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
     let hub = &page.hub;
     let mut log = hub.events.subscribe();
     let (entries, mut cursor) = hub.events.newest(HISTORY);
@@ -53,7 +54,7 @@ async fn watch(page: &Page, socket: &mut WebSocket) -> Option<()> {
     let points = lock(&hub.trail).points.clone();
     send_json(socket, &messages::Message::Trail { points: &points }).await?;
     send_json(socket, &messages::events(page, entries)).await?;
-    let mut previews: Vec<_> = hub.previews.iter().map(|camera| camera.subscribe()).collect();
+    let mut previews: Vec<_> = hub.previews.iter().map(watch::Sender::subscribe).collect();
     for preview in &mut previews {
         preview.mark_changed();
     }

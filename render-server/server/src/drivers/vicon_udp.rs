@@ -19,7 +19,7 @@ pub struct ViconUdp {
     address: SocketAddr,
     from: Option<SocketAddr>,
     stream: ViconStream,
-    buffer: Box<[u8; 65536]>,
+    buffer: Box<[u8]>,
     /// When anything last arrived; the start, before anything did.
     heard: ServerTime,
     silence_warned: bool,
@@ -45,7 +45,7 @@ impl ViconUdp {
             socket,
             from: None,
             stream: ViconStream::new(object),
-            buffer: Box::new([0; 65536]),
+            buffer: vec![0; 65536].into_boxed_slice(),
             heard: clock::now(),
             silence_warned: false,
             warnings: VecDeque::new(),

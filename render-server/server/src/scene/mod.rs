@@ -12,6 +12,7 @@ mod orient;
 pub use bare::{align, default_arena};
 pub use orient::{Up, WorldFromScene};
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -44,8 +45,8 @@ pub fn load(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
         }
         bail!("{} is a folder without an arena.toml", path.display());
     }
-    let extension = path.extension().map(|extension| extension.to_ascii_lowercase());
-    match extension.as_deref().and_then(|extension| extension.to_str()) {
+    let extension = path.extension().map(OsStr::to_ascii_lowercase);
+    match extension.as_deref().and_then(OsStr::to_str) {
         Some("toml") => with_arena(path),
         Some("ply") => Ok(without_arena(path, up, scale)?),
         _ => bail!("{} is neither an arena (.toml) nor a scene (.ply)", path.display()),

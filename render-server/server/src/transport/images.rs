@@ -104,13 +104,12 @@ async fn deliver(connection: &Connection, parts: &[&[u8]]) -> bool {
         // `None` inside is "acknowledged"; a code is "the runtime does not want it".
         stream.stopped().await.ok()?.is_none().then_some(())
     };
-    match timeout(DEADLINE, whole).await {
-        Ok(delivered) => delivered.is_some(),
-        Err(_) => {
-            // Fails only if it is finished and acknowledged after all.
-            let _ = stream.reset(VarInt::from_u32(0));
-            false
-        }
+    if let Ok(delivered) = timeout(DEADLINE, whole).await {
+        delivered.is_some()
+    } else {
+        // Fails only if it is finished and acknowledged after all.
+        let _ = stream.reset(VarInt::from_u32(0));
+        false
     }
 }
 

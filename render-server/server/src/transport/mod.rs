@@ -130,7 +130,7 @@ pub async fn serve(
                 Err(error) => Err(error),
             };
             match connection {
-                Ok(connection) => session::run(hub, connection).await,
+                Ok(connection) => Box::pin(session::run(hub, connection)).await,
                 Err(error) => debug!("{address}: no connection: {error}"),
             }
         });

@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, RecvStream, SendStream, VarInt};
+use quinn::{Connection, ConnectionError, RecvStream, SendStream, VarInt};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tracing::{debug, info, warn};
@@ -29,6 +29,8 @@ pub(super) async fn run(hub: Arc<Hub>, connection: Connection) {
         ending = talk(&hub, &connection) => ending,
         () = hub.stop.wait() => (END, "the server ends".to_owned()),
     };
+    // What the other side said on closing tells more than which of our calls failed first.
+    let reason = connection.close_reason().map_or(reason, |error| why(&error));
     info!("{address}: session ends: {reason}");
     // Why: RFC 9000 lets a reason be of any length, but it must fit a packet.
     let cut: String = reason.chars().take(200).collect();
@@ -65,7 +67,7 @@ async fn talk(hub: &Arc<Hub>, connection: &Connection) -> Ending {
         Err(_) => return (FOREIGN, "no Hello came for 5 s".to_owned()),
     };
     match hub.sit(&hello, connection.remote_address()) {
-        Ok(seat) => fly(hub, connection, &hello, &seat, send, incoming).await,
+        Ok(seat) => Box::pin(fly(hub, connection, &hello, &seat, send, incoming)).await,
         Err(reason) => {
             warn!("{}: refused: {reason}", connection.remote_address());
             let mut out = Outbound { send, buffer: [0; MAX_FRAMED] };
@@ -76,6 +78,19 @@ async fn talk(hub: &Arc<Hub>, connection: &Connection) -> Ending {
             let _ = out.send.finish();
             linger(connection, (REFUSED, reason)).await
         }
+    }
+}
+
+fn why(error: &ConnectionError) -> String {
+    match error {
+        ConnectionError::ApplicationClosed(close) if close.reason.is_empty() => {
+            "closed by the runtime".to_owned()
+        }
+        ConnectionError::ApplicationClosed(close) => {
+            format!("closed by the runtime: {}", String::from_utf8_lossy(&close.reason))
+        }
+        ConnectionError::TimedOut => "nothing came for 5 s".to_owned(),
+        other => other.to_string(),
     }
 }
 
@@ -110,7 +125,8 @@ async fn fly(
         }
         error = connection.closed() => gone(&error),
     };
-    hub.note(&format!("the runtime at {address} is gone: {}", ending.1));
+    let reason = connection.close_reason().map_or_else(|| ending.1.clone(), |error| why(&error));
+    hub.note(&format!("the runtime at {address} is gone: {reason}"));
     ending
 }
 

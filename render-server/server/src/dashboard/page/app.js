@@ -28,7 +28,7 @@ async function stop() {
   try {
     const answer = await fetch("/api/estop", { method: "POST" });
     say(await answer.text());
-    if (!answer.ok) banner("warn", "Not stopped", await Promise.resolve($("said").textContent));
+    if (!answer.ok) banner("warn", "Not stopped", $("said").textContent);
   } catch {
     banner("bad", "Not stopped", "the server cannot be reached: use the pilot's transmitter");
   }
@@ -218,7 +218,7 @@ function hearState(state) {
   tone("age", images?.age_ms_p99 > 80 ? "warn" : "");
   if (images?.delivered) push("age", images.age_ms_p50, now);
   put("rate", fixed(images?.delivered ? images.rate_hz : state.stream_hz, 0));
-  put("mbit", state.stream_mbit_s > 0.05 ? `${fixed(state.stream_mbit_s, 1)} Mbit/s` : "");
+  put("mbit", state.stream_mbit_s > 0.05 ? `${fixed(state.stream_mbit_s, 1)} Mb/s` : "");
   put("render", state.render.p50 ? fixed(state.render.p50, 1) : "–");
   put("render99", state.render.p99 ? `p99 ${fixed(state.render.p99, 1)}` : "");
 
@@ -266,7 +266,8 @@ function drawLine(name, now, colour) {
   g.clearRect(0, 0, w, h);
   if (line.length < 2) return;
   const top = Math.max(...line.map((p) => p[1]), 1e-3) * 1.15;
-  const at = ([t, v]) => [w - ((now - t) / SPAN_MS) * w, h - 3 - (Math.max(0, v) / top) * (h - 12)];
+  const span = Math.max(5000, Math.min(SPAN_MS, now - line[0][0]));
+  const at = ([t, v]) => [w - ((now - t) / span) * w, h - 3 - (Math.max(0, v) / top) * (h - 12)];
   const fade = g.createLinearGradient(0, 0, w, 0);
   fade.addColorStop(0, "transparent");
   fade.addColorStop(0.5, colour);
