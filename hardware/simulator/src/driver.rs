@@ -31,7 +31,8 @@ pub struct Driver {
 }
 
 impl Driver {
-    /// Opens the sockets: MAVLink, and where mocap datagrams go, if anywhere.
+    /// Opens the sockets: MAVLink, and where mocap datagrams go, if anywhere. `factor` is simulated
+    /// seconds per second.
     ///
     /// # Errors
     /// Fails if a socket cannot be opened.
@@ -67,39 +68,27 @@ impl Driver {
     /// Runs until `stop` is set; returns the simulation for its report, and the time given up
     /// because the machine was too slow. [s]
     pub fn run(mut self, stop: &Arc<AtomicBool>) -> (Simulation, f64) {
-        let tick = Duration::from_secs_f64(1.0 / (TICK_HZ as f64 * self.factor));
-        let most_behind = MAX_BEHIND.max(tick * 2);
-        let mut next = Instant::now();
-        let mut lost = Duration::ZERO;
+        let mut pacer = Pacer::new(Instant::now(), self.factor);
         let mut warned: Option<(Instant, Duration)> = None;
         while !stop.load(Ordering::Relaxed) {
             let (simulation, link) = (&mut self.simulation, &mut self.link);
             link.receive(|bytes| simulation.handle_mavlink(bytes));
-            let now = Instant::now();
-            let behind = now.saturating_duration_since(next);
-            if behind > most_behind {
-                let given_up = behind.saturating_sub(most_behind);
-                lost += given_up;
-                next += given_up;
-                if warned.is_none_or(|(at, _)| at.elapsed() > WARN_EVERY) {
-                    let since =
-                        lost.saturating_sub(warned.map_or(Duration::ZERO, |(_, lost)| lost));
-                    tracing::warn!(
-                        "simulator: {:.0} ms of simulated time given up; the machine is too busy for real time",
-                        since.as_secs_f64() * 1e3,
-                    );
-                    warned = Some((now, lost));
-                }
-            }
-            while next <= now {
+            for _ in 0..pacer.due(Instant::now()) {
                 self.simulation.tick();
-                next += tick;
                 self.send_mavlink();
             }
             self.send_mocap();
-            std::thread::sleep(next.saturating_duration_since(Instant::now()));
+            let before = warned.map_or(Duration::ZERO, |(_, lost)| lost);
+            if pacer.lost > before && warned.is_none_or(|(at, _)| at.elapsed() > WARN_EVERY) {
+                tracing::warn!(
+                    "simulator: gave up {:.0} ms of simulated time; this machine is too busy for real time",
+                    pacer.lost.saturating_sub(before).as_secs_f64() * 1e3,
+                );
+                warned = Some((Instant::now(), pacer.lost));
+            }
+            std::thread::sleep(pacer.next.saturating_duration_since(Instant::now()));
         }
-        (self.simulation, lost.as_secs_f64())
+        (self.simulation, pacer.lost.as_secs_f64())
     }
 
     fn send_mavlink(&mut self) {
@@ -119,6 +108,81 @@ impl Driver {
         if let (Some(datagram), Some((socket, target))) = (newest, &self.mocap) {
             // Lost like any datagram if nobody listens.
             let _ = socket.send_to(&datagram, target);
+        }
+    }
+}
+
+/// Says how many ticks are due, and gives up what cannot be caught up.
+#[derive(Clone, Copy, Debug)]
+struct Pacer {
+    tick: Duration,
+    most_behind: Duration,
+    /// When the next tick is due.
+    next: Instant,
+    /// Given up since the start.
+    lost: Duration,
+}
+
+impl Pacer {
+    fn new(start: Instant, factor: f64) -> Self {
+        let tick = Duration::from_secs_f64(1.0 / (TICK_HZ as f64 * factor));
+        Self { tick, most_behind: MAX_BEHIND.max(tick * 2), next: start, lost: Duration::ZERO }
+    }
+
+    /// Returns the ticks due at `now` and counts them as done.
+    fn due(&mut self, now: Instant) -> u32 {
+        let given_up = now.saturating_duration_since(self.next).saturating_sub(self.most_behind);
+        self.lost += given_up;
+        self.next += given_up;
+        let mut ticks = 0;
+        while self.next <= now {
+            self.next += self.tick;
+            ticks += 1;
+        }
+        ticks
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: Duration = Duration::from_millis(1);
+
+    #[test]
+    fn on_time_nothing_is_lost_and_late_wake_ups_are_made_good() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(start, 1.0);
+        // Wake-ups 1 to 30 ms late, as on a busy machine.
+        let mut ticks = 0;
+        let mut now = start;
+        for i in 0..1000u32 {
+            now += MS * (1 + i * 7 % 30);
+            ticks += pacer.due(now);
+        }
+        let expected = (now - start).as_secs_f64() * TICK_HZ as f64;
+        assert!((f64::from(ticks) - expected).abs() <= 1.0, "{ticks} of {expected}");
+        assert_eq!(pacer.lost, Duration::ZERO);
+    }
+
+    #[test]
+    fn a_long_pause_is_given_up_but_for_a_tenth_of_a_second() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(start, 1.0);
+        assert_eq!(pacer.due(start), 1);
+        let ticks = pacer.due(start + MS * 5000);
+        assert!(ticks <= 41, "{ticks}");
+        assert!(pacer.lost > MS * 4890 && pacer.lost <= MS * 4900, "{:?}", pacer.lost);
+        assert_eq!(pacer.due(start + MS * 5010), 4);
+    }
+
+    #[test]
+    fn the_factor_scales_time() {
+        let start = Instant::now();
+        for (factor, expected) in [(0.1, 4), (4.0, 160)] {
+            let mut pacer = Pacer::new(start, factor);
+            pacer.due(start);
+            assert_eq!(pacer.due(start + MS * 100), expected);
         }
     }
 }

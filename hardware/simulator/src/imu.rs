@@ -21,7 +21,7 @@ const GYRO_WALK: f64 = 1e-4;
 /// Random walk of the accelerometer bias. [m/s^2 / sqrt(s)]
 const ACCEL_WALK: f64 = 1e-3;
 /// Range of the accelerometer: 16 g. [m/s^2]
-const ACCEL_RANGE_MPS2: f64 = 157.0;
+pub const ACCEL_RANGE_MPS2: f64 = 157.0;
 /// Range of the gyro: 2000 degrees a second. [rad/s]
 const GYRO_RANGE_RADPS: f64 = 34.9;
 /// White noise of the barometer per sample at 400 Hz, propeller wash included. [m]

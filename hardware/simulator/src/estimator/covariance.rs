@@ -51,6 +51,11 @@ impl Covariance {
         self.p[index][index] = sigma * sigma;
     }
 
+    /// Adds to the deviation of one error.
+    pub(super) fn doubt(&mut self, index: usize, sigma: f64) {
+        self.p[index][index] += sigma * sigma;
+    }
+
     /// Carries the covariance over `dt_s` of flight at a specific force and a turn rate.
     pub(super) fn predict(
         &mut self,
@@ -130,6 +135,11 @@ impl Covariance {
     pub(super) fn take_correction(&mut self) -> [DVec3; 5] {
         let c = std::mem::replace(&mut self.correction, [0.0; N]);
         std::array::from_fn(|g| DVec3::new(c[3 * g], c[3 * g + 1], c[3 * g + 2]))
+    }
+
+    /// Whether every deviation is a number.
+    pub(super) fn is_finite(&self) -> bool {
+        (0..N).all(|i| self.p[i][i].is_finite())
     }
 
     /// Returns the standard deviation of one error.

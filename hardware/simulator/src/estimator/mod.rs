@@ -20,7 +20,7 @@ use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
 use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::GRAVITY_MPS2;
-use crate::imu::SensorSample;
+use crate::imu::{ACCEL_RANGE_MPS2, SensorSample};
 use covariance::{ATTITUDE, Covariance, POSITION, VELOCITY};
 use stamp::StampCorrector;
 
@@ -37,6 +37,12 @@ const BARO_AFTER_S: f64 = 1.0;
 const MIN_INTERVAL_S: f64 = 0.018;
 /// Innovations beyond this many deviations are dropped (EK3_POS_I_GATE = 500 %).
 const GATE: f64 = 5.0;
+/// A sample at the accelerometer's end hides a change of velocity of unknown size: doubt it by this
+/// much. [m/s]
+const CLIPPED_MPS: f64 = 3.0;
+/// Beyond these the filter has lost itself and starts anew. [m], [m/s]
+const ABSURD_M: f64 = 1e5;
+const ABSURD_MPS: f64 = 300.0;
 /// How much of the past is remembered for late measurements. [s]
 const HISTORY_S: f64 = 0.55;
 /// IMU samples per prediction of the covariance: 100 Hz.
@@ -112,6 +118,8 @@ pub struct Estimator {
     reset_counter: u8,
     last_vision: Option<AutopilotTime>,
     last_measured: Option<AutopilotTime>,
+    /// The last two positions measured. [m, world]
+    measured: [Option<(AutopilotTime, DVec3)>; 2],
     prediction: Prediction,
     baro: Baro,
     last_still: Option<AutopilotTime>,
@@ -178,6 +186,7 @@ impl Default for Estimator {
             reset_counter: 0,
             last_vision: None,
             last_measured: None,
+            measured: [None; 2],
             prediction: Prediction::default(),
             baro: Baro::default(),
             last_still: None,
@@ -244,6 +253,13 @@ impl Estimator {
             return;
         }
         self.integrate(sample, dt_s);
+        let clipped = sample.accel_body_mps2.abs().max_element() > 0.98 * ACCEL_RANGE_MPS2;
+        if clipped {
+            for i in 0..3 {
+                self.covariance.doubt(VELOCITY + i, CLIPPED_MPS);
+            }
+        }
+        self.recover();
         self.history.push_back(Past {
             stamp: now,
             p: self.estimate.p_world_m,
@@ -265,7 +281,7 @@ impl Estimator {
     pub fn handle_vision(&mut self, now: AutopilotTime, m: &VisionMeasurement) {
         let pose = &m.world_from_body;
         // A float can carry a number that is finite but absurd.
-        if !pose.is_valid() || pose.translation_m.abs().max_element() > 1e5 {
+        if !pose.is_valid() || pose.translation_m.abs().max_element() > ABSURD_M {
             return;
         }
         self.last_vision = Some(now);
@@ -285,6 +301,8 @@ impl Estimator {
             return;
         }
         let p = pose.translation_m + DVec3::Z * self.height_offset_m;
+        self.measured.rotate_left(1);
+        self.measured[1] = Some((valid_at, p));
         match self.position {
             Position::Fused { since, .. } if !jumped => {
                 if self.fuse_position(now, p, past.p, m.sigma_m) {
@@ -297,6 +315,9 @@ impl Estimator {
                     Position::Unknown => now,
                 };
                 self.reset_position(p - past.p);
+                if since == now {
+                    self.reset_velocity(p, valid_at);
+                }
                 self.position = Position::Fused { since, last: now };
             }
         }
@@ -410,6 +431,49 @@ impl Estimator {
         self.baro.datum_m = None;
     }
 
+    /// A position found anew after a loss comes with the velocity that vision shows, if it shows
+    /// one: the velocity of the IMU alone may be anything by then.
+    fn reset_velocity(&mut self, p: DVec3, valid_at: AutopilotTime) {
+        let Some((before, p_before)) = self.measured[0] else { return };
+        let dt_s = valid_at.seconds_since(before);
+        if !(dt_s > 0.005 && dt_s < 0.2) {
+            return;
+        }
+        let v = (p - p_before) / dt_s;
+        if v.length() < 30.0 {
+            self.estimate.v_world_mps = v;
+            for i in 0..3 {
+                self.covariance.reset(VELOCITY + i, 1.0);
+            }
+        }
+    }
+
+    /// Starts the filter anew if its numbers have become absurd: from level, at rest, keeping the
+    /// heading if there is one left.
+    fn recover(&mut self) {
+        let e = &mut self.estimate;
+        let sane = e.p_world_m.abs().max_element() < ABSURD_M
+            && e.v_world_mps.abs().max_element() < ABSURD_MPS
+            && e.p_world_m.is_finite()
+            && e.v_world_mps.is_finite()
+            && e.world_from_body.is_normalized()
+            && self.covariance.is_finite();
+        if sane {
+            return;
+        }
+        let yaw_rad = yaw_of(e.world_from_body);
+        let level = DQuat::from_rotation_z(if yaw_rad.is_finite() { yaw_rad } else { 0.0 });
+        let fresh = Self::default();
+        *self = Self {
+            estimate: Estimate { world_from_body: level, ..fresh.estimate },
+            align: Align { done: true, ..Align::default() },
+            origin: self.origin,
+            height_offset_m: self.height_offset_m,
+            reset_counter: self.reset_counter,
+            ..fresh
+        };
+    }
+
     /// Applies the gathered correction to the estimate and to what is remembered.
     fn apply(&mut self, now: Option<AutopilotTime>) {
         let [p, v, turn, gyro_bias, accel_bias] = self.covariance.take_correction();
@@ -434,7 +498,7 @@ impl Estimator {
         const SAMPLES: u32 = 16;
         const SIGMA_M: f64 = 0.25;
         const LEARN: f64 = 0.02;
-        if !baro_m.is_finite() {
+        if !(baro_m.abs() < ABSURD_M) {
             return;
         }
         self.baro.sum_m += baro_m;

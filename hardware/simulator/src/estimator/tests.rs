@@ -121,7 +121,7 @@ fn a_persistent_jump_is_believed_after_the_position_was_lost() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..Default::default() })]
+    #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..Default::default() })]
     #[test]
     fn no_input_makes_the_estimate_anything_but_finite(
         inputs in prop::collection::vec(
