@@ -1,8 +1,10 @@
 //! Motion capture: the true pose in, Vicon Tracker's UDP object stream out. 200 Hz.
 //!
 //! Layout, little-endian, packed: `u32 frame, u8 items`, then per item `u8 id = 0, u16 size = 72,
-//! char[24] name, f64 x, y, z [mm], f64 rx, ry, rz [rad]`. Rotation: R = Rz(rz) * Ry(ry) * Rx(rx),
-//! i.e. rotations about fixed X, then fixed Y, then fixed Z.
+//! char[24] name, f64 x, y, z [mm], f64 rx, ry, rz [rad]`.
+//!
+//! Rotation: turns about the fixed x, then the fixed y, then the fixed z axis,
+//! `R = Rz(rz) * Ry(ry) * Rx(rx)`.
 
 use std::collections::VecDeque;
 

@@ -7,7 +7,7 @@
 use glam::DVec3;
 use serde::Serialize;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET};
+use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::{Airframe, AirframeState};
@@ -78,6 +78,8 @@ pub struct SimulationReport {
     pub mavlink_packets_in: u64,
     /// MAVLink packets sent.
     pub mavlink_packets_out: u64,
+    /// MAVLink packets dropped unsent because nobody took them in time.
+    pub mavlink_packets_dropped: u64,
     /// Mocap poses sent.
     pub mocap_poses: u64,
 }
@@ -205,13 +207,9 @@ impl Simulation {
             seconds: self.now.seconds_since(AutopilotTime::ZERO),
             mavlink_packets_in: self.autopilot.link_stats().packets,
             mavlink_packets_out: self.packets_out,
+            mavlink_packets_dropped: self.autopilot.outbox_dropped(),
             mocap_poses: self.mocap_poses,
         }
-    }
-
-    /// Whether the flight is over: flown, landed and disarmed.
-    pub fn is_over(&self) -> bool {
-        self.truth.report().landed && self.autopilot.mode() == CopterMode::Land
     }
 }
 

@@ -3,7 +3,7 @@
 //! The thrust axis is turned first, by the shortest way; the heading follows with less authority
 //! (Brescianini, D'Andrea, "Tilt-prioritized quadrocopter attitude control", 2018).
 
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
 
 use super::Limits;
@@ -131,17 +131,10 @@ fn limited_force(a_world_mps2: DVec3, limits: &Limits) -> (DVec3, bool) {
     (allowed + DVec3::Z * lift, cut)
 }
 
-/// Returns the attitude whose thrust axis is `up_world` with a heading. [rad, world]
-pub fn attitude_of(up_world: DVec3, yaw_rad: f64) -> DQuat {
-    let tilt = DQuat::from_rotation_arc(DVec3::Z, up_world.normalize_or(DVec3::Z));
-    let turned = tilt * DQuat::from_rotation_z(yaw_rad);
-    // The shortest tilt moves the heading a little: turn it back about the thrust axis.
-    turned * DQuat::from_rotation_z(wrap_pi(yaw_rad - yaw_of(turned)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DQuat;
     use proptest::prelude::*;
 
     const LIMITS: Limits = Limits {
@@ -168,7 +161,7 @@ mod tests {
         let estimate = Estimate {
             p_world_m: DVec3::ZERO,
             v_world_mps: DVec3::ZERO,
-            world_from_body: attitude_of(DVec3::Z, 0.4),
+            world_from_body: DQuat::from_rotation_z(0.4),
             omega_body_radps: DVec3::ZERO,
             a_world_mps2: DVec3::ZERO,
         };

@@ -6,7 +6,7 @@ use vizflyt_protocol::mavlink::dialect::{
     MavCmd, MavFrame, MavMessage, PARAM_REQUEST_LIST_DATA, PositionTargetTypemask,
     SET_POSITION_TARGET_LOCAL_NED_DATA,
 };
-use vizflyt_protocol::mavlink::{GuidedMotion, MavHeader, encode};
+use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, MavHeader, encode};
 use vizflyt_protocol::messages::YawTarget;
 
 #[test]
