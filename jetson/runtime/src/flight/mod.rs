@@ -117,8 +117,6 @@ const LOST_WHILE_LANDING_S: f64 = 10.0;
 const INTERRUPT_S: f64 = 1.0;
 /// How often to say what is being waited for. [s]
 const REMIND_S: f64 = 5.0;
-/// How often to say that setpoints are refused. [s]
-const REFUSED_S: f64 = 1.0;
 
 /// One flight. See the module.
 #[derive(Debug)]
@@ -144,7 +142,9 @@ pub struct Flight {
     disarmed_at: Option<HostTime>,
     connected_at: HostTime,
     reminded_at: Option<HostTime>,
+    /// Since when all setpoints have been refused.
     refused_at: Option<HostTime>,
+    landed_at: Option<HostTime>,
     notices: VecDeque<Notice>,
 }
 
@@ -172,6 +172,7 @@ impl Flight {
             connected_at: now,
             reminded_at: None,
             refused_at: None,
+            landed_at: None,
             notices: VecDeque::new(),
         }
     }
@@ -191,9 +192,10 @@ impl Flight {
         self.fix.as_ref()
     }
 
-    /// Returns seconds since take-off; 0 before. [s]
+    /// Returns seconds from take-off to `now` or the end of the landing; 0 before. [s]
     pub fn seconds(&self, now: HostTime) -> f64 {
-        self.took_off_at.map_or(0.0, |at| now.seconds_since(at))
+        let end = self.landed_at.unwrap_or(now);
+        self.took_off_at.map_or(0.0, |at| end.seconds_since(at))
     }
 
     /// Returns the next thing to tell.
@@ -222,9 +224,6 @@ impl Flight {
             }
             Input::Answered { seq, setpoint } => self.handle_answer(now, seq, setpoint),
             Input::PluginFailed(reason) => {
-                if self.outcome.is_none() {
-                    self.notice(EventKind::PluginFailed, reason.clone());
-                }
                 self.end_in_order(now, OutcomeKind::PluginFailed, reason);
             }
             Input::Interrupt => {
@@ -322,10 +321,13 @@ impl Flight {
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
             self.unanswered = None;
         }
-        let (Some(guard), Some(setpoint)) = (&mut self.guard, setpoint) else { return };
-        if !guard.ask(now, setpoint)
-            && self.refused_at.is_none_or(|at| now.seconds_since(at) >= REFUSED_S)
-        {
+        let (Some(guard), Some(setpoint), None) = (&mut self.guard, setpoint, &self.outcome) else {
+            return;
+        };
+        if guard.ask(now, setpoint) {
+            self.refused_at = None;
+        } else if self.refused_at.is_none() {
+            // Once per series; the hold and the landing that follow name it again.
             self.refused_at = Some(now);
             let text = format!("setpoint refused: a number in it is not finite: {setpoint:?}");
             self.notice(EventKind::Note, text);
@@ -433,6 +435,7 @@ impl Flight {
         let landing_s = now.seconds_since(self.phase_at);
         let silent = !link.connected && now.seconds_since(self.connected_at) > LOST_WHILE_LANDING_S;
         if landed {
+            self.landed_at = self.disarmed_at;
             self.enter(now, FlightPhase::Landed, "on the ground, disarmed");
         } else if released {
             self.enter(now, FlightPhase::Landed, "leaving; the autopilot lands by itself");
@@ -486,18 +489,31 @@ impl Flight {
         }
     }
 
+    /// Sets the outcome, if it is not set yet; returns its reason.
+    fn decide(&mut self, kind: OutcomeKind, reason: String) -> String {
+        if let Some(outcome) = &self.outcome {
+            return outcome.reason.clone();
+        }
+        if kind == OutcomeKind::PluginFailed {
+            self.notice(EventKind::PluginFailed, reason.clone());
+        }
+        self.outcome = Some(Outcome { kind, reason: reason.clone() });
+        reason
+    }
+
     /// Ends the flight: at once on the ground, by LAND in the air.
     fn end_now(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
-        let reason = self.outcome.get_or_insert(Outcome { kind, reason }).reason.clone();
+        let reason = self.decide(kind, reason);
         match self.phase {
             FlightPhase::Connecting | FlightPhase::Preparing => {
+                self.landed_at = Some(now);
                 self.enter(now, FlightPhase::Landed, &reason);
             }
             FlightPhase::TakingOff | FlightPhase::Flying | FlightPhase::Holding => {
                 if let Some(guard) = &mut self.guard {
                     guard.land();
                 }
-                self.enter(now, FlightPhase::Landing, &reason);
+                self.enter(now, FlightPhase::Landing, &format!("landing: {reason}"));
             }
             FlightPhase::Landing | FlightPhase::Landed => {}
         }
@@ -508,7 +524,7 @@ impl Flight {
         match &mut self.guard {
             Some(guard) if self.outcome.is_none() && self.phase != FlightPhase::Landing => {
                 guard.brake_and_land(now);
-                self.outcome = Some(Outcome { kind, reason });
+                self.decide(kind, reason);
             }
             Some(_) => {}
             None => self.end_now(now, kind, reason),
@@ -587,6 +603,9 @@ impl Flight {
                 format!("the plugin has not answered image {seq} for {silent_s:.1} s")
             }
             None if self.sees_nothing(now) => "no image has come from the server".into(),
+            None if self.refused_at.is_some() => {
+                "the plugin's setpoints are not finite numbers".into()
+            }
             None => "the plugin answers images without a setpoint".into(),
         }
     }

@@ -1,1 +1,370 @@
+//! The flight on a virtual clock, with a vehicle that does as it is told.
 
+use glam::DVec3;
+use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::messages::{Limits, YawTarget, bounded};
+use vizflyt_protocol::time::ServerTime;
+
+use super::*;
+
+struct Script {
+    flight: Flight,
+    now: HostTime,
+    link: LinkView,
+    p_m: DVec3,
+    v_mps: DVec3,
+    poses: bool,
+    /// Images are published, and answered so.
+    images: bool,
+    answers: Option<Option<Setpoint>>,
+    seq: u64,
+    orders: Orders,
+    notices: Vec<Notice>,
+}
+
+fn arena() -> ArenaInfo {
+    ArenaInfo {
+        name: bounded("test"),
+        geofence: Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0)),
+        limits: Limits { max_speed_mps: 3.0, max_acceleration_mps2: 5.0 },
+        body_radius_m: 0.1,
+        takeoff_height_m: 1.0,
+        goal_m: None,
+        goal_radius_m: 1.0,
+        time_limit_s: 30.0,
+        cameras: heapless::Vec::new(),
+    }
+}
+
+impl Script {
+    fn new() -> Self {
+        let now = HostTime::from_ns(1_000_000_000);
+        let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0 };
+        Self {
+            flight: Flight::new(settings, now),
+            now,
+            link: LinkView {
+                connected: true,
+                armed: false,
+                mode: 0,
+                took_off: false,
+                ready_to_arm: Ok(()),
+            },
+            p_m: DVec3::Z * 0.05,
+            v_mps: DVec3::ZERO,
+            poses: true,
+            images: true,
+            answers: Some(Some(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep))),
+            seq: 0,
+            orders: Orders { goal: Goal::Prepare, setpoint: None },
+            notices: Vec::new(),
+        }
+    }
+
+    fn flying() -> Self {
+        let mut script = Self::new();
+        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+        script.flight.handle(script.now, Input::PluginReady);
+        script.run(4.0);
+        assert_eq!(script.flight.phase(), FlightPhase::Flying, "{:?}", script.notices);
+        script
+    }
+
+    fn run(&mut self, seconds: f64) {
+        for _ in 0..(seconds * 50.0).round() as usize {
+            self.now = self.now.plus_ns(20_000_000);
+            if self.poses {
+                let fix = Fix {
+                    stamp: self.now.plus_ns(-10_000_000),
+                    p_world_m: self.p_m,
+                    v_world_mps: self.v_mps,
+                    yaw_rad: 0.0,
+                };
+                self.flight.handle(self.now, Input::Pose(fix));
+            }
+            if self.images && self.flight.arena.is_some() {
+                self.seq += 1;
+                self.flight.handle(self.now, Input::ImagePublished { seq: self.seq });
+                if let Some(setpoint) = self.answers {
+                    let answer = Input::Answered { seq: self.seq, setpoint };
+                    self.flight.handle(self.now, answer);
+                }
+            }
+            self.orders = self.flight.tick(self.now, &self.link);
+            self.obey();
+            while let Some(notice) = self.flight.poll_notice() {
+                self.notices.push(notice);
+            }
+        }
+    }
+
+    /// The vehicle.
+    fn obey(&mut self) {
+        if !self.link.connected {
+            return;
+        }
+        self.v_mps = DVec3::ZERO;
+        match self.orders.goal {
+            Goal::Prepare | Goal::Fly => {}
+            Goal::TakeOff(height_m) => {
+                (self.link.mode, self.link.armed, self.link.took_off) = (4, true, true);
+                if self.p_m.z < 0.05 + f64::from(height_m) {
+                    self.v_mps = DVec3::Z * 0.5;
+                }
+            }
+            Goal::Land if self.link.armed => {
+                self.link.mode = 9;
+                self.v_mps = DVec3::NEG_Z * 0.5;
+                if self.p_m.z < 0.05 {
+                    self.link.armed = false;
+                }
+            }
+            Goal::Land => {}
+        }
+        if let Some(setpoint) = self.orders.setpoint
+            && let vizflyt_protocol::mavlink::GuidedMotion::Velocity(v) = setpoint.motion
+        {
+            self.v_mps = v;
+        }
+        self.p_m += self.v_mps * 0.02;
+    }
+
+    fn server(&mut self, kind: EventKind, text: &str) {
+        let event = Event { stamp: ServerTime::ZERO, kind, text: bounded(text) };
+        self.flight.handle(self.now, Input::Server(event));
+    }
+
+    fn phases(&self) -> Vec<FlightPhase> {
+        let phase = |notice: &Notice| match notice.kind {
+            EventKind::Phase(phase) => Some(phase),
+            _ => None,
+        };
+        self.notices.iter().filter_map(phase).collect()
+    }
+
+    /// Lets it end and checks how.
+    fn check_end(&mut self, kind: OutcomeKind, reason: &str) {
+        self.run(15.0);
+        let outcome = self.flight.outcome().unwrap_or_else(|| panic!("{:?}", self.notices));
+        assert_eq!(outcome.kind, kind, "{outcome:?}");
+        assert!(outcome.reason.contains(reason), "{outcome:?}");
+        assert!(!self.link.armed, "it is on the ground");
+    }
+}
+
+#[test]
+fn from_contact_to_the_goal_to_the_ground() {
+    let mut script = Script::flying();
+    script.run(3.0);
+    assert!(script.orders.setpoint.is_some() && script.orders.goal == Goal::Fly);
+    script.server(EventKind::Finished { seconds: 5.0 }, "goal reached in 5.0 s");
+    script.check_end(OutcomeKind::Finished, "goal reached");
+    use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
+    let phases = script.phases();
+    assert_eq!(phases[..3], [Preparing, TakingOff, Flying]);
+    assert_eq!(phases[phases.len() - 2..], [Landing, Landed]);
+    assert!(phases[3..phases.len() - 2].iter().all(|phase| *phase == Holding), "{phases:?}");
+    assert!(script.flight.seconds(script.now) > 5.0);
+}
+
+#[test]
+fn nothing_is_armed_before_all_are_ready() {
+    let checks: [(fn(&mut Script), &str); 6] = [
+        (|script| script.link.connected = false, "no heartbeat"),
+        (|script| script.link.ready_to_arm = Err("the compass is confused"), "compass"),
+        (|script| script.poses = false, "no pose"),
+        (|script| script.images = false, "not answered an image"),
+        (|script| script.answers = None, "not answered an image"),
+        (|script| script.link.armed = true, "armed already"),
+    ];
+    for (spoil, expected) in checks {
+        let mut script = Script::new();
+        spoil(&mut script);
+        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+        script.flight.handle(script.now, Input::PluginReady);
+        for _ in 0..18 {
+            script.run(1.0);
+            assert_eq!(script.orders.goal, Goal::Prepare, "{expected}");
+        }
+        let reminders: Vec<_> =
+            script.notices.iter().filter(|n| n.text.contains(expected)).collect();
+        assert!(reminders.len() >= 3, "{expected}: {:?}", script.notices);
+        script.run(3.0);
+        let outcome = script.flight.outcome().unwrap();
+        assert_eq!(outcome.kind, OutcomeKind::Error);
+        assert!(outcome.reason.starts_with("not in the air after 20 s"), "{outcome:?}");
+    }
+}
+
+#[test]
+fn the_plugin_must_be_ready_and_the_arena_known() {
+    let mut script = Script::new();
+    script.run(6.0);
+    assert!(script.notices.iter().any(|notice| notice.text.contains("no answer from the server")));
+    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.run(6.0);
+    assert!(script.notices.iter().any(|notice| notice.text.contains("on_start")));
+    assert_eq!(script.flight.phase(), FlightPhase::Connecting);
+}
+
+#[test]
+fn each_event_has_its_outcome() {
+    let (p_world_m, clearance_m) = (DVec3::ONE, -0.1);
+    let check = |kind: EventKind, outcome| {
+        let mut script = Script::flying();
+        script.server(kind, "the server says so");
+        let brakes = matches!(outcome, OutcomeKind::Timeout);
+        script.run(0.02);
+        assert!(brakes || script.orders.goal == Goal::Land, "lands at once");
+        script.check_end(outcome, "");
+    };
+    check(EventKind::Collision { p_world_m, clearance_m }, OutcomeKind::Collided);
+    check(EventKind::Geofence { p_world_m, margin_m: 0.0 }, OutcomeKind::Geofence);
+    check(EventKind::TimeLimit, OutcomeKind::Timeout);
+    check(EventKind::EmergencyStop, OutcomeKind::Landed);
+}
+
+#[test]
+fn on_the_ground_only_the_stop_button_ends_it() {
+    let mut script = Script::new();
+    script.server(EventKind::TimeLimit, "time");
+    script.server(EventKind::Collision { p_world_m: DVec3::ZERO, clearance_m: 0.0 }, "floor");
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), FlightPhase::Connecting);
+    script.server(EventKind::EmergencyStop, "stop");
+    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+}
+
+#[test]
+fn a_failed_plugin_lands_the_vehicle_and_says_why() {
+    let mut script = Script::flying();
+    script.answers = None;
+    script.flight.handle(script.now, Input::PluginFailed("killed by SIGSEGV".into()));
+    script.check_end(OutcomeKind::PluginFailed, "killed by SIGSEGV");
+    let failures =
+        script.notices.iter().filter(|notice| notice.kind == EventKind::PluginFailed).count();
+    assert_eq!(failures, 1);
+
+    let mut script = Script::new();
+    script.flight.handle(script.now, Input::PluginFailed("exit status 1".into()));
+    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::PluginFailed);
+}
+
+#[test]
+fn a_silent_plugin_holds_then_lands() {
+    let mut script = Script::flying();
+    script.answers = None;
+    script.run(0.7);
+    assert_eq!(script.flight.phase(), FlightPhase::Holding);
+    // One that comes back in time is given the vehicle back.
+    script.answers = Some(Some(Setpoint::Hold));
+    script.run(0.5);
+    assert_eq!(script.flight.phase(), FlightPhase::Flying);
+    script.answers = None;
+    script.check_end(OutcomeKind::PluginFailed, "has not answered image");
+}
+
+#[test]
+fn why_no_setpoint_comes_is_told_apart() {
+    let mut script = Script::flying();
+    script.answers = Some(None);
+    script.check_end(OutcomeKind::PluginFailed, "without a setpoint");
+
+    let mut script = Script::flying();
+    script.answers = Some(Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep)));
+    script.check_end(OutcomeKind::PluginFailed, "not finite");
+
+    let mut script = Script::flying();
+    script.images = false;
+    script.check_end(OutcomeKind::Error, "no image has come");
+}
+
+#[test]
+fn lost_poses_hold_then_land() {
+    let mut script = Script::flying();
+    script.poses = false;
+    script.run(0.7);
+    assert_eq!(script.flight.phase(), FlightPhase::Holding);
+    script.run(1.5);
+    assert_eq!(script.flight.phase(), FlightPhase::Landing);
+    script.check_end(OutcomeKind::Error, "pose lost for 2.0 s");
+}
+
+#[test]
+fn a_take_off_that_goes_wrong_is_landed() {
+    let mut script = Script::new();
+    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.flight.handle(script.now, Input::PluginReady);
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), FlightPhase::TakingOff);
+    script.flight.handle(script.now, Input::Link(LinkEvent::Refused("take-off denied".into())));
+    script.check_end(OutcomeKind::Error, "take-off denied");
+}
+
+#[test]
+fn a_lost_link_or_a_restart_ends_the_flight() {
+    for (event, expected) in [(LinkEvent::Lost, "silent"), (LinkEvent::Rebooted, "restarted")] {
+        let mut script = Script::flying();
+        script.flight.handle(script.now, Input::Link(event));
+        script.check_end(OutcomeKind::Error, expected);
+    }
+    // Nothing comes any more at all: the flight still ends.
+    let mut script = Script::flying();
+    script.link.connected = false;
+    script.flight.handle(script.now, Input::Link(LinkEvent::Lost));
+    script.run(12.0);
+    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Error);
+}
+
+#[test]
+fn a_pilot_who_takes_over_is_left_alone() {
+    let mut script = Script::flying();
+    script.link.mode = CopterMode::Loiter as u32;
+    script.run(5.0);
+    assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None });
+    assert_eq!(script.flight.phase(), FlightPhase::Landing);
+    script.link.armed = false;
+    script.check_end(OutcomeKind::Error, "switched to Loiter, not by this runtime");
+}
+
+#[test]
+fn an_interrupt_lands_first_and_leaves_soon() {
+    let mut script = Script::flying();
+    script.flight.handle(script.now, Input::Interrupt);
+    script.run(0.02);
+    assert_eq!(script.orders.goal, Goal::Land);
+    script.run(1.2);
+    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+    assert!(script.link.armed, "it is still coming down, in LAND");
+    assert_eq!(script.link.mode, 9);
+}
+
+#[test]
+fn time_limits_count_from_take_off_and_the_shorter_wins() {
+    let mut script = Script::flying();
+    script.flight.settings.time_limit_s = 5.0;
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), FlightPhase::Flying);
+    script.check_end(OutcomeKind::Timeout, "5 s");
+
+    let mut script = Script::flying();
+    script.flight.settings.time_limit_s = 500.0;
+    script.answers = Some(Some(Setpoint::Hold));
+    script.run(15.0);
+    script.check_end(OutcomeKind::Timeout, "30 s");
+}
+
+#[test]
+fn a_server_that_comes_back_with_another_arena_ends_it() {
+    let mut script = Script::flying();
+    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    assert_eq!(script.flight.phase(), FlightPhase::Flying, "the same arena is welcome");
+    let other = ArenaInfo { body_radius_m: 0.3, ..arena() };
+    script.flight.handle(script.now, Input::Arena(Box::new(other)));
+    script.check_end(OutcomeKind::Error, "another arena");
+
+    let mut script = Script::new();
+    let broken = ArenaInfo { takeoff_height_m: f64::NAN, ..arena() };
+    script.flight.handle(script.now, Input::Arena(Box::new(broken)));
+    assert!(script.flight.outcome().unwrap().reason.contains("takeoff_height_m"));
+}
