@@ -40,7 +40,8 @@ pub struct ImagePublisher {
     decoder: Decoder,
     seq: u64,
     under_way: Option<UnderWay>,
-    newest_tick: u64,
+    /// Tick of the newest image, and the stamp of its pose.
+    newest: (u64, HostTime),
     rejected: u64,
 }
 
@@ -63,7 +64,7 @@ impl ImagePublisher {
             decoder: Decoder::default(),
             seq: 0,
             under_way: None,
-            newest_tick: 0,
+            newest: (0, HostTime::ZERO),
             rejected: 0,
         }
     }
@@ -96,11 +97,12 @@ impl ImagePublisher {
             (ours.width_px, ours.height_px) == (theirs.width_px, theirs.height_px)
         });
         let tick = image.header.seq.get();
-        if !fits || tick < self.newest_tick {
+        // A server that restarted counts from the start again, but its poses are newer.
+        if !fits || (tick < self.newest.0 && image.pose <= self.newest.1) {
             self.reject("it is of no camera of this arena, or stale");
             return Ok(());
         }
-        self.newest_tick = tick;
+        self.newest = (tick, image.pose);
         if self.under_way.as_ref().is_some_and(|under_way| under_way.tick != tick) {
             self.publish(tell)?;
         }
@@ -166,5 +168,119 @@ impl ImagePublisher {
         if self.rejected.is_power_of_two() {
             tracing::warn!("{} images dropped so far; the last because {why}", self.rejected);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+    use vizflyt_protocol::messages::{Name, bounded};
+    use vizflyt_protocol::packet::ImageHeader;
+    use vizflyt_protocol::time::ServerTime;
+    use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
+    use vizflyt_sdk::Observation;
+    use vizflyt_sdk::glam::DVec3;
+    use vizflyt_sdk::ipc::{PluginEnd, unique_service};
+
+    fn camera(name: &str) -> CameraInfo {
+        CameraInfo {
+            name: bounded(name),
+            intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
+            body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+        }
+    }
+
+    fn image(camera: u8, tick: u64, depth_mm: u16) -> ReceivedImage {
+        let k = Intrinsics::from_horizontal_fov(32, 24, 1.5);
+        let (rgb, depth_mm) = (vec![90; 32 * 24 * 3], vec![depth_mm; 32 * 24]);
+        let view = RgbdView { width: 32, height: 24, rgb: &rgb, depth_mm: &depth_mm };
+        let mut payload = Vec::new();
+        Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
+        ReceivedImage {
+            header: ImageHeader::new(tick, camera, ServerTime::ZERO, &k, &Pose::IDENTITY),
+            payload,
+            pose: HostTime::from_ns(1000 * tick),
+            received: HostTime::from_ns(1000 * tick + 500),
+        }
+    }
+
+    /// Name, tick, depth. [m]
+    type Seen = (String, u64, f32);
+
+    struct Rig {
+        publisher: ImagePublisher,
+        plugin: PluginEnd,
+        names: Vec<Name>,
+    }
+
+    impl Rig {
+        fn new(names: &[&str]) -> Self {
+            let cameras: Vec<_> = names.iter().map(|name| camera(name)).collect();
+            let service = unique_service();
+            let len = ObservationWriter::len_for(&cameras);
+            let ipc = Arc::new(RuntimeEnd::create(&service, len).unwrap());
+            let plugin = PluginEnd::open(&service).unwrap();
+            let names = cameras.iter().map(|camera| camera.name.clone()).collect();
+            Self { publisher: ImagePublisher::new(ipc, cameras, Arc::default()), plugin, names }
+        }
+
+        /// Gives it an image; returns what was told and (tick, metres) of each camera the plugin
+        /// sees.
+        fn take(&mut self, image: &ReceivedImage) -> Option<(Published, Vec<Seen>)> {
+            let mut told = None;
+            self.publisher.take(image, &mut |published| told = Some(published)).unwrap();
+            let sample = self.plugin.observation().unwrap();
+            assert_eq!(told.is_some(), sample.is_some(), "told and published are the same");
+            let sample = sample?;
+            let observation = Observation::from_bytes(sample.bytes(), &self.names).unwrap();
+            let seen = observation
+                .cameras()
+                .map(|c| (c.name.to_owned(), c.seq, c.depth_m(31, 23).unwrap()))
+                .collect();
+            assert_eq!(observation.seq(), told.unwrap().seq);
+            Some((told.unwrap(), seen))
+        }
+    }
+
+    #[test]
+    fn an_image_is_decoded_into_the_plugins_memory() {
+        let mut rig = Rig::new(&["front"]);
+        let (published, seen) = rig.take(&image(0, 5, 1250)).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 5, 1.25)]);
+        assert_eq!((published.seq, published.pose.as_ns()), (1, 5000));
+        assert!(published.ready > published.received);
+        assert!(rig.take(&image(0, 4, 9)).is_none(), "stale");
+        assert_eq!(rig.take(&image(0, 6, 2000)).unwrap().0.seq, 2);
+        let restarted = ReceivedImage { pose: HostTime::from_ns(99_000), ..image(0, 1, 2000) };
+        assert_eq!(rig.take(&restarted).unwrap().0.seq, 3, "a server that counts anew");
+    }
+
+    #[test]
+    fn cameras_of_a_tick_come_together_and_a_missing_one_is_not_waited_for() {
+        let mut rig = Rig::new(&["front", "rear"]);
+        assert!(rig.take(&image(0, 1, 1000)).is_none());
+        let (_, seen) = rig.take(&image(1, 1, 2000)).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 1, 2.0)]);
+        // The rear image of tick 2 is lost.
+        assert!(rig.take(&image(0, 2, 1100)).is_none());
+        let (_, seen) = rig.take(&image(1, 3, 2200)).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 2, 1.1)]);
+        let (_, seen) = rig.take(&image(0, 3, 1200)).unwrap();
+        assert_eq!(seen.len(), 2);
+    }
+
+    #[test]
+    fn images_that_are_nonsense_are_dropped() {
+        let mut rig = Rig::new(&["front"]);
+        assert!(rig.take(&image(3, 1, 1000)).is_none(), "there is no camera 3");
+        let mut cut = image(0, 2, 1000);
+        cut.payload.truncate(cut.payload.len() / 2);
+        assert!(rig.take(&cut).is_none());
+        let mut other_size = image(0, 3, 1000);
+        other_size.header.width_px = 64.into();
+        assert!(rig.take(&other_size).is_none());
+        assert!(rig.take(&image(0, 4, 1000)).is_some());
+        assert_eq!(rig.publisher.rejected, 3);
     }
 }

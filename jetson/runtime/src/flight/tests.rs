@@ -6,6 +6,15 @@ use vizflyt_protocol::messages::{Limits, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
 
 use super::*;
+use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
+
+/// What the plugin does with an image.
+#[derive(Clone, Copy)]
+enum Answers {
+    Never,
+    Without,
+    With(Setpoint),
+}
 
 struct Script {
     flight: Flight,
@@ -16,7 +25,7 @@ struct Script {
     poses: bool,
     /// Images are published, and answered so.
     images: bool,
-    answers: Option<Option<Setpoint>>,
+    answers: Answers,
     seq: u64,
     orders: Orders,
     notices: Vec<Notice>,
@@ -54,7 +63,7 @@ impl Script {
             v_mps: DVec3::ZERO,
             poses: true,
             images: true,
-            answers: Some(Some(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep))),
+            answers: Answers::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
             seq: 0,
             orders: Orders { goal: Goal::Prepare, setpoint: None },
             notices: Vec::new(),
@@ -85,7 +94,12 @@ impl Script {
             if self.images && self.flight.arena.is_some() {
                 self.seq += 1;
                 self.flight.handle(self.now, Input::ImagePublished { seq: self.seq });
-                if let Some(setpoint) = self.answers {
+                let setpoint = match self.answers {
+                    Answers::Never => None,
+                    Answers::Without => Some(None),
+                    Answers::With(setpoint) => Some(Some(setpoint)),
+                };
+                if let Some(setpoint) = setpoint {
                     let answer = Input::Answered { seq: self.seq, setpoint };
                     self.flight.handle(self.now, answer);
                 }
@@ -105,7 +119,6 @@ impl Script {
         }
         self.v_mps = DVec3::ZERO;
         match self.orders.goal {
-            Goal::Prepare | Goal::Fly => {}
             Goal::TakeOff(height_m) => {
                 (self.link.mode, self.link.armed, self.link.took_off) = (4, true, true);
                 if self.p_m.z < 0.05 + f64::from(height_m) {
@@ -119,7 +132,7 @@ impl Script {
                     self.link.armed = false;
                 }
             }
-            Goal::Land => {}
+            Goal::Prepare | Goal::Fly | Goal::Land => {}
         }
         if let Some(setpoint) = self.orders.setpoint
             && let vizflyt_protocol::mavlink::GuidedMotion::Velocity(v) = setpoint.motion
@@ -159,7 +172,6 @@ fn from_contact_to_the_goal_to_the_ground() {
     assert!(script.orders.setpoint.is_some() && script.orders.goal == Goal::Fly);
     script.server(EventKind::Finished { seconds: 5.0 }, "goal reached in 5.0 s");
     script.check_end(OutcomeKind::Finished, "goal reached");
-    use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
     let phases = script.phases();
     assert_eq!(phases[..3], [Preparing, TakingOff, Flying]);
     assert_eq!(phases[phases.len() - 2..], [Landing, Landed]);
@@ -169,12 +181,13 @@ fn from_contact_to_the_goal_to_the_ground() {
 
 #[test]
 fn nothing_is_armed_before_all_are_ready() {
-    let checks: [(fn(&mut Script), &str); 6] = [
+    type Spoil = fn(&mut Script);
+    let checks: [(Spoil, &str); 6] = [
         (|script| script.link.connected = false, "no heartbeat"),
         (|script| script.link.ready_to_arm = Err("the compass is confused"), "compass"),
         (|script| script.poses = false, "no pose"),
         (|script| script.images = false, "not answered an image"),
-        (|script| script.answers = None, "not answered an image"),
+        (|script| script.answers = Answers::Never, "not answered an image"),
         (|script| script.link.armed = true, "armed already"),
     ];
     for (spoil, expected) in checks {
@@ -238,7 +251,7 @@ fn on_the_ground_only_the_stop_button_ends_it() {
 #[test]
 fn a_failed_plugin_lands_the_vehicle_and_says_why() {
     let mut script = Script::flying();
-    script.answers = None;
+    script.answers = Answers::Never;
     script.flight.handle(script.now, Input::PluginFailed("killed by SIGSEGV".into()));
     script.check_end(OutcomeKind::PluginFailed, "killed by SIGSEGV");
     let failures =
@@ -253,25 +266,25 @@ fn a_failed_plugin_lands_the_vehicle_and_says_why() {
 #[test]
 fn a_silent_plugin_holds_then_lands() {
     let mut script = Script::flying();
-    script.answers = None;
+    script.answers = Answers::Never;
     script.run(0.7);
     assert_eq!(script.flight.phase(), FlightPhase::Holding);
     // One that comes back in time is given the vehicle back.
-    script.answers = Some(Some(Setpoint::Hold));
+    script.answers = Answers::With(Setpoint::Hold);
     script.run(0.5);
     assert_eq!(script.flight.phase(), FlightPhase::Flying);
-    script.answers = None;
+    script.answers = Answers::Never;
     script.check_end(OutcomeKind::PluginFailed, "has not answered image");
 }
 
 #[test]
 fn why_no_setpoint_comes_is_told_apart() {
     let mut script = Script::flying();
-    script.answers = Some(None);
+    script.answers = Answers::Without;
     script.check_end(OutcomeKind::PluginFailed, "without a setpoint");
 
     let mut script = Script::flying();
-    script.answers = Some(Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep)));
+    script.answers = Answers::With(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
     script.check_end(OutcomeKind::PluginFailed, "not finite");
 
     let mut script = Script::flying();
@@ -349,7 +362,7 @@ fn time_limits_count_from_take_off_and_the_shorter_wins() {
 
     let mut script = Script::flying();
     script.flight.settings.time_limit_s = 500.0;
-    script.answers = Some(Some(Setpoint::Hold));
+    script.answers = Answers::With(Setpoint::Hold);
     script.run(15.0);
     script.check_end(OutcomeKind::Timeout, "30 s");
 }

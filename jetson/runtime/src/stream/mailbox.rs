@@ -36,7 +36,11 @@ impl Mailbox {
         let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(slot) = slots.get_mut(usize::from(image.header.camera)) else { return };
         match slot {
-            Some(waiting) if waiting.header.seq.get() >= image.header.seq.get() => {
+            // By pose too: a server that restarted counts from the start again.
+            Some(waiting)
+                if waiting.header.seq.get() >= image.header.seq.get()
+                    && waiting.pose >= image.pose =>
+            {
                 self.replaced.fetch_add(1, Ordering::Relaxed);
             }
             slot => {

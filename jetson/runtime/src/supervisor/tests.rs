@@ -17,7 +17,7 @@ use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use super::*;
 
 /// Far beyond anything a loaded machine needs; tests end when the awaited thing happens.
-const WAIT: Duration = Duration::from_secs(60);
+const WAIT: Duration = Duration::from_mins(1);
 
 fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
     let (sender, receiver) = channel();
