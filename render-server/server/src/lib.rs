@@ -1,7 +1,7 @@
 //! The render server: poses in, RGB-D out; referee's events, page, report.
 //!
 //! ```text
-//! drivers (Vicon UDP) -> tick::poses (track: gate, referee) -> hub: newest pose, events
+//! drivers (Vicon UDP) -> tick::poses (arena: gate, referee) -> hub: newest pose, events
 //!                        tick::draw  (renderer)             -> mailbox: newest drawn tick
 //!                        encode      (room in the outlet?)  -> outlet -> transport (QUIC)
 //!                                                           -> previews -> dashboard (WebSocket)
@@ -25,7 +25,6 @@ mod serve;
 pub mod stats;
 pub mod stop;
 pub mod tick;
-pub mod track;
 pub mod transport;
 
 pub use args::ServeArgs;

@@ -3,12 +3,11 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::Instant;
 
 use anyhow::{Context, Result};
 use glam::DVec2;
 use serde::Serialize;
-use tracing::info;
+use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
 use vizflyt_splat::Splats;
 
 use crate::args::ServeArgs;
@@ -21,7 +20,6 @@ use crate::render::{Renderer, best};
 use crate::scene::{self, Scene};
 use crate::stats::Report;
 use crate::stop::Stop;
-use crate::track::{Solid, Track};
 use crate::transport::{self, Identity};
 use crate::{dashboard, encode, tick};
 
@@ -81,7 +79,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     };
     let renderer_name = twin.renderer.name();
     let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), renderer_name, stop.clone()));
-    let threads = start_threads(args, &hub, twin.renderer, twin.track, vicon)?;
+    let threads = start_threads(args, &hub, twin.renderer, twin.referee, vicon)?;
 
     let fingerprint = identity.fingerprint();
     let spawn = twin.arena.spawn;
@@ -115,30 +113,29 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
 
 /// Everything made from the scene.
 struct Twin {
-    arena: vizflyt_arena::ArenaConfig,
+    arena: ArenaConfig,
     renderer: Box<dyn Renderer>,
-    track: Track,
+    referee: Referee,
     map: Map,
 }
 
 fn prepare(args: &ServeArgs) -> Result<Twin> {
     let Scene { arena, splats } = scene::load(&args.arena, args.up, args.scale)?;
-    let start = Instant::now();
-    let solid = Solid::bake(&splats, &arena)?;
-    info!("obstacles baked in {:.0} ms: {solid}", start.elapsed().as_secs_f64() * 1e3);
-    let map = draw_map(&splats, &arena, &solid);
+    let obstacles = scene::bake(&splats, &arena);
+    let map = draw_map(&splats, &arena, &obstacles);
     let renderer = best(&splats);
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
-    let track = Track::new(&arena, solid);
-    Ok(Twin { arena, renderer, track, map })
+    let referee = Referee::new(&arena, obstacles);
+    Ok(Twin { arena, renderer, referee, map })
 }
 
-fn draw_map(splats: &Splats, arena: &vizflyt_arena::ArenaConfig, solid: &Solid) -> Map {
+fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map {
     let (min, max) = (arena.geofence.min_m.truncate(), arena.geofence.max_m.truncate());
     let flight_m = arena.spawn.position_m.z + arena.takeoff_height_m;
-    let obstacles =
-        Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| solid.at(p.extend(flight_m)));
+    let obstacles = Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| {
+        field.obstacle_distance_m(p.extend(flight_m)) < 0.0
+    });
     let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M, best);
     Map { jpeg: jpeg.unwrap_or_default(), min_m: min.to_array(), max_m: max.to_array(), obstacles }
 }
@@ -147,7 +144,7 @@ fn start_threads(
     args: &ServeArgs,
     hub: &Arc<Hub>,
     mut renderer: Box<dyn Renderer>,
-    track: Track,
+    referee: Referee,
     mut source: impl PoseSource + 'static,
 ) -> Result<Vec<JoinHandle<()>>> {
     let newest = Arc::new(Mailbox::default());
@@ -162,7 +159,10 @@ fn start_threads(
     let (draw_hub, draw_drawn, max_rate) = (hub.clone(), drawn.clone(), args.max_rate);
     let (encode_hub, quality) = (hub.clone(), args.quality);
     Ok(vec![
-        start("pose", Box::new(move || tick::poses(&pose_hub, &mut source, track, &pose_newest)))?,
+        start(
+            "pose",
+            Box::new(move || tick::poses(&pose_hub, &mut source, referee, &pose_newest)),
+        )?,
         start(
             "render",
             Box::new(move || {

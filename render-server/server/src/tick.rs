@@ -1,7 +1,7 @@
 //! The two threads that drive everything: poses in, drawn ticks out.
 //!
 //! ```text
-//! pose thread:   source -> Track (gate, referee) -> Hub::pose, trail, events       200 Hz
+//! pose thread:   source -> Referee (gate, rules) -> Hub::pose, trail, events       200 Hz
 //!                                                \-> newest pose (mailbox)
 //! render thread: newest pose -> all cameras of the arena -> drawn ticks (mailbox)  as fast as
 //!                the machine draws, at most --max-rate; rests while nobody wants images
@@ -14,51 +14,69 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tracing::{trace_span, warn};
+use vizflyt_arena::Referee;
+use vizflyt_arena::pose::Rejected;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_splat::Camera;
 
 use crate::clock;
-use crate::drivers::PoseSource;
+use crate::drivers::{PoseSource, SourceCounters};
 use crate::encode::{self, DrawnTick};
+use crate::events::Origin;
 use crate::hub::{Hub, lock};
 use crate::mailbox::Mailbox;
 use crate::render::Renderer;
-use crate::track::Track;
 
 /// Takes poses from `source` until the server stops.
 pub fn poses(
     hub: &Arc<Hub>,
     source: &mut dyn PoseSource,
-    mut track: Track,
+    mut referee: Referee,
     newest: &Mailbox<Option<PoseSample>>,
 ) {
     let mut flights = hub.flights();
+    let (mut rejected, mut warned) = (0u64, None::<Instant>);
     while !hub.stop.is_set() {
-        let measured = source.receive(PATIENCE);
+        let due = referee.poll_timeout().map_or(PATIENCE, |due| {
+            Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
+        });
+        let measured = source.receive(due.min(PATIENCE));
         // A new runtime on the ground is a new flight: course and timer start afresh.
         let now_flights = hub.flights();
         if now_flights != flights {
             flights = now_flights;
-            track.restart();
+            referee.restart();
         }
-        track.phase(hub.phase());
         if let Some(measured) = measured {
-            if let Some(sample) = track.pose(&measured) {
-                hub.pose.send_replace(Some(sample));
-                newest.put(Some(sample));
-                lock(&hub.trail).add(&sample);
+            let _span = trace_span!("pose", stamp_ns = measured.stamp.as_ns()).entered();
+            match referee.handle_measurement(measured.stamp, measured.world_from_body) {
+                Ok(sample) => {
+                    hub.pose.send_replace(Some(sample));
+                    newest.put(Some(sample));
+                    lock(&hub.trail).add(&sample);
+                }
+                Err(reason) => {
+                    rejected += 1;
+                    // Two frames of one burst may bear the same stamp: no fault of anyone's.
+                    let known = matches!(reason, Rejected::Stale);
+                    if !known && warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
+                        warned = Some(Instant::now());
+                        warn!("{reason}");
+                        hub.note(&reason.to_string());
+                    }
+                }
             }
             hub.stats.pose.add(measured.arrival, clock::now());
         }
-        track.timeout(clock::now());
-        while let Some((kind, text)) = track.next_event() {
-            hub.tell(kind, &text);
+        referee.handle_timeout(clock::now());
+        while let Some(event) = referee.poll_event() {
+            hub.log(Origin::Server, event);
         }
         while let Some(warning) = source.next_warning() {
             warn!("{warning}");
             hub.note(&warning);
         }
-        *lock(&hub.source) = source.counters();
+        *lock(&hub.source) = SourceCounters { rejected, ..source.counters() };
     }
 }
 
@@ -121,6 +139,8 @@ pub fn draw(
 
 /// How long a stop may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
+/// A source that sends nonsense does so 200 times a second.
+const WARN_EVERY: Duration = Duration::from_secs(5);
 /// Nearer splats would fill the image when the body brushes something; less than its radius. [m]
 const NEAR_M: f32 = 0.05;
 /// Where the twin ends: black, like the trainers' background.

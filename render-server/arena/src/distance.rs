@@ -1,0 +1,299 @@
+//! The signed Euclidean distance to the nearest obstacle, one byte a voxel.
+//!
+//! Budget: 21 M voxels in half a second on two cores, in the memory of the occupancy grid itself;
+//! a query is eight byte loads, well under a microsecond.
+//!
+//! The transform is exact and separable (Felzenszwalb and Huttenlocher, Distance Transforms of
+//! Sampled Functions, 2012; integer envelope after Meijster et al., 2000): first along x, plane by
+//! plane over the whole grid; then every plane of constant x on its own, along z and y. Distances
+//! are between voxel centres; half a voxel less is the distance to the obstacle's face. They are
+//! kept in steps of a fifth of a voxel, from -7.9 to +43.1 voxels: 2.15 m at 5 cm. The byte is
+//! exact to a tenth of a voxel, and the trilinear query between centres to about half of one.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::grid::Grid;
+use crate::occupancy::OccupancyGrid;
+
+/// Distance to obstacles, and the floor beneath them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DistanceField {
+    grid: Grid,
+    /// Steps of [`STEP_VOXELS`] from [`CODE_ZERO`].
+    codes: Vec<u8>,
+    floor_z_m: f64,
+}
+
+impl DistanceField {
+    /// Computes the field of a grid, in the grid's own memory.
+    pub fn of(occupancy: OccupancyGrid) -> Self {
+        let OccupancyGrid { grid, cells: mut codes, floor_z_m, .. } = occupancy;
+        sweep_along_x(&mut codes, grid.plane());
+        let tables = Tables::new();
+        codes.par_chunks_mut(grid.plane()).for_each_init(Scratch::default, |scratch, plane| {
+            finish_plane(plane, grid.size[1], grid.size[2], &tables, scratch);
+        });
+        Self { grid, codes, floor_z_m }
+    }
+
+    /// Returns the voxels' places.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// Returns the height of the floor. [m, world]
+    pub fn floor_z_m(&self) -> f64 {
+        self.floor_z_m
+    }
+
+    /// Returns the greatest distance the field can say; further is this. [m]
+    pub fn max_distance_m(&self) -> f64 {
+        distance_voxels(u8::MAX) * self.grid.voxel_m
+    }
+
+    /// Returns the bytes the field occupies.
+    pub fn memory_bytes(&self) -> usize {
+        self.codes.len()
+    }
+
+    /// Returns the signed distance from a point to the nearest obstacle, the floor not counted:
+    /// negative inside, at most [`Self::max_distance_m`]. Outside the grid nothing is known, and
+    /// the nearest point of the grid answers. NaN for a point that is not a number. [m, world]
+    pub fn obstacle_distance_m(&self, p_m: DVec3) -> f64 {
+        if p_m.is_nan() {
+            return f64::NAN;
+        }
+        let [nx, ny, nz] = self.grid.size;
+        let last = DVec3::new((nx - 1) as f64, (ny - 1) as f64, (nz - 1) as f64);
+        let at = ((p_m - self.grid.min_m) / self.grid.voxel_m - 0.5).clamp(DVec3::ZERO, last);
+        // The cell's least corner, such that its greatest exists too where there are two voxels.
+        let corner = at.floor().min((last - 1.0).max(DVec3::ZERO));
+        let f = at - corner;
+        let base = self.grid.index([corner.x as usize, corner.y as usize, corner.z as usize]);
+        let step = |n: usize, stride: usize| if n > 1 { stride } else { 0 };
+        let (sx, sy, sz) = (step(nx, ny * nz), step(ny, nz), step(nz, 1));
+        let code = |offset: usize| f64::from(self.codes[base + offset]);
+        let along_z = |offset: usize| code(offset) * (1.0 - f.z) + code(offset + sz) * f.z;
+        let along_y = |offset: usize| along_z(offset) * (1.0 - f.y) + along_z(offset + sy) * f.y;
+        let mean = along_y(0) * (1.0 - f.x) + along_y(sx) * f.x;
+        (mean - CODE_ZERO) * STEP_VOXELS * self.grid.voxel_m
+    }
+
+    /// Returns the signed distance from a point to the nearest obstacle or the floor. [m, world]
+    pub fn distance_m(&self, p_m: DVec3) -> f64 {
+        let floor_m = p_m.z - self.floor_z_m;
+        let obstacle_m = self.obstacle_distance_m(p_m);
+        // Not `min`, which would drop a NaN.
+        if floor_m < obstacle_m { floor_m } else { obstacle_m }
+    }
+
+    /// Returns the obstacles at a height, for a top view. [m, world]
+    pub fn obstacle_slice(&self, z_m: f64) -> ObstacleSlice {
+        let [nx, ny, nz] = self.grid.size;
+        let layer = self.grid.layer_at(z_m);
+        let mut bits = vec![0; (nx * ny).div_ceil(8)];
+        for y in 0..ny {
+            for x in 0..nx {
+                if distance_voxels(self.codes[(x * ny + y) * nz + layer]) < 0.0 {
+                    let cell = y * nx + x;
+                    bits[cell / 8] |= 1 << (cell % 8);
+                }
+            }
+        }
+        ObstacleSlice {
+            min_m: [self.grid.min_m.x, self.grid.min_m.y],
+            cell_m: self.grid.voxel_m,
+            columns: nx,
+            rows: ny,
+            bits,
+        }
+    }
+}
+
+/// Occupied cells of one layer, for a top view.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct ObstacleSlice {
+    /// x and y of the least corner of the first cell. [m, world]
+    pub min_m: [f64; 2],
+    /// Side of a cell. [m]
+    pub cell_m: f64,
+    /// Cells along x.
+    pub columns: usize,
+    /// Cells along y.
+    pub rows: usize,
+    /// Row-major (y slowest), one bit a cell, low bit first; 1 is occupied.
+    pub bits: Vec<u8>,
+}
+
+impl ObstacleSlice {
+    /// Whether a cell is occupied.
+    pub fn is_occupied(&self, column: usize, row: usize) -> bool {
+        let cell = row * self.columns + column;
+        self.bits[cell / 8] >> (cell % 8) & 1 == 1
+    }
+}
+
+/// Returns what a code means. [voxels]
+fn distance_voxels(code: u8) -> f64 {
+    (f64::from(code) - CODE_ZERO) * STEP_VOXELS
+}
+
+/// A code is this many voxels.
+const STEP_VOXELS: f64 = 0.2;
+/// The code of the obstacle's face. Between two codes, so that half a voxel either way is exact.
+const CODE_ZERO: f64 = 39.5;
+/// Distances between centres from here on are all [`u8::MAX`]. [voxels]
+const REACH: u8 = 44;
+const REACH_SQUARED: i32 = REACH as i32 * REACH as i32;
+/// Marks occupied voxels between the first pass and the last.
+const OCCUPIED: u8 = 0x80;
+
+/// Turns 0 and 1 into the distance along x to the nearest voxel of the other kind, at most
+/// [`REACH`], with [`OCCUPIED`] kept on top.
+fn sweep_along_x(cells: &mut [u8], plane: usize) {
+    let nearer = |own: u8, neighbour: u8, limit: u8| {
+        let same = (own ^ neighbour) & OCCUPIED == 0;
+        let through = if same { (neighbour & !OCCUPIED) + 1 } else { 1 };
+        through.min(limit) | own & OCCUPIED
+    };
+    let planes = cells.len() / plane;
+    for cell in &mut cells[..plane] {
+        *cell = *cell << 7 | REACH;
+    }
+    for x in 1..planes {
+        let (before, after) = cells.split_at_mut(x * plane);
+        let before = &before[(x - 1) * plane..];
+        for (own, &neighbour) in after[..plane].iter_mut().zip(before) {
+            *own = nearer(*own << 7, neighbour, REACH);
+        }
+    }
+    for x in (1..planes).rev() {
+        let (before, after) = cells.split_at_mut(x * plane);
+        let before = &mut before[(x - 1) * plane..];
+        for (own, &neighbour) in before.iter_mut().zip(&after[..plane]) {
+            *own = nearer(*own, neighbour, *own & !OCCUPIED);
+        }
+    }
+}
+
+/// Codes by squared distance between centres.
+struct Tables {
+    free: Vec<u8>,
+    occupied: Vec<u8>,
+}
+
+impl Tables {
+    fn new() -> Self {
+        let code = |voxels: f64| (voxels / STEP_VOXELS + CODE_ZERO).round().clamp(0.0, 255.0) as u8;
+        let squares = || (0..=REACH_SQUARED).map(|square| f64::from(square).sqrt());
+        Self {
+            free: squares().map(|d| code(d - 0.5)).collect(),
+            occupied: squares().map(|d| code(0.5 - d)).collect(),
+        }
+    }
+}
+
+/// Working memory of a plane.
+#[derive(Default)]
+struct Scratch {
+    /// Squared distances, y by z.
+    squares: Vec<i32>,
+    line: Vec<i32>,
+    envelope: Envelope,
+}
+
+/// Turns a plane's distances along x into codes.
+fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch: &mut Scratch) {
+    let own: Vec<u8> = plane.iter().map(|&cell| cell & OCCUPIED).collect();
+    for kind in [0, OCCUPIED] {
+        if !own.contains(&kind) {
+            continue;
+        }
+        // Distance of each voxel of this kind to the other kind; those of the other are at 0.
+        scratch.squares.clear();
+        scratch.squares.extend(plane.iter().zip(&own).map(|(&cell, &own)| {
+            let along_x = i32::from(cell & !OCCUPIED);
+            if own == kind { along_x * along_x } else { 0 }
+        }));
+        if scratch.squares.iter().all(|&square| square >= REACH_SQUARED) {
+            scratch.squares.fill(REACH_SQUARED);
+        } else {
+            square_distances(scratch, ny, nz);
+        }
+        let table = if kind == OCCUPIED { &tables.occupied } else { &tables.free };
+        // The other kind's voxels keep their distance along x until their turn.
+        for ((cell, &own), &square) in plane.iter_mut().zip(&own).zip(&scratch.squares) {
+            if own == kind {
+                *cell = table[square as usize];
+            }
+        }
+    }
+}
+
+/// Adds the squared distances along z and y.
+fn square_distances(scratch: &mut Scratch, ny: usize, nz: usize) {
+    let Scratch { squares, line, envelope } = scratch;
+    for row in squares.chunks_exact_mut(nz) {
+        envelope.build(row);
+        envelope.write(row.iter_mut());
+    }
+    for z in 0..nz {
+        line.clear();
+        line.extend((0..ny).map(|y| squares[y * nz + z]));
+        envelope.build(line);
+        envelope.write(squares[z..].iter_mut().step_by(nz));
+    }
+}
+
+/// The lower envelope of parabolas `square[i] + (x - i)^2`.
+#[derive(Default)]
+struct Envelope {
+    /// Parabola's place, its square, and where it begins to be lowest.
+    parts: Vec<(i32, i32, i32)>,
+}
+
+impl Envelope {
+    /// Takes the parabolas that matter: those below the reach.
+    fn build(&mut self, squares: &[i32]) {
+        self.parts.clear();
+        for (u, &square) in (0..).zip(squares) {
+            if square >= REACH_SQUARED {
+                continue;
+            }
+            let mut begins = 0;
+            while let Some(&(i, lower, from)) = self.parts.last() {
+                // The first place at which the new parabola is lower (Meijster's Sep, plus one).
+                let meets = (u * u - i * i + square - lower).div_euclid(2 * (u - i)) + 1;
+                if meets > from {
+                    begins = meets;
+                    break;
+                }
+                self.parts.pop();
+            }
+            self.parts.push((u, square, begins));
+        }
+    }
+
+    /// Writes the envelope, at most the reach.
+    fn write<'a>(&self, line: impl Iterator<Item = &'a mut i32>) {
+        let Some(&first) = self.parts.first() else {
+            line.for_each(|out| *out = REACH_SQUARED);
+            return;
+        };
+        let mut rest = &self.parts[1..];
+        let (mut u, mut square, _) = first;
+        for (x, out) in (0..).zip(line) {
+            while let Some(&(next, lower, begins)) = rest.first()
+                && begins <= x
+            {
+                (u, square) = (next, lower);
+                rest = &rest[1..];
+            }
+            *out = (square + (x - u) * (x - u)).min(REACH_SQUARED);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,67 @@
+//! A regular grid of voxels in the world: sizes, indices, positions.
+
+use glam::DVec3;
+
+/// Where the voxels lie. Index order: x slowest, z fastest, so that a plane of constant x is
+/// contiguous and a column of constant x and y too.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Grid {
+    /// Least corner of the first voxel. [m, world]
+    pub min_m: DVec3,
+    /// Side of a voxel. [m]
+    pub voxel_m: f64,
+    /// Voxels along x, y and z, each at least 1.
+    pub size: [usize; 3],
+}
+
+impl Grid {
+    /// Returns the grid that covers the box from `min_m` to `max_m`. [m, world]
+    ///
+    /// ```
+    /// use glam::DVec3;
+    /// use vizflyt_arena::grid::Grid;
+    /// let grid = Grid::covering(DVec3::ZERO, DVec3::new(1.0, 0.5, 0.26), 0.25);
+    /// assert_eq!(grid.size, [4, 2, 2]);
+    /// assert_eq!(grid.center_m([1, 0, 0]), DVec3::new(0.375, 0.125, 0.125));
+    /// ```
+    ///
+    /// # Panics
+    /// If the box or the voxel is not finite, or the voxel is not positive.
+    pub fn covering(min_m: DVec3, max_m: DVec3, voxel_m: f64) -> Self {
+        assert!(min_m.is_finite() && max_m.is_finite() && voxel_m.is_finite() && voxel_m > 0.0);
+        // The allowance keeps 1.0 / 0.05 at 20 voxels.
+        let size = ((max_m - min_m) / voxel_m - 1e-6).ceil().max(DVec3::ONE);
+        Self { min_m, voxel_m, size: [size.x as usize, size.y as usize, size.z as usize] }
+    }
+
+    /// Returns the number of voxels.
+    pub fn voxels(&self) -> usize {
+        self.size.iter().product()
+    }
+
+    /// Returns the voxels of a plane of constant x.
+    pub fn plane(&self) -> usize {
+        self.size[1] * self.size[2]
+    }
+
+    /// Returns the place of a voxel in an array.
+    pub fn index(&self, [x, y, z]: [usize; 3]) -> usize {
+        (x * self.size[1] + y) * self.size[2] + z
+    }
+
+    /// Returns a voxel's centre. [m, world]
+    pub fn center_m(&self, [x, y, z]: [usize; 3]) -> DVec3 {
+        self.min_m + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * self.voxel_m
+    }
+
+    /// Returns the greatest corner. [m, world]
+    pub fn max_m(&self) -> DVec3 {
+        let [x, y, z] = self.size;
+        self.min_m + DVec3::new(x as f64, y as f64, z as f64) * self.voxel_m
+    }
+
+    /// Returns the layer whose voxels hold the height, held within the grid. [m, world]
+    pub fn layer_at(&self, z_m: f64) -> usize {
+        (((z_m - self.min_m.z) / self.voxel_m).max(0.0) as usize).min(self.size[2] - 1)
+    }
+}
