@@ -16,7 +16,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
@@ -109,6 +109,7 @@ struct PluginSide {
     started: bool,
     /// Ends its threads.
     stop: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 struct Loop {
@@ -148,7 +149,7 @@ impl Control {
             ticks: 0,
         };
         let outcome = state.fly(happenings);
-        state.finish(outcome)
+        state.finish(outcome, happenings)
     }
 }
 
@@ -366,7 +367,7 @@ impl Loop {
             }
         };
         let stop = Arc::new(AtomicBool::new(false));
-        self.start_threads(&ipc, &arena, &stop);
+        let threads = self.start_threads(&ipc, &arena, &stop);
         let mut command = self.control.plugin_command.clone();
         command.push(format!("{SERVICE_OPTION}={service}").into());
         let sender = self.sender.clone();
@@ -383,15 +384,20 @@ impl Loop {
                 None
             }
         };
-        self.plugin = Some(PluginSide { ipc, supervisor, arena, started: false, stop });
+        self.plugin = Some(PluginSide { ipc, supervisor, arena, started: false, stop, threads });
     }
 
-    fn start_threads(&self, ipc: &Arc<RuntimeEnd>, arena: &ArenaInfo, stop: &Arc<AtomicBool>) {
+    fn start_threads(
+        &self,
+        ipc: &Arc<RuntimeEnd>,
+        arena: &ArenaInfo,
+        stop: &Arc<AtomicBool>,
+    ) -> Vec<JoinHandle<()>> {
         let cameras = arena.cameras.to_vec();
         let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.vehicle));
         let mailbox = Arc::clone(&self.control.shared.mailbox);
         let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
-        spawn("images", move || {
+        let images = spawn("images", move || {
             publisher.run(
                 &mailbox,
                 || stopped.load(Ordering::Relaxed),
@@ -401,7 +407,7 @@ impl Loop {
             );
         });
         let (ipc, sender, stopped) = (Arc::clone(ipc), self.sender.clone(), Arc::clone(stop));
-        spawn("answers", move || {
+        let answers = spawn("answers", move || {
             while !stopped.load(Ordering::Relaxed) {
                 if ipc.wait(Duration::from_millis(100)).is_err() {
                     // No event comes any more; poll instead.
@@ -412,6 +418,7 @@ impl Loop {
                 }
             }
         });
+        images.into_iter().chain(answers).collect()
     }
 
     /// Greets the plugin once it has attached; shows it that we live.
@@ -496,7 +503,7 @@ impl Loop {
 
     // ---- the end ----
 
-    fn finish(mut self, outcome: Outcome) -> Flown {
+    fn finish(mut self, outcome: Outcome, happenings: &Receiver<Happening>) -> Flown {
         let now = host_now();
         self.tell_notices(now);
         self.report(now);
@@ -508,8 +515,15 @@ impl Loop {
             if let Some(supervisor) = &side.supervisor {
                 supervisor.end();
             }
-            side.stop.store(true, Ordering::Relaxed);
             side.ipc.clean_up();
+            side.stop.store(true, Ordering::Relaxed);
+            // Who drops the shared memory last removes its files, so they are waited for; and
+            // heard out, as they may be waiting for room in the queue.
+            for thread in side.threads {
+                while !thread.is_finished() {
+                    let _ = happenings.recv_timeout(Duration::from_millis(5));
+                }
+            }
         }
         let counters = Counters {
             seconds: self.flight.seconds(now),
@@ -521,10 +535,9 @@ impl Loop {
     }
 }
 
-fn spawn(name: &str, run: impl FnOnce() + Send + 'static) {
-    if let Err(error) = thread::Builder::new().name(name.into()).spawn(run) {
-        tracing::error!("thread {name}: {error}");
-    }
+fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Option<JoinHandle<()>> {
+    let thread = thread::Builder::new().name(name.into()).spawn(run);
+    thread.inspect_err(|error| tracing::error!("thread {name}: {error}")).ok()
 }
 
 /// Prints a line for a program that may have stopped listening.
