@@ -9,6 +9,8 @@
 //! supervisor ─────┤                             └─▶ standard output
 //! signals ────────┘
 //! ```
+//!
+//! Why longer than most: it is where everything meets, and holds no logic of its own.
 
 use std::ffi::OsString;
 use std::io::Write;

@@ -9,6 +9,8 @@
 //!                                  └────────────▶ Landing ──▶ Landed
 //! ```
 //! The first cause of a landing is the flight's [`Outcome`]; landing is never taken back.
+//!
+//! Why longer than most: one state machine, read best in one place.
 
 mod outcome;
 #[cfg(test)]

@@ -9,6 +9,8 @@
 //! ```
 //! Commands follow from what is observed, not from a script: whatever the goal needs next is
 //! sent, so a reboot of either side or a lost packet only repeats a step.
+//!
+//! Why longer than most: one state machine, read best in one place.
 
 // Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
 #![allow(deprecated)]
