@@ -50,8 +50,8 @@ pub fn sweep(field: &DistanceField, from_m: DVec3, to_m: DVec3, radius_m: f64) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
     use crate::grid::Grid;
+    use crate::occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
     use glam::{Quat, Vec3};
     use proptest::prelude::*;
 

@@ -108,8 +108,12 @@ impl PoseGate {
         speed_mps: f64,
     ) -> Result<(), Rejected> {
         let count = match self.jumped {
-            Some((at, place_m, count)) if (p_world_m - place_m).length()
-                <= JUMP_FLOOR_M + MOST_MPS * stamp.seconds_since(at).max(0.0) => count + 1,
+            Some((at, place_m, count))
+                if (p_world_m - place_m).length()
+                    <= JUMP_FLOOR_M + MOST_MPS * stamp.seconds_since(at).max(0.0) =>
+            {
+                count + 1
+            }
             _ => 1,
         };
         self.jumped = Some((stamp, p_world_m, count));

@@ -37,7 +37,7 @@ struct Run {
 /// All runs of cells of one value, and which belong together.
 pub(super) struct Runs {
     size: [usize; 3],
-    runs: Vec<Run>,
+    all: Vec<Run>,
     /// Runs of column n are `first[n]..first[n + 1]`.
     first: Vec<u32>,
     /// Union-find forest.
@@ -48,7 +48,7 @@ impl Runs {
     /// Finds the components of the cells that equal `value`.
     pub(super) fn of(cells: &[u8], grid: &Grid, value: u8, connectivity: Connectivity) -> Self {
         let [nx, ny, nz] = grid.size;
-        assert!(nz <= usize::from(u16::MAX), "columns of at most 65535 voxels");
+        assert!(u16::try_from(nz).is_ok(), "columns of at most 65535 voxels");
         let mut runs = Vec::new();
         let mut first = Vec::with_capacity(nx * ny + 1);
         for column in cells.chunks_exact(nz) {
@@ -63,7 +63,7 @@ impl Runs {
         }
         first.push(runs.len() as u32);
         let parent = (0..runs.len() as u32).collect();
-        let mut this = Self { size: grid.size, runs, first, parent };
+        let mut this = Self { size: grid.size, all: runs, first, parent };
         for x in 0..nx {
             for y in 0..ny {
                 // The neighbours that come before; the others meet this column from their side.
@@ -96,7 +96,7 @@ impl Runs {
         let (mut i, end_i) = (self.first[a], self.first[a + 1]);
         let (mut j, end_j) = (self.first[b], self.first[b + 1]);
         while i < end_i && j < end_j {
-            let (p, q) = (self.runs[i as usize], self.runs[j as usize]);
+            let (p, q) = (self.all[i as usize], self.all[j as usize]);
             if p.start < q.end + reach && q.start < p.end + reach {
                 self.union(i, j);
             }
@@ -131,11 +131,11 @@ impl Runs {
         chosen: impl Fn(&Component) -> bool,
     ) -> usize {
         let none = Component { voxels: 0, low: [u32::MAX; 3], high: [0; 3] };
-        let mut components = vec![none; self.runs.len()];
+        let mut components = vec![none; self.all.len()];
         let [nx, ny, nz] = self.size;
         for column in 0..nx * ny {
             for index in self.first[column]..self.first[column + 1] {
-                let run = self.runs[index as usize];
+                let run = self.all[index as usize];
                 let (start, end) = (u32::from(run.start), u32::from(run.end));
                 let root = self.root(index) as usize;
                 let (x, y) = ((column / ny) as u32, (column % ny) as u32);
@@ -153,7 +153,7 @@ impl Runs {
             for index in self.first[column]..self.first[column + 1] {
                 let root = self.root(index) as usize;
                 if chosen(&components[root]) {
-                    let run = self.runs[index as usize];
+                    let run = self.all[index as usize];
                     let (start, end) = (usize::from(run.start), usize::from(run.end));
                     cells[column * nz + start..column * nz + end].fill(value);
                     written += end - start;

@@ -111,12 +111,16 @@ impl OccupancyGrid {
         drop(prepared);
 
         let floater_voxels = (FLOATER_EXTENT_M / grid.voxel_m).round() as usize;
-        counts.floating = Runs::of(&cells, &grid, 1, Connectivity::Corners)
-            .overwrite(&mut cells, 0, |component| component.extent() < floater_voxels);
+        counts.floating = Runs::of(&cells, &grid, 1, Connectivity::Corners).overwrite(
+            &mut cells,
+            0,
+            |component| component.extent() < floater_voxels,
+        );
         stand_on_floor(&mut cells, spec);
         let void_voxels = (VOID_M3 / grid.voxel_m.powi(3)) as usize;
-        counts.enclosed = Runs::of(&cells, &grid, 0, Connectivity::Faces)
-            .overwrite(&mut cells, 1, |component| component.voxels < void_voxels);
+        counts.enclosed =
+            Runs::of(&cells, &grid, 0, Connectivity::Faces)
+                .overwrite(&mut cells, 1, |component| component.voxels < void_voxels);
         counts.occupied = cells.iter().map(|&cell| usize::from(cell)).sum();
         Self { grid, cells, floor_z_m: spec.floor_z_m, counts }
     }
@@ -303,11 +307,7 @@ pub const FLOOR_BAND_M: f64 = 0.3;
 const SLAB_PLANES: usize = 8;
 
 /// Returns a grid with the voxels occupied whose centre the function says; for tests and benches.
-pub fn occupancy_of(
-    grid: Grid,
-    floor_z_m: f64,
-    solid: impl Fn(DVec3) -> bool,
-) -> OccupancyGrid {
+pub fn occupancy_of(grid: Grid, floor_z_m: f64, solid: impl Fn(DVec3) -> bool) -> OccupancyGrid {
     let [nx, ny, nz] = grid.size;
     let mut cells = Vec::with_capacity(grid.voxels());
     for x in 0..nx {

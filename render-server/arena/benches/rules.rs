@@ -1,0 +1,68 @@
+//! Bake, query and swept tick of the collision rules, on a forest of Gaussians.
+//!
+//! `cargo bench -p vizflyt-arena`
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use glam::{DVec3, Quat, Vec3};
+use vizflyt_arena::collision::sweep;
+use vizflyt_arena::grid::Grid;
+use vizflyt_arena::{BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
+
+/// Trunks of flat Gaussians over 40 m x 14 m, `splats` in all.
+fn forest(splats: usize) -> Vec<Ellipsoid> {
+    (0..splats)
+        .map(|i| {
+            let (trunk, part) = (i % 60, i / 60);
+            let angle = (part * 7 % 40) as f32 / 40.0 * std::f32::consts::TAU;
+            let normal = Vec3::new(angle.cos(), angle.sin(), 0.0);
+            let root = Vec3::new(
+                (trunk * 37 % 400) as f32 * 0.1,
+                (trunk * 53 % 140) as f32 * 0.1 - 7.0,
+                0.0,
+            );
+            Ellipsoid {
+                center_m: root + normal * 0.2 + Vec3::Z * ((part * 13 % 400) as f32 * 0.01),
+                scales_m: Vec3::new(0.03, 0.03, 0.006),
+                rotation: Quat::from_rotation_arc(Vec3::Z, normal),
+                opacity: 0.95,
+            }
+        })
+        .collect()
+}
+
+fn spec() -> BakeSpec {
+    let grid = Grid::covering(DVec3::new(-1.5, -7.5, 0.0), DVec3::new(41.5, 7.5, 4.5), 0.05);
+    BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 }
+}
+
+fn rules(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("bake");
+    group.sample_size(10);
+    for splats in [130_000, 1_000_000] {
+        let forest = forest(splats);
+        group.bench_function(format!("{splats} splats, 5 cm, 43 x 15 x 4.5 m"), |bencher| {
+            bencher
+                .iter(|| DistanceField::of(OccupancyGrid::bake(forest.iter().copied(), &spec())));
+        });
+    }
+    group.finish();
+    let field = DistanceField::of(OccupancyGrid::bake(forest(130_000), &spec()));
+    println!("the field occupies {:.1} MB", field.memory_bytes() as f64 / 1e6);
+    let mut x_m = 0.0;
+    let mut next = move || {
+        x_m = (x_m + 0.37) % 40.0;
+        DVec3::new(x_m, (x_m * 3.1) % 12.0 - 6.0, 1.2)
+    };
+    criterion.bench_function("query", |bencher| {
+        bencher.iter(|| field.obstacle_distance_m(next()));
+    });
+    criterion.bench_function("swept tick, 6 m/s at 200 Hz", |bencher| {
+        bencher.iter(|| {
+            let from = next();
+            sweep(&field, from, from + DVec3::new(0.03, 0.0, 0.0), 0.12)
+        });
+    });
+}
+
+criterion_group!(benches, rules);
+criterion_main!(benches);

@@ -1,0 +1,140 @@
+use proptest::prelude::*;
+use vizflyt_protocol::geometry::Volume;
+
+use super::*;
+use crate::distance::DistanceField;
+
+const VOXEL_M: f64 = 0.05;
+
+/// Flat Gaussians on a surface, as trained and generated scenes have them.
+fn disc(center: DVec3, normal: DVec3, spread_m: f32) -> Ellipsoid {
+    Ellipsoid {
+        center_m: center.as_vec3(),
+        scales_m: Vec3::new(spread_m, spread_m, 0.008),
+        rotation: Quat::from_rotation_arc(Vec3::Z, normal.as_vec3().normalize()),
+        opacity: 0.95,
+    }
+}
+
+fn field(splats: Vec<Ellipsoid>) -> DistanceField {
+    let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 };
+    DistanceField::of(OccupancyGrid::bake(splats, &spec))
+}
+
+/// A trunk: a cylinder of the radius around (0, 0), 3 m high.
+fn trunk(radius_m: f64) -> (DistanceField, Volume) {
+    let around = (std::f64::consts::TAU * radius_m / 0.05).ceil() as usize;
+    let splats = (0..60)
+        .flat_map(|layer| {
+            (0..around).map(move |side| {
+                let angle = side as f64 / around as f64 * std::f64::consts::TAU;
+                let normal = DVec3::new(angle.cos(), angle.sin(), 0.0);
+                disc(normal * radius_m + DVec3::Z * (layer as f64 * 0.05 + 0.025), normal, 0.035)
+            })
+        })
+        .collect();
+    let axis = |z: f64| DVec3::new(0.0, 0.0, z);
+    (field(splats), Volume::Capsule { a_m: axis(-1.0), b_m: axis(4.0), radius_m })
+}
+
+fn wall() -> (DistanceField, Volume) {
+    let splats = (-24..24)
+        .flat_map(|y| {
+            (0..60).flat_map(move |z| {
+                let at = DVec3::new(0.0, f64::from(y) * 0.08, f64::from(z) * 0.05);
+                [
+                    disc(at + DVec3::X * 0.1, DVec3::X, 0.05),
+                    disc(at - DVec3::X * 0.1, DVec3::NEG_X, 0.05),
+                ]
+            })
+        })
+        .collect();
+    let half_m = DVec3::new(0.1, 1.92, 4.0);
+    let center_m = DVec3::new(0.0, -0.04, 0.0);
+    (field(splats), Volume::Cuboid { center_m, half_m, rotation: glam::DQuat::IDENTITY })
+}
+
+/// Compares verdicts "a sphere of 0.12 m touches" with the truth: none missed beyond one voxel,
+/// at most 1 % false beyond a voxel and a half.
+fn check(name: &str, (field, truth): &(DistanceField, Volume)) {
+    let (mut free, mut false_alarms) = (0, 0);
+    for x in -35..35 {
+        for y in -30..30 {
+            for z in [0.5, 1.23, 2.01] {
+                let p = DVec3::new(f64::from(x) * 0.05 + 0.013, f64::from(y) * 0.05 + 0.007, z);
+                let true_m = truth.signed_distance_m(p) - 0.12;
+                let touches = field.obstacle_distance_m(p) - 0.12 <= 0.0;
+                assert!(touches || true_m > -VOXEL_M, "{name}: missed at {p}, {true_m:.3} m deep");
+                if true_m > 1.5 * VOXEL_M {
+                    free += 1;
+                    false_alarms += usize::from(touches);
+                }
+            }
+        }
+    }
+    assert!(free > 1000, "{name}: the test looks at free space");
+    assert!(false_alarms * 100 <= free, "{name}: {false_alarms} false alarms in {free}");
+}
+
+#[test]
+fn trunks_and_walls_are_where_they_are() {
+    for radius_m in [0.12, 0.2, 0.3] {
+        check(&format!("trunk of {radius_m} m"), &trunk(radius_m));
+    }
+    check("wall", &wall());
+}
+
+#[test]
+fn faint_splats_floaters_and_litter_are_no_obstacles() {
+    let faint: Vec<_> = (0..400)
+        .map(|i| Ellipsoid {
+            opacity: 0.2,
+            ..disc(
+                DVec3::new(0.0, f64::from(i % 20) * 0.05, 1.0 + f64::from(i / 20) * 0.05),
+                DVec3::X,
+                0.05,
+            )
+        })
+        .collect();
+    let counts = |splats: Vec<Ellipsoid>| {
+        let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
+        OccupancyGrid::bake(splats, &BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 }).counts()
+    };
+    let found = counts(faint);
+    assert_eq!((found.occupied, found.splats_left_out), (0, 400));
+    // One opaque speck in the air.
+    let speck = Ellipsoid {
+        center_m: Vec3::new(0.0, 0.0, 1.5),
+        scales_m: Vec3::splat(0.05),
+        rotation: Quat::IDENTITY,
+        opacity: 0.99,
+    };
+    let found = counts(vec![speck]);
+    assert!(found.floating > 0, "{found:?}");
+    assert_eq!(found.occupied, 0);
+    assert_eq!(counts(Vec::new()).occupied, 0);
+}
+
+proptest! {
+    /// Poison costs itself only.
+    #[test]
+    fn no_splat_is_too_strange(
+        center in prop::array::uniform3(prop_oneof![Just(f32::NAN), Just(f32::INFINITY), -5.0f32..5.0]),
+        scales in prop::array::uniform3(prop_oneof![Just(f32::NAN), Just(0.0f32), Just(1e-30), Just(1e30), 0.01f32..1.0]),
+        opacity in prop_oneof![Just(f32::NAN), Just(f32::INFINITY), 0.0f32..1.0],
+    ) {
+        let strange = Ellipsoid {
+            center_m: center.into(),
+            scales_m: scales.into(),
+            rotation: Quat::IDENTITY,
+            opacity,
+        };
+        let grid = Grid::covering(DVec3::splat(-0.5), DVec3::splat(0.5), 0.1);
+        let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: -0.5 };
+        let baked = OccupancyGrid::bake([strange], &spec);
+        prop_assert!(baked.counts().occupied <= grid.voxels());
+        let field = DistanceField::of(baked);
+        prop_assert!(field.obstacle_distance_m(DVec3::ZERO).is_finite());
+    }
+}
