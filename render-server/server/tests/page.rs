@@ -41,7 +41,7 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
     let mut socket = Socket::open(server.http, &own).ok().unwrap();
     let arena = socket.message("arena");
     assert_eq!((&arena["name"], &arena["cameras"][0]["name"]), (&"wall".into(), &"front".into()));
-    assert_eq!(arena["fence"]["cuboid"]["half_m"][1], 6.0);
+    assert_eq!(arena["fence"]["cuboid"]["half_m"][1], 4.0);
     assert!(socket.message("trail")["points"].as_array().unwrap().is_empty());
     assert!(socket.message("state")["pose"].is_null());
     let _emitter = Emitter::start(server.vicon, "vizflyt");

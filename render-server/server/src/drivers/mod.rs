@@ -54,4 +54,6 @@ pub struct SourceCounters {
     pub lost_frames: u64,
     /// Frames in which the vehicle was not seen.
     pub occluded: u64,
+    /// Poses that the referee's gate did not believe; counted by the pose thread.
+    pub rejected: u64,
 }

@@ -5,6 +5,7 @@
 //! - up is scene -y (`--up`): structure from motion starts from an upright camera, y down;
 //! - the scene is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a room
 //!   or a garden as far as a hand-held camera sees it. The unit itself cannot be known;
+//! - the start is where the twin looks best (see `best_view`);
 //! - the floor is the 2nd percentile of height; it becomes the world's z = 0, and the middle of the
 //!   scene the origin.
 //!
@@ -12,13 +13,15 @@
 
 use std::path::Path;
 
-use glam::{DVec3, Vec3};
+use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{CameraConfig, Geofence, Occupancy, Spawn};
+use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
-use vizflyt_splat::Splats;
+use vizflyt_splat::{Camera, RgbdImage, Splats};
 
 use super::orient::{Up, WorldFromScene};
+use crate::render::best;
 
 /// Returns the similarity that puts a captured scene upright, to size, onto z = 0, its middle at
 /// the origin. `scale` is world metres per scene unit; `None` estimates it.
@@ -34,18 +37,17 @@ pub fn align(splats: &Splats, up: Up, scale: Option<f64>) -> WorldFromScene {
 }
 
 /// Returns an arena for a scene that already lies in the world (z up, metres): the fence around its
-/// robust bounds, the start on the floor where most room is nearest to the middle, nose toward the
-/// longest free view, one camera of 320x240, no goal.
+/// robust bounds, the start on the floor where there is room and the view is best, one camera of
+/// 320x240, no goal.
 ///
 /// `scene` is what the arena's `scene` key shall say.
 pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
     let bounds = Bounds::of(splats, |mean| mean);
-    let room = Plan::of(splats, &bounds);
-    let (spawn, yaw_rad) = room.start();
+    let (spawn, yaw_rad) = best_view(splats, &Plan::of(splats, &bounds).places());
     let name = scene.file_stem().map_or("scene".into(), |stem| stem.to_string_lossy());
     // Something to fly in, however small the scene.
     let least = DVec3::new(1.0, 1.0, 0.0);
-    let margin = DVec3::new(0.5, 0.5, 0.0);
+    let margin = OUTSIDE_M / 2.0;
     let min_m = (bounds.min - margin).min(spawn - least);
     let max_m = (bounds.max + margin).max(spawn + least);
     ArenaConfig {
@@ -66,12 +68,64 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
             name: "front".to_owned(),
             width_px: 320,
             height_px: 240,
-            horizontal_fov_deg: 90.0,
+            horizontal_fov_deg: FOV_DEG,
             position_m: DVec3::new(0.06, 0.0, 0.02),
             tilt_deg: 0.0,
         }],
         stages: Vec::new(),
     }
+}
+
+/// Returns the place [m, world] and heading [rad] from which, at the height of the flight, the
+/// twin looks best: most detail, least right before the lens.
+///
+/// A capture is sharp only near where its photographs were taken, and those places are not in the
+/// file. But seen from elsewhere it is blur and void, and that a picture shows: so small pictures
+/// are drawn from everywhere and compared.
+fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
+    let mut renderer = best(splats);
+    let mut images = vec![RgbdImage::default(); HEADINGS];
+    let mut found = (f32::NEG_INFINITY, DVec3::ZERO, 0.0);
+    for &place in places {
+        let heading_rad = |k: usize| std::f64::consts::TAU * k as f64 / HEADINGS as f64;
+        let cameras: Vec<Camera> = (0..HEADINGS)
+            .map(|k| {
+                let p_world = place + DVec3::Z * TAKEOFF_HEIGHT_M;
+                let world_from_body: Pose<World, Body> =
+                    Pose::new(p_world, DQuat::from_rotation_z(heading_rad(k)));
+                Camera {
+                    intrinsics: Intrinsics::from_horizontal_fov(48, 36, FOV_DEG.to_radians()),
+                    world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, 0.0),
+                    near_m: 0.05,
+                    background: [0.0; 3],
+                }
+            })
+            .collect();
+        if renderer.draw(&cameras, &mut images).is_err() {
+            continue;
+        }
+        for (k, image) in images.iter().enumerate() {
+            let score = detail(image);
+            if score > found.0 {
+                found = (score, place, heading_rad(k));
+            }
+        }
+    }
+    ((found.1 * 100.0).round() / 100.0, found.2)
+}
+
+/// Returns how much there is to see: the sum of steps in brightness, each counted up to a tenth,
+/// times the share of the picture, squared, that shows something not too close. Where a capture
+/// ends, stray splats make sharp spikes before a void; the share keeps those from winning.
+fn detail(image: &RgbdImage) -> f32 {
+    let width = image.width_px as usize;
+    let grey: Vec<f32> = image.rgb.chunks_exact(3).map(|c| (c[0] + c[1] + c[2]) / 3.0).collect();
+    let step = |a: f32, b: f32| (a - b).abs().min(0.1);
+    let across: f32 = grey.windows(2).map(|pair| step(pair[0], pair[1])).sum();
+    let down: f32 = grey.iter().zip(grey.iter().skip(width)).map(|(a, b)| step(*a, *b)).sum();
+    let clear = image.depth_median_m.iter().filter(|&&depth_m| depth_m > CLOSE_M).count();
+    let share = clear as f32 / grey.len() as f32;
+    (across + down) * share.powi(2)
 }
 
 /// Robust corners of a scene.
@@ -120,7 +174,7 @@ impl Plan {
             let flown = (0.3..TAKEOFF_HEIGHT_M as f32 + 0.5).contains(&mean.z);
             if flown
                 && *opacity >= SOLID_OPACITY
-                && let Some(cell) = plan.cell(mean.as_dvec3())
+                && let Some(cell) = plan.index(plan.column_and_row(mean.as_dvec3()))
             {
                 plan.filled[cell] += 1;
             }
@@ -128,57 +182,42 @@ impl Plan {
         plan
     }
 
-    fn cell(&self, p: DVec3) -> Option<usize> {
-        let at = |value: f64, count: usize| {
-            let cell = (value / CELL_M).floor();
-            (cell >= 0.0 && cell < count as f64).then_some(cell as usize)
-        };
-        let x = at(p.x - self.min.x, self.cells[0])?;
-        let y = at(p.y - self.min.y, self.cells[1])?;
-        Some(y * self.cells[0] + x)
+    /// Returns the column and row of a point, which may lie outside the plan.
+    fn column_and_row(&self, p: DVec3) -> [i64; 2] {
+        let at = (p - self.min) / CELL_M;
+        [at.x.floor() as i64, at.y.floor() as i64]
     }
 
-    fn filled_at(&self, p: DVec3) -> Option<u32> {
-        self.cell(p).map(|cell| self.filled[cell])
+    fn index(&self, [x, y]: [i64; 2]) -> Option<usize> {
+        let inside = |value: i64, count| usize::try_from(value).ok().filter(|&v| v < count);
+        Some(inside(y, self.cells[1])? * self.cells[0] + inside(x, self.cells[0])?)
     }
 
-    /// Returns where to stand [m, world] and where to look [rad].
-    fn start(&self) -> (DVec3, f64) {
+    /// Returns places to stand on, free of splats as far as there are such. [m, world]
+    fn places(&self) -> Vec<DVec3> {
         let extent = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
-        let middle = DVec3::new(self.min.x, self.min.y, 0.0) + extent / 2.0;
-        let mut best = (f64::INFINITY, middle);
-        for y in 0..self.cells[1] {
-            for x in 0..self.cells[0] {
-                let here = DVec3::new(x as f64 + 0.5, y as f64 + 0.5, 0.0) * CELL_M;
-                let p = DVec3::new(self.min.x, self.min.y, 0.0) + here;
-                // A splat in the way is worth a metre of walking toward the middle.
-                let cost = f64::from(self.crowd(p)) + (p - middle).length();
-                if cost < best.0 {
-                    best = (cost, p);
-                }
+        let low = DVec3::new(self.min.x, self.min.y, 0.0) - OUTSIDE_M;
+        let span = extent + 2.0 * OUTSIDE_M;
+        let step = (span.x.max(span.y) / PLACES_PER_SIDE).max(0.3);
+        let mut places = Vec::new();
+        for x in 0..=(span.x / step) as u32 {
+            for y in 0..=(span.y / step) as u32 {
+                let p = low + DVec3::new(f64::from(x), f64::from(y), 0.0) * step;
+                places.push((self.crowd(p), DVec3::new(p.x, p.y, 0.0)));
             }
         }
-        let free_view = |step: usize| {
-            let yaw_rad = step as f64 * std::f64::consts::TAU / 16.0;
-            let nose = DVec3::new(yaw_rad.cos(), yaw_rad.sin(), 0.0);
-            let mut cells = 1;
-            while self.filled_at(best.1 + nose * CELL_M * f64::from(cells)).is_some_and(|n| n < 3) {
-                cells += 1;
-            }
-            (cells, yaw_rad)
-        };
-        let longest = (0..16).map(free_view).fold((0, 0.0), |a, b| if b.0 > a.0 { b } else { a });
-        ((best.1 * 100.0).round() / 100.0, longest.1)
+        let least = places.iter().map(|place| place.0).min().unwrap_or(0);
+        places.retain(|place| place.0 <= least + FEW_SPLATS);
+        places.into_iter().map(|place| place.1).collect()
     }
 
     /// Returns the number of splats within a body's reach of the column at `p`.
     fn crowd(&self, p: DVec3) -> u32 {
-        let reach = 4;
+        let [x, y] = self.column_and_row(p);
         let mut sum = 0;
-        for dy in -reach..=reach {
-            for dx in -reach..=reach {
-                let offset = DVec3::new(f64::from(dx), f64::from(dy), 0.0) * CELL_M;
-                sum += self.filled_at(p + offset).unwrap_or(0);
+        for row in y - REACH_CELLS..=y + REACH_CELLS {
+            for column in x - REACH_CELLS..=x + REACH_CELLS {
+                sum += self.index([column, row]).map_or(0, |cell| self.filled[cell]);
             }
         }
         sum
@@ -194,7 +233,20 @@ const SOLID_OPACITY: f32 = 0.5;
 /// A palm-sized quadrotor of the course. [m]
 const BODY_RADIUS_M: f64 = 0.12;
 const TAKEOFF_HEIGHT_M: f64 = 1.2;
-/// Fine against the body's reach of 0.45 m. [m]
+const FOV_DEG: f64 = 90.0;
+/// Places are tried this far outside the scene's bounds: whoever photographs a corner of a room
+/// stands away from it. [m]
+const OUTSIDE_M: DVec3 = DVec3::new(1.0, 1.0, 0.0);
+/// At most 81 places, 8 pictures each: half a second.
+const PLACES_PER_SIDE: f64 = 8.0;
+const HEADINGS: usize = 8;
+/// Single splats are no obstacle to taking off.
+const FEW_SPLATS: u32 = 3;
+/// Nearer than this a thing hides the rest. [m]
+const CLOSE_M: f32 = 0.7;
+/// A body's radius, and as much room again twice over: 0.45 m.
+const REACH_CELLS: i64 = 4;
+/// Fine against that reach. [m]
 const CELL_M: f64 = 0.1;
 /// 40 m; larger captures are planned over their first corner only.
 const MOST_CELLS: usize = 400;
@@ -255,7 +307,9 @@ mod tests {
         let spawn = arena.spawn.position_m;
         assert_eq!((arena.name.as_str(), spawn.z), ("kitchen", 0.0));
         let post = spawn.truncate().length();
-        assert!((0.4..1.2).contains(&post), "the post is {post} m away");
+        assert!(post > 0.3, "the post is {post} m away");
+        // Inside the fence with room to spare.
+        assert!(arena.geofence().signed_distance_m(spawn) < -0.4);
         let text = arena.to_toml().unwrap();
         assert_eq!(ArenaConfig::parse(&text).unwrap(), arena);
     }

@@ -6,9 +6,11 @@
 //! ```
 //! Once, at the start; progress goes to the log.
 
+mod bake;
 mod bare;
 mod orient;
 
+pub use bake::bake;
 pub use bare::{align, default_arena};
 pub use orient::{Up, WorldFromScene};
 

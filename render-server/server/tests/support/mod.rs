@@ -53,7 +53,7 @@ scene = "scene.ply"
 body_radius_m = 0.12
 takeoff_height_m = 1.2
 spawn = {{ position_m = [0, 0, 0] }}
-geofence = {{ min_m = [-20, -6, -0.5], max_m = [42, 6, 4] }}
+geofence = {{ min_m = [-20, -4, -0.5], max_m = [6, 4, 4] }}
 limits = {{ max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }}
 [[cameras]]
 name = "front"

@@ -112,7 +112,14 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
     assert_eq!(stream.handle_packet(at(0), b"hello"), None);
     assert_eq!(
         stream.counters(),
-        SourceCounters { poses: 4, bad_packets: 1, stale_packets: 2, lost_frames: 2, occluded: 1 }
+        SourceCounters {
+            poses: 4,
+            bad_packets: 1,
+            stale_packets: 2,
+            lost_frames: 2,
+            occluded: 1,
+            rejected: 0
+        }
     );
     assert!(stream.next_warning().unwrap().starts_with("vicon: item 0 needs"));
 }
