@@ -1,5 +1,7 @@
 //! The command line: `vizflyt sim`, and this crate's own binary.
 
+use std::fmt::Display;
+use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -164,12 +166,12 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let driver = Driver::open(simulation, args.mavlink, args.vicon, args.realtime_factor)?;
     let address = driver.mavlink_address()?.to_string();
     if args.json {
-        println!("{}", serde_json::json!({ "ready": "simulator", "mavlink": address }));
+        say(&serde_json::json!({ "ready": "simulator", "mavlink": address }));
     } else {
-        println!(
+        say(&format!(
             "simulator ready: MAVLink {} (our address {address}); Ctrl-C ends it",
             args.mavlink
-        );
+        ));
     }
     // The loop has a thread of its own, whatever the caller's thread is busy with.
     let (simulation, lost_s) = std::thread::Builder::new()
@@ -182,10 +184,10 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     if args.json {
         let mut report = serde_json::to_value(&report).context("simulator: report")?;
         report["seconds_given_up"] = lost_s.into();
-        println!("{}", serde_json::json!({ "report": report }));
+        say(&serde_json::json!({ "report": report }));
     } else {
         let truth = &report.truth;
-        println!(
+        say(&format!(
             "flew {:.1} s, {:.1} m, at {:.1} m/s on average and {:.1} m/s at most; {}{}",
             truth.flight_seconds,
             truth.path_m,
@@ -195,9 +197,15 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
                 .min_clearance_m
                 .map_or("no obstacles".into(), |m| format!("least clearance {m:.2} m")),
             if truth.collided { ", collided" } else { "" },
-        );
+        ));
     }
     Ok(())
+}
+
+/// Prints a line; unlike `println!` it does not panic when the reader has gone.
+fn say(line: &impl Display) {
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
 #[cfg(test)]

@@ -140,7 +140,7 @@ fn a_killed_plugin_ends_in_a_landing_and_a_reason() {
     assert_eq!(report["outcome"], "plugin_failed", "{report:#}");
     let reason = report["reason"].as_str().unwrap();
     assert!(reason.contains("SIGKILL"), "the reason names the signal: {reason}");
-    assert!(demo.seen.iter().any(|line| line.contains("landed")), "{:#?}", demo.seen);
+    assert!(demo.seen.iter().any(|line| line.contains("on the ground")), "{:#?}", demo.seen);
 }
 
 #[test]
@@ -155,7 +155,7 @@ fn a_killed_server_ends_in_a_hold_and_a_landing() {
     demo.wait_for("land", FLIGHT);
     assert_eq!(demo.wait(FLIGHT), Some(1));
     assert_ne!(file.read()["outcome"], "finished");
-    assert!(demo.seen.iter().any(|line| line.contains("landed")), "{:#?}", demo.seen);
+    assert!(demo.seen.iter().any(|line| line.contains("on the ground")), "{:#?}", demo.seen);
 }
 
 #[test]

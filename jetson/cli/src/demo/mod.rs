@@ -88,7 +88,7 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     let log = match result {
         Ok(Flown::To { log }) => log,
         Ok(Flown::Interrupted) => {
-            println!("ended on request");
+            tell("ended on request");
             return Ok(ExitCode::FAILURE);
         }
         Err(error) => return Err(error),
@@ -97,7 +97,7 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     if let Some(path) = &args.report {
         report.write(path)?;
     }
-    println!("{}", report.summary());
+    tell(report.summary());
     Ok(if report.outcome == "finished" { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -135,7 +135,7 @@ impl Show {
             return Ok(Flown::Interrupted);
         };
         let url = text(&server, "http")?;
-        println!("page        {url}");
+        tell(format!("page        {url}"));
         if !args.headless {
             open_browser(&url);
         }
@@ -214,7 +214,9 @@ impl Show {
                 Ok(Notice::Line(from, line)) => self.note(from, &line),
                 Ok(Notice::Closed(Role::Runtime)) => return true,
                 // The runtime notices a dead server or vehicle by itself, and lands: let it.
-                Ok(Notice::Closed(from)) => println!("            the {} has ended", from.name()),
+                Ok(Notice::Closed(from)) => {
+                    tell(format!("            the {} has ended", from.name()))
+                }
                 Ok(Notice::Interrupted) | Err(_) => return false,
             }
         }
@@ -233,7 +235,7 @@ impl Show {
         if from == Role::Runtime
             && let Some(sentence) = line["event"]["text"].as_str()
         {
-            println!("            {sentence}");
+            tell(format!("            {sentence}"));
         }
     }
 
@@ -295,6 +297,13 @@ fn interrupt_notices(notices: Sender<Notice>) -> Result<()> {
     Ok(())
 }
 
+/// Prints a line for people; unlike `println!` it does not panic when nobody reads any more.
+fn tell(line: impl std::fmt::Display) {
+    use std::io::Write;
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}
+
 /// Opens the page where there is a desktop; the address is printed in any case.
 fn open_browser(url: &str) {
     let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
@@ -306,6 +315,6 @@ fn open_browser(url: &str) {
         .stderr(quiet())
         .spawn();
     if spawned.is_err() {
-        println!("            open it in a browser");
+        tell("            open it in a browser");
     }
 }

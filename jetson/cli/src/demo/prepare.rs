@@ -28,7 +28,7 @@ impl Stage {
                 .prefix("vizflyt-demo-")
                 .tempdir()
                 .context("cannot make a folder for the generated scene")?;
-            println!("scene       {kind}, seed {seed}");
+            super::tell(format!("scene       {kind}, seed {seed}"));
             let written = vizflyt_scenes::generate(kind, seed).write(folder.path())?;
             return Self::at(written.arena, Some(folder));
         }
@@ -39,7 +39,7 @@ impl Stage {
                  give one of the names, a folder with an arena.toml, or a splat .ply"
             );
         }
-        println!("scene       {}", path.display());
+        super::tell(format!("scene       {}", path.display()));
         if path.is_dir() {
             return Self::at(path.join("arena.toml"), None);
         }
