@@ -50,3 +50,8 @@ pub use memory::{
 };
 pub use observation::{CameraImage, Observation, Vehicle};
 pub use run::{attach, run};
+
+/// The plugin in the project's README compiles.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;
