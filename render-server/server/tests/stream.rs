@@ -36,7 +36,7 @@ async fn images_follow_the_poses() {
             header.encode_end_ns,
             header.send_ns,
         ]
-        .map(|stamp| stamp.get());
+        .map(zerocopy::byteorder::little_endian::U64::get);
         assert!(stamps.is_sorted(), "{stamps:?}");
         assert!(header.seq.get() > seq || header.pose_ns.get() < pose_ns);
         (seq, pose_ns) = (header.seq.get(), header.pose_ns.get());
@@ -259,6 +259,27 @@ async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
             _ => None,
         })
         .await;
+}
+
+#[tokio::test]
+async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let (mut client, _) = Client::welcomed(&server, usual()).await;
+    // Toward the wall at x = 5 m, 1 cm a frame.
+    let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| f64::from(frame) * 0.01);
+    let collision = |message| match message {
+        ToRuntime::Event(event) => match event.kind {
+            EventKind::Collision { p_world_m, clearance_m } => Some((p_world_m, clearance_m)),
+            _ => None,
+        },
+        _ => None,
+    };
+    let (p_world_m, clearance_m) = client.until(collision).await;
+    // The body's surface, 0.12 m before its centre, touches the wall's front, within two voxels.
+    assert!((p_world_m.x - 4.88).abs() < 0.15, "{p_world_m}");
+    assert!(clearance_m <= 0.0);
+    server.line(|line| line["event"]["kind"].get("collision").map(|_| ()));
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //!
 //! Everything waits on conditions; [`PATIENCE`] only bounds a test that fails.
 
-#![allow(dead_code)] // Why: every test file uses another part.
+#![allow(dead_code, unreachable_pub)] // Why: every test file uses another part, as its own module.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
@@ -24,7 +24,7 @@ use vizflyt_splat::{Splats, ply};
 use zerocopy::IntoBytes;
 
 /// Bounds a test that fails; never part of a passing one's outcome.
-pub const PATIENCE: Duration = Duration::from_secs(60);
+pub const PATIENCE: Duration = Duration::from_mins(1);
 
 /// Writes an arena whose scene is a wall of splats at x = 5 m, and returns the path of its
 /// arena.toml.
@@ -152,7 +152,7 @@ impl Drop for Server {
     }
 }
 
-/// Sends poses at about 200 Hz: frame n is at x = -n * STEP_M, level, nose along x.
+/// Sends poses at about 200 Hz: level, nose along x.
 pub struct Emitter {
     stop: Arc<AtomicBool>,
     paused: Arc<AtomicBool>,
@@ -166,7 +166,13 @@ pub const STEP_M: f64 = 0.001;
 pub const HEIGHT_M: f64 = 1.5;
 
 impl Emitter {
+    /// Frame n is at x = -n * `STEP_M`.
     pub fn start(to: SocketAddr, object: &'static str) -> Self {
+        Self::along(to, object, |frame| -f64::from(frame) * STEP_M)
+    }
+
+    /// Frame n is at x = `x_m(n)`.
+    pub fn along(to: SocketAddr, object: &'static str, x_m: fn(u32) -> f64) -> Self {
         let (stop, paused) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
         let sent = Arc::new(AtomicU32::new(0));
         let (stop2, paused2, sent2) = (stop.clone(), paused.clone(), sent.clone());
@@ -176,8 +182,7 @@ impl Emitter {
             while !stop2.load(Ordering::Relaxed) {
                 if !paused2.load(Ordering::Relaxed) {
                     frame += 1;
-                    let x_mm = -f64::from(frame) * STEP_M * 1e3;
-                    let values = [x_mm, 0.0, HEIGHT_M * 1e3, 0.0, 0.0, 0.0];
+                    let values = [x_m(frame) * 1e3, 0.0, HEIGHT_M * 1e3, 0.0, 0.0, 0.0];
                     let _ = socket.send_to(&vicon_packet(frame, object, values), to);
                     sent2.store(frame, Ordering::Relaxed);
                 }
@@ -208,7 +213,7 @@ pub fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
     let mut name = [0u8; 24];
     name[..object.len()].copy_from_slice(object.as_bytes());
     bytes.extend_from_slice(&name);
-    values.iter().for_each(|value| bytes.extend_from_slice(&value.to_le_bytes()));
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
     bytes
 }
 

@@ -178,7 +178,8 @@ const PHASES = {
   flying: ["good", "flying"], holding: ["warn", "holding"], landing: ["warn", "landing"], landed: ["idle", "landed"],
 };
 const lines = { altitude: [], speed: [], age: [] };
-const fixed = (value, digits) => (Number.isFinite(value) ? value.toFixed(digits) : "–");
+// Adding zero turns -0 into 0: a vehicle on the floor is not at "-0.00".
+const fixed = (value, digits) => (Number.isFinite(value) ? (+value.toFixed(digits) + 0).toFixed(digits) : "–");
 const put = (id, text) => {
   const node = $(id);
   if (node.textContent !== text) node.textContent = text;
