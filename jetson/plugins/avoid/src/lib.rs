@@ -7,8 +7,8 @@
 //! 4. [`steer`]: of all velocities, the one that gets on best without coming near anything;
 //! 5. here: height, heading and arrival; the velocity goes out as a [`Setpoint`].
 //!
-//! The nose turns to where the vehicle flies, so that the camera sees it. The whole takes less
-//! than a millisecond per image.
+//! The nose turns to where the vehicle flies, so that the camera sees it. The whole takes about
+//! 0.7 ms per image.
 //!
 //! To try an idea, change one of the constants at the foot of a file, or one step, and fly:
 //! `cargo run --release -- demo --plugin PATH`. Each constant says where it comes from.
@@ -69,6 +69,9 @@ impl Avoid {
         let Some(goal_m) = arena.goal_m.filter(|_| !self.finished) else {
             return Some(Setpoint::Hold);
         };
+        if !(vehicle.world_from_body.is_valid() && vehicle.v_world_mps.is_finite()) {
+            return None;
+        }
         let now = vehicle.stamp;
         let dt_s = self.last.map_or(0.0, |last| now.seconds_since(last)).clamp(0.0, MAX_DT_S);
         self.last = Some(now);
@@ -142,15 +145,17 @@ fn view_of<'a>(vehicle: &Vehicle, camera: &CameraImage<'a>) -> View<'a> {
     }
 }
 
-/// Fast enough to finish 37 m in ten seconds, slow enough to stop in half of what is seen. [m/s]
-const CRUISE_MPS: f64 = 4.2;
+/// Fast enough for 37 m in eleven seconds, slow enough to stop (2.9 m) in half of what the field
+/// holds (8 m). With 4.2 m/s, and 5 m/s^2 of slew,
+/// agile vehicles crossed every forest, but sluggish ones hit a tree in one of twenty. [m/s]
+const CRUISE_MPS: f64 = 3.6;
 /// Of the arena's greatest speed: the rest is for overshoot.
 const CRUISE_SHARE: f64 = 0.7;
 /// Deceleration at the goal. [m/s^2]
 const BRAKE_MPS2: f64 = 2.5;
 /// Within this share of the goal's radius the goal itself is the setpoint.
 const ARRIVED: f64 = 0.5;
-/// The setpoint leads the velocity by slew times lag, 1.25 m/s; a little more is allowed. [m/s]
+/// The setpoint leads the velocity by slew times lag, 1.2 m/s; a little more is allowed. [m/s]
 const MAX_LEAD_MPS: f64 = 1.6;
 /// Images farther apart than this are a gap, not a step. [s]
 const MAX_DT_S: f64 = 0.1;
@@ -161,3 +166,6 @@ const CLIMB_PER_S: f64 = 1.5;
 const CLIMB_MPS: f64 = 1.0;
 /// Slower than this the direction of travel means nothing, and the nose turns to the goal. [m/s]
 const LOOK_MPS: f64 = 0.3;
+
+#[cfg(test)]
+mod tests;

@@ -6,7 +6,7 @@
 //! the vehicle accelerates makes a false obstacle. About 20 000 pixels are looked at, whatever
 //! the size of the image: 0.2 ms.
 
-use vizflyt_sdk::glam::{DVec2, DVec3, Vec3};
+use vizflyt_sdk::glam::{DVec3, Vec3};
 use vizflyt_sdk::{Cam, Intrinsics, Pose, World};
 
 /// A depth image and where it was taken from.
@@ -135,22 +135,17 @@ fn bin_of(range_m: f32) -> usize {
     ((octaves * BINS_PER_OCTAVE) as usize).min(BINS - 1)
 }
 
-/// Returns the part of a point that matters for steering. [m, world]
-pub fn ground_plan(p_m: DVec3) -> DVec2 {
-    p_m.truncate()
-}
-
 /// Strips: 4 pixels of 320, so that a trunk of 0.12 m radius still fills one at 9 m
 /// (0.24 m / 9 m * 160 px = 4.3 px).
 pub const COLUMNS: usize = 80;
-/// Nothing farther is an obstacle yet: at 5 m/s it is two seconds away. [m]
-pub const FAR_M: f32 = 10.0;
+/// Nothing farther is an obstacle yet: the field reaches 8 m. At 3.6 m/s that is two seconds. [m]
+pub const FAR_M: f32 = 9.0;
 /// Nearer surfaces share the first bin. [m]
 const NEAR_M: f32 = 0.1;
 /// Nine bins an octave are 8 % of range each: wider than the noise of a surface, narrower than
 /// the distance between two trunks.
 const BINS_PER_OCTAVE: f32 = 9.0;
-/// log2(10 m / 0.1 m) * 9 = 59.8.
+/// log2(9 m / 0.1 m) * 9 = 58.4.
 const BINS: usize = 60;
 /// Pixels that must agree on a surface; fewer are speckle or the blur along an edge.
 const SUPPORT: u32 = 3;
@@ -168,3 +163,6 @@ const SEE_THROUGH_RATIO: f64 = 0.05;
 /// An image with less than one pixel in twenty is taken for a covered or broken camera; the
 /// emptiest real one, sky over a strip of floor, has more.
 const BLIND_FRACTION: f64 = 0.05;
+
+#[cfg(test)]
+mod tests;

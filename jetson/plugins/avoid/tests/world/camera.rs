@@ -7,7 +7,8 @@ use super::Random;
 
 /// Pixels of a side of the tiles in which solids are culled.
 const TILE_PX: u32 = 8;
-const FAR_M: f64 = 30.0;
+/// Beyond, everything is sky; the plugin looks 10 m far.
+const FAR_M: f64 = 15.0;
 
 /// Faults of a depth image.
 #[derive(Clone, Copy, Debug)]
@@ -35,8 +36,17 @@ pub(crate) fn render(
     let ray = |x: f64, y: f64| {
         world_from_cam.rotate(DVec3::new((x - k.cx_px) / k.fx_px, (y - k.cy_px) / k.fy_px, 1.0))
     };
-    let near: Vec<&Volume> =
-        volumes.iter().filter(|volume| volume.signed_distance_m(origin) < FAR_M).collect();
+    let forward = world_from_cam.rotate(DVec3::Z);
+    let near: Vec<&Volume> = volumes
+        .iter()
+        .filter(|volume| volume.signed_distance_m(origin) < FAR_M)
+        .filter(|volume| match **volume {
+            Volume::Capsule { a_m, b_m, radius_m } => {
+                (a_m - origin).dot(forward).max((b_m - origin).dot(forward)) + radius_m > 0.0
+            }
+            _ => true,
+        })
+        .collect();
     let mut ahead: Vec<&Volume> = Vec::new();
     for top in (0..k.height_px).step_by(TILE_PX as usize) {
         for left in (0..k.width_px).step_by(TILE_PX as usize) {

@@ -4,6 +4,8 @@
 pub(crate) mod camera;
 pub(crate) mod flight;
 
+use std::f64::consts::TAU;
+
 use vizflyt_sdk::Volume;
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
@@ -53,7 +55,7 @@ pub(crate) fn forest(seed: u64, trunks: usize) -> Vec<Volume> {
         let at_m =
             DVec2::new(random.between(3.5, 36.0), random.between(-HALF_WIDTH_M, HALF_WIDTH_M));
         let radius_m = random.between(0.12, 0.3);
-        let lean_m = DVec2::from_angle(random.between(0.0, 6.28)) * random.between(0.0, 0.2);
+        let lean_m = DVec2::from_angle(random.between(0.0, TAU)) * random.between(0.0, 0.2);
         let fits = |&(other_m, other_radius_m): &(DVec2, f64)| {
             at_m.distance(other_m) - radius_m - other_radius_m > 1.4
         };

@@ -1,0 +1,111 @@
+use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
+use vizflyt_sdk::protocol::messages::bounded;
+use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, Limits, ObservationBuffer, Volume};
+
+use super::*;
+
+fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
+    let front = CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians()),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    };
+    ArenaInfo {
+        name: bounded("test"),
+        geofence: Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 },
+        limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
+        body_radius_m: 0.12,
+        takeoff_height_m: 1.2,
+        goal_m,
+        goal_radius_m: 1.0,
+        time_limit_s: 0.0,
+        cameras: [front].into_iter().collect(),
+    }
+}
+
+const GOAL_M: DVec3 = DVec3::new(30.0, 0.0, 1.2);
+
+fn vehicle(p_m: DVec3, ms: u64) -> Vehicle {
+    Vehicle {
+        stamp: HostTime::from_ns(ms * 1_000_000),
+        world_from_body: Pose::new(p_m, DQuat::IDENTITY),
+        v_world_mps: DVec3::ZERO,
+        omega_body_radps: DVec3::ZERO,
+        battery_fraction: None,
+    }
+}
+
+/// One observation: everything `depth_mm` deep.
+fn see(plugin: &mut Avoid, vehicle: Option<Vehicle>, depth_mm: u16) -> Option<Setpoint> {
+    let mut buffer = ObservationBuffer::new(&arena(None).cameras);
+    let stamp = vehicle.map_or(HostTime::ZERO, |vehicle| vehicle.stamp);
+    if let Some(vehicle) = vehicle {
+        buffer.set_vehicle(&vehicle);
+    }
+    let stamps = ImageStamps { seq: 1, pose: stamp, ready: stamp };
+    buffer.set_image(0, stamps, |planes| planes.depth_mm.fill(depth_mm));
+    plugin.on_image(&buffer.observation())
+}
+
+fn started(goal_m: Option<DVec3>) -> Avoid {
+    let mut plugin = Avoid::default();
+    plugin.on_start(&arena(goal_m));
+    plugin
+}
+
+/// Returns velocity and heading after a second of images `depth_mm` deep. [m/s, rad, world]
+fn after_a_second(plugin: &mut Avoid, from_ms: u64, depth_mm: u16) -> (DVec3, f64) {
+    let mut last = None;
+    for ms in (from_ms..=from_ms + 1000).step_by(20) {
+        last = see(plugin, Some(vehicle(DVec3::new(0.0, 0.0, 1.0), ms)), depth_mm);
+    }
+    match last {
+        Some(Setpoint::Velocity { v_mps, yaw: YawTarget::Angle(yaw_rad), .. }) => (v_mps, yaw_rad),
+        other => panic!("{other:?} is no velocity with a heading"),
+    }
+}
+
+#[test]
+fn it_sets_off_for_the_goal_and_looks_there() {
+    let (v_mps, yaw_rad) = after_a_second(&mut started(Some(GOAL_M)), 1000, 20_000);
+    assert!(v_mps.x > 1.0 && v_mps.y.abs() < 0.1 && yaw_rad.abs() < 0.05, "{v_mps} {yaw_rad}");
+    assert!((v_mps.z - CLIMB_PER_S * 0.2).abs() < 1e-9, "climbs to the goal's height");
+}
+
+#[test]
+fn without_sight_it_stops_and_goes_on_when_sight_returns() {
+    let mut plugin = started(Some(GOAL_M));
+    after_a_second(&mut plugin, 1000, 20_000);
+    let (v_mps, _) = after_a_second(&mut plugin, 2020, 0);
+    assert!(v_mps.truncate().length() < 0.05, "{v_mps}");
+    let (v_mps, _) = after_a_second(&mut plugin, 3040, 20_000);
+    assert!(v_mps.x > 1.0, "{v_mps}");
+}
+
+#[test]
+fn at_the_goal_it_holds_the_goal() {
+    let p_m = GOAL_M + DVec3::new(0.2, 0.1, 0.0);
+    let answer = see(&mut started(Some(GOAL_M)), Some(vehicle(p_m, 1000)), 20_000);
+    assert!(matches!(answer, Some(Setpoint::Position { p_world_m: GOAL_M, .. })), "{answer:?}");
+}
+
+#[test]
+fn without_a_goal_or_after_the_finish_it_holds() {
+    let here = Some(vehicle(DVec3::Z, 1000));
+    assert_eq!(see(&mut started(None), here, 20_000), Some(Setpoint::Hold));
+    let mut plugin = started(Some(GOAL_M));
+    plugin.on_event(&Event {
+        stamp: vizflyt_sdk::protocol::time::ServerTime::ZERO,
+        kind: EventKind::Finished { seconds: 9.0 },
+        text: bounded("finished"),
+    });
+    assert_eq!(see(&mut plugin, here, 20_000), Some(Setpoint::Hold));
+}
+
+#[test]
+fn without_a_usable_pose_it_gives_no_answer() {
+    let mut plugin = started(Some(GOAL_M));
+    assert_eq!(see(&mut plugin, None, 20_000), None);
+    let lost = vehicle(DVec3::new(f64::NAN, 0.0, 0.0), 1000);
+    assert_eq!(see(&mut plugin, Some(lost), 20_000), None);
+}
