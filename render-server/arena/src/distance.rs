@@ -197,6 +197,8 @@ impl Tables {
 /// Working memory of a plane.
 #[derive(Default)]
 struct Scratch {
+    /// [`OCCUPIED`] or 0, y by z.
+    own: Vec<u8>,
     /// Squared distances, y by z.
     squares: Vec<i32>,
     line: Vec<i32>,
@@ -205,7 +207,9 @@ struct Scratch {
 
 /// Turns a plane's distances along x into codes.
 fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch: &mut Scratch) {
-    let own: Vec<u8> = plane.iter().map(|&cell| cell & OCCUPIED).collect();
+    let mut own = std::mem::take(&mut scratch.own);
+    own.clear();
+    own.extend(plane.iter().map(|&cell| cell & OCCUPIED));
     for kind in [0, OCCUPIED] {
         if !own.contains(&kind) {
             continue;
@@ -229,11 +233,12 @@ fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch
             }
         }
     }
+    scratch.own = own;
 }
 
 /// Adds the squared distances along z and y.
 fn square_distances(scratch: &mut Scratch, ny: usize, nz: usize) {
-    let Scratch { squares, line, envelope } = scratch;
+    let Scratch { squares, line, envelope, .. } = scratch;
     for row in squares.chunks_exact_mut(nz) {
         envelope.build(row);
         envelope.write(row.iter_mut());

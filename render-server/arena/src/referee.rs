@@ -152,8 +152,8 @@ impl Referee {
         self.least_clearance_m = self.least_clearance_m.min(found.clearance_m);
         let floor_m = to_m.z - radius_m - self.field.floor_z_m();
         let descent_mps = -sample.twist.linear_mps.z;
-        let contact = match found.contact_m {
-            Some(contact_m) => Some((contact_m, found.clearance_m, "an obstacle")),
+        let contact = match found.contact {
+            Some(touch) => Some((touch.p_world_m, touch.clearance_m, "an obstacle")),
             None if floor_m <= 0.0 && descent_mps > CRASH_MPS => Some((to_m, floor_m, "the floor")),
             None => None,
         };
