@@ -115,23 +115,37 @@ impl Hub {
 
     /// Appends to the log what the server or the runtime noticed.
     pub fn log(&self, origin: Origin, event: Event) {
-        if self.decides(&event.kind) {
-            lock(&self.flight).outcome.get_or_insert_with(|| event.clone());
-        }
+        self.judge(&event);
         self.events.push(origin, event);
     }
 
-    fn decides(&self, kind: &EventKind) -> bool {
-        match kind {
+    /// Notes what decides the flight: the first event of those that end one. A lost pose decides
+    /// only if nothing else does and it does not come back before the guard lands.
+    fn judge(&self, event: &Event) {
+        let phase = self.phase();
+        let under_way = self.under_way();
+        let mut flight = lock(&self.flight);
+        let provisional =
+            flight.outcome.as_ref().is_none_or(|e| matches!(e.kind, EventKind::PoseLost { .. }));
+        match event.kind {
             EventKind::Collision { .. }
             | EventKind::Geofence { .. }
             | EventKind::Finished { .. }
             | EventKind::TimeLimit
             | EventKind::EmergencyStop
-            | EventKind::PluginFailed => true,
+            | EventKind::PluginFailed
+                if provisional =>
+            {
+                flight.outcome = Some(event.clone());
+            }
             // On the ground a pose may come and go.
-            EventKind::PoseLost { .. } => self.under_way(),
-            _ => false,
+            EventKind::PoseLost { .. } if under_way => {
+                flight.outcome.get_or_insert_with(|| event.clone());
+            }
+            EventKind::PoseRegained if provisional && phase != FlightPhase::Landing => {
+                flight.outcome = None;
+            }
+            _ => {}
         }
     }
 
@@ -398,6 +412,25 @@ mod tests {
         let third = hub.sit(&hello("vizflyt"), address()).unwrap();
         assert_eq!((third.first_event, third.resumed, hub.flights()), (2, false, 2));
         assert!(hub.flight().outcome.is_none() && hub.telemetry.borrow().is_none());
+    }
+
+    #[test]
+    fn the_first_decisive_event_is_the_outcome_and_a_lost_pose_only_if_it_stays_lost() {
+        let hub = hub();
+        let outcome = || hub.flight().outcome.map(|event| event.text.as_str().to_owned());
+        let lost = EventKind::PoseLost { age_s: 0.2 };
+        hub.tell(lost.clone(), "on the ground");
+        assert_eq!(outcome(), None);
+        hub.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
+        hub.tell(lost.clone(), "a hiccup");
+        assert_eq!(outcome().as_deref(), Some("a hiccup"));
+        hub.tell(EventKind::PoseRegained, "back");
+        assert_eq!(outcome(), None);
+        hub.tell(lost.clone(), "lost");
+        hub.tell(EventKind::Finished { seconds: 9.0 }, "goal");
+        hub.tell(EventKind::EmergencyStop, "later");
+        hub.tell(lost, "later still");
+        assert_eq!(outcome().as_deref(), Some("goal"));
     }
 
     #[test]

@@ -41,6 +41,9 @@ pub fn poses(
             Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
         });
         let measured = source.receive(due.min(PATIENCE));
+        // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
+        // old by now but followed by a newer one, and that is not a lost pose.
+        let mut judged_at = clock::now();
         // A new runtime on the ground is a new flight: course and timer start afresh.
         let now_flights = hub.flights();
         if now_flights != flights {
@@ -51,6 +54,7 @@ pub fn poses(
             let _span = trace_span!("pose", stamp_ns = measured.stamp.as_ns()).entered();
             match referee.handle_measurement(measured.stamp, measured.world_from_body) {
                 Ok(sample) => {
+                    judged_at = sample.stamp;
                     hub.pose.send_replace(Some(sample));
                     newest.put(Some(sample));
                     lock(&hub.trail).add(&sample);
@@ -58,8 +62,11 @@ pub fn poses(
                 Err(reason) => {
                     rejected += 1;
                     // Two frames of one burst may bear the same stamp: no fault of anyone's.
-                    let known = matches!(reason, Rejected::Stale);
-                    if !known && warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
+                    let same = matches!(reason, Rejected::Stale);
+                    if same {
+                        judged_at = measured.stamp;
+                    }
+                    if !same && warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
                         warned = Some(Instant::now());
                         warn!("{reason}");
                         hub.note(&reason.to_string());
@@ -68,7 +75,7 @@ pub fn poses(
             }
             hub.stats.pose.add(measured.arrival, clock::now());
         }
-        referee.handle_timeout(clock::now());
+        referee.handle_timeout(judged_at);
         while let Some(event) = referee.poll_event() {
             hub.log(Origin::Server, event);
         }

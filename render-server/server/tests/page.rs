@@ -6,6 +6,9 @@ use quinn::TransportConfig;
 use support::{Client, Emitter, Server, Socket, http, write_arena};
 use vizflyt_protocol::messages::{EventKind, ToRuntime};
 
+/// Messages within which what is waited for must come: a minute's worth.
+const MANY: usize = 2000;
+
 #[test]
 fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
     let folder = tempfile::tempdir().unwrap();
@@ -45,9 +48,12 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
     assert!(socket.message("trail")["points"].as_array().unwrap().is_empty());
     assert!(socket.message("state")["pose"].is_null());
     let _emitter = Emitter::start(server.vicon, "vizflyt");
-    while socket.message("state")["pose"].is_null() {}
+    assert!((0..MANY).any(|_| !socket.message("state")["pose"].is_null()));
     let mut seen = [false; 2];
-    while seen != [true; 2] {
+    for _ in 0..MANY {
+        if seen == [true; 2] {
+            break;
+        }
         let (opcode, payload) = socket.next();
         if opcode == 2 {
             assert_eq!(payload[1], 0, "camera");
@@ -55,13 +61,10 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
             seen[usize::from(payload[0])] = true;
         }
     }
+    assert_eq!(seen, [true; 2], "colour and depth");
     // One that opens later is told the way so far.
-    loop {
-        let mut late = Socket::open(server.http, &own).ok().unwrap();
-        if !late.message("trail")["points"].as_array().unwrap().is_empty() {
-            break;
-        }
-    }
+    let mut late = Socket::open(server.http, &own).ok().unwrap();
+    assert!(!late.message("trail")["points"].as_array().unwrap().is_empty());
 }
 
 #[tokio::test]

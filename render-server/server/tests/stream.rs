@@ -266,8 +266,9 @@ async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (mut client, _) = Client::welcomed(&server, usual()).await;
-    // Toward the wall at x = 5 m, 1 cm a frame.
-    let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| f64::from(frame) * 0.01);
+    // Half a second in place, then toward the wall at x = 5 m, 1 cm a frame.
+    let _emitter =
+        Emitter::along(server.vicon, "vizflyt", |frame| f64::from(frame.max(100) - 100) * 0.01);
     let collision = |message| match message {
         ToRuntime::Event(event) => match event.kind {
             EventKind::Collision { p_world_m, clearance_m } => Some((p_world_m, clearance_m)),

@@ -2,7 +2,7 @@
 //!
 //! Frames are measured at a constant rate, but arrive late by a delay that varies: the network,
 //! and this computer waking up late. Over a window, arrival = offset + period * frame + delay with
-//! delay >= 0. The period is the slope of a least-squares line; the offset is the least
+//! delay >= 0. The period is the slope of a line through the promptest frames; the offset is the least
 //! `arrival - period * frame`, as in the minimum-delay filter of NTP. What remains in the stamp is
 //! the constant delay only. Velocity from finite differences needs this: two packets read at the
 //! same instant would otherwise be an infinite speed.
@@ -16,8 +16,13 @@ use vizflyt_protocol::time::ServerTime;
 pub struct FrameClock {
     /// (frame, arrival), oldest first, frames unwrapped relative to the first of the window.
     window: VecDeque<(u32, ServerTime)>,
-    late_in_a_row: u32,
+    /// Since when every frame has come late.
+    late_since: Option<ServerTime>,
     last: Option<ServerTime>,
+    /// The slope of the last window that was long enough. [s]
+    period_s: Option<f64>,
+    /// Scratch for that slope.
+    points: Vec<(f64, f64)>,
 }
 
 impl FrameClock {
@@ -36,9 +41,11 @@ impl FrameClock {
             self.window.pop_front();
         }
         let lateness_s = self.lateness_s();
-        // The counter's clock slipped against ours for good (the source paused): start over.
-        self.late_in_a_row = if lateness_s > SLIP_S { self.late_in_a_row + 1 } else { 0 };
-        if self.late_in_a_row > SLIP_FRAMES {
+        // The counter's clock slipped against ours for good (the source paused): start over. Time
+        // tells this from a burst after a pause of our own, which is over in an instant.
+        self.late_since =
+            if lateness_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
+        if self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S) {
             self.restart();
             self.window.push_back((frame, arrival));
             return self.monotone(arrival, arrival);
@@ -48,7 +55,7 @@ impl FrameClock {
 
     fn restart(&mut self) {
         self.window.clear();
-        self.late_in_a_row = 0;
+        self.late_since = None;
     }
 
     fn monotone(&mut self, stamp: ServerTime, arrival: ServerTime) -> ServerTime {
@@ -58,46 +65,69 @@ impl FrameClock {
     }
 
     /// Returns by how much the newest frame came later than the promptest of the window. [s]
-    fn lateness_s(&self) -> f64 {
-        let (Some(&(frame_0, arrival_0)), Some(&newest)) =
-            (self.window.front(), self.window.back())
-        else {
+    fn lateness_s(&mut self) -> f64 {
+        let (Some(&first), Some(&newest)) = (self.window.front(), self.window.back()) else {
             return 0.0;
         };
-        if self.window.len() < LEAST {
-            return 0.0;
+        let point = |(frame, arrival): (u32, ServerTime)| {
+            (f64::from(frame.wrapping_sub(first.0)), arrival.seconds_since(first.1))
+        };
+        // The period hardly changes: every few frames is often enough.
+        if self.window.len() >= LEAST && (self.period_s.is_none() || newest.0.is_multiple_of(8)) {
+            self.points.clear();
+            self.points.extend(self.window.iter().map(|&p| point(p)));
+            self.period_s = slope_of_the_prompt(&mut self.points).or(self.period_s);
         }
-        let point = |&(frame, arrival): &(u32, ServerTime)| {
-            (f64::from(frame.wrapping_sub(frame_0)), arrival.seconds_since(arrival_0))
-        };
-        let count = self.window.len() as f64;
-        let (sum_f, sum_a) =
-            self.window.iter().map(point).fold((0.0, 0.0), |s, (f, a)| (s.0 + f, s.1 + a));
+        // Before there ever was a slope, stamps are arrivals.
+        let Some(period_s) = self.period_s else { return 0.0 };
+        let offset = |(f, a): (f64, f64)| a - period_s * f;
+        let least = self.window.iter().map(|&p| offset(point(p))).fold(f64::INFINITY, f64::min);
+        (offset(point(newest)) - least).max(0.0)
+    }
+}
+
+/// Returns the slope of a least-squares line through the prompter half of (frame, arrival) points.
+///
+/// Delays are one-sided and come in bursts, which tilt a line through all points. So the later
+/// half is left out, judged by the line before, a few times over (the concentration steps of least
+/// trimmed squares: Rousseeuw and Van Driessen, 1999). Reorders the points.
+fn slope_of_the_prompt(points: &mut [(f64, f64)]) -> Option<f64> {
+    let mut kept = points.len();
+    let mut slope = None;
+    for _ in 0..STEPS {
+        let count = kept as f64;
+        let used = &points[..kept];
+        let (sum_f, sum_a) = used.iter().fold((0.0, 0.0), |s, (f, a)| (s.0 + f, s.1 + a));
         let (mean_f, mean_a) = (sum_f / count, sum_a / count);
-        let (cross, square) = self.window.iter().map(point).fold((0.0, 0.0), |s, (f, a)| {
+        let (cross, square) = used.iter().fold((0.0, 0.0), |s, (f, a)| {
             (s.0 + (f - mean_f) * (a - mean_a), s.1 + (f - mean_f).powi(2))
         });
         if !(square > 0.0) {
-            return 0.0;
+            return slope;
         }
         let period_s = cross / square;
-        let offset = |(f, a): (f64, f64)| a - period_s * f;
-        let least = self.window.iter().map(|p| offset(point(p))).fold(f64::INFINITY, f64::min);
-        (offset(point(&newest)) - least).max(0.0)
+        slope = Some(period_s);
+        kept = points.len().div_ceil(2).max(LEAST / 2).min(points.len());
+        points.select_nth_unstable_by(kept - 1, |p, q| {
+            (p.1 - period_s * p.0).total_cmp(&(q.1 - period_s * q.0))
+        });
     }
+    slope
 }
 
 /// Two seconds at 200 Hz. The slope's error is then 1 us a frame for 2 ms of jitter.
 const WINDOW: usize = 400;
-/// Fewer frames than this give no slope worth using: stamps are arrivals.
+/// Fewer frames than this give no slope worth using: the last one holds.
 const LEAST: usize = 20;
 /// A gap in the counter beyond this is another recording: a second at 200 Hz.
 const MOST_GAP: u32 = 200;
 /// Silence after which the counter is trusted no more. [s]
 const MOST_SILENCE_S: f64 = 1.0;
-/// Lateness that no network of a lab explains for [`SLIP_FRAMES`] frames in a row. [s]
+/// Enough for a burst of a quarter of the window.
+const STEPS: usize = 4;
+/// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
 const SLIP_S: f64 = 0.010;
-const SLIP_FRAMES: u32 = 20;
+const SLIP_LASTS_S: f64 = 0.3;
 
 #[cfg(test)]
 mod tests {
@@ -140,6 +170,21 @@ mod tests {
                 prop_assert!(stamp >= last && stamp <= arrival);
                 last = stamp;
             }
+        }
+    }
+
+    /// A pause of ours: frames queue in the socket and are read all at once. Their stamps keep the
+    /// source's rhythm; were they the arrivals, the vehicle would seem to jump.
+    #[test]
+    fn a_burst_keeps_the_rhythm_of_the_source() {
+        let mut clock = FrameClock::default();
+        for frame in 0..300 {
+            clock.stamp(frame, truth(frame));
+        }
+        let read = truth(350);
+        for frame in 300..350 {
+            let stamp = clock.stamp(frame, read);
+            assert!(stamp.seconds_since(truth(frame)).abs() < 2e-3, "frame {frame}: {stamp:?}");
         }
     }
 

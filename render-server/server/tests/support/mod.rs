@@ -349,11 +349,15 @@ impl Client {
 
     /// Returns the first message for which `wanted` yields something.
     pub async fn until<T>(&mut self, mut wanted: impl FnMut(ToRuntime) -> Option<T>) -> T {
-        loop {
-            if let Some(found) = wanted(self.next().await) {
-                return found;
+        tokio::time::timeout(PATIENCE, async {
+            loop {
+                if let Some(found) = wanted(self.next().await) {
+                    return found;
+                }
             }
-        }
+        })
+        .await
+        .expect("the message that is waited for")
     }
 
     /// Returns the next image stream that was not reset, whole.

@@ -146,7 +146,6 @@ const clock = (s) => `${Math.floor(s / 60)}:${(s % 60).toFixed(1).padStart(4, "0
 
 function hearEvents({ events }) {
   const list = $("events");
-  const atEnd = list.scrollTop + list.clientHeight >= list.scrollHeight - 30;
   for (const event of events) {
     if (shown.events.has(event.index)) continue;
     shown.events.add(event.index);
@@ -161,8 +160,18 @@ function hearEvents({ events }) {
       view.arena.stages[event.kind.stage.index].passed = true;
   }
   while (list.childElementCount > 400) list.firstChild.remove();
-  if (atEnd) list.scrollTop = list.scrollHeight;
+  follow();
 }
+
+// The newest event stays in sight until someone scrolls up to read.
+let following = true;
+function follow() {
+  if (following) $("events").scrollTop = $("events").scrollHeight;
+}
+$("events").addEventListener("scroll", ({ target }) => {
+  following = target.scrollTop + target.clientHeight >= target.scrollHeight - 40;
+});
+new ResizeObserver(follow).observe($("events"));
 
 function banner(tone, title, text) {
   const box = $("outcome");
