@@ -68,10 +68,11 @@ impl Child {
             let notices = notices.clone();
             std::thread::spawn(move || {
                 for line in BufReader::new(stdout).lines().map_while(Result::ok) {
-                    match serde_json::from_str(&line) {
+                    if let Ok(value) = serde_json::from_str(&line) {
                         // The demo may have ended; then nobody needs the line.
-                        Ok(value) => drop(notices.send(Notice::Line(role, value))),
-                        Err(_) => tracing::warn!("{} printed: {line}", role.name()),
+                        drop(notices.send(Notice::Line(role, value)));
+                    } else {
+                        tracing::warn!("{} printed: {line}", role.name());
                     }
                 }
                 drop(notices.send(Notice::Closed(role)));

@@ -66,7 +66,7 @@ pub(crate) struct DemoArgs {
 }
 
 /// How long a child may take to say it is ready: a large scene is loaded and baked.
-const READY_LIMIT: Duration = Duration::from_secs(120);
+const READY_LIMIT: Duration = Duration::from_mins(2);
 /// How long all children together may take to end.
 const END_LIMIT: Duration = Duration::from_millis(1500);
 
@@ -215,7 +215,7 @@ impl Show {
                 Ok(Notice::Closed(Role::Runtime)) => return true,
                 // The runtime notices a dead server or vehicle by itself, and lands: let it.
                 Ok(Notice::Closed(from)) => {
-                    tell(format!("            the {} has ended", from.name()))
+                    tell(format!("            the {} has ended", from.name()));
                 }
                 Ok(Notice::Interrupted) | Err(_) => return false,
             }
