@@ -141,12 +141,12 @@ mod tests {
     }
 
     proptest! {
-        /// With jitter of up to 4 ms, stamps settle to within 1 ms of the truth (plus the least
-        /// delay), where arrivals are off by up to 4.
+        /// With jitter of up to 4 ms, stamps settle to within 2 ms of the truth, 1 ms on average,
+        /// where arrivals are off by up to 4 and by 2.
         #[test]
         fn jitter_is_removed(delays in prop::collection::vec(0u64..4_000_000, 400..600)) {
             let mut clock = FrameClock::default();
-            let mut arrival = ServerTime::ZERO;
+            let (mut arrival, mut sum_s) = (ServerTime::ZERO, 0.0);
             for (frame, delay) in delays.iter().enumerate() {
                 let frame = frame as u32;
                 // Packets do not overtake each other.
@@ -154,9 +154,12 @@ mod tests {
                 let stamp = clock.stamp(frame, arrival);
                 prop_assert!(stamp <= arrival);
                 if frame > 200 {
-                    prop_assert!(stamp.seconds_since(truth(frame)).abs() < 1e-3);
+                    let error_s = stamp.seconds_since(truth(frame)).abs();
+                    prop_assert!(error_s < 2e-3, "frame {}: {} s", frame, error_s);
+                    sum_s += error_s;
                 }
             }
+            prop_assert!(sum_s / (delays.len() as f64 - 201.0) < 1e-3);
         }
 
         /// Whatever comes, stamps never run backwards nor ahead of the arrival.
