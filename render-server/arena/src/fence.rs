@@ -23,11 +23,12 @@ pub struct FenceCheck {
     pub verdict: FenceVerdict,
     /// From the body's surface to the fence; negative is outside. [m]
     pub margin_m: f64,
-    /// Way needed to stop toward the nearest side, `v^2 / 2a`. [m]
-    pub stopping_m: f64,
+    /// From the body's surface to the fence where the vehicle would come to rest, braking along
+    /// its way over `v^2 / 2a`; negative is outside. [m]
+    pub margin_at_rest_m: f64,
 }
 
-/// Room beyond the stopping distance below which a person should be told. [m]
+/// Room, now or at rest, below which a person should be told. [m]
 const NEAR_M: f64 = 0.3;
 /// The referee's tolerance over the guard's: the guard brakes with its own margin, and poses carry
 /// millimetres of noise. Only what it fails to hold is judged. [m]
@@ -41,18 +42,22 @@ pub fn check(
     p_world_m: DVec3,
     v_world_mps: DVec3,
 ) -> FenceCheck {
-    let margin_m = -fence.signed_distance_m(p_world_m) - radius_m;
-    let outward_mps = fence.outward_normal(p_world_m).dot(v_world_mps).max(0.0);
-    let stopping_m = outward_mps * outward_mps / (2.0 * limits.max_acceleration_mps2);
-    // Phrased so that a number that is none counts as a breach.
-    let verdict = if !(margin_m >= 0.0 && margin_m + TOLERANCE_M >= stopping_m) {
+    let margin_at = |p_m: DVec3| -fence.signed_distance_m(p_m) - radius_m;
+    let margin_m = margin_at(p_world_m);
+    // The place of rest, not the nearest side: low over the floor, the floor is always nearest,
+    // however fast the vehicle flies at the wall ahead.
+    let way_m = v_world_mps * (v_world_mps.length() / (2.0 * limits.max_acceleration_mps2));
+    let margin_at_rest_m = margin_at(p_world_m + way_m);
+    // A number that is none counts as a breach; a volume's distance may lose it on the way.
+    let known = p_world_m.is_finite() && v_world_mps.is_finite();
+    let verdict = if !(known && margin_m >= 0.0 && margin_at_rest_m + TOLERANCE_M >= 0.0) {
         FenceVerdict::Breach
-    } else if margin_m < stopping_m + NEAR_M {
+    } else if margin_m.min(margin_at_rest_m) < NEAR_M {
         FenceVerdict::Near
     } else {
         FenceVerdict::Inside
     };
-    FenceCheck { verdict, margin_m, stopping_m }
+    FenceCheck { verdict, margin_m, margin_at_rest_m }
 }
 
 #[cfg(test)]
@@ -72,6 +77,10 @@ mod tests {
         assert_eq!(verdict([8.9, 2.0, 1.5], [4.0, 0.0, 0.0]), FenceVerdict::Near);
         assert_eq!(verdict([8.9, 2.0, 1.5], [4.5, 0.0, 0.0]), FenceVerdict::Breach);
         assert_eq!(verdict([8.9, 2.0, 1.5], [-6.0, 0.0, 0.0]), FenceVerdict::Inside);
+        // The floor is nearer than the wall, and parallel to the way.
+        assert_eq!(verdict([8.9, 2.0, 0.6], [4.5, 0.0, 0.0]), FenceVerdict::Breach);
+        assert_eq!(verdict([8.9, 2.0, 0.6], [0.0, 4.5, 0.0]), FenceVerdict::Inside);
+        assert_eq!(verdict([8.9, 2.0, 1.5], [f64::NAN, 0.0, 0.0]), FenceVerdict::Breach);
         assert_eq!(verdict([9.95, 2.0, 1.5], [0.0, 0.0, 0.0]), FenceVerdict::Breach);
         assert_eq!(verdict([f64::NAN, 2.0, 1.5], [0.0, 0.0, 0.0]), FenceVerdict::Breach);
     }

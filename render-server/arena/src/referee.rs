@@ -190,8 +190,10 @@ impl Referee {
                     format!("left the geofence by {:.2} m", -margin_m)
                 } else {
                     format!(
-                        "cannot stop inside the geofence: {margin_m:.2} m left, {:.2} m needed",
-                        found.stopping_m
+                        "cannot stop inside the geofence: {margin_m:.2} m left, and at {:.1} m/s \
+                         it would come to rest {:.2} m outside",
+                        v_mps.length(),
+                        -found.margin_at_rest_m
                     )
                 };
                 self.end(sample.stamp, EventKind::Geofence { p_world_m, margin_m }, &text);
