@@ -61,6 +61,8 @@ proptest! {
         pitch in -0.4..0.4f64, roll in -0.3..0.3f64, x in 1.0..9.0f64, slope in -0.5..0.5f64,
     ) {
         let trunk_m = DVec2::new(x, slope * x);
+        // Further away nothing is noted.
+        prop_assume!(trunk_m.length() < f64::from(FAR_M));
         let world_from_cam = camera(pitch, roll);
         let found = scan(&picture(&world_from_cam, Some(trunk_m)), world_from_cam);
         prop_assert!(!found.points_m.is_empty());
