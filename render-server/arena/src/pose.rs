@@ -35,6 +35,8 @@ const JUMP_CONFIRMED: u32 = 10;
 /// Span of measurements from which the twist is taken. At 200 Hz and 0.3 mm of noise the
 /// velocity's own noise is 5 mm/s, its lag half the span. [s]
 const TWIST_SPAN_S: f64 = 0.05;
+/// Over less than this, noise and bunched packets make any speed; the former twist holds. [s]
+const LEAST_SPAN_S: f64 = 0.01;
 /// Measurements kept for the twist at most; 500 Hz fills the span with fewer.
 const TWIST_SAMPLES: usize = 32;
 /// Silence that counts as a lost pose: 30 missed packets of a 200 Hz mocap. [s]
@@ -85,8 +87,9 @@ impl PoseGate {
             }
         }
         self.jumped = None;
+        // The oldest kept is the last one before the span: after a pause there is a baseline.
         while self.recent.len() >= TWIST_SAMPLES
-            || self.recent.front().is_some_and(|(at, _)| stamp.seconds_since(*at) > TWIST_SPAN_S)
+            || self.recent.get(1).is_some_and(|(at, _)| stamp.seconds_since(*at) > TWIST_SPAN_S)
         {
             self.recent.pop_front();
         }
@@ -133,8 +136,12 @@ impl PoseGate {
             return Twist::default();
         };
         let span_s = newest.seconds_since(oldest);
-        if !(span_s > 0.0) {
-            return Twist::default();
+        if !(span_s >= LEAST_SPAN_S) {
+            // After a jump there is no former twist to keep.
+            return self
+                .newest
+                .filter(|_| self.recent.len() > 1)
+                .map_or_else(Twist::default, |n| n.twist);
         }
         let n = self.recent.len() as f64;
         let times = || self.recent.iter().map(|(at, _)| at.seconds_since(oldest));
@@ -251,6 +258,23 @@ mod tests {
         let (count, sample) = accepted.expect("a lasting jump is believed");
         assert_eq!(count, JUMP_CONFIRMED as i32);
         assert_eq!((sample.resets, sample.twist), (1, Twist::default()));
+    }
+
+    #[test]
+    fn packets_bunched_after_a_pause_are_no_speed() {
+        let mut gate = PoseGate::default();
+        // 2 m/s, read in time for 0.2 s; then 0.1 s of packets read at once.
+        for i in 0..40 {
+            let t = 0.005 * f64::from(i);
+            gate.handle_measurement(at(t), pose(DVec3::X * 2.0 * t)).unwrap();
+        }
+        for i in 40..60 {
+            let place = pose(DVec3::X * 2.0 * 0.005 * f64::from(i));
+            // Those that come at a jump's speed are turned away; the others make no great one.
+            let _ = gate.handle_measurement(at(0.3 + 1e-4 * f64::from(i - 40)), place);
+            let speed_mps = gate.newest().unwrap().twist.linear_mps.length();
+            assert!(speed_mps < 3.0, "{speed_mps} m/s after packet {i}");
+        }
     }
 
     #[test]
