@@ -72,9 +72,7 @@ impl<'m> ObservationWriter<'m> {
         for ((head, camera), &(rgb, depth)) in
             header.cameras.iter_mut().zip(cameras).zip(&layout.planes)
         {
-            let k = &camera.intrinsics;
-            // The size stays 0 until the image is there; see `camera`.
-            head.intrinsics_px = [k.fx_px, k.fy_px, k.cx_px, k.cy_px];
+            // The size stays 0 until the image is there; see `image_ready`.
             head.translation_m = camera.body_from_cam.translation_m.to_array();
             head.rotation_xyzw = camera.body_from_cam.rotation.to_array();
             (head.rgb_offset, head.depth_offset) = (rgb as u32, depth as u32);
@@ -132,8 +130,7 @@ impl<'m> ObservationWriter<'m> {
     pub fn image_ready(&mut self, index: usize, camera: &CameraInfo, stamps: ImageStamps) {
         let count = usize::from(self.header().camera_count);
         let Some(head) = self.header().cameras[..count].get_mut(index) else { return };
-        head.width_px = camera.intrinsics.width_px;
-        head.height_px = camera.intrinsics.height_px;
+        head.set_intrinsics(&camera.intrinsics);
         head.seq = stamps.seq;
         head.pose_ns = stamps.pose.as_ns();
         head.ready_ns = stamps.ready.as_ns();

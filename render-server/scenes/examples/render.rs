@@ -13,7 +13,7 @@ use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_splat::{Camera, CpuRenderer, RgbdImage};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         };
         let mut images = [RgbdImage::default()];
         let start = Instant::now();
-        renderer.render(std::slice::from_ref(&camera), &mut images)?;
+        renderer.render(&[], std::slice::from_ref(&camera), &mut images)?;
         let [seen] = images;
         let thin = seen.alpha.iter().filter(|alpha| **alpha < 0.98).count() as f64;
         println!(

@@ -4,7 +4,7 @@
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, Volume, World, body_from_forward_cam};
-use vizflyt_splat::{Camera, CpuRenderer, RgbdImage, Splats, ply};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply};
 
 use super::*;
 use crate::solids::{REACH_M, Solids};
@@ -172,7 +172,7 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
             world_from_body * body_from_forward_cam(DVec3::ZERO, pitch_deg.to_radians());
         let camera = Camera { intrinsics: k, world_from_cam, near_m: 0.05, background: [0.0; 3] };
         let mut images = [RgbdImage::default()];
-        renderer.render(std::slice::from_ref(&camera), &mut images).unwrap();
+        renderer.render(&[], std::slice::from_ref(&camera), &mut images).unwrap();
         let [seen] = images;
 
         // (camera-z depth, whether it is the floor) of what each pixel's centre sees.
@@ -180,7 +180,7 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
             .map(|i| {
                 let (u, v) = (i as u32 % width, i as u32 / width);
                 let pixel = DVec2::new(f64::from(u) + 0.5, f64::from(v) + 0.5);
-                let ray_cam = k.unproject(pixel, 1.0);
+                let ray_cam = k.unproject(pixel, 1.0).unwrap();
                 let ray = world_from_cam.rotate(ray_cam).normalize();
                 let mut along_m = 0.0;
                 for _ in 0..400 {
@@ -217,11 +217,11 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
                 sum.thin += usize::from(seen.alpha[i] < 0.95);
                 let depth_m = f64::from(seen.depth_median_m[i]);
                 let pixel = DVec2::new(f64::from(u) + 0.5, f64::from(v) + 0.5);
-                let truth_at_m = world_from_cam.transform_point(k.unproject(pixel, truth_m));
+                let truth_at_m = world_from_cam.transform_point(k.unproject(pixel, truth_m).unwrap());
                 if floor || fence.signed_distance_m(truth_at_m) > 0.0 {
                     // At a grazing angle a millimetre across a surface is decimetres of depth:
                     // here what counts is how far from the true surface the seen point lies.
-                    let q_m = world_from_cam.transform_point(k.unproject(pixel, depth_m));
+                    let q_m = world_from_cam.transform_point(k.unproject(pixel, depth_m).unwrap());
                     sum.ground_pixels += 1;
                     // Walls beyond the fence are painted coarsely.
                     let beyond = fence.signed_distance_m(truth_at_m) > 0.3;

@@ -7,7 +7,7 @@
 use axum::body::Bytes;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Camera, RgbdImage, Splats};
 
@@ -87,6 +87,7 @@ fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Ca
             fy_px: f_px,
             cx_px: f64::from(width_px) / 2.0,
             cy_px: f64::from(height_px) / 2.0,
+            distortion: Distortion::None,
         },
         world_from_cam: Pose::new(middle.extend(ceiling_m + height_m), DQuat::from_mat3(&axes)),
         near_m: height_m as f32,

@@ -18,8 +18,8 @@ use std::time::{Duration, Instant};
 use criterion::Criterion;
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use serde::Deserialize;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, PassTimes, RgbdImage, Splats, ply, render_reference};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, PassTimes, RgbdImage, Splats, ply, render_reference};
 
 /// A scene and where it is seen from.
 struct Case {
@@ -61,7 +61,7 @@ fn main() {
             for mut renderer in CpuRenderer::every(&case.splats) {
                 let mut image = [RgbdImage::default()];
                 group.bench_function(renderer.name(), |bencher| {
-                    bencher.iter(|| renderer.render(&[*camera], &mut image).map(|_| ()));
+                    bencher.iter(|| renderer.render(&[], &[*camera], &mut image).map(|_| ()));
                 });
             }
             group.finish();
@@ -82,12 +82,12 @@ fn passes(case: &Case) {
     );
     for (view, camera) in &case.cameras {
         let start = Instant::now();
-        black_box(render_reference(&case.splats, camera).expect("a valid camera"));
+        black_box(render_reference(&case.splats, &[], camera).expect("a valid camera"));
         let reference_ms = start.elapsed().as_secs_f32() * 1e3;
         for mut renderer in CpuRenderer::every(&case.splats) {
             let mut image = [RgbdImage::default()];
             let times: Vec<PassTimes> = (0..65)
-                .map(|_| renderer.render(&[*camera], &mut image).expect("a valid camera"))
+                .map(|_| renderer.render(&[], &[*camera], &mut image).expect("a valid camera"))
                 .skip(5)
                 .collect();
             let row = |pass: fn(&PassTimes) -> f32| {
@@ -223,6 +223,7 @@ fn captured() -> Vec<Case> {
                     fy_px: c.fy * zoom,
                     cx_px: c.cx * zoom,
                     cy_px: c.cy * zoom,
+                    distortion: Distortion::None,
                 };
                 cameras.push((format!("{pose}_{w}x{h}"), camera(intrinsics, world_from_cam)));
             }

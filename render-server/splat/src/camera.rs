@@ -1,11 +1,14 @@
-//! A pinhole camera placed in the world.
+//! A camera placed in the world.
 
-use vizflyt_protocol::geometry::{Cam, Intrinsics, InvalidIntrinsics, Pose, World};
+use glam::DVec2;
+use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
+
+use crate::limits::JACOBIAN_MARGIN;
 
 /// What is drawn, from where.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Size, focal lengths, principal point.
+    /// Size, focal lengths, principal point, lens.
     pub intrinsics: Intrinsics,
     /// Where the camera is.
     pub world_from_cam: Pose<World, Cam>,
@@ -31,6 +34,47 @@ impl Camera {
         }
         Ok(())
     }
+
+    /// Returns least and greatest `(x / z, y / z)` in which a splat is linearised: what the image
+    /// shows, and [`JACOBIAN_MARGIN`] of half its size on every side, since the linearisation
+    /// blows up outside.
+    pub(crate) fn slope_bounds(&self) -> [DVec2; 2] {
+        let k = &self.intrinsics;
+        let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
+        let mut low = DVec2::INFINITY;
+        let mut high = DVec2::NEG_INFINITY;
+        let mut show = |slope: DVec2| {
+            low = low.min(slope);
+            high = high.max(slope);
+        };
+        if k.distortion == Distortion::None {
+            let centre = DVec2::new(k.cx_px, k.cy_px);
+            let focal = DVec2::new(k.fx_px, k.fy_px);
+            show(-centre / focal);
+            show((size - centre) / focal);
+        } else {
+            // The lens bends the image's border; past its reach the reach itself is the border.
+            let reach = k.distortion.reach();
+            for i in 0..=BORDER_POINTS {
+                let t = f64::from(i) / f64::from(BORDER_POINTS);
+                for at in [
+                    DVec2::new(t, 0.0),
+                    DVec2::new(t, 1.0),
+                    DVec2::new(0.0, t),
+                    DVec2::new(1.0, t),
+                ] {
+                    let pixel = at * size;
+                    show(k.slope(pixel).unwrap_or_else(|| {
+                        let outward = pixel - DVec2::new(k.cx_px, k.cy_px);
+                        outward.normalize_or_zero() * reach
+                    }));
+                }
+            }
+            // The axis is within the reach, but a shifted image need not show it.
+        }
+        let margin = (high - low) * (0.5 * JACOBIAN_MARGIN);
+        [low - margin, high + margin]
+    }
 }
 
 /// Why a camera is refused.
@@ -50,6 +94,8 @@ pub enum InvalidCamera {
     Background([f32; 3]),
 }
 
+/// Points on each side of the image at which a lens's border is found.
+const BORDER_POINTS: u32 = 32;
 /// f32 resolves 1 m there. [m]
 const MAX_DISTANCE_M: f64 = 1e7;
 /// Closer, the squares of the projection leave f32. [m]

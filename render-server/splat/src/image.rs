@@ -1,6 +1,6 @@
 //! What a renderer writes, and its integer forms for encoders.
 
-/// Colour, depth and alpha of one camera; row-major, reused from image to image.
+/// Colour, depth, alpha and object ids of one camera; row-major, reused from image to image.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RgbdImage {
     /// Width. [px]
@@ -16,6 +16,9 @@ pub struct RgbdImage {
     /// H x W median camera-z depth: z of the splat at which transmittance falls to one half; 0
     /// where it never does. [m, cam]
     pub depth_median_m: Vec<f32>,
+    /// H x W [`crate::RigidObject::id`] of what the median depth is of; 0 for what stands still,
+    /// and where the median depth is 0.
+    pub ids: Vec<u16>,
 }
 
 /// Which of the two depths of an image.
@@ -43,6 +46,7 @@ impl RgbdImage {
         self.alpha.resize(pixels, 0.0);
         self.depth_expected_m.resize(pixels, 0.0);
         self.depth_median_m.resize(pixels, 0.0);
+        self.ids.resize(pixels, 0);
     }
 
     /// Writes H x W x 3 bytes of RGB, clamped and rounded, to `out`, whose length and contents are

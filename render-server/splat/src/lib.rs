@@ -1,13 +1,14 @@
-//! (scene, cameras) -> RGB, metric depth and alpha of 3D Gaussian splats.
+//! (scene, cameras) -> RGB, metric depth, alpha and object ids of 3D Gaussian splats.
 //!
-//! A scene comes from a file ([`ply`]) as [`Splats`]; a renderer ([`CpuRenderer`]) takes it once and
-//! then draws any number of [`Camera`]s per call into [`RgbdImage`]s that the caller keeps.
-//! [`render_reference`] is the plain truth every fast renderer is compared with.
+//! A twin comes from a file ([`format`]) as [`Splats`]; with the objects that move in it, it is a
+//! [`Scene`]. A [`Rasterizer`] takes the scene once and then draws any number of [`Camera`]s per
+//! call into [`RgbdImage`]s that the caller keeps. [`render_reference`] is the plain truth every
+//! fast renderer is compared with.
 //!
 //! ```
 //! use glam::{Quat, Vec3};
 //! use vizflyt_protocol::geometry::{Intrinsics, Pose};
-//! use vizflyt_splat::{Camera, CpuRenderer, DepthKind, RgbdImage, Splats};
+//! use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
 //!
 //! // One opaque grey ball of 10 cm, 2 m ahead of a camera at the origin.
 //! let splats = Splats {
@@ -25,26 +26,31 @@
 //!     background: [0.0; 3],
 //! };
 //! let mut images = [RgbdImage::default()];
-//! CpuRenderer::new(&splats).render(&[camera], &mut images)?;
+//! CpuRenderer::new(&splats).render(&[], &[camera], &mut images)?;
 //! let mut depth_mm = Vec::new();
 //! images[0].write_depth_mm(DepthKind::Median, &mut depth_mm);
 //! assert_eq!(depth_mm[24 * 64 + 32], 2000);
-//! # Ok::<(), vizflyt_splat::InvalidCamera>(())
+//! # Ok::<(), vizflyt_splat::RenderError>(())
 //! ```
 //!
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
 mod camera;
 mod cpu;
+pub mod format;
 mod harmonics;
 mod image;
 mod limits;
-pub mod ply;
+mod rasterizer;
 mod reference;
+mod scene;
 mod splats;
 
 pub use camera::{Camera, InvalidCamera};
-pub use cpu::{CpuRenderer, PassTimes, Workload};
+pub use format::ply;
+pub use cpu::CpuRenderer;
 pub use image::{DepthKind, RgbdImage};
+pub use rasterizer::{PassTimes, Rasterizer, RenderError, Workload};
 pub use reference::render_reference;
+pub use scene::{Placement, RigidObject, Scene};
 pub use splats::Splats;

@@ -6,25 +6,76 @@
 //! the splat that would bring its transmittance to 1e-4 or below.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Cam, Frame, Pose};
 
-use crate::camera::InvalidCamera;
 use crate::harmonics;
-use crate::limits::{
-    ALPHA_MAX, ALPHA_MIN, BLUR_PX2, JACOBIAN_MARGIN, MAX_SCALE_M, TRANSMITTANCE_MIN,
-};
-use crate::{Camera, RgbdImage, Splats};
+use crate::limits::{ALPHA_MAX, ALPHA_MIN, BLUR_PX2, MAX_SCALE_M, TRANSMITTANCE_MIN};
+use crate::rasterizer::{self, RenderError};
+use crate::{Camera, Placement, RgbdImage, Scene, Splats};
 
-/// Returns the image of `splats` seen by `camera`: RGB on the background, alpha, expected and
-/// median camera-z depth. [m, cam]
+/// Returns the image of a scene seen by `camera`, its objects placed: RGB on the background, alpha,
+/// expected and median camera-z depth [m, cam], ids.
 ///
 /// # Errors
-/// [`InvalidCamera`] names what is wrong with the camera.
-pub fn render_reference(splats: &Splats, camera: &Camera) -> Result<RgbdImage, InvalidCamera> {
-    camera.validate()?;
-    let mut projected: Vec<Projected> =
-        (0..splats.len()).filter_map(|i| project(splats, i, camera)).collect();
+/// [`RenderError`] names what is wrong with the camera or a placement.
+///
+/// # Panics
+/// If there are not as many placements as objects.
+pub fn render_reference<'a>(
+    scene: impl Into<Scene<'a>>,
+    placements: &[Placement],
+    camera: &Camera,
+) -> Result<RgbdImage, RenderError> {
+    let scene = scene.into();
+    let mut image = RgbdImage::default();
+    rasterizer::validate(
+        scene.objects.len(),
+        placements,
+        std::slice::from_ref(camera),
+        std::slice::from_ref(&image),
+    )?;
+    let lens = Lens::new(camera);
+    let mut projected = Vec::new();
+    let mut add = |splats: &Splats, id: u16, seen: Seen| {
+        let all = 0..splats.len();
+        projected.extend(all.filter_map(|i| project(splats, i, id, &seen, &lens, camera)));
+    };
+    add(scene.splats, 0, Seen::from(&camera.world_from_cam));
+    for (object, placement) in scene.objects.iter().zip(placements) {
+        if let Some(world_from_object) = placement {
+            // An object that moves is one that stands still before a camera that moves.
+            let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
+            add(&object.splats, object.id, Seen::from(&object_from_cam));
+        }
+    }
     projected.sort_by(|a, b| a.z_m.total_cmp(&b.z_m));
-    Ok(blend(&projected, camera))
+    blend(&projected, camera, &mut image);
+    Ok(image)
+}
+
+/// Where the camera is, from a part of the scene.
+struct Seen {
+    rotation: DMat3,
+    center_m: DVec3,
+}
+
+impl<F: Frame> From<&Pose<F, Cam>> for Seen {
+    fn from(part_from_cam: &Pose<F, Cam>) -> Self {
+        let rotation = DMat3::from_quat(part_from_cam.rotation.normalize()).transpose();
+        Self { rotation, center_m: part_from_cam.translation_m }
+    }
+}
+
+/// What of the camera's lens is worth computing once.
+struct Lens {
+    slopes: [DVec2; 2],
+    reach: f64,
+}
+
+impl Lens {
+    fn new(camera: &Camera) -> Self {
+        Self { slopes: camera.slope_bounds(), reach: camera.intrinsics.distortion.reach() }
+    }
 }
 
 /// A Gaussian on the image plane.
@@ -35,40 +86,44 @@ struct Projected {
     /// Half of the bounding box of `alpha >= 1/255`. [px]
     extent_px: DVec2,
     z_m: f64,
+    id: u16,
     opacity: f64,
     rgb: DVec3,
 }
 
 /// Projects one splat; `None` if it cannot touch the image.
-fn project(splats: &Splats, i: usize, camera: &Camera) -> Option<Projected> {
+fn project(
+    splats: &Splats,
+    i: usize,
+    id: u16,
+    seen: &Seen,
+    lens: &Lens,
+    camera: &Camera,
+) -> Option<Projected> {
     let k = &camera.intrinsics;
-    let cam_from_world = camera.world_from_cam.inverse();
-    let rotation = DMat3::from_quat(cam_from_world.rotation);
-    let mean_world = splats.means_m[i].as_dvec3();
-    let p_cam = cam_from_world.transform_point(mean_world);
+    let mean = splats.means_m[i].as_dvec3();
+    let p_cam = seen.rotation * (mean - seen.center_m);
+    let slope = p_cam.truncate() / p_cam.z;
     // Positive, so that NaN is refused.
-    if !(p_cam.z > f64::from(camera.near_m)) {
+    if !(p_cam.z > f64::from(camera.near_m) && slope.length() <= lens.reach) {
         return None;
     }
-    let (tx, ty) = (p_cam.x / p_cam.z, p_cam.y / p_cam.z);
-    let mean_px = DVec2::new(k.fx_px * tx + k.cx_px, k.fy_px * ty + k.cy_px);
+    let focal = DVec2::new(k.fx_px, k.fy_px);
+    let mean_px = focal * k.distortion.distort(slope).0 + DVec2::new(k.cx_px, k.cy_px);
 
     // The linearisation blows up outside the image: take it at the nearest point just outside.
-    let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
-    let margin_x = JACOBIAN_MARGIN * 0.5 * w / k.fx_px;
-    let margin_y = JACOBIAN_MARGIN * 0.5 * h / k.fy_px;
-    let clamp = |t: f64, low: f64, high: f64| t.max(low.min(high)).min(high.max(low));
-    let jx = clamp(tx, -(k.cx_px / k.fx_px) - margin_x, (w - k.cx_px) / k.fx_px + margin_x);
-    let jy = clamp(ty, -(k.cy_px / k.fy_px) - margin_y, (h - k.cy_px) / k.fy_px + margin_y);
-    let (ax, ay) = (k.fx_px / p_cam.z, k.fy_px / p_cam.z);
+    let at = slope.clamp(lens.slopes[0], lens.slopes[1]);
+    let (_, bend) = k.distortion.distort(at.clamp_length_max(lens.reach));
 
     let scale_m = splats.scales_m[i].as_dvec3().min(DVec3::splat(f64::from(MAX_SCALE_M)));
     let q = splats.rotations[i].as_dquat();
     let axes = DMat3::from_quat(DQuat::normalize(q)) * DMat3::from_diagonal(scale_m);
     // Rows of J W M: covariance = B B^T.
-    let in_cam = (rotation * axes).transpose();
-    let row_x = ax * (in_cam.x_axis - jx * in_cam.z_axis);
-    let row_y = ay * (in_cam.y_axis - jy * in_cam.z_axis);
+    let in_cam = (seen.rotation * axes).transpose();
+    let pinhole_x = (in_cam.x_axis - at.x * in_cam.z_axis) / p_cam.z;
+    let pinhole_y = (in_cam.y_axis - at.y * in_cam.z_axis) / p_cam.z;
+    let row_x = focal.x * (bend.x_axis.x * pinhole_x + bend.y_axis.x * pinhole_y);
+    let row_y = focal.y * (bend.x_axis.y * pinhole_x + bend.y_axis.y * pinhole_y);
     let a = row_x.dot(row_x) + BLUR_PX2;
     let b = row_x.dot(row_y);
     let c = row_y.dot(row_y) + BLUR_PX2;
@@ -81,6 +136,7 @@ fn project(splats: &Splats, i: usize, camera: &Camera) -> Option<Projected> {
         return None;
     }
     let extent_px = DVec2::new((reach * a).sqrt(), (reach * c).sqrt());
+    let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
     let touches = mean_px.x + extent_px.x > 0.0
         && mean_px.x - extent_px.x < w
         && mean_px.y + extent_px.y > 0.0
@@ -88,7 +144,7 @@ fn project(splats: &Splats, i: usize, camera: &Camera) -> Option<Projected> {
     if !touches {
         return None;
     }
-    let direction = (mean_world - camera.world_from_cam.translation_m).normalize_or(DVec3::Z);
+    let direction = (mean - seen.center_m).normalize_or(DVec3::Z);
     let numbers = splats.sh_coefficients() * 3;
     let sh = &splats.sh[i * numbers..(i + 1) * numbers];
     let rgb = harmonics::colour(sh, direction.to_array());
@@ -97,13 +153,14 @@ fn project(splats: &Splats, i: usize, camera: &Camera) -> Option<Projected> {
         conic: [c / determinant, -b / determinant, a / determinant],
         extent_px,
         z_m: p_cam.z,
+        id,
         opacity,
         rgb: DVec3::from(rgb),
     })
 }
 
 /// Blends splats, nearest first.
-fn blend(projected: &[Projected], camera: &Camera) -> RgbdImage {
+fn blend(projected: &[Projected], camera: &Camera, image: &mut RgbdImage) {
     let k = &camera.intrinsics;
     let (width, height) = (k.width_px as usize, k.height_px as usize);
     let pixels = k.pixels();
@@ -111,6 +168,7 @@ fn blend(projected: &[Projected], camera: &Camera) -> RgbdImage {
     let mut transmittance = vec![1f64; pixels];
     let mut weighted_z = vec![0f64; pixels];
     let mut median_m = vec![0f64; pixels];
+    let mut ids = vec![0u16; pixels];
     let mut ended = vec![false; pixels];
     for splat in projected {
         let range = |centre: f64, extent: f64, size: usize| {
@@ -140,13 +198,13 @@ fn blend(projected: &[Projected], camera: &Camera) -> RgbdImage {
                 weighted_z[i] += splat.z_m * alpha * before;
                 if before > 0.5 && after <= 0.5 {
                     median_m[i] = splat.z_m;
+                    ids[i] = splat.id;
                 }
                 transmittance[i] = after;
             }
         }
     }
     let background = DVec3::from_array(camera.background.map(f64::from));
-    let mut image = RgbdImage::default();
     image.resize(k.width_px, k.height_px);
     for i in 0..pixels {
         let colour = rgb[i] + transmittance[i] * background;
@@ -156,5 +214,5 @@ fn blend(projected: &[Projected], camera: &Camera) -> RgbdImage {
         image.depth_expected_m[i] = if alpha > 0.0 { (weighted_z[i] / alpha) as f32 } else { 0.0 };
         image.depth_median_m[i] = median_m[i] as f32;
     }
-    image
+    image.ids = ids;
 }

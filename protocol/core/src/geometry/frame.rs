@@ -26,4 +26,6 @@ frames! {
     Cam = "cam";
     /// A splat scene as trained, before `world_from_scene` is baked in.
     Scene = "scene";
+    /// A rigid part of a scene that moves: a door, a clock's hand, another vehicle.
+    Object = "object";
 }

@@ -1,18 +1,24 @@
-//! The pinhole camera. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel,
+//! The camera: a pinhole, with a lens before it or not. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel,
 //! pixel centres lie at +0.5.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Size, focal lengths and principal point of a pinhole camera.
+use super::Distortion;
+
+/// Size, focal lengths, principal point and distortion of a camera.
 ///
 /// ```
 /// use glam::{DVec2, DVec3};
-/// use vizflyt_protocol::geometry::Intrinsics;
-/// let k = Intrinsics { width_px: 320, height_px: 240, fx_px: 200.0, fy_px: 200.0, cx_px: 160.0, cy_px: 120.0 };
+/// use vizflyt_protocol::geometry::{Distortion, Intrinsics};
+/// let k = Intrinsics {
+///     width_px: 320, height_px: 240,
+///     fx_px: 200.0, fy_px: 200.0, cx_px: 160.0, cy_px: 120.0,
+///     distortion: Distortion::None,
+/// };
 /// // 0.5 m right, 0.25 m up, 2 m ahead: (160 + 200 * 0.25, 120 - 200 * 0.125).
 /// assert_eq!(k.project(DVec3::new(0.5, -0.25, 2.0)), Some(DVec2::new(210.0, 95.0)));
-/// assert_eq!(k.unproject(DVec2::new(210.0, 95.0), 2.0), DVec3::new(0.5, -0.25, 2.0));
+/// assert_eq!(k.unproject(DVec2::new(210.0, 95.0), 2.0), Some(DVec3::new(0.5, -0.25, 2.0)));
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
@@ -28,13 +34,15 @@ pub struct Intrinsics {
     pub cx_px: f64,
     /// Principal point, y. [px]
     pub cy_px: f64,
+    /// What the lens does to slopes before the focal lengths apply.
+    pub distortion: Distortion,
 }
 
 impl Intrinsics {
     /// Largest side of an image; 8K. Bounds every buffer sized from a header. [px]
     pub const MAX_SIDE_PX: u32 = 8192;
 
-    /// Returns square-pixel intrinsics with a centred principal point and the given horizontal
+    /// Returns square-pixel pinhole intrinsics with a centred principal point and the given horizontal
     /// field of view, measured from the left edge to the right edge. [rad]
     pub fn from_horizontal_fov(width_px: u32, height_px: u32, fov_rad: f64) -> Self {
         let f_px = f64::from(width_px) / 2.0 / libm::tan(fov_rad / 2.0);
@@ -45,6 +53,7 @@ impl Intrinsics {
             fy_px: f_px,
             cx_px: f64::from(width_px) / 2.0,
             cy_px: f64::from(height_px) / 2.0,
+            distortion: Distortion::None,
         }
     }
 
@@ -53,24 +62,34 @@ impl Intrinsics {
         self.width_px as usize * self.height_px as usize
     }
 
-    /// Projects a point [m, cam] to continuous pixel coordinates; `None` unless it is ahead.
+    /// Projects a point [m, cam] to continuous pixel coordinates; `None` unless it is ahead and
+    /// within the lens's reach.
     pub fn project(&self, p_cam: DVec3) -> Option<DVec2> {
         if !(p_cam.z > 0.0) {
             return None;
         }
-        Some(DVec2::new(
-            self.fx_px * p_cam.x / p_cam.z + self.cx_px,
-            self.fy_px * p_cam.y / p_cam.z + self.cy_px,
-        ))
+        let mut slope = p_cam.truncate() / p_cam.z;
+        if self.distortion != Distortion::None {
+            if !(slope.length() <= self.distortion.reach()) {
+                return None;
+            }
+            slope = self.distortion.distort(slope).0;
+        }
+        let focal = DVec2::new(self.fx_px, self.fy_px);
+        Some(focal * slope + DVec2::new(self.cx_px, self.cy_px))
     }
 
-    /// Returns the point [m, cam] seen at a continuous pixel with the given camera-z depth [m].
-    pub fn unproject(&self, pixel: DVec2, depth_m: f64) -> DVec3 {
-        DVec3::new(
-            (pixel.x - self.cx_px) / self.fx_px * depth_m,
-            (pixel.y - self.cy_px) / self.fy_px * depth_m,
-            depth_m,
-        )
+    /// Returns the point [m, cam] seen at a continuous pixel with the given camera-z depth [m];
+    /// `None` where the lens shows nothing.
+    pub fn unproject(&self, pixel: DVec2, depth_m: f64) -> Option<DVec3> {
+        Some((self.slope(pixel)? * depth_m).extend(depth_m))
+    }
+
+    /// Returns `(x / z, y / z)` in `cam` of the ray through a continuous pixel; `None` where the
+    /// lens shows nothing.
+    pub fn slope(&self, pixel: DVec2) -> Option<DVec2> {
+        let centre = DVec2::new(self.cx_px, self.cy_px);
+        self.distortion.undistort((pixel - centre) / DVec2::new(self.fx_px, self.fy_px))
     }
 
     /// Checks that every number is one a renderer and a receiver can work with.
@@ -86,6 +105,9 @@ impl Intrinsics {
         let centre = -1e6..=1e6;
         if !centre.contains(&self.cx_px) || !centre.contains(&self.cy_px) {
             return Err(InvalidIntrinsics::Centre(self.cx_px, self.cy_px));
+        }
+        if !self.distortion.is_valid() {
+            return Err(InvalidIntrinsics::Distortion);
         }
         Ok(())
     }
@@ -103,6 +125,9 @@ pub enum InvalidIntrinsics {
     /// The principal point is not finite or far outside the image.
     #[error("principal point ({0}, {1}) px is outside -1e6 to 1e6; give cx and cy in pixels")]
     Centre(f64, f64),
+    /// A coefficient is not finite or larger than any lens has.
+    #[error("a distortion coefficient is outside -1000 to 1000; give them as OpenCV prints them")]
+    Distortion,
 }
 
 #[cfg(test)]
@@ -118,7 +143,7 @@ mod tests {
         ) {
             let k = Intrinsics { cx_px: cx, ..Intrinsics::from_horizontal_fov(640, 480, fov) };
             let pixel = DVec2::new(u, v);
-            let back = k.project(k.unproject(pixel, z)).unwrap();
+            let back = k.project(k.unproject(pixel, z).unwrap()).unwrap();
             prop_assert!((back - pixel).length() < 1e-8);
         }
     }

@@ -3,12 +3,14 @@
 //! A transform is named `a_from_b` and typed [`Pose<A, B>`]; neighbours match or it does not
 //! compile. Vectors are plain [`glam`] values whose names carry the frame (`p_world`, `v_body`).
 
+mod distortion;
 mod frame;
 mod intrinsics;
 mod pose;
 mod volume;
 
-pub use frame::{Body, Cam, Frame, Scene, World};
+pub use distortion::Distortion;
+pub use frame::{Body, Cam, Frame, Object, Scene, World};
 pub use intrinsics::{Intrinsics, InvalidIntrinsics};
 pub use pose::{Pose, Twist, body_from_forward_cam, wrap_pi, yaw_of};
 pub use volume::Volume;

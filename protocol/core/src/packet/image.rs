@@ -5,7 +5,7 @@ use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::PROTOCOL_VERSION;
-use crate::geometry::{Cam, Intrinsics, InvalidIntrinsics, Pose, World};
+use crate::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 use crate::time::ServerTime;
 
 /// Who, when, from where; then `payload_len` bytes of RGB-D bitstream (`vizflyt-rgbd`).
@@ -21,7 +21,8 @@ pub struct ImageHeader {
     version: U16,
     /// Index into [`crate::messages::ArenaInfo::cameras`].
     pub camera: u8,
-    reserved: u8,
+    /// The lens: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
+    pub distortion_model: u8,
     /// Counts the server's ticks; equal for all cameras of a tick.
     pub seq: U64,
     /// When the pose the image was drawn for was measured. [ns, server]
@@ -42,6 +43,8 @@ pub struct ImageHeader {
     pub rotation_xyzw: [F64; 4],
     /// fx, fy, cx, cy. [px]
     pub intrinsics_px: [F64; 4],
+    /// Coefficients in the order of OpenCV, the rest 0.
+    pub distortion: [F64; 5],
     /// Image width. [px]
     pub width_px: U32,
     /// Image height. [px]
@@ -65,6 +68,9 @@ pub enum InvalidImageHeader {
     /// Camera that makes no sense.
     #[error("image header: {0}")]
     Intrinsics(InvalidIntrinsics),
+    /// Number of a lens model that this version does not know.
+    #[error("image header: lens model {0} is unknown")]
+    Lens(u8),
     /// Pose or depth unit not finite, or quaternion not unit.
     #[error("image header: camera pose or depth unit is not a number to work with")]
     Pose,
@@ -86,11 +92,12 @@ impl ImageHeader {
         k: &Intrinsics,
         world_from_cam: &Pose<World, Cam>,
     ) -> Self {
+        let (distortion_model, distortion) = k.distortion.to_wire();
         Self {
             magic: Self::MAGIC,
             version: PROTOCOL_VERSION.into(),
             camera,
-            reserved: 0,
+            distortion_model,
             seq: seq.into(),
             pose_ns: pose.as_ns().into(),
             exposure_ns: pose.as_ns().into(),
@@ -101,6 +108,7 @@ impl ImageHeader {
             translation_m: world_from_cam.translation_m.to_array().map(F64::new),
             rotation_xyzw: world_from_cam.rotation.to_array().map(F64::new),
             intrinsics_px: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(F64::new),
+            distortion: distortion.map(F64::new),
             width_px: k.width_px.into(),
             height_px: k.height_px.into(),
             depth_unit_m: F64::new(0.001),
@@ -115,6 +123,9 @@ impl ImageHeader {
             Self::read_from_prefix(bytes).map_err(|_| InvalidImageHeader::Short(bytes.len()))?;
         if header.magic != Self::MAGIC || header.version.get() != PROTOCOL_VERSION {
             return Err(InvalidImageHeader::Foreign);
+        }
+        if Distortion::from_wire(header.distortion_model, [0.0; 5]).is_none() {
+            return Err(InvalidImageHeader::Lens(header.distortion_model));
         }
         header.intrinsics().validate().map_err(InvalidImageHeader::Intrinsics)?;
         let unit_m = header.depth_unit_m.get();
@@ -139,6 +150,11 @@ impl ImageHeader {
             fy_px,
             cx_px,
             cy_px,
+            distortion: Distortion::from_wire(
+                self.distortion_model,
+                self.distortion.map(F64::get),
+            )
+            .unwrap_or_default(),
         }
     }
 

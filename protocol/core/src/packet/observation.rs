@@ -8,7 +8,7 @@ use glam::{DQuat, DVec3};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::PROTOCOL_VERSION;
-use crate::geometry::{Body, Cam, Intrinsics, Pose, World};
+use crate::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
 use crate::messages::MAX_CAMERAS;
 
 /// Alignment of the payload and of each plane in it. [bytes]
@@ -26,6 +26,8 @@ pub struct CameraHeader {
     pub seq: u64,
     /// fx, fy, cx, cy. [px]
     pub intrinsics_px: [f64; 4],
+    /// Coefficients in the order of OpenCV, the rest 0.
+    pub distortion: [f64; 5],
     /// Camera position in the body. [m, body]
     pub translation_m: [f64; 3],
     /// Camera to body rotation, xyzw.
@@ -38,6 +40,9 @@ pub struct CameraHeader {
     pub rgb_offset: u32,
     /// Start of the depth plane. [bytes]
     pub depth_offset: u32,
+    /// The lens: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
+    pub distortion_model: u32,
+    reserved: u32,
 }
 
 /// Head of an observation: the vehicle, and where the cameras' planes lie.
@@ -72,8 +77,8 @@ pub struct ObservationHeader {
 }
 
 // The layout is a contract with other languages and processes.
-const _: () = assert!(size_of::<CameraHeader>() == 128);
-const _: () = assert!(size_of::<ObservationHeader>() == 144 + 128 * MAX_CAMERAS);
+const _: () = assert!(size_of::<CameraHeader>() == 176);
+const _: () = assert!(size_of::<ObservationHeader>() == 144 + 176 * MAX_CAMERAS);
 
 /// Where the planes of a set of images lie.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -177,9 +182,20 @@ impl ObservationHeader {
 }
 
 impl CameraHeader {
+    /// Writes the camera's intrinsics.
+    pub fn set_intrinsics(&mut self, k: &Intrinsics) {
+        let (model, distortion) = k.distortion.to_wire();
+        self.width_px = k.width_px;
+        self.height_px = k.height_px;
+        self.intrinsics_px = [k.fx_px, k.fy_px, k.cx_px, k.cy_px];
+        self.distortion_model = model.into();
+        self.distortion = distortion;
+    }
+
     /// Returns the camera's intrinsics.
     pub fn intrinsics(&self) -> Intrinsics {
         let [fx_px, fy_px, cx_px, cy_px] = self.intrinsics_px;
+        let model = u8::try_from(self.distortion_model).unwrap_or(u8::MAX);
         Intrinsics {
             width_px: self.width_px,
             height_px: self.height_px,
@@ -187,6 +203,7 @@ impl CameraHeader {
             fy_px,
             cx_px,
             cy_px,
+            distortion: Distortion::from_wire(model, self.distortion).unwrap_or_default(),
         }
     }
 

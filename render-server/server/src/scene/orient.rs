@@ -229,7 +229,7 @@ mod tests {
                 near_m: 0.01,
                 background: [0.0; 3],
             };
-            let before = render_reference(&scene(), &camera).unwrap();
+            let before = render_reference(&scene(), &[], &camera).unwrap();
             let mut moved = scene();
             similarity.apply(&mut moved);
             let camera = Camera {
@@ -237,7 +237,7 @@ mod tests {
                 near_m: (0.01 * scale) as f32,
                 ..camera
             };
-            let after = render_reference(&moved, &camera).unwrap();
+            let after = render_reference(&moved, &[], &camera).unwrap();
             let mse: f32 = before.rgb.iter().zip(&after.rgb).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
                 / before.rgb.len() as f32;
             prop_assert!(mse < 1e-7, "mse {mse}");

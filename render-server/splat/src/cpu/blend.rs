@@ -16,8 +16,9 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use rayon::prelude::*;
 
 use super::bin::{Bins, TILE};
-use super::cull::View;
+use super::cull::{View, Visible};
 use super::project::{MIN_LEVEL, Splat2d};
+use super::scene::{BLOCK, Part};
 use super::simd::{Kernel, Simd};
 use crate::RgbdImage;
 use crate::limits::{ALPHA_MAX, TRANSMITTANCE_MIN};
@@ -30,12 +31,27 @@ const BLOCK_WIDTH: usize = 4;
 const MAX_BLOCKS: usize = TILE * TILE / 8;
 /// Pixels of a tile.
 const TILE_PIXELS: usize = TILE * TILE;
-/// Red, green, blue, weighted depth, median depth, transmittance: per block, vector by vector.
-const CHANNELS: usize = 6;
+/// Red, green, blue, weighted depth, median depth, transmittance, id: per block, vector by vector.
+const CHANNELS: usize = 7;
 /// Numbers of a tile.
 const TILE_NUMBERS: usize = CHANNELS * TILE_PIXELS;
 /// How far ahead records of the list are asked for.
 const PREFETCH: usize = 12;
+
+/// Which part of the scene a slot is of.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Tagged<'a> {
+    /// What stands still, then the objects.
+    pub(super) parts: &'a [Part],
+    /// Per region of slots.
+    pub(super) visible: &'a [Visible],
+}
+
+impl Tagged<'_> {
+    fn id(&self, slot: usize) -> u16 {
+        self.parts[self.visible[slot / BLOCK].part as usize].id
+    }
+}
 
 /// Blends all tiles into `image`; `tiles` is kept from image to image.
 pub(super) fn blend<S: Simd>(
@@ -43,6 +59,7 @@ pub(super) fn blend<S: Simd>(
     view: &View,
     splats: &[Splat2d],
     bins: &Bins,
+    tagged: &Tagged<'_>,
     tiles: &mut Vec<f32>,
     image: &mut RgbdImage,
 ) {
@@ -53,6 +70,7 @@ pub(super) fn blend<S: Simd>(
             view,
             splats,
             list: bins.list(index),
+            tagged,
             origin: [index % bins.tiles_x * TILE, index / bins.tiles_x * TILE],
             scratch,
             pixels,
@@ -84,6 +102,7 @@ struct Batch {
     red: [f32; 256],
     green: [f32; 256],
     blue: [f32; 256],
+    id: [f32; 256],
 }
 
 impl Scratch {
@@ -103,6 +122,7 @@ impl Scratch {
                 red: ZEROS,
                 green: ZEROS,
                 blue: ZEROS,
+                id: ZEROS,
             },
             lists: [[0; BATCH + 8]; MAX_BLOCKS],
         }
@@ -114,6 +134,7 @@ struct BlendTile<'a> {
     view: &'a View,
     splats: &'a [Splat2d],
     list: &'a [AtomicU32],
+    tagged: &'a Tagged<'a>,
     /// The tile's first pixel, x and y.
     origin: [usize; 2],
     scratch: &'a mut Scratch,
@@ -125,7 +146,9 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { view, splats, list, origin, scratch, pixels } = self;
+        let Self { view, splats, list, tagged, origin, scratch, pixels } = self;
+        // Ids cost a twentieth of the pass: only where something moves.
+        let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];
         let block_height = S::LANES / BLOCK_WIDTH;
         let blocks = TILE_PIXELS / S::LANES;
@@ -158,6 +181,11 @@ impl Kernel for BlendTile<'_> {
             }
             let ahead = &list[first * BATCH..];
             load_batch(s, splats, slots, ahead, origin, &mut scratch.batch);
+            if has_ids {
+                for (id, slot) in scratch.batch.id.iter_mut().zip(slots) {
+                    *id = f32::from(tagged.id(slot.load(Relaxed) as usize));
+                }
+            }
             let mut lengths = [0usize; MAX_BLOCKS];
             list_blocks(s, &scratch.batch, slots.len(), live, &mut scratch.lists, &mut lengths);
             for block in 0..blocks {
@@ -168,7 +196,12 @@ impl Kernel for BlendTile<'_> {
                 let (x, y) = (lane_x + s.splat(x), lane_y + s.splat(y));
                 let list = &scratch.lists[block][..lengths[block]];
                 let state = &mut pixels[block * CHANNELS * S::LANES..][..CHANNELS * S::LANES];
-                if !blend_block(s, &scratch.batch, list, x, y, state) {
+                let goes_on = if has_ids {
+                    blend_block::<S, true>(s, &scratch.batch, list, x, y, state)
+                } else {
+                    blend_block::<S, false>(s, &scratch.batch, list, x, y, state)
+                };
+                if !goes_on {
                     live &= !(1 << block);
                 }
             }
@@ -311,7 +344,7 @@ static POSITIONS: [u64; 256] = {
 
 /// Blends a list onto one block; returns whether any of its pixels goes on.
 #[inline(always)]
-fn blend_block<S: Simd>(
+fn blend_block<S: Simd, const IDS: bool>(
     s: S,
     batch: &Batch,
     list: &[u8],
@@ -325,6 +358,7 @@ fn blend_block<S: Simd>(
     let mut depth = s.load(&state[3 * S::LANES..]);
     let mut median = s.load(&state[4 * S::LANES..]);
     let mut transmittance = s.load(&state[5 * S::LANES..]);
+    let mut id = s.load(&state[6 * S::LANES..]);
     let mut goes_on = true;
     for &i in list {
         let i = usize::from(i);
@@ -347,13 +381,16 @@ fn blend_block<S: Simd>(
         // brought the pixel to half.
         let before_half = hit & s.lt(s.splat(0.5), transmittance);
         median = s.select(before_half, s.splat(batch.z_m[i]), median);
+        if IDS {
+            id = s.select(before_half, s.splat(batch.id[i]), id);
+        }
         transmittance = s.select(live, after, s.negative(transmittance));
         if !s.any(live) {
             goes_on = false;
             break;
         }
     }
-    let channels = [red, green, blue, depth, median, transmittance];
+    let channels = [red, green, blue, depth, median, transmittance, id];
     for channel in 0..CHANNELS {
         s.store(channels[channel], &mut state[channel * S::LANES..]);
     }
@@ -361,7 +398,7 @@ fn blend_block<S: Simd>(
 }
 
 /// Turns a block's sums into what an image holds: RGB on the background, expected depth, median
-/// depth, alpha.
+/// depth, alpha, id.
 #[inline(always)]
 fn finish<S: Simd>(s: S, view: &View, state: &mut [f32]) {
     let transmittance = s.splat(0.0) - s.negative(s.load(&state[5 * S::LANES..]));
@@ -378,6 +415,8 @@ fn finish<S: Simd>(s: S, view: &View, state: &mut [f32]) {
     let reached = s.lt(transmittance, s.splat(0.5 + f32::EPSILON / 2.0));
     let median = s.load(&state[4 * S::LANES..]);
     s.store(s.keep(reached, median), &mut state[4 * S::LANES..]);
+    let id = s.load(&state[6 * S::LANES..]);
+    s.store(s.keep(reached, id), &mut state[6 * S::LANES..]);
     s.store(alpha, &mut state[5 * S::LANES..]);
 }
 
@@ -392,8 +431,9 @@ fn untile(lanes: usize, tiles_x: usize, tiles: &[f32], image: &mut RgbdImage) {
         .zip(image.depth_expected_m.par_chunks_mut(band))
         .zip(image.depth_median_m.par_chunks_mut(band))
         .zip(image.alpha.par_chunks_mut(band))
+        .zip(image.ids.par_chunks_mut(band))
         .zip(tiles.par_chunks(tiles_x * TILE_NUMBERS))
-        .for_each(|((((rgb, expected), median), alpha), tiles)| {
+        .for_each(|(((((rgb, expected), median), alpha), ids), tiles)| {
             for row in 0..alpha.len() / width {
                 for x in (0..width).step_by(BLOCK_WIDTH) {
                     let tile = &tiles[x / TILE * TILE_NUMBERS..][..TILE_NUMBERS];
@@ -412,6 +452,9 @@ fn untile(lanes: usize, tiles_x: usize, tiles: &[f32], image: &mut RgbdImage) {
                     expected[at..at + count].copy_from_slice(&channel(3)[..count]);
                     median[at..at + count].copy_from_slice(&channel(4)[..count]);
                     alpha[at..at + count].copy_from_slice(&channel(5)[..count]);
+                    for (id, &value) in ids[at..at + count].iter_mut().zip(channel(6)) {
+                        *id = value as u16;
+                    }
                 }
             }
         });

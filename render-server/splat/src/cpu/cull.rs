@@ -3,19 +3,21 @@
 //! Budget: 5 planes per block of 256 splats, 20 us per million splats.
 
 use glam::{DMat3, Vec3};
+use vizflyt_protocol::geometry::{Cam, Frame, Pose};
 
-use super::scene::{Block, Scene};
+use super::scene::{Block, Part};
 use crate::Camera;
 use crate::limits::{BLUR_PX2, JACOBIAN_MARGIN};
 
-/// A camera in the numbers the passes use; f32, but for what is computed once per image.
+/// A camera, as one part of the scene sees it, in the numbers the passes use; f32, but for what is
+/// computed once per image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct View {
     pub(super) width_px: u32,
     pub(super) height_px: u32,
     /// Rows of the rotation to the camera's axes.
     pub(super) rows: [Vec3; 3],
-    /// The camera's centre. [m, world]
+    /// The camera's centre. [m, part]
     pub(super) center_m: Vec3,
     pub(super) near_m: f32,
     pub(super) fx_px: f32,
@@ -39,10 +41,10 @@ struct Plane {
 }
 
 impl View {
-    /// Prepares a validated camera.
-    pub(super) fn new(camera: &Camera) -> Self {
+    /// Prepares a validated camera that stands at `part_from_cam`.
+    pub(super) fn new<F: Frame>(camera: &Camera, part_from_cam: &Pose<F, Cam>) -> Self {
         let k = &camera.intrinsics;
-        let rotation = DMat3::from_quat(camera.world_from_cam.rotation.normalize()).transpose();
+        let rotation = DMat3::from_quat(part_from_cam.rotation.normalize()).transpose();
         let [x, y, z] = [rotation.row(0), rotation.row(1), rotation.row(2)];
         let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
         let slopes = |f: f64, c: f64, size: f64| {
@@ -79,7 +81,7 @@ impl View {
             width_px: k.width_px,
             height_px: k.height_px,
             rows: [x.as_vec3(), y.as_vec3(), z.as_vec3()],
-            center_m: camera.world_from_cam.translation_m.as_vec3(),
+            center_m: part_from_cam.translation_m.as_vec3(),
             near_m: camera.near_m,
             fx_px: k.fx_px as f32,
             fy_px: k.fy_px as f32,
@@ -105,9 +107,17 @@ impl View {
     }
 }
 
-/// Lists the blocks that may touch the image.
-pub(super) fn cull(scene: &Scene, view: &View, visible: &mut Vec<u32>) {
-    visible.clear();
-    let blocks = scene.blocks.iter().enumerate();
-    visible.extend(blocks.filter(|(_, block)| view.sees(block)).map(|(i, _)| i as u32));
+/// A block that may touch the image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Visible {
+    /// Index of the part.
+    pub(super) part: u32,
+    /// Index of the block in it.
+    pub(super) block: u32,
+}
+
+/// Appends the blocks of a part that may touch the image.
+pub(super) fn cull(index: usize, part: &Part, view: &View, visible: &mut Vec<Visible>) {
+    let blocks = part.blocks.iter().enumerate().filter(|(_, block)| view.sees(block));
+    visible.extend(blocks.map(|(i, _)| Visible { part: index as u32, block: i as u32 }));
 }

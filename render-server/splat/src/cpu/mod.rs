@@ -19,48 +19,24 @@ use std::time::Instant;
 
 use simd::{InstructionSet, Simd};
 
-use crate::{Camera, InvalidCamera, RgbdImage, Splats};
+use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
+use crate::{Camera, Placement, RgbdImage, Scene};
 
 /// Draws a scene with all cores of the processor.
 #[derive(Debug)]
 pub struct CpuRenderer {
     instructions: InstructionSet,
-    scene: scene::Scene,
+    /// What stands still, then the objects.
+    parts: Vec<scene::Part>,
     buffers: Buffers,
-}
-
-/// How long each pass took, summed over the cameras of a call. [ms]
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct PassTimes {
-    /// Blocks of splats against the view. [ms]
-    pub cull_ms: f32,
-    /// Splats onto the image plane. [ms]
-    pub project_ms: f32,
-    /// By depth. [ms]
-    pub sort_ms: f32,
-    /// Into tiles. [ms]
-    pub bin_ms: f32,
-    /// Tiles to pixels. [ms]
-    pub blend_ms: f32,
-    /// The whole call. [ms]
-    pub total_ms: f32,
-}
-
-/// How much work the last camera was.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Workload {
-    /// Splats the renderer keeps.
-    pub splats: usize,
-    /// Splats that touch the image.
-    pub visible: usize,
-    /// (Tile, splat) pairs.
-    pub pairs: usize,
 }
 
 /// What passes leave for each other; kept from image to image.
 #[derive(Debug, Default)]
 struct Buffers {
-    visible: Vec<u32>,
+    /// Per part; those that are not there see nothing, for none of their blocks is visible.
+    views: Vec<cull::View>,
+    visible: Vec<cull::Visible>,
     projected: project::Projected,
     sorter: sort::Sorter,
     bins: bin::Bins,
@@ -70,88 +46,106 @@ struct Buffers {
 impl CpuRenderer {
     /// Packs a scene for the fastest instruction set this processor has. Splats that no image
     /// would show (opacity below 1/255) or that hold numbers that are not finite are left out.
-    pub fn new(splats: &Splats) -> Self {
-        Self::with_instructions(splats, InstructionSet::available()[0])
+    pub fn new<'a>(scene: impl Into<Scene<'a>>) -> Self {
+        Self::with_instructions(scene.into(), InstructionSet::available()[0])
     }
 
     /// Packs a scene once per instruction set this processor has, fastest first: for tests and
     /// benchmarks.
-    pub fn every(splats: &Splats) -> Vec<Self> {
+    pub fn every<'a>(scene: impl Into<Scene<'a>>) -> Vec<Self> {
+        let scene = scene.into();
         let sets = InstructionSet::available().into_iter();
-        sets.map(|set| Self::with_instructions(splats, set)).collect()
+        sets.map(|set| Self::with_instructions(scene, set)).collect()
     }
 
-    fn with_instructions(splats: &Splats, instructions: InstructionSet) -> Self {
-        Self { instructions, scene: scene::Scene::new(splats), buffers: Buffers::default() }
+    fn with_instructions(scene: Scene<'_>, instructions: InstructionSet) -> Self {
+        let mut parts = vec![scene::Part::new(0, scene.splats)];
+        parts.extend(scene.objects.iter().map(|object| scene::Part::new(object.id, &object.splats)));
+        Self { instructions, parts, buffers: Buffers::default() }
     }
 
-    /// Returns what the renderer runs on: `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`.
-    pub fn name(&self) -> &'static str {
-        self.instructions.name()
-    }
-
-    /// Draws one image per camera, resizing each, and returns how long the passes took.
-    ///
-    /// # Errors
-    /// [`InvalidCamera`] for the first camera that is not valid; no image is changed then.
-    ///
-    /// # Panics
-    /// If there are not as many images as cameras.
-    pub fn render(
+    fn render_one<S: Simd>(
         &mut self,
+        simd: S,
+        placements: &[Placement],
+        camera: &Camera,
+        image: &mut RgbdImage,
+        times: &mut PassTimes,
+    ) {
+        let parts = &self.parts[..];
+        let Buffers { views, visible, projected, sorter, bins, tiles } = &mut self.buffers;
+        let start = Instant::now();
+        views.clear();
+        visible.clear();
+        let still = cull::View::new(camera, &camera.world_from_cam);
+        views.push(still);
+        cull::cull(0, &parts[0], &still, visible);
+        for (i, (part, placement)) in parts[1..].iter().zip(placements).enumerate() {
+            views.push(still);
+            if let Some(world_from_object) = placement {
+                let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
+                let view = cull::View::new(camera, &object_from_cam);
+                cull::cull(i + 1, part, &view, visible);
+                views[i + 1] = view;
+            }
+        }
+        times.cull_ms += milliseconds(start);
+        let start = Instant::now();
+        project::project(simd, parts, views, visible, projected);
+        times.project_ms += milliseconds(start);
+        let start = Instant::now();
+        sorter.sort(projected);
+        times.sort_ms += milliseconds(start);
+        let start = Instant::now();
+        bins.bin(simd, &still, projected, sorter.order());
+        times.bin_ms += milliseconds(start);
+        let start = Instant::now();
+        let tagged = blend::Tagged { parts, visible };
+        blend::blend(simd, &still, &projected.splats, bins, &tagged, tiles, image);
+        times.blend_ms += milliseconds(start);
+    }
+}
+
+impl Rasterizer for CpuRenderer {
+    /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`.
+    fn name(&self) -> String {
+        self.instructions.name().to_owned()
+    }
+
+    fn render(
+        &mut self,
+        placements: &[Placement],
         cameras: &[Camera],
         images: &mut [RgbdImage],
-    ) -> Result<PassTimes, InvalidCamera> {
-        assert_eq!(cameras.len(), images.len(), "one image per camera");
-        cameras.iter().try_for_each(Camera::validate)?;
+    ) -> Result<PassTimes, RenderError> {
+        rasterizer::validate(self.parts.len() - 1, placements, cameras, images)?;
         let start = Instant::now();
         let mut times = PassTimes::default();
         for (camera, image) in cameras.iter().zip(images) {
             match self.instructions {
                 #[cfg(target_arch = "x86_64")]
-                InstructionSet::Avx512(simd) => self.render_one(simd, camera, image, &mut times),
+                InstructionSet::Avx512(simd) => {
+                    self.render_one(simd, placements, camera, image, &mut times);
+                }
                 #[cfg(target_arch = "x86_64")]
-                InstructionSet::Avx2(simd) => self.render_one(simd, camera, image, &mut times),
-                InstructionSet::Portable(simd) => self.render_one(simd, camera, image, &mut times),
+                InstructionSet::Avx2(simd) => {
+                    self.render_one(simd, placements, camera, image, &mut times);
+                }
+                InstructionSet::Portable(simd) => {
+                    self.render_one(simd, placements, camera, image, &mut times);
+                }
             }
         }
         times.total_ms = milliseconds(start);
         Ok(times)
     }
 
-    /// Returns how much work the last camera was.
-    pub fn workload(&self) -> Workload {
+    fn workload(&self) -> Workload {
         Workload {
-            splats: self.scene.len,
+            splats: self.parts.iter().map(|part| part.len).sum(),
             visible: self.buffers.sorter.order().len(),
             pairs: self.buffers.bins.pairs(),
         }
-    }
-
-    fn render_one<S: Simd>(
-        &mut self,
-        simd: S,
-        camera: &Camera,
-        image: &mut RgbdImage,
-        times: &mut PassTimes,
-    ) {
-        let Buffers { visible, projected, sorter, bins, tiles } = &mut self.buffers;
-        let start = Instant::now();
-        let view = cull::View::new(camera);
-        cull::cull(&self.scene, &view, visible);
-        times.cull_ms += milliseconds(start);
-        let start = Instant::now();
-        project::project(simd, &self.scene, &view, visible, projected);
-        times.project_ms += milliseconds(start);
-        let start = Instant::now();
-        sorter.sort(projected);
-        times.sort_ms += milliseconds(start);
-        let start = Instant::now();
-        bins.bin(simd, &view, projected, sorter.order());
-        times.bin_ms += milliseconds(start);
-        let start = Instant::now();
-        blend::blend(simd, &view, &projected.splats, bins, tiles, image);
-        times.blend_ms += milliseconds(start);
     }
 }
 

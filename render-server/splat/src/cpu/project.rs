@@ -13,8 +13,8 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::bin::TILE;
-use super::cull::View;
-use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Scene, column};
+use super::cull::{View, Visible};
+use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
 use super::simd::{Kernel, Simd};
 use crate::harmonics::{C0, C1, C2, C3};
 use crate::limits::BLUR_PX2;
@@ -73,12 +73,12 @@ pub(super) struct Projected {
     pub(super) counts: Vec<u32>,
 }
 
-/// Projects all splats of the visible blocks.
+/// Projects all splats of the visible blocks; `views` are the camera as each of `parts` sees it.
 pub(super) fn project<S: Simd>(
     simd: S,
-    scene: &Scene,
-    view: &View,
-    visible: &[u32],
+    parts: &[Part],
+    views: &[View],
+    visible: &[Visible],
     out: &mut Projected,
 ) {
     let slots = visible.len() * BLOCK;
@@ -96,16 +96,17 @@ pub(super) fn project<S: Simd>(
         .zip(visible)
         // Four blocks are some 5 us of work.
         .with_min_len(4)
-        .for_each(|((((splats, boxes), keys), count), &block)| {
+        .for_each(|((((splats, boxes), keys), count), &Visible { part, block })| {
             let out = Region { splats, boxes, keys };
-            let task = ProjectBlock { scene, view, block: block as usize, out };
+            let (part, view) = (&parts[part as usize], &views[part as usize]);
+            let task = ProjectBlock { part, view, block: block as usize, out };
             *count = simd.run(task) as u32;
         });
 }
 
 /// One block; returns how many splats survived.
 struct ProjectBlock<'a> {
-    scene: &'a Scene,
+    part: &'a Part,
     view: &'a View,
     block: usize,
     out: Region<'a>,
@@ -124,9 +125,9 @@ impl Kernel for ProjectBlock<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, s: S) -> usize {
         let groups = BLOCK / GROUP;
-        let sh_numbers = self.scene.coefficients * 3 * GROUP;
-        let geometry = &self.scene.geometry[self.block * groups * GROUP_NUMBERS..];
-        let sh = &self.scene.sh[self.block * groups * sh_numbers..];
+        let sh_numbers = self.part.coefficients * 3 * GROUP;
+        let geometry = &self.part.geometry[self.block * groups * GROUP_NUMBERS..];
+        let sh = &self.part.sh[self.block * groups * sh_numbers..];
         let mut count = 0;
         for group in 0..groups {
             let geometry = &geometry[group * GROUP_NUMBERS..][..GROUP_NUMBERS];

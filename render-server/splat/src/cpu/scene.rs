@@ -1,4 +1,6 @@
-//! The renderer's own copy of a scene: reordered, precomputed, packed for vectors.
+//! The renderer's own copy of a scene: reordered, precomputed, packed for vectors. What stands
+//! still is one part, every rigid object another: a part that moves is drawn as one that stands
+//! still before a camera that moves.
 //!
 //! Splats stand in Morton order, so that 256 neighbours in memory are neighbours in space: a block,
 //! with bounds, that is culled as one. Within a block, groups of 16 splats hold column after column
@@ -47,9 +49,11 @@ pub(super) struct Block {
     pub(super) reach_m: f32,
 }
 
-/// See the module.
+/// What stands still, or one rigid object; packed in its own frame.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Scene {
+pub(super) struct Part {
+    /// What the image of ids shows.
+    pub(super) id: u16,
     pub(super) blocks: Vec<Block>,
     /// [`GROUP_NUMBERS`] per group, whole blocks; the last is padded with centres that are NaN.
     pub(super) geometry: Vec<f32>,
@@ -61,9 +65,9 @@ pub(super) struct Scene {
     pub(super) len: usize,
 }
 
-impl Scene {
-    /// Packs a scene.
-    pub(super) fn new(splats: &Splats) -> Self {
+impl Part {
+    /// Packs splats.
+    pub(super) fn new(id: u16, splats: &Splats) -> Self {
         let order = morton_order(splats);
         let coefficients = splats.sh_coefficients();
         let blocks = order.len().div_ceil(BLOCK);
@@ -98,7 +102,7 @@ impl Scene {
                 }
             });
         let blocks = order.par_chunks(BLOCK).map(|order| bounds(splats, order)).collect();
-        Self { blocks, geometry, sh, coefficients, len: order.len() }
+        Self { id, blocks, geometry, sh, coefficients, len: order.len() }
     }
 }
 

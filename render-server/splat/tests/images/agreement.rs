@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, DepthKind, RgbdImage, Splats, render_reference};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, DepthKind, RgbdImage, Splats, render_reference};
 
 use crate::compare;
 
@@ -66,21 +66,21 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
 pub(crate) fn check(splats: &Splats, cameras: &[Camera]) {
     let expected: Vec<RgbdImage> = cameras
         .iter()
-        .map(|camera| render_reference(splats, camera).expect("a valid camera"))
+        .map(|camera| render_reference(splats, &[], camera).expect("a valid camera"))
         .collect();
     for mut renderer in CpuRenderer::every(splats) {
         let mut images = vec![RgbdImage::default(); cameras.len()];
-        let times = renderer.render(cameras, &mut images).expect("valid cameras");
+        let times = renderer.render(&[], cameras, &mut images).expect("valid cameras");
         assert!(times.total_ms >= times.blend_ms);
         for (image, expected) in images.iter().zip(&expected) {
             compare::assert_clean(image);
-            assert_agrees(renderer.name(), image, expected);
+            assert_agrees(&renderer.name(), image, expected);
         }
     }
 }
 
 /// Two limits: the share of pixels off, which thresholds of f32 flip, and the error of the others.
-fn assert_agrees(name: &str, actual: &RgbdImage, expected: &RgbdImage) {
+pub(crate) fn assert_agrees(name: &str, actual: &RgbdImage, expected: &RgbdImage) {
     let pixels = expected.alpha.len();
     // Colours may be large where harmonics add up; they are judged relative to 1 or the colour.
     let off = |i: usize| {
@@ -147,16 +147,16 @@ fn images_do_not_depend_on_what_was_drawn_before() {
             ..camera
         };
         let mut first = [RgbdImage::default()];
-        renderer.render(&[camera], &mut first).unwrap();
+        renderer.render(&[], &[camera], &mut first).unwrap();
         let mut several = vec![RgbdImage::default(); 4];
-        renderer.render(&[away, small, camera, small], &mut several).unwrap();
+        renderer.render(&[], &[away, small, camera, small], &mut several).unwrap();
         assert_eq!(several[2], first[0], "{}", renderer.name());
         assert_eq!(several[1], several[3], "{}", renderer.name());
         // The one that looks away sees the background and nothing else.
         assert!(several[0].rgb.iter().chain(&several[0].alpha).all(|&v| v == 0.0));
         // An image that was larger before holds only the new one.
         let mut reused = [first[0].clone()];
-        renderer.render(&[small], &mut reused).unwrap();
+        renderer.render(&[], &[small], &mut reused).unwrap();
         assert_eq!(reused[0], several[1], "{}", renderer.name());
     }
 }
@@ -166,7 +166,7 @@ fn a_wall_is_where_it_stands() {
     let (splats, camera) = wall();
     check(&splats, &[camera]);
     let mut image = [RgbdImage::default()];
-    CpuRenderer::new(&splats).render(&[camera], &mut image).unwrap();
+    CpuRenderer::new(&splats).render(&[], &[camera], &mut image).unwrap();
     let mut mm = Vec::new();
     for kind in [DepthKind::Median, DepthKind::Expected] {
         image[0].write_depth_mm(kind, &mut mm);

@@ -43,6 +43,7 @@ pub(crate) fn assert_clean(image: &RgbdImage) {
     assert_eq!(image.rgb.len(), pixels * 3);
     assert!(image.rgb.iter().all(|v| v.is_finite()), "rgb");
     assert!(image.alpha.iter().all(|v| (0.0..=1.0).contains(v)), "alpha");
+    assert_eq!(image.ids.len(), pixels);
     for depth in [&image.depth_expected_m, &image.depth_median_m] {
         assert_eq!(depth.len(), pixels);
         assert!(depth.iter().all(|v| v.is_finite() && *v >= 0.0), "depth");

@@ -3,5 +3,6 @@
 mod agreement;
 mod compare;
 mod npz;
+mod objects;
 mod oracle;
 mod poison;

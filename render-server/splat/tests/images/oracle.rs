@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, RgbdImage, Splats, ply, render_reference};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply, render_reference};
 
 use crate::{compare, npz};
 
@@ -42,6 +42,7 @@ fn camera(path: &Path) -> Camera {
             fy_px: c.fy,
             cx_px: c.cx,
             cy_px: c.cy,
+            distortion: Distortion::None,
         },
         // Rows of world-to-camera are columns of camera-to-world.
         world_from_cam: Pose::new(-(rotation * translation), DQuat::from_mat3(&rotation)),
@@ -60,6 +61,7 @@ fn oracle_image(path: &Path, camera: &Camera) -> RgbdImage {
         alpha: take("alpha"),
         depth_expected_m: take("depth"),
         depth_median_m: take("depth_median"),
+        ids: vec![0; camera.intrinsics.pixels()],
     }
 }
 
@@ -86,12 +88,12 @@ fn check_scene(name: &str, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
         let camera = camera(camera_file);
         let expected = oracle_image(image_file, &camera);
         let name = image_file.file_stem().unwrap_or_default().to_string_lossy();
-        let reference = render_reference(splats, &camera).expect("a valid camera");
+        let reference = render_reference(splats, &[], &camera).expect("a valid camera");
         check(&name, "reference", &reference, &expected);
         for renderer in &mut renderers {
             let mut image = [RgbdImage::default()];
-            renderer.render(&[camera], &mut image).expect("a valid camera");
-            check(&name, renderer.name(), &image[0], &expected);
+            renderer.render(&[], &[camera], &mut image).expect("a valid camera");
+            check(&name, &renderer.name(), &image[0], &expected);
         }
     }
 }

@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, InvalidCamera, RgbdImage, Splats, render_reference};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, InvalidCamera, RenderError, RgbdImage, Splats, render_reference};
 
 use crate::{agreement, compare};
 
@@ -29,10 +29,10 @@ fn looking_ahead(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
 
 /// Renders with everything there is; all images are clean.
 fn render_all(splats: &Splats, camera: &Camera) -> Vec<RgbdImage> {
-    let mut images = vec![render_reference(splats, camera).expect("a valid camera")];
+    let mut images = vec![render_reference(splats, &[], camera).expect("a valid camera")];
     for mut renderer in CpuRenderer::every(splats) {
         let mut image = [RgbdImage::default()];
-        renderer.render(&[*camera], &mut image).expect("a valid camera");
+        renderer.render(&[], &[*camera], &mut image).expect("a valid camera");
         images.extend(image);
     }
     images.iter().for_each(compare::assert_clean);
@@ -74,7 +74,7 @@ fn what_is_not_finite_is_left_out() {
             spoil(&mut splats);
             for mut renderer in CpuRenderer::every(&splats) {
                 let mut image = [RgbdImage::default()];
-                renderer.render(&[looking_ahead(20, 20, 60.0)], &mut image).unwrap();
+                renderer.render(&[], &[looking_ahead(20, 20, 60.0)], &mut image).unwrap();
                 compare::assert_clean(&image[0]);
                 assert!(image[0].alpha.iter().all(|&alpha| alpha == 0.0));
                 assert_eq!(renderer.workload().splats, 0);
@@ -112,7 +112,7 @@ fn every_size_and_field_of_view_is_drawn() {
     }
     let camera = looking_ahead(3840, 2160, 90.0);
     let mut image = [RgbdImage::default()];
-    CpuRenderer::new(&splats).render(&[camera], &mut image).unwrap();
+    CpuRenderer::new(&splats).render(&[], &[camera], &mut image).unwrap();
     compare::assert_clean(&image[0]);
     assert!(image[0].alpha[1080 * 3840 + 1920] > 0.85);
 }
@@ -135,11 +135,11 @@ fn cameras_that_are_none_are_refused() {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     let check = |camera: Camera, part: &str| {
         let mut untouched = [RgbdImage::default()];
-        let refused = CpuRenderer::new(&splats).render(&[camera], &mut untouched);
+        let refused = CpuRenderer::new(&splats).render(&[], &[camera], &mut untouched);
         let message = refused.expect_err("an invalid camera").to_string();
         assert!(message.contains(part), "{message:?} lacks {part:?}");
         assert_eq!(untouched[0], RgbdImage::default());
-        assert!(render_reference(&splats, &camera).is_err());
+        assert!(render_reference(&splats, &[], &camera).is_err());
     };
     let mut camera = good;
     camera.intrinsics.width_px = 0;
@@ -160,8 +160,8 @@ fn cameras_that_are_none_are_refused() {
     }
     check(Camera { background: [0.0, f32::NAN, 0.0], ..good }, "background");
     assert!(matches!(
-        render_reference(&splats, &Camera { near_m: 0.0, ..good }),
-        Err(InvalidCamera::Near(_))
+        render_reference(&splats, &[], &Camera { near_m: 0.0, ..good }),
+        Err(RenderError::Camera(InvalidCamera::Near(_)))
     ));
 }
 
@@ -190,7 +190,7 @@ proptest! {
         }
         for mut renderer in CpuRenderer::every(&splats) {
             let mut image = [RgbdImage::default()];
-            renderer.render(&[camera], &mut image).unwrap();
+            renderer.render(&[], &[camera], &mut image).unwrap();
             compare::assert_clean(&image[0]);
         }
     }

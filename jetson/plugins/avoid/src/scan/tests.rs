@@ -25,7 +25,7 @@ fn picture(world_from_cam: &Pose<World, Cam>, trunk_m: Option<DVec2>) -> Vec<u16
     for y in 0..k.height_px {
         for x in 0..k.width_px {
             let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            let ray = world_from_cam.rotate(k.unproject(pixel, 1.0));
+            let ray = world_from_cam.rotate(k.unproject(pixel, 1.0).unwrap());
             let floor_m = if ray.z < 0.0 { -origin.z / ray.z } else { f64::INFINITY };
             let bark_m = trunk_m.map_or(f64::INFINITY, |trunk_m| {
                 let (d, w) = (ray.truncate(), origin.truncate() - trunk_m);
