@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::geometry::{
-    Body, Cam, Intrinsics, Pose, Volume, World, body_from_forward_cam,
-};
-use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, Limits, MAX_CAMERAS, bounded};
+use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
+use vizflyt_protocol::messages::{ArenaInfo, Limits, MAX_CAMERAS, bounded};
 
+mod camera;
 mod validate;
 
+pub use camera::{CameraConfig, LensConfig};
 pub use validate::ConfigError;
 
 /// The whole of `arena.toml`.
@@ -103,25 +103,6 @@ impl Default for Occupancy {
     }
 }
 
-/// `[[cameras]]`: a pinhole camera that looks along the nose.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraConfig {
-    /// What plugins call it; unique, at most 32 bytes.
-    pub name: String,
-    /// Image width. [px]
-    pub width_px: u32,
-    /// Image height. [px]
-    pub height_px: u32,
-    /// From the left edge to the right edge. [deg]
-    pub horizontal_fov_deg: f64,
-    /// Where it sits. [m, body]
-    pub position_m: DVec3,
-    /// Nose-up tilt of the optical axis. [deg]
-    #[serde(default)]
-    pub tilt_deg: f64,
-}
-
 /// `[[stages]]`: a rectangular opening to fly through.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -206,28 +187,6 @@ impl ArenaConfig {
             goal_radius_m: self.goal.map_or(0.0, |goal| goal.radius_m),
             time_limit_s: self.time_limit_s,
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
-        }
-    }
-}
-
-impl CameraConfig {
-    /// Returns size, focal lengths and principal point.
-    pub fn intrinsics(&self) -> Intrinsics {
-        let fov_rad = self.horizontal_fov_deg.to_radians();
-        Intrinsics::from_horizontal_fov(self.width_px, self.height_px, fov_rad)
-    }
-
-    /// Returns the extrinsics.
-    pub fn body_from_cam(&self) -> Pose<Body, Cam> {
-        body_from_forward_cam(self.position_m, self.tilt_deg.to_radians())
-    }
-
-    /// Returns what the runtime must know of it.
-    pub fn info(&self) -> CameraInfo {
-        CameraInfo {
-            name: bounded(&self.name),
-            intrinsics: self.intrinsics(),
-            body_from_cam: self.body_from_cam(),
         }
     }
 }

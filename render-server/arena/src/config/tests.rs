@@ -1,3 +1,5 @@
+use vizflyt_protocol::geometry::Distortion;
+
 use super::*;
 
 const FOREST: &str = r#"
@@ -101,6 +103,51 @@ fn values_that_cannot_work_are_refused_by_key_and_value() {
     check_refused("normal = [1.0, 0.0, 0.0]", "normal = [0, 0, 0]", &["stages[0].normal"]);
     check_refused("voxel_m = 0.05", "voxel_m = 0.0", &["occupancy.voxel_m = 0"]);
     check_refused("\"window 1\"", "\"\"", &["stages[0].name"]);
+}
+
+#[test]
+fn a_calibrated_camera_keeps_its_numbers() {
+    let calibration = "fx_px = 211.0\nfy_px = 212.5\ncx_px = 150.25\ncy_px = 130.0\n\
+        distortion = { model = \"brown-conrady\", k1 = -0.2, p2 = 0.001 }\n\
+        near_m = 0.2\nrate_hz = 15.0\nyaw_deg = 90.0\nroll_deg = 90.0";
+    let arena =
+        ArenaConfig::parse(&FOREST.replace("horizontal_fov_deg = 90.0", calibration)).unwrap();
+    assert_eq!(ArenaConfig::parse(&arena.to_toml().unwrap()).unwrap(), arena);
+    let camera = &arena.cameras[0];
+    let k = camera.intrinsics();
+    assert_eq!([k.fx_px, k.fy_px, k.cx_px, k.cy_px], [211.0, 212.5, 150.25, 130.0]);
+    let lens = Distortion::BrownConrady { k1: -0.2, k2: 0.0, p1: 0.0, p2: 0.001, k3: 0.0 };
+    assert_eq!(k.distortion, lens);
+    assert_eq!((camera.near_m, camera.rate_hz), (0.2, Some(15.0)));
+    // To the left, 10 degrees up; its right side, which level would be ahead, is down.
+    let pose = camera.body_from_cam();
+    let (sin, cos) = 10f64.to_radians().sin_cos();
+    assert!((pose.rotate(DVec3::Z) - DVec3::new(0.0, cos, sin)).length() < 1e-12);
+    assert!((pose.rotate(DVec3::X) - DVec3::new(0.0, sin, -cos)).length() < 1e-12);
+    assert!((pose.rotate(DVec3::Y) + DVec3::X).length() < 1e-12);
+}
+
+#[test]
+fn cameras_that_contradict_themselves_are_refused() {
+    let fov = "horizontal_fov_deg = 90.0";
+    let four = "fx_px = 100.0\nfy_px = 100.0\ncx_px = 160.0\ncy_px = 120.0";
+    check_refused(fov, "", &["cameras[0].fx_px = absent", "horizontal_fov_deg, or fx_px"]);
+    check_refused(fov, "fx_px = 100.0", &["cameras[0].fy_px = absent", "give all of"]);
+    check_refused(fov, &format!("{fov}\n{four}"), &["cameras[0].fx_px = 100", "remove it, or"]);
+    let lens = "distortion = { model = \"kannala-brandt\", k1 = 0.01 }";
+    check_refused(fov, &format!("{fov}\n{lens}"), &["horizontal_fov_deg = 90", "calibration"]);
+    check_refused(fov, lens, &["cameras[0].fx_px = absent", "give all of"]);
+    let bad = |from: &str, to: &str, parts: &[&str]| {
+        check_refused(fov, &format!("{four}\n{lens}").replace(from, to), parts);
+    };
+    bad("fx_px = 100.0", "fx_px = -1.0", &["cameras[0].fx_px, fy_px = -1, 100"]);
+    bad("cx_px = 160.0", "cx_px = nan", &["cameras[0].cx_px, cy_px = NaN, 120"]);
+    bad("k1 = 0.01", "k1 = 1e9", &["cameras[0].distortion", "OpenCV"]);
+    bad("k1 = 0.01", "p1 = 0.01", &["line", "p1"]);
+    bad("kannala-brandt", "fisheye", &["line", "kannala-brandt"]);
+    bad(lens, "near_m = 0.0", &["cameras[0].near_m = 0"]);
+    bad(lens, "rate_hz = 0.0", &["cameras[0].rate_hz = 0"]);
+    bad(lens, "roll_deg = inf", &["cameras[0].roll_deg = inf"]);
 }
 
 #[test]

@@ -30,7 +30,11 @@ pub enum ConfigError {
     },
 }
 
-fn invalid(key: impl Into<String>, value: impl Display, advice: impl Into<String>) -> ConfigError {
+pub(super) fn invalid(
+    key: impl Into<String>,
+    value: impl Display,
+    advice: impl Into<String>,
+) -> ConfigError {
     ConfigError::Invalid { key: key.into(), value: value.to_string(), advice: advice.into() }
 }
 
@@ -43,7 +47,7 @@ const MAX_STAGES: usize = 255;
 /// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
 const MAX_VOXELS: f64 = 4e8;
 
-fn check_number(
+pub(super) fn check_number(
     key: &str,
     value: f64,
     unit: &str,
@@ -56,7 +60,7 @@ fn check_number(
     Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
 }
 
-fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError> {
+pub(super) fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError> {
     if value.is_finite() && value.abs().max_element() <= MAX_COORDINATE_M {
         return Ok(());
     }
@@ -179,18 +183,7 @@ impl ArenaConfig {
         for (index, camera) in self.cameras.iter().enumerate() {
             let key = |field: &str| format!("cameras[{index}].{field}");
             check_name(&key("name"), &camera.name, &mut taken)?;
-            let fov_deg = camera.horizontal_fov_deg;
-            check_number(&key("horizontal_fov_deg"), fov_deg, "degrees", 5.0..=170.0)?;
-            camera.intrinsics().validate().map_err(|error| {
-                let size = format!("{}x{}", camera.width_px, camera.height_px);
-                invalid(key("width_px x height_px"), size, error.to_string())
-            })?;
-            check_position(&key("position_m"), camera.position_m)?;
-            if camera.position_m.length() > MAX_LEVER_M {
-                let advice = format!("the camera must be within {MAX_LEVER_M} m of the body");
-                return Err(invalid(key("position_m"), camera.position_m, advice));
-            }
-            check_number(&key("tilt_deg"), camera.tilt_deg, "degrees", -90.0..=90.0)?;
+            camera.check(key)?;
         }
         Ok(())
     }
@@ -225,6 +218,3 @@ impl ArenaConfig {
         Ok(())
     }
 }
-
-/// A camera further from the body than this is a typing error. [m]
-const MAX_LEVER_M: f64 = 2.0;

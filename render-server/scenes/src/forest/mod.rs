@@ -67,12 +67,5 @@ fn arena(site: &Site) -> ArenaConfig {
 
 /// Returns the camera every generated arena has: 320x240, 90 degrees across, in the nose.
 pub(crate) fn front_camera() -> CameraConfig {
-    CameraConfig {
-        name: "front".to_owned(),
-        width_px: 320,
-        height_px: 240,
-        horizontal_fov_deg: 90.0,
-        position_m: DVec3::new(0.06, 0.0, 0.02),
-        tilt_deg: 0.0,
-    }
+    CameraConfig::ahead("front", [320, 240], 90.0, DVec3::new(0.06, 0.0, 0.02))
 }

@@ -64,14 +64,12 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         },
         limits: Limits { max_speed_mps: 2.0, max_acceleration_mps2: 4.0 },
         occupancy: Occupancy::default(),
-        cameras: vec![CameraConfig {
-            name: "front".to_owned(),
-            width_px: 320,
-            height_px: 240,
-            horizontal_fov_deg: FOV_DEG,
-            position_m: DVec3::new(0.06, 0.0, 0.02),
-            tilt_deg: 0.0,
-        }],
+        cameras: vec![CameraConfig::ahead(
+            "front",
+            [320, 240],
+            FOV_DEG,
+            DVec3::new(0.06, 0.0, 0.02),
+        )],
         stages: Vec::new(),
     }
 }
