@@ -11,12 +11,12 @@ pub(super) const REQUIRED: [&str; 14] = [
 
 /// Where in [`Layout::slots`] each group starts.
 pub(super) mod slot {
-    pub(in crate::ply) const MEAN: usize = 0;
-    pub(in crate::ply) const LOG_SCALE: usize = 3;
-    pub(in crate::ply) const ROTATION_WXYZ: usize = 6;
-    pub(in crate::ply) const OPACITY_LOGIT: usize = 10;
-    pub(in crate::ply) const SH_DC: usize = 11;
-    pub(in crate::ply) const SH_REST: usize = 14;
+    pub(in crate::format::ply) const MEAN: usize = 0;
+    pub(in crate::format::ply) const LOG_SCALE: usize = 3;
+    pub(in crate::format::ply) const ROTATION_WXYZ: usize = 6;
+    pub(in crate::format::ply) const OPACITY_LOGIT: usize = 10;
+    pub(in crate::format::ply) const SH_DC: usize = 11;
+    pub(in crate::format::ply) const SH_REST: usize = 14;
 }
 
 /// One number of a splat: the column it stands in.
@@ -32,15 +32,29 @@ pub(super) struct Slot {
 pub(super) struct Layout {
     /// [`REQUIRED`], then `f_rest_0..`, which are channel-major: all of red, green, blue.
     pub(super) slots: Vec<Slot>,
+    /// The degree that is kept, 0 to 3.
     pub(super) sh_degree: u8,
+    /// Harmonics beyond the constant that are kept, per channel.
+    pub(super) rest_per_channel: usize,
+    /// The constant is not a harmonic but a colour of 0 to 255.
+    pub(super) colour_bytes: bool,
 }
+
+/// What splatfacto writes instead of `f_dc_*` when it trained without harmonics.
+const COLOUR: [&str; 3] = ["red", "green", "blue"];
 
 impl Layout {
     /// Finds the columns of a splat in a header.
     pub(super) fn find(header: &Header) -> Result<Self, PlyError> {
         let vertex = header.vertex();
+        let lacks = |names: &[&str]| names.iter().any(|name| column(vertex, name).is_none());
+        let mut names = REQUIRED;
+        let colour_bytes = lacks(&REQUIRED[slot::SH_DC..]) && !lacks(&COLOUR);
+        if colour_bytes {
+            names[slot::SH_DC..].copy_from_slice(&COLOUR);
+        }
         let missing: Vec<&str> =
-            REQUIRED.into_iter().filter(|name| column(vertex, name).is_none()).collect();
+            names.into_iter().filter(|name| column(vertex, name).is_none()).collect();
         if !missing.is_empty() {
             return Err(PlyError::NotSplats { reason: describe(header, &missing) });
         }
@@ -49,11 +63,17 @@ impl Layout {
             0 => 0,
             9 => 1,
             24 => 2,
-            45 => 3,
+            // Degree 4 is rare and adds little: its own coefficients are skipped.
+            45 | 72 => 3,
             found => return Err(PlyError::HarmonicsCount { found }),
         };
-        let rest_names: Vec<String> = (0..rest).map(|i| format!("f_rest_{i}")).collect();
-        let slots = REQUIRED
+        let rest_per_channel = rest / 3;
+        let kept_per_channel = (usize::from(sh_degree) + 1).pow(2) - 1;
+        let rest_names: Vec<String> = (0..3)
+            .flat_map(|channel| (0..kept_per_channel).map(move |k| channel * rest_per_channel + k))
+            .map(|i| format!("f_rest_{i}"))
+            .collect();
+        let slots = names
             .into_iter()
             .chain(rest_names.iter().map(String::as_str))
             .map(|name| {
@@ -68,7 +88,7 @@ impl Layout {
                 }
             })
             .collect::<Result<_, _>>()?;
-        Ok(Self { slots, sh_degree })
+        Ok(Self { slots, sh_degree, rest_per_channel: kept_per_channel, colour_bytes })
     }
 
     /// Returns the names of the vertex's columns that no splat needs.
@@ -85,11 +105,8 @@ fn column(vertex: &Element, name: &str) -> Option<usize> {
 
 /// Says what a PLY without splats seems to be.
 fn describe(header: &Header, missing: &[&str]) -> String {
-    let vertex = header.vertex();
     let names = missing.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
-    let kind = if vertex.properties.iter().any(|p| p.name == "packed_position") {
-        "this is SuperSplat's compressed PLY; export it as plain PLY"
-    } else if header.elements.iter().any(|e| e.name == "face") {
+    let kind = if header.elements.iter().any(|e| e.name == "face") {
         "this is a mesh; export Gaussian splats"
     } else if missing.len() > 8 {
         "this is a point cloud; train and export Gaussian splats"

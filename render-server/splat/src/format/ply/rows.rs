@@ -2,22 +2,22 @@
 //!
 //! Nothing is allocated before the file is known to be long enough for it.
 
-use rayon::prelude::*;
+use glam::Vec3;
 
-use super::decode::{Block, Builder};
 use super::header::{Element, Header, Kind, Scalar, VERTEX};
-use super::layout::Layout;
+use super::layout::{Layout, slot};
 use super::{DropCounts, PlyError};
 use crate::Splats;
-
-/// Rows decoded by one task: some 100 kB, so that tasks outnumber threads and cost nothing.
-const ROWS_PER_TASK: usize = 2048;
+use crate::format::activate::{exp, harmonic_of_colour, sigmoid};
+use crate::format::block::{Block, Builder, Gaussian, SPLATS_PER_TASK, decode_all};
+use crate::format::progress::Meter;
 
 /// Decodes the vertex element of a binary little-endian file.
 pub(super) fn read_binary(
     bytes: &[u8],
     header: &Header,
     layout: &Layout,
+    meter: &Meter,
 ) -> Result<(Splats, DropCounts), PlyError> {
     let mut offset = header.body;
     for element in header.elements.iter().take_while(|element| element.name != VERTEX) {
@@ -41,11 +41,11 @@ pub(super) fn read_binary(
         let slots: Vec<(usize, Scalar)> =
             layout.slots.iter().map(|slot| (starts[slot.column], slot.scalar)).collect();
         let data = &bytes[offset..offset + length];
-        return Ok(decode_all(layout, vertex.count, |first, block| {
+        return Ok(decode_all(layout.sh_degree, vertex.count, meter, |first, block| {
             let rows = data[first * row_bytes..].chunks_exact(row_bytes).take(block.len());
             for (i, row) in rows.enumerate() {
                 // Nearly every file is all f32: one well-predicted branch per number.
-                block.put(i, |slot| match slots[slot] {
+                put(block, layout, i, |slot| match slots[slot] {
                     (at, Scalar::F32) => {
                         f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]])
                     }
@@ -59,10 +59,10 @@ pub(super) fn read_binary(
     let columns = vertex.properties.len();
     let mut starts: Vec<usize> = Vec::with_capacity(vertex.count.saturating_mul(columns));
     variable_rows(bytes, offset, vertex, |_, at| starts.push(at))?;
-    Ok(decode_all(layout, vertex.count, |first, block| {
+    Ok(decode_all(layout.sh_degree, vertex.count, meter, |first, block| {
         for i in 0..block.len() {
             let row = &starts[(first + i) * columns..][..columns];
-            block.put(i, |slot| {
+            put(block, layout, i, |slot| {
                 let slot = layout.slots[slot];
                 slot.scalar.read(&bytes[row[slot.column]..]) as f32
             });
@@ -76,6 +76,7 @@ pub(super) fn read_ascii(
     bytes: &[u8],
     header: &Header,
     layout: &Layout,
+    meter: &Meter,
 ) -> Result<(Splats, DropCounts), PlyError> {
     let mut tokens = Tokens { bytes, offset: header.body };
     for element in header.elements.iter().take_while(|element| element.name != VERTEX) {
@@ -99,13 +100,13 @@ pub(super) fn read_ascii(
     for (i, slot) in layout.slots.iter().enumerate() {
         slot_of_column[slot.column] = i;
     }
-    let mut builder = Builder::new(layout, vertex.count);
+    let mut builder = Builder::new(layout.sh_degree, vertex.count);
     let mut values = vec![0f32; layout.slots.len()];
     let mut dropped = DropCounts::default();
-    for (first, block) in builder.blocks(ROWS_PER_TASK).enumerate() {
+    for (first, block) in builder.blocks(SPLATS_PER_TASK).enumerate() {
         let mut block = block;
         for i in 0..block.len() {
-            let row = first * ROWS_PER_TASK + i;
+            let row = first * SPLATS_PER_TASK + i;
             for (property, &slot) in vertex.properties.iter().zip(&slot_of_column) {
                 match property.kind {
                     Kind::Scalar(_) if slot != usize::MAX => {
@@ -114,43 +115,35 @@ pub(super) fn read_ascii(
                     kind => tokens.skip(vertex, row, kind)?,
                 }
             }
-            block.put(i, |slot| values[slot]);
+            put(&mut block, layout, i, |slot| values[slot]);
         }
-        dropped = add(dropped, block.dropped());
+        meter.add(block.len());
+        dropped = dropped.plus(block.dropped());
     }
     Ok((builder.finish(dropped), dropped))
 }
 
-/// Runs `fill(first row, block)` over all rows in parallel.
-fn decode_all(
-    layout: &Layout,
-    count: usize,
-    fill: impl Fn(usize, &mut Block) + Sync,
-) -> (Splats, DropCounts) {
-    let mut builder = Builder::new(layout, count);
-    let dropped = builder
-        .blocks(ROWS_PER_TASK)
-        .collect::<Vec<_>>()
-        .into_par_iter()
-        .enumerate()
-        .map(|(task, mut block)| {
-            fill(task * ROWS_PER_TASK, &mut block);
-            block.dropped()
-        })
-        .reduce(DropCounts::default, add);
-    (builder.finish(dropped), dropped)
-}
-
-fn add(a: DropCounts, b: DropCounts) -> DropCounts {
-    DropCounts {
-        non_finite: a.non_finite + b.non_finite,
-        zero_rotation: a.zero_rotation + b.zero_rotation,
-        scale_overflow: a.scale_overflow + b.scale_overflow,
-    }
+/// Stores row `i` from its raw numbers, `raw(slot)`.
+#[inline]
+fn put(block: &mut Block, layout: &Layout, i: usize, raw: impl Fn(usize) -> f32) {
+    let three = |first: usize| Vec3::new(raw(first), raw(first + 1), raw(first + 2));
+    let wxyz = [0, 1, 2, 3].map(|k| raw(slot::ROTATION_WXYZ + k));
+    let gaussian = Gaussian {
+        mean_m: three(slot::MEAN),
+        scale_m: exp(three(slot::LOG_SCALE)),
+        rotation_xyzw: [wxyz[1], wxyz[2], wxyz[3], wxyz[0]],
+        opacity: sigmoid(raw(slot::OPACITY_LOGIT)),
+    };
+    block.put(i, &gaussian, |k, channel| match k {
+        0 if layout.colour_bytes => harmonic_of_colour(raw(slot::SH_DC + channel) / 255.0),
+        0 => raw(slot::SH_DC + channel),
+        // Channel-major in the file, colour by colour in memory.
+        _ => raw(slot::SH_REST + channel * layout.rest_per_channel + k - 1),
+    });
 }
 
 /// Returns the bytes of an element of fixed rows, which are all there.
-fn fixed_length(
+pub(super) fn fixed_length(
     bytes: &[u8],
     offset: usize,
     element: &Element,
@@ -212,7 +205,12 @@ fn variable_rows(
     Ok(offset)
 }
 
-fn truncated(element: &Element, offset: usize, needed: u128, available: usize) -> PlyError {
+pub(super) fn truncated(
+    element: &Element,
+    offset: usize,
+    needed: u128,
+    available: usize,
+) -> PlyError {
     PlyError::Truncated {
         element: element.name.clone(),
         declared: element.count,

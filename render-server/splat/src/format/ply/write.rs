@@ -1,18 +1,11 @@
 //! Splats to the standard binary PLY.
 
-use std::fs::File;
-use std::io::Write as _;
 use std::path::Path;
 
 use super::PlyError;
 use crate::Splats;
-
-/// Logits beyond which the sigmoid is exactly 1 and exactly 0 in f32; finite, because many
-/// readers refuse infinities.
-const OPAQUE_LOGIT: f32 = 18.0;
-const TRANSPARENT_LOGIT: f32 = -104.0;
-/// The log scale whose exponential is exactly 0 in f32.
-const ZERO_LOG_SCALE: f32 = -104.0;
+use crate::format::activate::{log_scale, logit};
+use crate::format::{assert_whole, file};
 
 /// Writes a scene as binary little-endian PLY in INRIA's layout; [`super::read`] returns the same
 /// scene up to the rounding of logarithms. Written beside its place and then renamed, so that a
@@ -25,12 +18,11 @@ const ZERO_LOG_SCALE: f32 = -104.0;
 /// If the vectors of `splats` differ in length.
 pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
     let path = path.as_ref();
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".part");
-    let written = File::create(&partial)
-        .and_then(|mut file| file.write_all(&encode(splats)))
-        .and_then(|()| std::fs::rename(&partial, path));
-    written.map_err(|source| PlyError::Io { path: path.to_owned(), verb: "write", source })
+    file::replace(path, &encode(splats)).map_err(|source| PlyError::Io {
+        path: path.to_owned(),
+        verb: "write",
+        source,
+    })
 }
 
 /// Returns the bytes [`write()`] writes.
@@ -38,12 +30,9 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
 /// # Panics
 /// If the vectors of `splats` differ in length.
 pub fn encode(splats: &Splats) -> Vec<u8> {
+    assert_whole(splats);
     let coefficients = splats.sh_coefficients();
     let count = splats.len();
-    assert_eq!(splats.scales_m.len(), count, "one scale per splat");
-    assert_eq!(splats.rotations.len(), count, "one rotation per splat");
-    assert_eq!(splats.opacities.len(), count, "one opacity per splat");
-    assert_eq!(splats.sh.len(), count * coefficients * 3, "harmonics for every splat");
 
     let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(Into::into).into();
     names.extend((0..3).map(|i| format!("f_dc_{i}")));
@@ -71,17 +60,10 @@ pub fn encode(splats: &Splats) -> Vec<u8> {
         }
         put(logit(splats.opacities[i]));
         for scale_m in splats.scales_m[i].to_array() {
-            put(scale_m.ln().max(ZERO_LOG_SCALE));
+            put(log_scale(scale_m));
         }
         let [x, y, z, w] = splats.rotations[i].to_array();
         [w, x, y, z].into_iter().for_each(&mut put);
     }
     bytes
-}
-
-/// Returns the inverse of the sigmoid, finite for 0 and 1.
-fn logit(opacity: f32) -> f32 {
-    // In f64: near 1 an f32 difference from 1 keeps no digits.
-    let opacity = f64::from(opacity);
-    ((opacity / (1.0 - opacity)).ln() as f32).clamp(TRANSPARENT_LOGIT, OPAQUE_LOGIT)
 }

@@ -1,7 +1,8 @@
-//! Bytes of a file, without a second copy of them in memory.
+//! Files in and out: bytes without a second copy of them in memory, writes that are whole or not
+//! there.
 
 use std::fs::File;
-use std::io;
+use std::io::{self, Write as _};
 use std::path::Path;
 
 use memmap2::Mmap;
@@ -15,11 +16,20 @@ pub(super) fn map(path: &Path) -> io::Result<Mmap> {
     shared_memory::map(&file)
 }
 
+/// Writes a file beside its place and then renames it, so that a reader never sees half of it.
+pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".part");
+    let mut file = File::create(&partial)?;
+    file.write_all(bytes)?;
+    std::fs::rename(&partial, path)
+}
+
 /// The one call that the operating system cannot make safe.
 mod shared_memory {
     use super::{File, Mmap, io};
 
-    pub(super) fn map(file: &File) -> io::Result<Mmap> {
+    pub(in crate::format) fn map(file: &File) -> io::Result<Mmap> {
         // SAFETY: the mapping is private to this process and read-only. Another process that
         // rewrites the scene while it loads could change bytes under us: every number is read
         // once, by value, and checked after it was read, so the worst is a wrong splat; one that

@@ -37,7 +37,7 @@ pub enum PlyError {
         reason: String,
     },
     /// The number of `f_rest_*` properties belongs to no degree of harmonics.
-    #[error("{found} f_rest properties; expected 0, 9, 24 or 45 (harmonics of degree 0 to 3)")]
+    #[error("{found} f_rest properties; expected 0, 9, 24, 45 or 72 (harmonics of degree 0 to 4)")]
     HarmonicsCount {
         /// How many there are.
         found: usize,

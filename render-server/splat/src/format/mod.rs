@@ -1,0 +1,317 @@
+//! Scene files of every kind in, [`Splats`] out, and back.
+//!
+//! [`read`] tells the format by content, then by name, and hands the bytes (mapped, not copied) to
+//! the format's own module, which checks every size against the file's length before it allocates,
+//! and decodes in parallel into a [`Loaded`]: activated, in the axes of the PLY the scene was trained
+//! to, what cannot be drawn left out and counted. [`write`] goes the other way by file name. Called
+//! once per scene by whatever loads one: server, command line, benches.
+//!
+//! | format | names | read | written | harmonics | positions |
+//! |---|---|---|---|---|---|
+//! | [`Format::Ply`] | `.ply` | INRIA, splatfacto, brush, PostShot; binary and ascii | INRIA's layout | 0-3 | f32 |
+//! | [`Format::CompressedPly`] | `.compressed.ply` | with and without colour bounds and harmonics | with | 0-3 | 11-10-11 bits in blocks of 256 |
+//! | [`Format::Splat`] | `.splat` | all | all | 0 | f32 |
+//! | [`Format::Spz`] | `.spz` | versions 1-4 | version 3 | 0-3 (4 reduced) | 24 bits, 1/4096 m |
+//! | [`Format::Sog`] | `.sog`, `meta.json` or its folder | versions 1, 2 | version 2 | 0-3 | 16 bits of the logarithm |
+//! | [`Format::Ksplat`] | `.ksplat` | levels 0-2 | level 1 | 0-2 | f32, or 16 bits in 5 m |
+//!
+//! Hostile files cost at most a constant plus a multiple of their own size (`limit`), in time and
+//! memory. Budget: 1 M splats in a second on two cores, memory within twice the decoded size.
+
+mod activate;
+mod block;
+mod bytes;
+mod error;
+mod file;
+mod ksplat;
+mod limit;
+mod order;
+pub mod ply;
+mod progress;
+mod quantise;
+mod sog;
+mod splat;
+mod spz;
+
+use std::fmt;
+use std::path::Path;
+
+pub use block::DropCounts;
+pub use error::FormatError;
+pub use progress::{Progress, Report};
+
+use crate::Splats;
+use progress::Meter;
+
+/// A scene as read from a file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Loaded {
+    /// What kind of file it was.
+    pub format: Format,
+    /// What can be drawn, in file order.
+    pub splats: Splats,
+    /// What was left out, by reason.
+    pub dropped: DropCounts,
+    /// Whether the file says that the scene was trained with anti-aliasing (mip-splatting); drawn
+    /// without, its smallest splats look a little too bright.
+    pub antialiased: bool,
+    /// Names of what the file holds of each splat and no splat needs, in file order.
+    pub skipped_properties: Vec<String>,
+    /// Names of PLY elements that hold no splats, in file order.
+    pub skipped_elements: Vec<String>,
+}
+
+impl Loaded {
+    /// Returns a scene, unless nothing is left of it.
+    fn whole(
+        format: Format,
+        declared: usize,
+        splats: Splats,
+        dropped: DropCounts,
+    ) -> Result<Self, FormatError> {
+        if splats.is_empty() {
+            return Err(FormatError::Empty { format, declared, dropped: dropped.total() });
+        }
+        Ok(Self {
+            format,
+            splats,
+            dropped,
+            antialiased: false,
+            skipped_properties: Vec::new(),
+            skipped_elements: Vec::new(),
+        })
+    }
+}
+
+/// A kind of scene file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Format {
+    /// The trainers' PLY.
+    Ply,
+    /// SuperSplat's compressed PLY.
+    CompressedPly,
+    /// antimatter15's 32 bytes per splat.
+    Splat,
+    /// Niantic's.
+    Spz,
+    /// PlayCanvas's textures.
+    Sog,
+    /// GaussianSplats3D's.
+    Ksplat,
+}
+
+impl Format {
+    /// Every format, the plainest first.
+    pub const ALL: [Self; 6] =
+        [Self::Ply, Self::CompressedPly, Self::Splat, Self::Spz, Self::Sog, Self::Ksplat];
+
+    /// Returns the name people call it by.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ply => "PLY",
+            Self::CompressedPly => "compressed PLY",
+            Self::Splat => ".splat",
+            Self::Spz => "SPZ",
+            Self::Sog => "SOG",
+            Self::Ksplat => ".ksplat",
+        }
+    }
+
+    /// Returns the end of its files' names, without the dot before.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Ply => "ply",
+            Self::CompressedPly => "compressed.ply",
+            Self::Splat => "splat",
+            Self::Spz => "spz",
+            Self::Sog => "sog",
+            Self::Ksplat => "ksplat",
+        }
+    }
+
+    /// Returns the highest degree of harmonics it holds.
+    pub fn max_sh_degree(self) -> u8 {
+        match self {
+            Self::Splat => 0,
+            Self::Ksplat => ksplat::MAX_SH_DEGREE,
+            Self::Ply | Self::CompressedPly | Self::Spz | Self::Sog => 3,
+        }
+    }
+
+    /// Returns the format that a file's name says.
+    pub fn of_name(path: &Path) -> Option<Self> {
+        let name = path.file_name()?.to_str()?.to_ascii_lowercase();
+        if name == sog::META {
+            return Some(Self::Sog);
+        }
+        // The longest extension that fits: `.compressed.ply` is also a `.ply`.
+        Self::ALL
+            .into_iter()
+            .filter(|format| {
+                let stem = name.strip_suffix(format.extension());
+                stem.is_some_and(|stem| stem.ends_with('.'))
+            })
+            .max_by_key(|format| format.extension().len())
+    }
+
+    /// Returns the format that a file's first bytes say; `.splat` has no mark.
+    pub fn of_content(bytes: &[u8]) -> Option<Self> {
+        if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+            // Which of the two PLYs is told by its header.
+            Some(Self::Ply)
+        } else if bytes.starts_with(&spz::GZIP_MAGIC)
+            || bytes.starts_with(&spz::MAGIC.to_le_bytes())
+        {
+            Some(Self::Spz)
+        } else if bytes.starts_with(b"PK\x03\x04") {
+            Some(Self::Sog)
+        } else if ksplat::is_ksplat(bytes) {
+            Some(Self::Ksplat)
+        } else {
+            None
+        }
+    }
+
+    /// Returns all names with their extensions, for messages.
+    fn list() -> String {
+        let each = Self::ALL.map(|format| match format {
+            Self::Splat | Self::Ksplat => format.name().to_owned(),
+            Self::Sog => "SOG (.sog, or the folder of its meta.json)".into(),
+            _ => format!("{} (.{})", format.name(), format.extension()),
+        });
+        each.join(", ")
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Reads a scene file of any supported format, told by its content, then by its name. A folder is
+/// read as SOG, as is a `meta.json`.
+///
+/// # Errors
+/// [`FormatError::Io`] with the path, [`FormatError::Unknown`] with what is supported, or whatever
+/// keeps the file from being a scene of its format.
+pub fn read(path: impl AsRef<Path>) -> Result<Loaded, FormatError> {
+    read_metered(path.as_ref(), &Meter::SILENT)
+}
+
+/// [`read()`], telling `report` how far it came, so that a load of more than a second can show it.
+///
+/// # Errors
+/// As [`read()`].
+pub fn read_with_progress(path: impl AsRef<Path>, report: Report) -> Result<Loaded, FormatError> {
+    let meter = Meter::new(report);
+    let loaded = read_metered(path.as_ref(), &meter)?;
+    meter.finish();
+    Ok(loaded)
+}
+
+/// Reads the bytes of a scene file. Content decides where it has a mark, otherwise `named`.
+///
+/// # Errors
+/// As [`read()`], without the path.
+pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
+    decode(bytes, Format::of_content(bytes).unwrap_or(named), &Meter::SILENT)
+}
+
+/// Writes a scene in the format that the file's name says; a `meta.json` becomes a SOG scene of
+/// single files beside it. Beside its place first and then renamed, so that a reader never sees
+/// half a file.
+///
+/// # Errors
+/// [`FormatError::Unknown`] where the name says no format; [`FormatError::Io`] with the path.
+///
+/// # Panics
+/// If the vectors of `splats` differ in length.
+pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError> {
+    let path = path.as_ref();
+    let format = Format::of_name(path).ok_or_else(|| FormatError::Unknown {
+        what: format!("{} names no format to write", path.display()),
+    })?;
+    let place = |path: &Path, bytes: &[u8]| {
+        file::replace(path, bytes).map_err(|source| FormatError::Io {
+            path: path.to_owned(),
+            verb: "write",
+            source,
+        })
+    };
+    if path.file_name().is_some_and(|name| name == sog::META) {
+        return sog::parts(splats)?
+            .iter()
+            .try_for_each(|(name, bytes)| place(&path.with_file_name(name), bytes));
+    }
+    place(path, &encode(format, splats)?)
+}
+
+/// Returns the bytes [`write()`] writes. Harmonics beyond [`Format::max_sh_degree`] are left out;
+/// packed formats put splats in an order of their own.
+///
+/// # Errors
+/// [`FormatError::Invalid`] where the format cannot hold the scene.
+///
+/// # Panics
+/// If the vectors of `splats` differ in length.
+pub fn encode(format: Format, splats: &Splats) -> Result<Vec<u8>, FormatError> {
+    Ok(match format {
+        Format::Ply => ply::encode(splats),
+        Format::CompressedPly => ply::encode_compressed(splats),
+        Format::Splat => splat::encode(splats),
+        // What the most readers take: version 4 is younger, version 2 coarser.
+        Format::Spz => spz::encode(splats, 3),
+        Format::Sog => sog::encode(splats)?,
+        // The default of the viewer's own converter.
+        Format::Ksplat => ksplat::encode(splats, 1),
+    })
+}
+
+fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
+    let named = Format::of_name(path);
+    let is_meta = path.file_name().is_some_and(|name| name == sog::META);
+    if is_meta || path.join(sog::META).is_file() {
+        return sog::decode(sog::Files::from(path), meter);
+    }
+    let io = |source| FormatError::Io { path: path.to_owned(), verb: "read", source };
+    if path.file_name().is_some_and(|name| name == "lod-meta.json") {
+        return Err(FormatError::Unsupported {
+            format: Format::Sog,
+            what: "a streamed scene (lod-meta.json)".into(),
+            advice: "convert it to one .sog, or name the meta.json of one of its chunks",
+        });
+    }
+    let bytes = file::map(path).map_err(io)?;
+    let format = Format::of_content(&bytes).or(named).ok_or_else(|| {
+        let start = String::from_utf8_lossy(&bytes[..bytes.len().min(8)]).into_owned();
+        FormatError::Unknown {
+            what: format!("{} starts with {start:?}, like no scene file", path.display()),
+        }
+    })?;
+    decode(&bytes, format, meter)
+}
+
+fn decode(bytes: &[u8], format: Format, meter: &Meter) -> Result<Loaded, FormatError> {
+    match format {
+        Format::Ply | Format::CompressedPly => Ok(ply::decode(bytes, meter)?),
+        Format::Splat => splat::decode(bytes, meter),
+        Format::Spz => spz::decode(bytes, meter),
+        Format::Sog => sog::decode(sog::Files::zip(bytes)?, meter),
+        Format::Ksplat => ksplat::decode(bytes, meter),
+    }
+}
+
+/// # Panics
+/// If the vectors of `splats` differ in length.
+fn assert_whole(splats: &Splats) {
+    let count = splats.len();
+    assert_eq!(splats.scales_m.len(), count, "one scale per splat");
+    assert_eq!(splats.rotations.len(), count, "one rotation per splat");
+    assert_eq!(splats.opacities.len(), count, "one opacity per splat");
+    let numbers = count * splats.sh_coefficients() * 3;
+    assert_eq!(splats.sh.len(), numbers, "harmonics for every splat");
+}
+
+#[cfg(test)]
+mod tests;

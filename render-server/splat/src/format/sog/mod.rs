@@ -1,0 +1,41 @@
+//! SOG ("spatially ordered Gaussians"): PlayCanvas's textures of splats, one pixel per splat, either
+//! in a ZIP (`.sog`) or beside their `meta.json`. Versions 1 (no version in the meta) and 2.
+//!
+//! Data flow: `files` finds `meta.json` and what it names; `meta` turns either version into one set
+//! of tables, byte to value; `texture` decodes lossless WebP; `read` puts them together. The way
+//! back: `codebook` and `palette` find what the tables and the harmonics' palette hold, `write`.
+//!
+//! | texture | holds | version 1 | version 2 |
+//! |---|---|---|---|
+//! | `means_l`, `means_u` | low and high byte of x, y, z | between bounds of sign(x) ln(1 + abs x) | same |
+//! | `scales` | log of the standard deviation | between bounds per axis | codebook |
+//! | `quats` | the three smaller of wxyz, -1/sqrt(2) to 1/sqrt(2); alpha 252 + index of the largest | | same |
+//! | `sh0` | constant harmonic; opacity in alpha | between bounds; logit between bounds | codebook; linear |
+//! | `shN_labels` | index into the palette, low byte first | | same |
+//! | `shN_centroids` | palette, 64 entries to a row, one pixel (RGB) per coefficient | between bounds | codebook |
+//!
+//! Axes: PlayCanvas's converter copies them from the PLY unchanged, and so does this reader.
+
+mod codebook;
+mod files;
+mod meta;
+mod palette;
+mod read;
+mod texture;
+mod write;
+
+pub(super) use files::{Files, META};
+pub(super) use read::decode;
+pub(super) use write::{encode, parts};
+
+use super::{Format, FormatError};
+
+/// Entries of the palette per row of its texture.
+const PALETTE_WIDTH: usize = 64;
+/// Alpha of a quaternion whose largest component is w; x, y and z follow.
+const QUATERNION_TAG: u8 = 252;
+
+/// Returns an error about a part of a scene.
+fn invalid(part: &str, reason: impl Into<String>) -> FormatError {
+    FormatError::Invalid { format: Format::Sog, place: part.into(), reason: reason.into() }
+}

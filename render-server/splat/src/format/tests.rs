@@ -1,0 +1,574 @@
+use std::path::Path;
+
+use glam::{Quat, Vec3};
+use proptest::prelude::*;
+
+use super::order::morton;
+use super::{Format, FormatError, Loaded, Progress};
+use super::{ksplat, parse, ply, read, read_with_progress, sog, splat, spz, write};
+use crate::Splats;
+
+/// A writer, the order it writes in, and what it may lose.
+struct Way {
+    name: &'static str,
+    format: Format,
+    encode: fn(&Splats) -> Vec<u8>,
+    sorted: fn(&Splats) -> Vec<u32>,
+    loss: Loss,
+}
+
+/// Largest errors after a round trip.
+struct Loss {
+    /// Of positions, given the extent of what is packed together. [m]
+    mean_m: fn(f32) -> f32,
+    /// Of the logarithm of a scale; the tests' scenes stay where formats do not clamp.
+    log_scale: f32,
+    /// Of a rotation. [rad]
+    rotation_rad: f32,
+    /// Of opacity.
+    opacity: f32,
+    /// Of the constant harmonic.
+    constant: f32,
+    /// Of the other harmonics.
+    harmonic: f32,
+}
+
+fn as_is(splats: &Splats) -> Vec<u32> {
+    (0..splats.len() as u32).collect()
+}
+
+/// Half a step of a byte, as a constant harmonic, with room for rounding.
+const COLOUR_BYTE: f32 = 0.5 / 255.0 / 0.282_094_8 * 1.01;
+/// Half a step of an opacity byte.
+const OPACITY_BYTE: f32 = 0.5 / 255.0 * 1.01;
+
+const SPZ: Loss = Loss {
+    mean_m: |_| 0.5 / 4096.0 + 1e-5,
+    log_scale: 1.0 / 32.0 + 1e-4,
+    rotation_rad: 0.006,
+    opacity: OPACITY_BYTE,
+    constant: 0.5 / 255.0 / 0.15 * 1.01,
+    // 5 bits at degree 1, 4 beyond, and the end of a byte.
+    harmonic: 1.0 / 16.0 + 1.0 / 128.0,
+};
+
+const KSPLAT: Loss = Loss {
+    mean_m: |_| 2.5 / 32767.0,
+    log_scale: 1e-3,
+    rotation_rad: 2e-3,
+    opacity: OPACITY_BYTE,
+    constant: COLOUR_BYTE,
+    harmonic: 1e-3,
+};
+
+const WAYS: [Way; 10] = [
+    Way {
+        name: "PLY",
+        format: Format::Ply,
+        encode: ply::encode,
+        sorted: as_is,
+        loss: Loss {
+            mean_m: |_| 0.0,
+            log_scale: 1e-5,
+            rotation_rad: 1e-3,
+            opacity: 1e-6,
+            constant: 0.0,
+            harmonic: 0.0,
+        },
+    },
+    Way {
+        name: "compressed PLY",
+        format: Format::CompressedPly,
+        encode: ply::encode_compressed,
+        sorted: morton,
+        loss: Loss {
+            mean_m: |extent_m| extent_m / 2046.0 * 1.01,
+            // Scales of the tests span 2.5 in the logarithm.
+            log_scale: 2.5 / 2046.0 * 1.01,
+            rotation_rad: 0.004,
+            opacity: OPACITY_BYTE,
+            constant: COLOUR_BYTE,
+            harmonic: 1.0 / 64.0 * 1.01,
+        },
+    },
+    Way {
+        name: ".splat",
+        format: Format::Splat,
+        encode: splat::encode,
+        sorted: as_is,
+        loss: Loss {
+            mean_m: |_| 0.0,
+            log_scale: 1e-5,
+            rotation_rad: 0.02,
+            opacity: OPACITY_BYTE,
+            constant: COLOUR_BYTE,
+            harmonic: 0.0,
+        },
+    },
+    Way {
+        name: "SPZ 2",
+        format: Format::Spz,
+        encode: |splats| spz::encode(splats, 2),
+        sorted: as_is,
+        // w is what three bytes leave, so half a turn is known least.
+        loss: Loss { rotation_rad: 0.3, ..SPZ },
+    },
+    Way {
+        name: "SPZ 3",
+        format: Format::Spz,
+        encode: |splats| spz::encode(splats, 3),
+        sorted: as_is,
+        loss: SPZ,
+    },
+    Way {
+        name: "SPZ 4",
+        format: Format::Spz,
+        encode: |splats| spz::encode(splats, 4),
+        sorted: as_is,
+        loss: SPZ,
+    },
+    Way {
+        name: "SOG",
+        format: Format::Sog,
+        encode: |splats| sog::encode(splats).unwrap(),
+        sorted: morton,
+        loss: Loss {
+            // ln(1 + 5) to either side in 65535 steps, stretched by 6 at the far end.
+            mean_m: |_| 6.0 * 2.0 * 1.8 / 65535.0,
+            log_scale: 2.5 / 255.0,
+            rotation_rad: 0.02,
+            opacity: OPACITY_BYTE,
+            constant: 3.0 / 255.0,
+            harmonic: 2.0 / 255.0,
+        },
+    },
+    Way {
+        name: ".ksplat level 0",
+        format: Format::Ksplat,
+        encode: |splats| ksplat::encode(splats, 0),
+        sorted: as_is,
+        loss: Loss {
+            mean_m: |_| 0.0,
+            log_scale: 1e-5,
+            rotation_rad: 1e-3,
+            harmonic: 0.0,
+            ..KSPLAT
+        },
+    },
+    Way {
+        name: ".ksplat level 1",
+        format: Format::Ksplat,
+        encode: |splats| ksplat::encode(splats, 1),
+        sorted: by_cube,
+        loss: KSPLAT,
+    },
+    Way {
+        name: ".ksplat level 2",
+        format: Format::Ksplat,
+        encode: |splats| ksplat::encode(splats, 2),
+        sorted: by_cube,
+        loss: Loss { harmonic: 1.0 / 255.0 * 1.01, ..KSPLAT },
+    },
+];
+
+/// The order of `.ksplat`'s cubes of 5 m; the tests' scenes fill none of them.
+fn by_cube(splats: &Splats) -> Vec<u32> {
+    let mut order = as_is(splats);
+    order.sort_by_key(|&i| (splats.means_m[i as usize] / 5.0).floor().as_ivec3().to_array());
+    order
+}
+
+/// Scenes of up to 40 splats within 5 m, with values that no format clamps.
+fn scene() -> impl Strategy<Value = Splats> {
+    let splat = (
+        prop::array::uniform3(-5.0..5.0f32),
+        prop::array::uniform3(-4.5..-2.0f32),
+        prop::array::uniform4(-1.0..1.0f32),
+        0.0..=1.0f32,
+        prop::collection::vec(-1.0..1.0f32, 48),
+    );
+    (0..=3u8, prop::collection::vec(splat, 1..40)).prop_map(|(sh_degree, rows)| {
+        let mut splats = Splats { sh_degree, ..Splats::default() };
+        let numbers = splats.sh_coefficients() * 3;
+        for (mean_m, log_scale, q, opacity, sh) in rows {
+            let q = Quat::from_array(q);
+            splats.means_m.push(mean_m.into());
+            splats.scales_m.push(Vec3::from_array(log_scale.map(f32::exp)));
+            splats.rotations.push(if q.length() > 1e-2 { q.normalize() } else { Quat::IDENTITY });
+            splats.opacities.push(opacity);
+            splats.sh.extend(&sh[..numbers]);
+        }
+        splats
+    })
+}
+
+/// Some splats of degree 2, always the same.
+fn some() -> Splats {
+    let mut splats = Splats { sh_degree: 2, ..Splats::default() };
+    for i in 0..7 {
+        let f = i as f32;
+        splats.means_m.push(Vec3::new(f.sin() * 3.0, f.cos(), f * 0.5 - 2.0));
+        splats.scales_m.push(Vec3::new(0.02 + f * 0.01, 0.03, 0.05));
+        splats.rotations.push(Quat::from_xyzw(f - 3.0, 1.0, f * 0.5, -0.5).normalize());
+        splats.opacities.push(0.1 + f * 0.1);
+        splats.sh.extend((0..27).map(|k| ((k * 5 + i) as f32).sin() * 0.7));
+    }
+    splats
+}
+
+/// Compares a scene with what became of it.
+fn check_close(way: &Way, before: &Splats, after: &Splats) {
+    let Way { name, loss, format, .. } = way;
+    let order = (way.sorted)(before);
+    assert_eq!(after.len(), before.len(), "{name}");
+    assert_eq!(after.sh_degree, before.sh_degree.min(format.max_sh_degree()), "{name}");
+    let (old, new) = (before.sh_coefficients() * 3, after.sh_coefficients() * 3);
+    for (j, &i) in order.iter().enumerate() {
+        let i = i as usize;
+        let near = |what: &str, a: f32, b: f32, most: f32| {
+            assert!((a - b).abs() <= most, "{name}, splat {i}, {what}: {a} became {b}");
+        };
+        for axis in 0..3 {
+            let [low, high] = [Vec3::min, Vec3::max]
+                .map(|pick| before.means_m.iter().copied().reduce(pick).unwrap()[axis]);
+            let most = (loss.mean_m)(high - low);
+            near("position", before.means_m[i][axis], after.means_m[j][axis], most);
+            let [a, b] = [before.scales_m[i][axis], after.scales_m[j][axis]].map(f32::ln);
+            near("log scale", a, b, loss.log_scale);
+        }
+        let angle = before.rotations[i].dot(after.rotations[j]).abs().min(1.0).acos() * 2.0;
+        near("rotation", 0.0, angle, loss.rotation_rad);
+        near("opacity", before.opacities[i], after.opacities[j], loss.opacity);
+        for k in 0..new {
+            let most = if k < 3 { loss.constant } else { loss.harmonic };
+            near("harmonic", before.sh[i * old + k], after.sh[j * new + k], most);
+        }
+    }
+}
+
+/// A scene from damaged bytes must be one that a renderer takes.
+fn check_sound(loaded: &Loaded) {
+    let s = &loaded.splats;
+    assert_eq!(s.sh.len(), s.len() * 3 * s.sh_coefficients());
+    assert!(s.means_m.iter().chain(&s.scales_m).all(|v| v.is_finite()));
+    assert!(s.rotations.iter().all(|q| q.is_normalized()));
+    assert!(s.opacities.iter().all(|o| (0.0..=1.0).contains(o)));
+    assert!(s.sh.iter().all(|v| v.is_finite()));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn every_format_brings_a_scene_back_within_its_steps(splats in scene()) {
+        for way in &WAYS {
+            let loaded = parse(&(way.encode)(&splats), way.format).unwrap();
+            prop_assert_eq!(loaded.format, way.format);
+            prop_assert_eq!(loaded.dropped.total(), 0);
+            check_close(way, &splats, &loaded.splats);
+        }
+    }
+
+    #[test]
+    fn any_damage_is_an_error_or_a_sound_scene(
+        splats in scene(), at in any::<prop::sample::Index>(), bits in 1..=255u8,
+    ) {
+        for way in &WAYS {
+            let mut bytes = (way.encode)(&splats);
+            let at = at.index(bytes.len());
+            bytes[at] ^= bits;
+            if let Ok(loaded) = parse(&bytes, way.format) {
+                check_sound(&loaded);
+            }
+        }
+    }
+
+    #[test]
+    fn any_bytes_are_an_error_or_a_sound_scene(bytes in prop::collection::vec(any::<u8>(), 0..6000)) {
+        for format in Format::ALL {
+            if let Ok(loaded) = super::decode(&bytes, format, &super::Meter::SILENT) {
+                check_sound(&loaded);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_file_cut_anywhere_is_an_error() {
+    for way in &WAYS {
+        let bytes = (way.encode)(&some());
+        for length in 0..bytes.len() {
+            // A `.splat` cut between splats is one of fewer, and a gzip stream's last bytes are
+            // its checksum and length, without which it is refused as well.
+            if way.format == Format::Splat && length % 32 == 0 && length > 0 {
+                continue;
+            }
+            let result = super::decode(&bytes[..length], way.format, &super::Meter::SILENT);
+            assert!(result.is_err(), "{}: {length} of {} bytes", way.name, bytes.len());
+        }
+        assert!(parse(&bytes, way.format).is_ok());
+    }
+}
+
+#[test]
+fn content_decides_and_the_name_helps() {
+    for way in &WAYS {
+        let bytes = (way.encode)(&some());
+        let marked = way.format != Format::Splat;
+        assert_eq!(Format::of_content(&bytes).is_some(), marked, "{}", way.name);
+        if marked {
+            assert_eq!(parse(&bytes, Format::Splat).unwrap().format, way.format, "{}", way.name);
+        }
+    }
+    for format in Format::ALL {
+        let name = format!("a.b.{}", format.extension().to_uppercase());
+        assert_eq!(Format::of_name(Path::new(&name)), Some(format), "{name}");
+    }
+    assert_eq!(Format::of_name(Path::new("x/meta.json")), Some(Format::Sog));
+    assert_eq!(Format::of_name(Path::new("ply")), None);
+}
+
+#[test]
+fn files_and_folders_are_read_by_path() {
+    let folder = tempfile::tempdir().unwrap();
+    for format in Format::ALL {
+        let path = folder.path().join("scene").with_extension(format.extension());
+        write(&path, &some()).unwrap();
+        let mut heard = Vec::new();
+        let loaded = read_with_progress(&path, &mut |progress| heard.push(progress)).unwrap();
+        assert_eq!((loaded.format, loaded.splats.len()), (format, 7));
+        assert_eq!(loaded, read(&path).unwrap());
+        let last = *heard.last().unwrap();
+        assert_eq!(last.done, last.total, "{format}");
+        assert!(last.total >= 7 && heard.is_sorted_by_key(|Progress { done, .. }| *done));
+    }
+    let loose = folder.path().join("loose");
+    std::fs::create_dir(&loose).unwrap();
+    write(loose.join("meta.json"), &some()).unwrap();
+    let from_folder = read(&loose).unwrap();
+    assert_eq!(from_folder, read(loose.join("meta.json")).unwrap());
+    assert_eq!(from_folder, read(folder.path().join("scene.sog")).unwrap());
+}
+
+#[test]
+fn what_is_no_scene_is_refused_with_what_is_supported() {
+    let folder = tempfile::tempdir().unwrap();
+    let check = |name: &str, bytes: &[u8], parts: &[&str]| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        for part in parts {
+            assert!(error.contains(part), "{error:?} lacks {part:?}");
+        }
+    };
+    check("a.glb", b"glTF\x02\0\0\0", &["a.glb starts with \"glTF", "PLY (.ply)", ".ksplat"]);
+    check("a.usdz", b"PK\x05\x06", &["like no scene file"]);
+    check("lod-meta.json", b"{}", &["streamed", "convert"]);
+    check("a.splat", b"", &["no splats"]);
+    check("a.ksplat", &[0; 5000], &["version 0.0"]);
+    check("meta.json", b"{}", &["SOG, meta.json"]);
+    assert!(matches!(read("/nowhere/x.spz"), Err(FormatError::Io { .. })));
+    let error = write(folder.path().join("x.obj"), &some()).unwrap_err().to_string();
+    assert!(error.contains("names no format to write; supported are PLY"), "{error}");
+}
+
+#[test]
+fn an_empty_scene_is_written_and_refused_by_name() {
+    for way in &WAYS {
+        let result = parse(&(way.encode)(&Splats::default()), way.format);
+        let error = result.expect_err(way.name).to_string();
+        assert!(error.contains("no splats"), "{}: {error}", way.name);
+    }
+}
+
+#[test]
+fn values_beyond_a_format_are_clamped_not_dropped() {
+    let mut splats = some();
+    splats.means_m[0] = Vec3::new(4e4, -3e7, 0.5);
+    splats.scales_m[1] = Vec3::new(0.0, 1e-30, 1e3);
+    splats.opacities[2] = 0.0;
+    splats.opacities[3] = 1.0;
+    splats.sh[20] = 50.0;
+    splats.sh[21] = -50.0;
+    for way in &WAYS {
+        let loaded = parse(&(way.encode)(&splats), way.format).unwrap();
+        assert_eq!((loaded.splats.len(), loaded.dropped.total()), (7, 0), "{}", way.name);
+        check_sound(&loaded);
+    }
+}
+
+#[test]
+fn a_full_bucket_or_chunk_is_followed_by_another() {
+    let mut splats = Splats { sh_degree: 1, ..Splats::default() };
+    for i in 0..1300 {
+        let f = i as f32;
+        splats.means_m.push(Vec3::new(f * 0.003, (f * 0.01).sin(), f % 7.0));
+        splats.scales_m.push(Vec3::splat(0.05));
+        splats.rotations.push(Quat::IDENTITY);
+        splats.opacities.push(0.5);
+        splats.sh.extend((0..12).map(|k| (f + k as f32).sin() * 0.9));
+    }
+    for way in &WAYS {
+        let after = parse(&(way.encode)(&splats), way.format).unwrap().splats;
+        // Whatever the order: every splat has one near it, and positions tell them apart.
+        let most = (way.loss.mean_m)(7.0) * 2.0;
+        let mut before: Vec<Vec3> = splats.means_m.clone();
+        let mut after: Vec<Vec3> = after.means_m;
+        let key = |m: &Vec3| (m.z.round() as i32, (m.x * 1e3 / 3.0).round() as i32);
+        before.sort_by_key(key);
+        after.sort_by_key(key);
+        for (a, b) in before.iter().zip(&after) {
+            assert!((a - b).abs().max_element() <= most, "{}: {a} {b}", way.name);
+        }
+    }
+}
+
+#[test]
+fn hostile_sizes_are_refused_before_memory_is_taken() {
+    let refuse = |name: &str, bytes: &[u8], format: Format, part: &str| {
+        let error = parse(bytes, format).expect_err(name).to_string();
+        assert!(error.contains(part), "{name}: {error:?} lacks {part:?}");
+    };
+    // SPZ 3: 4 billion splats in a gzip stream of nothing.
+    let mut header = Vec::new();
+    for word in [spz::MAGIC, 3, u32::MAX] {
+        header.extend(word.to_le_bytes());
+    }
+    header.extend([3, 12, 0, 0]);
+    let gzip = |bytes: &[u8]| {
+        let mut stream = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+        std::io::Write::write_all(&mut stream, bytes).unwrap();
+        stream.finish().unwrap()
+    };
+    refuse("count", &gzip(&header), Format::Spz, "number of splats is 4294967295");
+    header[8..12].copy_from_slice(&30_000_000u32.to_le_bytes());
+    refuse("ratio", &gzip(&header), Format::Spz, "size when inflated");
+    header[8..12].copy_from_slice(&1_000_000u32.to_le_bytes());
+    refuse("bomb", &gzip(&header), Format::Spz, "truncated: an attribute takes");
+    header[4] = 5;
+    refuse("version", &gzip(&header), Format::Spz, "version 5 is not supported; save it as");
+
+    // SPZ 4 with a table of contents far away.
+    let mut four = spz::encode(&some(), 4);
+    four[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
+    refuse("table", &four, Format::Spz, "table of contents");
+
+    // .ksplat: sections and splats beyond the file.
+    let whole = ksplat::encode(&some(), 1);
+    for (at, part) in [(4, "section headers"), (4096 + 36, "a section takes")] {
+        let mut bytes = whole.clone();
+        bytes[at..at + 4].copy_from_slice(&u32::MAX.to_le_bytes());
+        refuse("sections", &bytes, Format::Ksplat, part);
+    }
+    let mut bytes = whole.clone();
+    bytes[4096 + 32..4096 + 40].fill(0xff);
+    bytes[4096 + 8..4096 + 12].fill(0xff);
+    refuse("buckets", &bytes, Format::Ksplat, "truncated");
+
+    // Compressed PLY: fewer chunks than splats need.
+    let text = String::from_utf8_lossy(&ply::encode_compressed(&some())).into_owned();
+    let header = text[..text.find("end_header").unwrap()].replace("chunk 1", "chunk 0");
+    let mut bytes = (header + "end_header\n").into_bytes();
+    bytes.resize(bytes.len() + 7 * (16 + 24), 0);
+    refuse("chunks", &bytes, Format::CompressedPly, "0 chunks for 7 splats");
+}
+
+/// A ZIP of the given parts.
+fn zip(parts: &[(&str, Vec<u8>)], method: zip::CompressionMethod) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default().compression_method(method);
+    for (name, bytes) in parts {
+        archive.start_file(*name, options).unwrap();
+        std::io::Write::write_all(&mut archive, bytes).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+#[test]
+fn sog_parts_are_held_to_their_limits() {
+    let parts = sog::parts(&some()).unwrap();
+    let meta = String::from_utf8(parts.last().unwrap().1.clone()).unwrap();
+    let with = |from: &str, to: &str| {
+        assert!(meta.contains(from), "{from}");
+        let mut parts: Vec<(&str, Vec<u8>)> = parts.clone();
+        parts.last_mut().unwrap().1 = meta.replacen(from, to, 1).into_bytes();
+        zip(&parts, zip::CompressionMethod::Stored)
+    };
+    let refuse = |bytes: &[u8], part: &str| {
+        let error = parse(bytes, Format::Sog).unwrap_err().to_string();
+        assert!(error.contains(part), "{error:?} lacks {part:?}");
+    };
+    refuse(&with("\"count\":7,\"means", "\"count\":99,\"means"), "16 pixels for 99 splats");
+    refuse(&with("\"count\":7,\"means", "\"count\":9999999999,\"means"), "number of splats");
+    refuse(&with("\"count\":7,\"means", "\"count\":30000000,\"means"), "size when inflated");
+    refuse(&with("\"version\":2", "\"version\":3"), "version 3 is not supported");
+    refuse(&with("\"sh0.webp\"", "\"../sh0.webp\""), "no file name");
+    refuse(&with("\"sh0.webp\"", "\"/etc/hostname\""), "no file name");
+    refuse(&with("\"sh0.webp\"", "\"absent.webp\""), "absent.webp");
+    refuse(&with("\"sh0.webp\"", "\"meta.json\""), "not a WebP image");
+    refuse(&with("\"bands\":2", "\"bands\":3"), "fits no degree");
+    // Deflated, and in a folder of the archive, it is the same scene.
+    let named: Vec<(String, Vec<u8>)> =
+        parts.iter().map(|(name, bytes)| (format!("my/{name}"), bytes.clone())).collect();
+    let named: Vec<(&str, Vec<u8>)> =
+        named.iter().map(|(name, bytes)| (name.as_str(), bytes.clone())).collect();
+    let deflated = zip(&named, zip::CompressionMethod::Deflated);
+    let expected = parse(&sog::encode(&some()).unwrap(), Format::Sog).unwrap();
+    assert_eq!(parse(&deflated, Format::Sog).unwrap(), expected);
+    // A texture that inflates to more than its splats have a use for.
+    let mut bomb: Vec<(&str, Vec<u8>)> = parts.clone();
+    bomb[0].1 = vec![0; 8 << 20];
+    refuse(&zip(&bomb, zip::CompressionMethod::Deflated), "the size of a part");
+    let mut encoded = Vec::new();
+    let pixels = vec![0; 4096 * 4096 * 3];
+    image_webp::WebPEncoder::new(&mut encoded)
+        .encode(&pixels, 4096, 4096, image_webp::ColorType::Rgb8)
+        .unwrap();
+    bomb[0].1 = encoded;
+    refuse(&zip(&bomb, zip::CompressionMethod::Stored), "the number of pixels of a texture");
+}
+
+#[test]
+fn sog_version_1_is_read_between_its_bounds() {
+    // Four splats on 4 x 4 pixels; every byte is between the bounds.
+    let pixels = |pixel: [u8; 4]| -> Vec<u8> {
+        let mut webp = Vec::new();
+        let bytes: Vec<u8> = std::iter::repeat_n(pixel, 16).flatten().collect();
+        image_webp::WebPEncoder::new(&mut webp)
+            .encode(&bytes, 4, 4, image_webp::ColorType::Rgba8)
+            .unwrap();
+        webp
+    };
+    let meta = br#"{
+        "means": { "shape": [4, 3], "dtype": "float32", "mins": [0, -1, -2], "maxs": [1, 0, 2],
+            "files": ["means_l.webp", "means_u.webp"] },
+        "scales": { "shape": [4, 3], "mins": [-5, -5, -5], "maxs": [0, 0, 0],
+            "files": ["scales.webp"] },
+        "quats": { "shape": [4, 4], "encoding": "quaternion_packed", "files": ["quats.webp"] },
+        "sh0": { "shape": [4, 1, 4], "mins": [-1, 0, 1, -4], "maxs": [1, 2, 3, 4],
+            "files": ["sh0.webp"] }
+    }"#;
+    let parts = [
+        ("means_l.webp", pixels([0, 255, 0, 255])),
+        ("means_u.webp", pixels([0, 255, 0, 255])),
+        ("scales.webp", pixels([0, 255, 51, 255])),
+        ("quats.webp", pixels([127, 128, 127, 254])),
+        ("sh0.webp", pixels([0, 51, 255, 255])),
+        ("meta.json", meta.to_vec()),
+    ];
+    let bytes = zip(&parts, zip::CompressionMethod::Stored);
+    let splats = parse(&bytes, Format::Sog).unwrap().splats;
+    assert_eq!(splats.len(), 4);
+    let near = |a: f32, b: f32| assert!((a - b).abs() < 1e-5, "{a} {b}");
+    let e = 1f32.exp();
+    for (a, b) in splats.means_m[3].to_array().into_iter().zip([0.0, 0.0, 1.0 - e * e]) {
+        near(a, b);
+    }
+    for (a, b) in splats.scales_m[3].to_array().into_iter().zip([-5f32, 0.0, -4.0]) {
+        near(a, b.exp());
+    }
+    // The tag says y.
+    assert!(splats.rotations[3].y > 0.999);
+    assert_eq!(splats.sh[..3], [-1.0, 0.4, 3.0]);
+    near(splats.opacities[3], 1.0 / (1.0 + (-4f32).exp()));
+}
