@@ -36,6 +36,7 @@
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
 mod camera;
+mod choose;
 mod cpu;
 pub mod format;
 mod harmonics;
@@ -47,8 +48,9 @@ mod scene;
 mod splats;
 
 pub use camera::{Camera, InvalidCamera};
+pub use choose::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
 pub use format::ply;
-pub use cpu::CpuRenderer;
+pub use cpu::{CpuRenderer, Detail};
 pub use image::{DepthKind, RgbdImage};
 pub use rasterizer::{PassTimes, Rasterizer, RenderError, Workload};
 pub use reference::render_reference;
