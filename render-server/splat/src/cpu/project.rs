@@ -14,6 +14,7 @@ use rayon::prelude::*;
 
 use super::bin::TILE;
 use super::cull::{View, Visible};
+use super::lens::{self, Model};
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
 use super::simd::{Kernel, Simd};
 use crate::harmonics::{C0, C1, C2, C3};
@@ -88,6 +89,8 @@ pub(super) fn project<S: Simd>(
         out.keys.resize(slots, 0);
     }
     out.counts.resize(visible.len(), 0);
+    // One camera has one lens, whichever part it sees.
+    let bent = views.first().is_some_and(|view| view.model != Model::Pinhole);
     out.splats
         .par_chunks_mut(BLOCK)
         .zip(out.boxes.par_chunks_mut(BLOCK))
@@ -99,13 +102,17 @@ pub(super) fn project<S: Simd>(
         .for_each(|((((splats, boxes), keys), count), &Visible { part, block })| {
             let out = Region { splats, boxes, keys };
             let (part, view) = (&parts[part as usize], &views[part as usize]);
-            let task = ProjectBlock { part, view, block: block as usize, out };
-            *count = simd.run(task) as u32;
+            let block = block as usize;
+            *count = if bent {
+                simd.run(ProjectBlock::<true> { part, view, block, out })
+            } else {
+                simd.run(ProjectBlock::<false> { part, view, block, out })
+            } as u32;
         });
 }
 
-/// One block; returns how many splats survived.
-struct ProjectBlock<'a> {
+/// One block, seen through a lens or a pinhole; returns how many splats survived.
+struct ProjectBlock<'a, const LENS: bool> {
     part: &'a Part,
     view: &'a View,
     block: usize,
@@ -119,7 +126,7 @@ struct Region<'a> {
     keys: &'a mut [u32],
 }
 
-impl Kernel for ProjectBlock<'_> {
+impl<const LENS: bool> Kernel for ProjectBlock<'_, LENS> {
     type Output = usize;
 
     #[inline(always)]
@@ -133,7 +140,8 @@ impl Kernel for ProjectBlock<'_> {
             let geometry = &geometry[group * GROUP_NUMBERS..][..GROUP_NUMBERS];
             let sh = &sh[group * sh_numbers..][..sh_numbers];
             for first in (0..GROUP).step_by(S::LANES) {
-                count = vector(s, self.view, geometry, sh, first, &mut self.out, count);
+                let (view, out) = (self.view, &mut self.out);
+                count = vector::<S, LENS>(s, view, geometry, sh, first, out, count);
             }
         }
         count
@@ -143,7 +151,7 @@ impl Kernel for ProjectBlock<'_> {
 /// Projects the lanes from `first` of a group, appends survivors from slot `count` on, and returns
 /// the new count.
 #[inline(always)]
-fn vector<S: Simd>(
+fn vector<S: Simd, const LENS: bool>(
     s: S,
     view: &View,
     geometry: &[f32],
@@ -160,20 +168,42 @@ fn vector<S: Simd>(
     let rows = [broadcast(s, view.rows[0]), broadcast(s, view.rows[1]), broadcast(s, view.rows[2])];
     let z = dot(s, rows[2], d);
     // NaN, of padding too, fails here.
-    let ahead = s.lt(s.splat(view.near_m), z);
+    let mut ahead = s.lt(s.splat(view.near_m), z);
     if !s.any(ahead) {
         return count;
     }
     let inverse_z = s.splat(1.0) / z;
     let (tx, ty) = (dot(s, rows[0], d) * inverse_z, dot(s, rows[1], d) * inverse_z);
-    let mean_x = s.mul_add(tx, s.splat(view.fx_px), s.splat(view.cx_px));
-    let mean_y = s.mul_add(ty, s.splat(view.fy_px), s.splat(view.cy_px));
+    let (fx, fy) = (s.splat(view.fx_px), s.splat(view.fy_px));
+    // Rows of J W, linearised where the slope is clamped.
+    let mut at = [clamp(s, tx, view.slope_x), clamp(s, ty, view.slope_y)];
+    let mut slope = [tx, ty];
+    let (gx, gy) = if LENS {
+        let reach = s.splat(view.reach);
+        ahead = ahead & s.lt(s.mul_add(tx, tx, ty * ty), reach * reach);
+        if !s.any(ahead) {
+            return count;
+        }
+        slope = lens::distort(s, &view.model, slope).slope;
+        let shorten = s.min(reach / s.sqrt(s.mul_add(at[0], at[0], at[1] * at[1])), s.splat(1.0));
+        at = [at[0] * shorten, at[1] * shorten];
+        let [xx, xy, yy] = lens::distort(s, &view.model, at).jacobian;
+        let pinhole_x = gradient(s, inverse_z, at[0], rows[0], rows[2]);
+        let pinhole_y = gradient(s, inverse_z, at[1], rows[1], rows[2]);
+        (
+            mix(s, fx * xx, pinhole_x, fx * xy, pinhole_y),
+            mix(s, fy * xy, pinhole_x, fy * yy, pinhole_y),
+        )
+    } else {
+        (
+            gradient(s, inverse_z * fx, at[0], rows[0], rows[2]),
+            gradient(s, inverse_z * fy, at[1], rows[1], rows[2]),
+        )
+    };
+    let mean_x = s.mul_add(slope[0], fx, s.splat(view.cx_px));
+    let mean_y = s.mul_add(slope[1], fy, s.splat(view.cy_px));
 
     // Rows of J W M, M the square root of the covariance.
-    let jx = clamp(s, tx, view.slope_x);
-    let jy = clamp(s, ty, view.slope_y);
-    let gx = gradient(s, inverse_z * s.splat(view.fx_px), jx, rows[0], rows[2]);
-    let gy = gradient(s, inverse_z * s.splat(view.fy_px), jy, rows[1], rows[2]);
     let axes = [
         columns.vector(column::AXES),
         columns.vector(column::AXES + 3),
@@ -311,6 +341,12 @@ fn gradient<S: Simd>(
         scale * s.neg_mul_add(slope, forward[1], row[1]),
         scale * s.neg_mul_add(slope, forward[2], row[2]),
     ]
+}
+
+/// Returns `p a + q b`.
+#[inline(always)]
+fn mix<S: Simd>(s: S, p: S::F, a: [S::F; 3], q: S::F, b: [S::F; 3]) -> [S::F; 3] {
+    [s.mul_add(p, a[0], q * b[0]), s.mul_add(p, a[1], q * b[1]), s.mul_add(p, a[2], q * b[2])]
 }
 
 /// Whether some pixel centre lies between `mean - extent` and `mean + extent`. NaN and overflow do

@@ -2,8 +2,10 @@
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, DepthKind, RgbdImage, Splats, render_reference};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_splat::{
+    Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats, render_reference,
+};
 
 use crate::compare;
 
@@ -32,6 +34,19 @@ pub(crate) fn splats(count: std::ops::Range<usize>) -> impl Strategy<Value = Spl
     })
 }
 
+/// No lens, or one up to where it turns back, wild ones too.
+pub(crate) fn distortion() -> impl Strategy<Value = Distortion> {
+    let radial = || -0.3..0.3f64;
+    let small = || -0.01..0.01f64;
+    prop_oneof![
+        2 => Just(Distortion::None),
+        1 => (radial(), radial(), small(), small(), radial())
+            .prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
+        1 => (radial(), small(), small(), small())
+            .prop_map(|(k1, k2, k3, k4)| Distortion::KannalaBrandt { k1, k2, k3, k4 }),
+    ]
+}
+
 pub(crate) fn camera() -> impl Strategy<Value = Camera> {
     (
         1..70u32,
@@ -41,9 +56,10 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
         prop::array::uniform3(-6.0..6.0f64),
         prop::array::uniform4(-1.0..1.0f64),
         prop::array::uniform3(0.0..1.0f32),
+        distortion(),
     )
         .prop_map(
-            |(width_px, height_px, (fov_deg, ratio), centre, position, q, background)| {
+            |(width_px, height_px, (fov_deg, ratio), centre, position, q, background, lens)| {
                 let k = Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians());
                 let q = DQuat::from_array(q);
                 let rotation = if q.length() > 1e-2 { q.normalize() } else { DQuat::IDENTITY };
@@ -52,6 +68,7 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
                         fy_px: k.fy_px * ratio,
                         cx_px: f64::from(width_px) * centre[0],
                         cy_px: f64::from(height_px) * centre[1],
+                        distortion: lens,
                         ..k
                     },
                     world_from_cam: Pose::new(DVec3::from(position), rotation),
