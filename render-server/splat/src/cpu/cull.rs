@@ -2,12 +2,13 @@
 //!
 //! Budget: 5 planes per block of 256 splats, 20 us per million splats.
 
-use glam::{DMat3, Vec3};
+use glam::{DMat3, DVec2, DVec3, Vec3};
 use vizflyt_protocol::geometry::{Cam, Frame, Pose};
 
+use super::lens::{Lens, Model};
 use super::scene::{Block, Part};
 use crate::Camera;
-use crate::limits::{BLUR_PX2, JACOBIAN_MARGIN};
+use crate::limits::BLUR_PX2;
 
 /// A camera, as one part of the scene sees it, in the numbers the passes use; f32, but for what is
 /// computed once per image.
@@ -29,7 +30,12 @@ pub(super) struct View {
     /// Where `y/z` is.
     pub(super) slope_y: [f32; 2],
     pub(super) background: [f32; 3],
+    pub(super) model: Model,
+    /// Means whose slope is longer are dropped; infinite without a lens.
+    pub(super) reach: f32,
     planes: [Plane; 5],
+    /// [`Lens::large`].
+    large: f32,
 }
 
 /// `normal . (p - camera) + reach * weight >= offset` where a splat at `p` may touch the image.
@@ -41,28 +47,19 @@ struct Plane {
 }
 
 impl View {
-    /// Prepares a validated camera that stands at `part_from_cam`.
-    pub(super) fn new<F: Frame>(camera: &Camera, part_from_cam: &Pose<F, Cam>) -> Self {
+    /// Prepares a validated camera, and its lens, that stands at `part_from_cam`.
+    pub(super) fn new<F: Frame>(
+        camera: &Camera,
+        lens: &Lens,
+        part_from_cam: &Pose<F, Cam>,
+    ) -> Self {
         let k = &camera.intrinsics;
         let rotation = DMat3::from_quat(part_from_cam.rotation.normalize()).transpose();
         let [x, y, z] = [rotation.row(0), rotation.row(1), rotation.row(2)];
         let (w, h) = (f64::from(k.width_px), f64::from(k.height_px));
-        let slopes = |f: f64, c: f64, size: f64| {
-            let margin = JACOBIAN_MARGIN * 0.5 * size / f;
-            let (a, b) = (-c / f - margin, (size - c) / f + margin);
-            [a.min(b), a.max(b)]
-        };
-        let slope_x = slopes(k.fx_px, k.cx_px, w);
-        let slope_y = slopes(k.fy_px, k.cy_px, h);
-
-        // A splat's mean is at u = fx x/z + cx; its extent is at most
-        //   sqrt(reach^2 fx^2 (1 + jx^2) / z^2 + 2 ln(255) 0.3),
-        // with jx the clamped slope. Both sides times z > 0 are linear in the position: u + extent
-        // >= 0 becomes fx x + (cx + blur) z + reach fx sqrt(1 + jx^2) >= 0, and so on.
-        let blur = (2.0 * 255f64.ln() * BLUR_PX2).sqrt();
-        let steep = |f: f64, [a, b]: [f64; 2]| f * (1.0 + (a * a).max(b * b)).sqrt();
-        let (steep_x, steep_y) = (steep(k.fx_px, slope_x), steep(k.fy_px, slope_y));
-        let plane = |normal: glam::DVec3, weight: f64| {
+        let bounds = |[low, high]: [DVec2; 2]| [[low.x, high.x], [low.y, high.y]];
+        let [slope_x, slope_y] = bounds(lens.slopes);
+        let plane = |normal: DVec3, weight: f64| {
             let length = normal.length();
             Plane {
                 normal: (normal / length).as_vec3(),
@@ -70,13 +67,33 @@ impl View {
                 weight: (weight / length) as f32,
             }
         };
-        let planes = [
-            Plane { normal: z.as_vec3(), offset: camera.near_m, weight: 0.0 },
-            plane(x * k.fx_px + z * (k.cx_px + blur), steep_x),
-            plane(-x * k.fx_px + z * (w - k.cx_px + blur), steep_x),
-            plane(y * k.fy_px + z * (k.cy_px + blur), steep_y),
-            plane(-y * k.fy_px + z * (h - k.cy_px + blur), steep_y),
-        ];
+        let ahead = Plane { normal: z.as_vec3(), offset: camera.near_m, weight: 0.0 };
+        let planes = if lens.model == Model::Pinhole {
+            // A splat's mean is at u = fx x/z + cx; its extent is at most
+            //   sqrt(reach^2 fx^2 (1 + jx^2) / z^2 + 2 ln(255) 0.3),
+            // with jx the clamped slope. Both sides times z > 0 are linear in the position: u +
+            // extent >= 0 becomes fx x + (cx + blur) z + reach fx sqrt(1 + jx^2) >= 0, and so on.
+            let blur = (2.0 * 255f64.ln() * BLUR_PX2).sqrt();
+            let steep = |f: f64, [a, b]: [f64; 2]| f * (1.0 + (a * a).max(b * b)).sqrt();
+            let (steep_x, steep_y) = (steep(k.fx_px, slope_x), steep(k.fy_px, slope_y));
+            [
+                ahead,
+                plane(x * k.fx_px + z * (k.cx_px + blur), steep_x),
+                plane(-x * k.fx_px + z * (w - k.cx_px + blur), steep_x),
+                plane(y * k.fy_px + z * (k.cy_px + blur), steep_y),
+                plane(-y * k.fy_px + z * (h - k.cy_px + blur), steep_y),
+            ]
+        } else {
+            // low <= x/z <= high is linear in the position too; `sees` keeps what is large.
+            let [shown_x, shown_y] = bounds(lens.shown);
+            [
+                ahead,
+                plane(x - z * shown_x[0], 0.0),
+                plane(z * shown_x[1] - x, 0.0),
+                plane(y - z * shown_y[0], 0.0),
+                plane(z * shown_y[1] - y, 0.0),
+            ]
+        };
         Self {
             width_px: k.width_px,
             height_px: k.height_px,
@@ -90,20 +107,30 @@ impl View {
             slope_x: slope_x.map(|v| v as f32),
             slope_y: slope_y.map(|v| v as f32),
             background: camera.background,
+            model: lens.model,
+            // f32's rounding, so that what lies on the reach itself is drawn.
+            reach: (lens.reach * (1.0 + 1e-6)) as f32,
             planes,
+            large: lens.large as f32,
         }
     }
 
     /// Whether a splat of the block may touch the image.
     fn sees(&self, block: &Block) -> bool {
         let center = block.center_m - self.center_m;
-        self.planes.iter().all(|plane| {
+        let beyond = |plane: &Plane| {
             let slack = plane.normal.abs().dot(block.half_m) + block.reach_m * plane.weight;
             // The rounding of the sums, so that nothing is lost at the very edge.
             let rounding = 1e-5 * (center.abs().max_element() + slack);
-            // Negated, so that an overflow to NaN keeps the block.
-            !(plane.normal.dot(center) + slack + rounding < plane.offset)
-        })
+            // Not `>=` elsewhere, so that an overflow to NaN keeps the block.
+            plane.normal.dot(center) + slack + rounding < plane.offset
+        };
+        if beyond(&self.planes[0]) {
+            return false;
+        }
+        let [z, half] = [self.rows[2].dot(center), self.rows[2].abs().dot(block.half_m)];
+        self.large > 0.0 && !(z - half >= self.large * block.reach_m)
+            || !self.planes[1..].iter().any(beyond)
     }
 }
 

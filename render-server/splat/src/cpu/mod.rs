@@ -10,6 +10,7 @@
 mod bin;
 mod blend;
 mod cull;
+mod lens;
 mod project;
 mod scene;
 mod simd;
@@ -34,6 +35,7 @@ pub struct CpuRenderer {
 /// What passes leave for each other; kept from image to image.
 #[derive(Debug, Default)]
 struct Buffers {
+    lenses: lens::Lenses,
     /// Per part; those that are not there see nothing, for none of their blocks is visible.
     views: Vec<cull::View>,
     visible: Vec<cull::Visible>,
@@ -60,7 +62,8 @@ impl CpuRenderer {
 
     fn with_instructions(scene: Scene<'_>, instructions: InstructionSet) -> Self {
         let mut parts = vec![scene::Part::new(0, scene.splats)];
-        parts.extend(scene.objects.iter().map(|object| scene::Part::new(object.id, &object.splats)));
+        parts
+            .extend(scene.objects.iter().map(|object| scene::Part::new(object.id, &object.splats)));
         Self { instructions, parts, buffers: Buffers::default() }
     }
 
@@ -73,18 +76,19 @@ impl CpuRenderer {
         times: &mut PassTimes,
     ) {
         let parts = &self.parts[..];
-        let Buffers { views, visible, projected, sorter, bins, tiles } = &mut self.buffers;
+        let Buffers { lenses, views, visible, projected, sorter, bins, tiles } = &mut self.buffers;
         let start = Instant::now();
         views.clear();
         visible.clear();
-        let still = cull::View::new(camera, &camera.world_from_cam);
+        let lens = lenses.of(camera);
+        let still = cull::View::new(camera, &lens, &camera.world_from_cam);
         views.push(still);
         cull::cull(0, &parts[0], &still, visible);
         for (i, (part, placement)) in parts[1..].iter().zip(placements).enumerate() {
             views.push(still);
             if let Some(world_from_object) = placement {
                 let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-                let view = cull::View::new(camera, &object_from_cam);
+                let view = cull::View::new(camera, &lens, &object_from_cam);
                 cull::cull(i + 1, part, &view, visible);
                 views[i + 1] = view;
             }
