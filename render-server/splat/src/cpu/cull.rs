@@ -5,6 +5,7 @@
 use glam::{DMat3, DVec2, DVec3, Vec3};
 use vizflyt_protocol::geometry::{Cam, Frame, Pose};
 
+use super::detail::BRANCH;
 use super::lens::{Lens, Model};
 use super::scene::{Block, Part};
 use crate::Camera;
@@ -143,8 +144,56 @@ pub(super) struct Visible {
     pub(super) block: u32,
 }
 
-/// Appends the blocks of a part that may touch the image.
-pub(super) fn cull(index: usize, part: &Part, view: &View, visible: &mut Vec<Visible>) {
-    let blocks = part.blocks.iter().enumerate().filter(|(_, block)| view.sees(block));
-    visible.extend(blocks.map(|(i, _)| Visible { part: index as u32, block: i as u32 }));
+/// Appends the blocks of a part that may touch the image; of its levels, everywhere the coarsest
+/// that is off by no more than `max_error_px`.
+pub(super) fn cull(
+    index: usize,
+    part: &Part,
+    view: &View,
+    max_error_px: f32,
+    visible: &mut Vec<Visible>,
+) {
+    let walk = Walk { index: index as u32, part, view, max_error_px };
+    let coarsest = part.levels.len() - 1;
+    let last = part.blocks.len() - part.levels[coarsest];
+    for block in 0..last {
+        walk.descend(coarsest, block, visible);
+    }
+}
+
+/// A walk over the tree of a part's levels.
+struct Walk<'a> {
+    index: u32,
+    part: &'a Part,
+    view: &'a View,
+    max_error_px: f32,
+}
+
+impl Walk<'_> {
+    /// Visits a block, given by its place in its level, and what it stands for.
+    fn descend(&self, level: usize, block: usize, visible: &mut Vec<Visible>) {
+        let at = self.part.levels[level] + block;
+        let bounds = &self.part.blocks[at];
+        if !self.view.sees(bounds) {
+            return;
+        }
+        if level == 0 || bounds.error_m * self.view.px_per_m(bounds) <= self.max_error_px {
+            visible.push(Visible { part: self.index, block: at as u32 });
+            return;
+        }
+        let finer = self.part.levels[level] - self.part.levels[level - 1];
+        for child in block * BRANCH..((block + 1) * BRANCH).min(finer) {
+            self.descend(level - 1, child, visible);
+        }
+    }
+}
+
+impl View {
+    /// Returns how many pixels a metre is at most where the block is nearest to the camera.
+    fn px_per_m(&self, block: &Block) -> f32 {
+        let forward = self.rows[2];
+        let center = block.center_m - self.center_m;
+        let nearest_m = forward.dot(center) - forward.abs().dot(block.half_m);
+        self.fx_px.abs().max(self.fy_px.abs()) / nearest_m.max(self.near_m)
+    }
 }

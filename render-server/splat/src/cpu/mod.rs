@@ -10,7 +10,9 @@
 mod bin;
 mod blend;
 mod cull;
+mod detail;
 mod lens;
+mod merge;
 mod project;
 mod scene;
 mod simd;
@@ -18,6 +20,7 @@ mod sort;
 
 use std::time::Instant;
 
+pub use detail::Detail;
 use simd::{InstructionSet, Simd};
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
@@ -27,6 +30,7 @@ use crate::{Camera, Placement, RgbdImage, Scene};
 #[derive(Debug)]
 pub struct CpuRenderer {
     instructions: InstructionSet,
+    detail: Detail,
     /// What stands still, then the objects.
     parts: Vec<scene::Part>,
     buffers: Buffers,
@@ -49,7 +53,12 @@ impl CpuRenderer {
     /// Packs a scene for the fastest instruction set this processor has. Splats that no image
     /// would show (opacity below 1/255) or that hold numbers that are not finite are left out.
     pub fn new<'a>(scene: impl Into<Scene<'a>>) -> Self {
-        Self::with_instructions(scene.into(), InstructionSet::available()[0])
+        Self::with_detail(scene, Detail::Full)
+    }
+
+    /// Packs a scene like [`Self::new`], with coarser levels for what will be small in an image.
+    pub fn with_detail<'a>(scene: impl Into<Scene<'a>>, detail: Detail) -> Self {
+        Self::with_instructions(scene.into(), detail, InstructionSet::available()[0])
     }
 
     /// Packs a scene once per instruction set this processor has, fastest first: for tests and
@@ -57,14 +66,14 @@ impl CpuRenderer {
     pub fn every<'a>(scene: impl Into<Scene<'a>>) -> Vec<Self> {
         let scene = scene.into();
         let sets = InstructionSet::available().into_iter();
-        sets.map(|set| Self::with_instructions(scene, set)).collect()
+        sets.map(|set| Self::with_instructions(scene, Detail::Full, set)).collect()
     }
 
-    fn with_instructions(scene: Scene<'_>, instructions: InstructionSet) -> Self {
-        let mut parts = vec![scene::Part::new(0, scene.splats)];
-        parts
-            .extend(scene.objects.iter().map(|object| scene::Part::new(object.id, &object.splats)));
-        Self { instructions, parts, buffers: Buffers::default() }
+    fn with_instructions(scene: Scene<'_>, detail: Detail, instructions: InstructionSet) -> Self {
+        let mut parts = vec![scene::Part::new(0, scene.splats, detail)];
+        let moving = scene.objects.iter();
+        parts.extend(moving.map(|object| scene::Part::new(object.id, &object.splats, detail)));
+        Self { instructions, detail, parts, buffers: Buffers::default() }
     }
 
     fn render_one<S: Simd>(
@@ -76,6 +85,10 @@ impl CpuRenderer {
         times: &mut PassTimes,
     ) {
         let parts = &self.parts[..];
+        let max_error_px = match self.detail {
+            Detail::Full => 0.0,
+            Detail::Adaptive { max_error_px } => max_error_px,
+        };
         let Buffers { lenses, views, visible, projected, sorter, bins, tiles } = &mut self.buffers;
         let start = Instant::now();
         views.clear();
@@ -83,13 +96,13 @@ impl CpuRenderer {
         let lens = lenses.of(camera);
         let still = cull::View::new(camera, &lens, &camera.world_from_cam);
         views.push(still);
-        cull::cull(0, &parts[0], &still, visible);
+        cull::cull(0, &parts[0], &still, max_error_px, visible);
         for (i, (part, placement)) in parts[1..].iter().zip(placements).enumerate() {
             views.push(still);
             if let Some(world_from_object) = placement {
                 let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
                 let view = cull::View::new(camera, &lens, &object_from_cam);
-                cull::cull(i + 1, part, &view, visible);
+                cull::cull(i + 1, part, &view, max_error_px, visible);
                 views[i + 1] = view;
             }
         }

@@ -14,6 +14,7 @@ use half::f16;
 use half::slice::{HalfBitsSliceExt as _, HalfFloatSliceExt as _};
 use rayon::prelude::*;
 
+use super::detail::{Detail, add_levels};
 use crate::Splats;
 use crate::limits::{ALPHA_MIN, MAX_SCALE_M};
 
@@ -47,6 +48,9 @@ pub(super) struct Block {
     pub(super) half_m: Vec3,
     /// The greatest distance from its centre at which a splat of the block still counts. [m]
     pub(super) reach_m: f32,
+    /// How far its splats are from what they stand for, as root mean square; 0 for the scene's own
+    /// splats. [m]
+    pub(super) error_m: f32,
 }
 
 /// What stands still, or one rigid object; packed in its own frame.
@@ -54,7 +58,10 @@ pub(super) struct Block {
 pub(super) struct Part {
     /// What the image of ids shows.
     pub(super) id: u16,
+    /// Level by level, the finest first.
     pub(super) blocks: Vec<Block>,
+    /// The first block of each level; at least one.
+    pub(super) levels: Vec<usize>,
     /// [`GROUP_NUMBERS`] per group, whole blocks; the last is padded with centres that are NaN.
     pub(super) geometry: Vec<f32>,
     /// Halves: per group, coefficient by coefficient, RGB within, 16 splats each.
@@ -66,8 +73,21 @@ pub(super) struct Part {
 }
 
 impl Part {
-    /// Packs splats.
-    pub(super) fn new(id: u16, splats: &Splats) -> Self {
+    /// Packs splats, and their coarser levels where asked for.
+    pub(super) fn new(id: u16, splats: &Splats, detail: Detail) -> Self {
+        let mut part = Self::packed(id, splats);
+        if let Detail::Adaptive { max_error_px } = detail {
+            add_levels(&mut part, max_error_px);
+        }
+        part
+    }
+
+    /// Returns how many numbers the harmonics of a splat are.
+    pub(super) fn sh_numbers(&self) -> usize {
+        self.coefficients * 3
+    }
+
+    fn packed(id: u16, splats: &Splats) -> Self {
         let order = morton_order(splats);
         let coefficients = splats.sh_coefficients();
         let blocks = order.len().div_ceil(BLOCK);
@@ -102,7 +122,7 @@ impl Part {
                 }
             });
         let blocks = order.par_chunks(BLOCK).map(|order| bounds(splats, order)).collect();
-        Self { id, blocks, geometry, sh, coefficients, len: order.len() }
+        Self { id, blocks, levels: vec![0], geometry, sh, coefficients, len: order.len() }
     }
 }
 
@@ -169,5 +189,5 @@ fn bounds(splats: &Splats, order: &[u32]) -> Block {
     // Halved before they are added: no sum overflows. Widened by their own rounding.
     let center_m = low * 0.5 + high * 0.5;
     let half_m = (high * 0.5 - low * 0.5) + center_m.abs() * 1e-6;
-    Block { center_m, half_m, reach_m: reach_m * 1.0001 }
+    Block { center_m, half_m, reach_m: reach_m * 1.0001, error_m: 0.0 }
 }
