@@ -138,6 +138,17 @@ impl Format {
         }
     }
 
+    /// Returns the variants that are written, the usual one first: versions of SPZ (2 is coarser,
+    /// fewer readers know 4) and SOG, levels of compression of `.ksplat`; 0 where there is but one.
+    pub fn variants(self) -> &'static [u32] {
+        match self {
+            Self::Ply | Self::CompressedPly | Self::Splat => &[0],
+            Self::Spz => &[3, 2, 4],
+            Self::Sog => &[2],
+            Self::Ksplat => &[1, 0, 2],
+        }
+    }
+
     /// Returns the format that a file's name says.
     pub fn of_name(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.to_ascii_lowercase();
@@ -247,7 +258,7 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError>
     place(path, &encode(format, splats)?)
 }
 
-/// Returns the bytes [`write()`] writes. Harmonics beyond [`Format::max_sh_degree`] are left out;
+/// Returns the bytes of a file of a format's first variant, which [`write()`] writes. Harmonics beyond [`Format::max_sh_degree`] are left out;
 /// packed formats put splats in an order of their own.
 ///
 /// # Errors
@@ -256,15 +267,35 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError>
 /// # Panics
 /// If the vectors of `splats` differ in length.
 pub fn encode(format: Format, splats: &Splats) -> Result<Vec<u8>, FormatError> {
+    encode_variant(format, format.variants()[0], splats)
+}
+
+/// [`encode`] in a given one of the format's [variants](Format::variants).
+///
+/// # Errors
+/// [`FormatError::Unsupported`] for another variant; otherwise as [`encode`].
+///
+/// # Panics
+/// If the vectors of `splats` differ in length.
+pub fn encode_variant(
+    format: Format,
+    variant: u32,
+    splats: &Splats,
+) -> Result<Vec<u8>, FormatError> {
+    if !format.variants().contains(&variant) {
+        return Err(FormatError::Unsupported {
+            format,
+            what: format!("writing variant {variant}"),
+            advice: "ask for one of `Format::variants`",
+        });
+    }
     Ok(match format {
         Format::Ply => ply::encode(splats),
         Format::CompressedPly => ply::encode_compressed(splats),
         Format::Splat => splat::encode(splats),
-        // What the most readers take: version 4 is younger, version 2 coarser.
-        Format::Spz => spz::encode(splats, 3),
+        Format::Spz => spz::encode(splats, variant),
         Format::Sog => sog::encode(splats)?,
-        // The default of the viewer's own converter.
-        Format::Ksplat => ksplat::encode(splats, 1),
+        Format::Ksplat => ksplat::encode(splats, variant),
     })
 }
 

@@ -22,9 +22,9 @@ pub(in crate::format) const MAX_SH_DEGREE: u8 = 2;
 ///
 /// # Panics
 /// If `level` is beyond 2.
-pub(in crate::format) fn encode(splats: &Splats, level: u16) -> Vec<u8> {
+pub(in crate::format) fn encode(splats: &Splats, level: u32) -> Vec<u8> {
     assert_whole(splats);
-    let row = Row::LEVELS[usize::from(level)];
+    let row = Row::LEVELS[level as usize];
     let (count, coefficients) = (splats.len(), splats.sh_coefficients());
     let sh_degree = splats.sh_degree.min(MAX_SH_DEGREE);
     let kept = (usize::from(sh_degree) + 1).pow(2);
@@ -40,7 +40,7 @@ pub(in crate::format) fn encode(splats: &Splats, level: u16) -> Vec<u8> {
     for (at, word) in [(4, 1), (8, 1), (12, count as u32), (16, count as u32)] {
         put(at, &word.to_le_bytes());
     }
-    put(20, &level.to_le_bytes());
+    put(20, &(level as u16).to_le_bytes());
     put(36, &low.to_le_bytes());
     put(40, &high.to_le_bytes());
     let section = HEADER_BYTES;

@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::files::{Files, META};
-use super::meta::{Meta, Table};
+use super::meta::{Meta, Palette};
 use super::texture::Texture;
 use super::{PALETTE_WIDTH, QUATERNION_TAG, invalid};
 use crate::format::block::{Gaussian, decode_all};
@@ -98,12 +98,16 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
                 opacity: meta.opacity[usize::from(colours.alpha(pixel))],
             };
             let colour = colours.rgb(pixel);
-            let entry = harmonics.as_ref().map(|harmonics| harmonics.entry(pixel));
-            block.put(i, &gaussian, |k, channel| match (k, &harmonics, entry) {
-                (0, ..) => meta.colours[channel][usize::from(colour[channel])],
-                (_, Some(harmonics), Some(entry)) => harmonics.value(entry, k, channel),
-                _ => 0.0,
-            });
+            let constant = |channel: usize| meta.colours[channel][usize::from(colour[channel])];
+            if let Some(harmonics) = &harmonics {
+                let entry = harmonics.entry(pixel);
+                block.put(i, &gaussian, |k, channel| match k {
+                    0 => constant(channel),
+                    _ => entry[(k - 1) * 3 + channel],
+                });
+            } else {
+                block.put(i, &gaussian, |_, channel| constant(channel));
+            }
         }
     });
     let mut loaded = Loaded::whole(Format::Sog, count, splats, dropped)?;
@@ -119,18 +123,17 @@ fn unwarp(warped: f32) -> f32 {
 /// The palette of harmonics and every splat's place in it.
 struct Harmonics<'a> {
     degree: u8,
-    /// Coefficients of an entry.
-    coefficients: usize,
-    count: usize,
-    values: &'a Table,
-    entries: &'a Texture,
+    /// Numbers of an entry.
+    length: usize,
+    /// Entry by entry, coefficient by coefficient, RGB within; one of zeros at the end.
+    values: Vec<f32>,
     labels: &'a Texture,
 }
 
 impl<'a> Harmonics<'a> {
     fn new(
-        described: &'a super::meta::Palette,
-        entries: &'a Texture,
+        described: &Palette,
+        entries: &Texture,
         labels: &'a Texture,
     ) -> Result<Self, FormatError> {
         let degree = [1u8, 2, 3]
@@ -141,31 +144,24 @@ impl<'a> Harmonics<'a> {
                 let (width, name) = (entries.width, &described.files[0]);
                 invalid(name, format!("{width} pixels wide, which fits no degree of harmonics"))
             })?;
+        let length = coefficients(degree) * 3;
         let room = PALETTE_WIDTH * entries.height;
-        Ok(Self {
-            degree,
-            coefficients: coefficients(degree),
-            count: described.count.unwrap_or(room).min(room),
-            values: &described.values,
-            entries,
-            labels,
-        })
-    }
-
-    /// Returns a splat's entry; none, and so no harmonics, where it is beyond the palette.
-    fn entry(&self, pixel: usize) -> usize {
-        let [low, high, _] = self.labels.rgb(pixel);
-        usize::from(u16::from_le_bytes([low, high]))
-    }
-
-    #[inline]
-    fn value(&self, entry: usize, k: usize, channel: usize) -> f32 {
-        if entry >= self.count {
-            return 0.0;
-        }
+        let count = described.count.unwrap_or(room).min(room);
         // Rows are exactly as wide as their entries, so that entries follow each other.
-        let pixel = self.entries.rgb(entry * self.coefficients + k - 1);
-        self.values[usize::from(pixel[channel])]
+        let mut values: Vec<f32> = (0..count * coefficients(degree))
+            .flat_map(|pixel| entries.rgb(pixel).map(|byte| described.values[usize::from(byte)]))
+            .collect();
+        values.resize(values.len() + length, 0.0);
+        Ok(Self { degree, length, values, labels })
+    }
+
+    /// Returns a splat's harmonics; zeros, as the reference, where its label is beyond the palette.
+    #[inline]
+    fn entry(&self, pixel: usize) -> &[f32] {
+        let [low, high, _] = self.labels.rgb(pixel);
+        let last = self.values.len() - self.length;
+        let at = usize::from(u16::from_le_bytes([low, high])) * self.length;
+        &self.values[at.min(last)..][..self.length]
     }
 }
 

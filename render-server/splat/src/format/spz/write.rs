@@ -77,13 +77,16 @@ pub(in crate::format) fn encode(splats: &Splats, version: u32) -> Vec<u8> {
         let written = parts.try_for_each(|part| stream.write_all(part));
         return written.and_then(|()| stream.finish()).expect("memory takes every write");
     }
-    let streams = attributes
-        .each_ref()
-        .map(|attribute| compress_to_vec(attribute.as_slice(), CompressionLevel::Fastest));
+    // Without harmonics there is no sixth stream; readers count.
+    let attributes = &attributes[..if coefficients > 1 { 6 } else { 5 }];
+    let streams: Vec<Vec<u8>> = attributes
+        .iter()
+        .map(|attribute| compress_to_vec(attribute.as_slice(), CompressionLevel::Fastest))
+        .collect();
     header[15] = streams.len() as u8;
     header.extend_from_slice(&32u32.to_le_bytes());
     header.resize(32, 0);
-    for (stream, attribute) in streams.iter().zip(&attributes) {
+    for (stream, attribute) in streams.iter().zip(attributes) {
         header.extend_from_slice(&(stream.len() as u64).to_le_bytes());
         header.extend_from_slice(&(attribute.len() as u64).to_le_bytes());
     }
