@@ -35,9 +35,13 @@ impl Camera {
         Ok(())
     }
 
-    /// Returns least and greatest `(x / z, y / z)` in which a splat is linearised: what the image
-    /// shows, and [`JACOBIAN_MARGIN`] of half its size on every side, since the linearisation
-    /// blows up outside.
+    /// Returns least and greatest `(x / z, y / z)` at which a splat is linearised.
+    ///
+    /// Where a pinhole, or a lens near to one, puts what is far outside the image, the linearisation
+    /// blows up: it is taken within what the image shows, and [`JACOBIAN_MARGIN`] of half its size
+    /// on every side. A fisheye's does not blow up, since the lens draws together what the slope
+    /// spreads; and all it can image lies close to the image: taken anywhere but at the splat
+    /// itself, splats at 80 degrees would swell over all of a narrower image.
     pub(crate) fn slope_bounds(&self) -> [DVec2; 2] {
         let k = &self.intrinsics;
         let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
@@ -47,30 +51,35 @@ impl Camera {
             low = low.min(slope);
             high = high.max(slope);
         };
-        if k.distortion == Distortion::None {
-            let centre = DVec2::new(k.cx_px, k.cy_px);
-            let focal = DVec2::new(k.fx_px, k.fy_px);
-            show(-centre / focal);
-            show((size - centre) / focal);
-        } else {
-            // The lens bends the image's border; past its reach the reach itself is the border.
-            let reach = k.distortion.reach();
-            for i in 0..=BORDER_POINTS {
-                let t = f64::from(i) / f64::from(BORDER_POINTS);
-                for at in [
-                    DVec2::new(t, 0.0),
-                    DVec2::new(t, 1.0),
-                    DVec2::new(0.0, t),
-                    DVec2::new(1.0, t),
-                ] {
-                    let pixel = at * size;
-                    show(k.slope(pixel).unwrap_or_else(|| {
-                        let outward = pixel - DVec2::new(k.cx_px, k.cy_px);
-                        outward.normalize_or_zero() * reach
-                    }));
+        let reach = k.distortion.reach();
+        match k.distortion {
+            Distortion::None => {
+                let centre = DVec2::new(k.cx_px, k.cy_px);
+                let focal = DVec2::new(k.fx_px, k.fy_px);
+                show(-centre / focal);
+                show((size - centre) / focal);
+            }
+            Distortion::BrownConrady { .. } => {
+                // The lens bends the border; past its reach the reach itself is the border.
+                for i in 0..=BORDER_POINTS {
+                    let t = f64::from(i) / f64::from(BORDER_POINTS);
+                    for at in [
+                        DVec2::new(t, 0.0),
+                        DVec2::new(t, 1.0),
+                        DVec2::new(0.0, t),
+                        DVec2::new(1.0, t),
+                    ] {
+                        let pixel = at * size;
+                        show(k.slope(pixel).unwrap_or_else(|| {
+                            let outward = pixel - DVec2::new(k.cx_px, k.cy_px);
+                            outward.normalize_or_zero() * reach
+                        }));
+                    }
                 }
             }
-            // The axis is within the reach, but a shifted image need not show it.
+            Distortion::KannalaBrandt { .. } => {
+                return [DVec2::splat(-reach), DVec2::splat(reach)];
+            }
         }
         let margin = (high - low) * (0.5 * JACOBIAN_MARGIN);
         [low - margin, high + margin]

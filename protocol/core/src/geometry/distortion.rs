@@ -69,14 +69,8 @@ impl Distortion {
                 );
                 let across = 2.0 * (x * y * growth + p1 * x + p2 * y);
                 let jacobian = DMat2::from_cols(
-                    DVec2::new(
-                        radial + 2.0 * (x * x * growth + p1 * y + 3.0 * p2 * x),
-                        across,
-                    ),
-                    DVec2::new(
-                        across,
-                        radial + 2.0 * (y * y * growth + 3.0 * p1 * y + p2 * x),
-                    ),
+                    DVec2::new(radial + 2.0 * (x * x * growth + p1 * y + 3.0 * p2 * x), across),
+                    DVec2::new(across, radial + 2.0 * (y * y * growth + 3.0 * p1 * y + p2 * x)),
                 );
                 (slope * radial + shift, jacobian)
             }
@@ -144,20 +138,32 @@ impl Distortion {
         (exact && slope.length() <= reach * (1.0 + 1e-9)).then_some(slope)
     }
 
-    /// Returns the greatest length of a slope that the lens images: beyond it the radial part
-    /// would turn back and show the same place twice. Infinite for a pinhole.
+    /// Returns the greatest length of a slope that the lens images: beyond it the map would turn
+    /// back in some direction and show the same place twice. Infinite for a pinhole.
+    ///
+    /// ```
+    /// use vizflyt_protocol::geometry::Distortion;
+    /// // r (1 - 0.3 r^2) grows until r^2 = 1 / 0.9.
+    /// let lens = Distortion::BrownConrady { k1: -0.3, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 };
+    /// assert!((lens.reach() - (1.0 / 0.9f64).sqrt()).abs() < 1e-9);
+    /// ```
     pub fn reach(&self) -> f64 {
-        // The derivative of the radial part, a polynomial in u: r^2, or t^2.
-        let (factors, is_angle) = match *self {
+        // The derivative along the radius, a polynomial in u: r^2, or t^2.
+        let (factors, tilt, is_angle) = match *self {
             Self::None => return f64::INFINITY,
-            Self::BrownConrady { k1, k2, k3, .. } => {
-                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0], false)
+            Self::BrownConrady { k1, k2, p1, p2, k3 } => {
+                // The tangential part adds 3 r^2 |p| along the radius, or takes it away opposite.
+                let tilt = 6.0 * libm::hypot(p1, p2);
+                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0], tilt, false)
             }
             Self::KannalaBrandt { k1, k2, k3, k4 } => {
-                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4], true)
+                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4], 0.0, true)
             }
         };
-        let grows = |u: f64| factors.iter().rev().fold(0.0, |sum, k| (sum + k) * u) > -1.0;
+        let grows = |u: f64| {
+            let radial = factors.iter().rev().fold(0.0, |sum, k| (sum + k) * u);
+            1.0 + radial - tilt * libm::sqrt(u) > 0.0
+        };
         let farthest = libm::tan(MAX_ANGLE_RAD);
         let end = if is_angle { MAX_ANGLE_RAD } else { farthest };
         // Its first root: by steps that are fine near the axis, where lenses have theirs, then by
@@ -241,16 +247,25 @@ mod tests {
         let k = || -0.3..0.3f64;
         let p = || -0.01..0.01f64;
         prop_oneof![
-            (k(), k(), p(), p(), k())
-                .prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
-            (p(), p(), p(), p())
-                .prop_map(|(k1, k2, k3, k4)| Distortion::KannalaBrandt { k1, k2, k3, k4 }),
+            (k(), k(), p(), p(), k()).prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady {
+                k1,
+                k2,
+                p1,
+                p2,
+                k3
+            }),
+            (p(), p(), p(), p()).prop_map(|(k1, k2, k3, k4)| Distortion::KannalaBrandt {
+                k1,
+                k2,
+                k3,
+                k4
+            }),
         ]
     }
 
     proptest! {
         #[test]
-        fn undistort_is_the_way_back(lens in lenses(), angle in 0.0..6.28f64, share in 0.0..0.9f64) {
+        fn undistort_is_the_way_back(lens in lenses(), angle in 0.0..core::f64::consts::TAU, share in 0.0..0.9f64) {
             let r = libm::tan(libm::atan(lens.reach().min(3.0)) * share);
             let slope = DVec2::from_angle(angle) * r;
             let back = lens.undistort(lens.distort(slope).0);
@@ -289,6 +304,19 @@ mod tests {
         // 2/3 of that is the greatest distorted radius.
         assert_eq!(lens.undistort(DVec2::new(0.71, 0.0)), None);
         assert!(lens.undistort(DVec2::new(0.70, 0.0)).is_some());
+    }
+
+    #[test]
+    fn a_tangential_lens_shows_nothing_twice() {
+        // Without the limit, slopes around 33 to one side would appear in the image's middle.
+        let lens = Distortion::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.01, k3: 0.0 };
+        assert!((lens.reach() - 1.0 / 0.06).abs() < 1e-6);
+        let mut last = f64::NEG_INFINITY;
+        for i in -1000..=1000 {
+            let x = lens.distort(DVec2::new(lens.reach() * f64::from(i) / 1000.0, 0.0)).0.x;
+            assert!(x > last, "it turns back at {i}");
+            last = x;
+        }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 mod agreement;
 mod compare;
+mod fisheye;
 mod npz;
 mod objects;
 mod oracle;

@@ -28,7 +28,7 @@ struct OracleCamera {
     w2c: [[f64; 4]; 4],
 }
 
-fn camera(path: &Path) -> Camera {
+pub(crate) fn camera(path: &Path) -> Camera {
     let text = std::fs::read_to_string(path).expect("a camera file");
     let c: OracleCamera = serde_json::from_str(&text).expect("a camera");
     let row = |i: usize| DVec3::new(c.w2c[i][0], c.w2c[i][1], c.w2c[i][2]);
