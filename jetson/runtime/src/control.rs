@@ -25,8 +25,8 @@ use serde_json::json;
 use tokio::sync::mpsc;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, Setpoint, Telemetry,
-    ToPlugin, ToServer, YawTarget, bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, Setpoint,
+    Telemetry, ToPlugin, ToServer, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
@@ -282,6 +282,21 @@ impl Loop {
                 self.publish_event(now, &event);
                 self.flight.handle(now, Input::Server(event));
             }
+            StreamEvent::Camera(index, camera) => self.take_camera(index, &camera),
+        }
+    }
+
+    /// A camera was changed. Images say themselves how they were drawn; this is for a plugin that
+    /// has not been greeted yet, and for the report.
+    fn take_camera(&mut self, index: u8, camera: &CameraInfo) {
+        let k = &camera.intrinsics;
+        tracing::info!("camera {} is now {}x{} px", camera.name, k.width_px, k.height_px);
+        if index == 0 {
+            self.image_size_px = (k.width_px, k.height_px);
+        }
+        let side = self.plugin.as_mut().filter(|side| !side.started);
+        if let Some(known) = side.and_then(|side| side.arena.cameras.get_mut(usize::from(index))) {
+            *known = camera.clone();
         }
     }
 

@@ -2,8 +2,11 @@
 //!
 //! Budget at 320x240: 0.4 MB written once (zeroing 0.02 ms, JPEG and depth about 1 ms), no copy
 //! afterwards. One thread; while it decodes, newer images replace each other in the mailbox.
-//! Several cameras of one tick share one observation; it is published when all have come, or when
-//! the next tick's first image has.
+//! Several cameras of one tick share one observation; it is published when all that were sent
+//! together have come, or when the next tick's first image has.
+//!
+//! Cameras may change while flying: each image says itself how it was drawn, and the observation
+//! that holds it says so too. The plugin never sees an image with another one's intrinsics.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -40,8 +43,8 @@ pub struct ImagePublisher {
     decoder: Decoder,
     seq: u64,
     under_way: Option<UnderWay>,
-    /// Tick of the newest image, and the stamp of its pose.
-    newest: (u64, HostTime),
+    /// Tick of the newest image of each camera, and the stamp of its pose.
+    newest: Vec<(u64, HostTime)>,
     rejected: u64,
 }
 
@@ -51,20 +54,22 @@ struct UnderWay {
     memory: LoanedObservation,
     /// Bit per camera.
     there: u8,
+    /// Bit per camera that the server sends together with the first one.
+    expected: u8,
     published: Published,
 }
 
 impl ImagePublisher {
-    /// Makes one for these cameras.
+    /// Makes one for these cameras (at most 8); what an image says of its camera later counts more.
     pub fn new(ipc: Arc<RuntimeEnd>, cameras: Vec<CameraInfo>, vehicle: SharedVehicle) -> Self {
         Self {
             ipc,
+            newest: vec![(0, HostTime::ZERO); cameras.len()],
             cameras,
             vehicle,
             decoder: Decoder::default(),
             seq: 0,
             under_way: None,
-            newest: (0, HostTime::ZERO),
             rejected: 0,
         }
     }
@@ -92,23 +97,27 @@ impl ImagePublisher {
         tell: &mut impl FnMut(Published),
     ) -> Result<(), IpcError> {
         let index = usize::from(image.header.camera);
-        let fits = self.cameras.get(index).is_some_and(|camera| {
-            let (ours, theirs) = (camera.intrinsics, image.header.intrinsics());
-            (ours.width_px, ours.height_px) == (theirs.width_px, theirs.height_px)
-        });
-        let tick = image.header.seq.get();
+        let (tick, bit) = (image.header.seq.get(), 1u8.unbounded_shl(index as u32));
+        let Some(newest) = self.newest.get_mut(index) else {
+            self.reject("it is of no camera of this arena");
+            return Ok(());
+        };
         // A server that restarted counts from the start again, but its poses are newer.
-        if !fits || (tick < self.newest.0 && image.pose <= self.newest.1) {
-            self.reject("it is of no camera of this arena, or stale");
+        if tick < newest.0 && image.pose <= newest.1 {
+            self.reject("it is stale");
             return Ok(());
         }
-        self.newest = (tick, image.pose);
-        if self.under_way.as_ref().is_some_and(|under_way| under_way.tick != tick) {
+        *newest = (tick, image.pose);
+        // A later tick, or a camera's next image: the observation has waited long enough. An
+        // earlier tick's image of another camera, overtaken on its way, comes along instead.
+        let waited = |under_way: &UnderWay| tick > under_way.tick || under_way.there & bit != 0;
+        if self.under_way.as_ref().is_some_and(waited) {
             self.publish(tell)?;
         }
+        self.follow(index, image)?;
         let mut under_way = match self.under_way.take() {
             Some(under_way) => under_way,
-            None => self.begin(tick)?,
+            None => self.begin(tick, image.header.together.get())?,
         };
         let camera = &self.cameras[index];
         let Ok(mut writer) = ObservationWriter::resume(under_way.memory.memory(), &self.cameras)
@@ -125,18 +134,40 @@ impl ImagePublisher {
         }
         let ready = host_now();
         writer.image_ready(index, camera, ImageStamps { seq: tick, pose: image.pose, ready });
-        under_way.there |= 1 << index;
+        under_way.there |= bit;
         let published = &mut under_way.published;
         published.pose = published.pose.max(image.pose);
         published.received = published.received.max(image.received);
         published.ready = ready;
-        let complete = under_way.there.count_ones() as usize == self.cameras.len();
+        let complete = under_way.there & under_way.expected == under_way.expected;
         self.under_way = Some(under_way);
         if complete { self.publish(tell) } else { Ok(()) }
     }
 
-    fn begin(&mut self, tick: u64) -> Result<UnderWay, IpcError> {
-        let mut memory = self.ipc.loan()?;
+    /// Takes over how the camera was when the image was drawn. Another size lays out memory anew,
+    /// and what this tick's observation has already moves there.
+    fn follow(&mut self, index: usize, image: &ReceivedImage) -> Result<(), IpcError> {
+        let before = self.cameras.clone();
+        let camera = &mut self.cameras[index];
+        camera.intrinsics = image.header.intrinsics();
+        camera.body_from_cam = image.header.body_from_cam();
+        let size = |camera: &CameraInfo| (camera.intrinsics.width_px, camera.intrinsics.height_px);
+        if size(&before[index]) == size(camera) {
+            return Ok(());
+        }
+        if let Some(mut under_way) = self.under_way.take() {
+            let mut memory = self.ipc.loan(ObservationWriter::len_for(&self.cameras))?;
+            let old = under_way.memory.bytes();
+            // The memory was sized for these cameras; if it were not, `resume` fails next.
+            let _ = ObservationWriter::adopt(memory.memory(), &self.cameras, old, &before);
+            under_way.memory = memory;
+            self.under_way = Some(under_way);
+        }
+        Ok(())
+    }
+
+    fn begin(&mut self, tick: u64, together: u32) -> Result<UnderWay, IpcError> {
+        let mut memory = self.ipc.loan(ObservationWriter::len_for(&self.cameras))?;
         self.seq += 1;
         // The memory was sized for these cameras; if it were not, `resume` fails next.
         let _ = ObservationWriter::new(memory.memory(), self.seq, &self.cameras);
@@ -146,7 +177,9 @@ impl ImagePublisher {
             received: HostTime::ZERO,
             ready: HostTime::ZERO,
         };
-        Ok(UnderWay { tick, memory, there: 0, published })
+        let all = 1u8.unbounded_shl(self.cameras.len() as u32).wrapping_sub(1);
+        let expected = if together as u8 & all == 0 { all } else { together as u8 & all };
+        Ok(UnderWay { tick, memory, there: 0, expected, published })
     }
 
     fn publish(&mut self, tell: &mut impl FnMut(Published)) -> Result<(), IpcError> {
@@ -180,7 +213,7 @@ mod tests {
     use vizflyt_protocol::time::ServerTime;
     use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
     use vizflyt_sdk::Observation;
-    use vizflyt_sdk::glam::DVec3;
+    use vizflyt_sdk::glam::{DQuat, DVec3};
     use vizflyt_sdk::ipc::{PluginEnd, unique_service};
 
     fn camera(name: &str) -> CameraInfo {
@@ -192,13 +225,26 @@ mod tests {
     }
 
     fn image(camera: u8, tick: u64, depth_mm: u16) -> ReceivedImage {
-        let k = Intrinsics::from_horizontal_fov(32, 24, 1.5);
-        let (rgb, depth_mm) = (vec![90; 32 * 24 * 3], vec![depth_mm; 32 * 24]);
-        let view = RgbdView { width: 32, height: 24, rgb: &rgb, depth_mm: &depth_mm };
+        sized_image(camera, tick, depth_mm, [32, 24])
+    }
+
+    fn sized_image(
+        camera: u8,
+        tick: u64,
+        depth_mm: u16,
+        [width, height]: [u32; 2],
+    ) -> ReceivedImage {
+        let k = Intrinsics::from_horizontal_fov(width, height, 1.5);
+        let pixels = k.pixels();
+        let (rgb, depth_mm) = (vec![90; pixels * 3], vec![depth_mm; pixels]);
+        let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
         let mut payload = Vec::new();
         Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
+        // Mounted as far ahead as the tick says.
+        let mount = Pose::new(DVec3::X * tick as f64, DQuat::IDENTITY);
+        let world_from_body = Pose::IDENTITY;
         ReceivedImage {
-            header: ImageHeader::new(tick, camera, ServerTime::ZERO, &k, &Pose::IDENTITY),
+            header: ImageHeader::new(tick, camera, ServerTime::ZERO, &k, &mount, &world_from_body),
             payload,
             pose: HostTime::from_ns(1000 * tick),
             received: HostTime::from_ns(1000 * tick + 500),
@@ -236,9 +282,16 @@ mod tests {
             let observation = Observation::from_bytes(sample.bytes(), &self.names).unwrap();
             let seen = observation
                 .cameras()
-                .map(|c| (c.name.to_owned(), c.seq, c.depth_m(31, 23).unwrap()))
+                .map(|c| {
+                    (c.name.to_owned(), c.seq, c.depth_m(c.width_px - 1, c.height_px - 1).unwrap())
+                })
                 .collect();
             assert_eq!(observation.seq(), told.unwrap().seq);
+            for camera in observation.cameras() {
+                let (k, x_m) = (camera.intrinsics, camera.body_from_cam.translation_m.x);
+                assert_eq!((k.width_px, k.height_px), (camera.width_px, camera.height_px));
+                assert_eq!(x_m, camera.seq as f64, "the mounting is that of the image");
+            }
             Some((told.unwrap(), seen))
         }
     }
@@ -268,6 +321,49 @@ mod tests {
         assert_eq!(seen, [("front".to_owned(), 2, 1.1)]);
         let (_, seen) = rig.take(&image(0, 3, 1200)).unwrap();
         assert_eq!(seen.len(), 2);
+    }
+
+    #[test]
+    fn a_camera_that_changes_its_size_loses_no_image() {
+        let mut rig = Rig::new(&["front"]);
+        let mut at = 0;
+        // Up, beyond what the memory was made for, down again, and up by many steps.
+        for size in [[32, 24], [640, 480], [8, 8], [32, 24], [1280, 720], [1, 1], [1920, 1080]] {
+            at += 1;
+            let depth_mm = 1000 + at as u16;
+            let (published, seen) = rig.take(&sized_image(0, at, depth_mm, size)).unwrap();
+            assert_eq!(published.seq, at, "no observation is skipped");
+            assert_eq!(seen, [("front".to_owned(), at, f32::from(depth_mm) / 1000.0)]);
+        }
+        assert_eq!(rig.publisher.rejected, 0);
+    }
+
+    #[test]
+    fn one_of_two_cameras_grows_between_the_images_of_a_tick() {
+        let mut rig = Rig::new(&["front", "rear"]);
+        assert!(rig.take(&image(0, 1, 1000)).is_none());
+        let (_, seen) = rig.take(&sized_image(1, 1, 2000, [400, 300])).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 1, 2.0)]);
+        // And both in the next.
+        assert!(rig.take(&sized_image(1, 2, 2100, [64, 48])).is_none());
+        let (_, seen) = rig.take(&sized_image(0, 2, 1100, [500, 10])).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 2, 1.1), ("rear".to_owned(), 2, 2.1)]);
+    }
+
+    #[test]
+    fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
+        let mut rig = Rig::new(&["front", "rear"]);
+        let together = |mut image: ReceivedImage, cameras: u32| {
+            image.header.together = cameras.into();
+            image
+        };
+        // The front camera alone, at once.
+        assert_eq!(rig.take(&together(image(0, 1, 1000), 0b01)).unwrap().1.len(), 1);
+        // Both; the rear one drawn a tick before, as it may be when the encoder was busy.
+        assert!(rig.take(&together(image(0, 3, 1100), 0b11)).is_none());
+        let (_, seen) = rig.take(&together(image(1, 2, 2000), 0b11)).unwrap();
+        assert_eq!(seen, [("front".to_owned(), 3, 1.1), ("rear".to_owned(), 2, 2.0)]);
+        assert_eq!(rig.publisher.rejected, 0);
     }
 
     #[test]

@@ -69,17 +69,50 @@ impl<'m> ObservationWriter<'m> {
         }
         let count = cameras.len().min(MAX_CAMERAS);
         let mut header = ObservationHeader::new(seq, count as u8, total_len);
-        for ((head, camera), &(rgb, depth)) in
-            header.cameras.iter_mut().zip(cameras).zip(&layout.planes)
-        {
-            // The size stays 0 until the image is there; see `image_ready`.
-            head.translation_m = camera.body_from_cam.translation_m.to_array();
-            head.rotation_xyzw = camera.body_from_cam.rotation.to_array();
+        for (head, &(rgb, depth)) in header.cameras[..count].iter_mut().zip(&layout.planes) {
+            // The rest is set when the image is there; see `image_ready`.
             (head.rgb_offset, head.depth_offset) = (rgb as u32, depth as u32);
         }
         let (place, _) = ObservationHeader::mut_from_prefix(memory).map_err(|_| error)?;
         *place = header;
         Ok(Self { memory, layout })
+    }
+
+    /// Starts `memory` as a copy of the observation `from` of `old_cameras`, laid out anew for
+    /// `cameras`: for when one of them has changed its size. The images in `from` of cameras whose
+    /// size is the same come along.
+    ///
+    /// # Errors
+    /// As [`Self::new`], for either memory.
+    pub fn adopt(
+        memory: &'m mut [u8],
+        cameras: &[CameraInfo],
+        from: &[u8],
+        old_cameras: &[CameraInfo],
+    ) -> Result<Self, ObservationTooLarge> {
+        let old_layout = layout_of(old_cameras);
+        let error = ObservationTooLarge { needed: old_layout.total_len, found: from.len() };
+        let (old, _) = ObservationHeader::ref_from_prefix(from).map_err(|_| error)?;
+        let mut new = Self::new(memory, old.seq, cameras)?;
+        for index in 0..cameras.len().min(old_cameras.len()).min(MAX_CAMERAS) {
+            let (camera, was) = (&cameras[index], old.cameras[index]);
+            let size = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+            if was.width_px == 0 || (was.width_px, was.height_px) != size {
+                continue;
+            }
+            let pixels = camera.intrinsics.pixels();
+            let (old_planes, new_planes) = (old_layout.planes[index], new.layout.planes[index]);
+            for (old_at, new_at, len) in
+                [(old_planes.0, new_planes.0, 3 * pixels), (old_planes.1, new_planes.1, 2 * pixels)]
+            {
+                let plane = from.get(old_at..old_at + len).ok_or(error)?;
+                new.memory[new_at..new_at + len].copy_from_slice(plane);
+            }
+            let mut head = was;
+            (head.rgb_offset, head.depth_offset) = (new_planes.0 as u32, new_planes.1 as u32);
+            new.header().cameras[index] = head;
+        }
+        Ok(new)
     }
 
     /// Goes on writing an observation of these cameras that [`Self::new`] started in `memory`.
@@ -131,6 +164,8 @@ impl<'m> ObservationWriter<'m> {
         let count = usize::from(self.header().camera_count);
         let Some(head) = self.header().cameras[..count].get_mut(index) else { return };
         head.set_intrinsics(&camera.intrinsics);
+        head.translation_m = camera.body_from_cam.translation_m.to_array();
+        head.rotation_xyzw = camera.body_from_cam.rotation.to_array();
         head.seq = stamps.seq;
         head.pose_ns = stamps.pose.as_ns();
         head.ready_ns = stamps.ready.as_ns();
@@ -299,6 +334,32 @@ mod tests {
             buffer.observation().vehicle().is_none()
                 && buffer.observation().cameras().next().is_none()
         );
+    }
+
+    #[test]
+    fn images_come_along_when_another_camera_grows() {
+        let old = [camera("front", 5, 3), camera("rear", 7, 4), camera("down", 2, 2)];
+        let mut buffer = ObservationBuffer::new(&old);
+        buffer.clear(6);
+        let stamps = ImageStamps { seq: 3, ..ImageStamps::default() };
+        for index in 0..3 {
+            buffer.set_image(index, stamps, |planes| {
+                planes.rgb.fill(10 + index as u8);
+                planes.depth_mm.fill(1000 * (1 + index as u16));
+            });
+        }
+        // The first grows, the last shrinks, the middle one stays.
+        let new = [camera("front", 50, 30), camera("rear", 7, 4), camera("down", 1, 2)];
+        let mut grown = ObservationBuffer::new(&new);
+        ObservationWriter::adopt(grown.blocks.as_mut_bytes(), &new, buffer.as_bytes(), &old)
+            .unwrap();
+        let found = grown.observation();
+        assert_eq!((found.seq(), found.cameras().count()), (6, 1));
+        let rear = found.camera("rear").unwrap();
+        assert_eq!((rear.seq, rear.rgb, rear.depth_mm), (3, &[11; 84][..], &[2000; 28][..]));
+        let mut small = vec![0; 64];
+        assert!(ObservationWriter::adopt(&mut small, &new, buffer.as_bytes(), &old).is_err());
+        assert!(ObservationWriter::adopt(grown.blocks.as_mut_bytes(), &new, &small, &old).is_err());
     }
 
     #[test]

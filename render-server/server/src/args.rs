@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use crate::render::RendererKind;
 use crate::scene::Up;
 use crate::transport::Congestion;
 
@@ -13,7 +14,7 @@ use crate::transport::Congestion;
 /// Example: vizflyt serve forest/arena.toml --vicon 0.0.0.0:51001 --http 127.0.0.1:8080
 #[derive(Args, Clone, Debug)]
 pub struct ServeArgs {
-    /// arena.toml, or a bare scene (.ply), for which an arena is made up
+    /// arena.toml, its folder, or a bare scene file, for which an arena is made up
     pub arena: PathBuf,
 
     /// Where runtimes connect (UDP)
@@ -31,6 +32,10 @@ pub struct ServeArgs {
     /// The vehicle: its object's name in the localization system
     #[arg(long, value_name = "NAME", default_value = "vizflyt")]
     pub vehicle: String,
+
+    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    pub renderer: RendererKind,
 
     /// Draw at most this often [Hz]
     #[arg(long, value_name = "HZ", default_value_t = 120.0, value_parser = rate)]

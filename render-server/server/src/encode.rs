@@ -17,26 +17,59 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, encode_jpeg};
 use vizflyt_splat::{DepthKind, RgbdImage};
 
+use crate::cameras::CameraSet;
 use crate::clock;
 use crate::hub::Hub;
 use crate::mailbox::Mailbox;
 use crate::outlet::Outgoing;
 
-/// All cameras' images of one tick, as drawn; reused from tick to tick.
+/// What was drawn in one tick, and what nobody took of the ticks it replaced; reused from tick to
+/// tick.
 #[derive(Debug, Default)]
 pub struct DrawnTick {
-    /// Counts ticks from 1.
+    /// One per camera of the arena.
+    pub slots: Vec<DrawnImage>,
+}
+
+/// The newest image of one camera.
+#[derive(Debug, Default)]
+pub struct DrawnImage {
+    /// Whether there is one; everything else counts only then.
+    pub fresh: bool,
+    /// Its tick, counted from 1.
     pub seq: u64,
     /// When the pose was measured.
     pub pose: ServerTime,
     /// The pose drawn from.
     pub world_from_body: Option<Pose<World, Body>>,
-    /// Rendering began.
+    /// The camera as it was drawn with: set and index.
+    pub camera: Option<(Arc<CameraSet>, usize)>,
+    /// Rendering of the tick began.
     pub render_start: ServerTime,
-    /// Rendering ended.
+    /// Rendering of the tick ended.
     pub render_end: ServerTime,
-    /// One image per camera of the arena.
-    pub images: Vec<RgbdImage>,
+    /// The image.
+    pub image: RgbdImage,
+}
+
+impl DrawnTick {
+    /// Takes over the images of `old`, which it replaces unread, of cameras that were not due
+    /// again: else a slow camera's images would be lost to a busy encoder.
+    pub fn inherit(&mut self, old: &mut Self) {
+        for (mine, theirs) in self.slots.iter_mut().zip(&mut old.slots) {
+            if theirs.fresh && !mine.fresh {
+                std::mem::swap(mine, theirs);
+            }
+        }
+    }
+}
+
+impl DrawnImage {
+    /// Whether its camera has fewer images than the page shows.
+    fn is_slow(&self) -> bool {
+        let rate_hz = self.camera.as_ref().and_then(|(set, index)| set.configs[*index].rate_hz);
+        rate_hz.is_some_and(|hz| hz < f64::from(PREVIEW_HZ))
+    }
 }
 
 /// Two small pictures for the page.
@@ -52,6 +85,7 @@ pub struct Preview {
 pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, quality: u8) {
     let mut stage = Stage::new(quality);
     let mut preview_due = Instant::now();
+    let mut order: Vec<usize> = Vec::new();
     while !hub.stop.is_set() {
         let wanted = hub.outlet.wait_for_room(preview_due, PATIENCE);
         if !wanted.preview && !wanted.stream.contains(&true) {
@@ -62,13 +96,22 @@ pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, quality: u8) {
         if preview {
             preview_due = Instant::now() + Duration::from_secs(1) / PREVIEW_HZ;
         }
-        for camera in 0..tick.images.len() {
-            if !(wanted.stream[camera] || preview) {
+        // The newest tick's first: an older image joins what the runtime has begun.
+        order.clear();
+        order.extend((0..tick.slots.len()).filter(|&camera| tick.slots[camera].fresh));
+        order.sort_by_key(|&camera| std::cmp::Reverse(tick.slots[camera].seq));
+        let together = order.iter().filter(|&&camera| wanted.stream[camera]);
+        let together = together.fold(0u32, |bits, &camera| bits | 1 << camera);
+        for &camera in &order {
+            let slot = &tick.slots[camera];
+            let stream = wanted.stream[camera].then_some(together);
+            // A slow camera's images come too seldom to wait for the page's turn.
+            let preview = preview || (hub.outlet.viewers() > 0 && slot.is_slow());
+            if stream.is_none() && !preview {
                 continue;
             }
-            let encoded = stage.encode(hub, &tick, camera, wanted.stream[camera], preview);
-            if let Err(error) = encoded {
-                warn!("camera {camera}: {error:#}; image {} is skipped", tick.seq);
+            if let Err(error) = stage.encode(hub, slot, camera, stream, preview) {
+                warn!("camera {camera}: {error:#}; image {} is skipped", slot.seq);
             }
         }
         drawn.recycle(tick);
@@ -101,32 +144,32 @@ impl Stage {
     fn encode(
         &mut self,
         hub: &Hub,
-        tick: &DrawnTick,
+        slot: &DrawnImage,
         camera: usize,
-        stream: bool,
+        stream: Option<u32>,
         preview: bool,
     ) -> Result<()> {
-        let (Some(info), Some(world_from_body)) =
-            (hub.arena.cameras.get(camera), tick.world_from_body)
+        let (Some((set, index)), Some(world_from_body)) = (&slot.camera, slot.world_from_body)
         else {
             return Ok(());
         };
-        let image = &tick.images[camera];
+        let (info, image) = (&set.infos[*index], &slot.image);
         image.write_rgb8(&mut self.rgb);
         image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
-        if stream {
-            let _span = trace_span!("encode", seq = tick.seq, camera).entered();
+        if let Some(together) = stream {
+            let _span = trace_span!("encode", seq = slot.seq, camera).entered();
             let start = clock::now();
-            let world_from_cam = world_from_body * info.body_from_cam;
             let mut header = ImageHeader::new(
-                tick.seq,
+                slot.seq,
                 camera as u8,
-                tick.pose,
+                slot.pose,
                 &info.intrinsics,
-                &world_from_cam,
+                &info.body_from_cam,
+                &world_from_body,
             );
-            header.render_start_ns = tick.render_start.as_ns().into();
-            header.render_end_ns = tick.render_end.as_ns().into();
+            header.together = together.into();
+            header.render_start_ns = slot.render_start.as_ns().into();
+            header.render_end_ns = slot.render_end.as_ns().into();
             let mut payload = hub.outlet.buffer();
             let view = RgbdView {
                 width: image.width_px,
@@ -220,6 +263,16 @@ mod tests {
         let light = |mm| depth_colour(mm).iter().map(|&c| u32::from(c)).sum::<u32>();
         let depths = [300u16, 600, 1200, 2400, 5000, 10_000, 20_000];
         assert!(depths.is_sorted_by_key(|&mm| std::cmp::Reverse(light(mm))));
+    }
+
+    #[test]
+    fn a_slow_cameras_image_outlives_the_tick_it_was_drawn_in() {
+        let slot = |seq, fresh| DrawnImage { seq, fresh, ..DrawnImage::default() };
+        let mut old = DrawnTick { slots: vec![slot(7, true), slot(7, true), slot(3, false)] };
+        let mut new = DrawnTick { slots: vec![slot(8, true), slot(1, false), slot(2, false)] };
+        new.inherit(&mut old);
+        let found: Vec<_> = new.slots.iter().map(|slot| (slot.seq, slot.fresh)).collect();
+        assert_eq!(found, [(8, true), (7, true), (2, false)]);
     }
 
     #[test]

@@ -12,12 +12,14 @@ use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use vizflyt_protocol::messages::{
     ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
+use crate::cameras::{CameraSet, Cameras};
 use crate::clock;
 use crate::drivers::SourceCounters;
 use crate::encode::Preview;
@@ -31,10 +33,12 @@ use crate::stop::Stop;
 pub struct Hub {
     /// The object in the localization system, and the only vehicle served.
     pub vehicle: Name,
-    /// What the runtime gets to know.
+    /// What the runtime gets to know; its cameras are those of the start, see [`Self::welcome`].
     pub arena: ArenaInfo,
-    /// Which renderer draws.
-    pub renderer: String,
+    /// The cameras of this moment.
+    pub cameras: Cameras,
+    /// Which renderer draws, and why.
+    pub renderer: RendererInfo,
     /// The end of the program.
     pub stop: Stop,
     /// What happened.
@@ -55,6 +59,15 @@ pub struct Hub {
     pub source: Mutex<SourceCounters>,
     seat: Mutex<SeatState>,
     flight: Mutex<Flight>,
+}
+
+/// Which renderer draws, for reports and the page.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct RendererInfo {
+    /// What it runs on: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
+    pub name: String,
+    /// Why it is this one.
+    pub reason: String,
 }
 
 /// How the present flight goes.
@@ -93,24 +106,36 @@ pub struct RuntimeInfo {
 
 impl Hub {
     /// Makes the state of a server that has seen nothing yet.
-    pub fn new(vehicle: &str, arena: ArenaInfo, renderer: String, stop: Stop) -> Self {
-        let cameras = arena.cameras.len();
+    pub fn new(
+        vehicle: &str,
+        arena: ArenaInfo,
+        cameras: Cameras,
+        renderer: RendererInfo,
+        stop: Stop,
+    ) -> Self {
+        let count = cameras.newest().configs.len();
         Self {
             vehicle: bounded(vehicle),
             arena,
+            cameras,
             renderer,
             stop,
             events: EventLog::default(),
             stats: Stats::default(),
-            outlet: Outlet::new(cameras),
+            outlet: Outlet::new(count),
             pose: watch::Sender::new(None),
             telemetry: watch::Sender::new(None),
-            previews: (0..cameras).map(|_| watch::Sender::new(None)).collect(),
+            previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
             trail: Mutex::default(),
             source: Mutex::default(),
             seat: Mutex::default(),
             flight: Mutex::default(),
         }
+    }
+
+    /// Returns what a runtime is told of the arena, with the cameras `set`.
+    pub fn welcome(&self, set: &CameraSet) -> ArenaInfo {
+        ArenaInfo { cameras: set.infos.iter().cloned().collect(), ..self.arena.clone() }
     }
 
     /// Appends to the log what the server or the runtime noticed.
@@ -363,7 +388,8 @@ mod tests {
             time_limit_s: 0.0,
             cameras: [].into_iter().collect(),
         };
-        Arc::new(Hub::new("vizflyt", arena, "test".to_owned(), Stop::default()))
+        let cameras = Cameras::new(Vec::new());
+        Arc::new(Hub::new("vizflyt", arena, cameras, RendererInfo::default(), Stop::default()))
     }
 
     fn hello(vehicle: &str) -> Hello {

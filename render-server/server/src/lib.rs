@@ -10,6 +10,7 @@
 //! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
 
 pub mod args;
+pub mod cameras;
 pub mod clock;
 pub mod dashboard;
 pub mod drivers;

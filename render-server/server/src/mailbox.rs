@@ -30,8 +30,17 @@ impl<T: Default> Mailbox<T> {
 
     /// Puts `item` in, in place of one that nobody took; returns whether it replaced one.
     pub fn put(&self, item: T) -> bool {
+        self.put_over(item, |_, _| {})
+    }
+
+    /// As [`Self::put`]; what is replaced may hand over to `item` first, by `inherit(item, old)`.
+    pub fn put_over(&self, mut item: T, inherit: impl FnOnce(&mut T, &mut T)) -> bool {
         let mut inner = self.lock();
-        let old = inner.slot.replace(item);
+        let mut old = inner.slot.take();
+        if let Some(old) = &mut old {
+            inherit(&mut item, old);
+        }
+        inner.slot = Some(item);
         let replaced = old.is_some();
         inner.replaced += u64::from(replaced);
         keep(&mut inner.spares, old);

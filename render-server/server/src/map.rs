@@ -9,9 +9,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
-use vizflyt_splat::{Camera, RgbdImage, Splats};
-
-use crate::render::Renderer;
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
@@ -96,20 +94,14 @@ fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Ca
 }
 
 /// Draws the top view of the rectangle up to `ceiling_m`, with a renderer of its own for the splats
-/// below; returns a JPEG, or nothing if drawing fails.
-pub fn picture(
-    splats: &Splats,
-    min_m: DVec2,
-    max_m: DVec2,
-    ceiling_m: f64,
-    make: impl FnOnce(&Splats) -> Box<dyn Renderer>,
-) -> Option<Bytes> {
+/// below: one picture is not worth a graphics device. Returns a JPEG, or nothing if drawing fails.
+pub fn picture(splats: &Splats, min_m: DVec2, max_m: DVec2, ceiling_m: f64) -> Option<Bytes> {
     let span = max_m - min_m;
     let px_per_m = f64::from(WANTED_SIDE_PX) / span.max_element();
     let camera = camera_above(min_m, max_m, ceiling_m, px_per_m);
-    let mut renderer = make(&below(splats, ceiling_m as f32));
+    let mut renderer = CpuRenderer::new(&below(splats, ceiling_m as f32));
     let mut images = [RgbdImage::default()];
-    renderer.draw(&[camera], &mut images).ok()?;
+    renderer.render(&[], &[camera], &mut images).ok()?;
     let mut rgb = Vec::new();
     images[0].write_rgb8(&mut rgb);
     let mut jpeg = Vec::new();

@@ -225,7 +225,14 @@ mod tests {
 
     fn image(outlet: &Outlet, camera: usize) -> Outgoing {
         let k = Intrinsics::from_horizontal_fov(4, 3, 1.0);
-        let header = ImageHeader::new(1, camera as u8, ServerTime::ZERO, &k, &Pose::IDENTITY);
+        let header = ImageHeader::new(
+            1,
+            camera as u8,
+            ServerTime::ZERO,
+            &k,
+            &Pose::IDENTITY,
+            &Pose::IDENTITY,
+        );
         Outgoing { camera, header, payload: outlet.buffer() }
     }
 

@@ -1,30 +1,48 @@
-//! The renderer behind one small trait, so that GPU and CPU are exchangeable.
+//! `--renderer`: which renderer draws, as the command line says it and as the page shows it.
 
-use vizflyt_splat::{Camera, CpuRenderer, InvalidCamera, RgbdImage, Splats};
+use std::fmt;
 
-/// Draws a scene it holds.
-pub trait Renderer: Send {
-    /// Draws each camera into the image of the same index.
-    ///
-    /// # Errors
-    /// The first camera that cannot be drawn; images are then unspecified.
-    fn draw(&mut self, cameras: &[Camera], images: &mut [RgbdImage]) -> Result<(), InvalidCamera>;
+use anyhow::{Context, Result};
+use clap::ValueEnum;
+use vizflyt_splat::{Backend, Chosen, Scene};
 
-    /// Returns its name for reports: `cpu avx2`.
-    fn name(&self) -> String;
+/// Values of `--renderer`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum RendererKind {
+    /// A graphics card if one answers, else the processor.
+    #[default]
+    Auto,
+    /// The processor.
+    Cpu,
+    /// Any graphics adapter, software Vulkan too.
+    Gpu,
 }
 
-impl Renderer for CpuRenderer {
-    fn draw(&mut self, cameras: &[Camera], images: &mut [RgbdImage]) -> Result<(), InvalidCamera> {
-        self.render(cameras, images).map(|_| ())
-    }
-
-    fn name(&self) -> String {
-        CpuRenderer::name(self).to_owned()
+impl From<RendererKind> for Backend {
+    fn from(kind: RendererKind) -> Self {
+        match kind {
+            RendererKind::Auto => Self::Auto,
+            RendererKind::Cpu => Self::Cpu,
+            RendererKind::Gpu => Self::Gpu,
+        }
     }
 }
 
-/// Returns the fastest renderer this machine has for a scene, which it copies.
-pub fn best(splats: &Splats) -> Box<dyn Renderer> {
-    Box::new(CpuRenderer::new(splats))
+/// As the command line spells it, for those who pass it on.
+impl fmt::Display for RendererKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Auto => "auto",
+            Self::Cpu => "cpu",
+            Self::Gpu => "gpu",
+        })
+    }
+}
+
+/// Returns the renderer of a scene, which it packs a copy of.
+///
+/// # Errors
+/// If a graphics adapter was asked for and none can be used.
+pub fn choose<'a>(scene: impl Into<Scene<'a>>, kind: RendererKind) -> Result<Chosen> {
+    vizflyt_splat::choose(scene, kind.into()).with_context(|| format!("--renderer {kind}"))
 }

@@ -8,15 +8,16 @@ use anyhow::{Context, Result};
 use glam::DVec2;
 use serde::Serialize;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
-use vizflyt_splat::Splats;
+use vizflyt_splat::{Chosen, Rasterizer, Splats};
 
 use crate::args::ServeArgs;
+use crate::cameras::Cameras;
 use crate::drivers::{PoseSource, ViconUdp};
 use crate::events::Origin;
-use crate::hub::{Hub, lock};
+use crate::hub::{Hub, RendererInfo, lock};
 use crate::mailbox::Mailbox;
 use crate::map::{self, Map, Obstacles};
-use crate::render::{Renderer, best};
+use crate::render::choose;
 use crate::scene::{self, Scene};
 use crate::stats::Report;
 use crate::stop::Stop;
@@ -58,6 +59,10 @@ struct Ready<'a> {
     /// Where the vehicle is expected to start: x, y, z [m, world], yaw [deg].
     spawn: [f64; 4],
     arena: &'a str,
+    /// What draws: `cpu avx2`.
+    renderer: &'a str,
+    /// Why it is this renderer.
+    renderer_reason: &'a str,
 }
 
 async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
@@ -77,9 +82,11 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         twin = load => twin.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
-    let renderer_name = twin.renderer.name();
-    let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), renderer_name, stop.clone()));
-    let threads = start_threads(args, &hub, twin.renderer, twin.referee, vicon)?;
+    let Chosen { rasterizer, reason } = twin.renderer;
+    let renderer = RendererInfo { name: rasterizer.name(), reason };
+    let cameras = Cameras::new(twin.arena.cameras.clone());
+    let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), cameras, renderer, stop.clone()));
+    let threads = start_threads(args, &hub, rasterizer, twin.referee, vicon)?;
 
     let fingerprint = identity.fingerprint();
     let spawn = twin.arena.spawn;
@@ -94,6 +101,8 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
             fingerprint: &fingerprint,
             spawn: [x, y, z, spawn.yaw_deg],
             arena: &twin.arena.name,
+            renderer: &hub.renderer.name,
+            renderer_reason: &hub.renderer.reason,
         },
     );
 
@@ -114,7 +123,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
 /// Everything made from the scene.
 struct Twin {
     arena: ArenaConfig,
-    renderer: Box<dyn Renderer>,
+    renderer: Chosen,
     referee: Referee,
     map: Map,
 }
@@ -123,7 +132,7 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
     let Scene { arena, splats } = scene::load(&args.arena, args.up, args.scale)?;
     let obstacles = scene::bake(&splats, &arena);
     let map = draw_map(&splats, &arena, &obstacles);
-    let renderer = best(&splats);
+    let renderer = choose(&splats, args.renderer)?;
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
     let referee = Referee::new(&arena, obstacles);
@@ -136,14 +145,14 @@ fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map 
     let obstacles = Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| {
         field.obstacle_distance_m(p.extend(flight_m)) < 0.0
     });
-    let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M, best);
+    let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M);
     Map { jpeg: jpeg.unwrap_or_default(), min_m: min.to_array(), max_m: max.to_array(), obstacles }
 }
 
 fn start_threads(
     args: &ServeArgs,
     hub: &Arc<Hub>,
-    mut renderer: Box<dyn Renderer>,
+    mut renderer: Box<dyn Rasterizer>,
     referee: Referee,
     mut source: impl PoseSource + 'static,
 ) -> Result<Vec<JoinHandle<()>>> {
@@ -201,6 +210,7 @@ fn announce(json: bool, ready: &Ready<'_>) {
         return line(ready);
     }
     say(&format!("arena        {}", ready.arena));
+    say(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
     say(&format!("page         {}", ready.http));
     say(&format!("vicon        {} (UDP object stream)", ready.vicon));
     say(&format!(

@@ -10,6 +10,7 @@ use serde::Serialize;
 use vizflyt_protocol::time::ServerTime;
 
 use crate::drivers::SourceCounters;
+use crate::hub::RendererInfo;
 
 /// Everything measured; shared by all threads.
 #[derive(Debug, Default)]
@@ -175,11 +176,13 @@ pub struct Report {
     pub peak_rss_mb: f64,
     /// Which renderer drew.
     pub renderer: String,
+    /// Why it was this one.
+    pub renderer_reason: String,
 }
 
 impl Stats {
     /// Returns the report over the whole run.
-    pub fn report(&self, source: SourceCounters, renderer: &str) -> Report {
+    pub fn report(&self, source: SourceCounters, renderer: &RendererInfo) -> Report {
         let (render, encode, send) =
             (self.render.overall(), self.encode.overall(), self.send.overall());
         Report {
@@ -196,7 +199,8 @@ impl Stats {
             sent_mb: self.bytes_sent.load(Ordering::Relaxed) as f64 / 1e6,
             source,
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
-            renderer: renderer.to_owned(),
+            renderer: renderer.name.clone(),
+            renderer_reason: renderer.reason.clone(),
         }
     }
 }

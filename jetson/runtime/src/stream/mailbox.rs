@@ -81,7 +81,14 @@ mod tests {
     fn image(camera: u8, seq: u64) -> ReceivedImage {
         let k = Intrinsics::from_horizontal_fov(32, 24, 1.5);
         ReceivedImage {
-            header: ImageHeader::new(seq, camera, ServerTime::ZERO, &k, &Pose::IDENTITY),
+            header: ImageHeader::new(
+                seq,
+                camera,
+                ServerTime::ZERO,
+                &k,
+                &Pose::IDENTITY,
+                &Pose::IDENTITY,
+            ),
             payload: Vec::new(),
             pose: HostTime::ZERO,
             received: HostTime::ZERO,

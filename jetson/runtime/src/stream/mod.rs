@@ -21,7 +21,7 @@ use std::time::Duration;
 use quinn::{AckFrequencyConfig, ClientConfig, Endpoint, EndpointConfig, TransportConfig, VarInt};
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::sync::mpsc;
-use vizflyt_protocol::messages::{ArenaInfo, Event, Name, PoseSample, ToServer};
+use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, Event, Name, PoseSample, ToServer};
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 
 pub use mailbox::{Mailbox, ReceivedImage};
@@ -51,6 +51,8 @@ pub enum StreamEvent {
     Pose(PoseSample, HostTime),
     /// Something happened.
     Event(Event),
+    /// A camera, by its index, was changed.
+    Camera(u8, Box<CameraInfo>),
 }
 
 /// The relation of the server's clock to ours, shared by all who stamp.

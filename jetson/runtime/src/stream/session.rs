@@ -142,6 +142,9 @@ fn take(
             }
         }
         Ok(ToRuntime::Event(event)) => tell(StreamEvent::Event(event)),
+        Ok(ToRuntime::Camera { index, camera }) => {
+            tell(StreamEvent::Camera(index, Box::new(camera)));
+        }
         Err(error @ FramingError::Body(_)) => tracing::warn!("server: {error}"),
         Err(error @ FramingError::TooLong(_)) => return Err(lost(error)),
     }

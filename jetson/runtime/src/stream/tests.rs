@@ -180,7 +180,7 @@ async fn a_conversation_and_an_image() {
     assert!(matches!(client.next(), StreamEvent::Event(found) if found == event));
 
     let k = Intrinsics::from_horizontal_fov(64, 48, 1.5);
-    let mut header = ImageHeader::new(9, 0, stamp, &k, &Pose::IDENTITY);
+    let mut header = ImageHeader::new(9, 0, stamp, &k, &Pose::IDENTITY, &Pose::IDENTITY);
     let payload: Vec<u8> = (0..20_000).map(|n| n as u8).collect();
     header.payload_len = (payload.len() as u32).into();
     for cut in [true, false] {

@@ -200,7 +200,8 @@ impl Rig {
 
     fn publish(&mut self) {
         self.seq += 1;
-        let (cameras, mut loan) = (cameras(), self.ipc.loan().unwrap());
+        let cameras = cameras();
+        let mut loan = self.ipc.loan(ObservationWriter::len_for(&cameras)).unwrap();
         let mut writer = ObservationWriter::new(loan.memory(), self.seq, &cameras).unwrap();
         writer.planes(0, &cameras[0]).unwrap().depth_mm.fill(1500);
         writer.image_ready(0, &cameras[0], ImageStamps::default());

@@ -8,7 +8,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::prelude::{AttributeSpecifier, PortFactory as _};
+use iceoryx2::prelude::{AllocationStrategy, AttributeSpecifier, PortFactory as _};
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use vizflyt_protocol::PROTOCOL_VERSION;
@@ -27,7 +27,6 @@ pub struct RuntimeEnd {
     wake_plugin: Notifier<Ipc>,
     wake_runtime: Listener<Ipc>,
     to_plugin_service: PortFactory<Ipc, [u8], ()>,
-    observation_len: usize,
     // Last, so that ports go before the node they belong to.
     node: Node<Ipc>,
 }
@@ -38,7 +37,8 @@ pub struct RuntimeEnd {
 pub struct LoanedObservation(SampleMut<Ipc, [u8], ()>);
 
 impl RuntimeEnd {
-    /// Creates the services under `prefix`, with room for observations of `observation_len` bytes.
+    /// Creates the services under `prefix`, with room for observations of `observation_len` bytes
+    /// to start with.
     ///
     /// # Errors
     /// [`IpcError::Transport`], as when shared memory is full or the prefix is in use.
@@ -71,6 +71,8 @@ impl RuntimeEnd {
             .map_err(IpcError::transport(creating))?
             .publisher_builder()
             .initial_max_slice_len(observation_len)
+            // Cameras may grow while flying; the memory follows.
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .max_loaned_samples(2)
             .create()
             .map_err(IpcError::transport(port))?;
@@ -122,7 +124,6 @@ impl RuntimeEnd {
             wake_plugin,
             wake_runtime,
             to_plugin_service,
-            observation_len,
             node,
         })
     }
@@ -148,12 +149,13 @@ impl RuntimeEnd {
         let _ = self.wake_plugin.notify();
     }
 
-    /// Lends shared memory for one observation: zeros, aligned to 64.
+    /// Lends shared memory for one observation of `len` bytes: zeros, aligned to 64. More than ever
+    /// before takes longer once.
     ///
     /// # Errors
-    /// [`IpcError::Transport`] if two are lent already.
-    pub fn loan(&self) -> Result<LoanedObservation, IpcError> {
-        let sample = self.observations.loan_slice(self.observation_len);
+    /// [`IpcError::Transport`] if two are lent already, or there is not so much memory.
+    pub fn loan(&self, len: usize) -> Result<LoanedObservation, IpcError> {
+        let sample = self.observations.loan_slice(len);
         Ok(LoanedObservation(sample.map_err(IpcError::transport("lending memory"))?))
     }
 
@@ -185,6 +187,11 @@ impl RuntimeEnd {
 }
 
 impl LoanedObservation {
+    /// Returns what was written.
+    pub fn bytes(&self) -> &[u8] {
+        self.0.payload()
+    }
+
     /// Returns the memory to write into.
     pub fn memory(&mut self) -> &mut [u8] {
         self.0.payload_mut()

@@ -21,7 +21,8 @@ fn cameras() -> Vec<CameraInfo> {
 }
 
 fn publish(runtime: &RuntimeEnd, seq: u64) {
-    let (cameras, mut loan) = (cameras(), runtime.loan().unwrap());
+    let cameras = cameras();
+    let mut loan = runtime.loan(ObservationWriter::len_for(&cameras)).unwrap();
     let mut writer = ObservationWriter::new(loan.memory(), seq, &cameras).unwrap();
     let planes = writer.planes(0, &cameras[0]).unwrap();
     planes.rgb.fill(seq as u8);

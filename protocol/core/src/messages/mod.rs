@@ -5,7 +5,8 @@
 //! 1. each side sends its [`crate::packet::Preamble`] and checks the other's;
 //! 2. the runtime sends [`ToServer::Hello`]; the server answers [`ToRuntime::Welcome`] or
 //!    [`ToRuntime::Refused`];
-//! 3. then poses, events and clock replies flow down; telemetry, events and clock requests up.
+//! 3. then poses, events, changed cameras and clock replies flow down; telemetry, events and clock
+//!    requests up.
 //!
 //! Each message is framed by [`crate::packet::framing`]. Plugin messages ([`ToPlugin`],
 //! [`FromPlugin`]) use the same encoding over shared-memory queues.

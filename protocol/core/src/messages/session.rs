@@ -59,6 +59,14 @@ pub enum ToRuntime {
     Pose(PoseSample),
     /// Something happened.
     Event(Event),
+    /// A camera was changed while flying. Images drawn with it may come before this does: each
+    /// says itself how it was drawn.
+    Camera {
+        /// Index into [`ArenaInfo::cameras`].
+        index: u8,
+        /// The camera as it is from now on; its name stays.
+        camera: CameraInfo,
+    },
 }
 
 /// The vehicle's pose as localized and fused by the server.

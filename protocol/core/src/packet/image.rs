@@ -5,7 +5,7 @@ use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::PROTOCOL_VERSION;
-use crate::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
+use crate::geometry::{Body, Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 use crate::time::ServerTime;
 
 /// Who, when, from where; then `payload_len` bytes of RGB-D bitstream (`vizflyt-rgbd`).
@@ -41,6 +41,10 @@ pub struct ImageHeader {
     pub translation_m: [F64; 3],
     /// Camera to world rotation, xyzw.
     pub rotation_xyzw: [F64; 4],
+    /// Camera position in the body: cameras may be moved while flying. [m, body]
+    pub mount_m: [F64; 3],
+    /// Camera to body rotation, xyzw.
+    pub mount_xyzw: [F64; 4],
     /// fx, fy, cx, cy. [px]
     pub intrinsics_px: [F64; 4],
     /// Coefficients in the order of OpenCV, the rest 0.
@@ -53,7 +57,9 @@ pub struct ImageHeader {
     pub depth_unit_m: F64,
     /// Bytes of bitstream that follow.
     pub payload_len: U32,
-    reserved2: U32,
+    /// The cameras whose images leave together with this one, bit by index: a receiver that has
+    /// them all need not wait for cameras of another rate. 0 is not known.
+    pub together: U32,
 }
 
 /// Why bytes are no image header.
@@ -90,9 +96,11 @@ impl ImageHeader {
         camera: u8,
         pose: ServerTime,
         k: &Intrinsics,
-        world_from_cam: &Pose<World, Cam>,
+        body_from_cam: &Pose<Body, Cam>,
+        world_from_body: &Pose<World, Body>,
     ) -> Self {
         let (distortion_model, distortion) = k.distortion.to_wire();
+        let world_from_cam = *world_from_body * *body_from_cam;
         Self {
             magic: Self::MAGIC,
             version: PROTOCOL_VERSION.into(),
@@ -107,13 +115,15 @@ impl ImageHeader {
             send_ns: 0.into(),
             translation_m: world_from_cam.translation_m.to_array().map(F64::new),
             rotation_xyzw: world_from_cam.rotation.to_array().map(F64::new),
+            mount_m: body_from_cam.translation_m.to_array().map(F64::new),
+            mount_xyzw: body_from_cam.rotation.to_array().map(F64::new),
             intrinsics_px: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(F64::new),
             distortion: distortion.map(F64::new),
             width_px: k.width_px.into(),
             height_px: k.height_px.into(),
             depth_unit_m: F64::new(0.001),
             payload_len: 0.into(),
-            reserved2: 0.into(),
+            together: 0.into(),
         }
     }
 
@@ -129,7 +139,8 @@ impl ImageHeader {
         }
         header.intrinsics().validate().map_err(InvalidImageHeader::Intrinsics)?;
         let unit_m = header.depth_unit_m.get();
-        if !(header.world_from_cam().is_valid() && (1e-6..=1.0).contains(&unit_m)) {
+        let posed = header.world_from_cam().is_valid() && header.body_from_cam().is_valid();
+        if !(posed && (1e-6..=1.0).contains(&unit_m)) {
             return Err(InvalidImageHeader::Pose);
         }
         // Eight bytes a pixel and some overhead exceed every mode of the bitstream.
@@ -150,11 +161,8 @@ impl ImageHeader {
             fy_px,
             cx_px,
             cy_px,
-            distortion: Distortion::from_wire(
-                self.distortion_model,
-                self.distortion.map(F64::get),
-            )
-            .unwrap_or_default(),
+            distortion: Distortion::from_wire(self.distortion_model, self.distortion.map(F64::get))
+                .unwrap_or_default(),
         }
     }
 
@@ -163,6 +171,14 @@ impl ImageHeader {
         Pose::new(
             DVec3::from_array(self.translation_m.map(F64::get)),
             DQuat::from_array(self.rotation_xyzw.map(F64::get)),
+        )
+    }
+
+    /// Returns where the camera sat on the body.
+    pub fn body_from_cam(&self) -> Pose<Body, Cam> {
+        Pose::new(
+            DVec3::from_array(self.mount_m.map(F64::get)),
+            DQuat::from_array(self.mount_xyzw.map(F64::get)),
         )
     }
 
@@ -179,7 +195,9 @@ mod tests {
 
     fn header() -> ImageHeader {
         let k = Intrinsics::from_horizontal_fov(320, 240, 1.3);
-        ImageHeader::new(9, 1, ServerTime::from_ns(77), &k, &Pose::IDENTITY)
+        let body_from_cam = crate::geometry::body_from_forward_cam(DVec3::X, 0.2);
+        let world_from_body = Pose::new(DVec3::Z, DQuat::from_rotation_z(0.5));
+        ImageHeader::new(9, 1, ServerTime::from_ns(77), &k, &body_from_cam, &world_from_body)
     }
 
     #[test]
@@ -189,12 +207,19 @@ mod tests {
         assert_eq!(found, sent);
         assert!(rest.is_empty());
         assert_eq!(found.pose_stamp(), ServerTime::from_ns(77));
+        // 1 m ahead of a body that is turned by 0.5 rad, 1 m up.
+        let p = found.world_from_cam().translation_m;
+        assert!((p - DVec3::new(0.87758, 0.47943, 1.0)).length() < 1e-5, "{p}");
+        assert_eq!(found.body_from_cam().translation_m, DVec3::X);
     }
 
     #[test]
     fn poison_is_refused() {
         let mut h = header();
         h.rotation_xyzw = [0.0; 4].map(F64::new);
+        assert_eq!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Pose));
+        let mut h = header();
+        h.mount_m[1] = F64::new(f64::NAN);
         assert_eq!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Pose));
         let mut h = header();
         h.payload_len = u32::MAX.into();

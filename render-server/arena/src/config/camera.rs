@@ -201,6 +201,14 @@ impl CameraConfig {
         }
     }
 
+    /// Checks every value but the name: for a camera that is changed later.
+    ///
+    /// # Errors
+    /// [`ConfigError::Invalid`] for the first value that cannot work.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.check(str::to_owned)
+    }
+
     /// Checks all but the name, which must differ from other cameras'; `key` names a field.
     pub(super) fn check(&self, key: impl Fn(&str) -> String) -> Result<(), ConfigError> {
         self.check_intrinsics(&key)?;

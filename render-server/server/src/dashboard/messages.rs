@@ -3,16 +3,17 @@
 use std::sync::atomic::Ordering;
 
 use serde::Serialize;
-use vizflyt_arena::config::StageConfig;
-use vizflyt_protocol::geometry::{Volume, yaw_of};
+use vizflyt_arena::config::{CameraConfig, StageConfig};
+use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
 use vizflyt_protocol::messages::{Event, Telemetry};
 use vizflyt_protocol::time::ServerTime;
 
 use super::Page;
+use crate::cameras::CameraSet;
 use crate::clock;
 use crate::drivers::SourceCounters;
 use crate::events::{Entry, Origin};
-use crate::hub::lock;
+use crate::hub::{RendererInfo, lock};
 use crate::map::Obstacles;
 use crate::stats::{Percentiles, Rate};
 
@@ -21,6 +22,10 @@ use crate::stats::{Percentiles, Rate};
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(super) enum Message<'a> {
     Arena(Arena<'a>),
+    /// The cameras, after one was changed.
+    Cameras {
+        cameras: Vec<CameraLine>,
+    },
     /// (x, y, z [m, world], speed [m/s]), oldest first.
     Trail {
         points: &'a [[f32; 4]],
@@ -37,14 +42,14 @@ pub(super) struct Arena<'a> {
     boot: String,
     name: &'a str,
     vehicle: &'a str,
-    renderer: &'a str,
+    renderer: &'a RendererInfo,
     fence: &'a Volume,
     goal_m: Option<[f64; 3]>,
     goal_radius_m: f64,
     body_radius_m: f64,
     max_speed_mps: f64,
     time_limit_s: f64,
-    cameras: Vec<CameraLine<'a>>,
+    cameras: Vec<CameraLine>,
     /// Corners of the top view's picture. [m, world]
     map_min_m: [f64; 2],
     map_max_m: [f64; 2],
@@ -52,11 +57,12 @@ pub(super) struct Arena<'a> {
     stages: &'a [StageConfig],
 }
 
+/// A camera: the keys of `[[cameras]]`, and what follows from them.
 #[derive(Debug, Serialize)]
-struct CameraLine<'a> {
-    name: &'a str,
-    width_px: u32,
-    height_px: u32,
+pub(super) struct CameraLine {
+    #[serde(flatten)]
+    config: CameraConfig,
+    intrinsics: Intrinsics,
 }
 
 /// One event of the feed.
@@ -133,20 +139,25 @@ pub(super) fn arena(page: &Page) -> Message<'_> {
         body_radius_m: info.body_radius_m,
         max_speed_mps: info.limits.max_speed_mps,
         time_limit_s: info.time_limit_s,
-        cameras: info
-            .cameras
-            .iter()
-            .map(|camera| CameraLine {
-                name: &camera.name,
-                width_px: camera.intrinsics.width_px,
-                height_px: camera.intrinsics.height_px,
-            })
-            .collect(),
+        cameras: camera_lines(&page.hub.cameras.newest()),
         map_min_m: page.map.min_m,
         map_max_m: page.map.max_m,
         obstacles: &page.map.obstacles,
         stages: &page.stages,
     })
+}
+
+pub(super) fn cameras(set: &CameraSet) -> Message<'static> {
+    Message::Cameras { cameras: camera_lines(set) }
+}
+
+/// Returns the cameras as page and API show them.
+pub(super) fn camera_lines(set: &CameraSet) -> Vec<CameraLine> {
+    let line = |config: &CameraConfig| CameraLine {
+        config: config.clone(),
+        intrinsics: config.intrinsics(),
+    };
+    set.configs.iter().map(line).collect()
 }
 
 pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {

@@ -6,10 +6,14 @@
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins
 //! GET /api/map     the top view: a JPEG drawn at the start
 //! POST /api/estop  EmergencyStop to the runtime
+//! GET /api/cameras          the cameras of this moment, JSON
+//! PUT /api/cameras/NAME     a whole camera, by the keys of `[[cameras]]`; from the next tick on
+//! PATCH /api/cameras/NAME   as PUT, but only what is given changes
 //! ```
 //! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
 //! nobody. Only pages of the same origin may watch or stop ([`origin`]).
 
+mod cameras;
 mod messages;
 mod origin;
 mod viewer;
@@ -19,10 +23,10 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use axum::Router;
-use axum::extract::{State, WebSocketUpgrade};
+use axum::extract::{DefaultBodyLimit, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post};
+use axum::routing::{get, post, put};
 use tokio::net::TcpListener;
 use tracing::warn;
 use vizflyt_arena::config::StageConfig;
@@ -83,7 +87,11 @@ fn router(page: Arc<Page>) -> Router {
         .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/api/map", get(map))
         .route("/api/estop", post(estop))
+        .route("/api/cameras", get(cameras::list))
+        .route("/api/cameras/{name}", put(cameras::put).patch(cameras::patch))
         .route("/ws", get(watch))
+        // A camera takes some hundred bytes.
+        .layer(DefaultBodyLimit::max(16 << 10))
         .with_state(page)
 }
 

@@ -49,6 +49,7 @@ pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
 async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
     let hub = &page.hub;
     let mut log = hub.events.subscribe();
+    let mut cameras = hub.cameras.subscribe();
     let (entries, mut cursor) = hub.events.newest(HISTORY);
     send_json(socket, &messages::arena(page)).await?;
     let points = lock(&hub.trail).points.clone();
@@ -79,6 +80,10 @@ async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
                 if !entries.is_empty() {
                     send_json(socket, &messages::events(page, entries)).await?;
                 }
+            }
+            _ = cameras.changed() => {
+                let newest = cameras.borrow_and_update().clone();
+                send_json(socket, &messages::cameras(&newest)).await?;
             }
             _ = tick.tick() => {
                 send_json(socket, &messages::state(page)).await?;

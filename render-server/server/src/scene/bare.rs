@@ -18,10 +18,9 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{CameraConfig, Geofence, Occupancy, Spawn};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
-use vizflyt_splat::{Camera, RgbdImage, Splats};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use super::orient::{Up, WorldFromScene};
-use crate::render::best;
 
 /// Returns the similarity that puts a captured scene upright, to size, onto z = 0, its middle at
 /// the origin. `scale` is world metres per scene unit; `None` estimates it.
@@ -81,7 +80,7 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
 /// file. But seen from elsewhere it is blur and void, and that a picture shows: so small pictures
 /// are drawn from everywhere and compared.
 fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
-    let mut renderer = best(splats);
+    let mut renderer = CpuRenderer::new(splats);
     let mut images = vec![RgbdImage::default(); HEADINGS];
     let mut found = (f32::NEG_INFINITY, DVec3::ZERO, 0.0);
     for &place in places {
@@ -99,7 +98,7 @@ fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
                 }
             })
             .collect();
-        if renderer.draw(&cameras, &mut images).is_err() {
+        if renderer.render(&[], &cameras, &mut images).is_err() {
             continue;
         }
         for (k, image) in images.iter().enumerate() {

@@ -15,6 +15,7 @@ use vizflyt_protocol::time::ServerTime;
 use zerocopy::IntoBytes;
 
 use super::{END, FOREIGN, REFUSED, REPLACED, SLOW, images};
+use crate::cameras::CameraSet;
 use crate::clock;
 use crate::events::Origin;
 use crate::hub::{Hub, Seat};
@@ -130,7 +131,7 @@ async fn fly(
     ending
 }
 
-/// Server to runtime: events first, then clock replies, then the newest pose.
+/// Server to runtime: events first, then changed cameras, clock replies, and the newest pose.
 async fn down(
     hub: &Hub,
     seat: &Seat,
@@ -142,7 +143,9 @@ async fn down(
     let mut log = hub.events.subscribe();
     log.mark_changed();
     let mut cursor = seat.first_event;
-    if let Err(ending) = out.write(&ToRuntime::Welcome(hub.arena.clone())).await {
+    let mut cameras = hub.cameras.subscribe();
+    let mut told = cameras.borrow_and_update().clone();
+    if let Err(ending) = out.write(&ToRuntime::Welcome(hub.welcome(&told))).await {
         return ending;
     }
     let mut last_pose = ServerTime::ZERO;
@@ -152,6 +155,11 @@ async fn down(
             _ = log.changed() => {
                 log.mark_unchanged();
                 tell(hub, &mut out, &mut cursor).await
+            }
+            _ = cameras.changed() => {
+                let newest = cameras.borrow_and_update().clone();
+                let before = std::mem::replace(&mut told, newest);
+                tell_cameras(&mut out, &before, &told).await
             }
             Some(request) = clock_requests.recv() => {
                 let reply = ClockReply { sent: request.sent, answered: clock::now() };
@@ -179,6 +187,20 @@ async fn tell(hub: &Hub, out: &mut Outbound, cursor: &mut u64) -> Result<(), End
     for entry in entries {
         if entry.origin == Origin::Server {
             out.write(&ToRuntime::Event(entry.event)).await?;
+        }
+    }
+    Ok(())
+}
+
+async fn tell_cameras(
+    out: &mut Outbound,
+    before: &CameraSet,
+    now: &CameraSet,
+) -> Result<(), Ending> {
+    for (index, camera) in now.infos.iter().enumerate() {
+        if before.infos.get(index) != Some(camera) {
+            let camera = camera.clone();
+            out.write(&ToRuntime::Camera { index: index as u8, camera }).await?;
         }
     }
     Ok(())

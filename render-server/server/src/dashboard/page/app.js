@@ -87,7 +87,7 @@ function hearArena(arena) {
   document.title = `${arena.name} · VizFlyt`;
   $("arena").textContent = arena.name;
   $("vehicle").textContent = arena.vehicle;
-  $("renderer").textContent = `renderer: ${arena.renderer}`;
+  $("renderer").textContent = `renderer: ${arena.renderer.name} (${arena.renderer.reason})`;
   $("speed-top").textContent = `${Math.max(1, arena.max_speed_mps)} m/s`;
   view.setArena(arena);
   const tabs = arena.cameras.map((camera, index) => {

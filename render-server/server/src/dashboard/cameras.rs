@@ -1,0 +1,87 @@
+//! The cameras over HTTP: read by anyone who may read the page, changed by our own page only.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::rejection::BytesRejection;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use vizflyt_arena::config::CameraConfig;
+use vizflyt_protocol::messages::EventKind;
+
+use super::{Page, messages, origin, refuse};
+use crate::cameras::ChangeError;
+
+/// Answers with all cameras.
+pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
+    Json(messages::camera_lines(&page.hub.cameras.newest())).into_response()
+}
+
+/// Replaces a camera.
+pub(super) async fn put(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    change(&page, &headers, body, |json| page.hub.cameras.put(&name, json))
+}
+
+/// Changes a camera.
+pub(super) async fn patch(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    change(&page, &headers, body, |json| page.hub.cameras.patch(&name, json))
+}
+
+fn change(
+    page: &Page,
+    headers: &HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+    apply: impl FnOnce(&[u8]) -> Result<CameraConfig, ChangeError>,
+) -> Response {
+    if let Err(refusal) = origin::check(headers) {
+        return refuse(&refusal);
+    }
+    let body = match body {
+        Ok(body) => body,
+        Err(rejection) => return rejection.into_response(),
+    };
+    match apply(&body) {
+        Ok(camera) => {
+            page.hub.tell(EventKind::Note, &describe(&camera));
+            Json(camera).into_response()
+        }
+        Err(error @ ChangeError::Unknown { .. }) => {
+            (StatusCode::NOT_FOUND, error.to_string()).into_response()
+        }
+        Err(error) => (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
+    }
+}
+
+/// Returns the camera in a line, for the page and the flight log.
+fn describe(camera: &CameraConfig) -> String {
+    let k = camera.intrinsics();
+    let lens = match k.distortion.to_wire().0 {
+        0 => "",
+        1 => ", Brown-Conrady",
+        _ => ", Kannala-Brandt",
+    };
+    let rate = camera.rate_hz.map_or_else(String::new, |hz| format!(", {hz} Hz at most"));
+    format!(
+        "camera {} is now {}x{} px, fx {:.1}, fy {:.1}{lens}, near {} m, at {} tilted {} deg{rate}",
+        camera.name,
+        k.width_px,
+        k.height_px,
+        k.fx_px,
+        k.fy_px,
+        camera.near_m,
+        camera.position_m,
+        camera.tilt_deg
+    )
+}
