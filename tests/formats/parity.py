@@ -7,8 +7,8 @@ DIR holds venv/ and node_modules/ (tests/formats/run installs them); CONVERT is 
 For every tool, format and degree of harmonics there are up to two comparisons: "we read theirs" (they
 write the known scene, we convert it to PLY) and "they read ours" (we write it, they convert it to PLY).
 Splats are matched by position and must agree within what the format's steps allow. A line each; the
-last says how many passed. --keep copies the files the tools wrote, which is how the fixtures of
-render-server/splat/tests/data/formats were made.
+last says how many passed. --keep copies the files the tools wrote and the known scenes, which is how
+the fixtures of render-server/splat/tests/data/formats were made.
 """
 import argparse, json, pathlib, shutil, subprocess, sys, tempfile
 import numpy as np
@@ -228,6 +228,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--tools', type=pathlib.Path, required=True)
     parser.add_argument('--keep', type=pathlib.Path)
+    parser.add_argument('--count', type=int, help='splats of every scene')
     parser.add_argument('--only', default='', help='part of "tool format"')
     parser.add_argument('convert', type=pathlib.Path)
     args = parser.parse_args()
@@ -241,7 +242,7 @@ def main():
             nonlocal passed, failed
             label = f'{tool:24} {kind:15} degree {degree}  {way:18}'
             try:
-                worst = errors(truth, make(), degree)
+                worst = errors(truth(), make(), degree)
                 over = [f'{part} {e:.2g} > {limit:.2g}'
                         for part, e, limit in zip(PARTS, worst, loss) if not e <= limit]
                 figures = ', '.join(f'{part} {e:.2g}' for part, e in zip(PARTS, worst))
@@ -261,7 +262,7 @@ def main():
                 # The palettes of harmonics keep every splat's own at these sizes; sogpy has no
                 # smaller one than 1024.
                 count = 600 if kind != 'sog' else 1024 if 'sogpy' in tool else 256
-                truth = known(degree, count, 7 + degree)
+                truth = known(degree, args.count or count, 7 + degree)
                 source, given = scratch / f'known{degree}.ply', scratch / f'given{degree}.ply'
                 write_ply(source, truth)
                 write_ply(given, turn(truth))
@@ -274,6 +275,7 @@ def main():
                     if args.keep:
                         stem = f"{tool.split()[0]}-{kind.replace('.', '-')}-sh{degree}"
                         shutil.copy(theirs, args.keep / f'{stem}.{extension}')
+                        shutil.copy(source, args.keep / f'known-sh{degree}.ply')
                     run(convert, theirs, out)
                     return read_ply(out)
 
@@ -282,16 +284,21 @@ def main():
                     reader(ours, out)
                     return turn(read_ply(out))
 
-                if writer and note == 'same':
+                def judged():
                     writer(given, theirs)
                     run('node', folder / 'node_modules/@playcanvas/splat-transform/bin/cli.mjs',
                         '-q', '-w', theirs, judge)
-                    compare(tool, kind, degree, 'as splat-transform', read_ply(judge), read_theirs,
+                    return read_ply(judge)
+
+                if writer and note == 'same':
+                    compare(tool, kind, degree, 'as splat-transform', judged, read_theirs,
                             LOSS['same'])
                 elif writer:
-                    compare(tool, kind, degree, 'we read theirs', truth, read_theirs, LOSS[kind])
+                    compare(tool, kind, degree, 'we read theirs', lambda: truth, read_theirs,
+                            LOSS[kind])
                 if reader:
-                    compare(tool, kind, degree, 'they read ours', truth, they_read, LOSS[kind])
+                    compare(tool, kind, degree, 'they read ours', lambda: truth, they_read,
+                            LOSS[kind])
     print(f'{passed} passed, {failed} failed')
     return failed > 0 or passed == 0
 

@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::files::{Files, META};
-use super::meta::{Meta, Palette};
+use super::meta::{Meta, Palette, Table};
 use super::texture::Texture;
 use super::{PALETTE_WIDTH, QUATERNION_TAG, invalid};
 use crate::format::block::{Gaussian, decode_all};
@@ -100,10 +100,12 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
             let colour = colours.rgb(pixel);
             let constant = |channel: usize| meta.colours[channel][usize::from(colour[channel])];
             if let Some(harmonics) = &harmonics {
-                let entry = harmonics.entry(pixel);
+                let (entry, stride) = (harmonics.entry(pixel), harmonics.entries.channels);
                 block.put(i, &gaussian, |k, channel| match k {
                     0 => constant(channel),
-                    _ => entry[(k - 1) * 3 + channel],
+                    _ => entry
+                        .get((k - 1) * stride + channel)
+                        .map_or(0.0, |&byte| harmonics.values[usize::from(byte)]),
                 });
             } else {
                 block.put(i, &gaussian, |_, channel| constant(channel));
@@ -123,17 +125,19 @@ fn unwarp(warped: f32) -> f32 {
 /// The palette of harmonics and every splat's place in it.
 struct Harmonics<'a> {
     degree: u8,
-    /// Numbers of an entry.
-    length: usize,
-    /// Entry by entry, coefficient by coefficient, RGB within; one of zeros at the end.
-    values: Vec<f32>,
+    /// Coefficients of an entry, and so its pixels: rows are exactly as wide as their entries, so
+    /// that entries follow each other.
+    coefficients: usize,
+    count: usize,
+    values: &'a Table,
+    entries: &'a Texture,
     labels: &'a Texture,
 }
 
 impl<'a> Harmonics<'a> {
     fn new(
-        described: &Palette,
-        entries: &Texture,
+        described: &'a Palette,
+        entries: &'a Texture,
         labels: &'a Texture,
     ) -> Result<Self, FormatError> {
         let degree = [1u8, 2, 3]
@@ -144,24 +148,28 @@ impl<'a> Harmonics<'a> {
                 let (width, name) = (entries.width, &described.files[0]);
                 invalid(name, format!("{width} pixels wide, which fits no degree of harmonics"))
             })?;
-        let length = coefficients(degree) * 3;
         let room = PALETTE_WIDTH * entries.height;
-        let count = described.count.unwrap_or(room).min(room);
-        // Rows are exactly as wide as their entries, so that entries follow each other.
-        let mut values: Vec<f32> = (0..count * coefficients(degree))
-            .flat_map(|pixel| entries.rgb(pixel).map(|byte| described.values[usize::from(byte)]))
-            .collect();
-        values.resize(values.len() + length, 0.0);
-        Ok(Self { degree, length, values, labels })
+        Ok(Self {
+            degree,
+            coefficients: coefficients(degree),
+            count: described.count.unwrap_or(room).min(room),
+            values: &described.values,
+            entries,
+            labels,
+        })
     }
 
-    /// Returns a splat's harmonics; zeros, as the reference, where its label is beyond the palette.
+    /// Returns the pixels of a splat's entry; none, and so no harmonics, as the reference, where its
+    /// label is beyond the palette.
     #[inline]
-    fn entry(&self, pixel: usize) -> &[f32] {
+    fn entry(&self, pixel: usize) -> &[u8] {
         let [low, high, _] = self.labels.rgb(pixel);
-        let last = self.values.len() - self.length;
-        let at = usize::from(u16::from_le_bytes([low, high])) * self.length;
-        &self.values[at.min(last)..][..self.length]
+        let entry = usize::from(u16::from_le_bytes([low, high]));
+        if entry < self.count {
+            self.entries.run(entry * self.coefficients, self.coefficients)
+        } else {
+            &[]
+        }
     }
 }
 

@@ -12,7 +12,7 @@ pub(super) struct Texture {
     pub(super) width: usize,
     pub(super) height: usize,
     /// Bytes per pixel, 3 or 4.
-    channels: usize,
+    pub(super) channels: usize,
     bytes: Vec<u8>,
 }
 
@@ -48,6 +48,12 @@ impl Texture {
     pub(super) fn rgb(&self, pixel: usize) -> [u8; 3] {
         let at = pixel * self.channels;
         [self.bytes[at], self.bytes[at + 1], self.bytes[at + 2]]
+    }
+
+    /// Returns all bytes of a run of pixels.
+    #[inline]
+    pub(super) fn run(&self, first: usize, pixels: usize) -> &[u8] {
+        &self.bytes[first * self.channels..(first + pixels) * self.channels]
     }
 
     /// Returns alpha of a pixel; 255 where there is none.
