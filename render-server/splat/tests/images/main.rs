@@ -2,8 +2,10 @@
 
 mod agreement;
 mod compare;
+mod corners;
 mod fisheye;
 mod npz;
 mod objects;
 mod oracle;
 mod poison;
+mod renderers;
