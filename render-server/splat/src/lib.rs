@@ -39,6 +39,8 @@ mod camera;
 mod choose;
 mod cpu;
 pub mod format;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 mod harmonics;
 mod image;
 mod limits;

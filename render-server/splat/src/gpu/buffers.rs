@@ -1,0 +1,145 @@
+//! What passes leave for each other; kept from tick to tick, and only ever grown.
+//!
+//! Two sizes depend on what a camera sees, and are known to the device alone: regions (256 slots,
+//! one per visible block) and pairs (of tile and splat). The device counts what it wants and uses
+//! what there is; the counts come back with the images, and where there was too little the buffers
+//! are grown and the tick is drawn again (`read.rs`).
+//!
+//! Memory: 68 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile, 16 (20 with objects)
+//! per pixel, and as much per pixel again for each of two staging buffers.
+
+use super::device::Device;
+use super::scene::BLOCK;
+use super::sort;
+
+/// How much there must be room for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Room {
+    /// Cameras times parts.
+    pub(super) views: u64,
+    /// Cameras times blocks.
+    pub(super) camera_blocks: u64,
+    pub(super) regions: u64,
+    pub(super) pairs: u64,
+    pub(super) tiles: u64,
+    pub(super) pixels: u64,
+    /// Digits of a tile's number; not grown but equalled.
+    pub(super) tile_digits: u32,
+}
+
+impl Room {
+    /// Returns the greatest that a device can give.
+    pub(super) fn limit(binding_bytes: u64) -> Self {
+        // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
+        let slots = (binding_bytes / 16).min(65_535 * 256);
+        Self {
+            views: binding_bytes / 272,
+            // Ranks, and a number per workgroup.
+            camera_blocks: (binding_bytes / 4 * 255 / 256).min(65_535 * 256),
+            regions: slots / BLOCK as u64,
+            // The counts of the sort take half a byte each; fewer than 65535 groups sort them.
+            pairs: (binding_bytes / 4).min(65_535 * sort::SORT_GROUP),
+            tiles: binding_bytes / 8,
+            pixels: binding_bytes / 16,
+            tile_digits: 4,
+        }
+    }
+
+    /// Whether it holds another.
+    pub(super) fn holds(&self, other: &Self) -> bool {
+        self.pairwise(other).iter().all(|(has, wants)| has >= wants)
+            && self.tile_digits == other.tile_digits
+    }
+
+    /// Whether a device can give it.
+    pub(super) fn is_within(&self, limit: &Self) -> bool {
+        self.pairwise(limit).iter().all(|(wants, limit)| wants <= limit)
+    }
+
+    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
+        let grow = |has: u64, wants: u64, limit: u64| {
+            if has >= wants { has } else { (wants + wants / 4).min(limit) }
+        };
+        Self {
+            views: grow(self.views, other.views, limit.views),
+            camera_blocks: grow(self.camera_blocks, other.camera_blocks, limit.camera_blocks),
+            regions: grow(self.regions, other.regions, limit.regions),
+            pairs: grow(self.pairs, other.pairs, limit.pairs),
+            tiles: grow(self.tiles, other.tiles, limit.tiles),
+            pixels: grow(self.pixels, other.pixels, limit.pixels),
+            tile_digits: other.tile_digits,
+        }
+    }
+
+    fn pairwise(&self, other: &Self) -> [(u64, u64); 6] {
+        [
+            (self.views, other.views),
+            (self.camera_blocks, other.camera_blocks),
+            (self.regions, other.regions),
+            (self.pairs, other.pairs),
+            (self.tiles, other.tiles),
+            (self.pixels, other.pixels),
+        ]
+    }
+}
+
+/// The buffers; named as in the shaders.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    pub(super) room: Room,
+    pub(super) tick: wgpu::Buffer,
+    pub(super) views: wgpu::Buffer,
+    pub(super) regions: wgpu::Buffer,
+    pub(super) sizes: wgpu::Buffer,
+    pub(super) dispatches: wgpu::Buffer,
+    pub(super) shapes: wgpu::Buffer,
+    pub(super) extents: wgpu::Buffer,
+    pub(super) colours: wgpu::Buffer,
+    pub(super) keys: [wgpu::Buffer; 2],
+    pub(super) order: [wgpu::Buffer; 2],
+    /// Of sorts.
+    pub(super) digits: wgpu::Buffer,
+    /// Tiles per splat.
+    pub(super) counts: wgpu::Buffer,
+    pub(super) tiles: [wgpu::Buffer; 2],
+    pub(super) slots: [wgpu::Buffer; 2],
+    pub(super) lists: wgpu::Buffer,
+    pub(super) pixels: wgpu::Buffer,
+    pub(super) ids: wgpu::Buffer,
+}
+
+/// Bytes of `sizes`.
+pub(super) const SIZES_BYTES: u64 = 32;
+
+impl Buffers {
+    pub(super) fn new(device: &Device, room: Room, has_ids: bool) -> Self {
+        let storage = |label: &str, words: u64| device.storage(label, words * 4);
+        let source = |label: &str, words: u64| {
+            let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
+            device.buffer(label, words * 4, usage)
+        };
+        let indirect = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::INDIRECT;
+        let slots = room.regions * BLOCK as u64;
+        Self {
+            room,
+            tick: device.uniform("tick", &[0; 32]),
+            views: storage("views", room.views * 68),
+            regions: storage("regions", room.camera_blocks + room.camera_blocks.div_ceil(256)),
+            sizes: source("sizes", SIZES_BYTES / 4),
+            dispatches: device.buffer("dispatches", 64, indirect),
+            shapes: storage("shapes", slots * 4),
+            extents: storage("extents", slots * 4),
+            colours: storage("colours", slots * 4),
+            keys: [storage("keys", slots), storage("keys", slots)],
+            order: [storage("order", slots), storage("order", slots)],
+            digits: device.storage("digits", sort::count_bytes(slots.max(room.pairs))),
+            counts: storage("counts", slots + slots.div_ceil(256)),
+            tiles: [storage("tiles", room.pairs), storage("tiles", room.pairs)],
+            slots: [storage("slots", room.pairs), storage("slots", room.pairs)],
+            lists: storage("lists", room.tiles * 2),
+            pixels: source("pixels", room.pixels * 4),
+            ids: source("ids", if has_ids { room.pixels } else { 0 }),
+        }
+    }
+}

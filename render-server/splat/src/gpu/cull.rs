@@ -1,0 +1,60 @@
+//! Pass 1: which blocks each camera may see.
+//!
+//! Budget: 32 bytes read per block of 256 splats and camera, 4 written; two dispatches, some 5 us
+//! per million splats.
+
+use super::device::{Device, Groups, Kernel};
+use super::buffers::Buffers;
+use super::scene::GpuScene;
+
+const SOURCE: &str =
+    concat!(include_str!("common.wgsl"), include_str!("scan.wgsl"), include_str!("sizes.wgsl"), include_str!("cull.wgsl"));
+
+/// The pass.
+#[derive(Debug)]
+pub(super) struct Cull {
+    cull: Kernel,
+    place: Kernel,
+}
+
+/// Its buffers, bound.
+#[derive(Debug)]
+pub(super) struct CullBindings {
+    cull: wgpu::BindGroup,
+    place: wgpu::BindGroup,
+}
+
+impl Cull {
+    pub(super) fn new(device: &Device) -> Self {
+        Self { cull: device.kernel(SOURCE, "cull", &[]), place: device.kernel(SOURCE, "place", &[]) }
+    }
+
+    pub(super) fn bind(&self, device: &Device, scene: &GpuScene, buffers: &Buffers) -> CullBindings {
+        CullBindings {
+            cull: device.bind(
+                &self.cull,
+                &[(0, &buffers.tick), (1, &buffers.views), (2, &scene.blocks), (3, &buffers.regions)],
+            ),
+            place: device.bind(
+                &self.place,
+                &[
+                    (0, &buffers.tick),
+                    (3, &buffers.regions),
+                    (4, &buffers.sizes),
+                    (5, &buffers.dispatches),
+                ],
+            ),
+        }
+    }
+
+    /// Runs for `count` pairs of camera and block.
+    pub(super) fn run(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &CullBindings,
+        count: u32,
+    ) {
+        self.cull.run(pass, &bindings.cull, Groups::Known(count.div_ceil(256), 1));
+        self.place.run(pass, &bindings.place, Groups::Known(1, 1));
+    }
+}

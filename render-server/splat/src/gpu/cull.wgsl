@@ -1,0 +1,88 @@
+// Pass 1: which blocks of splats each camera may see, and the region of slots of each.
+
+struct Block {
+    /// Middle of the box around the centres. [m, part]
+    center: vec3<f32>,
+    /// Greatest distance from its centre at which a splat of it still counts. [m]
+    reach: f32,
+    /// Half the sides of that box. [m]
+    half_size: vec3<f32>,
+    part: u32,
+}
+
+@group(0) @binding(0) var<uniform> tick: Tick;
+@group(0) @binding(1) var<storage, read> views: array<View>;
+@group(0) @binding(2) var<storage, read> blocks: array<Block>;
+// Per camera and block: 0, or 1 more than the region counted from the workgroup's first; then each
+// workgroup's number of regions, later its first.
+@group(0) @binding(3) var<storage, read_write> regions: array<u32>;
+@group(0) @binding(4) var<storage, read_write> sizes: array<u32>;
+@group(0) @binding(5) var<storage, read_write> dispatches: array<u32>;
+
+fn is_seen(block: Block, view: View) -> bool {
+    let center = block.center - vec3(view.row_x.w, view.row_y.w, view.row_z.w);
+    let farthest = max(max(abs(center.x), abs(center.y)), abs(center.z));
+    for (var i = 0u; i < 5u; i++) {
+        let plane = view.planes[i];
+        let slack = dot(abs(plane.xyz), block.half_size) + block.reach * view.weights[i / 4u][i % 4u];
+        // The rounding of the sums, so that nothing is lost at the very edge.
+        let rounding = 1e-5 * (farthest + slack);
+        if dot(plane.xyz, center) + slack + rounding < plane.w {
+            return false;
+        }
+    }
+    return true;
+}
+
+@compute @workgroup_size(256)
+fn cull(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let total = tick.cameras * tick.blocks;
+    let index = group.x * 256u + thread;
+    var seen = 0u;
+    if index < total {
+        let block = blocks[index % tick.blocks];
+        let view = index / tick.blocks * tick.parts + block.part;
+        if views[view].flags.y != 0u && is_seen(block, views[view]) {
+            seen = 1u;
+        }
+    }
+    let before = scan(thread, seen);
+    if index < total {
+        regions[index] = select(0u, before + 1u, seen == 1u);
+    }
+    if thread == 0u {
+        regions[total + group.x] = scan_total;
+    }
+}
+
+// One workgroup: turns numbers of regions into first regions.
+@compute @workgroup_size(256)
+fn place(@builtin(local_invocation_index) thread: u32) {
+    let total = tick.cameras * tick.blocks;
+    let groups = (total + 255u) / 256u;
+    var carry = 0u;
+    for (var first = 0u; first < groups; first += 256u) {
+        let i = first + thread;
+        var count = 0u;
+        if i < groups {
+            count = regions[total + i];
+        }
+        let before = scan(thread, count);
+        if i < groups {
+            regions[total + i] = carry + before;
+        }
+        carry += scan_total;
+        workgroupBarrier();
+    }
+    if thread == 0u {
+        sizes[REGIONS_WANTED] = carry;
+        let slots = min(carry, tick.regions) * BLOCK;
+        sizes[SLOTS] = slots;
+        dispatches[SORT_SLOTS] = (slots + SORT_GROUP - 1u) / SORT_GROUP;
+        dispatches[SORT_SLOTS + 1u] = 1u;
+        dispatches[SORT_SLOTS + 2u] = 1u;
+    }
+}

@@ -1,0 +1,237 @@
+//! Which adapter draws, and the device on it.
+//!
+//! Devices fail: drivers reset, cards are unplugged, memory runs out. Every error ends up in one
+//! place ([`Device::fault`]), asked after each tick; nothing panics.
+
+use std::future::Future;
+use std::pin::pin;
+use std::sync::{Arc, OnceLock};
+use std::task::{Context, Poll, Waker};
+
+use super::Budget;
+
+/// What adapters are there, for reports.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AdapterName {
+    /// As the driver says: `NVIDIA GeForce RTX 3080 (Vulkan)`.
+    pub name: String,
+    /// Whether it is the processor in disguise (llvmpipe, SwiftShader, WARP).
+    pub is_software: bool,
+}
+
+/// An adapter that can draw.
+#[derive(Debug)]
+pub struct Adapter {
+    inner: wgpu::Adapter,
+    name: AdapterName,
+}
+
+impl Adapter {
+    /// Returns all adapters that can draw, the likely fastest first.
+    pub fn all() -> Vec<Self> {
+        // No check of indirect dispatches: their arguments are ours, and bounded by the buffers.
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+            flags: wgpu::InstanceFlags::empty(),
+            ..wgpu::InstanceDescriptor::new_without_display_handle()
+        });
+        let mut adapters: Vec<_> = ready(instance.enumerate_adapters(wgpu::Backends::all()))
+            .into_iter()
+            .filter(|adapter| {
+                let downlevel = adapter.get_downlevel_capabilities();
+                downlevel.flags.contains(
+                    wgpu::DownlevelFlags::COMPUTE_SHADERS | wgpu::DownlevelFlags::INDIRECT_EXECUTION,
+                ) && wgpu::Limits::default().check_limits(&adapter.limits())
+            })
+            .collect();
+        adapters.sort_by_key(|adapter| {
+            match adapter.get_info().device_type {
+                wgpu::DeviceType::DiscreteGpu => 0,
+                wgpu::DeviceType::IntegratedGpu => 1,
+                wgpu::DeviceType::VirtualGpu => 2,
+                wgpu::DeviceType::Other => 3,
+                wgpu::DeviceType::Cpu => 4,
+            }
+        });
+        let named = |inner: wgpu::Adapter| {
+            let info = inner.get_info();
+            let name = format!("{} ({:?})", info.name, info.backend);
+            let is_software = info.device_type == wgpu::DeviceType::Cpu;
+            Self { inner, name: AdapterName { name, is_software } }
+        };
+        adapters.into_iter().map(named).collect()
+    }
+
+    /// Returns what it is.
+    pub fn name(&self) -> &AdapterName {
+        &self.name
+    }
+
+    /// Opens a device with the adapter's own limits on buffers.
+    pub(super) fn open(&self, budget: &Budget) -> Result<Device, String> {
+        let adapter = &self.inner;
+        let best = adapter.limits();
+        let limits = wgpu::Limits {
+            max_buffer_size: best.max_buffer_size,
+            max_storage_buffer_binding_size: best.max_storage_buffer_binding_size,
+            ..wgpu::Limits::default()
+        };
+        let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("vizflyt"),
+            required_features: timestamps,
+            required_limits: limits,
+            ..wgpu::DeviceDescriptor::default()
+        }))
+        .map_err(|error| error.to_string())?;
+        let fault = Arc::new(OnceLock::new());
+        let uncaptured = Arc::clone(&fault);
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            // The first says most; later ones follow from it.
+            let _ = uncaptured.set(error.to_string());
+        }));
+        let lost = Arc::clone(&fault);
+        device.set_device_lost_callback(move |reason, message| {
+            let _ = lost.set(format!("{reason:?}: {message}"));
+        });
+        let binding_bytes = best
+            .max_storage_buffer_binding_size
+            .min(best.max_buffer_size)
+            .min(budget.binding_bytes)
+            // Indices into words are 32 bits wide; a limit of 4 GiB less a page keeps them so.
+            .min(MAX_BINDING_BYTES);
+        Ok(Device {
+            device,
+            queue,
+            fault,
+            binding_bytes,
+            has_timestamps: !timestamps.is_empty(),
+        })
+    }
+}
+
+/// An open device and its limits.
+#[derive(Debug)]
+pub(super) struct Device {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    fault: Arc<OnceLock<String>>,
+    /// Greatest size of a buffer that a shader sees.
+    pub(super) binding_bytes: u64,
+    pub(super) has_timestamps: bool,
+}
+
+impl Device {
+    /// Returns what went wrong first, if anything did: the device is of no more use then.
+    pub(super) fn fault(&self) -> Option<String> {
+        self.fault.get().cloned()
+    }
+
+    /// Creates a buffer of at least one element of whatever it holds.
+    pub(super) fn buffer(&self, label: &str, bytes: u64, usage: wgpu::BufferUsages) -> wgpu::Buffer {
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: bytes.max(512).next_multiple_of(16),
+            usage,
+            mapped_at_creation: false,
+        })
+    }
+
+    /// Creates a buffer that passes use among themselves.
+    pub(super) fn storage(&self, label: &str, bytes: u64) -> wgpu::Buffer {
+        self.buffer(label, bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST)
+    }
+
+    /// Creates a buffer that the host writes and shaders read.
+    pub(super) fn uniform(&self, label: &str, contents: &[u8]) -> wgpu::Buffer {
+        let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST;
+        let buffer = self.buffer(label, contents.len() as u64, usage);
+        self.queue.write_buffer(&buffer, 0, contents);
+        buffer
+    }
+
+    /// Compiles one entry point of a shader.
+    pub(super) fn kernel(&self, source: &str, entry: &str, constants: &[(&str, f64)]) -> Kernel {
+        let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(entry),
+            source: wgpu::ShaderSource::Wgsl(source.into()),
+        });
+        let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(entry),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                constants,
+                // Every kernel writes its workgroup memory before it reads it.
+                zero_initialize_workgroup_memory: false,
+            },
+            cache: None,
+        });
+        Kernel { pipeline }
+    }
+
+    /// Binds whole buffers for a kernel.
+    pub(super) fn bind(&self, kernel: &Kernel, buffers: &[(u32, &wgpu::Buffer)]) -> wgpu::BindGroup {
+        let entries: Vec<_> = buffers
+            .iter()
+            .map(|&(binding, buffer)| wgpu::BindGroupEntry {
+                binding,
+                resource: buffer.as_entire_binding(),
+            })
+            .collect();
+        self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: None,
+            layout: &kernel.pipeline.get_bind_group_layout(0),
+            entries: &entries,
+        })
+    }
+}
+
+/// A compiled entry point.
+#[derive(Debug)]
+pub(super) struct Kernel {
+    pipeline: wgpu::ComputePipeline,
+}
+
+/// How many workgroups run.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Groups<'a> {
+    /// Known here: x, y.
+    Known(u32, u32),
+    /// Counted by the device: three words of a buffer, from this word on.
+    Counted(&'a wgpu::Buffer, u32),
+}
+
+impl Kernel {
+    /// Adds a run to a pass.
+    pub(super) fn run(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &wgpu::BindGroup,
+        groups: Groups<'_>,
+    ) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, bindings, &[]);
+        match groups {
+            Groups::Known(x, y) => pass.dispatch_workgroups(x, y, 1),
+            Groups::Counted(buffer, word) => {
+                pass.dispatch_workgroups_indirect(buffer, u64::from(word) * 4);
+            }
+        }
+    }
+}
+
+/// Returns what a future of wgpu holds: off the web they are ready at once.
+fn ready<F: Future>(future: F) -> F::Output {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(output) = future.as_mut().poll(&mut context) {
+            return output;
+        }
+        std::thread::yield_now();
+    }
+}
+
+/// 4 GiB less 64 KiB.
+const MAX_BINDING_BYTES: u64 = (1 << 32) - (1 << 16);

@@ -1,0 +1,478 @@
+//! The renderer for graphics cards, through wgpu: Vulkan, Metal, Direct3D 12.
+//!
+//! Data flow, the files in run order: `scene` packs and uploads once; `view` turns cameras and
+//! placements into numbers. Then, for all cameras of a tick in one submission: `cull` finds the
+//! blocks in view and gives each a region of slots, `project` brings their splats onto the image
+//! planes, `sort` orders them by depth, `bin` gives each 16x16-pixel tile its list, `blend` draws the
+//! tiles, `read` brings pixels home. `device` chooses the adapter; `buffers` is what passes share.
+//!
+//! Nothing is read back in mid-frame: the device counts and dispatches on its own. What it counted
+//! comes back with the images; had it too little room, buffers grow and the tick is drawn again, so
+//! that no image ever lacks a splat. No kernel uses subgroup operations or waits for another
+//! workgroup, and the slots of regions are in order of the scene: the same tick gives the same
+//! images, bit for bit, on any adapter that rounds alike.
+//!
+//! Memory: the formulas of `scene` and `buffers`. 5 M splats of degree 3, all in view of one camera
+//! at 640x480 with 20 M pairs: 0.74 + 0.35 + 0.33 + 0.02 GB.
+//!
+//! Budget per camera at 640x480, 1 M splats, some 300 k visible, 1 TB/s: cull and project 0.15 ms,
+//! sort 0.05, bin 0.1, blend 0.2, read 0.2; measured figures are in `docs/BENCHMARKS.md`.
+
+mod bin;
+mod blend;
+mod buffers;
+mod cull;
+mod device;
+mod project;
+mod read;
+mod scene;
+mod sort;
+mod view;
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+pub use device::{Adapter, AdapterName};
+
+use buffers::{Buffers, Room};
+use device::Device;
+use read::{Staging, Stamps};
+use scene::GpuScene;
+use sort::{Count, Pairs, Sort};
+use view::{Place, Tick, View};
+
+use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
+use crate::{Camera, Placement, RgbdImage, Scene};
+
+/// Side of a tile; `TILE` in `common.wgsl`. [px]
+const TILE_PX: u32 = 16;
+/// Ticks that may be under way at once.
+const FLIGHTS: usize = 2;
+/// Digits of a depth: 32 bits.
+const DEPTH_BITS: u32 = 32;
+/// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
+const SLOTS: Count = Count { size: 1, groups: 0 };
+const VISIBLE: Count = Count { size: 2, groups: 4 };
+
+/// What a renderer may use and starts with; the defaults suit every scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Greatest size of a buffer that shaders see; the adapter's own limit holds too.
+    pub binding_bytes: u64,
+    /// Regions of 256 slots to begin with; grown where an image needs more.
+    pub regions: u32,
+    /// (Tile, splat) pairs to begin with; grown where an image needs more.
+    pub pairs: u32,
+}
+
+impl Default for Budget {
+    /// 70 MB of slots, 32 MB of pairs.
+    fn default() -> Self {
+        Self { binding_bytes: u64::MAX, regions: 4096, pairs: 1 << 21 }
+    }
+}
+
+/// Draws a scene with a graphics card.
+#[derive(Debug)]
+pub struct GpuRenderer {
+    name: String,
+    device: Device,
+    passes: Passes,
+    stamps: Option<Stamps>,
+    scene: GpuScene,
+    limit: Room,
+    bound: Option<Bound>,
+    spare: Vec<Staging>,
+    /// Ticks under way.
+    flights: VecDeque<(Asked, wgpu::SubmissionIndex)>,
+    /// Cameras drawn in one submission at most; fewer once they have not fitted.
+    together: usize,
+    budget: Budget,
+    workload: Workload,
+}
+
+/// The kernels.
+#[derive(Debug)]
+struct Passes {
+    cull: cull::Cull,
+    project: project::Project,
+    sort: Sort,
+    bin: bin::Bin,
+    blend: blend::Blend,
+}
+
+/// Buffers, and the kernels' bindings to them.
+#[derive(Debug)]
+struct Bound {
+    buffers: Buffers,
+    cull: cull::CullBindings,
+    project: Vec<wgpu::BindGroup>,
+    sort: Vec<sort::Digit>,
+    bin: bin::BinBindings,
+    blend: wgpu::BindGroup,
+}
+
+/// A tick to be drawn.
+#[derive(Debug)]
+struct Asked {
+    placements: Vec<Placement>,
+    cameras: Vec<Camera>,
+    places: Vec<Place>,
+    /// `tiles` and `pixels` are exact.
+    wanted: Room,
+    staging: Staging,
+    began: Instant,
+}
+
+/// Why a tick cannot be drawn.
+enum Refused {
+    /// It needs larger buffers than the device has; fewer cameras at once may fit.
+    TooLarge(String),
+    Render(RenderError),
+}
+
+impl GpuRenderer {
+    /// Uploads a scene to a device on `adapter`. Splats that no image would show are left out.
+    ///
+    /// # Errors
+    /// [`RenderError::DeviceLost`] with what the driver said, if the device does not open or has no
+    /// room.
+    pub fn new<'a>(
+        scene: impl Into<Scene<'a>>,
+        adapter: &Adapter,
+        budget: Budget,
+    ) -> Result<Self, RenderError> {
+        let device = adapter.open(&budget).map_err(RenderError::DeviceLost)?;
+        let scene = GpuScene::new(&device, scene.into())?;
+        let passes = Passes {
+            cull: cull::Cull::new(&device),
+            project: project::Project::new(&device),
+            sort: Sort::new(&device),
+            bin: bin::Bin::new(&device),
+            blend: blend::Blend::new(&device),
+        };
+        let stamps = Stamps::new(&device);
+        if let Some(fault) = device.fault() {
+            return Err(RenderError::DeviceLost(fault));
+        }
+        Ok(Self {
+            name: format!("gpu {}", adapter.name().name),
+            limit: Room::limit(device.binding_bytes),
+            workload: Workload { splats: scene.len, ..Workload::default() },
+            device,
+            passes,
+            stamps,
+            scene,
+            bound: None,
+            spare: Vec::new(),
+            flights: VecDeque::new(),
+            together: usize::MAX,
+            budget,
+        })
+    }
+
+    /// Starts to draw one image per camera and returns at once; [`Self::finish`] fetches them. Two
+    /// ticks may be under way.
+    ///
+    /// # Errors
+    /// [`RenderError`], as [`Rasterizer::render`].
+    ///
+    /// # Panics
+    /// If two ticks are under way, or there are not as many placements as objects.
+    pub fn begin(
+        &mut self,
+        placements: &[Placement],
+        cameras: &[Camera],
+    ) -> Result<(), RenderError> {
+        let none = vec![RgbdImage::default(); cameras.len()];
+        rasterizer::validate(self.scene.ids.len() - 1, placements, cameras, &none)?;
+        self.take_off(placements, cameras).map_err(Refused::into_error)
+    }
+
+    /// Waits for the tick that was begun first, fills its images, and returns how long the passes
+    /// took on the device; `total_ms` counts from [`Self::begin`].
+    ///
+    /// # Errors
+    /// [`RenderError::DeviceLost`]; the tick is dropped then.
+    ///
+    /// # Panics
+    /// If no tick is under way, or there are not as many images as it has cameras.
+    pub fn finish(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, RenderError> {
+        self.land(images).map_err(Refused::into_error)
+    }
+
+    /// Destroys the device, as a driver's reset does: to test what takes over.
+    pub fn lose_device(&self) {
+        self.device.device.destroy();
+    }
+
+    /// Submits a tick.
+    fn take_off(&mut self, placements: &[Placement], cameras: &[Camera]) -> Result<(), Refused> {
+        assert!(self.flights.len() < FLIGHTS, "two ticks are under way already");
+        let began = Instant::now();
+        let mut places = Vec::with_capacity(cameras.len());
+        let (mut tiles, mut pixels) = (0u64, 0u64);
+        for camera in cameras {
+            let k = &camera.intrinsics;
+            places.push(Place { first_tile: tiles as u32, first_pixel: pixels as u32 });
+            let across = k.width_px.div_ceil(TILE_PX);
+            tiles += u64::from(across) * u64::from(k.height_px.div_ceil(TILE_PX));
+            pixels += k.pixels() as u64;
+        }
+        let wanted = Room {
+            views: (cameras.len() * self.scene.ids.len()) as u64,
+            camera_blocks: cameras.len() as u64 * u64::from(self.scene.block_count),
+            regions: u64::from(self.budget.regions).min(self.limit.regions),
+            pairs: u64::from(self.budget.pairs).min(self.limit.pairs),
+            tiles,
+            pixels,
+            // One number more than there are tiles: that of none.
+            tile_digits: sort::digits(u64::BITS - tiles.leading_zeros()),
+        };
+        self.make_room(&wanted)?;
+        let staging =
+            Staging::for_pixels(self.spare.pop(), &self.device, pixels, self.has_ids());
+        let tick = Asked {
+            placements: placements.to_vec(),
+            cameras: cameras.to_vec(),
+            places,
+            wanted,
+            staging,
+            began,
+        };
+        let submission = self.submit(&tick);
+        self.flights.push_back((tick, submission));
+        Ok(())
+    }
+
+    fn has_ids(&self) -> bool {
+        self.scene.ids.len() > 1
+    }
+
+    /// Makes sure of buffers for what is wanted.
+    fn make_room(&mut self, wanted: &Room) -> Result<(), Refused> {
+        if !wanted.is_within(&self.limit) || wanted.tile_digits > self.limit.tile_digits {
+            return Err(Refused::TooLarge(format!(
+                "a tick needs {wanted:?}, and the graphics device has {:?}",
+                self.limit
+            )));
+        }
+        let has = self.bound.as_ref().map(|bound| bound.buffers.room).unwrap_or_default();
+        if self.bound.is_some() && has.holds(wanted) {
+            return Ok(());
+        }
+        // The old buffers go first: the new ones may need their memory.
+        self.bound = None;
+        let room = has.grown_to(wanted, &self.limit);
+        let buffers = Buffers::new(&self.device, room, self.has_ids());
+        let (device, passes) = (&self.device, &self.passes);
+        let pairs = Pairs {
+            keys: [&buffers.keys[0], &buffers.keys[1]],
+            values: [&buffers.order[0], &buffers.order[1]],
+            counts: &buffers.digits,
+            sizes: &buffers.sizes,
+        };
+        let order = &buffers.order[sort::digits(DEPTH_BITS) as usize % 2];
+        self.bound = Some(Bound {
+            cull: passes.cull.bind(device, &self.scene, &buffers),
+            project: passes.project.bind(device, &self.scene, &buffers),
+            sort: passes.sort.bind(device, pairs, DEPTH_BITS, [SLOTS, VISIBLE], true),
+            bin: passes.bin.bind(device, &passes.sort, &buffers, order),
+            blend: passes.blend.bind(device, &buffers),
+            buffers,
+        });
+        self.check_device()
+    }
+
+    fn check_device(&self) -> Result<(), Refused> {
+        match self.device.fault() {
+            Some(fault) => Err(Refused::Render(RenderError::DeviceLost(fault))),
+            None => Ok(()),
+        }
+    }
+
+    /// Writes a tick's numbers and submits its passes and copies.
+    fn submit(&self, asked: &Asked) -> wgpu::SubmissionIndex {
+        let tiles = asked.wanted.tiles as u32;
+        let bound = self.bound.as_ref().expect("buffers were made before");
+        let (device, passes, buffers) = (&self.device, &self.passes, &bound.buffers);
+        let cameras = asked.cameras.len() as u32;
+        let tick = Tick {
+            cameras,
+            parts: self.scene.ids.len() as u32,
+            blocks: self.scene.block_count,
+            tiles,
+            regions: buffers.room.regions as u32,
+            pairs: buffers.room.pairs as u32,
+            has_ids: u32::from(self.has_ids()),
+            padding: 0,
+        };
+        let views = self.views(asked);
+        device.queue.write_buffer(&buffers.tick, 0, zerocopy::IntoBytes::as_bytes(&tick));
+        device.queue.write_buffer(&buffers.views, 0, zerocopy::IntoBytes::as_bytes(&views[..]));
+
+        let mut encoder = device
+            .device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("tick") });
+        let mut stage = 0;
+        let mut begin = |encoder: &mut wgpu::CommandEncoder| {
+            let label = ["cull", "project", "sort", "bin", "blend"][stage];
+            let pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                label: Some(label),
+                timestamp_writes: self.stamps.as_ref().map(|stamps| stamps.of_pass(stage)),
+            });
+            stage += 1;
+            pass.forget_lifetime()
+        };
+        encoder.clear_buffer(&buffers.lists, 0, Some(u64::from(tiles.max(1)) * 8));
+        let mut pass = begin(&mut encoder);
+        passes.cull.run(&mut pass, &bound.cull, cameras * self.scene.block_count);
+        drop(pass);
+        let mut pass = begin(&mut encoder);
+        passes.project.run(&mut pass, &bound.project, &self.scene, cameras);
+        drop(pass);
+        let mut pass = begin(&mut encoder);
+        for (i, digit) in bound.sort.iter().enumerate() {
+            passes.sort.run(&mut pass, digit, &buffers.dispatches);
+            if i == 0 {
+                passes.bin.count_visible(&mut pass, &bound.bin);
+            }
+        }
+        drop(pass);
+        let mut pass = begin(&mut encoder);
+        passes.bin.run(&mut pass, &bound.bin, &passes.sort, buffers);
+        drop(pass);
+        let mut pass = begin(&mut encoder);
+        passes.blend.run(&mut pass, &bound.blend, tiles);
+        drop(pass);
+        let has_ids = self.has_ids();
+        let pixels = asked.wanted.pixels;
+        asked.staging.copy(&mut encoder, buffers, self.stamps.as_ref(), pixels, has_ids);
+        let submission = device.queue.submit([encoder.finish()]);
+        asked.staging.map();
+        submission
+    }
+
+    /// Returns the cameras as each part sees them.
+    fn views(&self, asked: &Asked) -> Vec<View> {
+        let mut views = Vec::with_capacity(asked.cameras.len() * self.scene.ids.len());
+        for (camera, &place) in asked.cameras.iter().zip(&asked.places) {
+            views.push(View::new(camera, &camera.world_from_cam, place, self.scene.ids[0]));
+            for (placement, &id) in asked.placements.iter().zip(&self.scene.ids[1..]) {
+                views.push(match placement {
+                    Some(world_from_object) => {
+                        // An object that moves is one that stands still before a moving camera.
+                        let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
+                        View::new(camera, &object_from_cam, place, id)
+                    }
+                    None => View::absent(),
+                });
+            }
+        }
+        views
+    }
+
+    /// Waits for the first tick under way; draws it again where it had too little room.
+    fn land(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, Refused> {
+        let (mut asked, mut submission) = self.flights.pop_front().expect("a tick is under way");
+        assert_eq!(asked.cameras.len(), images.len(), "one image per camera");
+        let has_ids = self.has_ids();
+        loop {
+            let mut read_ms = 0.0;
+            let read = asked.staging.read(&self.device, submission, |bytes| {
+                let start = Instant::now();
+                let (sizes, passes_ms) = read::sizes(bytes, self.stamps.as_ref());
+                if sizes.is_complete() {
+                    let pixels = asked.wanted.pixels as usize;
+                    read::images(bytes, &asked.cameras, &asked.places, pixels, has_ids, images);
+                }
+                read_ms = milliseconds(start);
+                (sizes, passes_ms)
+            });
+            let (sizes, [cull_ms, project_ms, sort_ms, bin_ms, blend_ms]) =
+                read.map_err(|fault| Refused::Render(RenderError::DeviceLost(fault)))?;
+            if sizes.is_complete() {
+                let cameras = asked.cameras.len().max(1);
+                self.workload.visible = sizes.visible as usize / cameras;
+                self.workload.pairs = sizes.pairs as usize / cameras;
+                let total_ms = milliseconds(asked.began);
+                self.spare.push(asked.staging);
+                return Ok(PassTimes {
+                    cull_ms,
+                    project_ms,
+                    sort_ms,
+                    bin_ms,
+                    blend_ms,
+                    read_ms,
+                    total_ms,
+                });
+            }
+            let wanted = &mut asked.wanted;
+            wanted.regions = wanted.regions.max(u64::from(sizes.regions_wanted));
+            wanted.pairs = wanted.pairs.max(u64::from(sizes.pairs_wanted));
+            self.make_room(&asked.wanted)?;
+            submission = self.submit(&asked);
+        }
+    }
+}
+
+impl Refused {
+    fn into_error(self) -> RenderError {
+        match self {
+            // Another renderer must do it, as if this one were gone.
+            Self::TooLarge(why) => RenderError::DeviceLost(why),
+            Self::Render(error) => error,
+        }
+    }
+}
+
+impl Rasterizer for GpuRenderer {
+    /// Returns `gpu`, the adapter's name and the interface: `gpu llvmpipe (Vulkan)`.
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn render(
+        &mut self,
+        placements: &[Placement],
+        cameras: &[Camera],
+        images: &mut [RgbdImage],
+    ) -> Result<PassTimes, RenderError> {
+        rasterizer::validate(self.scene.ids.len() - 1, placements, cameras, images)?;
+        assert!(self.flights.is_empty(), "finish what was begun first");
+        let start = Instant::now();
+        let mut times = PassTimes::default();
+        let mut done = 0;
+        while done < cameras.len() {
+            let count = (cameras.len() - done).min(self.together);
+            let group = done..done + count;
+            let drawn = self
+                .take_off(placements, &cameras[group.clone()])
+                .and_then(|()| self.land(&mut images[group]));
+            match drawn {
+                Ok(part) => {
+                    times.cull_ms += part.cull_ms;
+                    times.project_ms += part.project_ms;
+                    times.sort_ms += part.sort_ms;
+                    times.bin_ms += part.bin_ms;
+                    times.blend_ms += part.blend_ms;
+                    times.read_ms += part.read_ms;
+                    done += count;
+                }
+                Err(Refused::TooLarge(_)) if count > 1 => self.together = count.div_ceil(2),
+                Err(refused) => return Err(refused.into_error()),
+            }
+        }
+        times.total_ms = milliseconds(start);
+        Ok(times)
+    }
+
+    /// Returns the mean per camera of the last submission.
+    fn workload(&self) -> Workload {
+        self.workload
+    }
+}
+
+fn milliseconds(since: Instant) -> f32 {
+    since.elapsed().as_secs_f32() * 1e3
+}

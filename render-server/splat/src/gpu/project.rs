@@ -1,0 +1,62 @@
+//! Pass 2: the splats of visible blocks onto the image plane.
+//!
+//! Budget: 52 bytes read per splat of a visible block, 2 per number of its harmonics where it is
+//! seen; 4 bytes written per slot and 48 per survivor. At 1 TB/s: 0.1 ms per million visible splats
+//! without harmonics, 0.2 ms with those of degree 3.
+
+use super::device::{Device, Groups, Kernel};
+use super::buffers::Buffers;
+use super::scene::GpuScene;
+
+const SOURCE: &str = concat!(include_str!("common.wgsl"), include_str!("project.wgsl"));
+
+/// The pass.
+#[derive(Debug)]
+pub(super) struct Project {
+    kernel: Kernel,
+}
+
+impl Project {
+    pub(super) fn new(device: &Device) -> Self {
+        Self { kernel: device.kernel(SOURCE, "project", &[]) }
+    }
+
+    /// Returns one set of bindings per chunk.
+    pub(super) fn bind(
+        &self,
+        device: &Device,
+        scene: &GpuScene,
+        buffers: &Buffers,
+    ) -> Vec<wgpu::BindGroup> {
+        let bind = |chunk: &super::scene::Chunk| {
+            device.bind(
+                &self.kernel,
+                &[
+                    (0, &buffers.tick),
+                    (1, &buffers.views),
+                    (2, &buffers.regions),
+                    (3, &chunk.place),
+                    (4, &chunk.geometry),
+                    (5, &chunk.harmonics),
+                    (6, &buffers.shapes),
+                    (7, &buffers.extents),
+                    (8, &buffers.colours),
+                    (9, &buffers.keys[0]),
+                ],
+            )
+        };
+        scene.chunks.iter().map(bind).collect()
+    }
+
+    pub(super) fn run(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &[wgpu::BindGroup],
+        scene: &GpuScene,
+        cameras: u32,
+    ) {
+        for (chunk, bindings) in scene.chunks.iter().zip(bindings) {
+            self.kernel.run(pass, bindings, Groups::Known(chunk.blocks, cameras));
+        }
+    }
+}

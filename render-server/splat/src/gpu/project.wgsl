@@ -1,0 +1,260 @@
+// Pass 2: the splats of visible blocks onto the image plane. See `cpu/project.rs` for the form in
+// which a projected Gaussian is kept, and why it is stable.
+
+struct Chunk {
+    /// The chunk's first block.
+    first_block: u32,
+    /// Words from block to block of `geometry`.
+    stride: u32,
+    padding: vec2<u32>,
+}
+
+@group(0) @binding(0) var<uniform> tick: Tick;
+@group(0) @binding(1) var<storage, read> views: array<View>;
+@group(0) @binding(2) var<storage, read> regions: array<u32>;
+@group(0) @binding(3) var<uniform> chunk: Chunk;
+// Per block: part, first word of its harmonics, coefficients per channel, splats; then 13 columns
+// of BLOCK numbers: centre, axes times scales, log2 of the opacity.
+@group(0) @binding(4) var<storage, read> geometry: array<u32>;
+// Halves, two to a word: per block, coefficient by coefficient, RGB within, BLOCK of each.
+@group(0) @binding(5) var<storage, read> harmonics: array<u32>;
+// Mean x, y [px], shear, falloff along x [1/px^2].
+@group(0) @binding(6) var<storage, read_write> shapes: array<vec4<f32>>;
+// Falloff along y, level, camera << 16 | id, dy of the ellipse's rightmost point.
+@group(0) @binding(7) var<storage, read_write> extents: array<vec4<f32>>;
+// Red, green, blue, camera z [m].
+@group(0) @binding(8) var<storage, read_write> colours: array<vec4<f32>>;
+// Camera z as bits, which order as the positive numbers do; EMPTY where there is no splat.
+@group(0) @binding(9) var<storage, read_write> keys: array<u32>;
+
+const HEADER = 4u;
+const BLUR = 0.3;
+/// Half of log2(e): sigma's 1/2, for powers of two.
+const HALF_LOG2_E = 0.72134752;
+/// Extent^2 of the ellipse per level and variance: 2 ln 2.
+const EXTENT2 = 1.3862944;
+/// No splat is wider; guards f32 against overflow. [px]
+const MAX_EXTENT = 1e18;
+/// Further from the camera, squares leave f32. [m]
+const MAX_DISTANCE = 1e18;
+
+const NO_LENS = 0u;
+const BROWN_CONRADY = 1u;
+
+fn number(first: u32, column: u32, lane: u32) -> f32 {
+    return bitcast<f32>(geometry[first + HEADER + column * BLOCK + lane]);
+}
+
+fn vector(first: u32, column: u32, lane: u32) -> vec3<f32> {
+    return vec3(
+        number(first, column, lane),
+        number(first, column + 1u, lane),
+        number(first, column + 2u, lane),
+    );
+}
+
+/// Arc tangent of a number that is not negative, to f32's rounding; drivers' own may be off by 1e-3.
+fn arc_tangent(r: f32) -> f32 {
+    // atan r = pi/2 - atan 1/r, and atan x = 2 atan(x / (1 + sqrt(1 + x^2))): to |x| < 0.42.
+    let x = select(r, 1.0 / r, r > 1.0);
+    let y = x / (1.0 + sqrt(1.0 + x * x));
+    let yy = y * y;
+    // The series of atan; its next term is below 3e-8.
+    var sum = 1.0 / 17.0;
+    sum = 1.0 / 15.0 - yy * sum;
+    sum = 1.0 / 13.0 - yy * sum;
+    sum = 1.0 / 11.0 - yy * sum;
+    sum = 1.0 / 9.0 - yy * sum;
+    sum = 1.0 / 7.0 - yy * sum;
+    sum = 1.0 / 5.0 - yy * sum;
+    sum = 1.0 / 3.0 - yy * sum;
+    let angle = 2.0 * (y - y * yy * sum);
+    return select(angle, 1.5707964 - angle, r > 1.0);
+}
+
+struct Bent {
+    slope: vec2<f32>,
+    /// How it changes with the slope, column by column.
+    along_x: vec2<f32>,
+    along_y: vec2<f32>,
+}
+
+/// As `vizflyt_protocol::geometry::Distortion::distort`.
+fn distort(view: View, slope: vec2<f32>) -> Bent {
+    let model = view.flags.x;
+    let k = view.lens;
+    let rr = dot(slope, slope);
+    let x = slope.x;
+    let y = slope.y;
+    if model == NO_LENS {
+        return Bent(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
+    }
+    if model == BROWN_CONRADY {
+        let k3 = view.more.x;
+        let p1 = k.z;
+        let p2 = k.w;
+        let radial = 1.0 + rr * (k.x + rr * (k.y + rr * k3));
+        let growth = k.x + rr * (2.0 * k.y + rr * 3.0 * k3);
+        let shift = vec2(
+            2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x),
+            p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y,
+        );
+        let across = 2.0 * (x * y * growth + p1 * x + p2 * y);
+        return Bent(
+            slope * radial + shift,
+            vec2(radial + 2.0 * (x * x * growth + p1 * y + 3.0 * p2 * x), across),
+            vec2(across, radial + 2.0 * (y * y * growth + 3.0 * p1 * y + p2 * x)),
+        );
+    }
+    let r = sqrt(rr);
+    if r < 1e-4 {
+        // What is left out is below 1e-8 of the slope.
+        return Bent(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
+    }
+    let t = arc_tangent(r);
+    let tt = t * t;
+    let bent = t * (1.0 + tt * (k.x + tt * (k.y + tt * (k.z + tt * k.w))));
+    let bend = 1.0 + tt * (3.0 * k.x + tt * (5.0 * k.y + tt * (7.0 * k.z + tt * 9.0 * k.w)));
+    let scale = bent / r;
+    let along = bend / (1.0 + rr);
+    let u = slope / r;
+    let d = along - scale;
+    return Bent(
+        slope * scale,
+        vec2(scale + d * u.x * u.x, d * u.x * u.y),
+        vec2(d * u.x * u.y, scale + d * u.y * u.y),
+    );
+}
+
+fn coefficient(first: u32, k: u32, lane: u32) -> vec3<f32> {
+    let word = first + k * 3u * (BLOCK / 2u) + lane / 2u;
+    let red = unpack2x16float(harmonics[word]);
+    let green = unpack2x16float(harmonics[word + BLOCK / 2u]);
+    let blue = unpack2x16float(harmonics[word + BLOCK]);
+    let odd = (lane & 1u) == 1u;
+    return vec3(
+        select(red.x, red.y, odd),
+        select(green.x, green.y, odd),
+        select(blue.x, blue.y, odd),
+    );
+}
+
+/// As `harmonics::colour`.
+fn colour(first: u32, coefficients: u32, lane: u32, direction: vec3<f32>) -> vec3<f32> {
+    let x = direction.x;
+    let y = direction.y;
+    let z = direction.z;
+    var rgb = vec3(0.5) + 0.28209479 * coefficient(first, 0u, lane);
+    if coefficients >= 4u {
+        rgb += -0.48860251 * y * coefficient(first, 1u, lane);
+        rgb += 0.48860251 * z * coefficient(first, 2u, lane);
+        rgb += -0.48860251 * x * coefficient(first, 3u, lane);
+    }
+    if coefficients >= 9u {
+        let xx = x * x;
+        let yy = y * y;
+        let zz = z * z;
+        rgb += 1.0925485 * (x * y) * coefficient(first, 4u, lane);
+        rgb += -1.0925485 * (y * z) * coefficient(first, 5u, lane);
+        rgb += 0.31539157 * (2.0 * zz - xx - yy) * coefficient(first, 6u, lane);
+        rgb += -1.0925485 * (x * z) * coefficient(first, 7u, lane);
+        rgb += 0.54627422 * (xx - yy) * coefficient(first, 8u, lane);
+        if coefficients >= 16u {
+            rgb += -0.59004359 * y * (3.0 * xx - yy) * coefficient(first, 9u, lane);
+            rgb += 2.8906114 * x * y * z * coefficient(first, 10u, lane);
+            rgb += -0.45704579 * y * (4.0 * zz - xx - yy) * coefficient(first, 11u, lane);
+            rgb += 0.37317633 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(first, 12u, lane);
+            rgb += -0.45704579 * x * (4.0 * zz - xx - yy) * coefficient(first, 13u, lane);
+            rgb += 1.4453057 * z * (xx - yy) * coefficient(first, 14u, lane);
+            rgb += -0.59004359 * x * (xx - 3.0 * yy) * coefficient(first, 15u, lane);
+        }
+    }
+    return max(rgb, vec3(0.0));
+}
+
+/// Projects one splat into a slot; returns its key.
+fn project_splat(view: View, camera: u32, first: u32, lane: u32, slot: u32) -> u32 {
+    if lane >= geometry[first + 3u] {
+        return EMPTY;
+    }
+    // Relative to the camera before anything else: large coordinates cancel while still exact.
+    let d = vector(first, 0u, lane) - vec3(view.row_x.w, view.row_y.w, view.row_z.w);
+    let z = dot(view.row_z.xyz, d);
+    let farthest = max(max(abs(d.x), abs(d.y)), abs(d.z));
+    if !(z > view.more.z && farthest < MAX_DISTANCE) {
+        return EMPTY;
+    }
+    let inverse_z = 1.0 / z;
+    let slope = vec2(dot(view.row_x.xyz, d), dot(view.row_y.xyz, d)) * inverse_z;
+    let has_lens = view.flags.x != NO_LENS;
+    if has_lens && !(length(slope) <= view.more.y) {
+        return EMPTY;
+    }
+    let mean = view.focal.xy * distort(view, slope).slope + view.focal.zw;
+
+    // Rows of J W M, M the square root of the covariance.
+    var at = clamp(slope, view.slopes.xy, view.slopes.zw);
+    if has_lens {
+        at *= min(1.0, view.more.y / max(length(at), 1e-30));
+    }
+    let bent = distort(view, at);
+    let pinhole_x = (view.row_x.xyz - at.x * view.row_z.xyz) * inverse_z;
+    let pinhole_y = (view.row_y.xyz - at.y * view.row_z.xyz) * inverse_z;
+    let gx = view.focal.x * (bent.along_x.x * pinhole_x + bent.along_y.x * pinhole_y);
+    let gy = view.focal.y * (bent.along_x.y * pinhole_x + bent.along_y.y * pinhole_y);
+    let axis_0 = vector(first, 3u, lane);
+    let axis_1 = vector(first, 6u, lane);
+    let axis_2 = vector(first, 9u, lane);
+    let u = vec3(dot(gx, axis_0), dot(gx, axis_1), dot(gx, axis_2));
+    let v = vec3(dot(gy, axis_0), dot(gy, axis_1), dot(gy, axis_2));
+    let uu = dot(u, u);
+    let vv = dot(v, v);
+    let a = uu + BLUR;
+    let b = dot(u, v);
+    let c = vv + BLUR;
+    let minors = cross(u, v);
+    let determinant = dot(minors, minors) + (BLUR * (uu + vv) + BLUR * BLUR);
+
+    let level = number(first, 12u, lane);
+    let reach2 = (level - MIN_LEVEL) * EXTENT2;
+    let extent = sqrt(reach2 * vec2(a, c));
+    // Whether some pixel centre is within the ellipse's box.
+    let size = vec2<f32>(view.size.xy);
+    let is_seen = reach2 >= 0.0
+        && all(mean + extent > vec2(0.5))
+        && all(mean - extent < size - 0.5)
+        && all(extent < vec2(MAX_EXTENT));
+    if !is_seen {
+        return EMPTY;
+    }
+    // Above 0, so that dividing by it is no trap where a splat covers everything evenly.
+    let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
+    let direction = d / sqrt(dot(d, d));
+    let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, direction);
+    let tag = camera << 16u | view.flags.w;
+    shapes[slot] = vec4(mean, b / c, falloff.x);
+    extents[slot] = vec4(falloff.y, level, bitcast<f32>(tag), b * extent.x / a);
+    colours[slot] = vec4(rgb, z);
+    return bitcast<u32>(z);
+}
+
+@compute @workgroup_size(256)
+fn project(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let camera = group.y;
+    let index = camera * tick.blocks + chunk.first_block + group.x;
+    let rank = regions[index];
+    if rank == 0u {
+        return;
+    }
+    let region = regions[tick.cameras * tick.blocks + index / 256u] + rank - 1u;
+    if region >= tick.regions {
+        return;
+    }
+    let first = group.x * chunk.stride;
+    let slot = region * BLOCK + lane;
+    let view = camera * tick.parts + geometry[first];
+    keys[slot] = project_splat(views[view], camera, first, lane, slot);
+}

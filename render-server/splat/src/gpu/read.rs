@@ -1,0 +1,245 @@
+//! From the device's memory to the images.
+//!
+//! Each tick copies its pixels, and what the device counted, to one of two staging buffers: while
+//! one tick is read here, the next is drawn there.
+//!
+//! Budget: 16 bytes per pixel over the bus (20 with ids): 4.9 MB at 640x480, 0.2 ms at 25 GB/s; then
+//! 28 bytes written per pixel, by all cores.
+
+use half::f16;
+use half::slice::HalfFloatSliceExt as _;
+use half::slice::HalfBitsSliceExt as _;
+use rayon::prelude::*;
+use zerocopy::{FromBytes, Immutable, KnownLayout};
+
+use super::buffers::{Buffers, SIZES_BYTES};
+use super::device::Device;
+use super::scene::BLOCK;
+use super::view::Place;
+use crate::{Camera, RgbdImage};
+
+/// Passes with timestamps.
+pub(super) const PASSES: usize = 5;
+/// Where the timestamps lie in a staging buffer.
+const STAMPS_AT: u64 = SIZES_BYTES;
+/// Where the pixels do.
+const PIXELS_AT: u64 = 128;
+/// Words per pixel.
+const PIXEL_WORDS: usize = 4;
+
+/// `sizes` of `sizes.wgsl`.
+#[derive(Clone, Copy, Debug, Default, FromBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub(super) struct Sizes {
+    pub(super) regions_wanted: u32,
+    pub(super) slots: u32,
+    pub(super) visible: u32,
+    pub(super) pairs_wanted: u32,
+    pub(super) pairs: u32,
+    padding: [u32; 3],
+}
+
+const _: () = assert!(size_of::<Sizes>() as u64 == SIZES_BYTES);
+
+impl Sizes {
+    /// Whether there was room for everything.
+    pub(super) fn is_complete(&self) -> bool {
+        u64::from(self.regions_wanted) * BLOCK as u64 == u64::from(self.slots)
+            && self.pairs_wanted == self.pairs
+    }
+}
+
+/// Timestamps of passes: begin and end each.
+#[derive(Debug)]
+pub(super) struct Stamps {
+    pub(super) queries: wgpu::QuerySet,
+    resolved: wgpu::Buffer,
+    /// [ms]
+    period_ms: f64,
+}
+
+impl Stamps {
+    /// Is `None` where the adapter has no clock.
+    pub(super) fn new(device: &Device) -> Option<Self> {
+        device.has_timestamps.then(|| Self {
+            queries: device.device.create_query_set(&wgpu::QuerySetDescriptor {
+                label: Some("passes"),
+                ty: wgpu::QueryType::Timestamp,
+                count: 2 * PASSES as u32,
+            }),
+            resolved: device.buffer(
+                "stamps",
+                16 * PASSES as u64,
+                wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+            ),
+            period_ms: f64::from(device.queue.get_timestamp_period()) * 1e-6,
+        })
+    }
+
+    /// Returns the two stamps of a pass.
+    pub(super) fn of_pass(&self, pass: usize) -> wgpu::ComputePassTimestampWrites<'_> {
+        wgpu::ComputePassTimestampWrites {
+            query_set: &self.queries,
+            beginning_of_pass_write_index: Some(2 * pass as u32),
+            end_of_pass_write_index: Some(2 * pass as u32 + 1),
+        }
+    }
+}
+
+/// A buffer that the host can read.
+#[derive(Debug)]
+pub(super) struct Staging {
+    buffer: wgpu::Buffer,
+}
+
+impl Staging {
+    /// Returns one for so many pixels; a given one if it is large enough.
+    pub(super) fn for_pixels(
+        old: Option<Self>,
+        device: &Device,
+        pixels: u64,
+        has_ids: bool,
+    ) -> Self {
+        let bytes = PIXELS_AT + pixels * if has_ids { 20 } else { 16 };
+        old.filter(|old| old.buffer.size() >= bytes).unwrap_or_else(|| {
+            let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
+            Self { buffer: device.buffer("staging", bytes, usage) }
+        })
+    }
+
+    /// Adds the copies of a tick of so many pixels.
+    pub(super) fn copy(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        buffers: &Buffers,
+        stamps: Option<&Stamps>,
+        pixels: u64,
+        has_ids: bool,
+    ) {
+        encoder.copy_buffer_to_buffer(&buffers.sizes, 0, &self.buffer, 0, SIZES_BYTES);
+        if let Some(stamps) = stamps {
+            encoder.resolve_query_set(&stamps.queries, 0..2 * PASSES as u32, &stamps.resolved, 0);
+            let bytes = 16 * PASSES as u64;
+            encoder.copy_buffer_to_buffer(&stamps.resolved, 0, &self.buffer, STAMPS_AT, bytes);
+        }
+        encoder.copy_buffer_to_buffer(&buffers.pixels, 0, &self.buffer, PIXELS_AT, pixels * 16);
+        if has_ids {
+            let at = PIXELS_AT + pixels * 16;
+            encoder.copy_buffer_to_buffer(&buffers.ids, 0, &self.buffer, at, pixels * 4);
+        }
+    }
+
+    /// Asks for the host's view; [`Self::read`] waits for it.
+    pub(super) fn map(&self) {
+        // Whether it worked is told by what follows: no view without it.
+        self.buffer.map_async(wgpu::MapMode::Read, .., |_| ());
+    }
+
+    /// Waits until the submission is done, and gives its bytes to `take`.
+    pub(super) fn read<R>(
+        &self,
+        device: &Device,
+        submission: wgpu::SubmissionIndex,
+        take: impl FnOnce(&[u8]) -> R,
+    ) -> Result<R, String> {
+        let wait = wgpu::PollType::Wait {
+            submission_index: Some(submission),
+            timeout: Some(std::time::Duration::from_secs(TIMEOUT_S)),
+        };
+        let polled = device.device.poll(wait);
+        if let Some(fault) = device.fault() {
+            return Err(fault);
+        }
+        polled.map_err(|error| error.to_string())?;
+        let taken = {
+            let view = self.buffer.get_mapped_range(..).map_err(|error| error.to_string())?;
+            take(&view)
+        };
+        self.buffer.unmap();
+        Ok(taken)
+    }
+}
+
+/// An image that takes longer will not come: drivers give up after 2 to 10 s themselves. [s]
+const TIMEOUT_S: u64 = 60;
+
+/// Returns what the device counted, and ms of each pass where it has a clock.
+pub(super) fn sizes(bytes: &[u8], stamps: Option<&Stamps>) -> (Sizes, [f32; PASSES]) {
+    let (sizes, _) = Sizes::read_from_prefix(bytes).expect("staging holds the sizes");
+    let mut times_ms = [0.0; PASSES];
+    if let Some(stamps) = stamps {
+        for (pass, ms) in times_ms.iter_mut().enumerate() {
+            let at = STAMPS_AT as usize + 16 * pass;
+            let stamp = |at: usize| {
+                bytes[at..at + 8].iter().rev().fold(0u64, |sum, &b| sum << 8 | u64::from(b))
+            };
+            // Clocks may be reset in between.
+            *ms = (stamp(at + 8).saturating_sub(stamp(at)) as f64 * stamps.period_ms) as f32;
+        }
+    }
+    (sizes, times_ms)
+}
+
+/// Unpacks the images of a tick; `pixels` in all.
+pub(super) fn images(
+    bytes: &[u8],
+    cameras: &[Camera],
+    places: &[Place],
+    pixels: usize,
+    has_ids: bool,
+    images: &mut [RgbdImage],
+) {
+    let words = |at: usize, count: usize| {
+        let bytes = &bytes[PIXELS_AT as usize + at * 4..][..count * 4];
+        <[u32]>::ref_from_bytes(bytes).expect("staging is aligned")
+    };
+    for ((camera, place), image) in cameras.iter().zip(places).zip(images) {
+        let k = &camera.intrinsics;
+        let (first, count) = (place.first_pixel as usize, k.pixels());
+        image.resize(k.width_px, k.height_px);
+        unpack(words(first * PIXEL_WORDS, count * PIXEL_WORDS), image);
+        if has_ids {
+            let ids = words(pixels * PIXEL_WORDS + first, count);
+            image.ids.par_chunks_mut(BAND).zip(ids.par_chunks(BAND)).for_each(|(out, ids)| {
+                for (out, &id) in out.iter_mut().zip(ids) {
+                    *out = id as u16;
+                }
+            });
+        } else {
+            image.ids.fill(0);
+        }
+    }
+}
+
+/// Pixels that one task unpacks: some 20 us of work.
+const BAND: usize = 16 * 1024;
+/// Pixels whose halves are converted at once; on the stack.
+const RUN: usize = 128;
+
+fn unpack(words: &[u32], image: &mut RgbdImage) {
+    image
+        .rgb
+        .par_chunks_mut(3 * BAND)
+        .zip(image.alpha.par_chunks_mut(BAND))
+        .zip(image.depth_expected_m.par_chunks_mut(BAND))
+        .zip(image.depth_median_m.par_chunks_mut(BAND))
+        .zip(words.par_chunks(PIXEL_WORDS * BAND))
+        .for_each(|((((rgb, alpha), expected), median), words)| {
+            let mut halves = [0u16; 3 * RUN];
+            for (run, words) in words.chunks(PIXEL_WORDS * RUN).enumerate() {
+                let first = run * RUN;
+                let count = words.len() / PIXEL_WORDS;
+                for (i, pixel) in words.chunks_exact(PIXEL_WORDS).enumerate() {
+                    halves[3 * i] = pixel[0] as u16;
+                    halves[3 * i + 1] = (pixel[0] >> 16) as u16;
+                    halves[3 * i + 2] = pixel[1] as u16;
+                    alpha[first + i] = (pixel[1] >> 16) as f32 / 65535.0;
+                    expected[first + i] = f32::from_bits(pixel[2]);
+                    median[first + i] = f32::from_bits(pixel[3]);
+                }
+                halves[..3 * count]
+                    .reinterpret_cast::<f16>()
+                    .convert_to_f32_slice(&mut rgb[3 * first..3 * (first + count)]);
+            }
+        });
+}
