@@ -1,10 +1,13 @@
 //! Input at and beyond the limits: clean images or precise errors, never NaN, never a panic.
+//!
+//! Each check takes the renderers that it is made of, so that it can be called with others.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, InvalidCamera, RenderError, RgbdImage, Splats, render_reference};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_splat::{Camera, InvalidCamera, RenderError, RgbdImage, Scene, Splats, ply};
 
+use crate::renderers::{self, Make};
 use crate::{agreement, compare};
 
 fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
@@ -27,142 +30,285 @@ fn looking_ahead(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     }
 }
 
+/// The same field of view through a pinhole, a barrel lens and a fisheye.
+fn through_lenses(width_px: u32, height_px: u32, fov_deg: f64) -> [Camera; 3] {
+    let camera = looking_ahead(width_px, height_px, fov_deg);
+    let half_rad = 0.5 * fov_deg.to_radians();
+    let barrel = Distortion::BrownConrady { k1: -0.2, k2: 0.05, p1: 1e-3, p2: -1e-3, k3: -0.002 };
+    let fisheye = Distortion::KannalaBrandt { k1: 0.01, k2: -0.002, k3: 0.0, k4: 0.0 };
+    // As far as the barrel lens sees, and as the fisheye puts angles on the radius.
+    let within = half_rad.tan().min(0.95 * barrel.reach());
+    [(Distortion::None, half_rad.tan()), (barrel, within), (fisheye, half_rad.tan())].map(
+        |(distortion, slope)| {
+            let radius = distortion.distort(glam::DVec2::new(slope, 0.0)).0.x;
+            let f_px = 0.5 * f64::from(width_px) / radius;
+            let k = Intrinsics { fx_px: f_px, fy_px: f_px, distortion, ..camera.intrinsics };
+            Camera { intrinsics: k, ..camera }
+        },
+    )
+}
+
 /// Renders with everything there is; all images are clean.
-fn render_all(splats: &Splats, camera: &Camera) -> Vec<RgbdImage> {
-    let mut images = vec![render_reference(splats, &[], camera).expect("a valid camera")];
-    for mut renderer in CpuRenderer::every(splats) {
+fn render_all(make: Make<'_>, splats: &Splats, camera: &Camera) -> Vec<(String, RgbdImage)> {
+    let mut images = Vec::new();
+    for mut renderer in make(Scene::from(splats)) {
         let mut image = [RgbdImage::default()];
         renderer.render(&[], &[*camera], &mut image).expect("a valid camera");
-        images.extend(image);
+        let [image] = image;
+        assert_eq!((image.width_px, image.height_px), size(camera));
+        compare::assert_clean(&image);
+        images.push((renderer.name(), image));
     }
-    images.iter().for_each(compare::assert_clean);
     images
 }
 
-#[test]
-fn extreme_scales_and_opacities_stay_clean_and_agree() {
-    for scale in [0.0, 1e-38, 1e-30, 1e-4, 1.0, 1e4, 1e30, f32::MAX] {
+fn size(camera: &Camera) -> (u32, u32) {
+    (camera.intrinsics.width_px, camera.intrinsics.height_px)
+}
+
+/// Scales from nothing to all there is, opacities from none to full.
+pub(crate) fn check_scales_and_opacities(make: Make<'_>) {
+    let cameras = through_lenses(32, 24, 70.0);
+    for scale in [0.0, 1e-38, 1e-30, 1e-4, 1.0, 1e4, 1e30, f32::MAX, f32::INFINITY] {
         for other in [scale, 0.01] {
             for opacity in [0.0, 1e-30, 1.0 / 255.0, 0.5, 1.0] {
-                let splats = one(Vec3::new(0.1, 0.0, 2.0), Vec3::new(scale, other, scale), opacity);
-                let camera = looking_ahead(32, 24, 70.0);
-                let images = render_all(&splats, &camera);
-                for image in &images[1..] {
-                    let middle = 12 * 32 + 17;
-                    let off = (image.alpha[middle] - images[0].alpha[middle]).abs();
-                    assert!(off < 0.02, "scale {scale} {other}, opacity {opacity}: {off}");
+                let scale_m = Vec3::new(scale, other, scale);
+                let splats = one(Vec3::new(0.1, 0.0, 2.0), scale_m, opacity);
+                for camera in &cameras {
+                    let expected = render_all(&renderers::reference, &splats, camera);
+                    for (name, image) in render_all(make, &splats, camera) {
+                        let middle = 12 * 32 + 17;
+                        let off = (image.alpha[middle] - expected[0].1.alpha[middle]).abs();
+                        assert!(off < 0.02, "{name}: {scale_m}, opacity {opacity}: {off}");
+                    }
                 }
             }
         }
     }
 }
 
-#[test]
-fn what_is_not_finite_is_left_out() {
+/// What is not finite, and rotations that are none, are left out.
+pub(crate) fn check_what_is_not_finite(make: Make<'_>) {
     let good = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.3), 0.8);
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let spoil: [&dyn Fn(&mut Splats); 6] = [
+        let spoil: [&dyn Fn(&mut Splats); 7] = [
             &|s| s.means_m[0].x = bad,
             &|s| s.means_m[0].z = bad,
             &|s| s.rotations[0] = Quat::from_xyzw(0.0, bad, 0.0, 1.0),
             &|s| s.rotations[0] = Quat::from_xyzw(0.0, 0.0, 0.0, 0.0),
             &|s| s.opacities[0] = bad,
             &|s| s.sh[1] = bad,
+            &|s| s.scales_m[0].y = f32::NAN,
         ];
         for spoil in spoil {
             let mut splats = good.clone();
             spoil(&mut splats);
-            for mut renderer in CpuRenderer::every(&splats) {
-                let mut image = [RgbdImage::default()];
-                renderer.render(&[], &[looking_ahead(20, 20, 60.0)], &mut image).unwrap();
-                compare::assert_clean(&image[0]);
-                assert!(image[0].alpha.iter().all(|&alpha| alpha == 0.0));
-                assert_eq!(renderer.workload().splats, 0);
+            for camera in through_lenses(20, 20, 60.0) {
+                for (name, image) in render_all(make, &splats, &camera) {
+                    assert!(image.alpha.iter().all(|&alpha| alpha == 0.0), "{name}: {splats:?}");
+                }
             }
         }
     }
 }
 
-#[test]
-fn distances_from_behind_to_far_stay_clean() {
-    let camera = looking_ahead(40, 30, 80.0);
-    let near = camera.near_m;
+/// What files hold before it is activated: infinite logits, logarithms, quaternions of any length.
+pub(crate) fn check_files(make: Make<'_>) {
+    let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.3), 0.8);
+    let file = ply::encode(&splats);
+    let header = file.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
+    let text = String::from_utf8_lossy(&file[..header]).into_owned();
+    let column = |name: &str| {
+        let mut names = text.lines().filter_map(|line| line.strip_prefix("property float "));
+        header + 4 * names.position(|n| n == name).expect("a property")
+    };
+    let with = |changes: &[(&str, f32)]| {
+        let mut bytes = file.clone();
+        for &(name, value) in changes {
+            bytes[column(name)..][..4].copy_from_slice(&value.to_le_bytes());
+        }
+        match ply::parse(&bytes) {
+            Ok(loaded) => loaded.splats,
+            // The reader left it out itself.
+            Err(ply::PlyError::Empty { declared: 1, dropped: 1 }) => Splats::default(),
+            Err(other) => panic!("{changes:?}: {other}"),
+        }
+    };
+    let rotations = ["rot_0", "rot_1", "rot_2", "rot_3"];
+    // What changes, and whether the splat is there afterwards.
+    let mut cases: Vec<(Vec<(&str, f32)>, bool)> = vec![
+        (vec![("opacity", f32::INFINITY)], true),
+        (vec![("opacity", f32::NEG_INFINITY)], false),
+        (vec![("opacity", f32::NAN)], false),
+        (vec![("opacity", f32::MAX)], true),
+        (vec![("scale_0", f32::NEG_INFINITY)], true),
+        (vec![("scale_0", f32::INFINITY)], false),
+        (vec![("scale_0", 88.0)], true),
+        (vec![("scale_0", f32::NAN)], false),
+        (vec![("x", f32::NAN)], false),
+        (vec![("f_dc_0", f32::INFINITY)], false),
+    ];
+    for (value, there) in [(0.0, false), (f32::NAN, false), (f32::INFINITY, false), (1e-3, true)] {
+        cases.push((rotations.map(|name| (name, value)).into(), there));
+    }
+    for (changes, there) in cases {
+        let splats = with(&changes);
+        for camera in through_lenses(24, 18, 60.0) {
+            for (name, image) in render_all(make, &splats, &camera) {
+                let seen = image.alpha[9 * 24 + 12] > 0.3;
+                assert_eq!(seen, there, "{name}: {changes:?}");
+            }
+        }
+    }
+}
+
+/// Behind, at and on the near plane, far away, to the side, and around the camera.
+pub(crate) fn check_distances(make: Make<'_>) {
     let next = |v: f32| f32::from_bits(v.to_bits() + 1);
-    for z in [-1e30, -1.0, 0.0, 1e-30, near, next(near), 0.06, 1.0, 1e6, 1e30, f32::MAX] {
-        for x in [0.0, 1e-3, 5.0, 1e30] {
-            let images = render_all(&one(Vec3::new(x, 0.0, z), Vec3::splat(0.2), 0.9), &camera);
-            if z <= near {
-                assert!(images.iter().all(|image| image.alpha.iter().all(|&a| a == 0.0)), "z {z}");
+    for camera in through_lenses(40, 30, 80.0) {
+        let near = camera.near_m;
+        for z in [-1e30, -1.0, -0.0, 0.0, 1e-30, near, next(near), 0.06, 1.0, 1e6, 1e30, f32::MAX] {
+            for x in [0.0, 1e-3, 5.0, 1e30] {
+                let splats = one(Vec3::new(x, 0.0, z), Vec3::splat(0.2), 0.9);
+                for (name, image) in render_all(make, &splats, &camera) {
+                    let nothing = image.alpha.iter().all(|&a| a == 0.0);
+                    assert!(nothing || z > near, "{name}: z {z}");
+                }
+            }
+        }
+        // Inside a splat: the camera sees what of it lies beyond the near plane.
+        let around = one(Vec3::new(0.0, 0.0, 0.06), Vec3::splat(3.0), 0.9);
+        for (name, image) in render_all(make, &around, &camera) {
+            assert!(image.alpha.iter().all(|&alpha| alpha > 0.85), "{name}");
+        }
+        // Its middle is where the camera is, or behind: a splat is where its middle is.
+        for z in [0.0, -0.5] {
+            let around = one(Vec3::new(0.0, 0.0, z), Vec3::splat(3.0), 0.9);
+            for (name, image) in render_all(make, &around, &camera) {
+                assert!(image.alpha.iter().all(|&alpha| alpha == 0.0), "{name}");
             }
         }
     }
-    // Inside a splat: the camera sees what of it lies beyond the near plane.
-    let inside = render_all(&one(Vec3::new(0.0, 0.0, 0.06), Vec3::splat(3.0), 0.9), &camera);
-    assert!(inside.iter().all(|image| image.alpha.iter().all(|&alpha| alpha > 0.85)));
 }
 
-#[test]
-fn every_size_and_field_of_view_is_drawn() {
+/// Fields of view from 1 to 170 degrees, through all lenses, in small images of all shapes.
+pub(crate) fn check_sizes_and_fields_of_view(make: Make<'_>) {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     for fov_deg in [1.0, 10.0, 90.0, 150.0, 170.0] {
         for (width, height) in [(1, 1), (3, 2), (16, 16), (17, 33), (200, 1), (1, 200)] {
-            let images = render_all(&splats, &looking_ahead(width, height, fov_deg));
-            assert!(images.iter().all(|image| image.rgb.len() == (width * height * 3) as usize));
+            for camera in through_lenses(width, height, fov_deg) {
+                for (name, image) in render_all(make, &splats, &camera) {
+                    let middle = (height / 2 * width + width / 2) as usize;
+                    // Over a single column 200 px high the fisheye of 170 degrees is one splat wide.
+                    assert!(image.alpha[middle] > 0.05, "{name}: {camera:?}");
+                }
+            }
         }
     }
-    let camera = looking_ahead(3840, 2160, 90.0);
-    let mut image = [RgbdImage::default()];
-    CpuRenderer::new(&splats).render(&[], &[camera], &mut image).unwrap();
-    compare::assert_clean(&image[0]);
-    assert!(image[0].alpha[1080 * 3840 + 1920] > 0.85);
 }
 
-#[test]
-fn a_scene_without_splats_is_the_background() {
-    let camera = looking_ahead(21, 10, 90.0);
+/// 3840 x 2160, through all lenses.
+pub(crate) fn check_the_largest_size(make: Make<'_>) {
+    let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
+    for camera in through_lenses(3840, 2160, 90.0) {
+        for (name, image) in render_all(make, &splats, &camera) {
+            assert!(image.alpha[1080 * 3840 + 1920] > 0.85, "{name}");
+        }
+    }
+}
+
+/// Nothing to see is the background.
+pub(crate) fn check_empty_scenes(make: Make<'_>) {
     let transparent = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.001);
     for splats in [Splats::default(), transparent] {
-        for image in render_all(&splats, &camera) {
-            assert!(image.rgb.chunks(3).all(|rgb| rgb == [0.2, 0.4, 0.6]));
-            assert!(image.depth_median_m.iter().all(|&z| z == 0.0));
+        for camera in through_lenses(21, 10, 90.0) {
+            for (name, image) in render_all(make, &splats, &camera) {
+                assert!(image.rgb.chunks(3).all(|rgb| rgb == [0.2, 0.4, 0.6]), "{name}");
+                assert!(image.depth_median_m.iter().all(|&z| z == 0.0), "{name}");
+            }
         }
     }
 }
 
-#[test]
-fn cameras_that_are_none_are_refused() {
+/// Cameras that are none are refused by name, and no image is touched.
+pub(crate) fn check_cameras_that_are_none(make: Make<'_>) {
     let good = looking_ahead(20, 10, 60.0);
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     let check = |camera: Camera, part: &str| {
-        let mut untouched = [RgbdImage::default()];
-        let refused = CpuRenderer::new(&splats).render(&[], &[camera], &mut untouched);
-        let message = refused.expect_err("an invalid camera").to_string();
-        assert!(message.contains(part), "{message:?} lacks {part:?}");
-        assert_eq!(untouched[0], RgbdImage::default());
-        assert!(render_reference(&splats, &[], &camera).is_err());
+        for mut renderer in make(Scene::from(&splats)) {
+            let mut untouched = [RgbdImage::default()];
+            let refused = renderer.render(&[], &[camera], &mut untouched);
+            let message = refused.expect_err("an invalid camera").to_string();
+            assert!(message.contains(part), "{}: {message:?} lacks {part:?}", renderer.name());
+            assert_eq!(untouched[0], RgbdImage::default());
+            // The next is drawn.
+            renderer.render(&[], &[good], &mut untouched).expect("a valid camera");
+        }
     };
-    let mut camera = good;
-    camera.intrinsics.width_px = 0;
-    check(camera, "image size 0x10");
-    camera = good;
-    camera.intrinsics.fx_px = f64::NAN;
-    check(camera, "focal length");
-    for position in [DVec3::splat(f64::NAN), DVec3::new(1e9, 0.0, 0.0)] {
-        check(
-            Camera { world_from_cam: Pose::new(position, DQuat::IDENTITY), ..good },
-            "camera pose",
-        );
+    let with = |k: Intrinsics| Camera { intrinsics: k, ..good };
+    let k = good.intrinsics;
+    check(with(Intrinsics { width_px: 0, ..k }), "image size 0x10");
+    check(with(Intrinsics { height_px: 8193, ..k }), "image size 20x8193");
+    for bad in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
+        check(with(Intrinsics { fx_px: bad, ..k }), "focal length");
     }
+    check(with(Intrinsics { cy_px: f64::NAN, ..k }), "principal point");
+    let bent = Distortion::KannalaBrandt { k1: f64::NAN, k2: 0.0, k3: 0.0, k4: 0.0 };
+    check(with(Intrinsics { distortion: bent, ..k }), "distortion coefficient");
     let zero = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0);
-    check(Camera { world_from_cam: Pose::new(DVec3::ZERO, zero), ..good }, "camera pose");
+    for pose in [
+        Pose::new(DVec3::splat(f64::NAN), DQuat::IDENTITY),
+        Pose::new(DVec3::new(1e9, 0.0, 0.0), DQuat::IDENTITY),
+        Pose::new(DVec3::ZERO, zero),
+    ] {
+        check(Camera { world_from_cam: pose, ..good }, "camera pose");
+    }
     for near_m in [0.0, -1.0, f32::NAN, f32::INFINITY] {
         check(Camera { near_m, ..good }, "near plane");
     }
     check(Camera { background: [0.0, f32::NAN, 0.0], ..good }, "background");
-    assert!(matches!(
-        render_reference(&splats, &[], &Camera { near_m: 0.0, ..good }),
-        Err(RenderError::Camera(InvalidCamera::Near(_)))
-    ));
+    for mut renderer in make(Scene::from(&splats)) {
+        let refused =
+            renderer.render(&[], &[Camera { near_m: 0.0, ..good }], &mut [RgbdImage::default()]);
+        assert!(matches!(refused, Err(RenderError::Camera(InvalidCamera::Near(_)))));
+    }
+}
+
+#[test]
+fn extreme_scales_and_opacities_stay_clean_and_agree() {
+    check_scales_and_opacities(&renderers::cpus);
+}
+
+#[test]
+fn what_is_not_finite_is_left_out() {
+    // Not of the reference, which takes what it is given.
+    check_what_is_not_finite(&renderers::cpus);
+}
+
+#[test]
+fn what_files_say_at_their_worst_stays_clean() {
+    check_files(&renderers::cpus);
+}
+
+#[test]
+fn distances_from_behind_to_far_stay_clean() {
+    check_distances(&renderers::every);
+}
+
+#[test]
+fn every_size_and_field_of_view_is_drawn() {
+    check_sizes_and_fields_of_view(&renderers::every);
+    check_the_largest_size(&renderers::cpus);
+}
+
+#[test]
+fn a_scene_without_splats_is_the_background() {
+    check_empty_scenes(&renderers::every);
+}
+
+#[test]
+fn cameras_that_are_none_are_refused() {
+    check_cameras_that_are_none(&renderers::every);
 }
 
 proptest! {
@@ -188,10 +334,6 @@ proptest! {
                 _ => splats.scales_m[i] = Vec3::splat(v.abs()),
             }
         }
-        for mut renderer in CpuRenderer::every(&splats) {
-            let mut image = [RgbdImage::default()];
-            renderer.render(&[], &[camera], &mut image).unwrap();
-            compare::assert_clean(&image[0]);
-        }
+        render_all(&renderers::cpus, &splats, &camera);
     }
 }

@@ -9,7 +9,7 @@ use vizflyt_splat::{
 pub(crate) type Make<'a> = &'a dyn Fn(Scene<'_>) -> Vec<Box<dyn Rasterizer>>;
 
 /// The plain renderer, as a [`Rasterizer`].
-pub(crate) struct Reference {
+struct Reference {
     splats: Splats,
     objects: Vec<RigidObject>,
 }
@@ -38,8 +38,8 @@ impl Rasterizer for Reference {
 }
 
 /// Returns the reference alone.
-pub(crate) fn reference(scene: Scene<'_>) -> Reference {
-    Reference { splats: scene.splats.clone(), objects: scene.objects.to_vec() }
+pub(crate) fn reference(scene: Scene<'_>) -> Vec<Box<dyn Rasterizer>> {
+    vec![Box::new(Reference { splats: scene.splats.clone(), objects: scene.objects.to_vec() })]
 }
 
 /// Returns the CPU renderer of every instruction set.
@@ -49,7 +49,7 @@ pub(crate) fn cpus(scene: Scene<'_>) -> Vec<Box<dyn Rasterizer>> {
 
 /// Returns the reference and every CPU renderer.
 pub(crate) fn every(scene: Scene<'_>) -> Vec<Box<dyn Rasterizer>> {
-    let mut all: Vec<Box<dyn Rasterizer>> = vec![Box::new(reference(scene))];
+    let mut all = reference(scene);
     all.extend(cpus(scene));
     all
 }
