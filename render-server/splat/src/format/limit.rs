@@ -5,7 +5,7 @@ use super::{Format, FormatError};
 /// Most splats of a scene: 8 GB of degree 3, several times what any scanner exports.
 const MAX_SPLATS: u64 = 1 << 25;
 /// Packed bytes that any file may inflate to, however small it is. [byte]
-const FREE_BYTES: u64 = 64 << 20;
+const FREE_BYTES: u64 = 16 << 20;
 /// Beyond those, how many times its own size a file may inflate to. Real scenes reach 4; a flat
 /// image or a run of zeros, of which bombs are made, 1000 and more.
 const MAX_EXPANSION: u64 = 100;

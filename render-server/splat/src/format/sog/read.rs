@@ -18,7 +18,7 @@ const MAX_META_BYTES: u64 = 4 << 20;
 const BYTES_PER_SPLAT: u64 = 24;
 /// Pixels that any texture may have; beyond those, the multiple of what its splats need.
 const FREE_PIXELS: u64 = 1 << 16;
-const SPARE_PIXELS: u64 = 4;
+const SPARE_PIXELS: u64 = 2;
 /// Indices of the palette are 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
 

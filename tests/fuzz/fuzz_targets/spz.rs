@@ -1,0 +1,20 @@
+//! A `.spz` from a stranger: an error or a sound scene. Most of what arrives as bytes ends at the
+//! gzip stream's checksum, so bytes that look like the inflated stream are also wrapped in one.
+#![no_main]
+use std::io::Write as _;
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use libfuzzer_sys::fuzz_target;
+use vizflyt_splat::format::{Format, parse};
+
+/// More than a file of the longest input may inflate to.
+const MOST: usize = 1 << 20;
+
+fuzz_target!(|bytes: &[u8]| {
+    vizflyt_fuzz::check_scene(parse(bytes, Format::Spz), MOST);
+    let mut stream = GzEncoder::new(Vec::new(), Compression::none());
+    stream.write_all(bytes).expect("memory");
+    let wrapped = stream.finish().expect("memory");
+    vizflyt_fuzz::check_scene(parse(&wrapped, Format::Spz), MOST);
+});
