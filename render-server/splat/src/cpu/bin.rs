@@ -68,9 +68,13 @@ impl Bins {
         let tiles = self.tiles_x * self.tiles_y;
         let wanted = rayon::current_num_threads() * SLICES_PER_THREAD;
         let count = (order.len() / MIN_SLICE).clamp(1, wanted.min(MAX_SLICES));
-        self.slices.resize_with(count, Slice::default);
+        // Never fewer than before: their buffers are kept.
+        if self.slices.len() < count {
+            self.slices.resize_with(count, Slice::default);
+        }
+        let slices = &mut self.slices[..count];
         let tiles_x = self.tiles_x;
-        self.slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
+        slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
             slice.places.clear();
             slice.places.resize(tiles, 0);
             let order = &order[order.len() * i / count..order.len() * (i + 1) / count];
@@ -81,7 +85,7 @@ impl Bins {
         let mut place = 0;
         for tile in 0..tiles {
             self.starts.push(place);
-            for slice in &mut self.slices {
+            for slice in &mut *slices {
                 let pairs = slice.places[tile];
                 slice.places[tile] = place;
                 place += pairs;
@@ -92,7 +96,7 @@ impl Bins {
             self.entries.resize_with(place as usize, AtomicU32::default);
         }
         let entries = &self.entries;
-        self.slices.par_iter_mut().with_max_len(1).for_each(|slice| {
+        slices.par_iter_mut().with_max_len(1).for_each(|slice| {
             for &pair in &slice.pairs {
                 let place = &mut slice.places[(pair >> 32) as usize];
                 // Disjoint from all other places; atomic because no borrow can say so.

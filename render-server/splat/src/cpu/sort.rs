@@ -51,8 +51,12 @@ impl Sorter {
             self.order.resize_with(len, AtomicU32::default);
         }
         let slices = (len / MIN_SLICE).clamp(1, rayon::current_num_threads());
-        self.histograms.resize_with(slices, || vec![0; BINS]);
+        // Never fewer than before: their memory is kept.
+        if self.histograms.len() < slices {
+            self.histograms.resize_with(slices, || vec![0; BINS]);
+        }
         self.split_regions(&projected.counts, len, slices);
+        let histograms = &mut self.histograms[..slices];
 
         let (least, shift) = key_range(projected);
         let regions = |slice: usize| self.bounds[slice]..self.bounds[slice + 1];
@@ -64,15 +68,15 @@ impl Sorter {
         let low = |key: u32| key as usize % BINS;
         let high = |key: u32| (key >> DIGIT_BITS) as usize % BINS;
 
-        self.histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
+        histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
             histogram.fill(0);
             for key in regions(slice).flat_map(keys) {
                 histogram[low(compact(*key))] += 1;
             }
         });
-        to_places(&mut self.histograms);
+        to_places(histograms);
         let half_sorted = &self.half_sorted;
-        self.histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
+        histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
             for region in regions(slice) {
                 for (i, &key) in keys(region).enumerate() {
                     let key = compact(key);
@@ -86,15 +90,15 @@ impl Sorter {
 
         let half_sorted = &self.half_sorted[..len];
         let part = |slice: usize| &half_sorted[len * slice / slices..len * (slice + 1) / slices];
-        self.histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
+        histograms.par_iter_mut().enumerate().for_each(|(slice, histogram)| {
             histogram.fill(0);
             for pair in part(slice) {
                 histogram[high((pair.load(Relaxed) >> 32) as u32)] += 1;
             }
         });
-        to_places(&mut self.histograms);
+        to_places(histograms);
         let order = &self.order;
-        self.histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
+        histograms.par_iter_mut().enumerate().for_each(|(slice, places)| {
             for pair in part(slice) {
                 let pair = pair.load(Relaxed);
                 let place = &mut places[high((pair >> 32) as u32)];

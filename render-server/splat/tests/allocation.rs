@@ -1,0 +1,117 @@
+//! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
+//! cameras, their lenses, and the objects that come and go.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+use glam::{DQuat, DVec3, Quat, Vec3};
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
+use vizflyt_splat::{
+    Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
+};
+
+struct Counting;
+
+/// Of all threads: the passes run on the pool's.
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call goes to the system's allocator unchanged; counting allocates nothing.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Relaxed);
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Relaxed);
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// `count` splats all around, up to 4 m away.
+fn cloud(count: u32, half_m: f32) -> Splats {
+    let mut splats = Splats::default();
+    for i in 0..count {
+        // Fractions of multiples of irrational numbers: spread, and the same every time.
+        let spread = |k: f64| (f64::from(i) * k).fract() as f32 * 2.0 - 1.0;
+        let at = Vec3::new(spread(0.618_034), spread(0.414_214), spread(0.732_051));
+        splats.means_m.push(at * half_m);
+        splats.scales_m.push(Vec3::new(0.03, 0.02, 0.01));
+        splats.rotations.push(Quat::from_rotation_x(spread(0.236_068)));
+        splats.opacities.push(0.7);
+        splats.sh.extend(at.to_array());
+    }
+    splats
+}
+
+fn cameras(turn: u32) -> Vec<Camera> {
+    let pinhole = Intrinsics::from_horizontal_fov(160, 120, 1.4);
+    let small = Intrinsics::from_horizontal_fov(99, 55, 1.0);
+    let barrel = Distortion::BrownConrady { k1: -0.2, k2: 0.04, p1: 0.001, p2: 0.0, k3: 0.0 };
+    let fisheye = Distortion::KannalaBrandt { k1: 0.01, k2: 0.0, k3: 0.0, k4: 0.0 };
+    let angle_rad = f64::from(turn) * 0.5;
+    let rotation =
+        DQuat::from_rotation_y(angle_rad) * DQuat::from_rotation_x(0.3 * angle_rad.sin());
+    let position_m = DVec3::new(angle_rad.cos(), 0.2, angle_rad.sin());
+    [
+        pinhole,
+        Intrinsics { distortion: barrel, ..pinhole },
+        Intrinsics { distortion: fisheye, ..small },
+        // Out where there is nothing to see: the buffers stand empty.
+        pinhole,
+    ]
+    .into_iter()
+    .enumerate()
+    .map(|(i, intrinsics)| Camera {
+        intrinsics,
+        world_from_cam: Pose::new(position_m * if i == 3 { 1e4 } else { 1.0 }, rotation),
+        near_m: 0.05,
+        background: [0.0; 3],
+    })
+    .collect()
+}
+
+fn placements(turn: u32) -> [Placement; 2] {
+    let world_from_object = |k: u32| -> Option<Pose<World, Object>> {
+        (turn % (k + 2) != 0).then(|| {
+            let rotation = DQuat::from_rotation_z(f64::from(turn));
+            Pose::new(DVec3::new(0.0, 0.0, f64::from(turn % 5)), rotation)
+        })
+    };
+    [world_from_object(0), world_from_object(1)]
+}
+
+#[test]
+fn nothing_is_allocated_once_every_view_was_seen() {
+    const TURNS: u32 = 13;
+    let splats = cloud(60_000, 4.0);
+    let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(2000, 0.5) });
+    let calls: Vec<_> = (0..TURNS).map(|turn| (placements(turn), cameras(turn))).collect();
+    // On the pool's own thread, as rayon itself allocates a little, now and then, to take in work
+    // from outside.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    for mut renderer in CpuRenderer::every(Scene { splats: &splats, objects: &objects }) {
+        let mut images = vec![RgbdImage::default(); calls[0].1.len()];
+        let counts = pool.install(|| {
+            [(); 4].map(|()| {
+                let before = ALLOCATIONS.load(Relaxed);
+                for (placements, cameras) in &calls {
+                    renderer.render(placements, cameras, &mut images).expect("a valid call");
+                }
+                ALLOCATIONS.load(Relaxed) - before
+            })
+        });
+        assert!(counts[0] > 0, "the counter counts");
+        assert_eq!(counts[1..], [0, 0, 0], "{}", renderer.name());
+    }
+}
