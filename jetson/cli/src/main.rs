@@ -1,6 +1,7 @@
 //! `vizflyt`: the one command people type. Each subcommand is a library of its own; this file only
 //! reads the command line and starts one.
 
+mod bench;
 mod demo;
 mod plugins;
 mod scene;
@@ -35,8 +36,10 @@ enum Command {
     Fly(vizflyt_runtime::FlyArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
-    /// Makes scenes.
+    /// Makes scenes, looks at them, draws them.
     Scene(scene::SceneArgs),
+    /// Measures how fast this machine draws.
+    Bench(bench::BenchArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
@@ -47,6 +50,8 @@ fn main() -> ExitCode {
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
         // The demo tells its own story; its children's logs would drown it.
         Command::Demo(_) => "warn".to_owned(),
+        // What they print is the result; a load of seconds still shows its progress.
+        Command::Bench(_) => "warn,vizflyt_server::scene=info".to_owned(),
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
@@ -69,6 +74,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Fly(args) => plugins::fly(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
+        Command::Bench(args) => bench::run(args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
     }
 }

@@ -70,7 +70,7 @@ fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
 }
 
-fn scale(text: &str) -> Result<f64, String> {
+pub(crate) fn scale(text: &str) -> Result<f64, String> {
     number(text, 1e-4, 1e4)
 }
 

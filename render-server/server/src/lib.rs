@@ -27,7 +27,9 @@ pub mod stats;
 pub mod stop;
 pub mod tick;
 pub mod transport;
+mod view;
 
 pub use args::ServeArgs;
 pub use scene::default_arena;
 pub use serve::serve;
+pub use view::{ViewArgs, view};

@@ -129,7 +129,7 @@ struct Twin {
 }
 
 fn prepare(args: &ServeArgs) -> Result<Twin> {
-    let Scene { arena, splats } = scene::load(&args.arena, args.up, args.scale)?;
+    let Scene { arena, splats, .. } = scene::load(&args.arena, args.up, args.scale)?;
     let obstacles = scene::bake(&splats, &arena);
     let map = draw_map(&splats, &arena, &obstacles);
     let renderer = choose(&splats, args.renderer)?;

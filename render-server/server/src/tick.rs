@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn every_camera_keeps_its_rate() {
-        assert_eq!(drawn_in_a_second(&[None], 1), [120]);
+        assert!(drawn_in_a_second(&[None], 1)[0].abs_diff(120) <= 1);
         let counts = drawn_in_a_second(&[Some(30.0), None, Some(10.0), Some(500.0)], 1);
         assert!(counts[0].abs_diff(30) <= 1 && counts[2].abs_diff(10) <= 1, "{counts:?}");
         assert!(counts[1].abs_diff(120) <= 1 && counts[3] == counts[1], "{counts:?}");

@@ -21,6 +21,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         "vizflyt",
         &[
             "vizflyt-protocol",
+            "vizflyt-splat",
             "vizflyt-arena",
             "vizflyt-scenes",
             "vizflyt-server",

@@ -25,6 +25,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::Value;
+use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
 use self::memory::MemoryWatch;
@@ -39,7 +40,7 @@ use self::report::Parts;
   vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
-    /// forest, race, room; or the path of a scene folder, an arena.toml or a splat .ply.
+    /// forest, race, room; or the path of a scene folder, an arena.toml or a scene file.
     #[arg(long, default_value = "forest")]
     scene: String,
     /// Plugin to fly: an executable, or the name of a built-in example.
@@ -51,6 +52,9 @@ pub(crate) struct DemoArgs {
     /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]
     #[arg(long)]
     seconds: Option<f64>,
+    /// What draws: a graphics card if one answers, the processor, or any graphics adapter.
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
     /// Opens no browser.
     #[arg(long)]
     headless: bool,
@@ -130,11 +134,17 @@ impl Show {
             "--quic=127.0.0.1:0".into(),
             "--vicon=127.0.0.1:0".into(),
             format!("--http={page}").into(),
+            format!("--renderer={}", args.renderer).into(),
         ];
         let Some(server) = self.start(Role::Server, &serve)? else {
             return Ok(Flown::Interrupted);
         };
         let url = text(&server, "http")?;
+        tell(format!(
+            "renderer    {} ({})",
+            text(&server, "renderer")?,
+            text(&server, "renderer_reason")?
+        ));
         tell(format!("page        {url}"));
         if !args.headless {
             open_browser(&url);
@@ -298,14 +308,14 @@ fn interrupt_notices(notices: Sender<Notice>) -> Result<()> {
 }
 
 /// Prints a line for people; unlike `println!` it does not panic when nobody reads any more.
-fn tell(line: impl std::fmt::Display) {
+pub(crate) fn tell(line: impl std::fmt::Display) {
     use std::io::Write;
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
 /// Opens the page where there is a desktop; the address is printed in any case.
-fn open_browser(url: &str) {
+pub(crate) fn open_browser(url: &str) {
     let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
     let quiet = std::process::Stdio::null;
     let spawned = std::process::Command::new(opener)

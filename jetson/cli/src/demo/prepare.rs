@@ -36,11 +36,11 @@ impl Stage {
         if !path.exists() {
             bail!(
                 "--scene '{scene}' is neither forest, race nor room, nor a path that exists; \
-                 give one of the names, a folder with an arena.toml, or a splat .ply"
+                 give one of the names, a folder with an arena.toml, or a scene file"
             );
         }
         super::tell(format!("scene       {}", path.display()));
-        if path.is_dir() {
+        if path.join("arena.toml").is_file() {
             return Self::at(path.join("arena.toml"), None);
         }
         if path.extension().is_some_and(|extension| extension == "toml") {

@@ -44,6 +44,8 @@ pub(crate) struct Report {
     pub peak_rss_mb: f64,
     /// The renderer that drew, such as `cpu avx2`.
     pub renderer: String,
+    /// Why it was this one.
+    pub renderer_reason: String,
     /// Where the flight log is.
     pub log: String,
 }
@@ -103,6 +105,7 @@ impl Parts {
             mavlink_packets: count(&self.runtime, "mavlink_packets"),
             peak_rss_mb,
             renderer: text(&self.server, "renderer").unwrap_or_default(),
+            renderer_reason: text(&self.server, "renderer_reason").unwrap_or_default(),
             log: log.to_owned(),
         }
     }

@@ -15,7 +15,7 @@
 
 mod cameras;
 mod messages;
-mod origin;
+pub(crate) mod origin;
 mod viewer;
 
 use std::net::SocketAddr;
@@ -95,7 +95,7 @@ fn router(page: Arc<Page>) -> Router {
         .with_state(page)
 }
 
-fn file(kind: &'static str, text: &'static str) -> Response {
+pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {
     let mut response = text.into_response();
     let headers = response.headers_mut();
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
@@ -144,7 +144,7 @@ async fn watch(
     }
 }
 
-fn refuse(refusal: &origin::Refusal) -> Response {
+pub(crate) fn refuse(refusal: &origin::Refusal) -> Response {
     warn!("page: {refusal}");
     (StatusCode::FORBIDDEN, refusal.to_string()).into_response()
 }
@@ -153,7 +153,7 @@ const INDEX: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 const APP: &str = include_str!("page/app.js");
 const MAP: &str = include_str!("page/map.js");
-const ICON: &str = include_str!("page/icon.svg");
+pub(crate) const ICON: &str = include_str!("page/icon.svg");
 
 /// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.
 const GUARDS: [(&str, &str); 5] = [

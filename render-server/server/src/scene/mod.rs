@@ -2,8 +2,9 @@
 //!
 //! ```text
 //! arena.toml -> ArenaConfig -> its scene file -> Splats --------> renderer
-//! scene.ply  -> upright, to size -> ArenaConfig (made up)   \---> occupancy -> referee, map
+//! scene file -> upright, to size -> ArenaConfig (made up)   \---> occupancy -> referee, map
 //! ```
+//! A scene file is of any format that [`vizflyt_splat::format`] knows, told by its content.
 //! Once, at the start; progress goes to the log.
 
 mod bake;
@@ -14,14 +15,14 @@ pub use bake::bake;
 pub use bare::{align, default_arena};
 pub use orient::{Up, WorldFromScene};
 
-use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use tracing::{info, warn};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_splat::{Splats, ply};
+use vizflyt_splat::Splats;
+use vizflyt_splat::format::{self, Loaded, Progress};
 
 /// A loaded twin.
 #[derive(Debug)]
@@ -30,10 +31,36 @@ pub struct Scene {
     pub arena: ArenaConfig,
     /// The twin. [m, world]
     pub splats: Splats,
+    /// How the scene's file was turned, scaled and moved to become the twin.
+    pub world_from_scene: WorldFromScene,
+}
+
+/// What a path on the command line names.
+enum Named {
+    Arena(PathBuf),
+    Scene(PathBuf),
 }
 
 /// Reads an arena with its scene, or a bare scene, which is then put upright and to size.
 pub fn load(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
+    match named(path)? {
+        Named::Arena(path) => with_arena(&path),
+        Named::Scene(path) => without_arena(&path, up, scale),
+    }
+}
+
+/// Reads a scene file as it is, neither turned nor scaled; of an arena, its scene file, which lies
+/// in the world already. Returns the file's path with what it holds.
+pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
+    let scene = match named(path)? {
+        Named::Arena(path) => parse_arena(&path)?.1,
+        Named::Scene(path) => path,
+    };
+    let loaded = read(&scene)?;
+    Ok((scene, loaded))
+}
+
+fn named(path: &Path) -> Result<Named> {
     if !path.exists() {
         bail!(
             "there is no {}; make a scene with: vizflyt scene generate forest -o forest",
@@ -43,25 +70,26 @@ pub fn load(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
     if path.is_dir() {
         let inside = path.join("arena.toml");
         if inside.is_file() {
-            return load(&inside, up, scale);
+            return Ok(Named::Arena(inside));
+        }
+        if path.join("meta.json").is_file() {
+            // An unpacked SOG.
+            return Ok(Named::Scene(path.to_owned()));
         }
         bail!("{} is a folder without an arena.toml", path.display());
     }
-    let extension = path.extension().map(OsStr::to_ascii_lowercase);
-    match extension.as_deref().and_then(OsStr::to_str) {
-        Some("toml") => with_arena(path),
-        Some("ply") => Ok(without_arena(path, up, scale)?),
-        _ => bail!("{} is neither an arena (.toml) nor a scene (.ply)", path.display()),
-    }
+    let is_toml = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("toml"));
+    Ok(if is_toml { Named::Arena(path.to_owned()) } else { Named::Scene(path.to_owned()) })
 }
 
-fn with_arena(path: &Path) -> Result<Scene> {
+/// Returns an arena and where its scene lies.
+fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let arena =
         ArenaConfig::parse(&text).with_context(|| format!("{} is wrong", path.display()))?;
     let scene = arena.scene_path(path);
-    if !scene.is_file() {
+    if !scene.exists() {
         bail!(
             "{} names the scene '{}', but there is no {}; generate it, or correct `scene`",
             path.display(),
@@ -69,11 +97,17 @@ fn with_arena(path: &Path) -> Result<Scene> {
             scene.display()
         );
     }
-    Ok(Scene { splats: read(&scene)?, arena })
+    Ok((arena, scene))
+}
+
+fn with_arena(path: &Path) -> Result<Scene> {
+    let (arena, scene) = parse_arena(path)?;
+    let world_from_scene = WorldFromScene::IDENTITY;
+    Ok(Scene { splats: read(&scene)?.splats, arena, world_from_scene })
 }
 
 fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
-    let mut splats = read(path)?;
+    let mut splats = read(path)?.splats;
     let world_from_scene = align(&splats, up, scale);
     world_from_scene.apply(&mut splats);
     let file = path.file_name().map_or_else(|| path.to_owned(), PathBuf::from);
@@ -85,29 +119,43 @@ fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
         if scale.is_none() { " (a guess; set --scale and --up)" } else { "" },
         arena.spawn.position_m
     );
-    Ok(Scene { arena, splats })
+    Ok(Scene { arena, splats, world_from_scene })
 }
 
-fn read(path: &Path) -> Result<Splats> {
+/// Reads a scene file of any format; how far it has come goes to the log, if it takes long.
+fn read(path: &Path) -> Result<Loaded> {
     let start = Instant::now();
-    let loaded = ply::read(path).with_context(|| format!("cannot use scene {}", path.display()))?;
+    let mut told = start;
+    let mut tell = |at: Progress| {
+        if told.elapsed() >= TELL_EVERY && at.done < at.total {
+            told = Instant::now();
+            info!("{}: {:.0} % read", path.display(), 100.0 * at.done as f64 / at.total as f64);
+        }
+    };
+    let loaded = format::read_with_progress(path, &mut tell)
+        .with_context(|| format!("cannot use scene {}", path.display()))?;
     let dropped = loaded.dropped.total();
     if dropped > 0 {
         warn!("{}: {dropped} faulty splats left out: {:?}", path.display(), loaded.dropped);
     }
     info!(
-        "{}: {} splats in {:.0} ms",
+        "{}: {}, {} splats in {:.0} ms",
         path.display(),
+        loaded.format,
         loaded.splats.len(),
         start.elapsed().as_secs_f64() * 1e3
     );
-    Ok(loaded.splats)
+    Ok(loaded)
 }
+
+/// Shorter loads need no progress.
+const TELL_EVERY: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::{Quat, Vec3};
+    use vizflyt_splat::ply;
 
     fn check(path: &Path, expected: &str) {
         let error = format!("{:#}", load(path, Up::default(), None).unwrap_err());
@@ -132,7 +180,7 @@ mod tests {
         check(&at("nothing.toml"), "make a scene with: vizflyt scene generate");
         check(folder.path(), "is a folder without an arena.toml");
         std::fs::write(at("notes.txt"), "x").unwrap();
-        check(&at("notes.txt"), "is neither an arena (.toml) nor a scene (.ply)");
+        check(&at("notes.txt"), "supported are");
         std::fs::write(at("bad.toml"), "name = 3").unwrap();
         check(&at("bad.toml"), "bad.toml is wrong");
         std::fs::write(at("bad.ply"), "ply\nformat nonsense\n").unwrap();

@@ -63,6 +63,10 @@ pub struct WorldFromScene {
 }
 
 impl WorldFromScene {
+    /// Leaves everything where it is.
+    pub const IDENTITY: Self =
+        Self { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
+
     /// Moves every splat into the world.
     pub fn apply(&self, splats: &mut Splats) {
         let rotation = self.rotation.as_quat();

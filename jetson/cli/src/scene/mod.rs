@@ -1,4 +1,9 @@
-//! `vizflyt scene`: makes scenes.
+//! `vizflyt scene`: makes scenes, looks at them, draws them.
+
+pub(crate) mod camera;
+mod inspect;
+mod npy;
+mod render;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -7,7 +12,9 @@ use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_scenes::SceneKind;
 
-/// Makes scenes.
+use crate::demo::{open_browser, tell};
+
+/// Makes scenes, looks at them, draws them.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -33,11 +40,36 @@ enum SceneCommand {
         #[arg(long)]
         force: bool,
     },
+    Inspect(inspect::InspectArgs),
+    Render(render::RenderArgs),
+    View(vizflyt_server::ViewArgs),
 }
 
 /// Runs `vizflyt scene`.
 pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
-    let SceneCommand::Generate { kind, seed, output, force } = args.command;
+    match args.command {
+        SceneCommand::Generate { kind, seed, output, force } => {
+            generate(kind, seed, &output, force)?;
+        }
+        SceneCommand::Inspect(args) => inspect::run(&args)?,
+        SceneCommand::Render(args) => render::run(&args)?,
+        SceneCommand::View(args) => view(args)?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn view(args: vizflyt_server::ViewArgs) -> Result<()> {
+    let quiet = args.no_browser;
+    vizflyt_server::view(args, |url, renderer| {
+        tell(format!("renderer    {} ({})", renderer.name, renderer.reason));
+        tell(format!("page        {url}"));
+        if !quiet {
+            open_browser(url);
+        }
+    })
+}
+
+fn generate(kind: SceneKind, seed: u64, output: &std::path::Path, force: bool) -> Result<()> {
     if output.join("arena.toml").exists() && !force {
         bail!(
             "{} already holds an arena.toml; give another folder, or --force to replace it",
@@ -45,9 +77,9 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         );
     }
     let scene = vizflyt_scenes::generate(kind, seed);
-    let written = scene.write(&output)?;
+    let written = scene.write(output)?;
     println!("{} splats     {}", scene.splats.len(), written.scene.display());
     println!("arena             {}", written.arena.display());
     println!("{} true solids   {}", scene.truth.len(), written.truth.display());
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }

@@ -1,0 +1,190 @@
+//! `vizflyt bench`: how fast this machine draws.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use serde::Serialize;
+use vizflyt_server::render::{RendererKind, choose};
+use vizflyt_server::scene::load_as_it_is;
+use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
+
+use crate::scene::camera::{self, ImageSize};
+
+/// Measures this machine.
+#[derive(Args, Debug)]
+pub(crate) struct BenchArgs {
+    #[command(subcommand)]
+    command: BenchCommand,
+}
+
+#[derive(Subcommand, Debug)]
+enum BenchCommand {
+    Render(RenderArgs),
+}
+
+/// Draws a scene many times over; prints milliseconds per image and pass.
+#[derive(Args, Debug)]
+#[command(after_help = "Each image has RGB, alpha, and expected and median depth. With several \
+cameras, each is drawn in turn, --images times; the figures are over all of them.
+
+Examples:
+  vizflyt bench render room.ply --camera cam.json
+  vizflyt bench render room.ply --camera a.json --camera b.json --size 640x480 --json
+  vizflyt bench render forest/arena.toml --camera cam.json --renderer cpu --images 200")]
+struct RenderArgs {
+    /// Scene file of any format, or an arena.toml (then its scene)
+    scene: PathBuf,
+    /// The camera, as for `vizflyt scene render`; may be given several times
+    #[arg(long = "camera", value_name = "CAM.json", required = true)]
+    cameras: Vec<PathBuf>,
+    /// Draws images of this size instead of the camera's; they show the same
+    #[arg(long, value_name = "WxH")]
+    size: Option<ImageSize>,
+    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
+    /// Images per camera that count; a few before them do not
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    images: u32,
+    /// Prints one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `--json` prints; times in milliseconds, medians but where the name says otherwise.
+#[derive(Debug, Serialize)]
+struct Figures {
+    scene: String,
+    splats: usize,
+    width_px: u32,
+    height_px: u32,
+    cameras: usize,
+    images: usize,
+    renderer: String,
+    renderer_reason: String,
+    prepare_ms: f64,
+    median_ms: f32,
+    p99_ms: f32,
+    passes: Passes,
+    /// Of the last image of each camera, the mean.
+    workload: Work,
+}
+
+#[derive(Debug, Serialize)]
+struct Passes {
+    cull_ms: f32,
+    project_ms: f32,
+    sort_ms: f32,
+    bin_ms: f32,
+    blend_ms: f32,
+    read_ms: f32,
+}
+
+#[derive(Debug, Default, Serialize)]
+struct Work {
+    splats: usize,
+    visible: usize,
+    pairs: usize,
+}
+
+/// Runs `vizflyt bench`.
+pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
+    let BenchCommand::Render(args) = args.command;
+    let figures = measure(&args)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&figures)?);
+    } else {
+        print(&figures);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn measure(args: &RenderArgs) -> Result<Figures> {
+    let cameras: Vec<Camera> = args
+        .cameras
+        .iter()
+        .map(|path| {
+            let camera = camera::read(path)?;
+            args.size.map_or(Ok(camera), |size| camera::resized(&camera, size))
+        })
+        .collect::<Result<_>>()?;
+    let (path, loaded) = load_as_it_is(&args.scene)?;
+    let start = std::time::Instant::now();
+    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer)?;
+    let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
+    let splats = loaded.splats.len();
+    drop(loaded);
+
+    let mut images = [RgbdImage::default()];
+    let mut times: Vec<PassTimes> = Vec::new();
+    let mut work = Work::default();
+    for camera in &cameras {
+        for image in 0..WARM_UP + args.images {
+            let taken = rasterizer.render(&[], std::slice::from_ref(camera), &mut images)?;
+            if image >= WARM_UP {
+                times.push(taken);
+            }
+        }
+        let seen = rasterizer.workload();
+        work.splats = seen.splats;
+        work.visible += seen.visible / cameras.len();
+        work.pairs += seen.pairs / cameras.len();
+    }
+    let at = |share: f64, of: fn(&PassTimes) -> f32| {
+        let mut values: Vec<f32> = times.iter().map(of).collect();
+        values.sort_unstable_by(f32::total_cmp);
+        values[(share * (values.len() - 1) as f64).round() as usize]
+    };
+    let k = cameras[0].intrinsics;
+    Ok(Figures {
+        scene: path.display().to_string(),
+        splats,
+        width_px: k.width_px,
+        height_px: k.height_px,
+        cameras: cameras.len(),
+        images: times.len(),
+        renderer: rasterizer.name(),
+        renderer_reason: reason,
+        prepare_ms,
+        median_ms: at(0.5, |t| t.total_ms),
+        p99_ms: at(0.99, |t| t.total_ms),
+        passes: Passes {
+            cull_ms: at(0.5, |t| t.cull_ms),
+            project_ms: at(0.5, |t| t.project_ms),
+            sort_ms: at(0.5, |t| t.sort_ms),
+            bin_ms: at(0.5, |t| t.bin_ms),
+            blend_ms: at(0.5, |t| t.blend_ms),
+            read_ms: at(0.5, |t| t.read_ms),
+        },
+        workload: work,
+    })
+}
+
+fn print(f: &Figures) {
+    println!("scene       {}: {} splats", f.scene, f.splats);
+    println!("renderer    {} ({})", f.renderer, f.renderer_reason);
+    println!("prepared    in {:.0} ms", f.prepare_ms);
+    println!(
+        "images      {} of {}x{} from {} cameras: RGB, alpha, expected and median depth",
+        f.images, f.width_px, f.height_px, f.cameras
+    );
+    println!("work        {} splats in sight, {} tile pairs", f.workload.visible, f.workload.pairs);
+    println!("median      {:.2} ms, {:.1} images/s", f.median_ms, 1e3 / f.median_ms);
+    println!("p99         {:.2} ms", f.p99_ms);
+    let passes = &f.passes;
+    for (name, ms) in [
+        ("cull", passes.cull_ms),
+        ("project", passes.project_ms),
+        ("sort", passes.sort_ms),
+        ("bin", passes.bin_ms),
+        ("blend", passes.blend_ms),
+        ("read", passes.read_ms),
+    ] {
+        println!("  {name:<9} {ms:.2} ms");
+    }
+}
+
+/// Buffers grow to their size, clocks to their speed.
+const WARM_UP: u32 = 5;

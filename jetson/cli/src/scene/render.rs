@@ -1,0 +1,146 @@
+//! `vizflyt scene render`: pictures of a scene from given cameras, as files.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+use image::{ImageBuffer, Luma, Rgb};
+use vizflyt_server::render::{RendererKind, choose};
+use vizflyt_server::scene::load_as_it_is;
+use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage};
+
+use super::camera;
+use super::npy;
+
+/// Draws a scene as it is, from cameras in its own frame, to files.
+#[derive(Args, Debug)]
+#[command(after_help = "CAM.json:
+  {\"fx\": 251.1, \"fy\": 251.1, \"cx\": 160, \"cy\": 120, \"w\": 320, \"h\": 240, \"bg\": [0, 0, 0],
+   \"w2c\": [[1,0,0,0], [0,1,0,0], [0,0,1,0], [0,0,0,1]]}
+  w2c takes points of the scene file to the camera (x right, y down, z forward); pixel centres at
+  +0.5. May also have near_m (0.01), and distortion {\"model\": \"brown-conrady\", \"k1\": ...} or
+  {\"model\": \"kannala-brandt\", ...}. `vizflyt scene view` copies one from where you have flown.
+
+Files:
+  png   rgb.png; depth_mm.png (16 bit, millimetres, median, 0 is no return)
+  npy   rgb.npy (H,W,3 float32, on bg, unclamped), alpha.npy, depth_expected.npy,
+        depth_median.npy (H,W float32, metres along the optical axis, 0 is none), and ids.npy
+        (H,W uint16) where objects are seen
+
+Examples:
+  vizflyt scene render room.ply --camera cam.json --out pictures
+  vizflyt scene render forest/arena.toml --camera a.json --camera b.json --format npy --out poses")]
+pub(crate) struct RenderArgs {
+    /// Scene file of any format, or an arena.toml (then its scene)
+    scene: PathBuf,
+    /// The camera; given several times, each has a folder of its name in --out
+    #[arg(long = "camera", value_name = "CAM.json", required = true)]
+    cameras: Vec<PathBuf>,
+    /// Folder to write to; made if absent
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    out: PathBuf,
+    /// png to look at, npy to compute with
+    #[arg(long, value_enum, default_value_t)]
+    format: FileFormat,
+    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
+}
+
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
+enum FileFormat {
+    /// 8-bit colour and 16-bit millimetres.
+    #[default]
+    Png,
+    /// float32 arrays for numpy.
+    Npy,
+}
+
+/// Runs `vizflyt scene render`.
+pub(super) fn run(args: &RenderArgs) -> Result<()> {
+    // Cameras first: a mistake in one is told before the scene is loaded.
+    let shots = shots(args)?;
+    let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let start = Instant::now();
+    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer)?;
+    println!("scene       {}: {} splats", scene.display(), loaded.splats.len());
+    println!("renderer    {} ({reason})", rasterizer.name());
+    drop(loaded);
+    println!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
+    let mut images = [RgbdImage::default()];
+    for Shot { camera, folder } in shots {
+        let times = rasterizer.render(&[], &[camera], &mut images)?;
+        let [image] = &images;
+        std::fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot make the folder {}", folder.display()))?;
+        match args.format {
+            FileFormat::Png => write_png(image, &folder)?,
+            FileFormat::Npy => write_npy(image, &folder)?,
+        }
+        let work = rasterizer.workload();
+        println!(
+            "{:<11} {}x{} in {:.1} ms, {} splats in sight",
+            folder.display(),
+            image.width_px,
+            image.height_px,
+            times.total_ms,
+            work.visible
+        );
+    }
+    Ok(())
+}
+
+struct Shot {
+    camera: Camera,
+    folder: PathBuf,
+}
+
+fn shots(args: &RenderArgs) -> Result<Vec<Shot>> {
+    let mut shots: Vec<Shot> = Vec::new();
+    for path in &args.cameras {
+        let camera = camera::read(path)?;
+        let folder = match &args.cameras[..] {
+            [_] => args.out.clone(),
+            _ => args.out.join(path.file_stem().unwrap_or(path.as_os_str())),
+        };
+        if shots.iter().any(|shot| shot.folder == folder) {
+            bail!(
+                "two cameras would write to {}; give their files different names",
+                folder.display()
+            );
+        }
+        shots.push(Shot { camera, folder });
+    }
+    Ok(shots)
+}
+
+fn write_png(image: &RgbdImage, folder: &Path) -> Result<()> {
+    let (width, height) = (image.width_px, image.height_px);
+    let (mut rgb, mut depth_mm) = (Vec::new(), Vec::new());
+    image.write_rgb8(&mut rgb);
+    image.write_depth_mm(DepthKind::Median, &mut depth_mm);
+    let path = folder.join("rgb.png");
+    ImageBuffer::<Rgb<u8>, _>::from_raw(width, height, rgb)
+        .expect("three bytes a pixel")
+        .save(&path)
+        .with_context(|| format!("cannot write {}", path.display()))?;
+    let path = folder.join("depth_mm.png");
+    ImageBuffer::<Luma<u16>, _>::from_raw(width, height, depth_mm)
+        .expect("one depth a pixel")
+        .save(&path)
+        .with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn write_npy(image: &RgbdImage, folder: &Path) -> Result<()> {
+    let (height, width) = (image.height_px as usize, image.width_px as usize);
+    npy::save(&folder.join("rgb.npy"), &[height, width, 3], &image.rgb)?;
+    let shape = [height, width];
+    npy::save(&folder.join("alpha.npy"), &shape, &image.alpha)?;
+    npy::save(&folder.join("depth_expected.npy"), &shape, &image.depth_expected_m)?;
+    npy::save(&folder.join("depth_median.npy"), &shape, &image.depth_median_m)?;
+    if image.ids.iter().any(|&id| id != 0) {
+        npy::save(&folder.join("ids.npy"), &shape, &image.ids)?;
+    }
+    Ok(())
+}
