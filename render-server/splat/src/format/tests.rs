@@ -457,6 +457,11 @@ fn hostile_sizes_are_refused_before_memory_is_taken() {
     let mut four = spz::encode(&some(), 4);
     four[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
     refuse("table", &four, Format::Spz, "table of contents");
+    let mut four = spz::encode(&some(), 4);
+    four[32..40].fill(0xff);
+    refuse("stream", &four, Format::Spz, "an attribute takes 18446744073709551615 bytes");
+    four[40..48].fill(0xff);
+    refuse("inflated", &four, Format::Spz, "18446744073709551615 bytes for 7 splats");
 
     // .ksplat: sections and splats beyond the file.
     let whole = ksplat::encode(&some(), 1);

@@ -189,7 +189,7 @@ fn unpack(bytes: &[u8], meter: &Meter) -> Result<(Header, Attributes), FormatErr
         }
         let available = bytes.len() - at;
         if packed > available as u64 {
-            return Err(truncated("an attribute", at as u64 + packed));
+            return Err(truncated("an attribute", packed.saturating_add(at as u64)));
         }
         let packed = &bytes[at..at + packed as usize];
         at += packed.len();
