@@ -2,7 +2,9 @@
 
 use std::str::FromStr;
 
-use crate::{CpuRenderer, Rasterizer, Scene};
+#[cfg(feature = "gpu")]
+use crate::gpu;
+use crate::{CpuRenderer, Rasterizer, Resilient, Scene};
 
 /// What the user asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -57,21 +59,193 @@ pub enum NoRenderer {
     Gpu(String),
 }
 
-/// Returns the renderer for a scene on this machine.
+/// Returns the renderer for a scene on this machine. One on a graphics card has the processor
+/// behind it ([`crate::Resilient`]): no image is missing when its device is lost.
 ///
 /// # Errors
 /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
 /// find one.
 pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chosen, NoRenderer> {
     let scene = scene.into();
-    let cpu = |why: &str| {
-        let cpu = CpuRenderer::new(scene);
-        let reason = format!("{why}; {}", cpu.name());
-        Ok(Chosen { rasterizer: Box::new(cpu), reason })
-    };
-    match backend {
-        Backend::Cpu => cpu("asked for"),
-        Backend::Auto => cpu("no graphics renderer in this build"),
-        Backend::Gpu => Err(NoRenderer::Gpu("built without the feature `gpu`".into())),
+    let cpu = CpuRenderer::new(scene);
+    if backend == Backend::Cpu {
+        let reason = format!("asked for; {}", cpu.name());
+        return Ok(Chosen { rasterizer: Box::new(cpu), reason });
+    }
+    match (graphics(scene, backend == Backend::Gpu), backend) {
+        (Ok((rasterizer, reason)), _) => {
+            Ok(Chosen { rasterizer: Box::new(Resilient::new(rasterizer, cpu)), reason })
+        }
+        (Err(why), Backend::Gpu) => Err(NoRenderer::Gpu(why)),
+        (Err(why), _) => {
+            let reason = format!("{why}; {}", cpu.name());
+            Ok(Chosen { rasterizer: Box::new(cpu), reason })
+        }
+    }
+}
+
+/// Returns a renderer on the first adapter that draws the test image, and what was found; or why
+/// there is none.
+#[cfg(feature = "gpu")]
+fn graphics(
+    scene: Scene<'_>,
+    takes_software: bool,
+) -> Result<(Box<dyn Rasterizer>, String), String> {
+    let mut found = Vec::new();
+    for adapter in gpu::Adapter::all() {
+        let gpu::AdapterName { name, is_software } = adapter.name();
+        if *is_software && !takes_software {
+            found.push(format!("software adapter {name} left alone"));
+            continue;
+        }
+        let kind = if *is_software { "software adapter" } else { "graphics adapter" };
+        let opened = trial::scene_and_camera();
+        let drawn = gpu::GpuRenderer::new(&opened.0, &adapter, gpu::Budget::default())
+            .map_err(|error| error.to_string())
+            .and_then(|mut renderer| {
+                let found_db = trial::check(&mut renderer, &opened.0, &opened.1)?;
+                renderer.load(scene).map_err(|error| error.to_string())?;
+                Ok((renderer, found_db))
+            });
+        match drawn {
+            Ok((renderer, found_db)) => {
+                found.push(format!("{kind} {name} draws as the processor does, {found_db:.0} dB"));
+                return Ok((Box::new(renderer), found.join("; ")));
+            }
+            Err(why) => found.push(format!("{kind} {name} refused: {why}")),
+        }
+    }
+    Err(if found.is_empty() { "no graphics adapter".to_owned() } else { found.join("; ") })
+}
+
+#[cfg(not(feature = "gpu"))]
+fn graphics(_: Scene<'_>, _: bool) -> Result<(Box<dyn Rasterizer>, String), String> {
+    Err("built without the feature `gpu`".to_owned())
+}
+
+/// The test image: drivers have been seen to sort wrongly, and to draw nothing.
+#[cfg(feature = "gpu")]
+mod trial {
+    use glam::{Quat, Vec3};
+    use vizflyt_protocol::geometry::{Intrinsics, Pose};
+
+    use crate::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+
+    /// Less is no rounding: right renderers differ by 75 dB and more.
+    const LEAST_DB: f64 = 50.0;
+
+    /// Returns 20 k splats in many layers, more than one group of the sort holds, and a camera that
+    /// sees most of them.
+    pub(super) fn scene_and_camera() -> (Splats, Camera) {
+        let mut splats = Splats { sh_degree: 1, ..Splats::default() };
+        for i in 0..20_000u32 {
+            // Low-discrepancy numbers (Roberts 2018, R3): evenly spread and without a pattern.
+            let r = |share: f64, i: u32| (0.5 + share * f64::from(i)).fract() as f32;
+            let (x, y, z) = (r(0.819_172_5, i), r(0.671_043_6, i), r(0.549_700_5, i));
+            splats.means_m.push(Vec3::new(x * 4.0 - 2.0, y * 3.0 - 1.5, 1.0 + 3.0 * z));
+            splats.scales_m.push(Vec3::new(0.01 + 0.04 * y, 0.01 + 0.04 * z, 0.01 + 0.04 * x));
+            let axis = Vec3::new(x - 0.5, y - 0.5, z - 0.5).normalize_or(Vec3::X);
+            splats.rotations.push(Quat::from_axis_angle(axis, 6.0 * y));
+            splats.opacities.push(0.05 + 0.9 * x);
+            splats.sh.extend((0..12).map(|k| r(0.137, i + k) - 0.5));
+        }
+        let camera = Camera {
+            intrinsics: Intrinsics::from_horizontal_fov(100, 75, 1.3),
+            world_from_cam: Pose::IDENTITY,
+            near_m: 0.05,
+            background: [0.1, 0.2, 0.3],
+        };
+        (splats, camera)
+    }
+
+    /// Draws the test image twice, and returns how like the processor's it is; or what is wrong.
+    pub(super) fn check(
+        renderer: &mut dyn Rasterizer,
+        splats: &Splats,
+        camera: &Camera,
+    ) -> Result<f64, String> {
+        let mut expected = [RgbdImage::default()];
+        let mut cpu = CpuRenderer::new(splats);
+        cpu.render(&[], &[*camera], &mut expected).map_err(|error| error.to_string())?;
+        let mut images = [RgbdImage::default(), RgbdImage::default()];
+        for image in images.chunks_mut(1) {
+            renderer.render(&[], &[*camera], image).map_err(|error| error.to_string())?;
+        }
+        if images[0] != images[1] {
+            return Err("draws the same test image differently each time".to_owned());
+        }
+        let found_db = alike_db(&images[0], &expected[0]);
+        // Positive, so that NaN is refused.
+        if found_db >= LEAST_DB {
+            Ok(found_db)
+        } else {
+            Err(format!("draws the test image {found_db:.0} dB from the processor's"))
+        }
+    }
+
+    /// Returns the least peak signal-to-noise ratio of colour, alpha and expected depth; depth
+    /// relative to 4 m. [dB]
+    fn alike_db(a: &RgbdImage, b: &RgbdImage) -> f64 {
+        let db = |a: &[f32], b: &[f32], peak: f64| {
+            let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+            let mean = sum / a.len() as f64;
+            10.0 * (peak * peak / mean.max(1e-20)).log10()
+        };
+        db(&a.rgb, &b.rgb, 1.0).min(db(&a.alpha, &b.alpha, 1.0)).min(db(
+            &a.depth_expected_m,
+            &b.depth_expected_m,
+            4.0,
+        ))
+    }
+
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+        use crate::{PassTimes, Placement, RenderError, Workload};
+
+        /// Draws as the processor, then spoils.
+        struct Spoiling(CpuRenderer, fn(&mut RgbdImage, usize), usize);
+
+        impl Rasterizer for Spoiling {
+            fn name(&self) -> String {
+                String::new()
+            }
+
+            fn render(
+                &mut self,
+                placements: &[Placement],
+                cameras: &[Camera],
+                images: &mut [RgbdImage],
+            ) -> Result<PassTimes, RenderError> {
+                let drawn = self.0.render(placements, cameras, images);
+                self.1(&mut images[0], self.2);
+                self.2 += 1;
+                drawn
+            }
+
+            fn workload(&self) -> Workload {
+                Workload::default()
+            }
+        }
+
+        #[test]
+        fn only_a_right_image_passes() {
+            let (splats, camera) = scene_and_camera();
+            let check = |spoil: fn(&mut RgbdImage, usize), part: &str| {
+                let mut renderer = Spoiling(CpuRenderer::new(&splats), spoil, 0);
+                let said = match check(&mut renderer, &splats, &camera) {
+                    Ok(found_db) => format!("{found_db} dB"),
+                    Err(why) => why,
+                };
+                assert!(said.contains(part), "{said:?} lacks {part:?}");
+            };
+            check(|_, _| (), "200 dB");
+            check(|image, _| image.rgb[777] += 1e-3, " dB");
+            check(|image, _| image.rgb.fill(0.0), "from the processor's");
+            check(|image, _| image.alpha[4000] = f32::NAN, "differently each time");
+            check(|image, _| image.alpha[4000] = f32::INFINITY, "from the processor's");
+            check(|image, _| image.depth_expected_m.fill(1.0), "from the processor's");
+            check(|image, i| image.rgb[5] = i as f32 * 1e-6, "differently each time");
+        }
     }
 }

@@ -46,6 +46,7 @@ mod image;
 mod limits;
 mod rasterizer;
 mod reference;
+mod resilient;
 mod scene;
 mod splats;
 
@@ -56,5 +57,6 @@ pub use cpu::{CpuRenderer, Detail};
 pub use image::{DepthKind, RgbdImage};
 pub use rasterizer::{PassTimes, Rasterizer, RenderError, Workload};
 pub use reference::render_reference;
+pub use resilient::Resilient;
 pub use scene::{Placement, RigidObject, Scene};
 pub use splats::Splats;

@@ -8,8 +8,12 @@ use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
 use super::sort::{Count, Digit, Pairs, Sort};
 
-const SOURCE: &str =
-    concat!(include_str!("common.wgsl"), include_str!("scan.wgsl"), include_str!("sizes.wgsl"), include_str!("bin.wgsl"));
+const SOURCE: &str = concat!(
+    include_str!("common.wgsl"),
+    include_str!("scan.wgsl"),
+    include_str!("sizes.wgsl"),
+    include_str!("bin.wgsl")
+);
 
 /// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
 const PAIRS: Count = Count { size: 4, groups: 12 };
@@ -87,19 +91,12 @@ impl Bin {
                 ],
             ),
             digits: sort.bind(device, pairs, b.room.tile_digits * 8, [PAIRS; 2], false),
-            bound: device.bind(
-                &self.bound,
-                &[tick, sizes, (11, &b.tiles[sorted]), (12, &b.lists)],
-            ),
+            bound: device.bind(&self.bound, &[tick, sizes, (11, &b.tiles[sorted]), (12, &b.lists)]),
         }
     }
 
     /// Counts what the first digit of the sort by depth has found visible.
-    pub(super) fn count_visible(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        bindings: &BinBindings,
-    ) {
+    pub(super) fn count_visible(&self, pass: &mut wgpu::ComputePass<'_>, bindings: &BinBindings) {
         self.count_visible.run(pass, &bindings.count_visible, Groups::Known(1, 1));
     }
 

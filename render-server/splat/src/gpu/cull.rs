@@ -3,12 +3,16 @@
 //! Budget: 32 bytes read per block of 256 splats and camera, 4 written; two dispatches, some 5 us
 //! per million splats.
 
-use super::device::{Device, Groups, Kernel};
 use super::buffers::Buffers;
+use super::device::{Device, Groups, Kernel};
 use super::scene::GpuScene;
 
-const SOURCE: &str =
-    concat!(include_str!("common.wgsl"), include_str!("scan.wgsl"), include_str!("sizes.wgsl"), include_str!("cull.wgsl"));
+const SOURCE: &str = concat!(
+    include_str!("common.wgsl"),
+    include_str!("scan.wgsl"),
+    include_str!("sizes.wgsl"),
+    include_str!("cull.wgsl")
+);
 
 /// The pass.
 #[derive(Debug)]
@@ -26,14 +30,27 @@ pub(super) struct CullBindings {
 
 impl Cull {
     pub(super) fn new(device: &Device) -> Self {
-        Self { cull: device.kernel(SOURCE, "cull", &[]), place: device.kernel(SOURCE, "place", &[]) }
+        Self {
+            cull: device.kernel(SOURCE, "cull", &[]),
+            place: device.kernel(SOURCE, "place", &[]),
+        }
     }
 
-    pub(super) fn bind(&self, device: &Device, scene: &GpuScene, buffers: &Buffers) -> CullBindings {
+    pub(super) fn bind(
+        &self,
+        device: &Device,
+        scene: &GpuScene,
+        buffers: &Buffers,
+    ) -> CullBindings {
         CullBindings {
             cull: device.bind(
                 &self.cull,
-                &[(0, &buffers.tick), (1, &buffers.views), (2, &scene.blocks), (3, &buffers.regions)],
+                &[
+                    (0, &buffers.tick),
+                    (1, &buffers.views),
+                    (2, &scene.blocks),
+                    (3, &buffers.regions),
+                ],
             ),
             place: device.bind(
                 &self.place,

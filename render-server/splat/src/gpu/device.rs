@@ -39,18 +39,17 @@ impl Adapter {
             .filter(|adapter| {
                 let downlevel = adapter.get_downlevel_capabilities();
                 downlevel.flags.contains(
-                    wgpu::DownlevelFlags::COMPUTE_SHADERS | wgpu::DownlevelFlags::INDIRECT_EXECUTION,
+                    wgpu::DownlevelFlags::COMPUTE_SHADERS
+                        | wgpu::DownlevelFlags::INDIRECT_EXECUTION,
                 ) && wgpu::Limits::default().check_limits(&adapter.limits())
             })
             .collect();
-        adapters.sort_by_key(|adapter| {
-            match adapter.get_info().device_type {
-                wgpu::DeviceType::DiscreteGpu => 0,
-                wgpu::DeviceType::IntegratedGpu => 1,
-                wgpu::DeviceType::VirtualGpu => 2,
-                wgpu::DeviceType::Other => 3,
-                wgpu::DeviceType::Cpu => 4,
-            }
+        adapters.sort_by_key(|adapter| match adapter.get_info().device_type {
+            wgpu::DeviceType::DiscreteGpu => 0,
+            wgpu::DeviceType::IntegratedGpu => 1,
+            wgpu::DeviceType::VirtualGpu => 2,
+            wgpu::DeviceType::Other => 3,
+            wgpu::DeviceType::Cpu => 4,
         });
         let named = |inner: wgpu::Adapter| {
             let info = inner.get_info();
@@ -99,13 +98,7 @@ impl Adapter {
             .min(budget.binding_bytes)
             // Indices into words are 32 bits wide; a limit of 4 GiB less a page keeps them so.
             .min(MAX_BINDING_BYTES);
-        Ok(Device {
-            device,
-            queue,
-            fault,
-            binding_bytes,
-            has_timestamps: !timestamps.is_empty(),
-        })
+        Ok(Device { device, queue, fault, binding_bytes, has_timestamps: !timestamps.is_empty() })
     }
 }
 
@@ -127,7 +120,12 @@ impl Device {
     }
 
     /// Creates a buffer of at least one element of whatever it holds.
-    pub(super) fn buffer(&self, label: &str, bytes: u64, usage: wgpu::BufferUsages) -> wgpu::Buffer {
+    pub(super) fn buffer(
+        &self,
+        label: &str,
+        bytes: u64,
+        usage: wgpu::BufferUsages,
+    ) -> wgpu::Buffer {
         self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size: bytes.max(512).next_multiple_of(16),
@@ -171,7 +169,11 @@ impl Device {
     }
 
     /// Binds whole buffers for a kernel.
-    pub(super) fn bind(&self, kernel: &Kernel, buffers: &[(u32, &wgpu::Buffer)]) -> wgpu::BindGroup {
+    pub(super) fn bind(
+        &self,
+        kernel: &Kernel,
+        buffers: &[(u32, &wgpu::Buffer)],
+    ) -> wgpu::BindGroup {
         let entries: Vec<_> = buffers
             .iter()
             .map(|&(binding, buffer)| wgpu::BindGroupEntry {

@@ -85,6 +85,7 @@ pub struct GpuRenderer {
     spare: Vec<Staging>,
     /// Ticks under way.
     flights: VecDeque<(Asked, wgpu::SubmissionIndex)>,
+    lenses: view::Lenses,
     /// Cameras drawn in one submission at most; fewer once they have not fitted.
     together: usize,
     budget: Budget,
@@ -166,9 +167,25 @@ impl GpuRenderer {
             bound: None,
             spare: Vec::new(),
             flights: VecDeque::new(),
+            lenses: view::Lenses::default(),
             together: usize::MAX,
             budget,
         })
+    }
+
+    /// Draws another scene from now on.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; this renderer is of no more use then.
+    ///
+    /// # Panics
+    /// If a tick is under way.
+    pub fn load<'a>(&mut self, scene: impl Into<Scene<'a>>) -> Result<(), RenderError> {
+        assert!(self.flights.is_empty(), "finish what was begun first");
+        self.bound = None;
+        self.scene = GpuScene::new(&self.device, scene.into())?;
+        self.workload = Workload { splats: self.scene.len, ..Workload::default() };
+        self.check_device().map_err(Refused::into_error)
     }
 
     /// Starts to draw one image per camera and returns at once; [`Self::finish`] fetches them. Two
@@ -230,8 +247,7 @@ impl GpuRenderer {
             tile_digits: sort::digits(u64::BITS - tiles.leading_zeros()),
         };
         self.make_room(&wanted)?;
-        let staging =
-            Staging::for_pixels(self.spare.pop(), &self.device, pixels, self.has_ids());
+        let staging = Staging::for_pixels(self.spare.pop(), &self.device, pixels, self.has_ids());
         let tick = Asked {
             placements: placements.to_vec(),
             cameras: cameras.to_vec(),
@@ -292,8 +308,9 @@ impl GpuRenderer {
     }
 
     /// Writes a tick's numbers and submits its passes and copies.
-    fn submit(&self, asked: &Asked) -> wgpu::SubmissionIndex {
+    fn submit(&mut self, asked: &Asked) -> wgpu::SubmissionIndex {
         let tiles = asked.wanted.tiles as u32;
+        let views = self.views(asked);
         let bound = self.bound.as_ref().expect("buffers were made before");
         let (device, passes, buffers) = (&self.device, &self.passes, &bound.buffers);
         let cameras = asked.cameras.len() as u32;
@@ -307,7 +324,6 @@ impl GpuRenderer {
             has_ids: u32::from(self.has_ids()),
             padding: 0,
         };
-        let views = self.views(asked);
         device.queue.write_buffer(&buffers.tick, 0, zerocopy::IntoBytes::as_bytes(&tick));
         device.queue.write_buffer(&buffers.views, 0, zerocopy::IntoBytes::as_bytes(&views[..]));
 
@@ -354,16 +370,17 @@ impl GpuRenderer {
     }
 
     /// Returns the cameras as each part sees them.
-    fn views(&self, asked: &Asked) -> Vec<View> {
+    fn views(&mut self, asked: &Asked) -> Vec<View> {
         let mut views = Vec::with_capacity(asked.cameras.len() * self.scene.ids.len());
         for (camera, &place) in asked.cameras.iter().zip(&asked.places) {
-            views.push(View::new(camera, &camera.world_from_cam, place, self.scene.ids[0]));
+            let lens = self.lenses.of(camera);
+            views.push(View::new(camera, &lens, &camera.world_from_cam, place, self.scene.ids[0]));
             for (placement, &id) in asked.placements.iter().zip(&self.scene.ids[1..]) {
                 views.push(match placement {
                     Some(world_from_object) => {
                         // An object that moves is one that stands still before a moving camera.
                         let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-                        View::new(camera, &object_from_cam, place, id)
+                        View::new(camera, &lens, &object_from_cam, place, id)
                     }
                     None => View::absent(),
                 });

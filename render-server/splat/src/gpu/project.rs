@@ -4,8 +4,8 @@
 //! seen; 4 bytes written per slot and 48 per survivor. At 1 TB/s: 0.1 ms per million visible splats
 //! without harmonics, 0.2 ms with those of degree 3.
 
-use super::device::{Device, Groups, Kernel};
 use super::buffers::Buffers;
+use super::device::{Device, Groups, Kernel};
 use super::scene::GpuScene;
 
 const SOURCE: &str = concat!(include_str!("common.wgsl"), include_str!("project.wgsl"));

@@ -7,8 +7,8 @@
 //! 28 bytes written per pixel, by all cores.
 
 use half::f16;
-use half::slice::HalfFloatSliceExt as _;
 use half::slice::HalfBitsSliceExt as _;
+use half::slice::HalfFloatSliceExt as _;
 use rayon::prelude::*;
 use zerocopy::{FromBytes, Immutable, KnownLayout};
 

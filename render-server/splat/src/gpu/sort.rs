@@ -8,8 +8,12 @@
 
 use super::device::{Device, Groups, Kernel};
 
-const SOURCE: &str =
-    concat!(include_str!("common.wgsl"), include_str!("scan.wgsl"), include_str!("sizes.wgsl"), include_str!("sort.wgsl"));
+const SOURCE: &str = concat!(
+    include_str!("common.wgsl"),
+    include_str!("scan.wgsl"),
+    include_str!("sizes.wgsl"),
+    include_str!("sort.wgsl")
+);
 
 /// Keys per workgroup; `SORT_GROUP` in `sizes.wgsl`.
 pub(super) const SORT_GROUP: u64 = 2048;
@@ -133,3 +137,6 @@ pub(super) fn digits(bits: u32) -> u32 {
 pub(super) fn count_bytes(keys: u64) -> u64 {
     (keys.div_ceil(SORT_GROUP) + 1) * 4 << DIGIT_BITS
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,7 +1,7 @@
 //! Cameras and sizes in the numbers the shaders use. f64 here, once per image; f32 there.
 
-use glam::{DMat3, DVec3};
-use vizflyt_protocol::geometry::{Cam, Distortion, Frame, Pose};
+use glam::{DMat3, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Cam, Distortion, Frame, Intrinsics, Pose};
 use zerocopy::{Immutable, IntoBytes};
 
 use super::TILE_PX;
@@ -47,10 +47,42 @@ pub(super) struct Place {
     pub(super) first_pixel: u32,
 }
 
+/// What of a lens takes long to find.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Lens {
+    slopes: [DVec2; 2],
+    reach: f64,
+}
+
+/// The lenses of the last few cameras.
+#[derive(Debug, Default)]
+pub(super) struct Lenses {
+    known: Vec<(Intrinsics, Lens)>,
+}
+
+/// More different cameras than this at once find their lenses anew for every image.
+const MAX_LENSES: usize = 32;
+
+impl Lenses {
+    pub(super) fn of(&mut self, camera: &Camera) -> Lens {
+        let k = &camera.intrinsics;
+        if let Some((_, lens)) = self.known.iter().find(|(known, _)| known == k) {
+            return *lens;
+        }
+        let lens = Lens { slopes: camera.slope_bounds(), reach: k.distortion.reach() };
+        if self.known.len() >= MAX_LENSES {
+            self.known.clear();
+        }
+        self.known.push((*k, lens));
+        lens
+    }
+}
+
 impl View {
     /// Prepares a validated camera as a part of the scene sees it that stands at `part_from_cam`.
     pub(super) fn new<F: Frame>(
         camera: &Camera,
+        lens: &Lens,
         part_from_cam: &Pose<F, Cam>,
         place: Place,
         id: u16,
@@ -62,12 +94,12 @@ impl View {
             let row = rotation.row(i).as_vec3();
             [row.x, row.y, row.z, center_m[i] as f32]
         };
-        let [low, high] = camera.slope_bounds();
+        let [low, high] = lens.slopes;
         let (model, coefficients) = k.distortion.to_wire();
         let c = coefficients.map(|c| c as f32);
         // Infinite for a pinhole, which the shader does not ask.
-        let reach = k.distortion.reach().min(f64::from(f32::MAX)) as f32;
-        let (planes, weights) = planes(camera, &rotation);
+        let reach = lens.reach.min(f64::from(f32::MAX)) as f32;
+        let (planes, weights) = planes(camera, lens, &rotation);
         let [r, g, b] = camera.background;
         Self {
             rows: [row(0), row(1), row(2)],
@@ -91,7 +123,7 @@ impl View {
 
 /// Returns the planes `normal . (p - camera) + reach * weight >= offset` between which a splat may
 /// touch the image: normal and offset, and the weights.
-fn planes(camera: &Camera, rotation: &DMat3) -> ([[f32; 4]; 5], [[f32; 4]; 2]) {
+fn planes(camera: &Camera, lens: &Lens, rotation: &DMat3) -> ([[f32; 4]; 5], [[f32; 4]; 2]) {
     let k = &camera.intrinsics;
     let [x, y, z] = [rotation.row(0), rotation.row(1), rotation.row(2)];
     // The first plane is the near plane, of the centres alone.
@@ -106,7 +138,7 @@ fn planes(camera: &Camera, rotation: &DMat3) -> ([[f32; 4]; 5], [[f32; 4]; 2]) {
     // with jx the clamped slope. Both sides times z > 0 are linear in the position: u + extent
     // >= 0 becomes fx x + (cx + blur) z + reach fx sqrt(1 + jx^2) >= 0, and so on.
     let blur = (2.0 * 255f64.ln() * BLUR_PX2).sqrt();
-    let [low, high] = camera.slope_bounds();
+    let [low, high] = lens.slopes;
     let steepest = low.abs().max(high.abs());
     let steep_x = k.fx_px * (1.0 + steepest.x * steepest.x).sqrt();
     let steep_y = k.fy_px * (1.0 + steepest.y * steepest.y).sqrt();

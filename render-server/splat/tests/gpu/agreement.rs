@@ -135,7 +135,9 @@ fn captured_scenes_agree() {
         }
         let splats = ply::read(&file).expect("a scene").splats;
         let cameras: Vec<Camera> = ["p0", "p1"]
-            .map(|pose| twins::oracle_camera(&shared.join(format!("ref/{scene}_{pose}_320x240.json"))))
+            .map(|pose| {
+                twins::oracle_camera(&shared.join(format!("ref/{scene}_{pose}_320x240.json")))
+            })
             .into();
         check(scene, &splats, &[], &cameras);
     }

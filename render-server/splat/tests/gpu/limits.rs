@@ -1,0 +1,162 @@
+//! Too little room, small bindings, devices that go.
+
+use vizflyt_splat::gpu::{Budget, GpuRenderer};
+use vizflyt_splat::{
+    Backend, Camera, CpuRenderer, NoRenderer, Rasterizer, RenderError, Resilient, RgbdImage,
+    RigidObject, Scene, choose,
+};
+
+use crate::agreement::assert_alike;
+use crate::{adapter, renderer, twins};
+
+fn draw(renderer: &mut dyn Rasterizer, cameras: &[Camera]) -> Vec<RgbdImage> {
+    let mut images = vec![RgbdImage::default(); cameras.len()];
+    renderer.render(&[], cameras, &mut images).expect("images");
+    images
+}
+
+fn with_budget<'a>(scene: impl Into<Scene<'a>>, budget: Budget) -> Option<GpuRenderer> {
+    Some(GpuRenderer::new(scene, adapter()?, budget).expect("a device"))
+}
+
+#[test]
+fn too_little_room_is_noticed_and_made() {
+    let splats = twins::cloud(3000, 0, 1);
+    let cameras = [twins::camera(80, 60, 90.0), twins::camera(64, 64, 70.0)];
+    let Some(mut ample) = renderer(&splats) else { return };
+    let expected = draw(&mut ample, &cameras);
+    let work = ample.workload();
+    assert!(work.pairs > 1000 && work.visible > 300, "{work:?}");
+    for (regions, pairs) in [(1, 1 << 20), (4096, 1), (1, 1), (3, 1000)] {
+        let budget = Budget { regions, pairs, ..Budget::default() };
+        let mut gpu = with_budget(&splats, budget).expect("an adapter was there");
+        // Two ticks at once: both have too little.
+        let mut first = vec![RgbdImage::default(); 2];
+        let mut second = first.clone();
+        gpu.begin(&[], &cameras).expect("cameras");
+        gpu.begin(&[], &cameras).expect("cameras");
+        gpu.finish(&mut first).expect("images");
+        gpu.finish(&mut second).expect("images");
+        // Bit for bit: not one splat is missing.
+        assert!(first == expected && second == expected, "{regions} regions, {pairs} pairs");
+        assert_eq!(gpu.workload(), work);
+    }
+}
+
+#[test]
+fn scenes_are_split_into_what_a_binding_holds() {
+    let splats = twins::cloud(1500, 3, 2);
+    // 12 frame-filling blocks: harmonics of one, geometry of two, regions for seven.
+    let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
+    let cameras: Vec<Camera> = (0..6u32).map(|i| twins::camera(20 + i, 30 - i, 80.0)).collect();
+    let Some(mut ample) = renderer(&splats) else { return };
+    let expected = draw(&mut ample, &cameras);
+    let mut gpu = with_budget(&splats, tiny).expect("an adapter was there");
+    // More than fits at once, again and again.
+    for _ in 0..2 {
+        assert!(draw(&mut gpu, &cameras) == expected);
+    }
+    assert!(draw(&mut gpu, &cameras[..1])[0] == expected[0]);
+    // Objects lie in other chunks than what stands still.
+    let objects = [RigidObject { id: 9, splats: twins::ball(400, 0.4, 3) }];
+    let small = twins::cloud(300, 1, 4);
+    let scene = Scene { splats: &small, objects: &objects };
+    let at = [Some(vizflyt_protocol::geometry::Pose::new(
+        glam::DVec3::new(0.1, 0.0, 1.5),
+        glam::DQuat::IDENTITY,
+    ))];
+    let mut images = [RgbdImage::default()];
+    let mut expected = images.clone();
+    let mut gpu = with_budget(scene, tiny).expect("an adapter was there");
+    gpu.render(&at, &cameras[..1], &mut images).expect("an image");
+    CpuRenderer::new(scene).render(&at, &cameras[..1], &mut expected).expect("an image");
+    assert_alike("small bindings", &images[0], &expected[0]);
+    assert!(images[0].ids.contains(&9));
+}
+
+#[test]
+fn what_no_device_can_hold_is_drawn_by_the_processor() {
+    let splats = twins::cloud(1500, 0, 2);
+    let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
+    let Some(mut gpu) = with_budget(&splats, tiny) else { return };
+    let large = [twins::camera(200, 100, 80.0)];
+    let refused = gpu.render(&[], &large, &mut [RgbdImage::default()]);
+    let Err(RenderError::DeviceLost(why)) = refused else { panic!("{refused:?}") };
+    assert!(why.contains("pixels: 20000"), "{why}");
+    // And what fits still works.
+    let small = [twins::camera(20, 20, 80.0)];
+    let expected = draw(&mut CpuRenderer::new(&splats), &small);
+    assert_alike("after all", &draw(&mut gpu, &small)[0], &expected[0]);
+    let mut resilient = Resilient::new(Box::new(gpu), CpuRenderer::new(&splats));
+    let expected = draw(&mut CpuRenderer::new(&splats), &large);
+    assert!(draw(&mut resilient, &large) == expected);
+    // Less than one block.
+    let none = Budget { binding_bytes: 5000, ..Budget::default() };
+    let refused = adapter().map(|adapter| GpuRenderer::new(&splats, adapter, none).map(|_| ()));
+    assert!(matches!(refused, Some(Err(RenderError::DeviceLost(_)))), "{refused:?}");
+}
+
+#[test]
+fn the_processor_takes_over_when_a_device_is_lost() {
+    let splats = twins::cloud(2000, 1, 6);
+    let camera = [twins::camera(90, 70, 80.0)];
+    let Some(mut gpu) = renderer(&splats) else { return };
+    let before = draw(&mut gpu, &camera);
+    gpu.lose_device();
+    let lost = gpu.render(&[], &camera, &mut [RgbdImage::default()]);
+    assert!(matches!(lost, Err(RenderError::DeviceLost(_))), "{lost:?}");
+    // And stays so.
+    assert!(gpu.render(&[], &camera, &mut [RgbdImage::default()]).is_err());
+    let mut resilient = Resilient::new(Box::new(gpu), CpuRenderer::new(&splats));
+    assert!(resilient.name().starts_with("gpu "), "{}", resilient.name());
+    let after = draw(&mut resilient, &camera);
+    assert_alike("before and after", &after[0], &before[0]);
+    let name = resilient.name();
+    assert!(name.starts_with("cpu ") && name.contains("is lost"), "{name}");
+}
+
+#[test]
+fn a_device_lost_between_begin_and_finish_is_told() {
+    let splats = twins::cloud(2000, 0, 6);
+    let camera = [twins::camera(90, 70, 80.0)];
+    let Some(mut gpu) = renderer(&splats) else { return };
+    gpu.begin(&[], &camera).expect("a camera");
+    gpu.lose_device();
+    // Either the tick was done before, or the loss is told; nothing hangs or panics.
+    let mut image = [RgbdImage::default()];
+    match gpu.finish(&mut image) {
+        Ok(_) => crate::compare::assert_clean(&image[0]),
+        Err(error) => assert!(matches!(error, RenderError::DeviceLost(_)), "{error}"),
+    }
+    assert!(gpu.begin(&[], &camera).and_then(|()| gpu.finish(&mut image).map(|_| ())).is_err());
+}
+
+#[test]
+fn the_choice_says_why() {
+    let splats = twins::cloud(1500, 0, 8);
+    let camera = [twins::camera(60, 40, 80.0)];
+    let expected = draw(&mut CpuRenderer::new(&splats), &camera);
+    let check = |backend: Backend| {
+        let mut chosen = choose(&splats, backend).expect("a renderer");
+        println!("{backend:?}: {} because {}", chosen.rasterizer.name(), chosen.reason);
+        let image = draw(&mut *chosen.rasterizer, &camera);
+        assert_alike(&format!("{backend:?}"), &image[0], &expected[0]);
+        (chosen.rasterizer.name(), chosen.reason)
+    };
+    let (name, reason) = check(Backend::Cpu);
+    assert!(name.starts_with("cpu ") && reason.starts_with("asked for"), "{name}: {reason}");
+    let (name, reason) = check(Backend::Auto);
+    match adapter() {
+        None => {
+            assert!(name.starts_with("cpu ") && reason.contains("no graphics adapter"), "{reason}");
+            let refused = choose(&splats, Backend::Gpu).map(|chosen| chosen.reason);
+            assert!(matches!(refused, Err(NoRenderer::Gpu(_))), "{refused:?}");
+        }
+        Some(adapter) => {
+            assert!(reason.contains(&adapter.name().name), "{reason}");
+            assert_eq!(name.starts_with("cpu "), adapter.name().is_software, "{name}: {reason}");
+            let (name, reason) = check(Backend::Gpu);
+            assert!(name.starts_with("gpu ") && reason.contains(" dB"), "{name}: {reason}");
+        }
+    }
+}

@@ -3,6 +3,7 @@
 #![cfg(feature = "gpu")]
 
 mod agreement;
+#[allow(dead_code, reason = "the oracle's tests use more of it")]
 #[path = "../images/compare.rs"]
 mod compare;
 mod limits;

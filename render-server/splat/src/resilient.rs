@@ -1,0 +1,132 @@
+//! A renderer that outlives its device: the image under way when a driver resets is drawn by the
+//! processor, and so are all after it.
+//!
+//! Cost: the processor's packed copy of the scene is there from the start, 52 bytes per splat and 6
+//! to 96 for its harmonics (0.74 GB for 5 M of degree 3), because packing takes seconds when the
+//! vehicle has none.
+
+use crate::{
+    Camera, CpuRenderer, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload,
+};
+
+/// A renderer on a device, and the processor behind it.
+pub struct Resilient {
+    active: Box<dyn Rasterizer>,
+    /// Until it is needed.
+    spare: Option<CpuRenderer>,
+    /// What was lost, and why.
+    lost: Option<String>,
+}
+
+impl Resilient {
+    /// Puts a processor's renderer of the same scene behind `first`.
+    pub fn new(first: Box<dyn Rasterizer>, spare: CpuRenderer) -> Self {
+        Self { active: first, spare: Some(spare), lost: None }
+    }
+}
+
+impl Rasterizer for Resilient {
+    /// Returns what draws now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
+    fn name(&self) -> String {
+        let name = self.active.name();
+        self.lost.as_ref().map_or(name.clone(), |lost| format!("{name}, for {lost}"))
+    }
+
+    fn render(
+        &mut self,
+        placements: &[Placement],
+        cameras: &[Camera],
+        images: &mut [RgbdImage],
+    ) -> Result<PassTimes, RenderError> {
+        match self.active.render(placements, cameras, images) {
+            Err(RenderError::DeviceLost(why)) if self.spare.is_some() => {
+                self.lost = Some(format!("{} is lost: {why}", self.active.name()));
+                if let Some(spare) = self.spare.take() {
+                    self.active = Box::new(spare);
+                }
+                self.active.render(placements, cameras, images)
+            }
+            drawn => drawn,
+        }
+    }
+
+    fn workload(&self) -> Workload {
+        self.active.workload()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{Quat, Vec3};
+    use vizflyt_protocol::geometry::{Intrinsics, Pose};
+
+    use super::*;
+    use crate::Splats;
+
+    /// Draws `left` images through another renderer, then its device is gone.
+    struct Failing {
+        inner: CpuRenderer,
+        left: usize,
+    }
+
+    impl Rasterizer for Failing {
+        fn name(&self) -> String {
+            "gpu of glass".into()
+        }
+
+        fn render(
+            &mut self,
+            placements: &[Placement],
+            cameras: &[Camera],
+            images: &mut [RgbdImage],
+        ) -> Result<PassTimes, RenderError> {
+            let Some(left) = self.left.checked_sub(1) else {
+                images.iter_mut().for_each(|image| image.resize(3, 3));
+                return Err(RenderError::DeviceLost("it broke".into()));
+            };
+            self.left = left;
+            self.inner.render(placements, cameras, images)
+        }
+
+        fn workload(&self) -> Workload {
+            self.inner.workload()
+        }
+    }
+
+    #[test]
+    fn no_image_is_missing_when_the_device_is_lost() {
+        let splats = Splats {
+            means_m: vec![Vec3::new(0.0, 0.0, 2.0)],
+            scales_m: vec![Vec3::splat(0.3)],
+            rotations: vec![Quat::IDENTITY],
+            opacities: vec![0.9],
+            sh_degree: 0,
+            sh: vec![0.1, 0.2, 0.3],
+        };
+        let camera = Camera {
+            intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.2),
+            world_from_cam: Pose::IDENTITY,
+            near_m: 0.01,
+            background: [0.0; 3],
+        };
+        let failing = Failing { inner: CpuRenderer::new(&splats), left: 2 };
+        let mut resilient = Resilient::new(Box::new(failing), CpuRenderer::new(&splats));
+        let mut images = Vec::new();
+        for i in 0..5 {
+            let is_lost = resilient.name() != "gpu of glass";
+            assert_eq!(is_lost, i > 2, "{}", resilient.name());
+            let mut image = [RgbdImage::default()];
+            resilient.render(&[], &[camera], &mut image).expect("an image");
+            images.extend(image);
+        }
+        assert!(images.iter().all(|image| *image == images[0]));
+        assert!(images[0].alpha[12 * 32 + 16] > 0.8);
+        assert!(resilient.name().starts_with("cpu "), "{}", resilient.name());
+        assert!(resilient.name().ends_with("for gpu of glass is lost: it broke"));
+        assert_eq!(resilient.workload().splats, 1);
+        // What is no device's fault stays an error.
+        let bad = Camera { near_m: f32::NAN, ..camera };
+        let refused = resilient.render(&[], &[bad], &mut [RgbdImage::default()]);
+        assert!(matches!(refused, Err(RenderError::Camera(_))));
+    }
+}
