@@ -35,7 +35,7 @@ pub(super) struct View {
     /// Means whose slope is longer are dropped; infinite without a lens.
     pub(super) reach: f32,
     planes: [Plane; 5],
-    /// [`Lens::large`].
+    /// [`Sight::large`](super::lens::Sight::large).
     large: f32,
 }
 
@@ -69,6 +69,7 @@ impl View {
             }
         };
         let ahead = Plane { normal: z.as_vec3(), offset: camera.near_m, weight: 0.0 };
+        let sight = &lens.sight;
         let planes = if lens.model == Model::Pinhole {
             // A splat's mean is at u = fx x/z + cx; its extent is at most
             //   sqrt(reach^2 fx^2 (1 + jx^2) / z^2 + 2 ln(255) 0.3),
@@ -85,14 +86,14 @@ impl View {
                 plane(-y * k.fy_px + z * (h - k.cy_px + blur), steep_y),
             ]
         } else {
-            // low <= x/z <= high is linear in the position too; `sees` keeps what is large.
-            let [shown_x, shown_y] = bounds(lens.shown);
+            // Linear in the position too: x - low z + spread d >= 0; `sees` keeps what is large.
+            let [shown_x, shown_y] = bounds([sight.low, sight.high]);
             [
                 ahead,
-                plane(x - z * shown_x[0], 0.0),
-                plane(z * shown_x[1] - x, 0.0),
-                plane(y - z * shown_y[0], 0.0),
-                plane(z * shown_y[1] - y, 0.0),
+                plane(x - z * shown_x[0], sight.spread),
+                plane(z * shown_x[1] - x, sight.spread),
+                plane(y - z * shown_y[0], sight.spread),
+                plane(z * shown_y[1] - y, sight.spread),
             ]
         };
         Self {
@@ -112,7 +113,7 @@ impl View {
             // f32's rounding, so that what lies on the reach itself is drawn.
             reach: (lens.reach * (1.0 + 1e-6)) as f32,
             planes,
-            large: lens.large as f32,
+            large: sight.large as f32,
         }
     }
 
@@ -197,3 +198,6 @@ impl View {
         self.fx_px.abs().max(self.fy_px.abs()) / nearest_m.max(self.near_m)
     }
 }
+
+#[cfg(test)]
+mod tests;

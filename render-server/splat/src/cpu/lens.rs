@@ -1,7 +1,7 @@
 //! The lens: what of a camera is computed once per intrinsics, and the distortion of vectors of
 //! slopes; the vector form of [`Distortion::distort`].
 //!
-//! Budget: finding the bounds costs some 300 inversions of the lens, about 2 ms, whenever a camera's
+//! Budget: finding the bounds costs some 250 inversions of the lens, about 2 ms, whenever a camera's
 //! intrinsics change, nothing after; the distortion some 2 ns per splat and thread.
 
 use glam::DVec2;
@@ -9,7 +9,7 @@ use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
 use super::simd::Simd;
 use crate::Camera;
-use crate::limits::{BLUR_PX2, JACOBIAN_MARGIN};
+use crate::limits::BLUR_PX2;
 
 /// A lens's coefficients, as [`Distortion`] has them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -31,11 +31,18 @@ pub(super) struct Lens {
     pub(super) slopes: [DVec2; 2],
     /// Means whose slope is longer are dropped.
     pub(super) reach: f64,
-    /// Slopes, least and greatest, outside of which no mean is of a splat that touches the image
-    /// unless it is [`Self::large`]. Of use only with a lens.
-    pub(super) shown: [DVec2; 2],
-    /// A splat may be too large for `shown` where its z is less than this times the distance at
-    /// which it still counts. With a lens alone; else 0.
+    /// Where means are whose splats may touch the image. Of use only with a lens.
+    pub(super) sight: Sight,
+}
+
+/// Bounds on the means of splats that may touch the image behind a lens. With `z` the mean's and
+/// `d` the distance at which its splat still counts:
+/// `low - spread d / z <= slope <= high + spread d / z`, unless `z < large d`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sight {
+    pub(super) low: DVec2,
+    pub(super) high: DVec2,
+    pub(super) spread: f64,
     pub(super) large: f64,
 }
 
@@ -44,8 +51,8 @@ impl Lens {
         let k = &camera.intrinsics;
         let slopes = camera.slope_bounds();
         let reach = k.distortion.reach();
-        let (model, shown, large) = match k.distortion {
-            Distortion::None => (Model::Pinhole, slopes, 0.0),
+        let (model, steep) = match k.distortion {
+            Distortion::None => (Model::Pinhole, 1.0),
             Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
                 // No slope that is linearised is longer than this.
                 let r = slopes[0].abs().max(slopes[1].abs()).length().min(reach);
@@ -54,63 +61,71 @@ impl Lens {
                 let radial = 3.0 * k1.abs() + rr * (5.0 * k2.abs() + rr * 7.0 * k3.abs());
                 let steep = 1.0 + rr * radial + 8.0 * r * (p1.abs() + p2.abs());
                 let model = Model::BrownConrady([k1, k2, p1, p2, k3].map(|k| k as f32));
-                (model, shown(k, reach), large(k, steep * (1.0 + rr).sqrt()))
+                (model, steep * (1.0 + rr).sqrt())
             }
             Distortion::KannalaBrandt { k1, k2, k3, k4 } => {
                 // In angles a fisheye is nowhere steep: slopes' growth and the arc's cancel.
                 let tt = std::f64::consts::FRAC_PI_2.powi(2);
                 let bend = 7.0 * k3.abs() + tt * 9.0 * k4.abs();
                 let steep = 1.0 + tt * (3.0 * k1.abs() + tt * (5.0 * k2.abs() + tt * bend));
-                let model = Model::KannalaBrandt([k1, k2, k3, k4].map(|k| k as f32));
-                (model, shown(k, reach), large(k, steep))
+                (Model::KannalaBrandt([k1, k2, k3, k4].map(|k| k as f32)), steep)
             }
         };
-        Self { of: *k, model, slopes, reach, shown, large }
+        // All that the lens shows, to begin with.
+        let whole =
+            Sight { low: DVec2::splat(-reach), high: DVec2::splat(reach), spread: 0.0, large: 0.0 };
+        let sight = match model {
+            Model::Pinhole => whole,
+            _ => MARGINS.iter().find_map(|&share| sight(k, steep, share)).unwrap_or(whole),
+        };
+        Self { of: *k, model, slopes, reach, sight }
     }
 }
 
-/// How far outside the image a mean may lie and still be within [`Lens::shown`]. [px]
-fn margin_px(k: &Intrinsics) -> f64 {
-    0.5 * JACOBIAN_MARGIN * f64::from(k.width_px.max(k.height_px)) + 2.0 * blur_px()
-}
+/// How far outside the image splats' means are bounded exactly, as shares of its size: the first
+/// that the lens still images.
+const MARGINS: [f64; 3] = [0.6, 0.3, 0.1];
 
-/// How far the blur alone lets the most opaque splat be seen. [px]
-fn blur_px() -> f64 {
-    (2.0 * 255f64.ln() * BLUR_PX2).sqrt()
-}
-
-/// Returns the box of the slopes that the image and a margin around it show.
-fn shown(k: &Intrinsics, reach: f64) -> [DVec2; 2] {
-    // Points on each side; the border is found from 5 % further out than is claimed, which is far
-    // more than it bends from one point to the next.
-    const POINTS: u32 = 32;
-    let margin = DVec2::splat(1.05 * margin_px(k));
-    let low_px = -margin;
-    let high_px = DVec2::new(f64::from(k.width_px), f64::from(k.height_px)) + margin;
-    let mut bounds = [DVec2::INFINITY, DVec2::NEG_INFINITY];
+/// Returns the sight of a lens that spreads no angle by more than `steep`, if it images all of the
+/// image and a margin of `share` of its size around.
+fn sight(k: &Intrinsics, steep: f64, share: f64) -> Option<Sight> {
+    let focal = DVec2::new(k.fx_px, k.fy_px);
+    let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
+    // How far the blur alone lets the most opaque splat be seen, and a pixel for the steps between
+    // the points.
+    let near_px = DVec2::splat((2.0 * 255f64.ln() * BLUR_PX2).sqrt() + 1.0);
+    let margin_px = share * size.max_element();
+    let far_px = near_px + margin_px;
+    let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    // The least that the lens moves a point when the slope moves by one.
+    let mut least = f64::INFINITY;
     for i in 0..=POINTS {
-        let at = low_px.lerp(high_px, f64::from(i) / f64::from(POINTS));
-        for pixel in [
-            DVec2::new(at.x, low_px.y),
-            DVec2::new(at.x, high_px.y),
-            DVec2::new(low_px.x, at.y),
-            DVec2::new(high_px.x, at.y),
-        ] {
-            let Some(slope) = k.slope(pixel) else {
-                // The lens ends within the image: its end is the bound.
-                return [DVec2::splat(-reach), DVec2::splat(reach)];
-            };
-            bounds = [bounds[0].min(slope), bounds[1].max(slope)];
+        for j in 0..=POINTS {
+            let at = DVec2::new(f64::from(i), f64::from(j)) / f64::from(POINTS);
+            let border = i % POINTS == 0 || j % POINTS == 0;
+            if border {
+                let slope = k.slope(at * (size + 2.0 * near_px) - near_px)?;
+                (low, high) = (low.min(slope), high.max(slope));
+            }
+            if border || i % 4 == 0 && j % 4 == 0 {
+                let slope = k.slope(at * (size + 2.0 * far_px) - far_px)?;
+                let bend = k.distortion.distort(slope).1;
+                // Singular values: their product over at least the greater.
+                let greatest = bend.x_axis.length().hypot(bend.y_axis.length());
+                least = least.min(bend.determinant().abs() / greatest);
+            }
         }
     }
-    bounds
+    // A splat touches the image where its mean, bent, is within `steep d / z` of it in x and in y,
+    // so its slope is within that, times the diagonal, over `least`. A quarter more, for what lies
+    // between the points.
+    let spread = 1.25 * steep * std::f64::consts::SQRT_2 / least;
+    let large = focal.max_element() * steep / margin_px;
+    (spread.is_finite() && large.is_finite()).then_some(Sight { low, high, spread, large })
 }
 
-/// Returns [`Lens::large`], given the most by which the lens spreads an angle.
-fn large(k: &Intrinsics, steep: f64) -> f64 {
-    // Extent of a splat: focal length * steep * distance / z, and the blur.
-    k.fx_px.max(k.fy_px) * steep / (margin_px(k) - blur_px())
-}
+/// Points, less one, along each side of the image at which a lens is examined.
+const POINTS: u32 = 24;
 
 /// Lenses by intrinsics: those drawn with last.
 #[derive(Debug, Default)]
