@@ -19,6 +19,7 @@ use rayon::prelude::*;
 
 use super::merge::{Blob, Origin, merge, square_root, trace};
 use super::scene::{BLOCK, Block, GROUP, GROUP_NUMBERS, Part, column};
+use crate::Scene;
 use crate::limits::BLUR_PX2;
 
 /// How much of a scene's detail is drawn.
@@ -30,14 +31,24 @@ pub enum Detail {
     /// Merged splats for what is small in the image: memory and packing time grow by a third, an
     /// image costs what it shows.
     Adaptive {
-        /// How far splats may be drawn from where they are, as root mean square. [px]
+        /// How far splats may be drawn from where they are, as root mean square; nothing is merged
+        /// unless it is above 0. [px]
         max_error_px: f32,
     },
 }
 
 impl Detail {
-    /// Merged splats whose error next to no pixel shows.
-    pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: 0.35 };
+    /// As coarse as stays like full detail to 40 dB and more, on generated and captured scenes.
+    pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: 0.5 };
+    /// Scenes of fewer splats are drawn fast enough in full. [splats]
+    pub const WORTHWHILE_FROM: usize = 1_000_000;
+
+    /// Returns what suits a scene: every splat of a small one, adaptive detail for a large one.
+    pub fn suited_to(scene: &Scene<'_>) -> Self {
+        let moving: usize = scene.objects.iter().map(|object| object.splats.len()).sum();
+        let all = scene.splats.len() + moving;
+        if all < Self::WORTHWHILE_FROM { Self::Full } else { Self::ADAPTIVE }
+    }
 }
 
 /// Blocks of one level that a block of the next stands for.

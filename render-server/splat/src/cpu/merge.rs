@@ -78,8 +78,9 @@ impl Blob {
         if !(opacity > 1.0) {
             return (self.covariance_m2, opacity);
         }
-        let grown = DMat3::from_diagonal(DVec3::splat((opacity - 1.0) * blur_m2));
-        (self.covariance_m2 * opacity + grown, 1.0)
+        let growth = (GROWTH_SHARE * (opacity - 1.0)).min(MAX_GROWTH);
+        let pixel = DMat3::from_diagonal(DVec3::splat(growth * blur_m2));
+        (self.covariance_m2 * (1.0 + growth) + pixel, 1.0)
     }
 }
 
@@ -155,9 +156,21 @@ pub(super) fn square_root(covariance: &DMat3) -> DMat3 {
     DMat3::from_cols(DVec3::new(xx, yx, zx), DVec3::new(0.0, yy, zy), DVec3::new(0.0, 0.0, zz))
 }
 
-/// Of the splats' own size, the share (of squares) that counts as error.
+/// Of the splats' own size, the share (of squares) that counts as error. Without it large splats
+/// that overlap merge too early: 32 instead of 52 dB at 0.7 px on a captured room.
 const SHAPE_SHARE: f64 = 0.25;
+/// Of what would be more than opaque, the share that makes the splat larger. All of it reaches over
+/// the edges of what the cluster shows, where splats ended sharper than a Gaussian does; none leaves
+/// gaps. Measured on 1.5 M splats of a city at 0.5 px: alpha within 52 / 46 / 41 dB for shares of 0.3
+/// / 0.5 / 0.7, but the mean alpha off by least for 0.5, as at other distances and sizes.
+const GROWTH_SHARE: f64 = 0.5;
+/// Hundreds of splats on each other are a plateau: a Gaussian of the same area is wider where it is
+/// seen. A ball of 20,000 splats on 78 pixels covers 70 / 77 / 87 / 120 at most 0.3 / 0.5 / 0.7 / 9.
+const MAX_GROWTH: f64 = 0.5;
 /// Keeps weights apart from 0 where splats are points; far below anything that is drawn. [m^2]
 const MIN_BLUR_M2: f64 = 1e-24;
 /// More splats than this differ from infinitely many by less than 1 %.
 const MAX_TERMS: f64 = 32.0;
+
+#[cfg(test)]
+mod tests;

@@ -17,7 +17,6 @@ pub(crate) struct Likeness {
     pub(crate) expected_off: f64,
     /// Share of the opaque pixels (alpha > 0.95) that lost more than 0.1 of alpha: holes.
     pub(crate) holes: f64,
-    pub(crate) bias: f64,
 }
 
 impl Likeness {
@@ -31,8 +30,6 @@ impl Likeness {
             alpha_db: psnr_db(&image.alpha, &truth.alpha),
             median_off: off(&image.depth_median_m, &truth.depth_median_m),
             expected_off: off(&image.depth_expected_m, &truth.depth_expected_m),
-            bias: image.alpha.iter().zip(&truth.alpha).map(|(a, b)| f64::from(a - b)).sum::<f64>()
-                / truth.alpha.len() as f64,
             holes: share((0..truth.alpha.len()).filter(|&i| truth.alpha[i] > 0.95), |i| {
                 truth.alpha[i] - image.alpha[i] > 0.1
             }),
@@ -44,13 +41,12 @@ impl fmt::Display for Likeness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "RGB {:.1} dB, alpha {:.1} dB, depth off > 1 %: median {:.2} %, expected {:.2} %, holes {:.3} %, bias {:.5}",
+            "RGB {:.1} dB, alpha {:.1} dB, depth off > 1 %: median {:.2} %, expected {:.2} %, holes {:.3} %",
             self.rgb_db,
             self.alpha_db,
             self.median_off * 100.0,
             self.expected_off * 100.0,
-            self.holes * 100.0,
-            self.bias
+            self.holes * 100.0
         )
     }
 }

@@ -1,0 +1,155 @@
+//! Images with coarser levels against images of every splat.
+
+use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_splat::{
+    Camera, CpuRenderer, Detail, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
+};
+
+use crate::city::city;
+use crate::likeness::Likeness;
+
+fn look(from: DVec3, to: DVec3) -> Camera {
+    let z = (to - from).normalize();
+    let x = z.cross(DVec3::Z).normalize();
+    let rotation = DMat3::from_cols(x, z.cross(x), z);
+    Camera {
+        intrinsics: Intrinsics::from_horizontal_fov(320, 240, 90f64.to_radians()),
+        world_from_cam: Pose::new(from, DQuat::from_mat3(&rotation)),
+        near_m: 0.05,
+        background: [0.5, 0.6, 0.8],
+    }
+}
+
+fn draw(
+    renderer: &mut CpuRenderer,
+    placements: &[Placement],
+    camera: &Camera,
+) -> (RgbdImage, usize) {
+    let mut image = [RgbdImage::default()];
+    renderer.render(placements, &[*camera], &mut image).expect("a valid camera");
+    let [image] = image;
+    (image, renderer.workload().visible)
+}
+
+#[test]
+fn a_city_from_afar_looks_the_same_for_less() {
+    for sh_degree in [0, 1] {
+        let splats = city(150_000, 3, sh_degree);
+        let mut full = CpuRenderer::new(&splats);
+        let mut adaptive = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
+        let (mut drawn, mut all) = (0, 0);
+        for (from, to) in [
+            (DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO),
+            (DVec3::new(10.0, -20.0, 130.0), DVec3::new(0.0, 10.0, 0.0)),
+            (DVec3::new(-58.0, -19.0, 1.6), DVec3::new(0.0, -18.0, 3.0)),
+        ] {
+            let camera = look(from, to);
+            let (truth, visible) = draw(&mut full, &[], &camera);
+            all += visible;
+            let (image, visible) = draw(&mut adaptive, &[], &camera);
+            drawn += visible;
+            let likeness = Likeness::of(&image, &truth);
+            assert!(likeness.rgb_db > 40.0, "{from}: {likeness}");
+            assert!(likeness.alpha_db > 36.0, "{from}: {likeness}");
+            assert!(likeness.median_off < 0.01, "{from}: {likeness}");
+            assert!(likeness.expected_off < 0.01, "{from}: {likeness}");
+            assert!(likeness.holes < 1e-3, "{from}: {likeness}");
+        }
+        assert!(drawn * 10 < all * 9, "drew {drawn} of {all}");
+    }
+}
+
+#[test]
+fn less_error_allowed_is_less_error() {
+    let splats = city(60_000, 3, 0);
+    let camera = look(DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO);
+    let (truth, all) = draw(&mut CpuRenderer::new(&splats), &[], &camera);
+    let mut before = (0.0, 0);
+    for max_error_px in [4.0, 2.0, 1.0] {
+        let mut renderer = CpuRenderer::with_detail(&splats, Detail::Adaptive { max_error_px });
+        let (image, visible) = draw(&mut renderer, &[], &camera);
+        let rgb_db = Likeness::of(&image, &truth).rgb_db;
+        assert!(rgb_db > before.0 && visible > before.1, "{max_error_px}: {rgb_db} {visible}");
+        before = (rgb_db, visible);
+    }
+    assert!(before.1 < all);
+    // None allowed: none made.
+    for max_error_px in [0.0, -1.0, f32::NAN] {
+        let mut renderer = CpuRenderer::with_detail(&splats, Detail::Adaptive { max_error_px });
+        let (image, visible) = draw(&mut renderer, &[], &camera);
+        assert!(image == truth && visible == all, "{max_error_px}");
+    }
+}
+
+#[test]
+fn what_is_near_is_drawn_in_full() {
+    let splats = city(60_000, 3, 1);
+    // A street's end: nothing in view is small.
+    let camera = look(DVec3::new(-22.0, -20.0, 1.6), DVec3::new(-20.0, -15.0, 1.2));
+    let near = Camera { intrinsics: Intrinsics::from_horizontal_fov(320, 240, 0.4), ..camera };
+    let (truth, _) = draw(&mut CpuRenderer::new(&splats), &[], &near);
+    let (image, _) = draw(&mut CpuRenderer::with_detail(&splats, Detail::ADAPTIVE), &[], &near);
+    let likeness = Likeness::of(&image, &truth);
+    assert!(likeness.rgb_db > 60.0, "{likeness}");
+}
+
+#[test]
+fn packing_and_drawing_again_give_the_same_bytes() {
+    let splats = city(40_000, 3, 1);
+    let camera = look(DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO);
+    let mut renderer = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
+    let first = draw(&mut renderer, &[], &camera);
+    assert_eq!(draw(&mut renderer, &[], &camera), first);
+    for _ in 0..2 {
+        let mut again = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
+        assert_eq!(draw(&mut again, &[], &camera), first);
+    }
+}
+
+/// A ball of small splats: an object that is one pixel wide, or all there is to see.
+fn ball(count: usize) -> Splats {
+    let random = &mut crate::city::Random::new(5);
+    let mut splats = Splats::default();
+    for _ in 0..count {
+        let q = [(); 4].map(|()| random.range(-1.0, 1.0));
+        let turn = Quat::from_array(q).normalize();
+        splats.means_m.push(turn * Vec3::Z * 0.5);
+        splats.scales_m.push(Vec3::new(0.02, 0.02, 0.002));
+        splats.rotations.push(turn);
+        splats.opacities.push(0.9);
+        splats.sh.extend([1.0, 0.2, -0.7]);
+    }
+    splats
+}
+
+#[test]
+fn objects_have_levels_of_their_own() {
+    let still = city(20_000, 2, 0);
+    let objects = [
+        RigidObject { id: 3, splats: ball(20_000) },
+        RigidObject { id: 4, splats: ball(20_000) },
+        RigidObject { id: 5, splats: Splats::default() },
+    ];
+    let scene = Scene { splats: &still, objects: &objects };
+    let camera = look(DVec3::new(-30.0, 0.0, 3.0), DVec3::new(0.0, 0.0, 3.0));
+    let at = |x_m: f64, y_m: f64| {
+        Some(Pose::new(DVec3::new(x_m, y_m, 3.0), DQuat::from_rotation_z(x_m)))
+    };
+    // One right before the camera, one far away.
+    let placements = [at(-28.0, 0.6), at(-5.0, -2.0), at(-27.0, 0.0)];
+    let (truth, all) = draw(&mut CpuRenderer::new(scene), &placements, &camera);
+    let mut renderer = CpuRenderer::with_detail(scene, Detail::ADAPTIVE);
+    let (image, drawn) = draw(&mut renderer, &placements, &camera);
+    let likeness = Likeness::of(&image, &truth);
+    assert!(likeness.rgb_db > 38.0 && likeness.median_off < 0.01, "{likeness}");
+    assert!(drawn + 10_000 < all, "{drawn} of {all}");
+    let count = |image: &RgbdImage, id: u16| image.ids.iter().filter(|&&v| v == id).count();
+    for id in [3, 4] {
+        let (a, b) = (count(&image, id), count(&truth, id));
+        assert!(b > 0 && a.abs_diff(b) <= 1 + b / 50, "object {id}: {a} and {b} pixels");
+    }
+    // Gone again.
+    let (image, _) = draw(&mut renderer, &[None, None, None], &camera);
+    assert!(image.ids.iter().all(|&id| id == 0));
+}

@@ -1,0 +1,7 @@
+//! Level of detail: like full detail, for less.
+
+#[path = "../../benches/scenes/city.rs"]
+mod city;
+mod images;
+mod likeness;
+mod poison;
