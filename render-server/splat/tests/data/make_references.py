@@ -3,14 +3,16 @@
 
     python3 make_references.py ORACLE.py
 
-ORACLE.py is a module with `load_ply(path)` and `render(splats, camera)` as tests/images/oracle.rs
-describes them; numpy is all it needs. Writes sh0 to sh3: .ply (INRIA layout), .json (camera),
-.npz (rgb, alpha, depth, depth_median; float32). The same numbers on every machine.
+ORACLE.py is an independent module with `load_ply(path)` and `render(splats, camera)` as
+tests/images/oracle.rs describes them; numpy is all it needs. Writes sh0 to sh3: .ply (INRIA
+layout), and for cameras a and b of each: _a.json (camera), _a.npz (rgb, alpha, depth, depth_median;
+float32, rounded). The same numbers on every machine.
 """
 import importlib.util, json, pathlib, sys
 import numpy as np
 
-SIZE = dict(w=48, h=36)
+# Width, height: one much wider than high, so that tiles are cut on both sides.
+SIZES = dict(a=(64, 48), b=(80, 36))
 
 
 def scene(rng, degree, count):
@@ -37,17 +39,29 @@ def write_ply(path, rows, degree):
     path.write_bytes(head.encode() + rows.tobytes())
 
 
-def camera(degree):
-    """Off-centre, unequal focal lengths, turned about all axes, on a background."""
+def camera(degree, which):
+    """Off-centre, unequal focal lengths, turned about all axes, on a background. `a` stands before
+    the scene; `b` is wide, and stands within it: splats beside, behind and around it."""
     a, b, c = 0.05 + 0.07 * degree, -0.12 + 0.08 * degree, 0.1 * degree
+    (w, h), f, shift = SIZES[which], 1.0, [0.1 * degree, -0.05, 0.3 - 0.2 * degree]
+    if which == 'b':
+        a, b, c, f, shift = -a, 0.5 - b, 1.5 - c, 0.55, [-0.2, 0.1 * degree, -1.6 - 0.3 * degree]
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
     rz = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
     w2c = np.eye(4)
     w2c[:3, :3] = rz @ ry @ rx
-    w2c[:3, 3] = [0.1 * degree, -0.05, 0.3 - 0.2 * degree]
-    return dict(fx=34.0 + 2 * degree, fy=36.0, cx=24.0 + 3.25 * degree, cy=18.0 - 1.5 * degree, **SIZE,
-                bg=[0.1, 0.2, 0.3], w2c=w2c.tolist())
+    w2c[:3, 3] = shift
+    return dict(fx=(0.7 + 0.04 * degree) * w * f, fy=0.75 * w * f, cx=w / 2 + 3.25 * degree,
+                cy=h / 2 - 1.5 * degree, w=w, h=h, bg=[0.1, 0.2, 0.3], w2c=w2c.tolist())
+
+
+def rounded(name, v):
+    """Colour and alpha to 1/4096 (83 dB), depth to 12 bits (1.2e-4 at most), so that they pack well."""
+    if name.startswith('depth'):
+        mantissa, exponent = np.frexp(v)
+        return np.ldexp(np.round(mantissa * 4096) / 4096, exponent).astype('<f4')
+    return (np.round(v * 4096) / 4096).astype('<f4')
 
 
 def main():
@@ -58,13 +72,16 @@ def main():
     for degree, count in enumerate([400, 250, 150, 100]):
         name = here / f'sh{degree}'
         write_ply(name.with_suffix('.ply'), scene(np.random.default_rng(100 + degree), degree, count), degree)
-        cam = camera(degree)
-        name.with_suffix('.json').write_text(json.dumps(cam) + '\n')
-        image = oracle.render(oracle.load_ply(str(name.with_suffix('.ply'))), cam)
-        np.savez_compressed(name.with_suffix('.npz'),
-                            **{k: image[k].astype('<f4') for k in ('rgb', 'alpha', 'depth', 'depth_median')})
-        print(name.name, 'visible', image['n_visible'], 'mean alpha %.3f' % image['alpha'].mean(),
-              'splats per pixel %.1f' % image['n_contrib'].mean())
+        splats = oracle.load_ply(str(name.with_suffix('.ply')))
+        for which in SIZES:
+            cam = camera(degree, which)
+            view = here / f'sh{degree}_{which}'
+            view.with_suffix('.json').write_text(json.dumps(cam) + '\n')
+            image = oracle.render(splats, cam)
+            np.savez_compressed(view.with_suffix('.npz'),
+                                **{k: rounded(k, image[k]) for k in ('rgb', 'alpha', 'depth', 'depth_median')})
+            print(view.name, 'visible', image['n_visible'], 'mean alpha %.3f' % image['alpha'].mean(),
+                  'splats per pixel %.1f' % image['n_contrib'].mean())
 
 
 main()

@@ -11,8 +11,9 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply, render_reference};
+use vizflyt_splat::{Camera, RgbdImage, Scene, Splats, ply};
 
+use crate::renderers::{self, Make};
 use crate::{compare, npz};
 
 /// A camera as the oracle writes it: pixel centres at +0.5, `w2c` row-major world to camera.
@@ -28,7 +29,7 @@ struct OracleCamera {
     w2c: [[f64; 4]; 4],
 }
 
-pub(crate) fn camera(path: &Path) -> Camera {
+fn camera(path: &Path) -> Camera {
     let text = std::fs::read_to_string(path).expect("a camera file");
     let c: OracleCamera = serde_json::from_str(&text).expect("a camera");
     let row = |i: usize| DVec3::new(c.w2c[i][0], c.w2c[i][1], c.w2c[i][2]);
@@ -80,16 +81,14 @@ fn check(name: &str, renderer: &str, actual: &RgbdImage, expected: &RgbdImage) {
     assert!(d.expected_off <= 0.005 && d.median_off <= 0.005, "{name}, {renderer}: {d:?}");
 }
 
-/// Compares every renderer with the references `cases`: (camera file, image file).
-fn check_scene(name: &str, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
-    assert!(!cases.is_empty(), "{name} has no references");
-    let mut renderers = CpuRenderer::every(splats);
+/// Compares renderers with the references `cases`: (camera file, image file).
+fn check_scene(make: Make<'_>, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
+    assert!(!cases.is_empty(), "no references");
+    let mut renderers = make(Scene::from(splats));
     for (camera_file, image_file) in cases {
         let camera = camera(camera_file);
         let expected = oracle_image(image_file, &camera);
         let name = image_file.file_stem().unwrap_or_default().to_string_lossy();
-        let reference = render_reference(splats, &[], &camera).expect("a valid camera");
-        check(&name, "reference", &reference, &expected);
         for renderer in &mut renderers {
             let mut image = [RgbdImage::default()];
             renderer.render(&[], &[camera], &mut image).expect("a valid camera");
@@ -98,19 +97,22 @@ fn check_scene(name: &str, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
     }
 }
 
-#[test]
-fn generated_scenes_of_every_degree_match_the_oracle() {
+/// Generated scenes of every degree.
+pub(crate) fn check_generated_scenes(make: Make<'_>) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
     for degree in 0..=3u8 {
-        let file = |extension: &str| data.join(format!("sh{degree}")).with_extension(extension);
-        let loaded = ply::read(file("ply")).expect("a scene");
+        let loaded = ply::read(data.join(format!("sh{degree}.ply"))).expect("a scene");
         assert_eq!(loaded.splats.sh_degree, degree);
-        check_scene("generated", &loaded.splats, &[(file("json"), file("npz"))]);
+        let cases = ["a", "b"].map(|camera| {
+            let view = data.join(format!("sh{degree}_{camera}"));
+            (view.with_extension("json"), view.with_extension("npz"))
+        });
+        check_scene(make, &loaded.splats, &cases);
     }
 }
 
-#[test]
-fn captured_scenes_match_the_oracle() {
+/// Captured scenes, where they are.
+pub(crate) fn check_captured_scenes(make: Make<'_>) {
     let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes");
     for scene in ["room", "flowers_lod2"] {
         let file = shared.join(scene).with_extension("ply");
@@ -129,6 +131,16 @@ fn captured_scenes_match_the_oracle() {
             .map(|image| (image.with_extension("json"), image))
             .collect();
         cases.sort();
-        check_scene(scene, &splats, &cases);
+        check_scene(make, &splats, &cases);
     }
+}
+
+#[test]
+fn generated_scenes_of_every_degree_match_the_oracle() {
+    check_generated_scenes(&renderers::every);
+}
+
+#[test]
+fn captured_scenes_match_the_oracle() {
+    check_captured_scenes(&renderers::every);
 }
