@@ -70,7 +70,9 @@ fn no_block_is_culled_that_holds_a_splat_in_view() {
             let mut visible = Vec::new();
             cull(0, &part, &view, 0.0, &mut visible);
             let mut is_visible = vec![false; part.blocks.len()];
-            visible.iter().for_each(|v| is_visible[v.block as usize] = true);
+            for v in &visible {
+                is_visible[v.block as usize] = true;
+            }
             project(Portable, std::slice::from_ref(&part), &[view], &everything, &mut projected);
             for (block, &count) in projected.counts.iter().enumerate() {
                 let culled_in_view = count > 0 && !is_visible[block];
