@@ -308,9 +308,9 @@ fn as_written_by(comments: &[&str], columns: &[String]) -> Vec<u8> {
     let header = std::str::from_utf8(&binary[..text_end]).unwrap();
     let names: Vec<&str> =
         header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
-    let comments: String = comments.iter().map(|text| format!("comment {text}\n")).collect();
+    let comments: String = comments.iter().flat_map(|text| ["comment ", text, "\n"]).collect();
     let properties: String =
-        columns.iter().map(|name| format!("property float {name}\n")).collect();
+        columns.iter().flat_map(|name| ["property float ", name, "\n"]).collect();
     let mut bytes = format!(
         "ply\nformat binary_little_endian 1.0\n{comments}element vertex 2\n{properties}end_header\n"
     )
@@ -391,7 +391,8 @@ fn colours_of_bytes_stand_for_the_constant_harmonic() {
 fn harmonics_of_degree_4_are_read_to_degree_3() {
     let mut names: Vec<String> = super::layout::REQUIRED.map(String::from).into();
     names.extend(numbered("f_rest", 72));
-    let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+    let properties: String =
+        names.iter().flat_map(|name| ["property float ", name, "\n"]).collect();
     let mut bytes =
         format!("ply\nformat binary_little_endian 1.0\nelement vertex 1\n{properties}end_header\n")
             .into_bytes();
