@@ -1,15 +1,19 @@
-//! One self-describing bitstream for an RGB-D image: colour as JPEG, depth as lossless u16
-//! millimetres. The server encodes, the runtime decodes straight into shared memory.
+//! One self-describing bitstream for an RGB-D image: any of colour, depth in u16 millimetres, alpha
+//! and object ids, in slices, so that encoding, sending, receiving and decoding overlap. The server
+//! encodes, the runtime decodes straight into shared memory.
 //!
 //! ```text
-//! RgbdView -> Encoder -> Header | JPEG | depth -> Decoder -> caller's rgb and depth slices
+//! ImageView -> Encoder -> header | slice | slice ... -> Decoder -> the caller's ImageMut
+//!                         slice: header | colour | depth | alpha | ids
 //! ```
 //!
 //! Read in this order:
-//! - [`Info`] and [`peek`]: the header, 24 bytes;
-//! - [`encode_jpeg`] for colour;
-//! - [`depth`]: banded prediction, zig-zag residuals, bit-packed blocks; a scalar reference and a
-//!   fast path that give the same bytes;
+//! - [`ImageView`], [`ImageMut`]: pixels;
+//! - [`Info`] and [`peek`]: the header; every choice is in it, so a decoder is told nothing;
+//! - `color`: JPEG whose tables are stored once, or exact planes; [`encode_jpeg`] for pictures;
+//! - [`depth`]: predicted, zig-zagged, bit-packed; a scalar reference and a fast path that give the
+//!   same bytes; [`DepthBound`] for depth that need not be exact;
+//! - `plane`: entropy-coded planes, for small depth, alpha and exact colour; `ids`: runs;
 //! - [`Encoder`], [`Decoder`]: the two ends. Keep one of each per stream: they own the scratch
 //!   memory, so that nothing of ours is allocated per image after the first.
 //!
@@ -25,11 +29,24 @@
 //! assert_eq!(depth_out, depth_mm);
 //! ```
 
-mod codec;
+mod bits;
 mod color;
+mod decode;
 pub mod depth;
+mod encode;
+mod error;
 mod header;
+mod ids;
+mod image;
+mod plane;
 
-pub use codec::{DecodeError, Decoder, EncodeError, EncodeOptions, Encoder, RgbdView};
 pub use color::encode_jpeg;
-pub use header::{DepthMode, Info, MAX_SIDE, peek};
+pub use decode::{Decoder, Progress};
+pub use depth::bound::DepthBound;
+pub use encode::{EncodeOptions, Encoder};
+pub use error::{DecodeError, EncodeError};
+pub use header::{
+    ColorMode, DepthMode, HEADER_BYTES, Info, MAX_SIDE, MAX_SLICES, SLICE_HEADER_BYTES, peek,
+    slice_len,
+};
+pub use image::{ImageMut, ImageView, Parts, RgbdView};

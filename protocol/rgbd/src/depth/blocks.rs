@@ -1,81 +1,155 @@
 //! Blocks of residuals to and from bits, 16 columns at a time.
 
-use super::{BLOCK_COLUMNS, BLOCK_ROWS};
+use super::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS};
+use crate::bits::{BitReader, BitWriter};
 
 /// One bit stream per column of a block: 16 lanes.
-type Lanes = [u16; BLOCK_COLUMNS];
+pub(super) type Lanes = [u16; BLOCK_COLUMNS];
+/// The residuals of a block.
+pub(super) type Block = [Lanes; BLOCK_ROWS];
 /// Bytes of one vector of lanes.
-const LANES_BYTES: usize = 2 * BLOCK_COLUMNS;
+pub(super) const LANES_BYTES: usize = 2 * BLOCK_COLUMNS;
 
-/// Returns the four-bit code of a block's width. Width 15 is stored as 16.
-pub(super) fn width_code(width_bits: u32) -> u8 {
-    debug_assert!(width_bits <= 16 && width_bits != 15);
-    width_bits.min(15) as u8
+/// How a block is stored: so many low bits of every residual, and so many more of those few that
+/// need them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Shape {
+    /// Low bits of every residual, 0 to 15.
+    pub(super) low: u32,
+    /// High bits of the residuals that the mask names, 0 to 15; 0: there is no mask.
+    pub(super) high: u32,
 }
 
-/// Returns the width of a four-bit code. [bits]
-pub(super) fn width_of_code(code: u8) -> u32 {
-    if code == 15 { 16 } else { u32::from(code) }
-}
+impl Shape {
+    /// Returns the byte of the table.
+    pub(super) fn code(self) -> u8 {
+        (self.low | self.high << 4) as u8
+    }
 
-/// Returns the bits that the largest of a block's residuals needs, as a code can say it.
-pub(super) fn width_of_residuals(or_of_all: u16) -> u32 {
-    match u16::BITS - or_of_all.leading_zeros() {
-        15 => 16,
-        width_bits => width_bits,
+    /// Reads a byte of the table; `None` if it asks for more than 16 bits.
+    pub(super) fn of_code(code: u8) -> Option<Self> {
+        let shape = Self { low: u32::from(code & 15), high: u32::from(code >> 4) };
+        (shape.low + shape.high <= 16).then_some(shape)
+    }
+
+    /// Returns the cheapest shape of a block, given how many of its residuals have each bit
+    /// length; of equals, the one with the most low bits.
+    #[inline(always)]
+    pub(super) fn cheapest(lengths: &[u16; 17]) -> Self {
+        // Lengths are counted up to 64, so the one below 0 is never reached.
+        let mut top = 16;
+        while top > 0 && lengths[top] == 0 {
+            top -= 1;
+        }
+        if top == 0 {
+            return Self { low: 0, high: 0 };
+        }
+        // 16 low bits have no code; 15 and one high bit do.
+        let mut best = Self { low: 15, high: 1 };
+        let mut best_bits = usize::MAX;
+        if top < 16 {
+            best = Self { low: top as u32, high: 0 };
+            best_bits = BLOCK_PIXELS * top;
+        }
+        let mut exceptions = 0;
+        for low in (0..top).rev() {
+            exceptions += usize::from(lengths[low + 1]);
+            let bits = BLOCK_PIXELS * (low + 1) + exceptions * (top - low);
+            if bits < best_bits && top - low <= 15 {
+                best_bits = bits;
+                best = Self { low: low as u32, high: (top - low) as u32 };
+            }
+        }
+        best
     }
 }
 
-/// Returns the bytes of bits after blocks whose widths sum to `width_sum`: each adds
+/// Returns the bytes of low bits after blocks whose low widths sum to `low_sum`: each adds
 /// [`BLOCK_ROWS`] residuals to each of the 16 streams.
-pub(super) fn bits_len(width_sum: usize) -> usize {
-    (width_sum * BLOCK_ROWS).div_ceil(16) * LANES_BYTES
+pub(super) fn low_len(low_sum: usize) -> usize {
+    (low_sum * BLOCK_ROWS).div_ceil(16) * LANES_BYTES
 }
 
 /// Residuals to bits.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Packer {
-    /// Full vectors, then room for the worst case.
-    bytes: Vec<u8>,
-    len: usize,
+    /// Low bits: full vectors, then room for the worst case.
+    low: Vec<u8>,
+    low_len: usize,
     open: Lanes,
     /// Bits used in `open`, 0 to 15.
     used: u32,
+    masks: Vec<u8>,
+    high: BitWriter,
 }
 
 impl Packer {
-    /// Forgets everything; makes room for so many blocks of 16 bits.
+    /// Forgets everything; makes room for so many blocks.
     pub(super) fn start(&mut self, blocks: usize) {
-        let room = bits_len(blocks * 16);
-        if self.bytes.len() < room {
-            self.bytes.resize(room, 0);
+        let room = low_len(blocks * 15);
+        if self.low.len() < room {
+            self.low.resize(room, 0);
         }
-        self.len = 0;
+        self.low_len = 0;
         self.open = [0; BLOCK_COLUMNS];
         self.used = 0;
+        self.masks.clear();
+        self.masks.reserve(8 * blocks);
+        self.high.start(blocks * BLOCK_PIXELS * 15);
     }
 
-    /// Adds the block at `column` of [`BLOCK_ROWS`] rows; returns its width. [bits]
-    #[inline]
-    pub(super) fn push_block(&mut self, rows: &[u16], stride: usize, column: usize) -> u32 {
-        let values: [Lanes; BLOCK_ROWS] =
-            std::array::from_fn(|row| lanes_at(rows, row * stride + column));
+    /// Adds a block; returns its shape.
+    #[inline(always)]
+    pub(super) fn push_block(&mut self, block: &Block) -> Shape {
         let mut or: Lanes = [0; BLOCK_COLUMNS];
-        for value in &values {
+        for row in block {
             for lane in 0..BLOCK_COLUMNS {
-                or[lane] |= value[lane];
+                or[lane] |= row[lane];
             }
         }
-        let width_bits = width_of_residuals(or.iter().fold(0, |a, b| a | b));
-        if width_bits > 0 {
-            for value in &values {
-                self.push(value, width_bits);
+        let or = or.iter().fold(0, |a, b| a | b);
+        if or == 0 {
+            return Shape { low: 0, high: 0 };
+        }
+        // Four histograms, so that equal neighbours need not wait for each other.
+        let mut counts = [[0u16; 17]; BLOCK_ROWS];
+        for lane in 0..BLOCK_COLUMNS {
+            for row in 0..BLOCK_ROWS {
+                counts[row][16 - block[row][lane].leading_zeros() as usize] += 1;
             }
         }
-        width_bits
+        let mut lengths = [0; 17];
+        for length in 0..17 {
+            lengths[length] = counts.iter().map(|count| count[length]).sum();
+        }
+        let shape = Shape::cheapest(&lengths);
+        if shape.low > 0 {
+            let kept = u16::MAX >> (16 - shape.low);
+            for row in block {
+                self.push(&row.map(|value| value & kept), shape.low);
+            }
+        }
+        if shape.high > 0 {
+            let mut mask = 0u64;
+            for (row, values) in block.iter().enumerate() {
+                let mut bits = 0u64;
+                for lane in 0..BLOCK_COLUMNS {
+                    bits |= u64::from(values[lane] >> shape.low != 0) << lane;
+                }
+                mask |= bits << (row * BLOCK_COLUMNS);
+            }
+            self.masks.extend_from_slice(&mask.to_le_bytes());
+            let values = block.as_flattened();
+            while mask != 0 {
+                let at = mask.trailing_zeros() as usize % BLOCK_PIXELS;
+                self.high.push(u32::from(values[at] >> shape.low), shape.high);
+                mask &= mask - 1;
+            }
+        }
+        shape
     }
 
-    #[inline]
+    #[inline(always)]
     fn push(&mut self, value: &Lanes, width_bits: u32) {
         for lane in 0..BLOCK_COLUMNS {
             self.open[lane] |= value[lane] << self.used;
@@ -95,61 +169,70 @@ impl Packer {
         }
     }
 
-    #[inline]
+    #[inline(always)]
     fn flush(&mut self) {
-        let room = &mut self.bytes[self.len..self.len + LANES_BYTES];
+        let room = &mut self.low[self.low_len..self.low_len + LANES_BYTES];
         for lane in 0..BLOCK_COLUMNS {
             room[2 * lane..2 * lane + 2].copy_from_slice(&self.open[lane].to_le_bytes());
         }
-        self.len += LANES_BYTES;
+        self.low_len += LANES_BYTES;
         self.open = [0; BLOCK_COLUMNS];
     }
 
-    /// Appends all bits to `out`.
+    /// Appends all bits to `out`: low ones, masks, high ones.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         if self.used > 0 {
             self.flush();
         }
-        out.extend_from_slice(&self.bytes[..self.len]);
+        out.extend_from_slice(&self.low[..self.low_len]);
+        out.extend_from_slice(&self.masks);
+        self.high.finish(out);
     }
 }
 
-fn lanes_at(rows: &[u16], at: usize) -> Lanes {
-    let mut lanes = [0; BLOCK_COLUMNS];
-    lanes.copy_from_slice(&rows[at..at + BLOCK_COLUMNS]);
-    lanes
-}
-
-/// Bits to residuals. The bits must be as long as the widths to come need ([`bits_len`]).
+/// Bits to residuals. The three streams must be as long as the shapes to come need.
 pub(super) struct Unpacker<'a> {
-    bits: &'a [u8],
+    low: &'a [u8],
     open: Lanes,
     /// Bits used up in `open`; 16 when the next vector must be loaded.
     used: u32,
+    masks: &'a [u8],
+    high: BitReader<'a>,
 }
 
 impl<'a> Unpacker<'a> {
-    pub(super) fn new(bits: &'a [u8]) -> Self {
-        Self { bits, open: [0; BLOCK_COLUMNS], used: 16 }
+    pub(super) fn new(low: &'a [u8], masks: &'a [u8], high: &'a [u8]) -> Self {
+        Self { low, open: [0; BLOCK_COLUMNS], used: 16, masks, high: BitReader::new(high) }
     }
 
-    /// Takes one block of this width and writes its residuals at `column` of the rows.
-    #[inline]
+    /// Takes one block of this shape and writes its residuals at `column` of the rows.
+    #[inline(always)]
     pub(super) fn pop_block(
         &mut self,
-        width_bits: u32,
+        shape: Shape,
         rows: &mut [u16],
         stride: usize,
         column: usize,
     ) {
         for row in 0..BLOCK_ROWS {
             let at = row * stride + column;
-            let value = if width_bits == 0 { [0; BLOCK_COLUMNS] } else { self.pop(width_bits) };
+            let value = if shape.low == 0 { [0; BLOCK_COLUMNS] } else { self.pop(shape.low) };
             rows[at..at + BLOCK_COLUMNS].copy_from_slice(&value);
+        }
+        if shape.high > 0 {
+            let (mask, rest) = self.masks.split_first_chunk().unwrap_or((&[0; 8], &[]));
+            self.masks = rest;
+            let mut mask = u64::from_le_bytes(*mask);
+            while mask != 0 {
+                let index = mask.trailing_zeros() as usize;
+                let at = index / BLOCK_COLUMNS * stride + column + index % BLOCK_COLUMNS;
+                rows[at] |= (self.high.pop(shape.high) << shape.low) as u16;
+                mask &= mask - 1;
+            }
         }
     }
 
-    #[inline]
+    #[inline(always)]
     fn pop(&mut self, width_bits: u32) -> Lanes {
         if self.used == 16 {
             self.load();
@@ -171,13 +254,13 @@ impl<'a> Unpacker<'a> {
         value.map(|lane| lane & mask)
     }
 
-    #[inline]
+    #[inline(always)]
     fn load(&mut self) {
-        let (vector, rest) = self.bits.split_at(LANES_BYTES);
+        let (vector, rest) = self.low.split_at(LANES_BYTES);
         for lane in 0..BLOCK_COLUMNS {
             self.open[lane] = u16::from_le_bytes([vector[2 * lane], vector[2 * lane + 1]]);
         }
-        self.bits = rest;
+        self.low = rest;
         self.used = 0;
     }
 }

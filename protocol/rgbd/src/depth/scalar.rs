@@ -1,9 +1,9 @@
 //! The reference: the format said a pixel and a bit at a time.
 
-use super::blocks::{width_code, width_of_code, width_of_residuals};
-use super::predict::{med, unzigzag, zigzag};
-use super::{BLOCK_COLUMNS, BLOCK_ROWS, Layout, checked_parts};
-use crate::codec::DecodeError;
+use super::blocks::Shape;
+use super::predict::{bases, med, unzigzag, zigzag};
+use super::{BLOCK_COLUMNS, BLOCK_ROWS, Bases, Layout, Parts};
+use crate::error::DecodeError;
 
 /// Appends the encoding of a row-major image to `out`. [mm]
 ///
@@ -12,64 +12,93 @@ use crate::codec::DecodeError;
 pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
     assert!(width > 0 && !depth.is_empty() && depth.len().is_multiple_of(width));
     let layout = Layout::new(width, depth.len() / width);
-    let mut codes = Vec::new();
-    let mut streams: Vec<Vec<bool>> = vec![Vec::new(); BLOCK_COLUMNS];
+    let bases = bases(depth, &layout);
+    let (mut table, mut masks) = (Vec::new(), Vec::new());
+    let mut low: Vec<Vec<bool>> = vec![Vec::new(); BLOCK_COLUMNS];
+    let mut high: Vec<bool> = Vec::new();
     for block in 0..layout.blocks() {
         let residuals = pixels_of_block(&layout, block).map(|(x, y)| {
             if x >= layout.width || y >= layout.height {
                 return 0;
             }
-            zigzag(depth[y * width + x].wrapping_sub(predicted(depth, &layout, x, y)))
+            zigzag(depth[y * width + x].wrapping_sub(predicted(depth, &bases, &layout, x, y)))
         });
         let residuals: Vec<u16> = residuals.collect();
-        let width_bits = width_of_residuals(residuals.iter().fold(0, |a, b| a | b));
-        codes.push(width_code(width_bits));
+        let mut lengths = [0; 17];
+        for residual in &residuals {
+            lengths[16 - residual.leading_zeros() as usize] += 1;
+        }
+        let shape = Shape::cheapest(&lengths);
+        table.push(shape.code());
         for (index, residual) in residuals.iter().enumerate() {
-            let stream = &mut streams[index % BLOCK_COLUMNS];
-            stream.extend((0..width_bits).map(|bit| residual >> bit & 1 == 1));
+            let bits = |from, count| (from..from + count).map(|bit| residual >> bit & 1 == 1);
+            low[index % BLOCK_COLUMNS].extend(bits(0, shape.low));
+            if shape.high > 0 {
+                let named = residual >> shape.low != 0;
+                masks.push(named);
+                high.extend(bits(shape.low, if named { shape.high } else { 0 }));
+            }
         }
     }
-    out.extend(codes.chunks(2).map(|pair| pair[0] | pair.get(1).unwrap_or(&0) << 4));
-    for word in 0..streams[0].len().div_ceil(16) {
-        for stream in &streams {
+    out.extend(bases.iter().flat_map(|base| base.to_le_bytes()));
+    out.extend(table);
+    for word in 0..low[0].len().div_ceil(16) {
+        for stream in &low {
             let bit = |n: usize| u16::from(stream.get(16 * word + n) == Some(&true)) << n;
             out.extend((0..16).map(bit).fold(0, |a, b| a | b).to_le_bytes());
         }
+    }
+    for stream in [masks, high] {
+        out.extend(stream.chunks(8).map(|byte| {
+            byte.iter().enumerate().fold(0, |all, (n, &bit)| all | u8::from(bit) << n)
+        }));
     }
 }
 
 /// Decodes into a row-major image. [mm]
 ///
 /// # Errors
-/// [`DecodeError::Depth`] unless `bytes` are as long as their own table of widths says.
+/// [`DecodeError::Depth`] unless `bytes` are as long as their own table says.
 ///
 /// # Panics
 /// If `depth` is empty or no whole number of rows.
 pub fn decode(bytes: &[u8], width: usize, depth: &mut [u16]) -> Result<(), DecodeError> {
     assert!(width > 0 && !depth.is_empty() && depth.len().is_multiple_of(width));
     let layout = Layout::new(width, depth.len() / width);
-    let (table, bits) = checked_parts(bytes, &layout)?;
+    let parts = Parts::checked(bytes, &layout)?;
+    let bit_of = |stream: &[u8], at: usize| stream[at / 8] >> (at % 8) & 1;
     let mut residuals = vec![0; depth.len()];
-    let mut used = 0;
+    let (mut low_at, mut mask_at, mut high_at) = (0, 0, 0);
     for block in 0..layout.blocks() {
-        let width_bits = width_of_code(table[block / 2] >> (4 * (block % 2)) & 15) as usize;
+        let shape = Shape::of_code(parts.table[block]).expect("the table was checked");
         for (index, (x, y)) in pixels_of_block(&layout, block).enumerate() {
             let (row, column) = (index / BLOCK_COLUMNS, index % BLOCK_COLUMNS);
-            let bit = |n: usize| {
-                let at = used + row * width_bits + n;
-                let byte = 2 * (at / 16 * BLOCK_COLUMNS + column) + at % 16 / 8;
-                u16::from(bits[byte] >> (at % 8) & 1) << n
-            };
+            let mut residual = 0;
+            for n in 0..shape.low {
+                let at = low_at + row * shape.low as usize + n as usize;
+                let at = 16 * (at / 16 * BLOCK_COLUMNS + column) + at % 16;
+                residual |= u16::from(bit_of(parts.low, at)) << n;
+            }
+            if shape.high > 0 {
+                if bit_of(parts.masks, mask_at) == 1 {
+                    for n in 0..shape.high {
+                        residual |= u16::from(bit_of(parts.high, high_at)) << (shape.low + n);
+                        high_at += 1;
+                    }
+                }
+                mask_at += 1;
+            }
             if x < layout.width && y < layout.height {
-                residuals[y * width + x] = (0..width_bits).map(bit).fold(0, |a, b| a | b);
+                residuals[y * width + x] = residual;
             }
         }
-        used += BLOCK_ROWS * width_bits;
+        low_at += BLOCK_ROWS * shape.low as usize;
     }
     for y in 0..layout.height {
         for x in 0..layout.width {
             let residual = unzigzag(residuals[y * width + x]);
-            depth[y * width + x] = predicted(depth, &layout, x, y).wrapping_add(residual);
+            depth[y * width + x] =
+                predicted(depth, &parts.bases, &layout, x, y).wrapping_add(residual);
         }
     }
     Ok(())
@@ -82,13 +111,12 @@ fn pixels_of_block(layout: &Layout, block: usize) -> impl Iterator<Item = (usize
     (0..BLOCK_ROWS).flat_map(move |dy| (0..BLOCK_COLUMNS).map(move |dx| (x0 + dx, y0 + dy)))
 }
 
-/// What a pixel is predicted to be from those before it in its band.
-fn predicted(depth: &[u16], layout: &Layout, x: usize, y: usize) -> u16 {
-    let top = y.is_multiple_of(layout.band_rows);
-    let at = |x: Option<usize>, y: Option<usize>| match (x, y) {
-        (Some(x), Some(y)) => depth[y * layout.width + x],
-        _ => 0,
-    };
-    let (left, above) = (x.checked_sub(1), if top { None } else { y.checked_sub(1) });
-    med(at(left, Some(y)), at(Some(x), above), at(left, above))
+/// What a pixel is predicted to be from those before it in its stripe.
+fn predicted(depth: &[u16], bases: &Bases, layout: &Layout, x: usize, y: usize) -> u16 {
+    let base = bases[x / layout.stripe_columns];
+    let above = |x: usize| if y == 0 { base } else { depth[(y - 1) * layout.width + x] };
+    if x.is_multiple_of(layout.stripe_columns) {
+        return above(x);
+    }
+    med(depth[y * layout.width + x - 1], above(x), above(x - 1))
 }

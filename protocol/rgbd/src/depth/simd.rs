@@ -1,74 +1,106 @@
-//! Undoing the prediction in all bands at once: lane `b` of a vector is a pixel of band `b`.
+//! Undoing the prediction in all stripes at once: lane `s` of a vector is a pixel of stripe `s`.
 //!
-//! Residuals lie in rows, so 8 columns of 8 bands are transposed in, predicted column after
-//! column, and transposed out: about one cycle a pixel, where a single band waits four cycles for
+//! Residuals lie in rows, so 8 columns of 8 stripes are transposed in, predicted column after
+//! column, and transposed out: about one cycle a pixel, where a single stripe waits four cycles for
 //! each pixel's left neighbour. SSE2 and NEON belong to the base of their machines, so nothing is
 //! asked at run time; any other machine takes the plain version.
 
-use super::{BANDS, Layout};
+use super::{DepthDecoder, DepthEncoder, Layout, Parts, STRIPES};
 
-/// Writes the image whose zig-zagged residuals these are. `above` is one vector per column, zero.
+/// Writes the image whose zig-zagged residuals these are. `above` is one vector per column of a
+/// stripe: what lies above the image.
 pub(super) fn undo_prediction(
     residuals: &[u16],
     layout: &Layout,
-    above: &mut [[u16; BANDS]],
+    above: &mut [[u16; STRIPES]],
     depth: &mut [u16],
 ) {
-    let &Layout { width, height, stride, band_rows, .. } = layout;
-    assert!(residuals.len() == BANDS * band_rows * stride && above.len() == stride);
-    assert!(depth.len() == width * height && stride.is_multiple_of(BANDS));
-    for row in 0..band_rows {
-        let mut left = [0; BANDS];
-        let mut corner = [0; BANDS];
-        for (group, above) in above.as_chunks_mut::<BANDS>().0.iter_mut().enumerate() {
-            let x = group * BANDS;
-            let mut square: Square = std::array::from_fn(|band| {
-                let at = (band * band_rows + row) * stride + x;
-                let mut eight = [0; BANDS];
-                eight.copy_from_slice(&residuals[at..at + BANDS]);
+    let &Layout { width, height, stride, stripe_columns, .. } = layout;
+    assert!(residuals.len() >= height * stride && above.len() == stripe_columns);
+    assert!(depth.len() == width * height && stride == STRIPES * stripe_columns);
+    for (residuals, depth) in residuals.chunks_exact(stride).zip(depth.chunks_exact_mut(width)) {
+        // The first pixel of a stripe knows only the one above: so do its left and corner.
+        let mut left = above[0];
+        let mut corner = above[0];
+        for (group, above) in above.as_chunks_mut::<STRIPES>().0.iter_mut().enumerate() {
+            let mut square: Square = std::array::from_fn(|stripe| {
+                let at = stripe * stripe_columns + group * STRIPES;
+                let mut eight = [0; STRIPES];
+                eight.copy_from_slice(&residuals[at..at + STRIPES]);
                 eight
             });
             kernel::columns(&mut square, above, &mut left, &mut corner);
-            let columns = BANDS.min(width.saturating_sub(x));
-            for (band, pixels) in square.iter().enumerate() {
-                let y = band * band_rows + row;
-                if y < height && columns > 0 {
-                    let at = y * width + x;
-                    if columns == BANDS {
-                        depth[at..at + BANDS].copy_from_slice(pixels);
-                    } else {
-                        depth[at..at + columns].copy_from_slice(&pixels[..columns]);
-                    }
+            for (stripe, pixels) in square.iter().enumerate() {
+                let x = stripe * stripe_columns + group * STRIPES;
+                if x + STRIPES <= width {
+                    depth[x..x + STRIPES].copy_from_slice(pixels);
+                } else if x < width {
+                    depth[x..].copy_from_slice(&pixels[..width - x]);
                 }
             }
         }
     }
 }
 
-/// 8 columns of 8 bands: rows are bands outside the kernel.
-type Square = [[u16; BANDS]; BANDS];
+/// Runs one of the loops below with AVX2 where the machine has it, and plain otherwise: the same
+/// code, compiled twice.
+macro_rules! widest {
+    ($name:ident($($argument:ident: $kind:ty),*), $plain:expr) => {
+        pub(super) fn $name($($argument: $kind),*) {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+                fn wide($($argument: $kind),*) {
+                    $plain($($argument),*);
+                }
+                if is_x86_feature_detected!("avx2")
+                    && is_x86_feature_detected!("bmi1")
+                    && is_x86_feature_detected!("bmi2")
+                    && is_x86_feature_detected!("lzcnt")
+                    && is_x86_feature_detected!("popcnt")
+                {
+                    // SAFETY: the machine has what the function is compiled for.
+                    return unsafe { wide($($argument),*) };
+                }
+            }
+            $plain($($argument),*);
+        }
+    };
+}
+
+widest!(
+    encode_blocks(encoder: &mut DepthEncoder, depth: &[u16], layout: &Layout, table: &mut [u8]),
+    DepthEncoder::encode_blocks
+);
+widest!(
+    unpack_blocks(decoder: &mut DepthDecoder, parts: &Parts<'_>, layout: &Layout),
+    DepthDecoder::unpack_blocks
+);
+
+/// 8 columns of 8 stripes: rows are stripes outside the kernel.
+type Square = [[u16; STRIPES]; STRIPES];
 
 /// The plain version, compiled everywhere so that it is tested everywhere.
 #[cfg_attr(any(target_arch = "x86_64", target_arch = "aarch64"), allow(dead_code))]
 mod plain {
     use super::super::predict::{med, unzigzag};
-    use super::{BANDS, Square};
+    use super::{STRIPES, Square};
 
     pub(super) fn columns(
         square: &mut Square,
-        above: &mut [[u16; BANDS]; BANDS],
-        left: &mut [u16; BANDS],
-        corner: &mut [u16; BANDS],
+        above: &mut [[u16; STRIPES]; STRIPES],
+        left: &mut [u16; STRIPES],
+        corner: &mut [u16; STRIPES],
     ) {
-        for column in 0..BANDS {
-            for band in 0..BANDS {
-                let up = above[column][band];
-                let residual = unzigzag(square[band][column]);
-                let pixel = med(left[band], up, corner[band]).wrapping_add(residual);
-                square[band][column] = pixel;
-                above[column][band] = pixel;
-                left[band] = pixel;
-                corner[band] = up;
+        for column in 0..STRIPES {
+            for stripe in 0..STRIPES {
+                let up = above[column][stripe];
+                let residual = unzigzag(square[stripe][column]);
+                let pixel = med(left[stripe], up, corner[stripe]).wrapping_add(residual);
+                square[stripe][column] = pixel;
+                above[column][stripe] = pixel;
+                left[stripe] = pixel;
+                corner[stripe] = up;
             }
         }
     }
@@ -86,13 +118,13 @@ mod kernel {
         _mm_unpacklo_epi64, _mm_xor_si128,
     };
 
-    use super::{BANDS, Square};
+    use super::{STRIPES, Square};
 
     pub(super) fn columns(
         square: &mut Square,
-        above: &mut [[u16; BANDS]; BANDS],
-        left: &mut [u16; BANDS],
-        corner: &mut [u16; BANDS],
+        above: &mut [[u16; STRIPES]; STRIPES],
+        left: &mut [u16; STRIPES],
+        corner: &mut [u16; STRIPES],
     ) {
         let mut vectors = transpose(square.each_ref().map(load));
         let (mut l, mut c) = (load(left), load(corner));
@@ -126,19 +158,19 @@ mod kernel {
     }
 
     #[inline(always)]
-    fn load(from: &[u16; BANDS]) -> __m128i {
+    fn load(from: &[u16; STRIPES]) -> __m128i {
         // SAFETY: the array is 16 readable bytes; the load needs no alignment.
         unsafe { _mm_loadu_si128(from.as_ptr().cast()) }
     }
 
     #[inline(always)]
-    fn store(to: &mut [u16; BANDS], vector: __m128i) {
+    fn store(to: &mut [u16; STRIPES], vector: __m128i) {
         // SAFETY: the array is 16 writable bytes; the store needs no alignment.
         unsafe { _mm_storeu_si128(to.as_mut_ptr().cast(), vector) }
     }
 
     #[inline(always)]
-    fn transpose(r: [__m128i; BANDS]) -> [__m128i; BANDS] {
+    fn transpose(r: [__m128i; STRIPES]) -> [__m128i; STRIPES] {
         // SAFETY: SSE2 is part of x86_64; these intrinsics work on values only.
         unsafe {
             let a = [
@@ -184,13 +216,13 @@ mod kernel {
         vtrn2q_u32, vtrn2q_u64,
     };
 
-    use super::{BANDS, Square};
+    use super::{STRIPES, Square};
 
     pub(super) fn columns(
         square: &mut Square,
-        above: &mut [[u16; BANDS]; BANDS],
-        left: &mut [u16; BANDS],
-        corner: &mut [u16; BANDS],
+        above: &mut [[u16; STRIPES]; STRIPES],
+        left: &mut [u16; STRIPES],
+        corner: &mut [u16; STRIPES],
     ) {
         let mut vectors = transpose(square.each_ref().map(load));
         let (mut l, mut c) = (load(left), load(corner));
@@ -217,20 +249,20 @@ mod kernel {
     }
 
     #[inline(always)]
-    fn load(from: &[u16; BANDS]) -> uint16x8_t {
+    fn load(from: &[u16; STRIPES]) -> uint16x8_t {
         // SAFETY: the array is 16 readable bytes; the load needs no alignment.
         unsafe { vld1q_u16(from.as_ptr()) }
     }
 
     #[inline(always)]
-    fn store(to: &mut [u16; BANDS], vector: uint16x8_t) {
+    fn store(to: &mut [u16; STRIPES], vector: uint16x8_t) {
         // SAFETY: the array is 16 writable bytes; the store needs no alignment.
         unsafe { vst1q_u16(to.as_mut_ptr(), vector) }
     }
 
     /// Swaps the off-diagonal quarters at three scales: elements, pairs, fours.
     #[inline(always)]
-    fn transpose(mut r: [uint16x8_t; BANDS]) -> [uint16x8_t; BANDS] {
+    fn transpose(mut r: [uint16x8_t; STRIPES]) -> [uint16x8_t; STRIPES] {
         // SAFETY: NEON is part of aarch64; these intrinsics work on values only.
         unsafe {
             for i in [0, 2, 4, 6] {
@@ -260,7 +292,7 @@ mod tests {
         /// The machine's kernel and the plain one agree on every input.
         #[test]
         fn kernels_agree(
-            square: Square, above: Square, left: [u16; BANDS], corner: [u16; BANDS],
+            square: Square, above: Square, left: [u16; STRIPES], corner: [u16; STRIPES],
         ) {
             let (mut s, mut a, mut l, mut c) = (square, above, left, corner);
             kernel::columns(&mut s, &mut a, &mut l, &mut c);

@@ -1,0 +1,69 @@
+//! JPEG in pure Rust: nothing but Rust and a C compiler to build.
+
+use jpeg_encoder::{ColorType, SamplingFactor};
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use super::jpeg::damaged;
+use crate::error::{DecodeError, EncodeError};
+use crate::header::ColorMode;
+
+/// Encodes whole JPEGs.
+#[derive(Debug, Default)]
+pub(super) struct Encoder {}
+
+impl Encoder {
+    /// Appends a baseline JPEG to `out`. `rgb` is of this size (width, height).
+    #[allow(clippy::unused_self)] // Why: the other library's encoder has state.
+    pub(super) fn encode(
+        &mut self,
+        rgb: &[u8],
+        size: (u16, u16),
+        quality: u8,
+        mode: ColorMode,
+        out: &mut Vec<u8>,
+    ) -> Result<(), EncodeError> {
+        let mut encoder = jpeg_encoder::Encoder::new(out, quality);
+        encoder.set_sampling_factor(match mode {
+            ColorMode::Jpeg420 => SamplingFactor::R_4_2_0,
+            ColorMode::Jpeg444 | ColorMode::Lossless => SamplingFactor::R_4_4_4,
+        });
+        encoder
+            .encode(rgb, size.0, size.1, ColorType::Rgb)
+            .map_err(|error| EncodeError::Jpeg(error.to_string()))
+    }
+}
+
+/// Decodes whole JPEGs.
+#[derive(Debug, Default)]
+pub(super) struct Decoder {}
+
+impl Decoder {
+    /// Decodes a baseline JPEG of exactly this size (width, height) into `rgb_out`.
+    #[allow(clippy::unused_self)] // Why: the other library's decoder has state.
+    pub(super) fn decode(
+        &mut self,
+        jpeg: &[u8],
+        (width, height): (u32, u32),
+        rgb_out: &mut [u8],
+    ) -> Result<(), DecodeError> {
+        let options = DecoderOptions::new_fast()
+            .set_max_width(width as usize)
+            .set_max_height(height as usize)
+            .set_strict_mode(true)
+            .jpeg_set_out_colorspace(ColorSpace::RGB);
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(jpeg), options);
+        decoder.decode_headers().map_err(|error| damaged(&format!("{error:?}")))?;
+        let info = decoder.info().ok_or_else(|| damaged("no image"))?;
+        if (u32::from(info.width), u32::from(info.height)) != (width, height) {
+            let (w, h) = (info.width, info.height);
+            return Err(damaged(&format!("JPEG is {w}x{h}, the header says {width}x{height}")));
+        }
+        if decoder.output_buffer_size() != Some(rgb_out.len()) {
+            return Err(damaged("JPEG does not decode to three bytes a pixel"));
+        }
+        decoder.decode_into(rgb_out).map_err(|error| damaged(&format!("{error:?}")))
+    }
+}

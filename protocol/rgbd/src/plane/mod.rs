@@ -1,0 +1,436 @@
+//! Entropy-coded planes: depth in its small mode, alpha, and each channel of lossless colour.
+//! Budget: 2 to 3 ms each way for a plane of 640x480 on one core, bound by the latency from one
+//! pixel to the next; four stripes run side by side to hide it.
+//!
+//! 1. **Stripes.** The plane is cut into 4 stripes of columns, each with a coder state of its own;
+//!    they advance together, 16 columns (a run) at a time.
+//! 2. **Runs.** A symbol says whether all pixels of a run are as predicted, coded, invalid, or
+//!    mixed; in the context of the runs to the left and above. The mask of a mixed run follows as
+//!    four symbols. So flat areas cost next to nothing, and a mask only where it changes.
+//! 3. **Prediction.** By the median edge detector, or by the mean of left and above, whichever
+//!    leaves less in a sample of the rows (the mean, where noise rules). Invalid pixels count as
+//!    predicted exactly, so that what lies beyond a hole is not surprised by it.
+//! 4. **Symbols.** Zig-zagged residuals up to 7 are symbols, larger ones a symbol for their bit
+//!    length and raw bits. Frequencies adapt, in contexts by how rough the neighbourhood is.
+//!
+//! Bytes: predictor, what each stripe starts from, then [`rans`]. One function walks the pixels for
+//! both ends, so they cannot disagree.
+
+mod cdf;
+mod rans;
+
+use cdf::{Cdf, SYMBOLS};
+use rans::{Coder, LANES, SymbolReader, SymbolWriter};
+
+use crate::depth::predict::{med, unzigzag, zigzag};
+
+/// What the samples of a plane are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Samples {
+    /// 0 to 255; residuals wrap there.
+    Bytes,
+    /// 0 to 65535, 0 is invalid.
+    Masked,
+}
+
+/// Encodes planes; owns the scratch memory.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PlaneEncoder {
+    walk: Walk,
+    symbols: SymbolWriter,
+}
+
+impl PlaneEncoder {
+    /// Appends the encoding of a row-major plane to `out`.
+    pub(crate) fn encode(
+        &mut self,
+        samples: &[u16],
+        width: usize,
+        kind: Samples,
+        out: &mut Vec<u8>,
+    ) {
+        assert!(width > 0 && !samples.is_empty() && samples.len().is_multiple_of(width));
+        let stripe = stripe_columns(width);
+        let bases: [u16; LANES] = std::array::from_fn(|lane| {
+            let row = &samples[(lane * stripe).min(width)..((lane + 1) * stripe).min(width)];
+            // A masked stripe starts from the first return, if there is one.
+            let first = row.iter().find(|&&sample| sample > 0 || kind == Samples::Bytes);
+            first.copied().unwrap_or(0)
+        });
+        let mean = mean_is_better(samples, width, kind);
+        out.push(u8::from(mean));
+        out.extend(bases.iter().flat_map(|base| base.to_le_bytes()));
+        // 3 + 15 raw bits at most for a pixel.
+        self.symbols.start(18 * samples.len());
+        let end = Giving { symbols: &mut self.symbols, samples };
+        self.walk.run(end, width, samples.len() / width, kind, mean, bases);
+        self.symbols.finish(out);
+    }
+}
+
+/// Decodes planes; owns the scratch memory.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PlaneDecoder {
+    walk: Walk,
+}
+
+impl PlaneDecoder {
+    /// Decodes into a row-major plane; `None` if the bytes are damaged.
+    pub(crate) fn decode(
+        &mut self,
+        bytes: &[u8],
+        width: usize,
+        kind: Samples,
+        samples: &mut [u16],
+    ) -> Option<()> {
+        assert!(width > 0 && !samples.is_empty() && samples.len().is_multiple_of(width));
+        let (&[mean, ref bases @ ..], rest) = bytes.split_first_chunk::<{ 1 + 2 * LANES }>()?;
+        if mean > 1 {
+            return None;
+        }
+        let bases =
+            std::array::from_fn(|lane| u16::from_le_bytes([bases[2 * lane], bases[2 * lane + 1]]));
+        let rows = samples.len() / width;
+        let mut symbols = SymbolReader::new(rest)?;
+        let end = Taking { symbols: &mut symbols, samples };
+        self.walk.run(end, width, rows, kind, mean == 1, bases);
+        symbols.is_finished().then_some(())
+    }
+}
+
+/// Which way pixels and symbols go.
+trait End {
+    type Coder: Coder;
+    fn coder(&mut self) -> &mut Self::Coder;
+    /// Returns a sample, if this end knows it.
+    fn known(&self, at: usize) -> u16;
+    /// Takes a sample, if this end wants it.
+    fn put(&mut self, at: usize, sample: u16);
+    /// Whether this end knows the samples.
+    const KNOWS: bool;
+}
+
+struct Giving<'a> {
+    symbols: &'a mut SymbolWriter,
+    samples: &'a [u16],
+}
+
+impl End for Giving<'_> {
+    type Coder = SymbolWriter;
+    const KNOWS: bool = true;
+    #[inline(always)]
+    fn coder(&mut self) -> &mut SymbolWriter {
+        self.symbols
+    }
+    #[inline(always)]
+    fn known(&self, at: usize) -> u16 {
+        self.samples[at]
+    }
+    #[inline(always)]
+    fn put(&mut self, _: usize, _: u16) {}
+}
+
+struct Taking<'a, 'b> {
+    symbols: &'a mut SymbolReader<'b>,
+    samples: &'a mut [u16],
+}
+
+impl<'b> End for Taking<'_, 'b> {
+    type Coder = SymbolReader<'b>;
+    const KNOWS: bool = false;
+    #[inline(always)]
+    fn coder(&mut self) -> &mut SymbolReader<'b> {
+        self.symbols
+    }
+    #[inline(always)]
+    fn known(&self, _: usize) -> u16 {
+        0
+    }
+    #[inline(always)]
+    fn put(&mut self, at: usize, sample: u16) {
+        self.samples[at] = sample;
+    }
+}
+
+/// What a run of pixels is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Run {
+    /// All valid, all as predicted.
+    Flat = 0,
+    /// All valid.
+    Coded = 1,
+    /// No return in any.
+    Invalid = 2,
+    /// Some valid.
+    Mixed = 3,
+}
+
+/// The model and its walk over the pixels.
+#[derive(Clone, Debug, Default)]
+struct Walk {
+    /// The row above, being overwritten; per lane, with one more column for the upper right.
+    row: Vec<u16>,
+    /// What the runs above were, per lane.
+    runs: Vec<u8>,
+    /// Frequencies of residuals, of runs, and of quarters of masks.
+    residuals: Vec<Cdf>,
+    run_kinds: Vec<Cdf>,
+    masks: Vec<Cdf>,
+}
+
+/// Where a lane is in its row.
+#[derive(Clone, Copy, Default)]
+struct Lane {
+    /// First column of the stripe, columns there are.
+    first: usize,
+    columns: usize,
+    left: u16,
+    corner: u16,
+    left_run: u8,
+    /// Of the run under way: which pixels are valid, and whether their residuals are coded.
+    valid: u16,
+    coded: bool,
+}
+
+impl Walk {
+    fn run(
+        &mut self,
+        end: impl End,
+        width: usize,
+        rows: usize,
+        kind: Samples,
+        mean: bool,
+        bases: [u16; LANES],
+    ) {
+        let stripe = stripe_columns(width);
+        self.row.clear();
+        for base in bases {
+            self.row.resize(self.row.len() + stripe + 1, base);
+        }
+        self.runs.clear();
+        self.runs.resize(LANES * stripe / RUN, Run::Coded as u8);
+        fill(&mut self.residuals, ROUGHNESSES, Cdf::even(SYMBOLS));
+        fill(&mut self.run_kinds, 16, Cdf::even(4));
+        fill(&mut self.masks, 64, Cdf::even(SYMBOLS));
+        match (kind, mean) {
+            (Samples::Bytes, false) => self.rows::<_, 8, false>(end, width, rows),
+            (Samples::Bytes, true) => self.rows::<_, 8, true>(end, width, rows),
+            (Samples::Masked, false) => self.rows::<_, 16, false>(end, width, rows),
+            (Samples::Masked, true) => self.rows::<_, 16, true>(end, width, rows),
+        }
+    }
+
+    fn rows<E: End, const BITS: u32, const MEAN: bool>(
+        &mut self,
+        mut end: E,
+        width: usize,
+        rows: usize,
+    ) {
+        let stripe = stripe_columns(width);
+        let mut lanes: [Lane; LANES] = std::array::from_fn(|lane| {
+            let first = lane * stripe;
+            Lane { first, columns: width.saturating_sub(first).min(stripe), ..Lane::default() }
+        });
+        for y in 0..rows {
+            for (n, lane) in lanes.iter_mut().enumerate() {
+                // The first pixel knows only the one above: so do its left and corner.
+                let above = self.row[n * (stripe + 1)];
+                (lane.left, lane.corner, lane.left_run) = (above, above, Run::Coded as u8);
+            }
+            for start in (0..lanes[0].columns).step_by(RUN) {
+                for (n, lane) in lanes.iter_mut().enumerate() {
+                    if start < lane.columns {
+                        self.begin_run::<E, BITS, MEAN>(&mut end, n, lane, start, y * width);
+                    }
+                }
+                for column in start..(start + RUN).min(stripe) {
+                    for (n, lane) in lanes.iter_mut().enumerate() {
+                        if column < lane.columns {
+                            self.pixel::<E, BITS, MEAN>(&mut end, n, lane, column, y * width);
+                        }
+                    }
+                }
+            }
+            for (n, lane) in lanes.iter().enumerate() {
+                if lane.columns > 0 {
+                    let last = n * (stripe + 1) + lane.columns;
+                    self.row[last] = self.row[last - 1];
+                }
+            }
+        }
+    }
+
+    /// Codes what the run from column `start` on is.
+    #[inline(always)]
+    fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
+        &mut self,
+        end: &mut E,
+        n: usize,
+        lane: &mut Lane,
+        start: usize,
+        row_at: usize,
+    ) {
+        let stripe = self.row.len() / LANES - 1;
+        let columns = RUN.min(lane.columns - start);
+        let all = u16::MAX >> (RUN - columns);
+        let (mut run, mut valid) = (Run::Coded, all);
+        if E::KNOWS {
+            let at = row_at + lane.first + start;
+            if BITS == 16 {
+                valid = 0;
+                for column in 0..columns {
+                    valid |= u16::from(end.known(at + column) != 0) << column;
+                }
+            }
+            run = if valid == all {
+                let row = &self.row[n * (stripe + 1) + start..][..columns];
+                let (mut left, mut corner) = (lane.left, lane.corner);
+                let flat = row.iter().enumerate().all(|(column, &up)| {
+                    let sample = end.known(at + column);
+                    let predicted = predict::<BITS, MEAN>(left, up, corner);
+                    (left, corner) = (sample, up);
+                    predicted == sample
+                });
+                if flat { Run::Flat } else { Run::Coded }
+            } else if valid == 0 {
+                Run::Invalid
+            } else {
+                Run::Mixed
+            };
+        }
+        let above = &mut self.runs[n * stripe / RUN + start / RUN];
+        let kinds = &mut self.run_kinds[usize::from(lane.left_run * 4 + *above) % 16];
+        // A decoder may find any of 16 symbols in damaged bytes.
+        run = match end.coder().symbol(n, kinds, run as usize) {
+            0 => Run::Flat,
+            2 if BITS == 16 => Run::Invalid,
+            3 if BITS == 16 => Run::Mixed,
+            _ => Run::Coded,
+        };
+        (*above, lane.left_run) = (run as u8, run as u8);
+        lane.coded = matches!(run, Run::Coded | Run::Mixed);
+        lane.valid = match run {
+            Run::Flat | Run::Coded => u16::MAX,
+            Run::Invalid => 0,
+            Run::Mixed => {
+                let mut mask = 0;
+                let mut before = 0;
+                for quarter in 0..4 {
+                    let bits = usize::from(valid >> (4 * quarter) & 15);
+                    let context = &mut self.masks[(before >> 3 << 2 | quarter) % 64];
+                    before = end.coder().symbol(n, context, bits);
+                    mask |= (before as u16 & 15) << (4 * quarter);
+                }
+                mask
+            }
+        };
+    }
+
+    #[inline(always)]
+    fn pixel<E: End, const BITS: u32, const MEAN: bool>(
+        &mut self,
+        end: &mut E,
+        n: usize,
+        lane: &mut Lane,
+        column: usize,
+        row_at: usize,
+    ) {
+        let stripe = self.row.len() / LANES - 1;
+        let row_index = n * (stripe + 1) + column;
+        let at = row_at + lane.first + column;
+        let (up, upper_right) = (self.row[row_index], self.row[row_index + 1]);
+        let predicted = predict::<BITS, MEAN>(lane.left, up, lane.corner);
+        let valid = lane.valid >> (column % RUN) & 1 == 1;
+        let mut sample = predicted;
+        if valid && lane.coded {
+            let rough = u32::from(lane.left.abs_diff(lane.corner))
+                + u32::from(up.abs_diff(lane.corner))
+                + u32::from(up.abs_diff(upper_right));
+            let context = &mut self.residuals[roughness(rough)];
+            let residual = if E::KNOWS { end.known(at).wrapping_sub(predicted) } else { 0 };
+            let wanted = u32::from(zigzag(residual << (16 - BITS)) >> (16 - BITS));
+            let code = code_number(end.coder(), n, context, wanted);
+            sample = predicted.wrapping_add(unzigzag(code as u16));
+            if BITS == 8 {
+                sample &= 255;
+            }
+        }
+        end.put(at, if valid { sample } else { 0 });
+        self.row[row_index] = sample;
+        (lane.corner, lane.left) = (up, sample);
+    }
+}
+
+/// Codes a zig-zagged residual.
+#[inline(always)]
+fn code_number(coder: &mut impl Coder, lane: usize, context: &mut Cdf, wanted: u32) -> u32 {
+    let length = u32::BITS - wanted.leading_zeros();
+    let symbol = if wanted < 8 { wanted } else { (length + 4).min(15) };
+    let symbol = coder.symbol(lane, context, symbol as usize) as u32;
+    if symbol < 8 {
+        return symbol;
+    }
+    let length =
+        if symbol < 15 { symbol - 4 } else { 11 + coder.raw(length.wrapping_sub(11) & 7, 3) };
+    // Lengths beyond 16 are damage; the bits read for them do no harm.
+    let low = length.min(16) - 1;
+    1 << low | coder.raw(wanted & ((1 << low) - 1), low)
+}
+
+/// Returns what a pixel is predicted to be.
+#[inline(always)]
+fn predict<const BITS: u32, const MEAN: bool>(left: u16, up: u16, corner: u16) -> u16 {
+    if MEAN {
+        // Of samples of at most 16 bits.
+        u32::midpoint(u32::from(left), u32::from(up)) as u16
+    } else {
+        med(left, up, corner)
+    }
+}
+
+/// Returns the context of a roughness: half octaves.
+#[inline(always)]
+fn roughness(rough: u32) -> usize {
+    let length = u32::BITS - rough.leading_zeros();
+    let context = if length > 3 { 2 * length - 3 + (rough >> (length - 2) & 1) } else { length };
+    (context as usize).min(ROUGHNESSES - 1)
+}
+
+/// Returns whether the mean of left and above predicts this plane better than the median edge
+/// detector, by the bit lengths of the residuals in every eighth row.
+fn mean_is_better(samples: &[u16], width: usize, kind: Samples) -> bool {
+    let (mut med_bits, mut mean_bits) = (0u32, 0u32);
+    let length = |sample: u16, predicted: u16| {
+        let residual = sample.wrapping_sub(predicted);
+        let shift = if kind == Samples::Bytes { 8 } else { 0 };
+        u16::BITS - (zigzag(residual << shift) >> shift).leading_zeros()
+    };
+    for y in (1..samples.len() / width).step_by(8) {
+        let (above, row) = samples[(y - 1) * width..(y + 1) * width].split_at(width);
+        for (row, above) in row.windows(2).zip(above.windows(2)) {
+            if kind == Samples::Masked && [row[0], row[1], above[0], above[1]].contains(&0) {
+                continue;
+            }
+            med_bits += length(row[1], predict::<16, false>(row[0], above[1], above[0]));
+            mean_bits += length(row[1], predict::<16, true>(row[0], above[1], above[0]));
+        }
+    }
+    mean_bits < med_bits
+}
+
+fn stripe_columns(width: usize) -> usize {
+    width.div_ceil(LANES).next_multiple_of(RUN)
+}
+
+fn fill(contexts: &mut Vec<Cdf>, count: usize, with: Cdf) {
+    contexts.clear();
+    contexts.resize(count, with);
+}
+
+/// Pixels of a run.
+const RUN: usize = 16;
+/// Contexts of residuals.
+const ROUGHNESSES: usize = 24;
+
+#[cfg(test)]
+mod tests;
