@@ -37,8 +37,8 @@ pub struct Hub {
     pub arena: ArenaInfo,
     /// The cameras of this moment.
     pub cameras: Cameras,
-    /// Which renderer draws, and why.
-    pub renderer: RendererInfo,
+    /// Which renderer draws, and why; it may give way to another in flight.
+    pub renderer: Mutex<RendererInfo>,
     /// The end of the program.
     pub stop: Stop,
     /// What happened.
@@ -118,7 +118,7 @@ impl Hub {
             vehicle: bounded(vehicle),
             arena,
             cameras,
-            renderer,
+            renderer: Mutex::new(renderer),
             stop,
             events: EventLog::default(),
             stats: Stats::default(),

@@ -86,6 +86,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     let renderer = RendererInfo { name: rasterizer.name(), reason };
     let cameras = Cameras::new(twin.arena.cameras.clone());
     let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), cameras, renderer, stop.clone()));
+    let renderer = lock(&hub.renderer).clone();
     let threads = start_threads(args, &hub, rasterizer, twin.referee, vicon)?;
 
     let fingerprint = identity.fingerprint();
@@ -101,8 +102,8 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
             fingerprint: &fingerprint,
             spawn: [x, y, z, spawn.yaw_deg],
             arena: &twin.arena.name,
-            renderer: &hub.renderer.name,
-            renderer_reason: &hub.renderer.reason,
+            renderer: &renderer.name,
+            renderer_reason: &renderer.reason,
         },
     );
 
@@ -116,7 +117,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         // A thread that panicked has said so on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
-    report(args.json, &hub.stats.report(*lock(&hub.source), &hub.renderer));
+    report(args.json, &hub.stats.report(*lock(&hub.source), &lock(&hub.renderer)));
     Ok(())
 }
 

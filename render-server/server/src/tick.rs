@@ -18,14 +18,14 @@ use tracing::{trace_span, warn};
 use vizflyt_arena::Referee;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_arena::pose::Rejected;
-use vizflyt_protocol::messages::{MAX_CAMERAS, PoseSample};
+use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS, PoseSample};
 use vizflyt_splat::{Camera, Rasterizer, RgbdImage};
 
 use crate::clock;
 use crate::drivers::{PoseSource, SourceCounters};
 use crate::encode::{self, DrawnTick};
 use crate::events::Origin;
-use crate::hub::{Hub, lock};
+use crate::hub::{Hub, RendererInfo, lock};
 use crate::mailbox::Mailbox;
 
 /// Takes poses from `source` until the server stops.
@@ -154,6 +154,9 @@ pub fn draw(
         match result {
             Ok(_) => {
                 hub.stats.render.add(start, end);
+                if seq.is_multiple_of(NAME_TICKS) {
+                    note_renderer(hub, renderer);
+                }
                 encode::count(hub, drawn.put_over(tick, DrawnTick::inherit));
             }
             Err(error) => {
@@ -163,6 +166,18 @@ pub fn draw(
                 drawn.recycle(tick);
             }
         }
+    }
+}
+
+/// Tells when another renderer has taken over, as the processor does from a lost graphics device.
+fn note_renderer(hub: &Hub, renderer: &dyn Rasterizer) {
+    let name = renderer.name();
+    let mut info = lock(&hub.renderer);
+    if info.name != name {
+        let text = format!("the renderer is now {name}");
+        *info = RendererInfo { name, reason: "took over in flight".to_owned() };
+        drop(info);
+        hub.tell(EventKind::Note, &text);
     }
 }
 
@@ -213,6 +228,8 @@ fn own_period(least: Duration, camera: &CameraConfig) -> Duration {
 const PATIENCE: Duration = Duration::from_millis(100);
 /// A source that sends nonsense does so 200 times a second.
 const WARN_EVERY: Duration = Duration::from_secs(5);
+/// The renderer is asked for its name this often: a second's worth.
+const NAME_TICKS: u64 = 64;
 /// Less than any sensor notices, more than clocks round. [s]
 const TOGETHER: Duration = Duration::from_millis(1);
 /// Where the twin ends: black, like the trainers' background.

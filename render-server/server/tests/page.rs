@@ -3,7 +3,7 @@
 mod support;
 
 use quinn::TransportConfig;
-use support::{Client, Emitter, Server, Socket, http, write_arena};
+use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{EventKind, ToRuntime};
 
 /// Messages within which what is waited for must come: a minute's worth.
@@ -17,6 +17,7 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
         ("/", "text/html"),
         ("/style.css", "text/css"),
         ("/app.js", "text/javascript"),
+        ("/cameras.js", "text/javascript"),
         ("/map.js", "text/javascript"),
         ("/icon.svg", "image/svg+xml"),
         ("/api/map", "image/jpeg"),
@@ -65,6 +66,50 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
     // One that opens later is told the way so far.
     let mut late = Socket::open(server.http, &own).ok().unwrap();
     assert!(!late.message("trail")["points"].as_array().unwrap().is_empty());
+}
+
+#[test]
+fn cameras_are_listed_and_changed_by_our_own_page_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let (status, answer) = http(server.http, "GET /api/cameras HTTP/1.1");
+    let cameras = answer.split_once("\r\n\r\n").unwrap().1;
+    let cameras: serde_json::Value = serde_json::from_str(cameras).unwrap();
+    assert_eq!(
+        (status, &cameras[0]["name"], &cameras[0]["near_m"]),
+        (200, &"front".into(), &0.05.into())
+    );
+
+    let mut socket = Socket::open(server.http, &format!("http://{}", server.http)).ok().unwrap();
+    let arena = socket.message("arena");
+    let fx_px = arena["cameras"][0]["intrinsics"]["fx_px"].as_f64();
+    assert_eq!(fx_px.map(f64::round), Some(80.0));
+    let put = |name: &str, body: &str| {
+        send_json(server.http, &format!("PUT /api/cameras/{name}"), None, body)
+    };
+    let good =
+        r#"{"width_px": 64, "height_px": 48, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}"#;
+    // What is listed can be put as it is.
+    assert_eq!(put("front", &cameras[0].to_string()).0, 200);
+    assert_eq!(put("front", good).0, 200);
+    // Every page is told, and so are the event feed and standard output.
+    assert_eq!(socket.message("cameras")["cameras"][0]["width_px"], 64);
+    let text = server.line(|line| line["event"]["text"].as_str().map(str::to_owned));
+    assert!(text.starts_with("camera front is now 64x48 px"), "{text}");
+
+    for (name, body, status, expected) in [
+        ("left", good, 404, "there is no camera 'left'; there are front"),
+        ("front", "{", 400, "no camera: EOF"),
+        ("front", r#"{"fov": 3}"#, 400, "unknown field `fov`"),
+        ("front", &good.replace("70", "700"), 400, "horizontal_fov_deg = 700"),
+        ("front", &" ".repeat(1 << 20), 413, "length limit"),
+    ] {
+        let (found, text) = put(name, body);
+        assert!(found == status && text.contains(expected), "{found} {text}");
+    }
+    let stranger = Some("http://evil.example");
+    assert_eq!(send_json(server.http, "PUT /api/cameras/front", stranger, good).0, 403);
+    assert_eq!(http(server.http, "PUT /api/cameras/front HTTP/1.1\r\nContent-Length: 0").0, 403);
 }
 
 #[tokio::test]

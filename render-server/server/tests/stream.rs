@@ -5,7 +5,10 @@ mod support;
 use std::sync::atomic::Ordering;
 
 use quinn::{TransportConfig, VarInt};
-use support::{Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, write_arena};
+use support::{
+    Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, send_json, write_arena,
+};
+use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{
     ClockRequest, EventKind, FlightPhase, Telemetry, ToRuntime, ToServer,
 };
@@ -104,7 +107,9 @@ async fn strangers_are_refused_by_name() {
     assert_eq!(&theirs[..4], b"VZFL");
     let closed = tokio::time::timeout(PATIENCE, connection.closed()).await.unwrap().to_string();
     assert!(
-        closed.contains("runtime speaks protocol 99, this server 1: update the server"),
+        closed.contains(&format!(
+            "runtime speaks protocol 99, this server {PROTOCOL_VERSION}: update the server"
+        )),
         "{closed}"
     );
 
@@ -266,9 +271,11 @@ async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (mut client, _) = Client::welcomed(&server, usual()).await;
-    // Half a second in place, then toward the wall at x = 5 m, 1 cm a frame.
-    let _emitter =
-        Emitter::along(server.vicon, "vizflyt", |frame| f64::from(frame.max(100) - 100) * 0.01);
+    // Half a second in place, then into the wall at x = 5 m, 1 cm a frame, and there it stays: a
+    // machine so loaded that packets are lost on the way still sees it touch.
+    let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| {
+        3.0 + f64::from(frame.clamp(100, 295) - 100) * 0.01
+    });
     let collision = |message| match message {
         ToRuntime::Event(event) => match event.kind {
             EventKind::Collision { p_world_m, clearance_m } => Some((p_world_m, clearance_m)),
@@ -281,6 +288,113 @@ async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
     assert!((p_world_m.x - 4.88).abs() < 0.15, "{p_world_m}");
     assert!(clearance_m <= 0.0);
     server.line(|line| line["event"]["kind"].get("collision").map(|_| ()));
+}
+
+#[tokio::test]
+async fn a_camera_that_changes_while_flying_loses_no_image() {
+    let folder = tempfile::tempdir().unwrap();
+    // Slow enough that even a loaded machine draws, encodes and sends every tick.
+    let server = Server::start(&write_arena(folder.path(), ""), &["--max-rate", "20"]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    let (mut client, _) = Client::welcomed(&server, usual()).await;
+    let mut images = Vec::new();
+    let changes = [
+        ((160, 120), 90.0, 0.0),
+        ((320, 200), 60.0, 10.0),
+        ((1280, 720), 60.0, 10.0),
+        ((40, 30), 120.0, -5.0),
+    ];
+    for (change, ((width, height), fov_deg, tilt_deg)) in changes.into_iter().enumerate() {
+        if change > 0 {
+            let json = format!(
+                r#"{{"width_px": {width}, "height_px": {height},
+                     "horizontal_fov_deg": {fov_deg}, "tilt_deg": {tilt_deg}}}"#
+            );
+            let http = server.http;
+            let patch = move || send_json(http, "PATCH /api/cameras/front", None, &json);
+            let (status, body) = tokio::task::spawn_blocking(patch).await.unwrap();
+            assert_eq!(status, 200, "{body}");
+            let (index, camera) = client
+                .until(|message| match message {
+                    ToRuntime::Camera { index, camera } => Some((index, camera)),
+                    _ => None,
+                })
+                .await;
+            assert_eq!((index, camera.intrinsics.width_px), (0, width));
+        }
+        let mut seen = 0;
+        while seen < 8 {
+            let (header, payload) = client.image().await;
+            let k = header.intrinsics();
+            seen += u32::from((k.width_px, k.height_px) == (width, height));
+            images.push((header, payload));
+        }
+    }
+    client.close().await;
+    let report = server.finish();
+
+    images.sort_by_key(|(header, _)| header.seq.get());
+    let mut now = 0;
+    for (header, payload) in &images {
+        // Changes come in order, and each image is whole and says how it was drawn.
+        let k = header.intrinsics();
+        while (k.width_px, k.height_px) != changes[now].0 {
+            now += 1;
+        }
+        let (_, fov_deg, tilt_deg): (_, f64, f64) = changes[now];
+        let f_px = f64::from(k.width_px) / 2.0 / (fov_deg / 2.0).to_radians().tan();
+        assert!((k.fx_px - f_px).abs() < 1e-9, "{k:?}");
+        let axis = header.body_from_cam().rotate(glam::DVec3::Z);
+        assert!((axis.z - tilt_deg.to_radians().sin()).abs() < 1e-9, "{axis}");
+        let pixels = k.pixels();
+        let (mut rgb, mut depth_mm) = (vec![0; pixels * 3], vec![0u16; pixels]);
+        Decoder::new().decode(payload, &mut rgb, &mut depth_mm).unwrap();
+    }
+    assert_eq!(now, changes.len() - 1);
+    // Whatever is missing gave way to a newer image, as without a change.
+    let (first, last) = (images[0].0.seq.get(), images[images.len() - 1].0.seq.get());
+    let missing = last - first + 1 - images.len() as u64;
+    let count = |key: &str| report[key].as_u64().unwrap();
+    let gave_way = count("ticks_skipped") + count("images_late");
+    assert!(missing <= gave_way, "{missing} images are missing, {gave_way} gave way: {report}");
+}
+
+#[tokio::test]
+async fn every_camera_has_its_own_rate_and_near_plane() {
+    let folder = tempfile::tempdir().unwrap();
+    let second = r#"
+[[cameras]]
+name = "slow"
+width_px = 64
+height_px = 48
+horizontal_fov_deg = 90.0
+position_m = [0.06, 0, 0.02]
+near_m = 20.0
+rate_hz = 5.0
+"#;
+    let server = Server::start(&write_arena(folder.path(), second), &["--max-rate", "40"]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    let (client, arena) = Client::welcomed(&server, usual()).await;
+    assert_eq!(arena.cameras.len(), 2);
+    let mut stamps_ns = [Vec::new(), Vec::new()];
+    while stamps_ns[1].len() < 5 {
+        let (header, payload) = client.image().await;
+        let camera = usize::from(header.camera);
+        stamps_ns[camera].push(header.render_start_ns.get());
+        assert!(header.together.get() & (1 << camera) != 0);
+        if camera == 1 {
+            // The wall is nearer than its near plane.
+            let (mut rgb, mut depth_mm) = (vec![0; 64 * 48 * 3], vec![0u16; 64 * 48]);
+            Decoder::new().decode(&payload, &mut rgb, &mut depth_mm).unwrap();
+            assert!(depth_mm.iter().all(|&mm| mm == 0));
+        }
+    }
+    // Never before it is due; the other one's images come between.
+    stamps_ns[1].sort_unstable();
+    let (first, last) = (stamps_ns[1][0], stamps_ns[1][4]);
+    assert!(last - first >= 4 * 190_000_000, "{stamps_ns:?}");
+    let between = stamps_ns[0].iter().filter(|&&ns| ns > first && ns < last).count();
+    assert!(between > 4, "{stamps_ns:?}");
 }
 
 #[test]

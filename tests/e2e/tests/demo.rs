@@ -49,10 +49,16 @@ fn signal(pid: u32, signal: Signal) {
 
 /// Sends one HTTP request and returns the whole response.
 fn http(url: &str, request: &str) -> String {
+    http_body(url, request, "")
+}
+
+/// As [`http`], with a body.
+fn http_body(url: &str, request: &str, body: &str) -> String {
     let address = url.trim_start_matches("http://").trim_end_matches('/');
     let mut stream = TcpStream::connect(address).unwrap();
     let host = format!("Host: {address}\r\nOrigin: http://{address}\r\nConnection: close\r\n");
-    write!(stream, "{request} HTTP/1.1\r\n{host}Content-Length: 0\r\n\r\n").unwrap();
+    let len = body.len();
+    write!(stream, "{request} HTTP/1.1\r\n{host}Content-Length: {len}\r\n\r\n{body}").unwrap();
     let mut response = String::new();
     stream.read_to_string(&mut response).unwrap();
     response
@@ -170,6 +176,28 @@ fn the_stop_button_lands_the_vehicle() {
     let report = file.read();
     assert_eq!(report["outcome"], "landed", "{report:#}");
     assert!(report["reason"].as_str().unwrap().contains("stop"), "{report:#}");
+}
+
+#[test]
+fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&["--seed", "7", "--seconds", "90"]);
+    let url = page_url(&mut demo);
+    demo.wait_for(FLYING, AIRBORNE);
+    let cameras = http(&url, "GET /api/cameras");
+    assert!(cameras.contains("\"name\":\"front\""), "{cameras}");
+    let change = r#"{"width_px": 400, "height_px": 200, "horizontal_fov_deg": 100}"#;
+    let response = http_body(&url, "PATCH /api/cameras/front", change);
+    assert!(response.starts_with("HTTP/1.1 200"), "{response}");
+    demo.wait_for("camera front is now 400x200 px", AIRBORNE);
+    let response = http_body(&url, "PATCH /api/cameras/front", r#"{"near_m": -1}"#);
+    assert!(response.starts_with("HTTP/1.1 400") && response.contains("near_m"), "{response}");
+    let code = demo.wait(FLIGHT);
+    let report = file.read();
+    // The example finds its way by what each image says of itself.
+    assert_eq!(report["outcome"], "finished", "{report:#} {:#?}", demo.seen);
+    assert_eq!(code, Some(0));
+    assert_eq!((&report["image_width"], &report["image_height"]), (&400.into(), &200.into()));
 }
 
 #[test]

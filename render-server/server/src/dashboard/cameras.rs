@@ -16,7 +16,8 @@ use crate::cameras::ChangeError;
 
 /// Answers with all cameras.
 pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
-    Json(messages::camera_lines(&page.hub.cameras.newest())).into_response()
+    let set = page.hub.cameras.newest();
+    Json(set.configs.iter().map(messages::camera_keys).collect::<Vec<_>>()).into_response()
 }
 
 /// Replaces a camera.
@@ -52,10 +53,14 @@ fn change(
         Ok(body) => body,
         Err(rejection) => return rejection.into_response(),
     };
+    let before = page.hub.cameras.newest();
     match apply(&body) {
         Ok(camera) => {
-            page.hub.tell(EventKind::Note, &describe(&camera));
-            Json(camera).into_response()
+            // The same again is no news.
+            if !Arc::ptr_eq(&before, &page.hub.cameras.newest()) {
+                page.hub.tell(EventKind::Note, &describe(&camera));
+            }
+            Json(messages::camera_keys(&camera)).into_response()
         }
         Err(error @ ChangeError::Unknown { .. }) => {
             (StatusCode::NOT_FOUND, error.to_string()).into_response()

@@ -3,6 +3,7 @@
 use std::sync::atomic::Ordering;
 
 use serde::Serialize;
+use serde_json::{Map, Value};
 use vizflyt_arena::config::{CameraConfig, StageConfig};
 use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
 use vizflyt_protocol::messages::{Event, Telemetry};
@@ -42,7 +43,6 @@ pub(super) struct Arena<'a> {
     boot: String,
     name: &'a str,
     vehicle: &'a str,
-    renderer: &'a RendererInfo,
     fence: &'a Volume,
     goal_m: Option<[f64; 3]>,
     goal_radius_m: f64,
@@ -61,7 +61,7 @@ pub(super) struct Arena<'a> {
 #[derive(Debug, Serialize)]
 pub(super) struct CameraLine {
     #[serde(flatten)]
-    config: CameraConfig,
+    keys: Map<String, Value>,
     intrinsics: Intrinsics,
 }
 
@@ -85,6 +85,7 @@ pub(super) struct State {
     render: Percentiles,
     encode: Percentiles,
     send: Percentiles,
+    renderer: RendererInfo,
     render_hz: f64,
     stream_hz: f64,
     stream_mbit_s: f64,
@@ -132,7 +133,6 @@ pub(super) fn arena(page: &Page) -> Message<'_> {
         boot: page.boot.as_ns().to_string(),
         name: &info.name,
         vehicle: &page.hub.vehicle,
-        renderer: &page.hub.renderer,
         fence: &info.geofence,
         goal_m: info.goal_m.map(|goal| goal.to_array()),
         goal_radius_m: info.goal_radius_m,
@@ -151,13 +151,25 @@ pub(super) fn cameras(set: &CameraSet) -> Message<'static> {
     Message::Cameras { cameras: camera_lines(set) }
 }
 
-/// Returns the cameras as page and API show them.
-pub(super) fn camera_lines(set: &CameraSet) -> Vec<CameraLine> {
+fn camera_lines(set: &CameraSet) -> Vec<CameraLine> {
     let line = |config: &CameraConfig| CameraLine {
-        config: config.clone(),
+        keys: camera_keys(config),
         intrinsics: config.intrinsics(),
     };
     set.configs.iter().map(line).collect()
+}
+
+/// Returns a camera by the keys of `[[cameras]]`, those of default value too.
+pub(super) fn camera_keys(config: &CameraConfig) -> Map<String, Value> {
+    let mut keys = match serde_json::to_value(config) {
+        Ok(Value::Object(keys)) => keys,
+        // A camera is a map of numbers and names: there is nothing that JSON cannot hold.
+        _ => Map::new(),
+    };
+    keys.insert("near_m".to_owned(), config.near_m.into());
+    keys.insert("yaw_deg".to_owned(), config.yaw_deg.into());
+    keys.insert("roll_deg".to_owned(), config.roll_deg.into());
+    keys
 }
 
 pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
@@ -195,6 +207,7 @@ pub(super) fn state(page: &Page) -> Message<'static> {
         render: stats.render.recent(),
         encode: stats.encode.recent(),
         send: stats.send.recent(),
+        renderer: lock(&hub.renderer).clone(),
         render_hz: page.rates.ticks.of(total(&stats.ticks), now),
         stream_hz: page.rates.images.of(total(&stats.images_sent), now),
         stream_mbit_s: page.rates.bytes.of(total(&stats.bytes_sent), now) * 8e-6,

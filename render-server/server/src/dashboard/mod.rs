@@ -84,6 +84,7 @@ fn router(page: Arc<Page>) -> Router {
         .route("/style.css", get(async || file("text/css; charset=utf-8", STYLE)))
         .route("/app.js", get(async || file("text/javascript; charset=utf-8", APP)))
         .route("/map.js", get(async || file("text/javascript; charset=utf-8", MAP)))
+        .route("/cameras.js", get(async || file("text/javascript; charset=utf-8", CAMERAS)))
         .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/api/map", get(map))
         .route("/api/estop", post(estop))
@@ -152,6 +153,7 @@ pub(crate) fn refuse(refusal: &origin::Refusal) -> Response {
 const INDEX: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 const APP: &str = include_str!("page/app.js");
+const CAMERAS: &str = include_str!("page/cameras.js");
 const MAP: &str = include_str!("page/map.js");
 pub(crate) const ICON: &str = include_str!("page/icon.svg");
 

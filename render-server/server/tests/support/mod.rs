@@ -393,6 +393,28 @@ pub fn http(address: SocketAddr, head: &str) -> (u16, String) {
     (status(&answer), answer)
 }
 
+/// Sends JSON as our own page would, or a page of `origin`, and returns the status and the body.
+pub fn send_json(
+    address: SocketAddr,
+    request: &str,
+    origin: Option<&str>,
+    body: &str,
+) -> (u16, String) {
+    let own = format!("http://{address}");
+    let (origin, len) = (origin.unwrap_or(&own), body.len());
+    let head = format!(
+        "{request} HTTP/1.1\r\nOrigin: {origin}\r\nContent-Type: application/json\r\n\
+         Content-Length: {len}"
+    );
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n{body}").unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    let body = answer.split_once("\r\n\r\n").expect("a body").1.to_owned();
+    (status(&answer), body)
+}
+
 fn status(answer: &str) -> u16 {
     answer.split(' ').nth(1).and_then(|code| code.parse().ok()).expect("a status line")
 }

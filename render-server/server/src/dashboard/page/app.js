@@ -1,11 +1,13 @@
 // The page: one WebSocket in, the stop button out. Everything shown is the newest; a lost
 // connection comes back by itself, and what was last known stays on the screen.
 
+import { CameraForm } from "/cameras.js";
 import { TopView } from "/map.js";
 
 const $ = (id) => document.getElementById(id);
 const view = new TopView($("map"));
-const shown = { pose: null, state: null, camera: 0, boot: null, events: new Set(), outcome: null };
+const form = new CameraForm($("camera-form"), $("camera-said"));
+const shown = { pose: null, state: null, camera: 0, cameras: [], boot: null, events: new Set(), outcome: null };
 
 // ---- theme -------------------------------------------------------------------------------
 const wantsLight = matchMedia("(prefers-color-scheme: light)");
@@ -37,8 +39,9 @@ async function stop() {
 $("estop").addEventListener("click", stop);
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-  // Space on another focused button is that button's own.
-  const elsewhere = event.target instanceof HTMLButtonElement && event.target !== $("estop");
+  // Space on another focused control is that control's own.
+  const control = event.target.closest?.("button, input, select, summary");
+  const elsewhere = control && control !== $("estop");
   if (event.code === "Escape" || (event.code === "Space" && !elsewhere)) {
     event.preventDefault();
     stop();
@@ -72,7 +75,7 @@ function link(tone, text) {
 }
 
 function hear(message) {
-  ({ arena: hearArena, trail: hearTrail, events: hearEvents, state: hearState })[message.type]?.(message);
+  ({ arena: hearArena, cameras: hearCameras, trail: hearTrail, events: hearEvents, state: hearState })[message.type]?.(message);
 }
 
 function hearArena(arena) {
@@ -87,10 +90,10 @@ function hearArena(arena) {
   document.title = `${arena.name} · VizFlyt`;
   $("arena").textContent = arena.name;
   $("vehicle").textContent = arena.vehicle;
-  $("renderer").textContent = `renderer: ${arena.renderer.name} (${arena.renderer.reason})`;
   $("speed-top").textContent = `${Math.max(1, arena.max_speed_mps)} m/s`;
   view.setArena(arena);
-  const tabs = arena.cameras.map((camera, index) => {
+  shown.cameras = arena.cameras;
+  const tabs = shown.cameras.map((camera, index) => {
     const tab = document.createElement("button");
     tab.type = "button";
     tab.textContent = camera.name;
@@ -103,9 +106,19 @@ function hearArena(arena) {
   function pick(index) {
     shown.camera = index;
     tabs.forEach((tab, k) => tab.setAttribute("aria-pressed", k === index));
-    const camera = arena.cameras[index];
-    $("camera-name").textContent = camera ? `${camera.name} · ${camera.width_px} × ${camera.height_px}` : "";
+    showCamera(false);
   }
+}
+
+function hearCameras({ cameras }) {
+  shown.cameras = cameras;
+  showCamera(true);
+}
+
+function showCamera(again) {
+  const camera = shown.cameras[shown.camera];
+  put("camera-name", camera ? `${camera.name} · ${camera.width_px} × ${camera.height_px}` : "");
+  form.show(camera, again);
 }
 
 function hearTrail({ points }) {
@@ -244,6 +257,7 @@ function hearState(state) {
   const { bad_packets, lost_frames, occluded } = state.source;
   put("pose-note", !pose ? "no pose yet" : !live ? `lost ${fixed(pose.age_s, 1)} s`
     : bad_packets ? `${bad_packets} bad` : lost_frames ? `${lost_frames} lost` : occluded ? `${occluded} unseen` : "");
+  put("renderer", `renderer: ${state.renderer.name} (${state.renderer.reason})`);
   put("runtime", state.runtime ? `${state.runtime.program} at ${state.runtime.address}` : "no runtime connected");
 
   const hint = !pose ? "waiting for the first pose of the vehicle" : !state.runtime && !state.landed ? "waiting for a runtime: vizflyt fly PLUGIN --server …" : "";

@@ -1,0 +1,368 @@
+//! `vizflyt scene` and `vizflyt bench` as a person uses them, and as a script does.
+
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::{Value, json};
+use vizflyt_e2e::{root, vizflyt};
+
+fn run(args: &[&str]) -> Output {
+    Command::new(vizflyt()).args(args).output().unwrap()
+}
+
+/// Runs, expects success, and returns standard output.
+fn good(args: &[&str]) -> String {
+    let output = run(args);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{args:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Runs, expects failure, and a message that contains every given text.
+fn refused(args: &[&str], texts: &[&str]) {
+    let output = run(args);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{args:?} succeeded");
+    assert!(!message.contains("panicked"), "{args:?}: {message}");
+    for text in texts {
+        assert!(message.contains(text), "{args:?} does not say '{text}': {message}");
+    }
+}
+
+/// A generated scene and a camera in it, in a folder that cleans up.
+struct Rig(tempfile::TempDir);
+
+impl Rig {
+    fn new() -> Self {
+        let rig = Self(tempfile::tempdir().unwrap());
+        good(&["scene", "generate", "race", "-o", &rig.at("race")]);
+        // 1.2 m above the world's origin, looking along x.
+        let w2c = json!([[0, -1, 0, 0], [0, 0, -1, 1.2], [1, 0, 0, 0], [0, 0, 0, 1]]);
+        let camera = json!({"fx": 80, "fy": 80, "cx": 80, "cy": 60, "w": 160, "h": 120,
+                            "w2c": w2c, "bg": [0.5, 0, 0]});
+        rig.write("cam.json", &camera.to_string());
+        rig
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.0.path().join(name).to_str().unwrap().to_owned()
+    }
+
+    fn write(&self, name: &str, text: &str) {
+        fs::write(self.at(name), text).unwrap();
+    }
+}
+
+/// An array as numpy saves it, of f32.
+struct Array {
+    shape: Vec<usize>,
+    values: Vec<f32>,
+}
+
+fn array(bytes: &[u8]) -> Option<Array> {
+    assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
+    let head = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+    let text = String::from_utf8_lossy(&bytes[10..head]);
+    if !text.contains("'<f4'") {
+        return None;
+    }
+    let shape = text.split("'shape': (").nth(1)?.split(')').next()?;
+    let shape = shape.split(',').filter_map(|side| side.trim().parse().ok()).collect();
+    let values = bytes[head..].chunks_exact(4);
+    let values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    Some(Array { shape, values })
+}
+
+fn saved(folder: &str, name: &str) -> Array {
+    array(&fs::read(Path::new(folder).join(name)).unwrap()).expect("f32")
+}
+
+/// Width, height, bits per channel and colour type of a PNG (its IHDR).
+fn png_head(path: &Path) -> (u32, u32, u8, u8) {
+    let bytes = fs::read(path).unwrap();
+    assert_eq!(&bytes[..8], b"\x89PNG\r\n\x1a\n");
+    let side = |at: usize| u32::from_be_bytes(bytes[at..at + 4].try_into().unwrap());
+    (side(16), side(20), bytes[24], bytes[25])
+}
+
+#[test]
+fn pictures_are_written_as_png_and_as_arrays() {
+    let rig = Rig::new();
+    let said = good(&[
+        "scene",
+        "render",
+        &rig.at("race"),
+        "--camera",
+        &rig.at("cam.json"),
+        "--out",
+        &rig.at("a"),
+    ]);
+    assert!(said.contains("renderer") && said.contains("160x120 in "), "{said}");
+    let folder = PathBuf::from(rig.at("a"));
+    assert_eq!(png_head(&folder.join("rgb.png")), (160, 120, 8, 2));
+    assert_eq!(png_head(&folder.join("depth_mm.png")), (160, 120, 16, 0));
+
+    fs::copy(rig.at("cam.json"), rig.at("other.json")).unwrap();
+    good(&[
+        "scene",
+        "render",
+        &rig.at("race/arena.toml"),
+        "--camera",
+        &rig.at("cam.json"),
+        "--camera",
+        &rig.at("other.json"),
+        "--format",
+        "npy",
+        "--out",
+        &rig.at("b"),
+        "--renderer",
+        "cpu",
+    ]);
+    let (one, two) = (rig.at("b/cam"), rig.at("b/other"));
+    let rgb = saved(&one, "rgb.npy");
+    assert_eq!(rgb.shape, [120, 160, 3]);
+    assert!(rgb.values == saved(&two, "rgb.npy").values, "the same camera, another picture");
+    let [alpha, expected, median] =
+        ["alpha.npy", "depth_expected.npy", "depth_median.npy"].map(|name| saved(&one, name));
+    let middle = 60 * 160 + 80;
+    assert_eq!(alpha.shape, [120, 160]);
+    assert!(alpha.values[middle] > 0.9, "something is ahead");
+    let (a, b) = (expected.values[middle], median.values[middle]);
+    assert!(a > 0.5 && (a / b - 1.0).abs() < 0.2, "expected {a} m, median {b} m");
+}
+
+#[test]
+fn mistakes_in_a_picture_are_explained() {
+    let rig = Rig::new();
+    let (scene, camera) = (rig.at("race"), rig.at("cam.json"));
+    let out = rig.at("out");
+    let render = |scene: &str, camera: &str, texts: &[&str]| {
+        refused(&["scene", "render", scene, "--camera", camera, "--out", &out], texts);
+    };
+    render(&rig.at("gone.ply"), &camera, &["there is no", "vizflyt scene generate"]);
+    render(&scene, &rig.at("gone.json"), &["cannot read the camera", "gone.json"]);
+    rig.write("bad.json", "{\"fx\": 1");
+    render(&scene, &rig.at("bad.json"), &["bad.json is no camera", "w2c (4x4", "line 1"]);
+    rig.write("notes.txt", "just words, of no format at all");
+    render(&rig.at("notes.txt"), &camera, &["supported are", "PLY", "SPZ", ".splat", "SOG"]);
+    fs::create_dir(rig.at("empty")).unwrap();
+    render(&rig.at("empty"), &camera, &["is a folder without an arena.toml"]);
+    refused(&["scene", "render", &scene], &["--camera"]);
+    refused(
+        &["scene", "render", &scene, "--camera", &camera, "--renderer", "voodoo"],
+        &["voodoo", "auto, cpu, gpu"],
+    );
+    refused(
+        &["scene", "render", &scene, "--camera", &camera, "--camera", &camera, "--out", &out],
+        &["two cameras would write to"],
+    );
+    refused(
+        &["bench", "render", &scene, "--camera", &camera, "--size", "big"],
+        &["'big' is no size in pixels; write it as 640x480"],
+    );
+    assert!(!Path::new(&out).exists(), "nothing is left behind");
+}
+
+#[test]
+fn a_scene_is_inspected() {
+    let rig = Rig::new();
+    let found: Value =
+        serde_json::from_str(&good(&["scene", "inspect", &rig.at("race"), "--json"])).unwrap();
+    assert_eq!((&found["format"], &found["dropped"]), (&"PLY".into(), &0.into()), "{found:#}");
+    assert!(found["splats"].as_u64().unwrap() > 10_000);
+    assert!(found["core_bounds"][1][0].as_f64().unwrap() > 5.0, "{found:#}");
+    let text = good(&["scene", "inspect", &rig.at("race/scene.ply")]);
+    assert!(text.contains("opacity") && text.contains("harmonics"), "{text}");
+}
+
+#[test]
+fn a_benchmark_prints_what_scripts_read() {
+    let rig = Rig::new();
+    let (scene, camera) = (rig.at("race"), rig.at("cam.json"));
+    let args = ["bench", "render", &scene, "--camera", &camera, "--images", "4", "--size", "96x72"];
+    let figures: Value = serde_json::from_str(&good(&[&args[..], &["--json"]].concat())).unwrap();
+    for key in ["median_ms", "p99_ms"] {
+        assert!(figures[key].as_f64().is_some_and(|ms| ms > 0.0), "{key}: {figures:#}");
+    }
+    assert!(figures["passes"]["blend_ms"].as_f64().is_some_and(|ms| ms > 0.0), "{figures:#}");
+    assert_eq!((&figures["width_px"], &figures["images"]), (&96.into(), &4.into()));
+    assert!(figures["workload"]["visible"].as_u64().unwrap() > 100);
+    assert!(!figures["renderer"].as_str().unwrap().is_empty());
+    let table = good(&args);
+    assert!(table.contains("median") && table.contains("images/s"), "{table}");
+}
+
+/// The renderer against an independent one in float64; see `../shared/tools/splat_oracle.py`.
+#[test]
+fn pictures_are_those_of_the_oracle() {
+    let shared = root().join("../shared/scenes");
+    if !shared.join("room.ply").exists() {
+        println!("skipped: the captured scenes are not beside the repository");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    for (scene, pose) in [("room", "room_p0_320x240"), ("flowers_lod2", "flowers_lod2_p1_320x240")]
+    {
+        let out = folder.path().join(pose).to_str().unwrap().to_owned();
+        let (file, camera) = (format!("{scene}.ply"), format!("ref/{pose}.json"));
+        let path = |name: &str| shared.join(name).to_str().unwrap().to_owned();
+        good(&[
+            "scene",
+            "render",
+            &path(&file),
+            "--camera",
+            &path(&camera),
+            "--format",
+            "npy",
+            "--out",
+            &out,
+        ]);
+        let oracle = npz(&shared.join(format!("ref/{pose}.npz")));
+        for (ours, theirs) in [("rgb.npy", "rgb.npy"), ("alpha.npy", "alpha.npy")] {
+            let db = psnr(&saved(&out, ours).values, &oracle[theirs].values);
+            assert!(db >= 60.0, "{pose} {ours}: {db:.1} dB");
+        }
+        let alpha = &oracle["alpha.npy"].values;
+        for (ours, theirs) in
+            [("depth_median.npy", "depth_median.npy"), ("depth_expected.npy", "depth.npy")]
+        {
+            let (found, truth) = (saved(&out, ours).values, &oracle[theirs].values);
+            let solid: Vec<_> =
+                (0..truth.len()).filter(|&k| alpha[k] > 0.5 && truth[k] > 0.0).collect();
+            let near = |&&k: &&usize| (found[k] - truth[k]).abs() <= 1e-3 * truth[k];
+            let share = solid.iter().filter(near).count() as f64 / solid.len() as f64;
+            assert!(share >= 0.995, "{pose} {ours}: {share:.4} within 0.1 %");
+        }
+    }
+}
+
+fn npz(path: &Path) -> HashMap<String, Array> {
+    let mut archive = zip::ZipArchive::new(File::open(path).unwrap()).unwrap();
+    (0..archive.len())
+        .filter_map(|index| {
+            let mut file = archive.by_index(index).unwrap();
+            let mut bytes = Vec::new();
+            file.read_to_end(&mut bytes).unwrap();
+            Some((file.name().to_owned(), array(&bytes)?))
+        })
+        .collect()
+}
+
+fn psnr(a: &[f32], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
+    let mean = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
+    -10.0 * mean.log10()
+}
+
+/// The page asks for a picture over its WebSocket, copies the camera, and `scene render` draws it.
+#[test]
+fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
+    let rig = Rig::new();
+    let mut child = Command::new(vizflyt())
+        .args(["scene", "view", &rig.at("race"), "--no-browser"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let line = lines.by_ref().map(Result::unwrap).find(|line| line.contains("http://"));
+    let line = line.expect("the address is printed");
+    let address = line.rsplit("http://").next().unwrap().to_owned();
+
+    let mut page = TcpStream::connect(&address).unwrap();
+    write!(page, "GET / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut text = String::new();
+    page.read_to_string(&mut text).unwrap();
+    assert!(text.starts_with("HTTP/1.1 200") && text.contains("<canvas"), "{text}");
+
+    let mut socket = Socket::open(&address);
+    let welcome: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    assert!(welcome["renderer"]["reason"].is_string(), "{welcome}");
+    socket.send("{\"what\": 1}");
+    let error: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    assert!(error["error"].as_str().unwrap().contains("unknown field `what`"), "{error}");
+    let ask = json!({"p_m": welcome["start_m"], "yaw_rad": 0.3, "pitch_rad": -0.1, "fov_deg": 80,
+                     "width_px": 200, "height_px": 100, "depth": false});
+    socket.send(&ask.to_string());
+    let told: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    assert!(told["visible"].as_u64().unwrap() > 100, "{told}");
+    assert_eq!(socket.receive()[..2], [0xff, 0xd8], "a JPEG follows");
+
+    rig.write("copied.json", &told["camera"].to_string());
+    let said = good(&[
+        "scene",
+        "render",
+        &rig.at("race"),
+        "--camera",
+        &rig.at("copied.json"),
+        "--out",
+        &rig.at("copied"),
+    ]);
+    assert!(said.contains(&format!("{} splats in sight", told["visible"])), "{said} {told}");
+
+    kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM).unwrap();
+    assert!(child.wait().unwrap().success());
+}
+
+/// A browser's WebSocket (RFC 6455), as far as the viewer needs one.
+struct Socket(TcpStream);
+
+impl Socket {
+    fn open(address: &str) -> Self {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
+        write!(
+            stream,
+            "GET /ws HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n\
+             Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        .unwrap();
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).unwrap();
+            head.push(byte[0]);
+        }
+        assert!(head.starts_with(b"HTTP/1.1 101"), "{}", String::from_utf8_lossy(&head));
+        Self(stream)
+    }
+
+    fn send(&mut self, text: &str) {
+        // A client masks; with zeros the text stays as it is.
+        let mut frame = vec![0x81, 0x80 | 126];
+        frame.extend((text.len() as u16).to_be_bytes());
+        frame.extend([0; 4]);
+        frame.extend(text.as_bytes());
+        self.0.write_all(&frame).unwrap();
+    }
+
+    /// Returns the payload of the next frame.
+    fn receive(&mut self) -> Vec<u8> {
+        let mut head = [0; 2];
+        self.0.read_exact(&mut head).unwrap();
+        let len = match head[1] {
+            126 => {
+                let mut len = [0; 2];
+                self.0.read_exact(&mut len).unwrap();
+                u64::from(u16::from_be_bytes(len))
+            }
+            127 => {
+                let mut len = [0; 8];
+                self.0.read_exact(&mut len).unwrap();
+                u64::from_be_bytes(len)
+            }
+            len => u64::from(len),
+        };
+        let mut payload = vec![0; len as usize];
+        self.0.read_exact(&mut payload).unwrap();
+        payload
+    }
+}
