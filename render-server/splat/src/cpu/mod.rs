@@ -148,6 +148,10 @@ impl Rasterizer for CpuRenderer {
                 InstructionSet::Avx2(simd) => {
                     self.render_one(simd, placements, camera, image, &mut times);
                 }
+                #[cfg(target_arch = "aarch64")]
+                InstructionSet::Neon(simd) => {
+                    self.render_one(simd, placements, camera, image, &mut times);
+                }
                 InstructionSet::Portable(simd) => {
                     self.render_one(simd, placements, camera, image, &mut times);
                 }

@@ -12,6 +12,8 @@ fn every_set<K: Kernel + Clone>(kernel: &K) {
             InstructionSet::Avx512(simd) => drop(simd.run(kernel.clone())),
             #[cfg(target_arch = "x86_64")]
             InstructionSet::Avx2(simd) => drop(simd.run(kernel.clone())),
+            #[cfg(target_arch = "aarch64")]
+            InstructionSet::Neon(simd) => drop(simd.run(kernel.clone())),
             InstructionSet::Portable(simd) => drop(simd.run(kernel.clone())),
         }
     }
