@@ -38,7 +38,7 @@ pub enum Detail {
 }
 
 impl Detail {
-    /// As coarse as stays like full detail to 40 dB and more, on generated and captured scenes.
+    /// As coarse as stays like full detail to 37 dB and more, on generated and captured scenes.
     pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: 0.5 };
     /// Scenes of fewer splats are drawn fast enough in full. [splats]
     pub const WORTHWHILE_FROM: usize = 1_000_000;
@@ -146,6 +146,7 @@ struct Cluster {
 }
 
 fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
+    let Out { geometry: out_geometry, sh: out_sh, origins: out_origins } = out;
     let (low, high) = from.blocks.iter().fold((Vec3::MAX, Vec3::MIN), |(low, high), block| {
         (low.min(block.center_m - block.half_m), high.max(block.center_m + block.half_m))
     });
@@ -169,7 +170,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
         merge(members.iter().map(|&i| blobs[i as usize]), weight_blur_m2)
     };
     let (mut mass, mut error_m2) = (0.0, 0.0);
-    for (cluster, origin) in clusters.iter().zip(&mut *out.origins) {
+    for (cluster, origin) in clusters.iter().zip(out_origins) {
         let blob = merged(cluster);
         let m = blob.mass(weight_blur_m2);
         mass += m;
@@ -187,7 +188,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
     let mut rows = vec![0f32; numbers * GROUP];
     for (i, group) in clusters.chunks(GROUP).enumerate() {
         rows.fill(0.0);
-        let geometry = &mut out.geometry[i * GROUP_NUMBERS..][..GROUP_NUMBERS];
+        let geometry = &mut out_geometry[i * GROUP_NUMBERS..][..GROUP_NUMBERS];
         for (lane, cluster) in group.iter().enumerate() {
             let mut put = |column: usize, v: f32| geometry[column * GROUP + lane] = v;
             let blob = merged(cluster);
@@ -216,7 +217,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
                 }
             }
         }
-        let halves = &mut out.sh[i * numbers * GROUP..][..numbers * GROUP];
+        let halves = &mut out_sh[i * numbers * GROUP..][..numbers * GROUP];
         halves.reinterpret_cast_mut::<f16>().convert_from_f32_slice(&rows);
     }
     block

@@ -1,6 +1,6 @@
 //! Level of detail: like full detail, for less.
 
-#[path = "../../benches/scenes/city.rs"]
+#[path = "../../benches/detail/city.rs"]
 mod city;
 mod images;
 mod likeness;
