@@ -1,6 +1,7 @@
 //! The renderer for processors: SIMD, all cores, no allocation per image after the first.
 //!
-//! Data flow, the files in run order: `scene` packs the splats once. Then, per camera: `cull` lists
+//! Data flow, the files in run order: `scene` packs the splats once, and `detail` adds coarser levels
+//! of them where asked for, made by `merge`. Then, per camera: `cull` lists
 //! the blocks of splats in view, `project` brings their splats onto the image plane, `sort` orders
 //! them by depth, `bin` gives each 16x16-pixel tile its list, `blend` draws the tiles. `simd` holds
 //! the instruction sets and all unsafe code; every pass is written once, generic over them.

@@ -7,7 +7,8 @@
 //! (16 x, 16 y, ...), so that a vector of 8 or 16 lanes is one load. What would be dropped from
 //! every image (opacity below 1/255, numbers that are not finite) is dropped here, once.
 //!
-//! Memory: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16.
+//! Memory: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16; coarser levels, where
+//! asked for, a third more.
 
 use glam::{Mat3, Vec3};
 use half::f16;
