@@ -1,7 +1,7 @@
 //! Pass 5: the pixels of each tile, from near to far.
 //!
 //! Budget: 48 bytes read per pair that is not behind opaque ones, 16 written per pixel (20 with
-//! ids). Bound by arithmetic: some 20 operations per pair and pixel of the tile.
+//! ids). Bound by arithmetic: some 20 operations per pair and pixel of the tile; a thread has four pixels, for whom it fetches each splat once.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};

@@ -19,12 +19,13 @@ struct Block {
 @group(0) @binding(4) var<storage, read_write> sizes: array<u32>;
 @group(0) @binding(5) var<storage, read_write> dispatches: array<u32>;
 
-fn is_seen(block: Block, view: View) -> bool {
-    let center = block.center - vec3(view.row_x.w, view.row_y.w, view.row_z.w);
+// Views by index, not by value: a copy indexed in a loop would go to memory.
+fn is_seen(block: Block, view: u32) -> bool {
+    let center = block.center - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
     let farthest = max(max(abs(center.x), abs(center.y)), abs(center.z));
     for (var i = 0u; i < 5u; i++) {
-        let plane = view.planes[i];
-        let slack = dot(abs(plane.xyz), block.half_size) + block.reach * view.weights[i / 4u][i % 4u];
+        let plane = views[view].planes[i];
+        let slack = dot(abs(plane.xyz), block.half_size) + block.reach * views[view].weights[i / 4u][i % 4u];
         // The rounding of the sums, so that nothing is lost at the very edge.
         let rounding = 1e-5 * (farthest + slack);
         if dot(plane.xyz, center) + slack + rounding < plane.w {
@@ -45,7 +46,7 @@ fn cull(
     if index < total {
         let block = blocks[index % tick.blocks];
         let view = index / tick.blocks * tick.parts + block.part;
-        if views[view].flags.y != 0u && is_seen(block, views[view]) {
+        if views[view].flags.y != 0u && is_seen(block, view) {
             seen = 1u;
         }
     }

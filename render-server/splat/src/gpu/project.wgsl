@@ -80,9 +80,9 @@ struct Bent {
 }
 
 /// As `vizflyt_protocol::geometry::Distortion::distort`.
-fn distort(view: View, slope: vec2<f32>) -> Bent {
-    let model = view.flags.x;
-    let k = view.lens;
+fn distort(view: u32, slope: vec2<f32>) -> Bent {
+    let model = views[view].flags.x;
+    let k = views[view].lens;
     let rr = dot(slope, slope);
     let x = slope.x;
     let y = slope.y;
@@ -90,7 +90,7 @@ fn distort(view: View, slope: vec2<f32>) -> Bent {
         return Bent(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
     }
     if model == BROWN_CONRADY {
-        let k3 = view.more.x;
+        let k3 = views[view].more.x;
         let p1 = k.z;
         let p2 = k.w;
         let radial = 1.0 + rr * (k.x + rr * (k.y + rr * k3));
@@ -173,35 +173,35 @@ fn colour(first: u32, coefficients: u32, lane: u32, direction: vec3<f32>) -> vec
 }
 
 /// Projects one splat into a slot; returns its key.
-fn project_splat(view: View, camera: u32, first: u32, lane: u32, slot: u32) -> u32 {
+fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u32 {
     if lane >= geometry[first + 3u] {
         return EMPTY;
     }
     // Relative to the camera before anything else: large coordinates cancel while still exact.
-    let d = vector(first, 0u, lane) - vec3(view.row_x.w, view.row_y.w, view.row_z.w);
-    let z = dot(view.row_z.xyz, d);
+    let d = vector(first, 0u, lane) - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
+    let z = dot(views[view].row_z.xyz, d);
     let farthest = max(max(abs(d.x), abs(d.y)), abs(d.z));
-    if !(z > view.more.z && farthest < MAX_DISTANCE) {
+    if !(z > views[view].more.z && farthest < MAX_DISTANCE) {
         return EMPTY;
     }
     let inverse_z = 1.0 / z;
-    let slope = vec2(dot(view.row_x.xyz, d), dot(view.row_y.xyz, d)) * inverse_z;
-    let has_lens = view.flags.x != NO_LENS;
-    if has_lens && !(length(slope) <= view.more.y) {
+    let slope = vec2(dot(views[view].row_x.xyz, d), dot(views[view].row_y.xyz, d)) * inverse_z;
+    let has_lens = views[view].flags.x != NO_LENS;
+    if has_lens && !(length(slope) <= views[view].more.y) {
         return EMPTY;
     }
-    let mean = view.focal.xy * distort(view, slope).slope + view.focal.zw;
+    let mean = views[view].focal.xy * distort(view, slope).slope + views[view].focal.zw;
 
     // Rows of J W M, M the square root of the covariance.
-    var at = clamp(slope, view.slopes.xy, view.slopes.zw);
+    var at = clamp(slope, views[view].slopes.xy, views[view].slopes.zw);
     if has_lens {
-        at *= min(1.0, view.more.y / max(length(at), 1e-30));
+        at *= min(1.0, views[view].more.y / max(length(at), 1e-30));
     }
     let bent = distort(view, at);
-    let pinhole_x = (view.row_x.xyz - at.x * view.row_z.xyz) * inverse_z;
-    let pinhole_y = (view.row_y.xyz - at.y * view.row_z.xyz) * inverse_z;
-    let gx = view.focal.x * (bent.along_x.x * pinhole_x + bent.along_y.x * pinhole_y);
-    let gy = view.focal.y * (bent.along_x.y * pinhole_x + bent.along_y.y * pinhole_y);
+    let pinhole_x = (views[view].row_x.xyz - at.x * views[view].row_z.xyz) * inverse_z;
+    let pinhole_y = (views[view].row_y.xyz - at.y * views[view].row_z.xyz) * inverse_z;
+    let gx = views[view].focal.x * (bent.along_x.x * pinhole_x + bent.along_y.x * pinhole_y);
+    let gy = views[view].focal.y * (bent.along_x.y * pinhole_x + bent.along_y.y * pinhole_y);
     let axis_0 = vector(first, 3u, lane);
     let axis_1 = vector(first, 6u, lane);
     let axis_2 = vector(first, 9u, lane);
@@ -219,7 +219,7 @@ fn project_splat(view: View, camera: u32, first: u32, lane: u32, slot: u32) -> u
     let reach2 = (level - MIN_LEVEL) * EXTENT2;
     let extent = sqrt(reach2 * vec2(a, c));
     // Whether some pixel centre is within the ellipse's box.
-    let size = vec2<f32>(view.size.xy);
+    let size = vec2<f32>(views[view].size.xy);
     let is_seen = reach2 >= 0.0
         && all(mean + extent > vec2(0.5))
         && all(mean - extent < size - 0.5)
@@ -231,7 +231,7 @@ fn project_splat(view: View, camera: u32, first: u32, lane: u32, slot: u32) -> u
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
     let direction = d / sqrt(dot(d, d));
     let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, direction);
-    let tag = camera << 16u | view.flags.w;
+    let tag = camera << 16u | views[view].flags.w;
     shapes[slot] = vec4(mean, b / c, falloff.x);
     extents[slot] = vec4(falloff.y, level, bitcast<f32>(tag), b * extent.x / a);
     colours[slot] = vec4(rgb, z);
@@ -256,5 +256,5 @@ fn project(
     let first = group.x * chunk.stride;
     let slot = region * BLOCK + lane;
     let view = camera * tick.parts + geometry[first];
-    keys[slot] = project_splat(views[view], camera, first, lane, slot);
+    keys[slot] = project_splat(view, camera, first, lane, slot);
 }

@@ -135,7 +135,7 @@ pub(super) fn digits(bits: u32) -> u32 {
 
 /// Returns the bytes of counts that sorting so many keys needs.
 pub(super) fn count_bytes(keys: u64) -> u64 {
-    (keys.div_ceil(SORT_GROUP) + 1) * 4 << DIGIT_BITS
+    ((keys.div_ceil(SORT_GROUP) + 1) * 4) << DIGIT_BITS
 }
 
 #[cfg(test)]
