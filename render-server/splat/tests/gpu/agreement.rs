@@ -154,7 +154,10 @@ fn images_do_not_depend_on_what_was_drawn_before() {
         ..camera
     };
     let away = Camera {
-        world_from_cam: Pose::new(DVec3::new(0.0, 0.0, -9.0), DQuat::from_rotation_y(3.14)),
+        world_from_cam: Pose::new(
+            DVec3::new(0.0, 0.0, -9.0),
+            DQuat::from_rotation_y(std::f64::consts::PI),
+        ),
         ..camera
     };
     let mut draw = |cameras: &[Camera]| {
