@@ -83,7 +83,7 @@ fn cameras(turn: u32) -> Vec<Camera> {
 
 fn placements(turn: u32) -> [Placement; 2] {
     let world_from_object = |k: u32| -> Option<Pose<World, Object>> {
-        (turn % (k + 2) != 0).then(|| {
+        (!turn.is_multiple_of(k + 2)).then(|| {
             let rotation = DQuat::from_rotation_z(f64::from(turn));
             Pose::new(DVec3::new(0.0, 0.0, f64::from(turn % 5)), rotation)
         })
