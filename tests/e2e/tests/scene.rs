@@ -250,7 +250,8 @@ fn npz(path: &Path) -> HashMap<String, Array> {
             let mut file = archive.by_index(index).unwrap();
             let mut bytes = Vec::new();
             file.read_to_end(&mut bytes).unwrap();
-            Some((file.name().to_owned(), array(&bytes)?))
+            let name = file.name().unwrap().into_owned();
+            Some((name, array(&bytes)?))
         })
         .collect()
 }
