@@ -1,14 +1,28 @@
-//! The RGB-D bitstream: an error, or an image of the size it says; bounded time and memory.
+//! The RGB-D bitstream, whole: an error, or an image of the size it says; bounded time and memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
+use vizflyt_rgbd::{Decoder, ImageMut, peek};
 
 fuzz_target!(|bytes: &[u8]| {
-    let Ok(info) = vizflyt_rgbd::peek(bytes) else { return };
+    let Ok(info) = peek(bytes) else { return };
     let pixels = info.width as usize * info.height as usize;
     // What the receiver does: it knows the size from the image header and refuses others.
     if pixels > 1 << 20 {
         return;
     }
-    let (mut rgb, mut depth) = (vec![0; 3 * pixels], vec![0; pixels]);
-    let _ = vizflyt_rgbd::Decoder::new().decode(bytes, &mut rgb, &mut depth);
+    let parts = info.parts();
+    let room = |present: bool, len: usize| if present { len } else { 0 };
+    let mut rgb = vec![0; room(parts.color, 3 * pixels)];
+    let mut depth_mm = vec![0; room(parts.depth, pixels)];
+    let mut alpha = vec![0; room(parts.alpha, pixels)];
+    let mut ids = vec![0; room(parts.ids, pixels)];
+    let mut out =
+        ImageMut { rgb: &mut rgb, depth_mm: &mut depth_mm, alpha: &mut alpha, ids: &mut ids };
+    let mut decoder = Decoder::new();
+    let at_once = decoder.decode_image(bytes, &mut out);
+    // As it arrives: the same end.
+    decoder.restart();
+    let half = decoder.feed(&bytes[..bytes.len() / 2], &mut out);
+    let fed = half.and_then(|_| decoder.feed(bytes, &mut out));
+    assert!(at_once.is_err() || fed.is_ok_and(|progress| progress.complete));
 });

@@ -24,11 +24,9 @@ pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
             zigzag(depth[y * width + x].wrapping_sub(predicted(depth, &bases, &layout, x, y)))
         });
         let residuals: Vec<u16> = residuals.collect();
-        let mut lengths = [0; 17];
-        for residual in &residuals {
-            lengths[16 - residual.leading_zeros() as usize] += 1;
-        }
-        let shape = Shape::cheapest(&lengths);
+        let shape = Shape::cheapest(|bits| {
+            residuals.iter().filter(|&&residual| residual >> bits != 0).count() as u32
+        });
         table.push(shape.code());
         for (index, residual) in residuals.iter().enumerate() {
             let bits = |from, count| (from..from + count).map(|bit| residual >> bit & 1 == 1);

@@ -1,10 +1,13 @@
-//! Undoing the prediction in all stripes at once: lane `s` of a vector is a pixel of stripe `s`.
+//! What the machine's vectors do: the bit lengths of a block at once, and undoing the prediction.
+//!
+//! The prediction is undone in all stripes at once: lane `s` of a vector is a pixel of stripe `s`.
 //!
 //! Residuals lie in rows, so 8 columns of 8 stripes are transposed in, predicted column after
 //! column, and transposed out: about one cycle a pixel, where a single stripe waits four cycles for
 //! each pixel's left neighbour. SSE2 and NEON belong to the base of their machines, so nothing is
 //! asked at run time; any other machine takes the plain version.
 
+use super::blocks::Block;
 use super::{DepthDecoder, DepthEncoder, Layout, Parts, STRIPES};
 
 /// Writes the image whose zig-zagged residuals these are. `above` is one vector per column of a
@@ -77,12 +80,19 @@ widest!(
     DepthDecoder::unpack_blocks
 );
 
+/// Returns, for 0 to 15 bits, which residuals of a block have more: bit by bit, row by row.
+#[inline(always)]
+pub(super) fn longer_than(block: &Block) -> [u64; 16] {
+    kernel::longer_than(block)
+}
+
 /// 8 columns of 8 stripes: rows are stripes outside the kernel.
 type Square = [[u16; STRIPES]; STRIPES];
 
 /// The plain version, compiled everywhere so that it is tested everywhere.
 #[cfg_attr(any(target_arch = "x86_64", target_arch = "aarch64"), allow(dead_code))]
 mod plain {
+    use super::super::blocks::Block;
     use super::super::predict::{med, unzigzag};
     use super::{STRIPES, Square};
 
@@ -104,6 +114,17 @@ mod plain {
             }
         }
     }
+
+    #[inline(always)]
+    pub(super) fn longer_than(block: &Block) -> [u64; 16] {
+        let mut longer = [0; 16];
+        for (at, &residual) in block.as_flattened().iter().enumerate() {
+            for mask in longer.iter_mut().take(16 - residual.leading_zeros() as usize) {
+                *mask |= 1 << at;
+            }
+        }
+        longer
+    }
 }
 
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
@@ -112,12 +133,15 @@ use plain as kernel;
 #[cfg(target_arch = "x86_64")]
 mod kernel {
     use core::arch::x86_64::{
-        __m128i, _mm_add_epi16, _mm_and_si128, _mm_loadu_si128, _mm_set1_epi16, _mm_setzero_si128,
-        _mm_srli_epi16, _mm_storeu_si128, _mm_sub_epi16, _mm_subs_epu16, _mm_unpackhi_epi16,
-        _mm_unpackhi_epi32, _mm_unpackhi_epi64, _mm_unpacklo_epi16, _mm_unpacklo_epi32,
-        _mm_unpacklo_epi64, _mm_xor_si128,
+        __m128i, _mm_add_epi8, _mm_add_epi16, _mm_and_si128, _mm_loadu_si128, _mm_movemask_epi8,
+        _mm_or_si128, _mm_packus_epi16, _mm_set1_epi16, _mm_setzero_si128, _mm_srli_epi16,
+        _mm_storeu_si128, _mm_sub_epi16, _mm_subs_epu16, _mm_unpackhi_epi16, _mm_unpackhi_epi32,
+        _mm_unpackhi_epi64, _mm_unpacklo_epi16, _mm_unpacklo_epi32, _mm_unpacklo_epi64,
+        _mm_xor_si128,
     };
 
+    use super::super::BLOCK_ROWS;
+    use super::super::blocks::{Block, Lanes};
     use super::{STRIPES, Square};
 
     pub(super) fn columns(
@@ -205,6 +229,46 @@ mod kernel {
             ]
         }
     }
+
+    /// A residual has more than n bits where any of its bits from n on is set: each is smeared
+    /// downwards, so bit n of the smear says it, and the sign mask of bytes collects 16 at a time.
+    #[inline(always)]
+    pub(super) fn longer_than(block: &Block) -> [u64; 16] {
+        let mut longer = [0; 16];
+        // SAFETY: SSE2 is part of x86_64; these intrinsics work on values only.
+        unsafe {
+            let low_byte = _mm_set1_epi16(255);
+            let mut low = [_mm_setzero_si128(); BLOCK_ROWS];
+            let mut high = low;
+            for (row, values) in block.iter().enumerate() {
+                let [left, right] = halves(values).map(|half| {
+                    let half = _mm_or_si128(half, _mm_srli_epi16::<1>(half));
+                    let half = _mm_or_si128(half, _mm_srli_epi16::<2>(half));
+                    let half = _mm_or_si128(half, _mm_srli_epi16::<4>(half));
+                    _mm_or_si128(half, _mm_srli_epi16::<8>(half))
+                });
+                low[row] =
+                    _mm_packus_epi16(_mm_and_si128(left, low_byte), _mm_and_si128(right, low_byte));
+                high[row] = _mm_packus_epi16(_mm_srli_epi16::<8>(left), _mm_srli_epi16::<8>(right));
+            }
+            for (bytes, masks) in [low, high].iter_mut().zip(longer.chunks_exact_mut(8)) {
+                for mask in masks.iter_mut().rev() {
+                    for (row, bytes) in bytes.iter_mut().enumerate() {
+                        let bits = _mm_movemask_epi8(*bytes).cast_unsigned();
+                        *mask |= u64::from(bits) << (16 * row);
+                        *bytes = _mm_add_epi8(*bytes, *bytes);
+                    }
+                }
+            }
+        }
+        longer
+    }
+
+    #[inline(always)]
+    fn halves(values: &Lanes) -> [__m128i; 2] {
+        let (from, _) = values.as_chunks::<8>();
+        [load(&from[0]), load(&from[1])]
+    }
 }
 
 #[cfg(target_arch = "aarch64")]
@@ -216,6 +280,8 @@ mod kernel {
         vtrn2q_u32, vtrn2q_u64,
     };
 
+    // Why: NEON has no movemask; the plain loop serves until it is measured on such a machine.
+    pub(super) use super::plain::longer_than;
     use super::{STRIPES, Square};
 
     pub(super) fn columns(
@@ -289,6 +355,22 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
+        /// Residuals of every length.
+        #[test]
+        fn lengths_agree(block: Block, shifts in prop::array::uniform32(0u32..17)) {
+            let mut block = block;
+            for (at, value) in block.as_flattened_mut().iter_mut().enumerate() {
+                *value = value.checked_shr(shifts[at % 32]).unwrap_or(0);
+            }
+            let longer = longer_than(&block);
+            prop_assert_eq!(longer, plain::longer_than(&block));
+            for (at, &value) in block.as_flattened().iter().enumerate() {
+                for (bits, mask) in longer.iter().enumerate() {
+                    prop_assert_eq!(mask >> at & 1 == 1, value >> bits != 0);
+                }
+            }
+        }
+
         /// The machine's kernel and the plain one agree on every input.
         #[test]
         fn kernels_agree(

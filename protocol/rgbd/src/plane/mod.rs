@@ -101,13 +101,13 @@ impl PlaneDecoder {
 /// Which way pixels and symbols go.
 trait End {
     type Coder: Coder;
-    fn coder(&mut self) -> &mut Self::Coder;
-    /// Returns a sample, if this end knows it.
-    fn known(&self, at: usize) -> u16;
-    /// Takes a sample, if this end wants it.
-    fn put(&mut self, at: usize, sample: u16);
     /// Whether this end knows the samples.
     const KNOWS: bool;
+    fn coder(&mut self) -> &mut Self::Coder;
+    /// Copies samples, if this end knows them.
+    fn know(&self, at: usize, run: &mut [u16]);
+    /// Takes samples, if this end wants them.
+    fn put(&mut self, at: usize, run: &[u16]);
 }
 
 struct Giving<'a> {
@@ -123,11 +123,11 @@ impl End for Giving<'_> {
         self.symbols
     }
     #[inline(always)]
-    fn known(&self, at: usize) -> u16 {
-        self.samples[at]
+    fn know(&self, at: usize, run: &mut [u16]) {
+        run.copy_from_slice(&self.samples[at..at + run.len()]);
     }
     #[inline(always)]
-    fn put(&mut self, _: usize, _: u16) {}
+    fn put(&mut self, _: usize, _: &[u16]) {}
 }
 
 struct Taking<'a, 'b> {
@@ -143,12 +143,10 @@ impl<'b> End for Taking<'_, 'b> {
         self.symbols
     }
     #[inline(always)]
-    fn known(&self, _: usize) -> u16 {
-        0
-    }
+    fn know(&self, _: usize, _: &mut [u16]) {}
     #[inline(always)]
-    fn put(&mut self, at: usize, sample: u16) {
-        self.samples[at] = sample;
+    fn put(&mut self, at: usize, run: &[u16]) {
+        self.samples[at..at + run.len()].copy_from_slice(run);
     }
 }
 
@@ -166,19 +164,31 @@ enum Run {
 }
 
 /// The model and its walk over the pixels.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 struct Walk {
     /// The row above, being overwritten; per lane, with one more column for the upper right.
     row: Vec<u16>,
     /// What the runs above were, per lane.
     runs: Vec<u8>,
     /// Frequencies of residuals, of runs, and of quarters of masks.
-    residuals: Vec<Cdf>,
-    run_kinds: Vec<Cdf>,
-    masks: Vec<Cdf>,
+    residuals: [Cdf; ROUGHNESSES],
+    run_kinds: [Cdf; 16],
+    masks: [Cdf; 16],
 }
 
-/// Where a lane is in its row.
+impl Default for Walk {
+    fn default() -> Self {
+        Self {
+            row: Vec::new(),
+            runs: Vec::new(),
+            residuals: [Cdf::even(SYMBOLS); ROUGHNESSES],
+            run_kinds: [Cdf::even(4); 16],
+            masks: [Cdf::even(SYMBOLS); 16],
+        }
+    }
+}
+
+/// Where a lane is in its row, and the run under way.
 #[derive(Clone, Copy, Default)]
 struct Lane {
     /// First column of the stripe, columns there are.
@@ -187,9 +197,13 @@ struct Lane {
     left: u16,
     corner: u16,
     left_run: u8,
-    /// Of the run under way: which pixels are valid, and whether their residuals are coded.
+    /// Which pixels of the run are valid, and which have coded residuals.
     valid: u16,
-    coded: bool,
+    coded: u16,
+    /// Above the run and its upper right; replaced by the run, holes filled.
+    row: [u16; RUN + 1],
+    /// The run's samples: known to the encoder, found by the decoder.
+    samples: [u16; RUN],
 }
 
 impl Walk {
@@ -209,9 +223,9 @@ impl Walk {
         }
         self.runs.clear();
         self.runs.resize(LANES * stripe / RUN, Run::Coded as u8);
-        fill(&mut self.residuals, ROUGHNESSES, Cdf::even(SYMBOLS));
-        fill(&mut self.run_kinds, 16, Cdf::even(4));
-        fill(&mut self.masks, 64, Cdf::even(SYMBOLS));
+        self.residuals.fill(Cdf::even(SYMBOLS));
+        self.run_kinds.fill(Cdf::even(4));
+        self.masks.fill(Cdf::even(SYMBOLS));
         match (kind, mean) {
             (Samples::Bytes, false) => self.rows::<_, 8, false>(end, width, rows),
             (Samples::Bytes, true) => self.rows::<_, 8, true>(end, width, rows),
@@ -240,14 +254,50 @@ impl Walk {
             for start in (0..lanes[0].columns).step_by(RUN) {
                 for (n, lane) in lanes.iter_mut().enumerate() {
                     if start < lane.columns {
-                        self.begin_run::<E, BITS, MEAN>(&mut end, n, lane, start, y * width);
+                        let columns = RUN.min(lane.columns - start);
+                        let at = n * (stripe + 1) + start;
+                        lane.row[..=columns].copy_from_slice(&self.row[at..=at + columns]);
+                        end.know(y * width + lane.first + start, &mut lane.samples[..columns]);
+                        let above = &mut self.runs[(n * stripe + start) / RUN];
+                        let run = self.run_kinds[usize::from(lane.left_run * 4 + *above) % 16..]
+                            .first_mut();
+                        if let Some(kinds) = run {
+                            *above = begin_run::<E, BITS, MEAN>(
+                                &mut end,
+                                n,
+                                lane,
+                                columns,
+                                kinds,
+                                &mut self.masks,
+                            ) as u8;
+                        }
+                        lane.left_run = *above;
+                    } else {
+                        (lane.valid, lane.coded) = (0, 0);
                     }
                 }
-                for column in start..(start + RUN).min(stripe) {
+                let any_coded = lanes.iter().fold(0, |all, lane| all | lane.coded) != 0;
+                for column in 0..RUN {
                     for (n, lane) in lanes.iter_mut().enumerate() {
-                        if column < lane.columns {
-                            self.pixel::<E, BITS, MEAN>(&mut end, n, lane, column, y * width);
+                        if any_coded {
+                            pixel::<E, BITS, MEAN>(
+                                end.coder(),
+                                n,
+                                lane,
+                                column,
+                                &mut self.residuals,
+                            );
+                        } else {
+                            predicted_pixel::<BITS, MEAN>(lane, column);
                         }
+                    }
+                }
+                for (n, lane) in lanes.iter().enumerate() {
+                    if start < lane.columns {
+                        let columns = RUN.min(lane.columns - start);
+                        let at = n * (stripe + 1) + start;
+                        self.row[at..at + columns].copy_from_slice(&lane.row[..columns]);
+                        end.put(y * width + lane.first + start, &lane.samples[..columns]);
                     }
                 }
             }
@@ -259,127 +309,148 @@ impl Walk {
             }
         }
     }
+}
 
-    /// Codes what the run from column `start` on is.
-    #[inline(always)]
-    fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
-        &mut self,
-        end: &mut E,
-        n: usize,
-        lane: &mut Lane,
-        start: usize,
-        row_at: usize,
-    ) {
-        let stripe = self.row.len() / LANES - 1;
-        let columns = RUN.min(lane.columns - start);
-        let all = u16::MAX >> (RUN - columns);
-        let (mut run, mut valid) = (Run::Coded, all);
-        if E::KNOWS {
-            let at = row_at + lane.first + start;
-            if BITS == 16 {
-                valid = 0;
-                for column in 0..columns {
-                    valid |= u16::from(end.known(at + column) != 0) << column;
-                }
+/// Codes what the run is, and its mask.
+#[inline(always)]
+fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
+    end: &mut E,
+    n: usize,
+    lane: &mut Lane,
+    columns: usize,
+    kinds: &mut Cdf,
+    masks: &mut [Cdf; 16],
+) -> Run {
+    let all = u16::MAX >> (RUN - columns);
+    let (mut run, mut valid) = (Run::Coded, all);
+    if E::KNOWS {
+        if BITS == 16 {
+            valid = 0;
+            for (column, &sample) in lane.samples.iter().enumerate() {
+                valid |= u16::from(sample != 0) << column;
             }
-            run = if valid == all {
-                let row = &self.row[n * (stripe + 1) + start..][..columns];
-                let (mut left, mut corner) = (lane.left, lane.corner);
-                let flat = row.iter().enumerate().all(|(column, &up)| {
-                    let sample = end.known(at + column);
-                    let predicted = predict::<BITS, MEAN>(left, up, corner);
-                    (left, corner) = (sample, up);
-                    predicted == sample
-                });
-                if flat { Run::Flat } else { Run::Coded }
-            } else if valid == 0 {
-                Run::Invalid
-            } else {
-                Run::Mixed
-            };
+            valid &= all;
         }
-        let above = &mut self.runs[n * stripe / RUN + start / RUN];
-        let kinds = &mut self.run_kinds[usize::from(lane.left_run * 4 + *above) % 16];
-        // A decoder may find any of 16 symbols in damaged bytes.
-        run = match end.coder().symbol(n, kinds, run as usize) {
-            0 => Run::Flat,
-            2 if BITS == 16 => Run::Invalid,
-            3 if BITS == 16 => Run::Mixed,
-            _ => Run::Coded,
-        };
-        (*above, lane.left_run) = (run as u8, run as u8);
-        lane.coded = matches!(run, Run::Coded | Run::Mixed);
-        lane.valid = match run {
-            Run::Flat | Run::Coded => u16::MAX,
-            Run::Invalid => 0,
-            Run::Mixed => {
-                let mut mask = 0;
-                let mut before = 0;
-                for quarter in 0..4 {
-                    let bits = usize::from(valid >> (4 * quarter) & 15);
-                    let context = &mut self.masks[(before >> 3 << 2 | quarter) % 64];
-                    before = end.coder().symbol(n, context, bits);
-                    mask |= (before as u16 & 15) << (4 * quarter);
-                }
-                mask
-            }
+        run = if valid == all {
+            let (mut left, mut corner) = (lane.left, lane.corner);
+            let flat = lane.row[..columns].iter().zip(&lane.samples).all(|(&up, &sample)| {
+                let predicted = predict::<MEAN>(left, up, corner);
+                (left, corner) = (sample, up);
+                predicted == sample
+            });
+            if flat { Run::Flat } else { Run::Coded }
+        } else if valid == 0 {
+            Run::Invalid
+        } else {
+            Run::Mixed
         };
     }
-
-    #[inline(always)]
-    fn pixel<E: End, const BITS: u32, const MEAN: bool>(
-        &mut self,
-        end: &mut E,
-        n: usize,
-        lane: &mut Lane,
-        column: usize,
-        row_at: usize,
-    ) {
-        let stripe = self.row.len() / LANES - 1;
-        let row_index = n * (stripe + 1) + column;
-        let at = row_at + lane.first + column;
-        let (up, upper_right) = (self.row[row_index], self.row[row_index + 1]);
-        let predicted = predict::<BITS, MEAN>(lane.left, up, lane.corner);
-        let valid = lane.valid >> (column % RUN) & 1 == 1;
-        let mut sample = predicted;
-        if valid && lane.coded {
-            let rough = u32::from(lane.left.abs_diff(lane.corner))
-                + u32::from(up.abs_diff(lane.corner))
-                + u32::from(up.abs_diff(upper_right));
-            let context = &mut self.residuals[roughness(rough)];
-            let residual = if E::KNOWS { end.known(at).wrapping_sub(predicted) } else { 0 };
-            let wanted = u32::from(zigzag(residual << (16 - BITS)) >> (16 - BITS));
-            let code = code_number(end.coder(), n, context, wanted);
-            sample = predicted.wrapping_add(unzigzag(code as u16));
-            if BITS == 8 {
-                sample &= 255;
+    // A decoder may find any of 16 symbols in damaged bytes.
+    run = match end.coder().symbol(n, kinds, run as usize) {
+        0 => Run::Flat,
+        2 if BITS == 16 => Run::Invalid,
+        3 if BITS == 16 => Run::Mixed,
+        _ => Run::Coded,
+    };
+    (lane.valid, lane.coded) = match run {
+        Run::Flat => (all, 0),
+        Run::Coded => (all, all),
+        Run::Invalid => (0, 0),
+        Run::Mixed => {
+            let (mut mask, mut before) = (0, 0);
+            for quarter in 0..4 {
+                let bits = usize::from(valid >> (4 * quarter) & 15);
+                // By place, and whether the pixel before was valid.
+                let context = &mut masks[(before >> 3 & 1) << 2 | quarter];
+                before = end.coder().symbol(n, context, bits);
+                mask |= (before as u16 & 15) << (4 * quarter);
             }
+            (mask & all, mask & all)
         }
-        end.put(at, if valid { sample } else { 0 });
-        self.row[row_index] = sample;
-        (lane.corner, lane.left) = (up, sample);
+    };
+    run
+}
+
+/// Codes a pixel.
+#[inline(always)]
+fn pixel<E: End, const BITS: u32, const MEAN: bool>(
+    coder: &mut E::Coder,
+    n: usize,
+    lane: &mut Lane,
+    column: usize,
+    residuals: &mut [Cdf; ROUGHNESSES],
+) {
+    if lane.coded >> column & 1 == 0 {
+        return predicted_pixel::<BITS, MEAN>(lane, column);
     }
+    let (up, upper_right) = (lane.row[column % RUN], lane.row[column % RUN + 1]);
+    let predicted = predict::<MEAN>(lane.left, up, lane.corner);
+    let rough = u32::from(lane.left.abs_diff(lane.corner))
+        + u32::from(up.abs_diff(lane.corner))
+        + u32::from(up.abs_diff(upper_right));
+    let context = &mut residuals[roughness(rough)];
+    let known = lane.samples[column % RUN];
+    let residual = if E::KNOWS { known.wrapping_sub(predicted) } else { 0 };
+    let wanted = u32::from(zigzag(residual << (16 - BITS)) >> (16 - BITS));
+    let code = code_number(coder, n, context, wanted);
+    let sample = predicted.wrapping_add(unzigzag(code as u16)) & (u16::MAX >> (16 - BITS));
+    lane.samples[column % RUN] = sample;
+    lane.row[column % RUN] = sample;
+    (lane.corner, lane.left) = (up, sample);
+}
+
+/// Passes a pixel that is as predicted, or invalid.
+#[inline(always)]
+fn predicted_pixel<const BITS: u32, const MEAN: bool>(lane: &mut Lane, column: usize) {
+    let up = lane.row[column % RUN];
+    let predicted = predict::<MEAN>(lane.left, up, lane.corner) & (u16::MAX >> (16 - BITS));
+    let valid = lane.valid >> column & 1 == 1;
+    lane.samples[column % RUN] = if valid { predicted } else { 0 };
+    lane.row[column % RUN] = predicted;
+    (lane.corner, lane.left) = (up, predicted);
 }
 
 /// Codes a zig-zagged residual.
 #[inline(always)]
 fn code_number(coder: &mut impl Coder, lane: usize, context: &mut Cdf, wanted: u32) -> u32 {
     let length = u32::BITS - wanted.leading_zeros();
-    let symbol = if wanted < 8 { wanted } else { (length + 4).min(15) };
-    let symbol = coder.symbol(lane, context, symbol as usize) as u32;
-    if symbol < 8 {
-        return symbol;
+    let symbol = if wanted < 8 { wanted } else { (length + 4).min(LONG) };
+    let symbol = coder.symbol(lane, context, symbol as usize) % SYMBOLS;
+    if symbol == LONG as usize {
+        return code_long_number(coder, wanted);
     }
-    let length =
-        if symbol < 15 { symbol - 4 } else { 11 + coder.raw(length.wrapping_sub(11) & 7, 3) };
+    // Without a branch, as half the residuals of a rough image go either way.
+    let (first, bits) = NUMBERS[symbol];
+    first + coder.raw(wanted.wrapping_sub(first) & ((1 << bits) - 1), bits)
+}
+
+/// Codes a number of 11 bits or more.
+#[cold]
+fn code_long_number(coder: &mut impl Coder, wanted: u32) -> u32 {
+    let length = u32::BITS - wanted.leading_zeros();
     // Lengths beyond 16 are damage; the bits read for them do no harm.
-    let low = length.min(16) - 1;
+    let length = (11 + coder.raw(length.wrapping_sub(11) & 7, 3)).min(16);
+    let low = length - 1;
     1 << low | coder.raw(wanted & ((1 << low) - 1), low)
 }
 
+/// The symbol of numbers of 11 bits and more.
+const LONG: u32 = 15;
+/// The first number of each symbol, and its raw bits: 0 to 7 alone, then by bit length.
+const NUMBERS: [(u32, u32); SYMBOLS] = {
+    let mut numbers = [(0, 0); SYMBOLS];
+    let mut symbol = 0;
+    while symbol < SYMBOLS {
+        numbers[symbol] =
+            if symbol < 8 { (symbol as u32, 0) } else { (1 << (symbol - 5), symbol as u32 - 5) };
+        symbol += 1;
+    }
+    numbers
+};
+
 /// Returns what a pixel is predicted to be.
 #[inline(always)]
-fn predict<const BITS: u32, const MEAN: bool>(left: u16, up: u16, corner: u16) -> u16 {
+fn predict<const MEAN: bool>(left: u16, up: u16, corner: u16) -> u16 {
     if MEAN {
         // Of samples of at most 16 bits.
         u32::midpoint(u32::from(left), u32::from(up)) as u16
@@ -411,8 +482,8 @@ fn mean_is_better(samples: &[u16], width: usize, kind: Samples) -> bool {
             if kind == Samples::Masked && [row[0], row[1], above[0], above[1]].contains(&0) {
                 continue;
             }
-            med_bits += length(row[1], predict::<16, false>(row[0], above[1], above[0]));
-            mean_bits += length(row[1], predict::<16, true>(row[0], above[1], above[0]));
+            med_bits += length(row[1], predict::<false>(row[0], above[1], above[0]));
+            mean_bits += length(row[1], predict::<true>(row[0], above[1], above[0]));
         }
     }
     mean_bits < med_bits
@@ -420,11 +491,6 @@ fn mean_is_better(samples: &[u16], width: usize, kind: Samples) -> bool {
 
 fn stripe_columns(width: usize) -> usize {
     width.div_ceil(LANES).next_multiple_of(RUN)
-}
-
-fn fill(contexts: &mut Vec<Cdf>, count: usize, with: Cdf) {
-    contexts.clear();
-    contexts.resize(count, with);
 }
 
 /// Pixels of a run.

@@ -33,25 +33,30 @@ impl SymbolWriter {
     /// Forgets everything; makes room for so many raw bits.
     pub(super) fn start(&mut self, most_raw_bits: usize) {
         self.symbols.clear();
-        self.words.clear();
         self.raw.start(most_raw_bits);
     }
 
     /// Appends everything to `out`.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         let mut states = [LEAST; LANES];
+        // A word a symbol at most, and one more to write in vain.
+        if self.words.len() <= self.symbols.len() {
+            self.words.resize(self.symbols.len() + 1, 0);
+        }
+        let mut len = 0;
         for &symbol in self.symbols.iter().rev() {
             let (start, share) = (symbol & 0x7fff, (symbol >> 15 & 0x7fff) + 1);
             let state = &mut states[(symbol >> 30) as usize % LANES];
-            if u64::from(*state) >= u64::from(share) << (32 - TOTAL_BITS) {
-                self.words.push(*state as u16);
-                *state >>= 16;
-            }
+            // Without a branch: a word goes out as often as the bits have it, which is no pattern.
+            let full = u64::from(*state) >= u64::from(share) << (32 - TOTAL_BITS);
+            self.words[len] = *state as u16;
+            len += usize::from(full);
+            *state >>= 16 * u32::from(full);
             *state = ((*state / share) << TOTAL_BITS) + *state % share + start;
         }
-        out.extend_from_slice(&(self.words.len() as u32).to_le_bytes());
+        out.extend_from_slice(&(len as u32).to_le_bytes());
         out.extend(states.iter().flat_map(|state| state.to_le_bytes()));
-        out.extend(self.words.iter().rev().flat_map(|word| word.to_le_bytes()));
+        out.extend(self.words[..len].iter().rev().flat_map(|word| word.to_le_bytes()));
         self.raw.finish(out);
     }
 }
@@ -111,11 +116,12 @@ impl Coder for SymbolReader<'_> {
         let (start, share) = cdf.share(symbol);
         // At most 2^17 of 2^15 shares: no more than 32 bits.
         *state = share.wrapping_mul(*state >> TOTAL_BITS).wrapping_add(place - start);
-        if *state < LEAST {
-            let word = self.words.get(self.next).copied().unwrap_or_default();
-            *state = *state << 16 | u32::from(u16::from_le_bytes(word));
-            self.next += 1;
-        }
+        // Without a branch, as above.
+        let word = self.words.get(self.next).copied().unwrap_or_default();
+        let short = *state < LEAST;
+        let refilled = *state << 16 | u32::from(u16::from_le_bytes(word));
+        *state = if short { refilled } else { *state };
+        self.next += usize::from(short);
         cdf.learn(symbol);
         symbol
     }
