@@ -16,7 +16,8 @@
 //! at 640x480 with 20 M pairs: 0.74 + 0.35 + 0.33 + 0.02 GB.
 //!
 //! Budget per camera at 640x480, 1 M splats, some 300 k visible, 1 TB/s: cull and project 0.15 ms,
-//! sort 0.05, bin 0.1, blend 0.2, read 0.2; measured figures are in `docs/BENCHMARKS.md`.
+//! sort 0.05, bin 0.1, blend 0.2, read 0.2: from bytes and operations, not measured on a card yet;
+//! `tests/gpu/table` measures.
 
 mod bin;
 mod blend;
