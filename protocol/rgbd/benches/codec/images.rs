@@ -21,8 +21,7 @@ pub(crate) fn groups() -> Vec<(&'static str, Vec<Image>)> {
     if !captured.is_empty() {
         groups.push(("captured scenes", captured));
     }
-    let noisy: Vec<Image> =
-        groups.iter().flat_map(|(_, images)| images).map(|image| with_noise(image)).collect();
+    let noisy: Vec<Image> = groups.iter().flat_map(|(_, images)| images).map(with_noise).collect();
     groups.push(("all, depth noisy", noisy));
     groups
 }

@@ -142,17 +142,17 @@ fn entries() -> Vec<Entry> {
         entries.push(Entry { name, given, exact, codec });
     };
     let ours = |given, options| Box::new(Ours::new(given, options));
-    add("depth: RVL", Given::Depth, true, Box::new(Rvl::default()));
+    add("depth: RVL", Given::Depth, true, Box::<Rvl>::default());
     add("depth: zstd 1", Given::Depth, true, Box::new(Zstd::new(Given::Depth)));
     add("depth: lz4", Given::Depth, true, Box::new(Lz4::new(Given::Depth)));
-    add("depth: PNG 16 bit", Given::Depth, true, Box::new(Png16::default()));
+    add("depth: PNG 16 bit", Given::Depth, true, Box::<Png16>::default());
     add("depth: ours fast", Given::Depth, true, ours(Given::Depth, default));
     add("depth: ours small", Given::Depth, true, ours(Given::Depth, small));
     add("depth: ours bounded fast 0.001", Given::Depth, false, ours(Given::Depth, bounded));
     add("depth: ours bounded small 0.001", Given::Depth, false, ours(Given::Depth, bounded_small));
     add("colour: zstd 1", Given::Color, true, Box::new(Zstd::new(Given::Color)));
     add("colour: lz4", Given::Color, true, Box::new(Lz4::new(Given::Color)));
-    add("colour: QOI", Given::Color, true, Box::new(Qoi::default()));
+    add("colour: QOI", Given::Color, true, Box::<Qoi>::default());
     #[cfg(feature = "turbo")]
     {
         use peers::TurboJpeg;
