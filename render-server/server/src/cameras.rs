@@ -90,7 +90,7 @@ impl Cameras {
             let mut new: Map<String, Value> = serde_json::from_value(serde_json::to_value(old)?)?;
             if says(&FIELD_OF_VIEW) {
                 new.retain(|key, _| !CALIBRATION.contains(&key.as_str()));
-            } else if CALIBRATION.iter().any(|key| says(&key)) {
+            } else if CALIBRATION.iter().any(says) {
                 new.remove(FIELD_OF_VIEW);
             }
             for (key, value) in patch {

@@ -267,7 +267,7 @@ mod tests {
 
     #[test]
     fn a_slow_cameras_image_outlives_the_tick_it_was_drawn_in() {
-        let slot = |seq, fresh| DrawnImage { seq, fresh, ..DrawnImage::default() };
+        let slot = |seq, fresh| DrawnImage { fresh, seq, ..DrawnImage::default() };
         let mut old = DrawnTick { slots: vec![slot(7, true), slot(7, true), slot(3, false)] };
         let mut new = DrawnTick { slots: vec![slot(8, true), slot(1, false), slot(2, false)] };
         new.inherit(&mut old);

@@ -338,7 +338,7 @@ impl Socket {
 
     fn send(&mut self, text: &str) {
         // A client masks; with zeros the text stays as it is.
-        let mut frame = vec![0x81, 0x80 | 126];
+        let mut frame = vec![0x81, 0x80 | 0x7e];
         frame.extend((text.len() as u16).to_be_bytes());
         frame.extend([0; 4]);
         frame.extend(text.as_bytes());

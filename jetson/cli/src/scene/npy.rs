@@ -46,8 +46,9 @@ pub(crate) fn save<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Re
 fn write<T: Element>(out: &mut impl Write, shape: &[usize], values: &[T]) -> io::Result<()> {
     assert_eq!(shape.iter().product::<usize>(), values.len(), "one value per place");
     // A tuple as Python writes it: (4,) and (2, 3).
-    let sides: String = shape.iter().map(|side| format!("{side}, ")).collect();
-    let sides = if shape.len() == 1 { sides.trim_end() } else { sides.trim_end_matches(", ") };
+    let sides: Vec<String> = shape.iter().map(ToString::to_string).collect();
+    let comma = if shape.len() == 1 { "," } else { "" };
+    let sides = sides.join(", ") + comma;
     let description = T::DESCRIPTION;
     let mut head =
         format!("{{'descr': '{description}', 'fortran_order': False, 'shape': ({sides}), }}");
