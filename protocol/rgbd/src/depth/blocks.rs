@@ -46,8 +46,7 @@ impl Shape {
         let mut best_bits = if top == 16 { u32::MAX } else { (BLOCK_PIXELS * top) as u32 };
         for low in (0..top).rev().take(15) {
             let high = (top - low) as u32;
-            let bits =
-                (BLOCK_PIXELS * (low + 1)) as u32 + longer_than(low) * (high + EXCEPTION_BITS);
+            let bits = (BLOCK_PIXELS * (low + 1)) as u32 + longer_than(low) * high;
             if bits < best_bits {
                 best_bits = bits;
                 best = Self { low: low as u32, high };
@@ -56,10 +55,6 @@ impl Shape {
         best
     }
 }
-
-/// What an exception counts for beside its bits: it costs time at both ends. Measured on rendered
-/// depth: a tenth of the time for a hundredth of the size.
-const EXCEPTION_BITS: u32 = 4;
 
 /// Returns the bytes of low bits after blocks whose low widths sum to `low_sum`: each adds
 /// [`BLOCK_ROWS`] residuals to each of the 16 streams.
