@@ -217,7 +217,8 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
                 sum.thin += usize::from(seen.alpha[i] < 0.95);
                 let depth_m = f64::from(seen.depth_median_m[i]);
                 let pixel = DVec2::new(f64::from(u) + 0.5, f64::from(v) + 0.5);
-                let truth_at_m = world_from_cam.transform_point(k.unproject(pixel, truth_m).unwrap());
+                let truth_at_m =
+                    world_from_cam.transform_point(k.unproject(pixel, truth_m).unwrap());
                 if floor || fence.signed_distance_m(truth_at_m) > 0.0 {
                     // At a grazing angle a millimetre across a surface is decimetres of depth:
                     // here what counts is how far from the true surface the seen point lies.

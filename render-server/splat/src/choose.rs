@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 #[cfg(feature = "gpu")]
 use crate::gpu;
-use crate::{CpuRenderer, Rasterizer, Resilient, Scene};
+use crate::{CpuRenderer, Detail, Rasterizer, Resilient, Scene};
 
 /// What the user asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -60,14 +60,15 @@ pub enum NoRenderer {
 }
 
 /// Returns the renderer for a scene on this machine. One on a graphics card has the processor
-/// behind it ([`crate::Resilient`]): no image is missing when its device is lost.
+/// behind it ([`crate::Resilient`]): no image is missing when its device is lost. The processor
+/// draws large scenes in adaptive detail ([`Detail::suited_to`]).
 ///
 /// # Errors
 /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
 /// find one.
 pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chosen, NoRenderer> {
     let scene = scene.into();
-    let cpu = CpuRenderer::new(scene);
+    let cpu = CpuRenderer::with_detail(scene, Detail::suited_to(&scene));
     if backend == Backend::Cpu {
         let reason = format!("asked for; {}", cpu.name());
         return Ok(Chosen { rasterizer: Box::new(cpu), reason });

@@ -35,6 +35,7 @@
 //!
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
+mod blocks;
 mod camera;
 mod choose;
 mod cpu;
@@ -52,8 +53,8 @@ mod splats;
 
 pub use camera::{Camera, InvalidCamera};
 pub use choose::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
-pub use format::ply;
 pub use cpu::{CpuRenderer, Detail};
+pub use format::ply;
 pub use image::{DepthKind, RgbdImage};
 pub use rasterizer::{PassTimes, Rasterizer, RenderError, Workload};
 pub use reference::render_reference;

@@ -66,9 +66,9 @@ pub enum RenderError {
     /// The placement of an object is no rotation and finite position; no image is changed.
     #[error("object {0} is placed at {1}, which is no rotation and finite position within 1e7 m")]
     Placement(usize, String),
-    /// The device is gone: the renderer must be made anew.
-    #[error("the graphics device was lost: {0}")]
-    DeviceLost(String),
+    /// The graphics device is gone, or cannot hold what was asked of it, and why.
+    #[error("the graphics device cannot draw this: {0}; use the processor")]
+    Device(String),
 }
 
 /// Checks what every renderer asks of a call.

@@ -39,7 +39,7 @@ impl Rasterizer for Resilient {
         images: &mut [RgbdImage],
     ) -> Result<PassTimes, RenderError> {
         match self.active.render(placements, cameras, images) {
-            Err(RenderError::DeviceLost(why)) if self.spare.is_some() => {
+            Err(RenderError::Device(why)) if self.spare.is_some() => {
                 self.lost = Some(format!("{} is lost: {why}", self.active.name()));
                 if let Some(spare) = self.spare.take() {
                     self.active = Box::new(spare);
@@ -81,8 +81,10 @@ mod tests {
             images: &mut [RgbdImage],
         ) -> Result<PassTimes, RenderError> {
             let Some(left) = self.left.checked_sub(1) else {
-                images.iter_mut().for_each(|image| image.resize(3, 3));
-                return Err(RenderError::DeviceLost("it broke".into()));
+                for image in images.iter_mut() {
+                    image.resize(3, 3);
+                }
+                return Err(RenderError::Device("it broke".into()));
             };
             self.left = left;
             self.inner.render(placements, cameras, images)

@@ -9,8 +9,8 @@
 //! per pixel, and as much per pixel again for each of two staging buffers.
 
 use super::device::Device;
-use super::scene::BLOCK;
 use super::sort;
+use crate::blocks::BLOCK;
 
 /// How much there must be room for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

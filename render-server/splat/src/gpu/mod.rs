@@ -137,14 +137,14 @@ impl GpuRenderer {
     /// Uploads a scene to a device on `adapter`. Splats that no image would show are left out.
     ///
     /// # Errors
-    /// [`RenderError::DeviceLost`] with what the driver said, if the device does not open or has no
+    /// [`RenderError::Device`] with what the driver said, if the device does not open or has no
     /// room.
     pub fn new<'a>(
         scene: impl Into<Scene<'a>>,
         adapter: &Adapter,
         budget: Budget,
     ) -> Result<Self, RenderError> {
-        let device = adapter.open(&budget).map_err(RenderError::DeviceLost)?;
+        let device = adapter.open(&budget).map_err(RenderError::Device)?;
         let scene = GpuScene::new(&device, scene.into())?;
         let passes = Passes {
             cull: cull::Cull::new(&device),
@@ -155,7 +155,7 @@ impl GpuRenderer {
         };
         let stamps = Stamps::new(&device);
         if let Some(fault) = device.fault() {
-            return Err(RenderError::DeviceLost(fault));
+            return Err(RenderError::Device(fault));
         }
         Ok(Self {
             name: format!("gpu {}", adapter.name().name),
@@ -211,7 +211,7 @@ impl GpuRenderer {
     /// took on the device; `total_ms` counts from [`Self::begin`].
     ///
     /// # Errors
-    /// [`RenderError::DeviceLost`]; the tick is dropped then.
+    /// [`RenderError::Device`]; the tick is dropped then.
     ///
     /// # Panics
     /// If no tick is under way, or there are not as many images as it has cameras.
@@ -303,7 +303,7 @@ impl GpuRenderer {
 
     fn check_device(&self) -> Result<(), Refused> {
         match self.device.fault() {
-            Some(fault) => Err(Refused::Render(RenderError::DeviceLost(fault))),
+            Some(fault) => Err(Refused::Render(RenderError::Device(fault))),
             None => Ok(()),
         }
     }
@@ -408,7 +408,7 @@ impl GpuRenderer {
                 (sizes, passes_ms)
             });
             let (sizes, [cull_ms, project_ms, sort_ms, bin_ms, blend_ms]) =
-                read.map_err(|fault| Refused::Render(RenderError::DeviceLost(fault)))?;
+                read.map_err(|fault| Refused::Render(RenderError::Device(fault)))?;
             if sizes.is_complete() {
                 let cameras = asked.cameras.len().max(1);
                 self.workload.visible = sizes.visible as usize / cameras;
@@ -438,7 +438,7 @@ impl Refused {
     fn into_error(self) -> RenderError {
         match self {
             // Another renderer must do it, as if this one were gone.
-            Self::TooLarge(why) => RenderError::DeviceLost(why),
+            Self::TooLarge(why) => RenderError::Device(why),
             Self::Render(error) => error,
         }
     }

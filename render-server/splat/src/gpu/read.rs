@@ -14,8 +14,8 @@ use zerocopy::{FromBytes, Immutable, KnownLayout};
 
 use super::buffers::{Buffers, SIZES_BYTES};
 use super::device::Device;
-use super::scene::BLOCK;
 use super::view::Place;
+use crate::blocks::BLOCK;
 use crate::{Camera, RgbdImage};
 
 /// Passes with timestamps.

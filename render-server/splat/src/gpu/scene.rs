@@ -1,24 +1,20 @@
 //! Packs a scene for the device, once; then it is only read.
 //!
-//! As for the processor (`cpu/scene.rs`), splats are put along a Morton curve and cut into blocks of
-//! 256 neighbours, culled as one, column after column: the threads of a workgroup read neighbouring
+//! As for the processor, splats stand in blocks ([`crate::blocks`]), here column after column: the threads of a workgroup read neighbouring
 //! words. Blocks of all parts (what stands still, then the objects) lie one after the other in
 //! chunks, each of which a binding can hold.
 //!
 //! Memory on the device: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16: 740 MB for
 //! 5 M splats of degree 3. On the host it is packed chunk by chunk and not kept.
 
-use glam::{Mat3, Vec3};
 use half::f16;
 use rayon::prelude::*;
 use zerocopy::{Immutable, IntoBytes};
 
 use super::device::Device;
-use crate::limits::{ALPHA_MIN, MAX_SCALE_M};
+use crate::blocks::{self, BLOCK};
 use crate::{RenderError, Scene, Splats};
 
-/// Splats per block; `BLOCK` in `common.wgsl`.
-pub(super) const BLOCK: usize = 256;
 /// Words before a block's columns; `HEADER` in `project.wgsl`.
 const HEADER: usize = 4;
 /// Centre, axes times scales, log2 of the opacity.
@@ -84,7 +80,7 @@ impl GpuScene {
     pub(super) fn new(device: &Device, scene: Scene<'_>) -> Result<Self, RenderError> {
         let objects = scene.objects.iter().map(|object| &object.splats);
         let parts: Vec<&Splats> = std::iter::once(scene.splats).chain(objects).collect();
-        let orders: Vec<Vec<u32>> = parts.iter().map(|splats| morton_order(splats)).collect();
+        let orders: Vec<Vec<u32>> = parts.iter().map(|splats| blocks::order(splats)).collect();
         let pending: Vec<Pending<'_>> = parts
             .iter()
             .zip(&orders)
@@ -107,7 +103,7 @@ impl GpuScene {
                     "the graphics device binds {} bytes at once, less than 256 splats take",
                     device.binding_bytes
                 );
-                return Err(RenderError::DeviceLost(message));
+                return Err(RenderError::Device(message));
             }
             chunks.push(upload(device, first as u32, chunk));
             rest = later;
@@ -175,8 +171,7 @@ fn pack(block: &Pending<'_>) -> (Vec<u32>, Vec<u32>) {
     let mut halves = vec![0u32; block.harmonics_words()];
     for (lane, &i) in order.iter().enumerate() {
         let i = i as usize;
-        let scale_m = splats.scales_m[i].min(Vec3::splat(MAX_SCALE_M));
-        let axes = Mat3::from_quat(splats.rotations[i].normalize()) * Mat3::from_diagonal(scale_m);
+        let axes = blocks::axes(splats, i);
         let values = splats.means_m[i].to_array().into_iter().chain(axes.to_cols_array());
         for (column, value) in values.chain([splats.opacities[i].log2()]).enumerate() {
             columns[HEADER + column * BLOCK + lane] = value.to_bits();
@@ -190,70 +185,7 @@ fn pack(block: &Pending<'_>) -> (Vec<u32>, Vec<u32>) {
     (columns, halves)
 }
 
-/// Returns the indices of the splats that can be seen at all, along a Morton curve. The rules are
-/// those of `cpu/scene.rs`; a test compares the numbers kept.
-fn morton_order(splats: &Splats) -> Vec<u32> {
-    let numbers = splats.sh_coefficients() * 3;
-    let visible = |&i: &u32| {
-        let i = i as usize;
-        let q = splats.rotations[i];
-        f64::from(splats.opacities[i]) >= ALPHA_MIN
-            && splats.opacities[i] <= 1.0
-            && splats.means_m[i].is_finite()
-            && !splats.scales_m[i].is_nan()
-            && splats.scales_m[i].min_element() >= 0.0
-            && (q.length_squared() - 1.0).abs() < 1e-2
-            && splats.sh[i * numbers..(i + 1) * numbers].iter().all(|v| v.is_finite())
-    };
-    let count = u32::try_from(splats.len()).expect("fewer than 2^32 splats");
-    let kept: Vec<u32> = (0..count).into_par_iter().filter(visible).collect();
-    let (low, high) = kept.iter().fold((Vec3::MAX, Vec3::MIN), |(low, high), &i| {
-        let mean = splats.means_m[i as usize];
-        (low.min(mean), high.max(mean))
-    });
-    // One scale for all axes keeps blocks roundish.
-    let side = (high - low).max_element().max(f32::MIN_POSITIVE);
-    let mut keyed: Vec<(u64, u32)> = kept
-        .par_iter()
-        .map(|&i| {
-            let cell = (splats.means_m[i as usize] - low) / side * ((1 << 21) - 1) as f32;
-            let [x, y, z] = cell.to_array().map(|v| spread(v as u64));
-            (x | y << 1 | z << 2, i)
-        })
-        .collect();
-    keyed.par_sort_unstable();
-    keyed.into_iter().map(|(_, i)| i).collect()
-}
-
-/// Spreads 21 bits so that two zeros follow each.
-fn spread(v: u64) -> u64 {
-    let v = v & 0x1f_ffff;
-    let v = (v | v << 32) & 0x001f_0000_0000_ffff;
-    let v = (v | v << 16) & 0x001f_0000_ff00_00ff;
-    let v = (v | v << 8) & 0x100f_00f0_0f00_f00f;
-    let v = (v | v << 4) & 0x10c3_0c30_c30c_30c3;
-    (v | v << 2) & 0x1249_2492_4924_9249
-}
-
 fn bounds(block: &Pending<'_>) -> Bounds {
-    let splats = block.splats;
-    let (mut low, mut high, mut reach_m) = (Vec3::MAX, Vec3::MIN, 0f32);
-    for &i in block.order {
-        let i = i as usize;
-        low = low.min(splats.means_m[i]);
-        high = high.max(splats.means_m[i]);
-        // alpha >= 1/255 within this many standard deviations.
-        let deviations = (2.0 * (splats.opacities[i] * 255.0).ln().max(0.0)).sqrt();
-        let largest_m = splats.scales_m[i].max_element().min(MAX_SCALE_M);
-        reach_m = reach_m.max(deviations * largest_m);
-    }
-    // Halved before they are added: no sum overflows. Widened by their own rounding.
-    let center_m = low * 0.5 + high * 0.5;
-    let half_m = (high * 0.5 - low * 0.5) + center_m.abs() * 1e-6;
-    Bounds {
-        center_m: center_m.to_array(),
-        reach_m: reach_m * 1.0001,
-        half_m: half_m.to_array(),
-        part: block.part,
-    }
+    let blocks::Bounds { center_m, half_m, reach_m } = blocks::bounds(block.splats, block.order);
+    Bounds { center_m: center_m.to_array(), reach_m, half_m: half_m.to_array(), part: block.part }
 }

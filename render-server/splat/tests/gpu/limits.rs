@@ -81,7 +81,7 @@ fn what_no_device_can_hold_is_drawn_by_the_processor() {
     let Some(mut gpu) = with_budget(&splats, tiny) else { return };
     let large = [twins::camera(200, 100, 80.0)];
     let refused = gpu.render(&[], &large, &mut [RgbdImage::default()]);
-    let Err(RenderError::DeviceLost(why)) = refused else { panic!("{refused:?}") };
+    let Err(RenderError::Device(why)) = refused else { panic!("{refused:?}") };
     assert!(why.contains("pixels: 20000"), "{why}");
     // And what fits still works.
     let small = [twins::camera(20, 20, 80.0)];
@@ -93,7 +93,7 @@ fn what_no_device_can_hold_is_drawn_by_the_processor() {
     // Less than one block.
     let none = Budget { binding_bytes: 5000, ..Budget::default() };
     let refused = adapter().map(|adapter| GpuRenderer::new(&splats, adapter, none).map(|_| ()));
-    assert!(matches!(refused, Some(Err(RenderError::DeviceLost(_)))), "{refused:?}");
+    assert!(matches!(refused, Some(Err(RenderError::Device(_)))), "{refused:?}");
 }
 
 #[test]
@@ -104,7 +104,7 @@ fn the_processor_takes_over_when_a_device_is_lost() {
     let before = draw(&mut gpu, &camera);
     gpu.lose_device();
     let lost = gpu.render(&[], &camera, &mut [RgbdImage::default()]);
-    assert!(matches!(lost, Err(RenderError::DeviceLost(_))), "{lost:?}");
+    assert!(matches!(lost, Err(RenderError::Device(_))), "{lost:?}");
     // And stays so.
     assert!(gpu.render(&[], &camera, &mut [RgbdImage::default()]).is_err());
     let mut resilient = Resilient::new(Box::new(gpu), CpuRenderer::new(&splats));
@@ -126,7 +126,7 @@ fn a_device_lost_between_begin_and_finish_is_told() {
     let mut image = [RgbdImage::default()];
     match gpu.finish(&mut image) {
         Ok(_) => crate::compare::assert_clean(&image[0]),
-        Err(error) => assert!(matches!(error, RenderError::DeviceLost(_)), "{error}"),
+        Err(error) => assert!(matches!(error, RenderError::Device(_)), "{error}"),
     }
     assert!(gpu.begin(&[], &camera).and_then(|()| gpu.finish(&mut image).map(|_| ())).is_err());
 }
