@@ -46,6 +46,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    quiet_mesa();
     let cli = Cli::parse();
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
         // The demo tells its own story; its children's logs would drown it.
@@ -76,6 +77,15 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
+    }
+}
+
+/// Keeps one of Mesa's Vulkan layers from looking for a screen where there is none: it would print
+/// `error: XDG_RUNTIME_DIR is invalid` at every start, and we draw to memory.
+fn quiet_mesa() {
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
+        // SAFETY: the first statement of `main`: no other thread reads the environment yet.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     }
 }
 

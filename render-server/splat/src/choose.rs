@@ -41,7 +41,7 @@ pub struct UnknownBackend(String);
 pub struct Chosen {
     /// Holds its own packed copy of the scene.
     pub rasterizer: Box<dyn Rasterizer>,
-    /// In words: `no graphics adapter; cpu avx2`.
+    /// In words: `no graphics adapter`.
     pub reason: String,
 }
 
@@ -70,18 +70,14 @@ pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chose
     let scene = scene.into();
     let cpu = CpuRenderer::with_detail(scene, Detail::suited_to(&scene));
     if backend == Backend::Cpu {
-        let reason = format!("asked for; {}", cpu.name());
-        return Ok(Chosen { rasterizer: Box::new(cpu), reason });
+        return Ok(Chosen { rasterizer: Box::new(cpu), reason: "asked for".to_owned() });
     }
     match (graphics(scene, backend == Backend::Gpu), backend) {
         (Ok((rasterizer, reason)), _) => {
             Ok(Chosen { rasterizer: Box::new(Resilient::new(rasterizer, cpu)), reason })
         }
         (Err(why), Backend::Gpu) => Err(NoRenderer::Gpu(why)),
-        (Err(why), _) => {
-            let reason = format!("{why}; {}", cpu.name());
-            Ok(Chosen { rasterizer: Box::new(cpu), reason })
-        }
+        (Err(reason), _) => Ok(Chosen { rasterizer: Box::new(cpu), reason }),
     }
 }
 

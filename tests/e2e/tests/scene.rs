@@ -147,7 +147,7 @@ fn mistakes_in_a_picture_are_explained() {
         refused(&["scene", "render", scene, "--camera", camera, "--out", &out], texts);
     };
     render(&rig.at("gone.ply"), &camera, &["there is no", "vizflyt scene generate"]);
-    render(&scene, &rig.at("gone.json"), &["cannot read the camera", "gone.json"]);
+    render(&scene, &rig.at("gone.json"), &["cannot read", "gone.json", "as a camera"]);
     rig.write("bad.json", "{\"fx\": 1");
     render(&scene, &rig.at("bad.json"), &["bad.json is no camera", "w2c (4x4", "line 1"]);
     rig.write("notes.txt", "just words, of no format at all");

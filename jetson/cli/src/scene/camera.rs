@@ -44,7 +44,7 @@ fn oracle_near_m() -> f32 {
 /// Reads a camera; its world is the frame of the scene's file.
 pub(crate) fn read(path: &Path) -> Result<Camera> {
     let text = std::fs::read_to_string(path)
-        .with_context(|| format!("cannot read the camera {}", path.display()))?;
+        .with_context(|| format!("cannot read {} as a camera, a JSON file", path.display()))?;
     parse(&text).with_context(|| format!("{} is no camera", path.display()))
 }
 
