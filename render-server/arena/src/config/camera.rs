@@ -249,7 +249,7 @@ impl CameraConfig {
             }
         } else if let Some((name, _)) = absent {
             let advice = if given.is_some() || self.distortion.is_some() {
-                "give all of fx_px, fy_px, cx_px and cy_px"
+                "a calibration is whole: give all of fx_px, fy_px, cx_px and cy_px"
             } else {
                 "give horizontal_fov_deg, or fx_px, fy_px, cx_px and cy_px"
             };
