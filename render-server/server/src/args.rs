@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::Args;
+use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
 use crate::render::RendererKind;
 use crate::scene::Up;
@@ -45,6 +46,19 @@ pub struct ServeArgs {
     #[arg(long, value_name = "Q", default_value_t = 93, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,
 
+    /// How the colour images are stored
+    #[arg(long, value_enum, default_value_t)]
+    pub color: Color,
+
+    /// How depth is packed; both are exact
+    #[arg(long, value_enum, default_value_t)]
+    pub depth: Depth,
+
+    /// Lets depth z be off by up to K z², but 1 mm at least, for half the bytes or less; 0.001 is 25 mm
+    /// at 5 m [default: exact]
+    #[arg(long, value_name = "K", value_parser = depth_bound)]
+    pub depth_error: Option<DepthBound>,
+
     /// Congestion control of the image stream
     #[arg(long, value_enum, default_value_t)]
     pub congestion: Congestion,
@@ -64,6 +78,55 @@ pub struct ServeArgs {
     /// End when standard input ends
     #[arg(long, hide = true)]
     pub lifeline: bool,
+}
+
+/// How colour is stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Color {
+    /// JPEG, colour in full resolution
+    #[default]
+    #[value(name = "444")]
+    Jpeg444,
+    /// JPEG, colour in half resolution: a quarter smaller, bleeds at edges
+    #[value(name = "420")]
+    Jpeg420,
+    /// Every value comes back: three times the size, 15 ms at 640x480
+    Lossless,
+}
+
+/// How depth is packed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Depth {
+    /// Under a millisecond at 640x480
+    #[default]
+    Fast,
+    /// A sixth smaller, 5 ms
+    Small,
+}
+
+impl ServeArgs {
+    /// Returns how images are encoded.
+    pub fn encode_options(&self) -> EncodeOptions {
+        EncodeOptions {
+            jpeg_quality: self.quality,
+            color_mode: match self.color {
+                Color::Jpeg444 => ColorMode::Jpeg444,
+                Color::Jpeg420 => ColorMode::Jpeg420,
+                Color::Lossless => ColorMode::Lossless,
+            },
+            depth_mode: match self.depth {
+                Depth::Fast => DepthMode::Fast,
+                Depth::Small => DepthMode::Small,
+            },
+            depth_bound: self.depth_error,
+            ..EncodeOptions::default()
+        }
+    }
+}
+
+fn depth_bound(text: &str) -> Result<DepthBound, String> {
+    let k_per_m = number(text, 1e-6, 0.1)?;
+    DepthBound::new(k_per_m).ok_or_else(|| format!("{k_per_m} is outside 0.000001 to 0.1"))
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -105,12 +168,23 @@ mod tests {
             parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
         assert_eq!((args.up, args.scale), (Up::NegY, Some(0.2)));
         assert_eq!(args.congestion, Congestion::Bbr);
+        assert_eq!(args.encode_options(), EncodeOptions::default());
+        let args = parse("a.toml --color 420 --depth small --depth-error 0.002").unwrap();
+        let options = args.encode_options();
+        assert_eq!(
+            (options.color_mode, options.depth_mode),
+            (ColorMode::Jpeg420, DepthMode::Small)
+        );
+        assert_eq!(options.depth_bound, DepthBound::new(0.002));
         assert_eq!(parse("a.toml --up z").unwrap().up, Up::Z);
         for wrong in [
             "a.toml --max-rate nan",
             "a.toml --max-rate 0",
             "a.toml --quality 0",
             "a.toml --scale -1",
+            "a.toml --depth-error 0",
+            "a.toml --depth-error 0.2",
+            "a.toml --color 422",
         ] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }

@@ -82,8 +82,8 @@ pub struct Preview {
 }
 
 /// Encodes until the server stops.
-pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, quality: u8) {
-    let mut stage = Stage::new(quality);
+pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, options: EncodeOptions) {
+    let mut stage = Stage::new(options);
     let mut preview_due = Instant::now();
     let mut order: Vec<usize> = Vec::new();
     while !hub.stop.is_set() {
@@ -128,12 +128,9 @@ struct Stage {
 }
 
 impl Stage {
-    fn new(quality: u8) -> Self {
+    fn new(options: EncodeOptions) -> Self {
         Self {
-            encoder: Encoder::new(EncodeOptions {
-                jpeg_quality: quality,
-                ..EncodeOptions::default()
-            }),
+            encoder: Encoder::new(options),
             rgb: Vec::new(),
             depth_mm: Vec::new(),
             coloured: Vec::new(),

@@ -167,7 +167,7 @@ fn start_threads(
     };
     let (pose_hub, pose_newest) = (hub.clone(), newest.clone());
     let (draw_hub, draw_drawn, max_rate) = (hub.clone(), drawn.clone(), args.max_rate);
-    let (encode_hub, quality) = (hub.clone(), args.quality);
+    let (encode_hub, options) = (hub.clone(), args.encode_options());
     Ok(vec![
         start(
             "pose",
@@ -179,7 +179,7 @@ fn start_threads(
                 tick::draw(&draw_hub, &mut *renderer, &newest, &draw_drawn, max_rate);
             }),
         )?,
-        start("encode", Box::new(move || encode::run(&encode_hub, &drawn, quality)))?,
+        start("encode", Box::new(move || encode::run(&encode_hub, &drawn, options)))?,
     ])
 }
 
