@@ -8,6 +8,8 @@
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod portable;
 #[cfg(test)]
 mod tests;
@@ -18,6 +20,8 @@ use std::ops::{Add, BitAnd, Div, Mul, Sub};
 pub(super) use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
 pub(super) use avx512::Avx512;
+#[cfg(target_arch = "aarch64")]
+pub(super) use neon::Neon;
 pub(super) use portable::Portable;
 
 /// Operations on one vector of f32. Comparisons with NaN are false.
@@ -95,6 +99,8 @@ pub(super) enum InstructionSet {
     Avx512(Avx512),
     #[cfg(target_arch = "x86_64")]
     Avx2(Avx2),
+    #[cfg(target_arch = "aarch64")]
+    Neon(Neon),
     Portable(Portable),
 }
 
@@ -102,10 +108,12 @@ impl InstructionSet {
     /// Returns every set this processor has, fastest first; never empty.
     pub(super) fn available() -> Vec<Self> {
         #[cfg(target_arch = "x86_64")]
-        let x86 = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
-        #[cfg(not(target_arch = "x86_64"))]
-        let x86: [Option<Self>; 0] = [];
-        x86.into_iter().flatten().chain([Self::Portable(Portable)]).collect()
+        let wide = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
+        #[cfg(target_arch = "aarch64")]
+        let wide = [Some(Self::Neon(Neon))];
+        #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+        let wide: [Option<Self>; 0] = [];
+        wide.into_iter().flatten().chain([Self::Portable(Portable)]).collect()
     }
 
     /// Returns the name for reports.
@@ -115,7 +123,8 @@ impl InstructionSet {
             Self::Avx512(_) => "cpu avx512",
             #[cfg(target_arch = "x86_64")]
             Self::Avx2(_) => "cpu avx2",
-            Self::Portable(_) if cfg!(target_arch = "aarch64") => "cpu neon",
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(_) => "cpu neon",
             Self::Portable(_) => "cpu portable",
         }
     }

@@ -1,4 +1,4 @@
-//! Plain arrays that the compiler vectorises for whatever the target always has (SSE2, NEON).
+//! Plain arrays that the compiler vectorises for whatever the target always has.
 
 use std::array;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};

@@ -76,6 +76,8 @@ fn every_set_computes_what_plain_arithmetic_does() {
             InstructionSet::Avx512(simd) => simd.run(Check),
             #[cfg(target_arch = "x86_64")]
             InstructionSet::Avx2(simd) => simd.run(Check),
+            #[cfg(target_arch = "aarch64")]
+            InstructionSet::Neon(simd) => simd.run(Check),
             InstructionSet::Portable(simd) => simd.run(Check),
         }
     }
