@@ -19,15 +19,16 @@ use vizflyt_splat::{DepthKind, RgbdImage};
 
 use crate::cameras::CameraSet;
 use crate::clock;
-use crate::hub::Hub;
+use crate::hub::{Hub, MAX_VEHICLES};
 use crate::mailbox::Mailbox;
 use crate::outlet::Outgoing;
+use crate::vehicle::Vehicle;
 
 /// What was drawn in one tick, and what nobody took of the ticks it replaced; reused from tick to
 /// tick.
 #[derive(Debug, Default)]
 pub struct DrawnTick {
-    /// One per camera of the arena.
+    /// One per camera, vehicle by vehicle.
     pub slots: Vec<DrawnImage>,
 }
 
@@ -36,14 +37,18 @@ pub struct DrawnTick {
 pub struct DrawnImage {
     /// Whether there is one; everything else counts only then.
     pub fresh: bool,
+    /// Index of the vehicle.
+    pub vehicle: usize,
+    /// Index into the vehicle's cameras.
+    pub camera: usize,
     /// Its tick, counted from 1.
     pub seq: u64,
     /// When the pose was measured.
     pub pose: ServerTime,
     /// The pose drawn from.
     pub world_from_body: Option<Pose<World, Body>>,
-    /// The camera as it was drawn with: set and index.
-    pub camera: Option<(Arc<CameraSet>, usize)>,
+    /// The vehicle's cameras as they were drawn with.
+    pub set: Option<Arc<CameraSet>>,
     /// Rendering of the tick began.
     pub render_start: ServerTime,
     /// Rendering of the tick ended.
@@ -67,7 +72,7 @@ impl DrawnTick {
 impl DrawnImage {
     /// Whether its camera has fewer images than the page shows.
     fn is_slow(&self) -> bool {
-        let rate_hz = self.camera.as_ref().and_then(|(set, index)| set.configs[*index].rate_hz);
+        let rate_hz = self.set.as_ref().and_then(|set| set.configs[self.camera].rate_hz);
         rate_hz.is_some_and(|hz| hz < f64::from(PREVIEW_HZ))
     }
 }
@@ -88,30 +93,36 @@ pub fn run(hub: &Arc<Hub>, drawn: &Mailbox<DrawnTick>, options: EncodeOptions) {
     let mut order: Vec<usize> = Vec::new();
     while !hub.stop.is_set() {
         let wanted = hub.outlet.wait_for_room(preview_due, PATIENCE);
-        if !wanted.preview && !wanted.stream.contains(&true) {
+        if !wanted.anything() {
             continue;
         }
         let Some(tick) = drawn.take(PATIENCE) else { continue };
-        let preview = wanted.preview && Instant::now() >= preview_due;
-        if preview {
+        if wanted.preview.contains(&true) {
             preview_due = Instant::now() + Duration::from_secs(1) / PREVIEW_HZ;
         }
         // The newest tick's first: an older image joins what the runtime has begun.
         order.clear();
-        order.extend((0..tick.slots.len()).filter(|&camera| tick.slots[camera].fresh));
-        order.sort_by_key(|&camera| std::cmp::Reverse(tick.slots[camera].seq));
-        let together = order.iter().filter(|&&camera| wanted.stream[camera]);
-        let together = together.fold(0u32, |bits, &camera| bits | 1 << camera);
-        for &camera in &order {
-            let slot = &tick.slots[camera];
-            let stream = wanted.stream[camera].then_some(together);
+        order.extend((0..tick.slots.len()).filter(|&index| tick.slots[index].fresh));
+        order.sort_by_key(|&index| std::cmp::Reverse(tick.slots[index].seq));
+        let mut together = [0u32; MAX_VEHICLES];
+        for &index in &order {
+            let slot = &tick.slots[index];
+            if wanted.stream[slot.vehicle][slot.camera] {
+                together[slot.vehicle] |= 1 << slot.camera;
+            }
+        }
+        for &index in &order {
+            let slot = &tick.slots[index];
+            let (vehicle, camera) = (slot.vehicle, slot.camera);
+            let stream = wanted.stream[vehicle][camera].then_some(together[vehicle]);
             // A slow camera's images come too seldom to wait for the page's turn.
-            let preview = preview || (hub.outlet.viewers() > 0 && slot.is_slow());
+            let preview = wanted.preview[vehicle] || (hub.outlet.viewers() > 0 && slot.is_slow());
             if stream.is_none() && !preview {
                 continue;
             }
-            if let Err(error) = stage.encode(hub, slot, camera, stream, preview) {
-                warn!("camera {camera}: {error:#}; image {} is skipped", slot.seq);
+            if let Err(error) = stage.encode(hub, slot, stream, preview) {
+                let name = &hub.vehicles[vehicle].name;
+                warn!("{name}: camera {camera}: {error:#}; image {} is skipped", slot.seq);
             }
         }
         drawn.recycle(tick);
@@ -142,15 +153,14 @@ impl Stage {
         &mut self,
         hub: &Hub,
         slot: &DrawnImage,
-        camera: usize,
         stream: Option<u32>,
         preview: bool,
     ) -> Result<()> {
-        let (Some((set, index)), Some(world_from_body)) = (&slot.camera, slot.world_from_body)
-        else {
+        let (Some(set), Some(world_from_body)) = (&slot.set, slot.world_from_body) else {
             return Ok(());
         };
-        let (info, image) = (&set.infos[*index], &slot.image);
+        let (vehicle, camera) = (slot.vehicle, slot.camera);
+        let (info, image) = (&set.infos[camera], &slot.image);
         image.write_rgb8(&mut self.rgb);
         image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
         if let Some(together) = stream {
@@ -179,15 +189,15 @@ impl Stage {
             header.payload_len = (payload.len() as u32).into();
             header.encode_end_ns = end.as_ns().into();
             hub.stats.encode.add(start, end);
-            hub.outlet.send(Outgoing { camera, header, payload });
+            hub.outlet.send(Outgoing { vehicle, camera, header, payload });
         }
         if preview {
-            self.preview(hub, image, camera)?;
+            self.preview(&hub.vehicles[vehicle], image, camera)?;
         }
         Ok(())
     }
 
-    fn preview(&mut self, hub: &Hub, image: &RgbdImage, camera: usize) -> Result<()> {
+    fn preview(&mut self, vehicle: &Vehicle, image: &RgbdImage, camera: usize) -> Result<()> {
         let (width, height) = (image.width_px, image.height_px);
         self.coloured.clear();
         for &mm in &self.depth_mm {
@@ -199,7 +209,7 @@ impl Stage {
             Ok(out)
         };
         let preview = Preview { colour: jpeg(&self.rgb)?, depth: jpeg(&self.coloured)? };
-        if let Some(slot) = hub.previews.get(camera) {
+        if let Some(slot) = vehicle.previews.get(camera) {
             slot.send_replace(Some(Arc::new(preview)));
         }
         Ok(())

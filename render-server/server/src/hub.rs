@@ -1,64 +1,36 @@
-//! What the threads and tasks of the server share: the newest of everything, and the seats.
+//! What the threads and tasks of the server share.
 //!
 //! ```text
-//! pose thread ----> pose (watch), trail, events ----> session, page
-//! render, encode -> stats, previews (watch) --------> page
-//! session --------> telemetry (watch), events ------> page, pose thread (phase of flight)
-//! page -----------> events (stop button) -----------> session
+//! vehicles   each with its newest pose, cameras, events, seat: see [`crate::vehicle`]
+//! outlet     who wants images of which vehicle, and the way out to them
+//! stats      what was measured, of all vehicles together
 //! ```
-//! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
 
-use std::net::SocketAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
-use tokio::sync::{Notify, watch};
-use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, bounded,
-};
-use vizflyt_protocol::time::ServerTime;
 
-use crate::cameras::{CameraSet, Cameras};
-use crate::clock;
 use crate::drivers::SourceCounters;
-use crate::encode::Preview;
-use crate::events::{EventLog, Origin};
 use crate::outlet::Outlet;
-use crate::stats::Stats;
+use crate::stats::{Report, Stats};
 use crate::stop::Stop;
+use crate::vehicle::Vehicle;
 
-/// Shared state of one vehicle's flight in one arena.
+/// Shared state of all vehicles in one arena.
 #[derive(Debug)]
 pub struct Hub {
-    /// The object in the localization system, and the only vehicle served.
-    pub vehicle: Name,
-    /// What the runtime gets to know; its cameras are those of the start, see [`Self::welcome`].
-    pub arena: ArenaInfo,
-    /// The cameras of this moment.
-    pub cameras: Cameras,
+    /// The vehicles served, each at its index; at least one, at most [`MAX_VEHICLES`].
+    pub vehicles: Vec<Arc<Vehicle>>,
     /// Which renderer draws, and why; it may give way to another in flight.
     pub renderer: Mutex<RendererInfo>,
     /// The end of the program.
     pub stop: Stop,
-    /// What happened.
-    pub events: EventLog,
     /// What was measured.
     pub stats: Stats,
     /// Who wants images.
     pub outlet: Outlet,
-    /// The newest pose.
-    pub pose: watch::Sender<Option<PoseSample>>,
-    /// The runtime's newest report.
-    pub telemetry: watch::Sender<Option<Telemetry>>,
-    /// The newest previews, by camera.
-    pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
-    /// Where the vehicle was.
-    pub trail: Mutex<Trail>,
     /// What the localization delivered.
     pub source: Mutex<SourceCounters>,
-    seat: Mutex<SeatState>,
-    flight: Mutex<Flight>,
 }
 
 /// Which renderer draws, for reports and the page.
@@ -70,216 +42,39 @@ pub struct RendererInfo {
     pub reason: String,
 }
 
-/// How the present flight goes.
-#[derive(Clone, Debug, Default)]
-pub struct Flight {
-    /// When the runtime first reported taking off.
-    pub took_off: Option<ServerTime>,
-    /// When it first reported having landed.
-    pub landed: Option<ServerTime>,
-    /// The event that decided it: the first that makes the guard land.
-    pub outcome: Option<Event>,
-}
-
-#[derive(Debug, Default)]
-struct SeatState {
-    sessions: u64,
-    taken: Option<RuntimeInfo>,
-    /// Index of the first event of the present flight.
-    flight_start: u64,
-    /// How many flights have begun; the pose thread starts its referee anew with each.
-    flights: u64,
-}
-
-/// The runtime that flies.
-#[derive(Clone, Debug)]
-pub struct RuntimeInfo {
-    /// Session number.
-    pub id: u64,
-    /// Where it is.
-    pub address: SocketAddr,
-    /// Which program.
-    pub program: Text,
-    heard_ns: Arc<AtomicU64>,
-    evicted: Arc<Notify>,
-}
-
 impl Hub {
     /// Makes the state of a server that has seen nothing yet.
-    pub fn new(
-        vehicle: &str,
-        arena: ArenaInfo,
-        cameras: Cameras,
-        renderer: RendererInfo,
-        stop: Stop,
-    ) -> Self {
-        let count = cameras.newest().configs.len();
+    pub fn new(vehicles: Vec<Vehicle>, renderer: RendererInfo, stop: Stop) -> Self {
+        let cameras: Vec<_> = vehicles.iter().map(|vehicle| vehicle.previews.len()).collect();
         Self {
-            vehicle: bounded(vehicle),
-            arena,
-            cameras,
+            vehicles: vehicles.into_iter().map(Arc::new).collect(),
             renderer: Mutex::new(renderer),
             stop,
-            events: EventLog::default(),
             stats: Stats::default(),
-            outlet: Outlet::new(count),
-            pose: watch::Sender::new(None),
-            telemetry: watch::Sender::new(None),
-            previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
-            trail: Mutex::default(),
+            outlet: Outlet::new(&cameras),
             source: Mutex::default(),
-            seat: Mutex::default(),
-            flight: Mutex::default(),
         }
     }
 
-    /// Returns what a runtime is told of the arena, with the cameras `set`.
-    pub fn welcome(&self, set: &CameraSet) -> ArenaInfo {
-        ArenaInfo { cameras: set.infos.iter().cloned().collect(), ..self.arena.clone() }
-    }
-
-    /// Appends to the log what the server or the runtime noticed.
-    pub fn log(&self, origin: Origin, event: Event) {
-        self.judge(&event);
-        self.events.push(origin, event);
-    }
-
-    /// Notes what decides the flight: the first event of those that end one. A lost pose decides
-    /// only if nothing else does and it does not come back before the guard lands.
-    fn judge(&self, event: &Event) {
-        let phase = self.phase();
-        let under_way = self.under_way();
-        let mut flight = lock(&self.flight);
-        let provisional =
-            flight.outcome.as_ref().is_none_or(|e| matches!(e.kind, EventKind::PoseLost { .. }));
-        match event.kind {
-            EventKind::Collision { .. }
-            | EventKind::Geofence { .. }
-            | EventKind::Finished { .. }
-            | EventKind::TimeLimit
-            | EventKind::EmergencyStop
-            | EventKind::PluginFailed
-                if provisional =>
-            {
-                flight.outcome = Some(event.clone());
-            }
-            // On the ground a pose may come and go.
-            EventKind::PoseLost { .. } if under_way => {
-                flight.outcome.get_or_insert_with(|| event.clone());
-            }
-            EventKind::PoseRegained if provisional && phase != FlightPhase::Landing => {
-                flight.outcome = None;
-            }
-            _ => {}
-        }
-    }
-
-    /// Takes the runtime's report.
-    pub fn report(&self, report: Telemetry) {
-        let now = clock::now();
-        let phase = report.phase;
-        self.telemetry.send_replace(Some(report));
-        let mut flight = lock(&self.flight);
-        if self.under_way() {
-            flight.took_off.get_or_insert(now);
-        } else if phase == FlightPhase::Landed && flight.took_off.is_some() {
-            flight.landed.get_or_insert(now);
-        }
-    }
-
-    /// Returns how the present flight goes.
-    pub fn flight(&self) -> Flight {
-        lock(&self.flight).clone()
-    }
-
-    /// Logs something this server noticed; it goes to the runtime, the page and standard output.
-    pub fn tell(&self, kind: EventKind, text: &str) {
-        let event = Event { stamp: clock::now(), kind, text: bounded(text) };
-        self.log(Origin::Server, event);
-    }
-
-    /// Logs something for the page alone; the runtime has no use for it.
-    pub fn note(&self, text: &str) {
-        let event = Event { stamp: clock::now(), kind: EventKind::Note, text: bounded(text) };
-        self.log(Origin::Page, event);
-    }
-
-    /// Returns the phase of flight by the runtime's newest report.
-    pub fn phase(&self) -> FlightPhase {
-        self.telemetry.borrow().as_ref().map_or(FlightPhase::Connecting, |report| report.phase)
-    }
-
-    /// Returns the runtime that holds the seat.
-    pub fn runtime(&self) -> Option<RuntimeInfo> {
-        self.lock_seat().taken.clone()
-    }
-
-    /// Returns how many flights have begun: rises when a runtime takes the seat on the ground.
-    pub fn flights(&self) -> u64 {
-        self.lock_seat().flights
-    }
-
-    /// Presses the stop button; returns whether a runtime is there to obey.
-    pub fn emergency_stop(&self, by: &str) -> bool {
-        self.tell(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
-        self.runtime().is_some()
-    }
-
-    /// Gives the seat of the vehicle to a runtime.
-    ///
-    /// A runtime that has been silent for [`SILENT_S`] loses it to the newcomer: it is the same
-    /// one after an outage, or it is dead. If the former flight was under way, the newcomer is
-    /// told everything since that flight's start, so that no collision is lost with a connection.
+    /// Returns the vehicle of this name.
     ///
     /// # Errors
     /// The reason to refuse, for a person.
-    pub fn sit(self: &Arc<Self>, hello: &Hello, address: SocketAddr) -> Result<Seat, String> {
-        if hello.vehicle != self.vehicle {
-            return Err(format!(
-                "no vehicle '{}' here, only '{}'; start the runtime with --vehicle {}",
-                hello.vehicle, self.vehicle, self.vehicle
-            ));
-        }
-        let now = clock::now();
-        let mut state = self.lock_seat();
-        if let Some(first) = &state.taken {
-            let heard = ServerTime::from_ns(first.heard_ns.load(Ordering::Relaxed));
-            if !(now.seconds_since(heard) > SILENT_S) {
-                return Err(format!(
-                    "vehicle '{}' is flown by {} at {}; stop that runtime first",
-                    self.vehicle, first.program, first.address
-                ));
-            }
-            first.evicted.notify_one();
-        }
-        state.sessions += 1;
-        let resumed = self.under_way();
-        if !resumed {
-            state.flights += 1;
-            state.flight_start = self.events.next_index();
-            self.telemetry.send_replace(None);
-            lock(&self.trail).clear();
-            *lock(&self.flight) = Flight::default();
-        }
-        let info = RuntimeInfo {
-            id: state.sessions,
-            address,
-            program: hello.program.clone(),
-            heard_ns: Arc::new(AtomicU64::new(now.as_ns())),
-            evicted: Arc::new(Notify::new()),
-        };
-        state.taken = Some(info.clone());
-        Ok(Seat { hub: self.clone(), info, resumed, first_event: state.flight_start })
+    pub fn vehicle(&self, name: &str) -> Result<&Arc<Vehicle>, String> {
+        self.vehicles.iter().find(|vehicle| vehicle.name == name).ok_or_else(|| {
+            let names: Vec<_> = self.vehicles.iter().map(|v| format!("'{}'", v.name)).collect();
+            let first = self.vehicles.first().map_or("NAME", |vehicle| &vehicle.name);
+            format!(
+                "no vehicle '{name}' here, only {}; start the runtime with --vehicle {first}",
+                names.join(", ")
+            )
+        })
     }
 
-    /// Whether a flight had begun and not ended when its runtime was last heard.
-    fn under_way(&self) -> bool {
-        use FlightPhase::{Flying, Holding, Landing, TakingOff};
-        matches!(self.phase(), TakingOff | Flying | Holding | Landing)
-    }
-
-    fn lock_seat(&self) -> MutexGuard<'_, SeatState> {
-        lock(&self.seat)
+    /// Returns the report over the whole run.
+    pub fn report(&self) -> Report {
+        let images: Vec<_> = self.vehicles.iter().map(|vehicle| &vehicle.images).collect();
+        self.stats.report(&images, *lock(&self.source), &lock(&self.renderer))
     }
 }
 
@@ -288,191 +83,22 @@ pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The right to fly the vehicle; given back when dropped.
-#[derive(Debug)]
-pub struct Seat {
-    hub: Arc<Hub>,
-    /// Who sits.
-    pub info: RuntimeInfo,
-    /// Whether the flight goes on after an outage.
-    pub resumed: bool,
-    /// The first event to tell.
-    pub first_event: u64,
-}
-
-impl Seat {
-    /// Notes that the runtime has been heard at `now`.
-    pub fn heard(&self, now: ServerTime) {
-        self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
-    }
-
-    /// Completes when a newcomer has taken the seat.
-    pub async fn evicted(&self) {
-        self.info.evicted.notified().await;
-    }
-}
-
-impl Drop for Seat {
-    fn drop(&mut self) {
-        let mut state = self.hub.lock_seat();
-        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
-            state.taken = None;
-        }
-    }
-}
-
-/// The path of the vehicle since the flight began, thinned so that it stays small for ever.
-#[derive(Debug)]
-pub struct Trail {
-    /// (x, y, z [m, world], speed [m/s]), oldest first.
-    pub points: Vec<[f32; 4]>,
-    spacing_m: f32,
-}
-
-impl Default for Trail {
-    fn default() -> Self {
-        Self { points: Vec::new(), spacing_m: LEAST_SPACING_M }
-    }
-}
-
-impl Trail {
-    /// Adds where the vehicle is, if it has moved enough.
-    pub fn add(&mut self, sample: &PoseSample) {
-        let p = sample.world_from_body.translation_m.as_vec3();
-        let far = self
-            .points
-            .last()
-            .is_none_or(|&[x, y, z, _]| p.distance(glam::Vec3::new(x, y, z)) >= self.spacing_m);
-        if !far {
-            return;
-        }
-        if self.points.len() >= MOST_POINTS {
-            let mut keep = false;
-            self.points.retain(|_| {
-                keep = !keep;
-                keep
-            });
-            self.spacing_m *= 2.0;
-        }
-        self.points.push([p.x, p.y, p.z, sample.twist.linear_mps.length() as f32]);
-    }
-
-    fn clear(&mut self) {
-        *self = Self::default();
-    }
-}
-
-/// Runtimes report ten times a second; ten reports missed are an outage. [s]
-const SILENT_S: f64 = 1.0;
-/// About the vehicle's radius. [m]
-const LEAST_SPACING_M: f32 = 0.05;
-/// 32 KB; 100 m of path at the finest spacing.
-const MOST_POINTS: usize = 2048;
+/// Vehicles that one server serves at most: a net holds no more.
+pub const MAX_VEHICLES: usize = 8;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DQuat, DVec3};
-    use vizflyt_protocol::geometry::{Pose, Twist, Volume};
-    use vizflyt_protocol::messages::Limits;
-
-    fn hub() -> Arc<Hub> {
-        let arena = ArenaInfo {
-            name: bounded("test"),
-            geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
-            limits: Limits { max_speed_mps: 1.0, max_acceleration_mps2: 1.0 },
-            body_radius_m: 0.1,
-            takeoff_height_m: 1.0,
-            goal_m: None,
-            goal_radius_m: 1.0,
-            time_limit_s: 0.0,
-            cameras: [].into_iter().collect(),
-        };
-        let cameras = Cameras::new(Vec::new());
-        Arc::new(Hub::new("vizflyt", arena, cameras, RendererInfo::default(), Stop::default()))
-    }
-
-    fn hello(vehicle: &str) -> Hello {
-        Hello { vehicle: bounded(vehicle), program: bounded("runtime 0.1") }
-    }
-
-    fn address() -> SocketAddr {
-        "127.0.0.1:9".parse().unwrap()
-    }
 
     #[test]
-    fn one_vehicle_has_one_runtime() {
-        let hub = hub();
-        let refusal = hub.sit(&hello("wasp"), address()).unwrap_err();
-        assert!(refusal.starts_with("no vehicle 'wasp' here, only 'vizflyt'"), "{refusal}");
-        let first = hub.sit(&hello("vizflyt"), address()).unwrap();
-        let refusal = hub.sit(&hello("vizflyt"), address()).unwrap_err();
+    fn a_vehicle_that_is_not_here_is_refused_with_the_names_of_those_that_are() {
+        let vehicles = ["wasp", "bee"].iter().enumerate();
+        let vehicles = vehicles.map(|(index, name)| crate::vehicle::tests::named(index, name));
+        let hub = Hub::new(vehicles.collect(), RendererInfo::default(), Stop::default());
+        assert_eq!(hub.vehicle("bee").map(|vehicle| vehicle.index), Ok(1));
         assert_eq!(
-            refusal,
-            "vehicle 'vizflyt' is flown by runtime 0.1 at 127.0.0.1:9; stop that runtime first"
+            hub.vehicle("fly").unwrap_err(),
+            "no vehicle 'fly' here, only 'wasp', 'bee'; start the runtime with --vehicle wasp"
         );
-        drop(first);
-        assert!(hub.runtime().is_none());
-        assert!(hub.sit(&hello("vizflyt"), address()).is_ok());
-    }
-
-    #[tokio::test]
-    async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
-        let hub = hub();
-        hub.tell(EventKind::Note, "before the flight");
-        let first = hub.sit(&hello("vizflyt"), address()).unwrap();
-        assert_eq!((first.first_event, first.resumed, hub.flights()), (1, false, 1));
-        hub.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
-        hub.tell(EventKind::EmergencyStop, "stop");
-        // As if it had last been heard two seconds ago.
-        first.heard(clock::now().plus_seconds(-2.0));
-        let second = hub.sit(&hello("vizflyt"), address()).unwrap();
-        first.evicted().await;
-        assert_eq!((second.first_event, second.resumed, hub.flights()), (1, true, 1));
-        drop(first);
-        assert_eq!(hub.runtime().map(|runtime| runtime.id), Some(second.info.id));
-        drop(second);
-        // After the landing the next runtime begins a new flight.
-        assert!(hub.flight().outcome.is_some_and(|event| event.text == "stop"));
-        hub.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
-        let third = hub.sit(&hello("vizflyt"), address()).unwrap();
-        assert_eq!((third.first_event, third.resumed, hub.flights()), (2, false, 2));
-        assert!(hub.flight().outcome.is_none() && hub.telemetry.borrow().is_none());
-    }
-
-    #[test]
-    fn the_first_decisive_event_is_the_outcome_and_a_lost_pose_only_if_it_stays_lost() {
-        let hub = hub();
-        let outcome = || hub.flight().outcome.map(|event| event.text.as_str().to_owned());
-        let lost = EventKind::PoseLost { age_s: 0.2 };
-        hub.tell(lost.clone(), "on the ground");
-        assert_eq!(outcome(), None);
-        hub.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
-        hub.tell(lost.clone(), "a hiccup");
-        assert_eq!(outcome().as_deref(), Some("a hiccup"));
-        hub.tell(EventKind::PoseRegained, "back");
-        assert_eq!(outcome(), None);
-        hub.tell(lost.clone(), "lost");
-        hub.tell(EventKind::Finished { seconds: 9.0 }, "goal");
-        hub.tell(EventKind::EmergencyStop, "later");
-        hub.tell(lost, "later still");
-        assert_eq!(outcome().as_deref(), Some("goal"));
-    }
-
-    #[test]
-    fn a_trail_keeps_its_ends_and_stays_small() {
-        let mut trail = Trail::default();
-        for k in 0..20_000 {
-            trail.add(&PoseSample {
-                stamp: ServerTime::ZERO,
-                world_from_body: Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY),
-                twist: Twist::default(),
-                resets: 0,
-            });
-        }
-        assert!(trail.points.len() <= MOST_POINTS);
-        assert_eq!(trail.points[0][0], 0.0);
-        assert!(trail.points.last().unwrap()[0] > 398.0);
-        assert!(trail.points.is_sorted_by(|a, b| a[0] < b[0]));
     }
 }

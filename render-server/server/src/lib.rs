@@ -1,12 +1,13 @@
 //! The render server: poses in, RGB-D out; referee's events, page, report.
 //!
 //! ```text
-//! drivers (Vicon UDP) -> tick::poses (arena: gate, referee) -> hub: newest pose, events
+//! drivers (Vicon UDP) -> tick::poses (arena: gate, referee) -> vehicle: newest pose, events
 //!                        tick::draw  (renderer)             -> mailbox: newest drawn tick
 //!                        encode      (room in the outlet?)  -> outlet -> transport (QUIC)
 //!                                                           -> previews -> dashboard (WebSocket)
 //! ```
-//! Three threads (poses, render, encode) and a tokio runtime for sockets meet in [`hub::Hub`].
+//! Three threads (poses, render, encode) and a tokio runtime for sockets meet in [`hub::Hub`],
+//! which holds a [`vehicle::Vehicle`] each.
 //! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
 
 pub mod args;
@@ -27,6 +28,7 @@ pub mod stats;
 pub mod stop;
 pub mod tick;
 pub mod transport;
+pub mod vehicle;
 mod view;
 
 pub use args::ServeArgs;

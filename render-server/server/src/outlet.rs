@@ -1,6 +1,6 @@
 //! Who wants images at this moment, and the way out to them.
 //!
-//! The runtime's session opens the outlet; for each camera at most K images may be in flight
+//! A runtime's session opens its vehicle's way out; for each camera at most K images may be in flight
 //! (handed to the transport, not yet acknowledged). Viewers of the page are counted. The render
 //! thread rests while nobody wants anything; the encode thread takes the newest drawn tick only
 //! when a camera has room, so that what waits is always the newest, and nothing is encoded that
@@ -13,10 +13,14 @@ use tokio::sync::mpsc;
 use vizflyt_protocol::messages::MAX_CAMERAS;
 use vizflyt_protocol::packet::ImageHeader;
 
+use crate::hub::MAX_VEHICLES;
+
 /// One encoded image on its way to the session.
 #[derive(Debug)]
 pub struct Outgoing {
-    /// Index into the arena's cameras.
+    /// Index of the vehicle.
+    pub vehicle: usize,
+    /// Index into the vehicle's cameras.
     pub camera: usize,
     /// Goes before the bitstream.
     pub header: ImageHeader,
@@ -27,22 +31,22 @@ pub struct Outgoing {
 /// What the encode thread may do now.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// By camera: the session has room for an image.
-    pub stream: [bool; MAX_CAMERAS],
-    /// A page wants a preview, and one is due.
-    pub preview: bool,
+    /// By vehicle and camera: the session has room for an image.
+    pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
+    /// By vehicle: a page wants a preview, and one is due.
+    pub preview: [bool; MAX_VEHICLES],
 }
 
 impl Wanted {
-    fn anything(&self) -> bool {
-        self.preview || self.stream.contains(&true)
+    /// Whether anyone wants anything.
+    pub fn anything(&self) -> bool {
+        self.preview.contains(&true) || self.stream.as_flattened().contains(&true)
     }
 }
 
 /// Demand and way out; shared by the render, encode and transport sides.
 #[derive(Debug)]
 pub struct Outlet {
-    cameras: usize,
     state: Mutex<State>,
     changed: Condvar,
     buffers: Mutex<Vec<Vec<u8>>>,
@@ -50,9 +54,26 @@ pub struct Outlet {
 
 #[derive(Debug, Default)]
 struct State {
+    vehicles: Vec<Way>,
+    closed: bool,
+}
+
+/// Who wants the images of one vehicle.
+#[derive(Debug, Default)]
+struct Way {
+    cameras: usize,
     session: Option<Session>,
     viewers: u32,
-    closed: bool,
+}
+
+impl Way {
+    fn session(&mut self, id: u64) -> Option<&mut Session> {
+        self.session.as_mut().filter(|session| session.id == id)
+    }
+
+    fn is_wanted(&self) -> bool {
+        self.session.is_some() || self.viewers > 0
+    }
 }
 
 #[derive(Debug)]
@@ -64,36 +85,36 @@ struct Session {
 }
 
 impl Outlet {
-    /// Makes the outlet of an arena with this many cameras (at most [`MAX_CAMERAS`]).
-    pub fn new(cameras: usize) -> Self {
+    /// Makes the outlet of vehicles with this many cameras each (at most [`MAX_CAMERAS`] of at
+    /// most [`MAX_VEHICLES`]).
+    pub fn new(cameras: &[usize]) -> Self {
+        let way = |&cameras: &usize| Way { cameras: cameras.min(MAX_CAMERAS), ..Way::default() };
+        let vehicles = cameras.iter().take(MAX_VEHICLES).map(way).collect();
         Self {
-            cameras: cameras.min(MAX_CAMERAS),
-            state: Mutex::default(),
+            state: Mutex::new(State { vehicles, closed: false }),
             changed: Condvar::new(),
             buffers: Mutex::default(),
         }
     }
 
-    /// Lets images flow to session `id`, at most `allowed` in flight per camera, in place of any
+    /// Lets images flow to session `id` of a vehicle, at most `allowed` in flight per camera, in place of any
     /// earlier session. The channel holds no more than that, for the count bounds it.
-    pub fn open(&self, id: u64, allowed: u32) -> mpsc::UnboundedReceiver<Outgoing> {
+    pub fn open(&self, vehicle: usize, id: u64, allowed: u32) -> mpsc::UnboundedReceiver<Outgoing> {
         let (images, receiver) = mpsc::unbounded_channel();
-        self.lock().session = Some(Session { id, allowed, in_flight: [0; MAX_CAMERAS], images });
+        let session = Session { id, allowed, in_flight: [0; MAX_CAMERAS], images };
+        self.lock().vehicles[vehicle].session = Some(session);
         self.changed.notify_all();
         receiver
     }
 
-    /// Stops the flow to session `id`.
-    pub fn close(&self, id: u64) {
-        let mut state = self.lock();
-        if state.session.as_ref().is_some_and(|session| session.id == id) {
-            state.session = None;
-        }
+    /// Stops the flow to session `id` of a vehicle.
+    pub fn close(&self, vehicle: usize, id: u64) {
+        self.lock().vehicles[vehicle].session.take_if(|session| session.id == id);
     }
 
-    /// Sets how many images of each camera session `id` may have in flight.
-    pub fn allow(&self, id: u64, allowed: u32) {
-        if let Some(session) = self.lock().session.as_mut().filter(|session| session.id == id) {
+    /// Sets how many images of each camera session `id` of a vehicle may have in flight.
+    pub fn allow(&self, vehicle: usize, id: u64, allowed: u32) {
+        if let Some(session) = self.lock().vehicles[vehicle].session(id) {
             session.allowed = allowed;
         }
         self.changed.notify_all();
@@ -102,7 +123,7 @@ impl Outlet {
     /// Hands an image to the session; returns whether there is one.
     pub fn send(&self, image: Outgoing) -> bool {
         let mut state = self.lock();
-        let refused = match &mut state.session {
+        let refused = match &mut state.vehicles[image.vehicle].session {
             Some(session) => {
                 session.in_flight[image.camera] += 1;
                 session.images.send(image).err().map(|error| error.0)
@@ -119,9 +140,9 @@ impl Outlet {
         }
     }
 
-    /// Tells that an image of session `id` is no longer in flight.
-    pub fn landed(&self, id: u64, camera: usize) {
-        if let Some(session) = self.lock().session.as_mut().filter(|session| session.id == id) {
+    /// Tells that an image of session `id` of a vehicle is no longer in flight.
+    pub fn landed(&self, vehicle: usize, id: u64, camera: usize) {
+        if let Some(session) = self.lock().vehicles[vehicle].session(id) {
             session.in_flight[camera] = session.in_flight[camera].saturating_sub(1);
         }
         self.changed.notify_all();
@@ -143,32 +164,35 @@ impl Outlet {
         }
     }
 
-    /// Counts a viewer of the page until [`Self::viewer_left`].
-    pub fn viewer_came(&self) {
-        self.lock().viewers += 1;
+    /// Counts a viewer of a vehicle's page until [`Self::viewer_left`].
+    pub fn viewer_came(&self, vehicle: usize) {
+        self.lock().vehicles[vehicle].viewers += 1;
         self.changed.notify_all();
     }
 
     /// Counts a viewer out.
-    pub fn viewer_left(&self) {
-        let mut state = self.lock();
-        state.viewers = state.viewers.saturating_sub(1);
+    pub fn viewer_left(&self, vehicle: usize) {
+        let viewers = &mut self.lock().vehicles[vehicle].viewers;
+        *viewers = viewers.saturating_sub(1);
     }
 
-    /// Returns the number of viewers.
+    /// Returns the number of viewers of all vehicles.
     pub fn viewers(&self) -> u32 {
-        self.lock().viewers
+        self.lock().vehicles.iter().map(|way| way.viewers).sum()
     }
 
-    /// Waits at most `timeout` until someone wants images; returns whether someone does.
-    pub fn wait_for_interest(&self, timeout: Duration) -> bool {
-        let interested =
-            |state: &mut State| !state.closed && state.session.is_none() && state.viewers == 0;
+    /// Waits at most `timeout` until someone wants images; returns of which vehicles.
+    pub fn wait_for_interest(&self, timeout: Duration) -> [bool; MAX_VEHICLES] {
+        let idle = |state: &mut State| !state.closed && !state.vehicles.iter().any(Way::is_wanted);
         let (state, _) = self
             .changed
-            .wait_timeout_while(self.lock(), timeout, interested)
+            .wait_timeout_while(self.lock(), timeout, idle)
             .unwrap_or_else(PoisonError::into_inner);
-        !state.closed && (state.session.is_some() || state.viewers > 0)
+        let mut wanted = [false; MAX_VEHICLES];
+        for (wanted, way) in wanted.iter_mut().zip(&state.vehicles) {
+            *wanted = !state.closed && way.is_wanted();
+        }
+        wanted
     }
 
     /// Waits at most `timeout` until an image may be encoded: the session has room for one, or a
@@ -178,17 +202,19 @@ impl Outlet {
         let mut state = self.lock();
         loop {
             let now = Instant::now();
-            let mut wanted =
-                Wanted { preview: state.viewers > 0 && now >= preview_due, ..Wanted::default() };
-            if let Some(session) = &state.session {
-                for camera in 0..self.cameras {
-                    wanted.stream[camera] = session.in_flight[camera] < session.allowed;
+            let (mut wanted, mut viewed) = (Wanted::default(), false);
+            for (vehicle, way) in state.vehicles.iter().enumerate() {
+                viewed |= way.viewers > 0;
+                wanted.preview[vehicle] = way.viewers > 0 && now >= preview_due;
+                let Some(session) = &way.session else { continue };
+                for camera in 0..way.cameras {
+                    wanted.stream[vehicle][camera] = session.in_flight[camera] < session.allowed;
                 }
             }
             if state.closed || wanted.anything() || now >= deadline {
                 return if state.closed { Wanted::default() } else { wanted };
             }
-            let until = if state.viewers > 0 { deadline.min(preview_due) } else { deadline };
+            let until = if viewed { deadline.min(preview_due) } else { deadline };
             let left = until.saturating_duration_since(now);
             state =
                 self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
@@ -233,58 +259,58 @@ mod tests {
             &Pose::IDENTITY,
             &Pose::IDENTITY,
         );
-        Outgoing { camera, header, payload: outlet.buffer() }
+        Outgoing { vehicle: 0, camera, header, payload: outlet.buffer() }
     }
 
     #[test]
     fn at_most_k_images_of_each_camera_are_in_flight() {
-        let outlet = Outlet::new(2);
+        let outlet = Outlet::new(&[2]);
         assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
-        let mut images = outlet.open(7, 2);
+        let mut images = outlet.open(0, 7, 2);
         assert!(outlet.send(image(&outlet, 0)));
         assert!(outlet.send(image(&outlet, 0)));
         let wanted = outlet.wait_for_room(far(), LONG);
-        assert_eq!(wanted.stream[..2], [false, true], "camera 1 is not held up by camera 0");
+        assert_eq!(wanted.stream[0][..2], [false, true], "camera 1 is not held up by camera 0");
         outlet.send(image(&outlet, 1));
         outlet.send(image(&outlet, 1));
         assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
         assert_eq!(images.try_recv().unwrap().camera, 0);
-        outlet.landed(7, 0);
-        assert_eq!(outlet.wait_for_room(far(), LONG).stream[..2], [true, false]);
-        outlet.allow(7, 3);
-        assert_eq!(outlet.wait_for_room(far(), LONG).stream[..2], [true, true]);
+        outlet.landed(0, 7, 0);
+        assert_eq!(outlet.wait_for_room(far(), LONG).stream[0][..2], [true, false]);
+        outlet.allow(0, 7, 3);
+        assert_eq!(outlet.wait_for_room(far(), LONG).stream[0][..2], [true, true]);
     }
 
     #[test]
     fn an_old_session_does_not_disturb_a_new_one() {
-        let outlet = Outlet::new(1);
-        let _old = outlet.open(1, 1);
+        let outlet = Outlet::new(&[1]);
+        let _old = outlet.open(0, 1, 1);
         outlet.send(image(&outlet, 0));
-        let _new = outlet.open(2, 1);
+        let _new = outlet.open(0, 2, 1);
         outlet.send(image(&outlet, 0));
-        outlet.landed(1, 0);
-        outlet.close(1);
+        outlet.landed(0, 1, 0);
+        outlet.close(0, 1);
         assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
-        outlet.landed(2, 0);
-        assert!(outlet.wait_for_room(far(), LONG).stream[0]);
-        outlet.close(2);
+        outlet.landed(0, 2, 0);
+        assert!(outlet.wait_for_room(far(), LONG).stream[0][0]);
+        outlet.close(0, 2);
         assert!(!outlet.send(image(&outlet, 0)));
     }
 
     #[test]
     fn previews_wait_for_a_viewer_and_for_their_time() {
-        let outlet = Outlet::new(1);
-        assert!(!outlet.wait_for_interest(NOT_YET));
-        outlet.viewer_came();
-        assert!(outlet.wait_for_interest(LONG));
-        assert!(!outlet.wait_for_room(far(), NOT_YET).preview);
+        let outlet = Outlet::new(&[1]);
+        assert!(!outlet.wait_for_interest(NOT_YET)[0]);
+        outlet.viewer_came(0);
+        assert!(outlet.wait_for_interest(LONG)[0]);
+        assert!(!outlet.wait_for_room(far(), NOT_YET).preview[0]);
         let soon = Instant::now() + Duration::from_millis(5);
-        assert!(outlet.wait_for_room(soon, LONG).preview);
-        outlet.viewer_left();
-        assert!(!outlet.wait_for_room(soon, NOT_YET).preview);
-        outlet.viewer_came();
+        assert!(outlet.wait_for_room(soon, LONG).preview[0]);
+        outlet.viewer_left(0);
+        assert!(!outlet.wait_for_room(soon, NOT_YET).preview[0]);
+        outlet.viewer_came(0);
         outlet.shut();
-        assert!(!outlet.wait_for_interest(LONG));
+        assert!(!outlet.wait_for_interest(LONG)[0]);
         assert_eq!(outlet.wait_for_room(soon, LONG), Wanted::default());
     }
 }

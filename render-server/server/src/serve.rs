@@ -22,6 +22,7 @@ use crate::scene::{self, Scene};
 use crate::stats::Report;
 use crate::stop::Stop;
 use crate::transport::{self, Identity};
+use crate::vehicle::Vehicle;
 use crate::{dashboard, encode, tick};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
@@ -85,7 +86,8 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     let Chosen { rasterizer, reason } = twin.renderer;
     let renderer = RendererInfo { name: rasterizer.name(), reason };
     let cameras = Cameras::new(twin.arena.cameras.clone());
-    let hub = Arc::new(Hub::new(&args.vehicle, twin.arena.info(), cameras, renderer, stop.clone()));
+    let vehicle = Vehicle::new(0, &args.vehicle, twin.arena.info(), cameras);
+    let hub = Arc::new(Hub::new(vec![vehicle], renderer, stop.clone()));
     let renderer = lock(&hub.renderer).clone();
     let threads = start_threads(args, &hub, rasterizer, twin.referee, vicon)?;
 
@@ -117,7 +119,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         // A thread that panicked has said so on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
-    report(args.json, &hub.stats.report(*lock(&hub.source), &lock(&hub.renderer)));
+    report(args.json, &hub.report());
     Ok(())
 }
 
@@ -184,12 +186,13 @@ fn start_threads(
 }
 
 async fn print_events(hub: Arc<Hub>, json: bool) {
-    let mut log = hub.events.subscribe();
+    let vehicle = &hub.vehicles[0];
+    let mut log = vehicle.events.subscribe();
     log.mark_changed();
     let mut cursor = 0;
     while log.changed().await.is_ok() {
         log.mark_unchanged();
-        let entries = match hub.events.read(&mut cursor) {
+        let entries = match vehicle.events.read(&mut cursor) {
             Ok(entries) => entries,
             Err(lagged) => {
                 cursor = lagged.oldest;

@@ -11,6 +11,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::drivers::SourceCounters;
 use crate::hub::RendererInfo;
+use crate::vehicle::ImageCounters;
 
 /// Everything measured; shared by all threads.
 #[derive(Debug, Default)]
@@ -27,12 +28,6 @@ pub struct Stats {
     pub ticks: AtomicU64,
     /// Ticks drawn that no one took before the next.
     pub ticks_skipped: AtomicU64,
-    /// Images that a runtime acknowledged.
-    pub images_sent: AtomicU64,
-    /// Images reset past their deadline or refused by the runtime.
-    pub images_late: AtomicU64,
-    /// Bytes of images acknowledged.
-    pub bytes_sent: AtomicU64,
 }
 
 /// Durations of one stage.
@@ -181,8 +176,16 @@ pub struct Report {
 }
 
 impl Stats {
-    /// Returns the report over the whole run.
-    pub fn report(&self, source: SourceCounters, renderer: &RendererInfo) -> Report {
+    /// Returns the report over the whole run; `images` are those of all vehicles.
+    pub fn report(
+        &self,
+        images: &[&ImageCounters],
+        source: SourceCounters,
+        renderer: &RendererInfo,
+    ) -> Report {
+        let total = |counter: fn(&ImageCounters) -> &AtomicU64| -> u64 {
+            images.iter().map(|images| counter(images).load(Ordering::Relaxed)).sum()
+        };
         let (render, encode, send) =
             (self.render.overall(), self.encode.overall(), self.send.overall());
         Report {
@@ -194,9 +197,9 @@ impl Stats {
             send_ms_p99: send.p99,
             ticks: self.ticks.load(Ordering::Relaxed),
             ticks_skipped: self.ticks_skipped.load(Ordering::Relaxed),
-            images_sent: self.images_sent.load(Ordering::Relaxed),
-            images_late: self.images_late.load(Ordering::Relaxed),
-            sent_mb: self.bytes_sent.load(Ordering::Relaxed) as f64 / 1e6,
+            images_sent: total(|images| &images.sent),
+            images_late: total(|images| &images.late),
+            sent_mb: total(|images| &images.bytes) as f64 / 1e6,
             source,
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
             renderer: renderer.name.clone(),

@@ -35,7 +35,8 @@ pub fn poses(
     mut referee: Referee,
     newest: &Mailbox<Option<PoseSample>>,
 ) {
-    let mut flights = hub.flights();
+    let vehicle = &*hub.vehicles[0];
+    let mut flights = vehicle.flights();
     let (mut rejected, mut warned) = (0u64, None::<Instant>);
     while !hub.stop.is_set() {
         let due = referee.poll_timeout().map_or(PATIENCE, |due| {
@@ -46,7 +47,7 @@ pub fn poses(
         // old by now but followed by a newer one, and that is not a lost pose.
         let mut judged_at = clock::now();
         // A new runtime on the ground is a new flight: course and timer start afresh.
-        let now_flights = hub.flights();
+        let now_flights = vehicle.flights();
         if now_flights != flights {
             flights = now_flights;
             referee.restart();
@@ -56,9 +57,9 @@ pub fn poses(
             match referee.handle_measurement(measured.stamp, measured.world_from_body) {
                 Ok(sample) => {
                     judged_at = sample.stamp;
-                    hub.pose.send_replace(Some(sample));
+                    vehicle.pose.send_replace(Some(sample));
                     newest.put(Some(sample));
-                    lock(&hub.trail).add(&sample);
+                    lock(&vehicle.trail).add(&sample);
                 }
                 Err(reason) => {
                     rejected += 1;
@@ -70,7 +71,7 @@ pub fn poses(
                     if !same && warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
                         warned = Some(Instant::now());
                         warn!("{reason}");
-                        hub.note(&reason.to_string());
+                        vehicle.note(&reason.to_string());
                     }
                 }
             }
@@ -78,11 +79,11 @@ pub fn poses(
         }
         referee.handle_timeout(judged_at);
         while let Some(event) = referee.poll_event() {
-            hub.log(Origin::Server, event);
+            vehicle.log(Origin::Server, event);
         }
         while let Some(warning) = source.next_warning() {
             warn!("{warning}");
-            hub.note(&warning);
+            vehicle.note(&warning);
         }
         *lock(&hub.source) = SourceCounters { rejected, ..source.counters() };
     }
@@ -99,16 +100,17 @@ pub fn draw(
     drawn: &Mailbox<DrawnTick>,
     max_rate_hz: f64,
 ) {
+    let vehicle = &*hub.vehicles[0];
     let mut schedule = Schedule::new(max_rate_hz, Instant::now());
     let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_CAMERAS);
     // The renderer wants the images of the cameras that are due side by side.
     let mut images: Vec<RgbdImage> = Vec::new();
     let (mut seq, mut refused) = (0u64, false);
     while !hub.stop.is_set() {
-        if !hub.outlet.wait_for_interest(PATIENCE) {
+        if !hub.outlet.wait_for_interest(PATIENCE).contains(&true) {
             continue;
         }
-        let next = schedule.next(&hub.cameras.newest().configs, Instant::now());
+        let next = schedule.next(&vehicle.cameras.newest().configs, Instant::now());
         if let Some(early) = next.checked_duration_since(Instant::now()) {
             std::thread::sleep(early.min(PATIENCE));
             if early > PATIENCE {
@@ -116,7 +118,7 @@ pub fn draw(
             }
         }
         let Some(Some(sample)) = newest.take(PATIENCE) else { continue };
-        let set = hub.cameras.newest();
+        let set = vehicle.cameras.newest();
         let due = schedule.take(&set.configs, Instant::now());
         seq += 1;
         let span = trace_span!("tick", seq, stamp_ns = sample.stamp.as_ns()).entered();
@@ -138,7 +140,8 @@ pub fn draw(
             slot.seq = seq;
             slot.pose = sample.stamp;
             slot.world_from_body = Some(sample.world_from_body);
-            slot.camera = Some((set.clone(), index));
+            (slot.vehicle, slot.camera) = (vehicle.index, index);
+            slot.set = Some(set.clone());
             images.resize_with(images.len().max(cameras.len()), Default::default);
             std::mem::swap(&mut images[cameras.len() - 1], &mut slot.image);
         }
@@ -177,7 +180,9 @@ fn note_renderer(hub: &Hub, renderer: &dyn Rasterizer) {
         let text = format!("the renderer is now {name}");
         *info = RendererInfo { name, reason: "took over in flight".to_owned() };
         drop(info);
-        hub.tell(EventKind::Note, &text);
+        for vehicle in &hub.vehicles {
+            vehicle.tell(EventKind::Note, &text);
+        }
     }
 }
 

@@ -16,7 +16,7 @@ use crate::cameras::ChangeError;
 
 /// Answers with all cameras.
 pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
-    let set = page.hub.cameras.newest();
+    let set = page.hub.vehicles[0].cameras.newest();
     Json(set.configs.iter().map(messages::camera_keys).collect::<Vec<_>>()).into_response()
 }
 
@@ -27,7 +27,7 @@ pub(super) async fn put(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    change(&page, &headers, body, |json| page.hub.cameras.put(&name, json))
+    change(&page, &headers, body, |json| page.hub.vehicles[0].cameras.put(&name, json))
 }
 
 /// Changes a camera.
@@ -37,7 +37,7 @@ pub(super) async fn patch(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    change(&page, &headers, body, |json| page.hub.cameras.patch(&name, json))
+    change(&page, &headers, body, |json| page.hub.vehicles[0].cameras.patch(&name, json))
 }
 
 fn change(
@@ -53,12 +53,12 @@ fn change(
         Ok(body) => body,
         Err(rejection) => return rejection.into_response(),
     };
-    let before = page.hub.cameras.newest();
+    let before = page.hub.vehicles[0].cameras.newest();
     match apply(&body) {
         Ok(camera) => {
             // The same again is no news.
-            if !Arc::ptr_eq(&before, &page.hub.cameras.newest()) {
-                page.hub.tell(EventKind::Note, &describe(&camera));
+            if !Arc::ptr_eq(&before, &page.hub.vehicles[0].cameras.newest()) {
+                page.hub.vehicles[0].tell(EventKind::Note, &describe(&camera));
             }
             Json(messages::camera_keys(&camera)).into_response()
         }

@@ -128,18 +128,19 @@ pub(crate) struct Rates {
 }
 
 pub(super) fn arena(page: &Page) -> Message<'_> {
-    let info = &page.hub.arena;
+    let vehicle = &page.hub.vehicles[0];
+    let info = &vehicle.arena;
     Message::Arena(Arena {
         boot: page.boot.as_ns().to_string(),
         name: &info.name,
-        vehicle: &page.hub.vehicle,
+        vehicle: &vehicle.name,
         fence: &info.geofence,
         goal_m: info.goal_m.map(|goal| goal.to_array()),
         goal_radius_m: info.goal_radius_m,
         body_radius_m: info.body_radius_m,
         max_speed_mps: info.limits.max_speed_mps,
         time_limit_s: info.time_limit_s,
-        cameras: camera_lines(&page.hub.cameras.newest()),
+        cameras: camera_lines(&vehicle.cameras.newest()),
         map_min_m: page.map.min_m,
         map_max_m: page.map.max_m,
         obstacles: &page.map.obstacles,
@@ -187,31 +188,32 @@ pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
 
 pub(super) fn state(page: &Page) -> Message<'static> {
     let hub = &page.hub;
+    let vehicle = &hub.vehicles[0];
     let now = clock::now();
-    let flight = hub.flight();
+    let flight = vehicle.flight();
     let source = *lock(&hub.source);
     let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
     let stats = &hub.stats;
     Message::State(Box::new(State {
-        pose: (*hub.pose.borrow()).map(|sample| PoseLine {
+        pose: (*vehicle.pose.borrow()).map(|sample| PoseLine {
             p_world_m: sample.world_from_body.translation_m.to_array(),
             yaw_rad: yaw_of(sample.world_from_body.rotation),
             v_world_mps: sample.twist.linear_mps.to_array(),
             age_s: now.seconds_since(sample.stamp),
         }),
-        runtime: hub.runtime().map(|runtime| RuntimeLine {
+        runtime: vehicle.runtime().map(|runtime| RuntimeLine {
             address: runtime.address.to_string(),
             program: runtime.program.as_str().to_owned(),
         }),
-        report: hub.telemetry.borrow().clone(),
+        report: vehicle.telemetry.borrow().clone(),
         render: stats.render.recent(),
         encode: stats.encode.recent(),
         send: stats.send.recent(),
         renderer: lock(&hub.renderer).clone(),
         render_hz: page.rates.ticks.of(total(&stats.ticks), now),
-        stream_hz: page.rates.images.of(total(&stats.images_sent), now),
-        stream_mbit_s: page.rates.bytes.of(total(&stats.bytes_sent), now) * 8e-6,
-        images_late: total(&stats.images_late),
+        stream_hz: page.rates.images.of(total(&vehicle.images.sent), now),
+        stream_mbit_s: page.rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
+        images_late: total(&vehicle.images.late),
         source,
         source_hz: page.rates.poses.of(source.poses, now),
         flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),

@@ -120,7 +120,7 @@ async fn estop(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
-    if page.hub.emergency_stop("the page") {
+    if page.hub.vehicles[0].emergency_stop("the page") {
         (StatusCode::ACCEPTED, "the runtime lands the vehicle").into_response()
     } else {
         (StatusCode::CONFLICT, "no runtime is connected: nobody to land the vehicle")

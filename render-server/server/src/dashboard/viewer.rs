@@ -19,14 +19,14 @@ struct Presence<'a>(&'a Page);
 
 impl<'a> Presence<'a> {
     fn new(page: &'a Page) -> Self {
-        page.hub.outlet.viewer_came();
+        page.hub.outlet.viewer_came(0);
         Self(page)
     }
 }
 
 impl Drop for Presence<'_> {
     fn drop(&mut self) {
-        self.0.hub.outlet.viewer_left();
+        self.0.hub.outlet.viewer_left(0);
     }
 }
 
@@ -47,7 +47,7 @@ pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
 
 /// Returns `None` when the viewer is gone.
 async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
-    let hub = &page.hub;
+    let hub = &page.hub.vehicles[0];
     let mut log = hub.events.subscribe();
     let mut cameras = hub.cameras.subscribe();
     let (entries, mut cursor) = hub.events.newest(HISTORY);

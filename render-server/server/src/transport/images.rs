@@ -20,20 +20,28 @@ use crate::clock;
 use crate::hub::Hub;
 use crate::outlet::Outgoing;
 use crate::stats::Rate;
+use crate::vehicle::Vehicle;
 
 /// The way of images to one session; closes the outlet when dropped.
 pub(super) struct Lane {
     hub: Arc<Hub>,
+    vehicle: Arc<Vehicle>,
     connection: Connection,
     id: u64,
     images: mpsc::UnboundedReceiver<Outgoing>,
 }
 
 impl Lane {
-    /// Opens the outlet for session `id`.
-    pub(super) fn open(hub: Arc<Hub>, connection: Connection, id: u64) -> Self {
-        let images = hub.outlet.open(id, in_flight(connection.min_rtt(), USUAL_RATE_HZ));
-        Self { hub, connection, id, images }
+    /// Opens the outlet of `vehicle` for its session `id`.
+    pub(super) fn open(
+        hub: Arc<Hub>,
+        vehicle: Arc<Vehicle>,
+        connection: Connection,
+        id: u64,
+    ) -> Self {
+        let allowed = in_flight(connection.min_rtt(), USUAL_RATE_HZ);
+        let images = hub.outlet.open(vehicle.index, id, allowed);
+        Self { hub, vehicle, connection, id, images }
     }
 
     /// Sends images until the connection ends.
@@ -46,8 +54,8 @@ impl Lane {
             tokio::select! {
                 image = self.images.recv() => match image {
                     Some(image) => {
-                        let (hub, connection) = (self.hub.clone(), self.connection.clone());
-                        sending.spawn(send(hub, connection, self.id, image));
+                        let (hub, vehicle) = (self.hub.clone(), self.vehicle.clone());
+                        sending.spawn(send(hub, vehicle, self.connection.clone(), self.id, image));
                     }
                     None => return (END, "images go to another session".to_owned()),
                 },
@@ -55,7 +63,8 @@ impl Lane {
                 _ = every_second.tick() => {
                     let ticks = self.hub.stats.ticks.load(Ordering::Relaxed);
                     let hz = rate.of(ticks, clock::now()).max(USUAL_RATE_HZ);
-                    self.hub.outlet.allow(self.id, in_flight(self.connection.min_rtt(), hz));
+                    let allowed = in_flight(self.connection.min_rtt(), hz);
+                    self.hub.outlet.allow(self.vehicle.index, self.id, allowed);
                 }
             }
         }
@@ -64,7 +73,7 @@ impl Lane {
 
 impl Drop for Lane {
     fn drop(&mut self) {
-        self.hub.outlet.close(self.id);
+        self.hub.outlet.close(self.vehicle.index, self.id);
     }
 }
 
@@ -74,21 +83,27 @@ fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
     1 + (spanned as u32).clamp(1, MOST_IN_FLIGHT - 1)
 }
 
-async fn send(hub: Arc<Hub>, connection: Connection, session: u64, mut image: Outgoing) {
+async fn send(
+    hub: Arc<Hub>,
+    vehicle: Arc<Vehicle>,
+    connection: Connection,
+    session: u64,
+    mut image: Outgoing,
+) {
     let start = clock::now();
     image.header.send_ns = start.as_ns().into();
     let delivered = deliver(&connection, &[image.header.as_bytes(), &image.payload]).await;
     let end = clock::now();
     if delivered {
         hub.stats.send.add(start, end);
-        hub.stats.images_sent.fetch_add(1, Ordering::Relaxed);
-        hub.stats.bytes_sent.fetch_add(image.payload.len() as u64, Ordering::Relaxed);
+        vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
+        vehicle.images.bytes.fetch_add(image.payload.len() as u64, Ordering::Relaxed);
     } else {
-        hub.stats.images_late.fetch_add(1, Ordering::Relaxed);
+        vehicle.images.late.fetch_add(1, Ordering::Relaxed);
     }
     trace!(camera = image.camera, delivered, ms = end.seconds_since(start) * 1e3, "send");
     hub.outlet.recycle(image.payload);
-    hub.outlet.landed(session, image.camera);
+    hub.outlet.landed(vehicle.index, session, image.camera);
 }
 
 /// Sends `parts` on a stream of their own; returns whether all was acknowledged in time.

@@ -1,13 +1,15 @@
 //! QUIC to the runtime: one endpoint, one session per connection.
 //!
 //! ```text
-//! accept -> session: preambles, Hello -> Welcome | Refused
-//!        -> control stream: poses, events, clock down; telemetry, events, clock up
+//! accept -> greeting: preambles, Hello -> Welcome | Refused
+//!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
 //! ```
 //! Settings and figures: docs/BENCHMARKS.md.
 
 mod certificate;
+mod control;
+mod greeting;
 mod images;
 mod lan;
 mod session;
@@ -130,7 +132,7 @@ pub async fn serve(
                 Err(error) => Err(error),
             };
             match connection {
-                Ok(connection) => Box::pin(session::run(hub, connection)).await,
+                Ok(connection) => Box::pin(greeting::run(hub, connection)).await,
                 Err(error) => debug!("{address}: no connection: {error}"),
             }
         });

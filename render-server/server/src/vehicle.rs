@@ -1,0 +1,453 @@
+//! One vehicle: what a runtime is told of it, its cameras, its seat, and how its flight goes.
+//!
+//! ```text
+//! pose thread ----> pose (watch), trail, events ----> session, page
+//! encode ---------> previews (watch) ---------------> page
+//! session --------> telemetry (watch), events ------> page, pose thread (phase of flight)
+//! page -----------> events (stop button) -----------> session
+//! ```
+//! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard};
+
+use tokio::sync::{Notify, watch};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, bounded,
+};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::cameras::{CameraSet, Cameras};
+use crate::clock;
+use crate::encode::Preview;
+use crate::events::{EventLog, Origin};
+use crate::hub::lock;
+
+/// One vehicle in the arena.
+#[derive(Debug)]
+pub struct Vehicle {
+    /// Its place in [`Hub::vehicles`](crate::hub::Hub::vehicles).
+    pub index: usize,
+    /// The object in the localization system.
+    pub name: Name,
+    /// What the runtime gets to know; its cameras are those of the start, see [`Self::welcome`].
+    pub arena: ArenaInfo,
+    /// The cameras of this moment.
+    pub cameras: Cameras,
+    /// What happened to it.
+    pub events: EventLog,
+    /// The newest pose.
+    pub pose: watch::Sender<Option<PoseSample>>,
+    /// The runtime's newest report.
+    pub telemetry: watch::Sender<Option<Telemetry>>,
+    /// The newest previews, by camera.
+    pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
+    /// Where the vehicle was.
+    pub trail: Mutex<Trail>,
+    /// Its images on their way.
+    pub images: ImageCounters,
+    seat: Mutex<SeatState>,
+    flight: Mutex<Flight>,
+}
+
+/// What became of a vehicle's images.
+#[derive(Debug, Default)]
+pub struct ImageCounters {
+    /// Images that the runtime acknowledged.
+    pub sent: AtomicU64,
+    /// Images reset past their deadline or refused by the runtime.
+    pub late: AtomicU64,
+    /// Bytes of images acknowledged.
+    pub bytes: AtomicU64,
+}
+
+/// How the present flight goes.
+#[derive(Clone, Debug, Default)]
+pub struct Flight {
+    /// When the runtime first reported taking off.
+    pub took_off: Option<ServerTime>,
+    /// When it first reported having landed.
+    pub landed: Option<ServerTime>,
+    /// The event that decided it: the first that makes the guard land.
+    pub outcome: Option<Event>,
+}
+
+#[derive(Debug, Default)]
+struct SeatState {
+    sessions: u64,
+    taken: Option<RuntimeInfo>,
+    /// Index of the first event of the present flight.
+    flight_start: u64,
+    /// How many flights have begun; the pose thread starts its referee anew with each.
+    flights: u64,
+}
+
+/// The runtime that flies.
+#[derive(Clone, Debug)]
+pub struct RuntimeInfo {
+    /// Session number.
+    pub id: u64,
+    /// Where it is.
+    pub address: SocketAddr,
+    /// Which program.
+    pub program: Text,
+    heard_ns: Arc<AtomicU64>,
+    evicted: Arc<Notify>,
+}
+
+impl Vehicle {
+    /// Makes the state of a vehicle of which nothing has been heard yet.
+    pub fn new(index: usize, name: &str, arena: ArenaInfo, cameras: Cameras) -> Self {
+        let count = cameras.newest().configs.len();
+        Self {
+            index,
+            name: bounded(name),
+            arena,
+            cameras,
+            events: EventLog::default(),
+            pose: watch::Sender::new(None),
+            telemetry: watch::Sender::new(None),
+            previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
+            trail: Mutex::default(),
+            images: ImageCounters::default(),
+            seat: Mutex::default(),
+            flight: Mutex::default(),
+        }
+    }
+
+    /// Returns what a runtime is told of the arena, with the cameras `set`.
+    pub fn welcome(&self, set: &CameraSet) -> ArenaInfo {
+        ArenaInfo { cameras: set.infos.iter().cloned().collect(), ..self.arena.clone() }
+    }
+
+    /// Appends to the log what the server or the runtime noticed.
+    pub fn log(&self, origin: Origin, event: Event) {
+        self.judge(&event);
+        self.events.push(origin, event);
+    }
+
+    /// Notes what decides the flight: the first event of those that end one. A lost pose decides
+    /// only if nothing else does and it does not come back before the guard lands.
+    fn judge(&self, event: &Event) {
+        let phase = self.phase();
+        let under_way = self.under_way();
+        let mut flight = lock(&self.flight);
+        let provisional =
+            flight.outcome.as_ref().is_none_or(|e| matches!(e.kind, EventKind::PoseLost { .. }));
+        match event.kind {
+            EventKind::Collision { .. }
+            | EventKind::Geofence { .. }
+            | EventKind::Finished { .. }
+            | EventKind::TimeLimit
+            | EventKind::EmergencyStop
+            | EventKind::PluginFailed
+                if provisional =>
+            {
+                flight.outcome = Some(event.clone());
+            }
+            // On the ground a pose may come and go.
+            EventKind::PoseLost { .. } if under_way => {
+                flight.outcome.get_or_insert_with(|| event.clone());
+            }
+            EventKind::PoseRegained if provisional && phase != FlightPhase::Landing => {
+                flight.outcome = None;
+            }
+            _ => {}
+        }
+    }
+
+    /// Takes the runtime's report.
+    pub fn report(&self, report: Telemetry) {
+        let now = clock::now();
+        let phase = report.phase;
+        self.telemetry.send_replace(Some(report));
+        let mut flight = lock(&self.flight);
+        if self.under_way() {
+            flight.took_off.get_or_insert(now);
+        } else if phase == FlightPhase::Landed && flight.took_off.is_some() {
+            flight.landed.get_or_insert(now);
+        }
+    }
+
+    /// Returns how the present flight goes.
+    pub fn flight(&self) -> Flight {
+        lock(&self.flight).clone()
+    }
+
+    /// Logs something this server noticed; it goes to the runtime, the page and standard output.
+    pub fn tell(&self, kind: EventKind, text: &str) {
+        let event = Event { stamp: clock::now(), kind, text: bounded(text) };
+        self.log(Origin::Server, event);
+    }
+
+    /// Logs something for the page alone; the runtime has no use for it.
+    pub fn note(&self, text: &str) {
+        let event = Event { stamp: clock::now(), kind: EventKind::Note, text: bounded(text) };
+        self.log(Origin::Page, event);
+    }
+
+    /// Returns the phase of flight by the runtime's newest report.
+    pub fn phase(&self) -> FlightPhase {
+        self.telemetry.borrow().as_ref().map_or(FlightPhase::Connecting, |report| report.phase)
+    }
+
+    /// Returns the runtime that holds the seat.
+    pub fn runtime(&self) -> Option<RuntimeInfo> {
+        self.lock_seat().taken.clone()
+    }
+
+    /// Returns how many flights have begun: rises when a runtime takes the seat on the ground.
+    pub fn flights(&self) -> u64 {
+        self.lock_seat().flights
+    }
+
+    /// Presses the stop button; returns whether a runtime is there to obey.
+    pub fn emergency_stop(&self, by: &str) -> bool {
+        self.tell(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
+        self.runtime().is_some()
+    }
+
+    /// Gives the seat of the vehicle to a runtime.
+    ///
+    /// A runtime that has been silent for [`SILENT_S`] loses it to the newcomer: it is the same
+    /// one after an outage, or it is dead. If the former flight was under way, the newcomer is
+    /// told everything since that flight's start, so that no collision is lost with a connection.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn sit(self: &Arc<Self>, hello: &Hello, address: SocketAddr) -> Result<Seat, String> {
+        let now = clock::now();
+        let mut state = self.lock_seat();
+        if let Some(first) = &state.taken {
+            let heard = ServerTime::from_ns(first.heard_ns.load(Ordering::Relaxed));
+            if !(now.seconds_since(heard) > SILENT_S) {
+                return Err(format!(
+                    "vehicle '{}' is flown by {} at {}; stop that runtime first",
+                    self.name, first.program, first.address
+                ));
+            }
+            first.evicted.notify_one();
+        }
+        state.sessions += 1;
+        let resumed = self.under_way();
+        if !resumed {
+            state.flights += 1;
+            state.flight_start = self.events.next_index();
+            self.telemetry.send_replace(None);
+            lock(&self.trail).clear();
+            *lock(&self.flight) = Flight::default();
+        }
+        let info = RuntimeInfo {
+            id: state.sessions,
+            address,
+            program: hello.program.clone(),
+            heard_ns: Arc::new(AtomicU64::new(now.as_ns())),
+            evicted: Arc::new(Notify::new()),
+        };
+        state.taken = Some(info.clone());
+        Ok(Seat { vehicle: self.clone(), info, resumed, first_event: state.flight_start })
+    }
+
+    /// Whether a flight had begun and not ended when its runtime was last heard.
+    fn under_way(&self) -> bool {
+        use FlightPhase::{Flying, Holding, Landing, TakingOff};
+        matches!(self.phase(), TakingOff | Flying | Holding | Landing)
+    }
+
+    fn lock_seat(&self) -> MutexGuard<'_, SeatState> {
+        lock(&self.seat)
+    }
+}
+
+/// The right to fly the vehicle; given back when dropped.
+#[derive(Debug)]
+pub struct Seat {
+    /// Which vehicle.
+    pub vehicle: Arc<Vehicle>,
+    /// Who sits.
+    pub info: RuntimeInfo,
+    /// Whether the flight goes on after an outage.
+    pub resumed: bool,
+    /// The first event to tell.
+    pub first_event: u64,
+}
+
+impl Seat {
+    /// Notes that the runtime has been heard at `now`.
+    pub fn heard(&self, now: ServerTime) {
+        self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
+    }
+
+    /// Completes when a newcomer has taken the seat.
+    pub async fn evicted(&self) {
+        self.info.evicted.notified().await;
+    }
+}
+
+impl Drop for Seat {
+    fn drop(&mut self) {
+        let mut state = self.vehicle.lock_seat();
+        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
+            state.taken = None;
+        }
+    }
+}
+
+/// The path of the vehicle since the flight began, thinned so that it stays small for ever.
+#[derive(Debug)]
+pub struct Trail {
+    /// (x, y, z [m, world], speed [m/s]), oldest first.
+    pub points: Vec<[f32; 4]>,
+    spacing_m: f32,
+}
+
+impl Default for Trail {
+    fn default() -> Self {
+        Self { points: Vec::new(), spacing_m: LEAST_SPACING_M }
+    }
+}
+
+impl Trail {
+    /// Adds where the vehicle is, if it has moved enough.
+    pub fn add(&mut self, sample: &PoseSample) {
+        let p = sample.world_from_body.translation_m.as_vec3();
+        let far = self
+            .points
+            .last()
+            .is_none_or(|&[x, y, z, _]| p.distance(glam::Vec3::new(x, y, z)) >= self.spacing_m);
+        if !far {
+            return;
+        }
+        if self.points.len() >= MOST_POINTS {
+            let mut keep = false;
+            self.points.retain(|_| {
+                keep = !keep;
+                keep
+            });
+            self.spacing_m *= 2.0;
+        }
+        self.points.push([p.x, p.y, p.z, sample.twist.linear_mps.length() as f32]);
+    }
+
+    fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+/// Runtimes report ten times a second; ten reports missed are an outage. [s]
+const SILENT_S: f64 = 1.0;
+/// About the vehicle's radius. [m]
+const LEAST_SPACING_M: f32 = 0.05;
+/// 32 KB; 100 m of path at the finest spacing.
+const MOST_POINTS: usize = 2048;
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+    use vizflyt_protocol::geometry::{Pose, Twist, Volume};
+    use vizflyt_protocol::messages::Limits;
+
+    pub(crate) fn named(index: usize, name: &str) -> Vehicle {
+        let arena = ArenaInfo {
+            name: bounded("test"),
+            geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
+            limits: Limits { max_speed_mps: 1.0, max_acceleration_mps2: 1.0 },
+            body_radius_m: 0.1,
+            takeoff_height_m: 1.0,
+            goal_m: None,
+            goal_radius_m: 1.0,
+            time_limit_s: 0.0,
+            cameras: [].into_iter().collect(),
+        };
+        let cameras = Cameras::new(Vec::new());
+        Vehicle::new(index, name, arena, cameras)
+    }
+
+    fn vehicle() -> Arc<Vehicle> {
+        Arc::new(named(0, "vizflyt"))
+    }
+
+    fn hello() -> Hello {
+        Hello { vehicle: bounded("vizflyt"), program: bounded("runtime 0.1") }
+    }
+
+    fn address() -> SocketAddr {
+        "127.0.0.1:9".parse().unwrap()
+    }
+
+    #[test]
+    fn one_vehicle_has_one_runtime() {
+        let vehicle = vehicle();
+        let first = vehicle.sit(&hello(), address()).unwrap();
+        let refusal = vehicle.sit(&hello(), address()).unwrap_err();
+        assert_eq!(
+            refusal,
+            "vehicle 'vizflyt' is flown by runtime 0.1 at 127.0.0.1:9; stop that runtime first"
+        );
+        drop(first);
+        assert!(vehicle.runtime().is_none());
+        assert!(vehicle.sit(&hello(), address()).is_ok());
+    }
+
+    #[tokio::test]
+    async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
+        let vehicle = vehicle();
+        vehicle.tell(EventKind::Note, "before the flight");
+        let first = vehicle.sit(&hello(), address()).unwrap();
+        assert_eq!((first.first_event, first.resumed, vehicle.flights()), (1, false, 1));
+        vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
+        vehicle.tell(EventKind::EmergencyStop, "stop");
+        // As if it had last been heard two seconds ago.
+        first.heard(clock::now().plus_seconds(-2.0));
+        let second = vehicle.sit(&hello(), address()).unwrap();
+        first.evicted().await;
+        assert_eq!((second.first_event, second.resumed, vehicle.flights()), (1, true, 1));
+        drop(first);
+        assert_eq!(vehicle.runtime().map(|runtime| runtime.id), Some(second.info.id));
+        drop(second);
+        // After the landing the next runtime begins a new flight.
+        assert!(vehicle.flight().outcome.is_some_and(|event| event.text == "stop"));
+        vehicle.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
+        let third = vehicle.sit(&hello(), address()).unwrap();
+        assert_eq!((third.first_event, third.resumed, vehicle.flights()), (2, false, 2));
+        assert!(vehicle.flight().outcome.is_none() && vehicle.telemetry.borrow().is_none());
+    }
+
+    #[test]
+    fn the_first_decisive_event_is_the_outcome_and_a_lost_pose_only_if_it_stays_lost() {
+        let vehicle = vehicle();
+        let outcome = || vehicle.flight().outcome.map(|event| event.text.as_str().to_owned());
+        let lost = EventKind::PoseLost { age_s: 0.2 };
+        vehicle.tell(lost.clone(), "on the ground");
+        assert_eq!(outcome(), None);
+        vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
+        vehicle.tell(lost.clone(), "a hiccup");
+        assert_eq!(outcome().as_deref(), Some("a hiccup"));
+        vehicle.tell(EventKind::PoseRegained, "back");
+        assert_eq!(outcome(), None);
+        vehicle.tell(lost.clone(), "lost");
+        vehicle.tell(EventKind::Finished { seconds: 9.0 }, "goal");
+        vehicle.tell(EventKind::EmergencyStop, "later");
+        vehicle.tell(lost, "later still");
+        assert_eq!(outcome().as_deref(), Some("goal"));
+    }
+
+    #[test]
+    fn a_trail_keeps_its_ends_and_stays_small() {
+        let mut trail = Trail::default();
+        for k in 0..20_000 {
+            trail.add(&PoseSample {
+                stamp: ServerTime::ZERO,
+                world_from_body: Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY),
+                twist: Twist::default(),
+                resets: 0,
+            });
+        }
+        assert!(trail.points.len() <= MOST_POINTS);
+        assert_eq!(trail.points[0][0], 0.0);
+        assert!(trail.points.last().unwrap()[0] > 398.0);
+        assert!(trail.points.is_sorted_by(|a, b| a[0] < b[0]));
+    }
+}
