@@ -1,6 +1,7 @@
 //! Blocks of residuals to and from bits, 16 columns at a time.
 
-use super::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS, simd};
+use super::simd::Kernel;
+use super::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS};
 use crate::bits::{BitReader, BitWriter};
 
 /// One bit stream per column of a block: 16 lanes.
@@ -32,27 +33,32 @@ impl Shape {
         (shape.low + shape.high <= 16).then_some(shape)
     }
 
-    /// Returns the cheapest shape of a block, given how many of its residuals have more bits than
-    /// each of 0 to 15; of equals, the one with the most low bits.
+    /// Returns the cheapest shape of a block of residuals, and which of them have high bits; of
+    /// equals, the shape with the most low bits. `top` is the length of the longest residual, and
+    /// `longer` tells, called for `top - 1` low bits and then ever fewer, which have more.
     #[inline(always)]
-    pub(super) fn cheapest(longer_than: impl Fn(usize) -> u32) -> Self {
-        let mut top = 16;
-        while top > 0 && longer_than(top - 1) == 0 {
-            top -= 1;
-        }
+    pub(super) fn cheapest(top: u32, mut longer: impl FnMut(u32) -> u64) -> (Self, u64) {
         // 16 low bits have no code; 15 and one high bit do.
-        let mut best =
-            if top == 16 { Self { low: 15, high: 1 } } else { Self { low: top as u32, high: 0 } };
-        let mut best_bits = if top == 16 { u32::MAX } else { (BLOCK_PIXELS * top) as u32 };
-        for low in (0..top).rev().take(15) {
-            let high = (top - low) as u32;
-            let bits = (BLOCK_PIXELS * (low + 1)) as u32 + longer_than(low) * high;
+        let (mut best, mut best_bits) = if top == 16 {
+            (Self { low: 15, high: 1 }, u32::MAX)
+        } else {
+            (Self { low: top, high: 0 }, BLOCK_PIXELS as u32 * top)
+        };
+        let mut best_mask = 0;
+        // High bits have a width of 15 at most.
+        for low in (top.saturating_sub(15)..top).rev() {
+            let mask = longer(low);
+            let (count, high) = (mask.count_ones(), top - low);
+            let bits = BLOCK_PIXELS as u32 * (low + 1) + count * high;
             if bits < best_bits {
-                best_bits = bits;
-                best = Self { low: low as u32, high };
+                (best, best_bits, best_mask) = (Self { low, high }, bits, mask);
+            }
+            // With fewer low bits all have high ones too, which is never cheaper.
+            if count == BLOCK_PIXELS as u32 {
+                break;
             }
         }
-        best
+        (best, best_mask)
     }
 }
 
@@ -92,17 +98,12 @@ impl Packer {
 
     /// Adds a block; returns its shape.
     #[inline(always)]
-    pub(super) fn push_block(&mut self, block: &Block) -> Shape {
-        let longer = simd::longer_than(block);
-        let shape = Shape::cheapest(|bits| longer[bits].count_ones());
+    pub(super) fn push_block<K: Kernel>(&mut self, block: &Block) -> Shape {
+        let (shape, mut mask) = K::cheapest(block);
         if shape.low > 0 {
-            let kept = u16::MAX >> (16 - shape.low);
-            for row in block {
-                self.push(&row.map(|value| value & kept), shape.low);
-            }
+            self.push_low(block, shape.low);
         }
         if shape.high > 0 {
-            let mut mask = longer[shape.low as usize];
             self.masks.extend_from_slice(&mask.to_le_bytes());
             let values = block.as_flattened();
             while mask != 0 {
@@ -115,39 +116,41 @@ impl Packer {
     }
 
     #[inline(always)]
-    fn push(&mut self, value: &Lanes, width_bits: u32) {
-        for lane in 0..BLOCK_COLUMNS {
-            self.open[lane] |= value[lane] << self.used;
-        }
-        let used = self.used + width_bits;
-        if used < 16 {
-            self.used = used;
-            return;
-        }
-        self.flush();
-        self.used = used - 16;
-        if self.used > 0 {
-            // What did not fit: the upper `used - 16` bits, so the shift is 1 to 15.
+    fn push_low(&mut self, block: &Block, width_bits: u32) {
+        let kept = u16::MAX >> (16 - width_bits);
+        // In locals, so that they stay in registers from row to row.
+        let (mut open, mut used) = (self.open, self.used);
+        for row in block {
+            let value = row.map(|value| value & kept);
             for lane in 0..BLOCK_COLUMNS {
-                self.open[lane] = value[lane] >> (width_bits - self.used);
+                open[lane] |= value[lane] << used;
+            }
+            used += width_bits;
+            if used >= 16 {
+                self.flush(&open);
+                used -= 16;
+                // What did not fit: the upper `used` bits.
+                let spent = width_bits - used;
+                open = value.map(|lane| lane >> spent);
             }
         }
+        (self.open, self.used) = (open, used);
     }
 
     #[inline(always)]
-    fn flush(&mut self) {
+    fn flush(&mut self, open: &Lanes) {
         let room = &mut self.low[self.low_len..self.low_len + LANES_BYTES];
         for lane in 0..BLOCK_COLUMNS {
-            room[2 * lane..2 * lane + 2].copy_from_slice(&self.open[lane].to_le_bytes());
+            room[2 * lane..2 * lane + 2].copy_from_slice(&open[lane].to_le_bytes());
         }
         self.low_len += LANES_BYTES;
-        self.open = [0; BLOCK_COLUMNS];
     }
 
     /// Appends all bits to `out`: low ones, masks, high ones.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         if self.used > 0 {
-            self.flush();
+            let open = self.open;
+            self.flush(&open);
         }
         out.extend_from_slice(&self.low[..self.low_len]);
         out.extend_from_slice(&self.masks);
@@ -179,10 +182,13 @@ impl<'a> Unpacker<'a> {
         stride: usize,
         column: usize,
     ) {
-        for row in 0..BLOCK_ROWS {
-            let at = row * stride + column;
-            let value = if shape.low == 0 { [0; BLOCK_COLUMNS] } else { self.pop(shape.low) };
-            rows[at..at + BLOCK_COLUMNS].copy_from_slice(&value);
+        if shape.low == 0 {
+            for row in 0..BLOCK_ROWS {
+                let at = row * stride + column;
+                rows[at..at + BLOCK_COLUMNS].fill(0);
+            }
+        } else {
+            self.pop_low(shape.low, rows, stride, column);
         }
         if shape.high > 0 {
             let (mask, rest) = self.masks.split_first_chunk().unwrap_or((&[0; 8], &[]));
@@ -198,34 +204,35 @@ impl<'a> Unpacker<'a> {
     }
 
     #[inline(always)]
-    fn pop(&mut self, width_bits: u32) -> Lanes {
-        if self.used == 16 {
-            self.load();
-        }
+    fn pop_low(&mut self, width_bits: u32, rows: &mut [u16], stride: usize, column: usize) {
         let mask = u16::MAX >> (16 - width_bits);
-        let mut value: Lanes = std::array::from_fn(|lane| self.open[lane] >> self.used);
-        let end = self.used + width_bits;
-        if end > 16 {
-            // The first part has 16 - used bits, 1 to 15 of them.
-            let have = 16 - self.used;
-            self.load();
-            for lane in 0..BLOCK_COLUMNS {
-                value[lane] |= self.open[lane] << have;
+        // In locals, so that they stay in registers from row to row.
+        let (mut open, mut used) = (self.open, self.used);
+        for row in 0..BLOCK_ROWS {
+            if used == 16 {
+                (open, used) = (self.load(), 0);
             }
-            self.used = end - 16;
-        } else {
-            self.used = end;
+            let mut value: Lanes = open.map(|lane| lane >> used);
+            used += width_bits;
+            if used > 16 {
+                // The first part has `have` bits, 1 to 15 of them.
+                let have = 16 + width_bits - used;
+                open = self.load();
+                for lane in 0..BLOCK_COLUMNS {
+                    value[lane] |= open[lane] << have;
+                }
+                used -= 16;
+            }
+            let at = row * stride + column;
+            rows[at..at + BLOCK_COLUMNS].copy_from_slice(&value.map(|lane| lane & mask));
         }
-        value.map(|lane| lane & mask)
+        (self.open, self.used) = (open, used);
     }
 
     #[inline(always)]
-    fn load(&mut self) {
+    fn load(&mut self) -> Lanes {
         let (vector, rest) = self.low.split_at(LANES_BYTES);
-        for lane in 0..BLOCK_COLUMNS {
-            self.open[lane] = u16::from_le_bytes([vector[2 * lane], vector[2 * lane + 1]]);
-        }
         self.low = rest;
-        self.used = 0;
+        std::array::from_fn(|lane| u16::from_le_bytes([vector[2 * lane], vector[2 * lane + 1]]))
     }
 }

@@ -29,6 +29,7 @@ mod simd;
 
 use blocks::{Block, Packer, Shape, Unpacker};
 use predict::{bases, residual_rows};
+use simd::Kernel;
 
 use crate::error::DecodeError;
 
@@ -109,16 +110,17 @@ impl DepthEncoder {
     }
 
     #[inline(always)]
-    fn encode_blocks(&mut self, depth: &[u16], layout: &Layout, table: &mut [u8]) {
+    fn encode_blocks<K: Kernel>(&mut self, depth: &[u16], layout: &Layout, table: &mut [u8]) {
         let mut table = table.iter_mut();
         for first_row in (0..layout.height).step_by(BLOCK_ROWS) {
             residual_rows(depth, layout, first_row, &self.before, &mut self.rows);
             for across in 0..layout.blocks_across {
-                let block: Block = std::array::from_fn(|row| {
+                let mut block: Block = [[0; BLOCK_COLUMNS]; BLOCK_ROWS];
+                for (row, lanes) in block.iter_mut().enumerate() {
                     let at = row * layout.stride + across * BLOCK_COLUMNS;
-                    std::array::from_fn(|lane| self.rows[at + lane])
-                });
-                let shape = self.packer.push_block(&block);
+                    lanes.copy_from_slice(&self.rows[at..at + BLOCK_COLUMNS]);
+                }
+                let shape = self.packer.push_block::<K>(&block);
                 if let Some(code) = table.next() {
                     *code = shape.code();
                 }

@@ -24,9 +24,8 @@ pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
             zigzag(depth[y * width + x].wrapping_sub(predicted(depth, &bases, &layout, x, y)))
         });
         let residuals: Vec<u16> = residuals.collect();
-        let shape = Shape::cheapest(|bits| {
-            residuals.iter().filter(|&&residual| residual >> bits != 0).count() as u32
-        });
+        let top = 16 - residuals.iter().max().map_or(16, |most| most.leading_zeros());
+        let (shape, _) = Shape::cheapest(top, |bits| longer_than(&residuals, bits));
         table.push(shape.code());
         for (index, residual) in residuals.iter().enumerate() {
             let bits = |from, count| (from..from + count).map(|bit| residual >> bit & 1 == 1);
@@ -100,6 +99,11 @@ pub fn decode(bytes: &[u8], width: usize, depth: &mut [u16]) -> Result<(), Decod
         }
     }
     Ok(())
+}
+
+/// Returns which residuals have more than so many bits, the first in bit 0.
+pub(super) fn longer_than(residuals: &[u16], bits: u32) -> u64 {
+    residuals.iter().rev().fold(0, |mask, &residual| mask << 1 | u64::from(residual >> bits != 0))
 }
 
 /// The pixels of a block, row by row.
