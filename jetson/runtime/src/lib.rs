@@ -14,6 +14,7 @@
 //! [`stats`], [`log`], [`report`]. [`fly()`] starts it all.
 
 pub mod args;
+pub mod clock;
 pub mod control;
 pub mod flight;
 pub mod fly;

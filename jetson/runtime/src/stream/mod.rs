@@ -107,12 +107,24 @@ const RETRY: Duration = Duration::from_millis(200);
 pub async fn run(
     settings: StreamSettings,
     shared: Shared,
+    outbox: mpsc::Receiver<ToServer>,
+    tell: impl Fn(StreamEvent) + Send + Sync,
+) {
+    run_over(endpoint, settings, shared, outbox, tell).await;
+}
+
+/// As [`run`], over endpoints that `open` makes, a new one for every connection: another network
+/// may be below.
+pub async fn run_over(
+    open: impl Fn(SocketAddr) -> std::io::Result<Endpoint>,
+    settings: StreamSettings,
+    shared: Shared,
     mut outbox: mpsc::Receiver<ToServer>,
     tell: impl Fn(StreamEvent) + Send + Sync,
 ) {
     let mut last = String::new();
     loop {
-        let error = match connect(&settings).await {
+        let error = match connect(&open, &settings).await {
             Ok((endpoint, connection)) => {
                 let error =
                     session::converse(&settings, &shared, &connection, &mut outbox, &tell).await;
@@ -151,12 +163,15 @@ enum SessionEnd {
     Final(String),
 }
 
-async fn connect(settings: &StreamSettings) -> Result<(Endpoint, quinn::Connection), SessionEnd> {
+async fn connect(
+    open: &impl Fn(SocketAddr) -> std::io::Result<Endpoint>,
+    settings: &StreamSettings,
+) -> Result<(Endpoint, quinn::Connection), SessionEnd> {
     let retry = |what: &str, error: &dyn std::fmt::Display| {
         SessionEnd::Retry(format!("server {}: {what}: {error}", settings.server))
     };
     let pin = pinning::Pin::new(settings.fingerprint);
-    let endpoint = endpoint(settings.server).map_err(|error| retry("socket", &error))?;
+    let endpoint = open(settings.server).map_err(|error| retry("socket", &error))?;
     let config =
         client_config(&pin).map_err(|error| SessionEnd::Final(format!("TLS set-up: {error}")))?;
     let connecting = endpoint

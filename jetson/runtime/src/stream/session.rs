@@ -9,8 +9,9 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 use vizflyt_protocol::messages::{ClockRequest, Hello, ToRuntime, ToServer, bounded};
 use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, encode};
 use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
-use vizflyt_sdk::host_now;
 use zerocopy::IntoBytes;
+
+use crate::clock;
 
 use super::{IMAGES_AT_ONCE, ReceivedImage, SessionEnd, Shared, StreamEvent, StreamSettings};
 
@@ -113,7 +114,7 @@ async fn converse_inner(
                 let silent = heard.elapsed() >= SILENCE / 4;
                 if asked_count < CLOCK_FIRST || silent || asked.elapsed() >= CLOCK_SLOW {
                     (asked, asked_count) = (Instant::now(), asked_count + 1);
-                    write(&mut send, &ToServer::Clock(ClockRequest { sent: host_now() })).await?;
+                    write(&mut send, &ToServer::Clock(ClockRequest { sent: clock::now() })).await?;
                 }
             }
         }
@@ -133,7 +134,7 @@ fn take(
             return Err(SessionEnd::Retry(format!("the server refuses: {why}")));
         }
         Ok(ToRuntime::Clock(reply)) => {
-            shared.clock.update(reply.sent, reply.answered, host_now());
+            shared.clock.update(reply.sent, reply.answered, clock::now());
         }
         Ok(ToRuntime::Pose(sample)) => {
             // Before the first clock exchange a pose cannot be placed in time.
@@ -171,7 +172,7 @@ async fn receive_image(mut stream: RecvStream, shared: &Shared) {
         Some((header, payload))
     };
     let Ok(Some((header, payload))) = timeout(IMAGE_WITHIN, image).await else { return };
-    let received = host_now();
+    let received = clock::now();
     let Some(pose) = shared.clock.to_host(header.pose_stamp()) else { return };
     shared.mailbox.offer(ReceivedImage { header, payload, pose, received });
 }

@@ -84,7 +84,8 @@ impl Controller for Lan {
     fn on_mtu_update(&mut self, _new_mtu: u16) {}
 
     fn window(&self) -> u64 {
-        self.window_at(Instant::now())
+        // Tokio's clock, which the connection's own stamps are of.
+        self.window_at(tokio::time::Instant::now().into_std())
     }
 
     fn clone_box(&self) -> Box<dyn Controller> {

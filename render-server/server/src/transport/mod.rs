@@ -89,11 +89,16 @@ pub fn bind(address: SocketAddr, identity: &Identity, congestion: Congestion) ->
         )
     })?;
     let config = server_config(identity, congestion)?;
+    Endpoint::new(endpoint_config()?, Some(config), socket, Arc::new(quinn::TokioRuntime))
+        .context("cannot start QUIC")
+}
+
+/// Returns the settings of the endpoint itself.
+pub fn endpoint_config() -> Result<EndpointConfig> {
     let mut endpoint = EndpointConfig::default();
     // Jumbo packets from a peer whose network carries them.
     endpoint.max_udp_payload_size(MOST_MTU).context("cannot set the packet size")?;
-    Endpoint::new(endpoint, Some(config), socket, Arc::new(quinn::TokioRuntime))
-        .context("cannot start QUIC")
+    Ok(endpoint)
 }
 
 /// Accepts runtimes until the server stops.
@@ -143,7 +148,8 @@ pub async fn serve(
     let _ = tokio::time::timeout(Duration::from_millis(300), endpoint.wait_idle()).await;
 }
 
-fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
+/// Returns the settings of connections, with the certificate that runtimes pin.
+pub fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let mut tls = rustls::ServerConfig::builder_with_provider(provider)
         .with_protocol_versions(&[&rustls::version::TLS13])
