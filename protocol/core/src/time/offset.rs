@@ -1,0 +1,223 @@
+//! Relates two clocks from request-reply exchanges: offset, drift, and a bound of the error.
+//!
+//! An exchange says that the remote clock showed `remote` at some moment between `sent` and
+//! `received`. As clocks run forward, their offset (remote less local) was at most
+//! `remote - sent` when it was sent, and at least `remote - received` when the answer was read.
+//! Over a window of exchanges these are half-planes in (offset, drift); what all of them leave is
+//! where the truth lies, and its middle is the estimate. No delay needs to be symmetric, and a
+//! slow exchange costs nothing: it only says little.
+//!
+//! The bound rests on two assumptions: a clock runs wrong by at most [`MOST_DRIFT`], and over the
+//! window its drift changes by at most [`WANDER`]. Exchanges that contradict each other prove a
+//! step (a restart, a suspended computer): then only the newest counts.
+
+#[cfg(test)]
+mod tests;
+
+use core::marker::PhantomData;
+
+use super::{Clock, Stamp};
+
+/// The relation of a remote clock to a local one. See the module.
+#[derive(Clone, Copy, Debug)]
+pub struct OffsetFilter<Local, Remote> {
+    window: [Exchange; WINDOW],
+    filled: usize,
+    next: usize,
+    fit: Option<Fit>,
+    steps: u64,
+    clocks: PhantomData<fn() -> (Local, Remote)>,
+}
+
+/// One exchange. [ns]
+#[derive(Clone, Copy, Debug, Default)]
+struct Exchange {
+    sent_ns: u64,
+    remote_ns: u64,
+    received_ns: u64,
+}
+
+/// What the window says.
+#[derive(Clone, Copy, Debug)]
+struct Fit {
+    /// When the offset was so: the end of the newest exchange. [ns, local]
+    at_ns: u64,
+    /// Remote less local. [ns]
+    offset_ns: i64,
+    /// Bound of its error at that time. [ns]
+    error_ns: f64,
+    /// How much faster the remote clock runs.
+    drift: f64,
+    /// Bound of its error.
+    drift_error: f64,
+}
+
+/// Exchanges remembered: a minute at one a second. Twice as many would know the drift twice as
+/// well, but by then it has changed by as much. 1.5 KB.
+const WINDOW: usize = 64;
+/// No clock runs wrong by more: crystals are cut to 50 ppm or better, so two differ by at most
+/// 100, and time services that slew gently add as much.
+const MOST_DRIFT: f64 = 200e-6;
+/// How far the drift strays from its mean over the window: a crystal that warms by 5 degrees as
+/// the computer gets busy changes by about 1 ppm.
+const WANDER: f64 = 1e-6;
+/// Clocks may count microseconds, as ArduPilot's does. [ns]
+const GRAIN_NS: f64 = 1_000.0;
+
+impl<Local: Clock, Remote: Clock> Default for OffsetFilter<Local, Remote> {
+    fn default() -> Self {
+        Self {
+            window: [Exchange::default(); WINDOW],
+            filled: 0,
+            next: 0,
+            fit: None,
+            steps: 0,
+            clocks: PhantomData,
+        }
+    }
+}
+
+impl<Local: Clock, Remote: Clock> OffsetFilter<Local, Remote> {
+    /// Takes one exchange: asked at `sent`, answered by the remote at `remote`, answer read at
+    /// `received`. An exchange that ends before it began is dropped.
+    pub fn update(&mut self, sent: Stamp<Local>, remote: Stamp<Remote>, received: Stamp<Local>) {
+        if received < sent {
+            return;
+        }
+        let newest = Exchange {
+            sent_ns: sent.as_ns(),
+            remote_ns: remote.as_ns(),
+            received_ns: received.as_ns(),
+        };
+        self.window[self.next] = newest;
+        self.next = (self.next + 1) % WINDOW;
+        self.filled = (self.filled + 1).min(WINDOW);
+        self.fit = fit(&self.window[..self.filled], newest);
+        if self.fit.is_none() {
+            self.steps += 1;
+            (self.window[0], self.filled, self.next) = (newest, 1, 1);
+            self.fit = fit(&self.window[..1], newest);
+        }
+    }
+
+    /// Returns what was to be added to local time at `at` to give remote time; `None` before the
+    /// first exchange. [ns]
+    pub fn offset_ns(&self, at: Stamp<Local>) -> Option<i64> {
+        let fit = self.fit?;
+        let drifted_ns = fit.drift * since(at.as_ns(), fit.at_ns);
+        Some(fit.offset_ns.wrapping_add(drifted_ns as i64))
+    }
+
+    /// Returns the bound of the offset's error at `at`: about half the best round trip when
+    /// exchanges come regularly, and growing by the drift's uncertainty in a silence; `None`
+    /// before the first exchange. [ns]
+    pub fn error_bound_ns(&self, at: Stamp<Local>) -> Option<u64> {
+        let fit = self.fit?;
+        let away_ns = since(at.as_ns(), fit.at_ns).abs();
+        // Rounding up, of this and of the offset.
+        Some((fit.error_ns + fit.drift_error * away_ns) as u64 + 2)
+    }
+
+    /// Returns how much faster the remote clock runs than the local one, and the bound of the
+    /// error of that; `None` before the first exchange. [ppm]
+    pub fn drift_ppm(&self) -> Option<(f64, f64)> {
+        self.fit.map(|fit| (fit.drift * 1e6, fit.drift_error * 1e6))
+    }
+
+    /// Returns how often exchanges contradicted each other: a clock was set or restarted.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// Converts a remote stamp to the local clock; `None` before the first exchange.
+    ///
+    /// ```
+    /// use vizflyt_protocol::time::{Autopilot, AutopilotTime, Host, HostTime, OffsetFilter};
+    /// let mut filter = OffsetFilter::<Host, Autopilot>::default();
+    /// // Asked at 1000 ns, answered "50 000" half-way through a 200 ns round trip.
+    /// filter.update(HostTime::from_ns(1_000), AutopilotTime::from_ns(50_000), HostTime::from_ns(1_200));
+    /// assert_eq!(filter.to_local(AutopilotTime::from_ns(50_900)), Some(HostTime::from_ns(2_000)));
+    /// assert_eq!(filter.to_remote(HostTime::from_ns(2_000)), Some(AutopilotTime::from_ns(50_900)));
+    /// ```
+    pub fn to_local(&self, remote: Stamp<Remote>) -> Option<Stamp<Local>> {
+        let fit = self.fit?;
+        let then_ns = fit.at_ns.wrapping_add(fit.offset_ns as u64);
+        let drifted_ns = since(remote.as_ns(), then_ns) * (fit.drift / (1.0 + fit.drift));
+        let offset_ns = fit.offset_ns.wrapping_add(drifted_ns as i64);
+        Some(Stamp::from_ns(remote.as_ns().wrapping_sub(offset_ns as u64)))
+    }
+
+    /// Converts a local stamp to the remote clock; `None` before the first exchange.
+    pub fn to_remote(&self, local: Stamp<Local>) -> Option<Stamp<Remote>> {
+        let offset_ns = self.offset_ns(local)?;
+        Some(Stamp::from_ns(local.as_ns().wrapping_add(offset_ns as u64)))
+    }
+}
+
+/// Returns `a - b` of two stamps of one clock less than 292 years apart. [ns]
+fn since(a: u64, b: u64) -> f64 {
+    a.wrapping_sub(b).cast_signed() as f64
+}
+
+/// Bounds on the offset that one exchange sets: at most `above` at `sent`, at least `below` at
+/// `received`; all relative to the newest exchange. [ns]
+#[derive(Clone, Copy, Default)]
+struct Bounds {
+    sent: f64,
+    above: f64,
+    received: f64,
+    below: f64,
+}
+
+/// Returns the middle of what all exchanges leave possible; `None` if they contradict each other.
+fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
+    let base_ns = newest.remote_ns.wrapping_sub(newest.sent_ns);
+    let mut storage = [Bounds::default(); WINDOW];
+    let bounds = &mut storage[..window.len()];
+    for (bounds, e) in bounds.iter_mut().zip(window) {
+        *bounds = Bounds {
+            sent: since(e.sent_ns, newest.sent_ns),
+            above: since(e.remote_ns.wrapping_sub(e.sent_ns), base_ns) + GRAIN_NS,
+            received: since(e.received_ns, newest.sent_ns),
+            below: since(e.remote_ns.wrapping_sub(e.received_ns), base_ns) - GRAIN_NS,
+        };
+    }
+    // The mean drift between any two of them; at 64 exchanges 4096 pairs a second.
+    let (mut least, mut most) = (-MOST_DRIFT, MOST_DRIFT);
+    for later in &*bounds {
+        for earlier in &*bounds {
+            let span = later.received - earlier.sent;
+            if span > 0.0 {
+                least = least.max((later.below - earlier.above) / span - WANDER);
+            }
+            let span = later.sent - earlier.received;
+            if span > 0.0 {
+                most = most.min((later.above - earlier.below) / span + WANDER);
+            }
+        }
+    }
+    if !(least <= most) {
+        return None;
+    }
+    // From each exchange to the end of the newest: later by `span`, or earlier where answers
+    // overtook each other.
+    let at = since(newest.received_ns, newest.sent_ns);
+    let (slow, fast) = (least - WANDER, most + WANDER);
+    let (mut low, mut high) = (f64::NEG_INFINITY, f64::INFINITY);
+    for b in &*bounds {
+        let span = at - b.sent;
+        high = high.min(b.above + span * if span >= 0.0 { fast } else { slow });
+        let span = at - b.received;
+        low = low.max(b.below + span * if span >= 0.0 { slow } else { fast });
+    }
+    if !(low <= high) {
+        return None;
+    }
+    Some(Fit {
+        at_ns: newest.received_ns,
+        offset_ns: base_ns.cast_signed().wrapping_add((0.5 * (low + high)) as i64),
+        error_ns: 0.5 * (high - low),
+        drift: 0.5 * (least + most),
+        drift_error: 0.5 * (most - least) + WANDER,
+    })
+}
