@@ -6,7 +6,7 @@
 //!                        encode      (room in the outlet?)  -> outlet -> transport (QUIC)
 //!                                                           -> previews -> dashboard (WebSocket)
 //! ```
-//! Three threads (poses, render, encode) and a tokio runtime for sockets meet in [`hub::Hub`],
+//! Four threads (poses, render, encode, previews) and a tokio runtime for sockets meet in [`hub::Hub`],
 //! which holds a [`vehicle::Vehicle`] each.
 //! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
 
@@ -14,6 +14,7 @@ pub mod args;
 pub mod cameras;
 pub mod clock;
 pub mod dashboard;
+pub mod drawn;
 pub mod drivers;
 pub mod encode;
 pub mod events;
@@ -21,6 +22,7 @@ pub mod hub;
 pub mod mailbox;
 pub mod map;
 pub mod outlet;
+pub mod previews;
 pub mod render;
 pub mod scene;
 mod serve;

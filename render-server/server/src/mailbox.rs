@@ -30,22 +30,21 @@ impl<T: Default> Mailbox<T> {
 
     /// Puts `item` in, in place of one that nobody took; returns whether it replaced one.
     pub fn put(&self, item: T) -> bool {
-        self.put_over(item, |_, _| {})
+        self.put_over(item, |_, _| {}).map(|old| self.recycle(old)).is_some()
     }
 
-    /// As [`Self::put`]; what is replaced may hand over to `item` first, by `inherit(item, old)`.
-    pub fn put_over(&self, mut item: T, inherit: impl FnOnce(&mut T, &mut T)) -> bool {
+    /// As [`Self::put`]; what is replaced may hand over to `item` first, by `inherit(item, old)`,
+    /// and is returned for another use.
+    pub fn put_over(&self, mut item: T, inherit: impl FnOnce(&mut T, &mut T)) -> Option<T> {
         let mut inner = self.lock();
         let mut old = inner.slot.take();
         if let Some(old) = &mut old {
             inherit(&mut item, old);
         }
         inner.slot = Some(item);
-        let replaced = old.is_some();
-        inner.replaced += u64::from(replaced);
-        keep(&mut inner.spares, old);
+        inner.replaced += u64::from(old.is_some());
         self.filled.notify_one();
-        replaced
+        old
     }
 
     /// Waits at most `timeout` for an item; `None` if none came or the mailbox was closed.
@@ -66,7 +65,10 @@ impl<T: Default> Mailbox<T> {
 
     /// Gives a buffer back.
     pub fn recycle(&self, item: T) {
-        keep(&mut self.lock().spares, Some(item));
+        let spares = &mut self.lock().spares;
+        if spares.len() < MOST_SPARES {
+            spares.push(item);
+        }
     }
 
     /// Makes every present and future [`Self::take`] return at once.
@@ -86,14 +88,8 @@ impl<T: Default> Mailbox<T> {
     }
 }
 
-fn keep<T>(spares: &mut Vec<T>, item: Option<T>) {
-    if spares.len() < MOST_SPARES {
-        spares.extend(item);
-    }
-}
-
-/// One being written, one in the slot, one being read.
-const MOST_SPARES: usize = 3;
+/// One being written, one in the slot, one being read; and two on their way back another way.
+const MOST_SPARES: usize = 5;
 
 #[cfg(test)]
 mod tests {

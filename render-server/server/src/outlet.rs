@@ -33,14 +33,14 @@ pub struct Outgoing {
 pub struct Wanted {
     /// By vehicle and camera: the session has room for an image.
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
-    /// By vehicle: a page wants a preview, and one is due.
-    pub preview: [bool; MAX_VEHICLES],
+    /// No runtime wants anything, but a page does: drawn ticks go on to the previews.
+    pub pass_on: bool,
 }
 
 impl Wanted {
     /// Whether anyone wants anything.
     pub fn anything(&self) -> bool {
-        self.preview.contains(&true) || self.stream.as_flattened().contains(&true)
+        self.pass_on || self.stream.as_flattened().contains(&true)
     }
 }
 
@@ -181,6 +181,15 @@ impl Outlet {
         self.lock().vehicles.iter().map(|way| way.viewers).sum()
     }
 
+    /// Returns which vehicles' pages someone watches.
+    pub fn watched(&self) -> [bool; MAX_VEHICLES] {
+        let mut watched = [false; MAX_VEHICLES];
+        for (watched, way) in watched.iter_mut().zip(&self.lock().vehicles) {
+            *watched = way.viewers > 0;
+        }
+        watched
+    }
+
     /// Waits at most `timeout` until someone wants images; returns of which vehicles.
     pub fn wait_for_interest(&self, timeout: Duration) -> [bool; MAX_VEHICLES] {
         let idle = |state: &mut State| !state.closed && !state.vehicles.iter().any(Way::is_wanted);
@@ -195,17 +204,18 @@ impl Outlet {
         wanted
     }
 
-    /// Waits at most `timeout` until an image may be encoded: the session has room for one, or a
-    /// page wants a preview and `preview_due` has passed. Returns for whom.
-    pub fn wait_for_room(&self, preview_due: Instant, timeout: Duration) -> Wanted {
+    /// Waits at most `timeout` until an image may be encoded: a session has room for one, or there
+    /// is none but a page that wants previews. Returns for whom.
+    pub fn wait_for_room(&self, timeout: Duration) -> Wanted {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
         loop {
             let now = Instant::now();
-            let (mut wanted, mut viewed) = (Wanted::default(), false);
-            for (vehicle, way) in state.vehicles.iter().enumerate() {
-                viewed |= way.viewers > 0;
-                wanted.preview[vehicle] = way.viewers > 0 && now >= preview_due;
+            let mut wanted = Wanted::default();
+            let ways = &state.vehicles;
+            wanted.pass_on = ways.iter().any(|way| way.viewers > 0)
+                && ways.iter().all(|way| way.session.is_none());
+            for (vehicle, way) in ways.iter().enumerate() {
                 let Some(session) = &way.session else { continue };
                 for camera in 0..way.cameras {
                     wanted.stream[vehicle][camera] = session.in_flight[camera] < session.allowed;
@@ -214,8 +224,7 @@ impl Outlet {
             if state.closed || wanted.anything() || now >= deadline {
                 return if state.closed { Wanted::default() } else { wanted };
             }
-            let until = if viewed { deadline.min(preview_due) } else { deadline };
-            let left = until.saturating_duration_since(now);
+            let left = deadline.saturating_duration_since(now);
             state =
                 self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
         }
@@ -245,10 +254,6 @@ mod tests {
     const LONG: Duration = Duration::from_secs(30);
     const NOT_YET: Duration = Duration::from_millis(1);
 
-    fn far() -> Instant {
-        Instant::now() + LONG
-    }
-
     fn image(outlet: &Outlet, camera: usize) -> Outgoing {
         let k = Intrinsics::from_horizontal_fov(4, 3, 1.0);
         let header = ImageHeader::new(
@@ -265,20 +270,20 @@ mod tests {
     #[test]
     fn at_most_k_images_of_each_camera_are_in_flight() {
         let outlet = Outlet::new(&[2]);
-        assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
         let mut images = outlet.open(0, 7, 2);
         assert!(outlet.send(image(&outlet, 0)));
         assert!(outlet.send(image(&outlet, 0)));
-        let wanted = outlet.wait_for_room(far(), LONG);
+        let wanted = outlet.wait_for_room(LONG);
         assert_eq!(wanted.stream[0][..2], [false, true], "camera 1 is not held up by camera 0");
         outlet.send(image(&outlet, 1));
         outlet.send(image(&outlet, 1));
-        assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
         assert_eq!(images.try_recv().unwrap().camera, 0);
         outlet.landed(0, 7, 0);
-        assert_eq!(outlet.wait_for_room(far(), LONG).stream[0][..2], [true, false]);
+        assert_eq!(outlet.wait_for_room(LONG).stream[0][..2], [true, false]);
         outlet.allow(0, 7, 3);
-        assert_eq!(outlet.wait_for_room(far(), LONG).stream[0][..2], [true, true]);
+        assert_eq!(outlet.wait_for_room(LONG).stream[0][..2], [true, true]);
     }
 
     #[test]
@@ -290,27 +295,30 @@ mod tests {
         outlet.send(image(&outlet, 0));
         outlet.landed(0, 1, 0);
         outlet.close(0, 1);
-        assert_eq!(outlet.wait_for_room(far(), NOT_YET), Wanted::default());
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
         outlet.landed(0, 2, 0);
-        assert!(outlet.wait_for_room(far(), LONG).stream[0][0]);
+        assert!(outlet.wait_for_room(LONG).stream[0][0]);
         outlet.close(0, 2);
         assert!(!outlet.send(image(&outlet, 0)));
     }
 
     #[test]
-    fn previews_wait_for_a_viewer_and_for_their_time() {
+    fn a_page_alone_has_ticks_passed_on_and_a_session_has_them_first() {
         let outlet = Outlet::new(&[1]);
         assert!(!outlet.wait_for_interest(NOT_YET)[0]);
         outlet.viewer_came(0);
         assert!(outlet.wait_for_interest(LONG)[0]);
-        assert!(!outlet.wait_for_room(far(), NOT_YET).preview[0]);
-        let soon = Instant::now() + Duration::from_millis(5);
-        assert!(outlet.wait_for_room(soon, LONG).preview[0]);
+        assert!(outlet.wait_for_room(LONG).pass_on && outlet.watched()[0]);
+        let images = outlet.open(0, 1, 0);
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default(), "no room, and no ticks lost");
+        drop(images);
+        outlet.close(0, 1);
+        assert!(outlet.wait_for_room(LONG).pass_on);
         outlet.viewer_left(0);
-        assert!(!outlet.wait_for_room(soon, NOT_YET).preview[0]);
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
         outlet.viewer_came(0);
         outlet.shut();
         assert!(!outlet.wait_for_interest(LONG)[0]);
-        assert_eq!(outlet.wait_for_room(soon, LONG), Wanted::default());
+        assert_eq!(outlet.wait_for_room(LONG), Wanted::default());
     }
 }

@@ -12,6 +12,7 @@ use vizflyt_splat::{Chosen, Rasterizer, Splats};
 
 use crate::args::ServeArgs;
 use crate::cameras::Cameras;
+use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, ViconUdp};
 use crate::events::Origin;
 use crate::hub::{Hub, RendererInfo, lock};
@@ -23,7 +24,7 @@ use crate::stats::Report;
 use crate::stop::Stop;
 use crate::transport::{self, Identity};
 use crate::vehicle::Vehicle;
-use crate::{dashboard, encode, tick};
+use crate::{dashboard, encode, previews, tick};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -160,7 +161,7 @@ fn start_threads(
     mut source: impl PoseSource + 'static,
 ) -> Result<Vec<JoinHandle<()>>> {
     let newest = Arc::new(Mailbox::default());
-    let drawn = Arc::new(Mailbox::default());
+    let ticks = Arc::new(Ticks::default());
     let start = |name: &str, run: Box<dyn FnOnce() + Send>| {
         std::thread::Builder::new()
             .name(name.to_owned())
@@ -168,8 +169,9 @@ fn start_threads(
             .with_context(|| format!("cannot start the {name} thread"))
     };
     let (pose_hub, pose_newest) = (hub.clone(), newest.clone());
-    let (draw_hub, draw_drawn, max_rate) = (hub.clone(), drawn.clone(), args.max_rate);
-    let (encode_hub, options) = (hub.clone(), args.encode_options());
+    let (draw_hub, draw_ticks, max_rate) = (hub.clone(), ticks.clone(), args.max_rate);
+    let (encode_hub, encode_ticks, options) = (hub.clone(), ticks.clone(), args.encode_options());
+    let previews_hub = hub.clone();
     Ok(vec![
         start(
             "pose",
@@ -178,10 +180,11 @@ fn start_threads(
         start(
             "render",
             Box::new(move || {
-                tick::draw(&draw_hub, &mut *renderer, &newest, &draw_drawn, max_rate);
+                tick::draw(&draw_hub, &mut *renderer, &newest, &draw_ticks, max_rate);
             }),
         )?,
-        start("encode", Box::new(move || encode::run(&encode_hub, &drawn, options)))?,
+        start("encode", Box::new(move || encode::run(&encode_hub, &encode_ticks, options)))?,
+        start("previews", Box::new(move || previews::run(&previews_hub, &ticks)))?,
     ])
 }
 

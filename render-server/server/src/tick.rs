@@ -12,6 +12,7 @@
 //! late, and drawing would block its workers.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use tracing::{trace_span, warn};
@@ -22,8 +23,8 @@ use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS, PoseSample};
 use vizflyt_splat::{Camera, Rasterizer, RgbdImage};
 
 use crate::clock;
+use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, SourceCounters};
-use crate::encode::{self, DrawnTick};
 use crate::events::Origin;
 use crate::hub::{Hub, RendererInfo, lock};
 use crate::mailbox::Mailbox;
@@ -97,7 +98,7 @@ pub fn draw(
     hub: &Arc<Hub>,
     renderer: &mut dyn Rasterizer,
     newest: &Mailbox<Option<PoseSample>>,
-    drawn: &Mailbox<DrawnTick>,
+    ticks: &Ticks,
     max_rate_hz: f64,
 ) {
     let vehicle = &*hub.vehicles[0];
@@ -122,7 +123,7 @@ pub fn draw(
         let due = schedule.take(&set.configs, Instant::now());
         seq += 1;
         let span = trace_span!("tick", seq, stamp_ns = sample.stamp.as_ns()).entered();
-        let mut tick = drawn.spare();
+        let mut tick = ticks.spare();
         tick.slots.resize_with(set.configs.len(), Default::default);
         cameras.clear();
         for (index, slot) in tick.slots.iter_mut().enumerate() {
@@ -160,13 +161,15 @@ pub fn draw(
                 if seq.is_multiple_of(NAME_TICKS) {
                     note_renderer(hub, renderer);
                 }
-                encode::count(hub, drawn.put_over(tick, DrawnTick::inherit));
+                let skipped = ticks.publish(tick, hub.outlet.viewers() > 0);
+                hub.stats.ticks.fetch_add(1, Ordering::Relaxed);
+                hub.stats.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
             }
             Err(error) => {
                 if !std::mem::replace(&mut refused, true) {
                     warn!("tick {seq} is not drawn: {error}; more of these go unsaid");
                 }
-                drawn.recycle(tick);
+                ticks.recycle(tick);
             }
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! pose thread ----> pose (watch), trail, events ----> session, page
-//! encode ---------> previews (watch) ---------------> page
+//! previews -------> previews (watch) ---------------> page
 //! session --------> telemetry (watch), events ------> page, pose thread (phase of flight)
 //! page -----------> events (stop button) -----------> session
 //! ```
@@ -20,9 +20,9 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::cameras::{CameraSet, Cameras};
 use crate::clock;
-use crate::encode::Preview;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
+use crate::previews::Preview;
 
 /// One vehicle in the arena.
 #[derive(Debug)]

@@ -11,8 +11,8 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::debug;
 
 use super::{Page, messages};
-use crate::encode::Preview;
 use crate::hub::lock;
+use crate::previews::Preview;
 
 /// Counts a viewer for as long as it lives.
 struct Presence<'a>(&'a Page);

@@ -7,7 +7,7 @@ use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forwar
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Camera, DepthKind, Rasterizer, RgbdImage};
 
-use crate::encode::depth_colour;
+use crate::previews::depth_colour;
 use crate::scene::WorldFromScene;
 
 /// What a page asks for.
