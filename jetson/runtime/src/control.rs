@@ -1,5 +1,5 @@
-//! The control loop: one thread that owns link, flight and plugin, ticks at 50 Hz, and otherwise
-//! waits for what the other threads send. All safety decisions are made here, one at a time.
+//! The control loop: one thread that owns link, flight and plugin, ticks at 50 Hz, sends each answer
+//! of the plugin at once ([`crate::steering`]), and otherwise waits for what the other threads send. All safety decisions are made here, one at a time.
 //!
 //! ```text
 //! stream (tokio) ─┐                             ┌─▶ MAVLink socket
@@ -25,8 +25,8 @@ use serde_json::json;
 use tokio::sync::mpsc;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, Setpoint,
-    Telemetry, ToPlugin, ToServer, YawTarget, bounded,
+    ArenaInfo, Arrivals, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, MAX_CAMERAS,
+    PoseSample, Setpoint, Telemetry, ToPlugin, ToServer, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
@@ -40,11 +40,13 @@ use crate::link::{Link, LinkEvent};
 use crate::log::{Channel, FlightLog};
 use crate::report::Counters;
 use crate::stats::ImageTimes;
+use crate::steering::Steering;
 use crate::stream::{Shared, StreamEvent};
 use crate::supervisor::{PluginEvent, Stream, Supervisor};
 
 /// Something another thread tells the control loop.
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant)] // Why: the queue of 0.7 MB is there anyway; a box is one per image.
 pub enum Happening {
     /// Bytes from the MAVLink socket.
     Mavlink(Vec<u8>, SocketAddr),
@@ -60,10 +62,12 @@ pub enum Happening {
     Interrupt,
 }
 
-/// Control ticks: setpoints go out at this rate.
+/// Control ticks. Setpoints have a rhythm of their own.
 const TICK: Duration = Duration::from_millis(20);
 /// Reports to the server every so many ticks: 10 Hz.
 const TELEMETRY_TICKS: u64 = 5;
+/// Where images get their age, to the server every so many ticks: 1 Hz.
+const TIMING_TICKS: u64 = 50;
 /// The plugin hears of us at least this often.
 const HEARTBEAT_TICKS: u64 = 20;
 /// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
@@ -127,6 +131,7 @@ struct Loop {
     image_size_px: (u32, u32),
     setpoints_sent: u64,
     last_setpoint: Setpoint,
+    steering: Steering,
     ticks: u64,
 }
 
@@ -148,6 +153,7 @@ impl Control {
             image_size_px: (0, 0),
             setpoints_sent: 0,
             last_setpoint: Setpoint::Hold,
+            steering: Steering::new(now),
             ticks: 0,
         };
         let outcome = state.fly(happenings);
@@ -159,32 +165,36 @@ impl Loop {
     fn fly(&mut self, happenings: &Receiver<Happening>) -> Outcome {
         let mut next = Instant::now();
         loop {
-            match happenings.recv_timeout(next.saturating_duration_since(Instant::now())) {
+            let to_steering_s = self.steering.due().seconds_since(host_now()).max(0.0);
+            let to_tick = next.saturating_duration_since(Instant::now());
+            match happenings.recv_timeout(to_tick.min(Duration::from_secs_f64(to_steering_s))) {
                 Ok(happening) => {
                     self.take(happening);
                     self.transmit();
-                    if Instant::now() < next {
-                        continue;
-                    }
                 }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => thread::sleep(TICK),
             }
-            next += TICK;
-            if next < Instant::now() {
-                // The machine stalled: do not make up for lost ticks.
-                next = Instant::now() + TICK;
+            let now = host_now();
+            if now >= self.steering.due() {
+                self.steer(now);
             }
-            self.tick(host_now());
+            if Instant::now() >= next {
+                next += TICK;
+                if next < Instant::now() {
+                    // The machine stalled: do not make up for lost ticks.
+                    next = Instant::now() + TICK;
+                }
+                self.tick(host_now());
+            }
             if let Some(outcome) = self.flight.outcome() {
                 return outcome.clone();
             }
         }
     }
 
-    fn tick(&mut self, now: HostTime) {
-        self.ticks += 1;
-        self.link.handle_timeout(now);
+    /// Lets the flight decide, and sends what it orders.
+    fn steer(&mut self, now: HostTime) {
         let state = self.link.state();
         let view = LinkView {
             connected: self.link.is_connected(),
@@ -194,18 +204,31 @@ impl Loop {
             ready_to_arm: self.link.ready_to_arm(),
         };
         let orders = self.flight.tick(now, &view);
+        self.steering.done(now);
         self.link.set_goal(now, orders.goal);
-        if let Some(setpoint) = orders.setpoint
-            && self.link.setpoint(now, &setpoint)
-        {
+        let Some(setpoint) = orders.setpoint else { return self.transmit() };
+        let is_sent = self.link.setpoint(now, &setpoint);
+        self.transmit();
+        if is_sent {
+            if let Some(seq) = orders.answers {
+                self.times.sent(seq, host_now());
+            }
             self.setpoints_sent += 1;
             self.log_sent(now, &setpoint);
         }
+    }
+
+    fn tick(&mut self, now: HostTime) {
+        self.ticks += 1;
+        self.link.handle_timeout(now);
         self.transmit();
         self.tend_plugin();
         self.tell_notices(now);
         if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
             self.report(now);
+        }
+        if self.ticks.is_multiple_of(TIMING_TICKS) {
+            self.report_timing(now);
         }
     }
 
@@ -240,7 +263,12 @@ impl Loop {
             Happening::Published(published) => {
                 self.published += 1;
                 self.image_seq = published.seq;
-                self.times.published(published.seq, published.pose);
+                let Published { seq, pose, ready, mut images, .. } = published.clone();
+                let clock_error_ns = self.control.shared.clock.error_bound_ns(now).unwrap_or(0);
+                for image in &mut images {
+                    image.clock_error_ns = clock_error_ns;
+                }
+                self.times.published(seq, pose, ready, images);
                 self.flight.handle(now, Input::ImagePublished { seq: published.seq });
                 self.control.log.write(
                     Channel::Image,
@@ -337,6 +365,7 @@ impl Loop {
                 self.flight.handle(now, Input::Answered { seq, setpoint });
                 if let Some(setpoint) = setpoint {
                     self.last_setpoint = setpoint;
+                    self.steering.answered();
                 }
                 let asked = json!({"seq": seq, "setpoint": setpoint});
                 self.control.log.write(Channel::Asked, returned, &asked);
@@ -500,6 +529,19 @@ impl Loop {
         self.send(ToServer::Telemetry(telemetry));
     }
 
+    fn report_timing(&mut self, now: HostTime) {
+        let clock = self.control.shared.clock.state(now);
+        let timing = self.times.timing(now, clock, &self.arrived());
+        self.control.log.write(Channel::Timing, now, &timing);
+        self.send(ToServer::Timing(timing));
+    }
+
+    /// Returns what became of images before they reached shared memory, by camera.
+    fn arrived(&self) -> Vec<Arrivals> {
+        let cameras = self.plugin.as_ref().map_or(0, |side| side.arena.cameras.len());
+        self.control.shared.mailbox.arrivals()[..cameras.min(MAX_CAMERAS)].to_vec()
+    }
+
     fn log_sent(&mut self, now: HostTime, setpoint: &GuidedSetpoint) {
         let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return };
         self.last_setpoint = Setpoint::velocity(v_mps, setpoint.yaw);
@@ -524,6 +566,8 @@ impl Loop {
         let now = host_now();
         self.tell_notices(now);
         self.report(now);
+        self.report_timing(now);
+        let (clock, arrived) = (self.control.shared.clock.state(now), self.arrived());
         debug_assert_eq!(self.flight.phase(), FlightPhase::Landed);
         if let Some(side) = self.plugin.take() {
             if side.ipc.plugin_attached() {
@@ -547,6 +591,8 @@ impl Loop {
             image_size_px: self.image_size_px,
             setpoints_sent: self.setpoints_sent,
             mavlink_packets: self.link.packets(),
+            clock,
+            cameras: self.times.arrivals(&arrived).to_vec(),
         };
         Flown { outcome, times: self.times, counters, log: self.control.log }
     }

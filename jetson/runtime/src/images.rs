@@ -11,19 +11,20 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use vizflyt_protocol::messages::CameraInfo;
+use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::Decoder;
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 use vizflyt_sdk::{ImageStamps, ObservationWriter, Vehicle, host_now};
 
 use crate::stream::{Mailbox, ReceivedImage};
+use crate::waterfall::Stamps;
 
 /// The vehicle's newest state, for the plugin's eyes.
 pub type SharedVehicle = Arc<Mutex<Option<Vehicle>>>;
 
 /// An observation that went to the plugin.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Published {
     /// Its number, from 1.
     pub seq: u64,
@@ -33,6 +34,8 @@ pub struct Published {
     pub received: HostTime,
     /// When it was decoded. [host]
     pub ready: HostTime,
+    /// Its images on their way.
+    pub images: heapless::Vec<Stamps, MAX_CAMERAS>,
 }
 
 /// Decodes and publishes. See the module.
@@ -139,6 +142,9 @@ impl ImagePublisher {
         published.pose = published.pose.max(image.pose);
         published.received = published.received.max(image.received);
         published.ready = ready;
+        let stamps = Stamps::of(&image.header, image.pose, [image.first, image.received, ready]);
+        // One image of each camera at most, so there is room.
+        let _ = published.images.push(stamps);
         let complete = under_way.there & under_way.expected == under_way.expected;
         self.under_way = Some(under_way);
         if complete { self.publish(tell) } else { Ok(()) }
@@ -176,6 +182,7 @@ impl ImagePublisher {
             pose: HostTime::ZERO,
             received: HostTime::ZERO,
             ready: HostTime::ZERO,
+            images: heapless::Vec::new(),
         };
         let all = 1u8.unbounded_shl(self.cameras.len() as u32).wrapping_sub(1);
         let expected = if together as u8 & all == 0 { all } else { together as u8 & all };
@@ -191,7 +198,7 @@ impl ImagePublisher {
             writer.vehicle(&vehicle);
         }
         // Told first: the answer must not overtake it.
-        tell(done.published);
+        tell(done.published.clone());
         self.ipc.publish(done.memory)
     }
 
@@ -247,6 +254,7 @@ mod tests {
             header: ImageHeader::new(tick, camera, ServerTime::ZERO, &k, &mount, &world_from_body),
             payload,
             pose: HostTime::from_ns(1000 * tick),
+            first: HostTime::from_ns(1000 * tick + 300),
             received: HostTime::from_ns(1000 * tick + 500),
         }
     }
@@ -286,7 +294,7 @@ mod tests {
                     (c.name.to_owned(), c.seq, c.depth_m(c.width_px - 1, c.height_px - 1).unwrap())
                 })
                 .collect();
-            assert_eq!(observation.seq(), told.unwrap().seq);
+            assert_eq!(observation.seq(), told.as_ref().unwrap().seq);
             for camera in observation.cameras() {
                 let (k, x_m) = (camera.intrinsics, camera.body_from_cam.translation_m.x);
                 assert_eq!((k.width_px, k.height_px), (camera.width_px, camera.height_px));

@@ -11,7 +11,8 @@
 //! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
 //! [`supervisor`] (the plugin's process), [`control`] (the loop that owns the rest), [`flight`]
 //! (phases and outcome, pure), [`guard`] (the last word, pure), [`link`] (MAVLink, sans-IO),
-//! [`stats`], [`log`], [`report`]. [`fly()`] starts it all.
+//! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
+//! [`report`]. [`fly()`] starts it all.
 
 pub mod args;
 pub mod clock;
@@ -24,8 +25,10 @@ pub mod link;
 pub mod log;
 pub mod report;
 pub mod stats;
+pub mod steering;
 pub mod stream;
 pub mod supervisor;
+pub mod waterfall;
 
 pub use args::FlyArgs;
 pub use flight::{Outcome, OutcomeKind};

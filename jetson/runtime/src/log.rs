@@ -38,10 +38,12 @@ pub enum Channel {
     PluginOutput,
     /// Stamps of each image on its way.
     Image,
+    /// Where images get their age, over the last seconds.
+    Timing,
 }
 
 impl Channel {
-    const ALL: [Self; 7] = [
+    const ALL: [Self; 8] = [
         Self::Pose,
         Self::Asked,
         Self::Sent,
@@ -49,6 +51,7 @@ impl Channel {
         Self::Telemetry,
         Self::PluginOutput,
         Self::Image,
+        Self::Timing,
     ];
 
     /// Topic and schema name.
@@ -61,6 +64,7 @@ impl Channel {
             Self::Telemetry => ("/telemetry", "vizflyt.Telemetry"),
             Self::PluginOutput => ("/plugin/output", "vizflyt.PluginOutput"),
             Self::Image => ("/image/timing", "vizflyt.ImageTiming"),
+            Self::Timing => ("/timing", "vizflyt.Timing"),
         }
     }
 
@@ -85,6 +89,10 @@ impl Channel {
             Self::Image => json!({
                 "seq": number, "pose_ns": number, "received_ns": number, "ready_ns": number,
                 "entered_ns": number, "returned_ns": number, "age_ms": number
+            }),
+            Self::Timing => json!({
+                "seconds": number, "waterfall": {"type": "object"},
+                "intervals": {"type": "object"}, "clock": {}, "cameras": {"type": "array"}
             }),
         };
         json!({"type": "object", "title": self.names().1, "properties": properties})

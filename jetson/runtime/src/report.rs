@@ -3,6 +3,7 @@
 use std::fs;
 
 use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::{Arrivals, ClockState, Intervals, StageTimes, Stages};
 
 use crate::flight::{Outcome, OutcomeKind};
 use crate::stats::ImageTimes;
@@ -30,6 +31,18 @@ pub struct Report {
     pub age_ms_p99: f64,
     /// Time inside the plugin's `on_image`, median. [ms]
     pub plugin_ms_p50: f64,
+    /// What each stage adds to the age. [ms]
+    pub stages: Stages<StageTimes>,
+    /// Pose stamp to plugin callback. [ms]
+    pub age: StageTimes,
+    /// Pose stamp to the setpoint that carries the answer. [ms]
+    pub total: StageTimes,
+    /// Times between an image at the plugin and the next.
+    pub intervals: Intervals,
+    /// The server's clock at the end; absent if it was never known.
+    pub clock: Option<ClockState>,
+    /// What became of the images that came, by camera.
+    pub cameras: Vec<Arrivals>,
     /// Setpoints sent to the autopilot.
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
@@ -41,7 +54,7 @@ pub struct Report {
 }
 
 /// Counters that the report adds to the outcome.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Counters {
     /// From take-off to the end. [s]
     pub seconds: f64,
@@ -51,11 +64,16 @@ pub struct Counters {
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
     pub mavlink_packets: u64,
+    /// The server's clock.
+    pub clock: Option<ClockState>,
+    /// What became of the images that came, by camera.
+    pub cameras: Vec<Arrivals>,
 }
 
 impl Report {
     /// Makes the report.
     pub fn new(outcome: &Outcome, times: &ImageTimes, counters: &Counters) -> Self {
+        let (waterfall, intervals) = times.flight();
         Self {
             outcome: outcome.kind,
             reason: outcome.reason.clone(),
@@ -67,6 +85,12 @@ impl Report {
             age_ms_p50: times.ages().quantile_ms(0.5),
             age_ms_p99: times.ages().quantile_ms(0.99),
             plugin_ms_p50: times.plugin().quantile_ms(0.5),
+            stages: waterfall.stages,
+            age: waterfall.age,
+            total: waterfall.total,
+            intervals,
+            clock: counters.clock,
+            cameras: counters.cameras.clone(),
             setpoints_sent: counters.setpoints_sent,
             mavlink_packets: counters.mavlink_packets,
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
@@ -103,5 +127,6 @@ mod tests {
         for key in ["age_ms_p99", "image_hz", "setpoints_sent", "mavlink_packets", "peak_rss_mb"] {
             assert!(json[key].is_number(), "{key}");
         }
+        assert!(json["stages"]["handover"]["p99"].is_number());
     }
 }

@@ -1,48 +1,18 @@
-//! Ages and times of images: for the flight in a histogram, for the last second exactly.
+//! How images fare between the pose and the plugin: ages, rates, and what became of each.
 
 use std::collections::VecDeque;
 
-use vizflyt_protocol::messages::ImageStats;
+use heapless::Vec as Bounded;
+use vizflyt_protocol::histogram::Histogram;
+use vizflyt_protocol::messages::{
+    Arrivals, ClockState, ImageStats, Intervals, MAX_CAMERAS, Timing, Waterfall,
+};
 use vizflyt_protocol::time::HostTime;
 
-/// Quantiles of durations at a resolution of 0.1 ms, in 80 KB however long the flight.
-#[derive(Clone, Debug)]
-pub struct Histogram {
-    bins: Vec<u64>,
-    count: u64,
-}
+use crate::waterfall::{RECENT_S, Stamps, Waterfalls};
 
-const BIN_MS: f64 = 0.1;
-/// Two seconds; longer ones count as that.
-const BINS: usize = 20_000;
-
-impl Default for Histogram {
-    fn default() -> Self {
-        Self { bins: vec![0; BINS], count: 0 }
-    }
-}
-
-impl Histogram {
-    /// Takes one duration. [ms]
-    pub fn add(&mut self, ms: f64) {
-        let bin = (ms / BIN_MS).clamp(0.0, (BINS - 1) as f64) as usize;
-        self.bins[bin] += 1;
-        self.count += 1;
-    }
-
-    /// Returns the duration that a share `q` of all stay below; 0 if there is none. [ms]
-    pub fn quantile_ms(&self, q: f64) -> f64 {
-        let rank = (q * self.count as f64).ceil().max(1.0) as u64;
-        let mut seen = 0;
-        for (bin, &count) in self.bins.iter().enumerate() {
-            seen += count;
-            if seen >= rank {
-                return (bin as f64 + 0.5) * BIN_MS;
-            }
-        }
-        0.0
-    }
-}
+/// The images of one observation.
+type Images = Bounded<Stamps, MAX_CAMERAS>;
 
 /// One answered image.
 #[derive(Clone, Copy, Debug)]
@@ -52,43 +22,89 @@ struct Answered {
     plugin_ms: f32,
 }
 
-/// How images fare between pose and plugin.
+/// An observation that was published and not answered.
+#[derive(Debug)]
+struct Pending {
+    seq: u64,
+    /// The pose it shows.
+    pose: HostTime,
+    /// When it was there for the plugin to take.
+    ready: HostTime,
+    images: Images,
+}
+
+/// An answer whose setpoint has not left.
+#[derive(Debug)]
+struct Unsent {
+    seq: u64,
+    returned: HostTime,
+    images: Images,
+}
+
+/// How images fare. See the module.
 #[derive(Debug, Default)]
 pub struct ImageTimes {
-    /// Published and not answered: number, stamp of the pose it shows.
-    pending: VecDeque<(u64, HostTime)>,
+    pending: VecDeque<Pending>,
+    unsent: Option<Unsent>,
     recent: VecDeque<Answered>,
+    waterfalls: Waterfalls,
     ages: Histogram,
     plugin: Histogram,
     delivered: u64,
+    /// By camera: what the plugin got, and what it did not and why.
+    cameras: [Arrivals; MAX_CAMERAS],
+    /// When the plugin last returned.
+    returned_at: HostTime,
     first_at: Option<HostTime>,
     last_at: Option<HostTime>,
 }
 
-/// Images published and unanswered that are remembered; a plugin has one at a time, so more are
-/// skipped ones.
+/// Observations published and unanswered that are remembered; a plugin has one at a time, so more
+/// are skipped ones.
 const PENDING: usize = 256;
 
 impl ImageTimes {
-    /// Takes note of image `seq`, which shows the pose of `pose`.
-    pub fn published(&mut self, seq: u64, pose: HostTime) {
+    /// Takes note of observation `seq`, which shows the pose of `pose` and was there for the
+    /// plugin at `ready`.
+    pub fn published(&mut self, seq: u64, pose: HostTime, ready: HostTime, images: Images) {
         if self.pending.len() == PENDING {
-            self.pending.pop_front();
+            self.skip_first();
         }
-        self.pending.push_back((seq, pose));
+        self.pending.push_back(Pending { seq, pose, ready, images });
+    }
+
+    /// Counts the oldest that waits for an answer as skipped.
+    fn skip_first(&mut self) {
+        let Some(skipped) = self.pending.pop_front() else { return };
+        // Whether the plugin was still at an earlier one when this one was there to take.
+        let was_busy = skipped.ready < self.returned_at || self.pending.len() + 1 >= PENDING;
+        for image in &skipped.images {
+            let camera = &mut self.cameras[usize::from(image.camera) % MAX_CAMERAS];
+            if was_busy {
+                camera.overrun += 1;
+            } else {
+                camera.unasked += 1;
+            }
+        }
     }
 
     /// Takes note of the plugin's answer; returns the image's age when the plugin got it. [ms]
     pub fn answered(&mut self, seq: u64, entered: HostTime, returned: HostTime) -> Option<f64> {
-        while self.pending.front().is_some_and(|&(older, _)| older < seq) {
-            self.pending.pop_front();
+        while self.pending.front().is_some_and(|older| older.seq < seq) {
+            self.skip_first();
         }
-        let (_, pose) = self.pending.pop_front_if(|(found, _)| *found == seq)?;
+        let Pending { pose, images, .. } = self.pending.pop_front_if(|found| found.seq == seq)?;
         let age_ms = entered.seconds_since(pose) * 1e3;
         let plugin_ms = returned.seconds_since(entered) * 1e3;
         self.ages.add(age_ms);
         self.plugin.add(plugin_ms);
         self.delivered += 1;
+        for image in &images {
+            self.cameras[usize::from(image.camera) % MAX_CAMERAS].delivered += 1;
+        }
+        self.waterfalls.answered(&images, entered, returned);
+        self.unsent = Some(Unsent { seq, returned, images });
+        self.returned_at = returned;
         self.first_at.get_or_insert(entered);
         self.last_at = Some(entered);
         self.recent.push_back(Answered {
@@ -97,6 +113,14 @@ impl ImageTimes {
             plugin_ms: plugin_ms as f32,
         });
         Some(age_ms)
+    }
+
+    /// Takes note that a setpoint that carries the answer to observation `seq` left at `sent`; only
+    /// the first of them counts.
+    pub fn sent(&mut self, seq: u64, sent: HostTime) {
+        if let Some(unsent) = self.unsent.take_if(|unsent| unsent.seq == seq) {
+            self.waterfalls.sent(&unsent.images, unsent.returned, sent);
+        }
     }
 
     /// Returns the figures of the last second before `now`; `replaced` images were replaced by
@@ -119,6 +143,31 @@ impl ImageTimes {
             age_ms_p99: quantile(0.99, |image| image.age_ms),
             plugin_ms_p50: quantile(0.5, |image| image.plugin_ms),
         }
+    }
+
+    /// Returns the regular report of times at `now`; `arrived` says what became of images before
+    /// they reached shared memory, by camera.
+    pub fn timing(&self, now: HostTime, clock: Option<ClockState>, arrived: &[Arrivals]) -> Timing {
+        let (waterfall, intervals) = self.waterfalls.recent(now);
+        let cameras = self.arrivals(arrived);
+        Timing { seconds: RECENT_S as f32, waterfall, intervals, clock, cameras }
+    }
+
+    /// Returns what became of images, by camera: what is known here, added to what `before` says
+    /// of those that did not reach shared memory.
+    pub fn arrivals(&self, before: &[Arrivals]) -> Bounded<Arrivals, MAX_CAMERAS> {
+        let join = |(before, own): (&Arrivals, &Arrivals)| Arrivals {
+            delivered: own.delivered,
+            unasked: own.unasked,
+            overrun: own.overrun,
+            ..*before
+        };
+        before.iter().zip(&self.cameras).map(join).collect()
+    }
+
+    /// Returns the ages and intervals of the whole flight.
+    pub fn flight(&self) -> (Waterfall, Intervals) {
+        self.waterfalls.flight()
     }
 
     /// Returns images that reached the plugin.
@@ -150,30 +199,35 @@ impl ImageTimes {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
 
     fn ms(ms: u64) -> HostTime {
         HostTime::from_ns(ms * 1_000_000)
     }
 
-    #[test]
-    fn quantiles_are_within_a_bin() {
-        let mut histogram = Histogram::default();
-        assert_eq!(histogram.quantile_ms(0.5), 0.0);
-        for n in 1..=1000 {
-            histogram.add(f64::from(n) * 0.1);
-        }
-        assert!((histogram.quantile_ms(0.5) - 50.0).abs() <= 0.1);
-        assert!((histogram.quantile_ms(0.99) - 99.0).abs() <= 0.1);
-        histogram.add(f64::MAX);
-        histogram.add(-1.0);
-        assert!(histogram.quantile_ms(1.0) <= 2000.0);
+    /// Images of these cameras, decoded at `ready`.
+    fn images(cameras: &[u8], pose: HostTime, ready: HostTime) -> Images {
+        let stamps = |&camera| Stamps {
+            camera,
+            pose,
+            render_start: pose,
+            render_end: pose,
+            encode_end: pose,
+            send: pose,
+            receive_first: ready,
+            receive: ready,
+            decode_end: ready,
+            clock_error_ns: 0,
+        };
+        cameras.iter().map(stamps).collect()
     }
 
     #[test]
     fn ages_belong_to_the_image_answered() {
         let mut times = ImageTimes::default();
         for seq in 0..5 {
-            times.published(seq, ms(1000 + 20 * seq));
+            let pose = ms(1000 + 20 * seq);
+            times.published(seq, pose, pose.plus_seconds(0.01), images(&[0], pose, pose));
         }
         // 0 to 2 were skipped.
         assert_eq!(times.answered(3, ms(1070), ms(1075)), Some(10.0));
@@ -185,5 +239,68 @@ mod tests {
         assert_eq!((stats.rate_hz, stats.age_ms_p99, stats.plugin_ms_p50), (2.0, 10.0, 1.0));
         assert_eq!(times.last_second(ms(9000), 5, 7).rate_hz, 0.0);
         assert_eq!(times.rate_hz(), 100.0);
+    }
+
+    #[test]
+    fn an_image_is_skipped_because_the_plugin_was_busy_or_slept() {
+        let mut times = ImageTimes::default();
+        let publish = |times: &mut ImageTimes, seq, ready| {
+            times.published(
+                seq,
+                ms(ready - 10),
+                ms(ready),
+                images(&[0, 2], ms(ready - 10), ms(ready)),
+            );
+        };
+        publish(&mut times, 1, 100);
+        times.answered(1, ms(100), ms(150));
+        // There while the plugin was at 1; there when it had done, but 4 was before it woke.
+        publish(&mut times, 2, 120);
+        publish(&mut times, 3, 151);
+        publish(&mut times, 4, 152);
+        times.answered(4, ms(153), ms(154));
+        let arrived = [Arrivals { arrived: 4, ..Arrivals::default() }; 3];
+        let found = times.arrivals(&arrived);
+        let expected =
+            Arrivals { arrived: 4, delivered: 2, overrun: 1, unasked: 1, ..Arrivals::default() };
+        assert_eq!((found[0], found[2]), (expected, expected));
+        assert_eq!(found[0].ended(), 4);
+        assert_eq!(found[1], arrived[1], "no camera 1 here");
+    }
+
+    #[test]
+    fn only_the_first_setpoint_of_an_answer_counts() {
+        let mut times = ImageTimes::default();
+        times.published(1, ms(100), ms(110), images(&[0], ms(100), ms(110)));
+        times.sent(1, ms(111));
+        times.answered(1, ms(112), ms(115));
+        times.sent(7, ms(116));
+        times.sent(1, ms(118));
+        times.sent(1, ms(138));
+        let (waterfall, _) = times.flight();
+        assert_eq!((waterfall.images, waterfall.answered), (1, 1));
+        assert!((waterfall.total.max - 18.0).abs() < 1e-3);
+        assert!((waterfall.stages.setpoint.max - 3.0).abs() < 1e-3);
+    }
+
+    proptest! {
+        /// Every image that was published is accounted for, whatever the plugin does.
+        #[test]
+        fn every_image_has_one_end(script in prop::collection::vec((0u64..30, any::<bool>()), 1..600)) {
+            let mut times = ImageTimes::default();
+            let (mut now, mut seq, mut published) = (1000, 0, 0u64);
+            for (pause, answers) in script {
+                now += pause;
+                seq += 1;
+                published += 1;
+                times.published(seq, ms(now), ms(now), images(&[1], ms(now), ms(now)));
+                if answers {
+                    times.answered(seq, ms(now), ms(now + pause));
+                }
+            }
+            let found = times.arrivals(&[Arrivals { arrived: published, ..Arrivals::default() }; 2]);
+            prop_assert_eq!(found[1].ended() + times.pending.len() as u64, published);
+            prop_assert_eq!(found[1].delivered, times.delivered());
+        }
     }
 }

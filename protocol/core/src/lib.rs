@@ -5,6 +5,7 @@
 //! - [`geometry`]: frames as types, [`geometry::Pose`], [`geometry::Intrinsics`], and
 //!   [`geometry::Volume`], the solids that geofence, truth and tests are made of;
 //! - [`time`]: one stamp type per clock, and the filter that relates two clocks;
+//! - [`histogram`]: durations counted, the same way at both ends;
 //! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
@@ -15,6 +16,7 @@
 #![no_std]
 
 pub mod geometry;
+pub mod histogram;
 pub mod mavlink;
 pub mod messages;
 pub mod packet;

@@ -14,7 +14,8 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::{Notify, watch};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, Timing,
+    bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -41,6 +42,8 @@ pub struct Vehicle {
     pub pose: watch::Sender<Option<PoseSample>>,
     /// The runtime's newest report.
     pub telemetry: watch::Sender<Option<Telemetry>>,
+    /// Where images get their age, by the runtime's newest report.
+    pub timing: watch::Sender<Option<Timing>>,
     /// The newest previews, by camera.
     pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
     /// Where the vehicle was.
@@ -108,6 +111,7 @@ impl Vehicle {
             events: EventLog::default(),
             pose: watch::Sender::new(None),
             telemetry: watch::Sender::new(None),
+            timing: watch::Sender::new(None),
             previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
             trail: Mutex::default(),
             images: ImageCounters::default(),
@@ -235,6 +239,7 @@ impl Vehicle {
             state.flights += 1;
             state.flight_start = self.events.next_index();
             self.telemetry.send_replace(None);
+            self.timing.send_replace(None);
             lock(&self.trail).clear();
             *lock(&self.flight) = Flight::default();
         }

@@ -1,5 +1,5 @@
 //! The flight from first contact to disarming: a sans-IO state machine that ties guard, link and
-//! plugin together. [`control`](crate::control) drives it at 50 Hz.
+//! plugin together. [`control`](crate::control) drives it at 50 to 100 Hz.
 //!
 //! ```text
 //! Connecting ──▶ Preparing ──▶ TakingOff ──▶ Flying ◀──▶ Holding
@@ -92,6 +92,8 @@ pub struct Orders {
     pub goal: Goal,
     /// What to send to the autopilot.
     pub setpoint: Option<GuidedSetpoint>,
+    /// The image whose answer this setpoint carries; the same as long as the answer is in force.
+    pub answers: Option<u64>,
 }
 
 /// Something to tell the server, the plugin, the log and the person.
@@ -133,6 +135,8 @@ pub struct Flight {
     took_off_at: Option<HostTime>,
     plugin_ready: bool,
     answered_at: Option<HostTime>,
+    /// The image whose answer the guard took last.
+    taken: Option<u64>,
     /// Oldest image that the plugin has not answered: its number, and when it got it.
     unanswered: Option<(u64, HostTime)>,
     guard: Option<Guard>,
@@ -164,6 +168,7 @@ impl Flight {
             took_off_at: None,
             plugin_ready: false,
             answered_at: None,
+            taken: None,
             unanswered: None,
             guard: None,
             stance: None,
@@ -235,7 +240,7 @@ impl Flight {
         }
     }
 
-    /// Does what is due at `now`; 50 Hz.
+    /// Does what is due at `now`; 50 to 100 Hz, see [`crate::steering`].
     pub fn tick(&mut self, now: HostTime, link: &LinkView) -> Orders {
         if link.connected {
             self.connected_at = now;
@@ -248,7 +253,7 @@ impl Flight {
             FlightPhase::Landing => self.landing(now, link),
             FlightPhase::Landed => {}
         }
-        Orders { goal: self.goal(), setpoint: None }
+        Orders { goal: self.goal(), setpoint: None, answers: None }
     }
 
     fn goal(&self) -> Goal {
@@ -327,6 +332,7 @@ impl Flight {
             return;
         };
         if guard.ask(now, setpoint) {
+            self.taken = Some(seq);
             self.refused_at = None;
         } else if self.refused_at.is_none() {
             // Once per series; the hold and the landing that follow name it again.
@@ -413,14 +419,18 @@ impl Flight {
         }
         let flies = self.phase_flies();
         let (Some(guard), Some(fix), true) = (&mut self.guard, &self.fix, flies) else {
-            return Orders { goal: self.goal(), setpoint: None };
+            return Orders { goal: self.goal(), setpoint: None, answers: None };
         };
         let (passed, stance) = guard.tick(now, fix);
         self.take_stance(now, stance);
-        match passed {
-            Passed::Guided(setpoint) => Orders { goal: self.goal(), setpoint: Some(setpoint) },
-            Passed::Land => Orders { goal: self.goal(), setpoint: None },
-        }
+        let setpoint = match passed {
+            Passed::Guided(setpoint) => Some(setpoint),
+            Passed::Land => None,
+        };
+        // Any other stance is the guard's own will.
+        let is_answer = matches!(stance, Stance::Passing | Stance::Holding(HoldReason::Asked));
+        let answers = self.taken.filter(|_| is_answer && setpoint.is_some());
+        Orders { goal: self.goal(), setpoint, answers }
     }
 
     fn landing(&mut self, now: HostTime, link: &LinkView) {

@@ -65,7 +65,7 @@ impl Script {
             images: true,
             answers: Answers::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
             seq: 0,
-            orders: Orders { goal: Goal::Prepare, setpoint: None },
+            orders: Orders { goal: Goal::Prepare, setpoint: None, answers: None },
             notices: Vec::new(),
         }
     }
@@ -334,7 +334,7 @@ fn a_pilot_who_takes_over_is_left_alone() {
     let mut script = Script::flying();
     script.link.mode = CopterMode::Loiter as u32;
     script.run(5.0);
-    assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None });
+    assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None, answers: None });
     assert_eq!(script.flight.phase(), FlightPhase::Landing);
     script.link.armed = false;
     script.check_end(OutcomeKind::Error, "switched to Loiter, not by this runtime");

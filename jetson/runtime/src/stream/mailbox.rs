@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
-use vizflyt_protocol::messages::MAX_CAMERAS;
+use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 
@@ -17,6 +17,8 @@ pub struct ReceivedImage {
     pub payload: Vec<u8>,
     /// The pose's stamp on this computer's clock.
     pub pose: HostTime,
+    /// When the first byte had come.
+    pub first: HostTime,
     /// When the last byte had come.
     pub received: HostTime,
 }
@@ -27,6 +29,8 @@ pub struct Mailbox {
     slots: Mutex<[Option<ReceivedImage>; MAX_CAMERAS]>,
     filled: Condvar,
     replaced: AtomicU64,
+    /// What became of images so far, by camera.
+    arrivals: Mutex<[Arrivals; MAX_CAMERAS]>,
 }
 
 impl Mailbox {
@@ -35,16 +39,20 @@ impl Mailbox {
     pub fn offer(&self, image: ReceivedImage) {
         let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(slot) = slots.get_mut(usize::from(image.header.camera)) else { return };
+        let camera = usize::from(image.header.camera);
+        self.note(camera, |counts| counts.arrived += 1);
         match slot {
             // By pose too: a server that restarted counts from the start again.
             Some(waiting)
                 if waiting.header.seq.get() >= image.header.seq.get()
                     && waiting.pose >= image.pose =>
             {
+                self.note(camera, |counts| counts.stale += 1);
                 self.replaced.fetch_add(1, Ordering::Relaxed);
             }
             slot => {
                 if slot.replace(image).is_some() {
+                    self.note(camera, |counts| counts.superseded += 1);
                     self.replaced.fetch_add(1, Ordering::Relaxed);
                 }
                 self.filled.notify_one();
@@ -64,6 +72,19 @@ impl Mailbox {
             .filter(|slot| slot.is_some())
             .min_by_key(|slot| slot.as_ref().map(|image| image.header.seq.get()))?
             .take()
+    }
+
+    /// Counts what became of an image of a camera.
+    pub fn note(&self, camera: usize, count: impl FnOnce(&mut Arrivals)) {
+        let mut arrivals = self.arrivals.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(counts) = arrivals.get_mut(camera) {
+            count(counts);
+        }
+    }
+
+    /// Returns what became of images before they reached shared memory, by camera.
+    pub fn arrivals(&self) -> [Arrivals; MAX_CAMERAS] {
+        *self.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Returns how many images gave way to newer ones.
@@ -91,6 +112,7 @@ mod tests {
             ),
             payload: Vec::new(),
             pose: HostTime::ZERO,
+            first: HostTime::ZERO,
             received: HostTime::ZERO,
         }
     }
@@ -107,6 +129,9 @@ mod tests {
             .collect();
         assert_eq!(taken, [(1, 2), (0, 3)]);
         assert_eq!(mailbox.replaced(), 3);
+        let [front, rear, ..] = mailbox.arrivals();
+        assert_eq!((front.arrived, front.stale, front.superseded), (3, 1, 1));
+        assert_eq!((rear.arrived, rear.stale, rear.superseded), (2, 0, 1));
         mailbox.offer(image(200, 1));
         assert!(mailbox.take(Duration::ZERO).is_none(), "there is no camera 200");
     }

@@ -21,7 +21,9 @@ use std::time::Duration;
 use quinn::{AckFrequencyConfig, ClientConfig, Endpoint, EndpointConfig, TransportConfig, VarInt};
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::sync::mpsc;
-use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, Event, Name, PoseSample, ToServer};
+use vizflyt_protocol::messages::{
+    ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, ToServer,
+};
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 
 pub use mailbox::{Mailbox, ReceivedImage};
@@ -72,6 +74,25 @@ impl ServerClock {
     /// Returns a stamp of this computer on the server's clock; zero before the first exchange.
     pub fn to_server(&self, stamp: HostTime) -> ServerTime {
         self.filter().to_remote(stamp).unwrap_or(ServerTime::ZERO)
+    }
+
+    /// Returns the relation at `now`; `None` before the first exchange.
+    pub fn state(&self, now: HostTime) -> Option<ClockState> {
+        let filter = self.filter();
+        let (drift_ppm, drift_bound_ppm) = filter.drift_ppm()?;
+        Some(ClockState {
+            offset_ns: filter.offset_ns(now)?,
+            error_bound_ms: (filter.error_bound_ns(now)? as f64 * 1e-6) as f32,
+            drift_ppm: drift_ppm as f32,
+            drift_bound_ppm: drift_bound_ppm as f32,
+            steps: u32::try_from(filter.steps()).unwrap_or(u32::MAX),
+        })
+    }
+
+    /// Returns the bound of the error of [`Self::to_host`] at `now`; `None` before the first
+    /// exchange. [ns]
+    pub fn error_bound_ns(&self, now: HostTime) -> Option<u64> {
+        self.filter().error_bound_ns(now)
     }
 
     fn update(&self, sent: HostTime, answered: ServerTime, received: HostTime) {

@@ -163,16 +163,17 @@ async fn receive_image(mut stream: RecvStream, shared: &Shared) {
     let image = async {
         let mut bytes = [0; ImageHeader::SIZE];
         stream.read_exact(&mut bytes).await.ok()?;
+        let first = clock::now();
         let (header, _) = ImageHeader::parse(&bytes)
             .inspect_err(|error| tracing::debug!("image dropped: {error}"))
             .ok()?;
         // Bounded by `parse`.
         let mut payload = vec![0; header.payload_len.get() as usize];
         stream.read_exact(&mut payload).await.ok()?;
-        Some((header, payload))
+        Some((header, payload, first))
     };
-    let Ok(Some((header, payload))) = timeout(IMAGE_WITHIN, image).await else { return };
+    let Ok(Some((header, payload, first))) = timeout(IMAGE_WITHIN, image).await else { return };
     let received = clock::now();
     let Some(pose) = shared.clock.to_host(header.pose_stamp()) else { return };
-    shared.mailbox.offer(ReceivedImage { header, payload, pose, received });
+    shared.mailbox.offer(ReceivedImage { header, payload, pose, first, received });
 }

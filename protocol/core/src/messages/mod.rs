@@ -16,6 +16,7 @@ mod plugin;
 mod session;
 mod setpoint;
 mod telemetry;
+mod timing;
 
 pub use event::{Event, EventKind};
 pub use plugin::{FromPlugin, ToPlugin};
@@ -24,6 +25,10 @@ pub use session::{
 };
 pub use setpoint::{Axes, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};
+pub use timing::{
+    Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Stages, Timing,
+    Waterfall,
+};
 
 /// A short name: of a vehicle, a camera, a stage.
 pub type Name = heapless::String<32>;

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use super::{Event, MAX_CAMERAS, Name, Telemetry, Text};
+use super::{Event, MAX_CAMERAS, Name, Telemetry, Text, Timing};
 use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 use crate::time::{HostTime, ServerTime};
 
@@ -34,6 +34,7 @@ pub struct ClockReply {
 
 /// Runtime to server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // Why: the largest comes once a second, and there is no heap.
 pub enum ToServer {
     /// Opens the conversation.
     Hello(Hello),
@@ -43,6 +44,8 @@ pub enum ToServer {
     Telemetry(Telemetry),
     /// Something the page should show.
     Event(Event),
+    /// Reports where images get their age. 1 Hz.
+    Timing(Timing),
 }
 
 /// Server to runtime.

@@ -186,5 +186,34 @@ mod tests {
         assert!(encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
         let telemetry = ToServer::Telemetry(Telemetry::default());
         assert!(encode(&telemetry, &mut buffer).len() < 1024);
+        let times = StageTimes { p50: 1e9, p90: 1e9, p99: 1e9, max: 1e9 };
+        let most = u64::MAX;
+        let arrivals = Arrivals {
+            arrived: most,
+            delivered: most,
+            stale: most,
+            broken: most,
+            superseded: most,
+            unasked: most,
+            overrun: most,
+        };
+        let timing = Timing {
+            seconds: 1e9,
+            waterfall: Waterfall {
+                images: most,
+                answered: most,
+                stages: Stages::from_fn(|_| times),
+                age: times,
+                total: times,
+                clamped: most,
+                out_of_bound: most,
+            },
+            intervals: Intervals { times, bins: [u32::MAX; 20] },
+            clock: Some(ClockState { offset_ns: i64::MIN, ..ClockState::default() }),
+            cameras: core::iter::repeat_n(arrivals, MAX_CAMERAS).collect(),
+        };
+        let message = ToServer::Timing(timing);
+        assert!(encode(&message, &mut buffer).len() < 1536);
+        assert_eq!(decode_body(encode_body(&message, &mut buffer)), Ok(message));
     }
 }

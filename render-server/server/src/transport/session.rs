@@ -141,6 +141,9 @@ async fn up(
             ToServer::Telemetry(report) => {
                 seat.vehicle.report(report);
             }
+            ToServer::Timing(timing) => {
+                seat.vehicle.timing.send_replace(Some(timing));
+            }
             ToServer::Event(event) => {
                 seat.vehicle.log(Origin::Page, event);
             }
