@@ -145,7 +145,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         height_px: k.height_px,
         cameras: cameras.len(),
         images: times.len(),
-        renderer: rasterizer.name(),
+        renderer: rasterizer.name().into_owned(),
         renderer_reason: reason,
         prepare_ms,
         median_ms: at(0.5, |t| t.total_ms),

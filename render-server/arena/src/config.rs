@@ -14,9 +14,11 @@ use vizflyt_protocol::messages::{ArenaInfo, Limits, MAX_CAMERAS, bounded};
 
 mod camera;
 mod validate;
+mod vehicle;
 
 pub use camera::{CameraConfig, LensConfig};
 pub use validate::ConfigError;
+pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
 /// The whole of `arena.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -47,6 +49,9 @@ pub struct ArenaConfig {
     pub occupancy: Occupancy,
     /// The cameras, in the order of their index on the wire; 1 to 8.
     pub cameras: Vec<CameraConfig>,
+    /// The vehicles, up to 8; without any, the server's command line names them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub vehicles: Vec<VehicleConfig>,
     /// The course's gates in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<StageConfig>,

@@ -9,6 +9,7 @@
 //! flight is said once; after it nothing more is judged until [`Referee::restart`].
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
@@ -33,7 +34,7 @@ pub struct Referee {
     config: ArenaConfig,
     fence: Volume,
     limits: Limits,
-    field: DistanceField,
+    field: Arc<DistanceField>,
     gate: PoseGate,
     course: Course,
     last_m: Option<DVec3>,
@@ -45,12 +46,13 @@ pub struct Referee {
 }
 
 impl Referee {
-    /// Makes a referee for an arena with its baked obstacles; no flight has begun.
-    pub fn new(config: &ArenaConfig, field: DistanceField) -> Self {
+    /// Makes a referee for an arena with its baked obstacles, which the referees of several vehicles
+    /// share; no flight has begun.
+    pub fn new(config: &ArenaConfig, field: impl Into<Arc<DistanceField>>) -> Self {
         Self {
             fence: config.geofence(),
             limits: config.limits,
-            field,
+            field: field.into(),
             gate: PoseGate::default(),
             course: Course::new(config),
             last_m: None,

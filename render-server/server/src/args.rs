@@ -30,9 +30,10 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:51001")]
     pub vicon: SocketAddr,
 
-    /// The vehicle: its object's name in the localization system
-    #[arg(long, value_name = "NAME", default_value = "vizflyt")]
-    pub vehicle: String,
+    /// A vehicle: its object's name in the localization system; repeat for more
+    /// [default: the [[vehicles]] of arena.toml, else vizflyt]
+    #[arg(long = "vehicle", value_name = "NAME")]
+    pub vehicles: Vec<String>,
 
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]

@@ -9,6 +9,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
+pub use vizflyt_arena::config::MAX_VEHICLES;
 
 use crate::drivers::SourceCounters;
 use crate::outlet::Outlet;
@@ -29,7 +30,7 @@ pub struct Hub {
     pub stats: Stats,
     /// Who wants images.
     pub outlet: Outlet,
-    /// What the localization delivered.
+    /// What the localization delivered, of all vehicles.
     pub source: Mutex<SourceCounters>,
 }
 
@@ -71,6 +72,13 @@ impl Hub {
         })
     }
 
+    /// Logs something for the pages of all vehicles; runtimes have no use for it.
+    pub fn note(&self, text: &str) {
+        for vehicle in &self.vehicles {
+            vehicle.note(text);
+        }
+    }
+
     /// Returns the report over the whole run.
     pub fn report(&self) -> Report {
         let images: Vec<_> = self.vehicles.iter().map(|vehicle| &vehicle.images).collect();
@@ -82,9 +90,6 @@ impl Hub {
 pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
-
-/// Vehicles that one server serves at most: a net holds no more.
-pub const MAX_VEHICLES: usize = 8;
 
 #[cfg(test)]
 mod tests {

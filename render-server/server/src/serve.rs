@@ -58,13 +58,31 @@ struct Ready<'a> {
     http: String,
     vicon: SocketAddr,
     fingerprint: &'a str,
-    /// Where the vehicle is expected to start: x, y, z [m, world], yaw [deg].
+    /// Where the first vehicle is expected to start: x, y, z [m, world], yaw [deg].
     spawn: [f64; 4],
+    vehicles: Vec<ReadyVehicle>,
     arena: &'a str,
     /// What draws: `cpu avx2`.
     renderer: &'a str,
     /// Why it is this renderer.
     renderer_reason: &'a str,
+}
+
+/// A vehicle, as it is printed when the server is ready.
+#[derive(Debug, Serialize)]
+struct ReadyVehicle {
+    name: String,
+    /// Where it is expected to start: x, y, z [m, world], yaw [deg].
+    spawn: [f64; 4],
+    cameras: Vec<String>,
+}
+
+impl ReadyVehicle {
+    fn of(vehicle: &Vehicle, arena: &ArenaConfig) -> Self {
+        let [x, y, z] = arena.spawn.position_m.to_array();
+        let cameras = arena.cameras.iter().map(|camera| camera.name.clone()).collect();
+        Self { name: vehicle.name.to_string(), spawn: [x, y, z, arena.spawn.yaw_deg], cameras }
+    }
 }
 
 async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
@@ -75,7 +93,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     let quic = endpoint.local_addr().context("QUIC has no address")?;
     let listener = dashboard::bind(args.http).await?;
     let http = format!("http://{}", listener.local_addr().context("the page has no address")?);
-    let vicon = ViconUdp::bind(args.vicon, &args.vehicle)?;
+    let vicon = ViconUdp::bind(args.vicon)?;
     let vicon_address = vicon.address();
 
     let loading = args.clone();
@@ -85,16 +103,19 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         () = stop.wait() => return Ok(()),
     };
     let Chosen { rasterizer, reason } = twin.renderer;
-    let renderer = RendererInfo { name: rasterizer.name(), reason };
-    let cameras = Cameras::new(twin.arena.cameras.clone());
-    let vehicle = Vehicle::new(0, &args.vehicle, twin.arena.info(), cameras);
-    let hub = Arc::new(Hub::new(vec![vehicle], renderer, stop.clone()));
+    let renderer = RendererInfo { name: rasterizer.name().into_owned(), reason };
+    let vehicles = twin.flying.iter().enumerate().map(|(index, (name, arena))| {
+        Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()))
+    });
+    let hub = Arc::new(Hub::new(vehicles.collect(), renderer, stop.clone()));
     let renderer = lock(&hub.renderer).clone();
-    let threads = start_threads(args, &hub, rasterizer, twin.referee, vicon)?;
+    let names: Vec<_> = hub.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
+    let threads = start_threads(args, &hub, rasterizer, twin.referees, vicon.of(&names))?;
 
     let fingerprint = identity.fingerprint();
-    let spawn = twin.arena.spawn;
-    let [x, y, z] = spawn.position_m.to_array();
+    let vehicles = hub.vehicles.iter().zip(&twin.flying);
+    let vehicles: Vec<_> =
+        vehicles.map(|(vehicle, (_, arena))| ReadyVehicle::of(vehicle, arena)).collect();
     announce(
         args.json,
         &Ready {
@@ -103,7 +124,8 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
             http,
             vicon: vicon_address,
             fingerprint: &fingerprint,
-            spawn: [x, y, z, spawn.yaw_deg],
+            spawn: vehicles.first().map_or([0.0; 4], |vehicle| vehicle.spawn),
+            vehicles,
             arena: &twin.arena.name,
             renderer: &renderer.name,
             renderer_reason: &renderer.reason,
@@ -111,11 +133,15 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     );
 
     let page = tokio::spawn(dashboard::serve(hub.clone(), twin.map, twin.arena.stages, listener));
-    let printer = tokio::spawn(print_events(hub.clone(), args.json));
+    let mut printers = tokio::task::JoinSet::new();
+    for vehicle in &hub.vehicles {
+        let alone = hub.vehicles.len() == 1;
+        printers.spawn(print_events(vehicle.clone(), alone, args.json));
+    }
     transport::serve(hub.clone(), endpoint, identity, args.congestion).await;
     hub.outlet.shut();
     page.abort();
-    printer.abort();
+    printers.shutdown().await;
     for thread in threads {
         // A thread that panicked has said so on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
@@ -128,19 +154,26 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
 struct Twin {
     arena: ArenaConfig,
     renderer: Chosen,
-    referee: Referee,
+    /// Each vehicle's name, and the arena as it has it.
+    flying: Vec<(String, ArenaConfig)>,
+    referees: Vec<Referee>,
     map: Map,
 }
 
 fn prepare(args: &ServeArgs) -> Result<Twin> {
     let Scene { arena, splats, .. } = scene::load(&args.arena, args.up, args.scale)?;
-    let obstacles = scene::bake(&splats, &arena);
+    let flying: Vec<_> = arena
+        .flying(&args.vehicles)?
+        .iter()
+        .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
+        .collect();
+    let obstacles = Arc::new(scene::bake(&splats, &arena));
     let map = draw_map(&splats, &arena, &obstacles);
     let renderer = choose(&splats, args.renderer)?;
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
-    let referee = Referee::new(&arena, obstacles);
-    Ok(Twin { arena, renderer, referee, map })
+    let referees = flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone())).collect();
+    Ok(Twin { arena, renderer, flying, referees, map })
 }
 
 fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map {
@@ -157,7 +190,7 @@ fn start_threads(
     args: &ServeArgs,
     hub: &Arc<Hub>,
     mut renderer: Box<dyn Rasterizer>,
-    referee: Referee,
+    mut referees: Vec<Referee>,
     mut source: impl PoseSource + 'static,
 ) -> Result<Vec<JoinHandle<()>>> {
     let newest = Arc::new(Mailbox::default());
@@ -175,7 +208,7 @@ fn start_threads(
     Ok(vec![
         start(
             "pose",
-            Box::new(move || tick::poses(&pose_hub, &mut source, referee, &pose_newest)),
+            Box::new(move || tick::poses(&pose_hub, &mut source, &mut referees, &pose_newest)),
         )?,
         start(
             "render",
@@ -188,8 +221,8 @@ fn start_threads(
     ])
 }
 
-async fn print_events(hub: Arc<Hub>, json: bool) {
-    let vehicle = &hub.vehicles[0];
+/// Prints what happens to a vehicle; unless it is `alone`, each line names it.
+async fn print_events(vehicle: Arc<Vehicle>, alone: bool, json: bool) {
     let mut log = vehicle.events.subscribe();
     log.mark_changed();
     let mut cursor = 0;
@@ -203,10 +236,13 @@ async fn print_events(hub: Arc<Hub>, json: bool) {
             }
         };
         for entry in entries.into_iter().filter(|entry| entry.origin == Origin::Server) {
-            if json {
-                line(&serde_json::json!({ "event": entry.event }));
-            } else {
-                say(&entry.event.text);
+            match (json, alone) {
+                (true, true) => line(&serde_json::json!({ "event": entry.event })),
+                (true, false) => {
+                    line(&serde_json::json!({ "vehicle": vehicle.name, "event": entry.event }));
+                }
+                (false, true) => say(&entry.event.text),
+                (false, false) => say(&format!("{}: {}", vehicle.name, entry.event.text)),
             }
         }
     }
@@ -220,10 +256,16 @@ fn announce(json: bool, ready: &Ready<'_>) {
     say(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
     say(&format!("page         {}", ready.http));
     say(&format!("vicon        {} (UDP object stream)", ready.vicon));
-    say(&format!(
-        "runtime      vizflyt fly PLUGIN --server {} --fingerprint {}",
-        ready.quic, ready.fingerprint
-    ));
+    for vehicle in &ready.vehicles {
+        let named = match &*ready.vehicles {
+            [one] if one.name == "vizflyt" => String::new(),
+            _ => format!(" --vehicle {}", vehicle.name),
+        };
+        say(&format!(
+            "runtime      vizflyt fly PLUGIN --server {} --fingerprint {}{named}",
+            ready.quic, ready.fingerprint
+        ));
+    }
 }
 
 fn report(json: bool, report: &Report) {

@@ -1,14 +1,15 @@
 //! The two threads that drive everything: poses in, drawn ticks out.
 //!
 //! ```text
-//! pose thread:   source -> Referee (gate, rules) -> Hub::pose, trail, events       200 Hz
-//!                                                \-> newest pose (mailbox)
-//! render thread: newest pose -> the cameras that are due -> drawn ticks (mailbox)  as fast as
-//!                the machine draws, at most --max-rate and each camera's own rate; rests while
-//!                nobody wants images
+//! pose thread:   source -> a Referee for each vehicle (gate, rules) -> pose, trail, events
+//!                                                                  \-> newest poses (mailbox)
+//! render thread: newest poses -> the cameras that are due, all vehicles' in one call -> drawn
+//!                ticks, as fast as the machine draws, at most --max-rate and each camera's own
+//!                rate; rests while nobody wants a vehicle's images
 //! ```
-//! Budget of the pose thread: 20 us a pose, bounded by the referee's swept query. The render
-//! thread is bounded by the renderer. Both are plain threads: tokio's timers are a millisecond
+//! Budget of the pose thread: 20 us a pose, at 200 Hz for each vehicle, bounded by the referee's
+//! swept query. The render thread is bounded by the renderer; it allocates nothing once every
+//! buffer has been used (tests/allocations.rs). Both are plain threads: tokio's timers are a millisecond
 //! late, and drawing would block its workers.
 
 use std::sync::Arc;
@@ -20,132 +21,189 @@ use vizflyt_arena::Referee;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_arena::pose::Rejected;
 use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS, PoseSample};
+use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::{Camera, Rasterizer, RgbdImage};
 
+use crate::cameras::CameraSet;
 use crate::clock;
 use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, SourceCounters};
 use crate::events::Origin;
-use crate::hub::{Hub, RendererInfo, lock};
+use crate::hub::{Hub, MAX_VEHICLES, RendererInfo, lock};
 use crate::mailbox::Mailbox;
+use crate::vehicle::Vehicle;
 
-/// Takes poses from `source` until the server stops.
+/// The newest poses on their way to the render thread, by vehicle.
+pub type Poses = [Option<PoseSample>; MAX_VEHICLES];
+
+/// Takes poses from `source` until the server stops; `referees` has one for each vehicle.
 pub fn poses(
     hub: &Arc<Hub>,
     source: &mut dyn PoseSource,
-    mut referee: Referee,
-    newest: &Mailbox<Option<PoseSample>>,
+    referees: &mut [Referee],
+    newest: &Mailbox<Poses>,
 ) {
-    let vehicle = &*hub.vehicles[0];
-    let mut flights = vehicle.flights();
-    let (mut rejected, mut warned) = (0u64, None::<Instant>);
+    let flights = hub.vehicles.iter().map(|vehicle| vehicle.flights());
+    let mut watches: Vec<_> =
+        flights.map(|flights| Watch { flights, ..Watch::default() }).collect();
     while !hub.stop.is_set() {
-        let due = referee.poll_timeout().map_or(PATIENCE, |due| {
+        let due = referees.iter().filter_map(Referee::poll_timeout).min();
+        let due = due.map_or(PATIENCE, |due| {
             Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
         });
         let measured = source.receive(due.min(PATIENCE));
-        // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
-        // old by now but followed by a newer one, and that is not a lost pose.
-        let mut judged_at = clock::now();
-        // A new runtime on the ground is a new flight: course and timer start afresh.
-        let now_flights = vehicle.flights();
-        if now_flights != flights {
-            flights = now_flights;
-            referee.restart();
+        for ((vehicle, referee), watch) in hub.vehicles.iter().zip(&mut *referees).zip(&mut watches)
+        {
+            // A new runtime on the ground is a new flight: course and timer start afresh.
+            let flights = vehicle.flights();
+            if flights != watch.flights {
+                watch.flights = flights;
+                referee.restart();
+            }
         }
-        if let Some(measured) = measured {
+        // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
+        // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
+        let mut judged_at = None;
+        let mut believed = Poses::default();
+        for measured in measured {
+            let index = measured.vehicle;
             let _span = trace_span!("pose", stamp_ns = measured.stamp.as_ns()).entered();
-            match referee.handle_measurement(measured.stamp, measured.world_from_body) {
+            match referees[index].handle_measurement(measured.stamp, measured.world_from_body) {
                 Ok(sample) => {
-                    judged_at = sample.stamp;
+                    judged_at = judged_at.max(Some(sample.stamp));
+                    believed[index] = Some(sample);
+                    let vehicle = &hub.vehicles[index];
                     vehicle.pose.send_replace(Some(sample));
-                    newest.put(Some(sample));
                     lock(&vehicle.trail).add(&sample);
                 }
-                Err(reason) => {
-                    rejected += 1;
-                    // Two frames of one burst may bear the same stamp: no fault of anyone's.
-                    let same = matches!(reason, Rejected::Stale);
-                    if same {
-                        judged_at = measured.stamp;
-                    }
-                    if !same && warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
-                        warned = Some(Instant::now());
-                        warn!("{reason}");
-                        vehicle.note(&reason.to_string());
-                    }
+                // Two frames of one burst may bear the same stamp: no fault of anyone's.
+                Err(Rejected::Stale) => {
+                    watches[index].rejected += 1;
+                    judged_at = judged_at.max(Some(measured.stamp));
                 }
+                Err(reason) => watches[index].rejected(&hub.vehicles[index], reason),
             }
             hub.stats.pose.add(measured.arrival, clock::now());
         }
-        referee.handle_timeout(judged_at);
-        while let Some(event) = referee.poll_event() {
-            vehicle.log(Origin::Server, event);
+        if believed.iter().any(Option::is_some) {
+            // What nobody took of the others is still their newest.
+            newest.put_over(believed, |poses, old| merge(old, poses));
+        }
+        let judged_at = judged_at.unwrap_or_else(clock::now);
+        let mut all = SourceCounters::default();
+        for ((vehicle, referee), watch) in hub.vehicles.iter().zip(&mut *referees).zip(&watches) {
+            referee.handle_timeout(judged_at);
+            while let Some(event) = referee.poll_event() {
+                vehicle.log(Origin::Server, event);
+            }
+            let own = source.counters(vehicle.index);
+            let own = SourceCounters { rejected: watch.rejected, ..own };
+            *lock(&vehicle.source) = own;
+            all = all.and(own);
         }
         while let Some(warning) = source.next_warning() {
             warn!("{warning}");
-            vehicle.note(&warning);
+            hub.note(&warning);
         }
-        *lock(&hub.source) = SourceCounters { rejected, ..source.counters() };
+        *lock(&hub.source) = all;
     }
 }
 
-/// Draws the newest pose until the server stops: each tick the cameras that are due.
+/// What the pose thread remembers of one vehicle.
+#[derive(Debug, Default)]
+struct Watch {
+    flights: u64,
+    rejected: u64,
+    warned: Option<Instant>,
+}
+
+impl Watch {
+    fn rejected(&mut self, vehicle: &Vehicle, reason: Rejected) {
+        self.rejected += 1;
+        if self.warned.is_none_or(|at| at.elapsed() > WARN_EVERY) {
+            self.warned = Some(Instant::now());
+            warn!("{}: {reason}", vehicle.name);
+            vehicle.note(&reason.to_string());
+        }
+    }
+}
+
+/// Draws the newest poses until the server stops: each tick the cameras that are due of the
+/// vehicles that someone wants images of.
 ///
 /// # Errors
 /// None; a camera that the renderer refuses is logged once and the tick left out.
 pub fn draw(
     hub: &Arc<Hub>,
     renderer: &mut dyn Rasterizer,
-    newest: &Mailbox<Option<PoseSample>>,
+    newest: &Mailbox<Poses>,
     ticks: &Ticks,
     max_rate_hz: f64,
 ) {
-    let vehicle = &*hub.vehicles[0];
-    let mut schedule = Schedule::new(max_rate_hz, Instant::now());
-    let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_CAMERAS);
+    let schedule = Schedule::new(max_rate_hz, Instant::now());
+    let mut schedules = vec![schedule; hub.vehicles.len()];
+    let mut sets: Vec<Arc<CameraSet>> = Vec::with_capacity(MAX_VEHICLES);
+    let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS);
     // The renderer wants the images of the cameras that are due side by side.
     let mut images: Vec<RgbdImage> = Vec::new();
+    // Poses that nothing was drawn from yet.
+    let mut poses = Poses::default();
     let (mut seq, mut refused) = (0u64, false);
     while !hub.stop.is_set() {
-        if !hub.outlet.wait_for_interest(PATIENCE).contains(&true) {
+        let wanted = hub.outlet.wait_for_interest(PATIENCE);
+        if !wanted.contains(&true) {
             continue;
         }
-        let next = schedule.next(&vehicle.cameras.newest().configs, Instant::now());
-        if let Some(early) = next.checked_duration_since(Instant::now()) {
-            std::thread::sleep(early.min(PATIENCE));
-            if early > PATIENCE {
-                continue;
-            }
+        sets.clear();
+        sets.extend(hub.vehicles.iter().map(|vehicle| vehicle.cameras.newest()));
+        let now = Instant::now();
+        let ready = (0..sets.len()).filter(|&index| wanted[index] && poses[index].is_some());
+        let next = ready.map(|index| schedules[index].next(&sets[index].configs, now)).min();
+        // Where nothing is due, a newer pose is worth waking up for: it may be another vehicle's.
+        let wait = next.map_or(PATIENCE, |next| next.saturating_duration_since(now).min(PATIENCE));
+        if let Some(newer) = newest.take(wait) {
+            merge(&newer, &mut poses);
         }
-        let Some(Some(sample)) = newest.take(PATIENCE) else { continue };
-        let set = vehicle.cameras.newest();
-        let due = schedule.take(&set.configs, Instant::now());
+        if !wait.is_zero() {
+            continue;
+        }
         seq += 1;
-        let span = trace_span!("tick", seq, stamp_ns = sample.stamp.as_ns()).entered();
         let mut tick = ticks.spare();
-        tick.slots.resize_with(set.configs.len(), Default::default);
+        let slots = sets.iter().map(|set| set.configs.len()).sum();
+        tick.slots.resize_with(slots, Default::default);
+        let mut slots = tick.slots.iter_mut();
+        let mut stamp = ServerTime::ZERO;
         cameras.clear();
-        for (index, slot) in tick.slots.iter_mut().enumerate() {
-            slot.fresh = due[index];
-            if !slot.fresh {
-                continue;
-            }
-            let (config, info) = (&set.configs[index], &set.infos[index]);
-            cameras.push(Camera {
-                intrinsics: info.intrinsics,
-                world_from_cam: sample.world_from_body * info.body_from_cam,
-                near_m: config.near_m as f32,
-                background: BACKGROUND,
+        for (vehicle, set) in sets.iter().enumerate() {
+            let mut due = [false; MAX_CAMERAS];
+            // A vehicle's pose is kept until a camera of it is due.
+            let sample = poses[vehicle].filter(|_| wanted[vehicle]).inspect(|_| {
+                due = schedules[vehicle].take(&set.configs, Instant::now());
             });
-            slot.seq = seq;
-            slot.pose = sample.stamp;
-            slot.world_from_body = Some(sample.world_from_body);
-            (slot.vehicle, slot.camera) = (vehicle.index, index);
-            slot.set = Some(set.clone());
-            images.resize_with(images.len().max(cameras.len()), Default::default);
-            std::mem::swap(&mut images[cameras.len() - 1], &mut slot.image);
+            if due.contains(&true) {
+                poses[vehicle] = None;
+            }
+            for (camera, slot) in slots.by_ref().take(set.configs.len()).enumerate() {
+                slot.fresh = due[camera];
+                let Some(sample) = sample.filter(|_| slot.fresh) else { continue };
+                let (config, info) = (&set.configs[camera], &set.infos[camera]);
+                cameras.push(Camera {
+                    intrinsics: info.intrinsics,
+                    world_from_cam: sample.world_from_body * info.body_from_cam,
+                    near_m: config.near_m as f32,
+                    background: BACKGROUND,
+                });
+                stamp = stamp.max(sample.stamp);
+                (slot.vehicle, slot.camera) = (vehicle, camera);
+                slot.seq = seq;
+                slot.pose = sample.stamp;
+                slot.world_from_body = Some(sample.world_from_body);
+                slot.set = Some(set.clone());
+                images.resize_with(images.len().max(cameras.len()), Default::default);
+                std::mem::swap(&mut images[cameras.len() - 1], &mut slot.image);
+            }
         }
+        let span = trace_span!("tick", seq, stamp_ns = stamp.as_ns()).entered();
         let images = &mut images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| renderer.render(&[], &cameras, images));
@@ -175,13 +233,20 @@ pub fn draw(
     }
 }
 
+/// Takes the poses of `newer` into `poses`, where there are any.
+fn merge(newer: &Poses, poses: &mut Poses) {
+    for (pose, newer) in poses.iter_mut().zip(newer) {
+        *pose = newer.or(*pose);
+    }
+}
+
 /// Tells when another renderer has taken over, as the processor does from a lost graphics device.
 fn note_renderer(hub: &Hub, renderer: &dyn Rasterizer) {
     let name = renderer.name();
     let mut info = lock(&hub.renderer);
     if info.name != name {
         let text = format!("the renderer is now {name}");
-        *info = RendererInfo { name, reason: "took over in flight".to_owned() };
+        *info = RendererInfo { name: name.into_owned(), reason: "took over in flight".to_owned() };
         drop(info);
         for vehicle in &hub.vehicles {
             vehicle.tell(EventKind::Note, &text);
@@ -189,8 +254,8 @@ fn note_renderer(hub: &Hub, renderer: &dyn Rasterizer) {
     }
 }
 
-/// When each camera is due.
-#[derive(Debug)]
+/// When each camera of a vehicle is due.
+#[derive(Clone, Debug)]
 struct Schedule {
     /// The shortest time between two ticks.
     least: Duration,

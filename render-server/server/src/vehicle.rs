@@ -21,6 +21,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::cameras::{CameraSet, Cameras};
 use crate::clock;
+use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
 use crate::previews::Preview;
@@ -48,6 +49,8 @@ pub struct Vehicle {
     pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
     /// Where the vehicle was.
     pub trail: Mutex<Trail>,
+    /// What the localization delivered of it.
+    pub source: Mutex<SourceCounters>,
     /// Its images on their way.
     pub images: ImageCounters,
     seat: Mutex<SeatState>,
@@ -114,6 +117,7 @@ impl Vehicle {
             timing: watch::Sender::new(None),
             previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
             trail: Mutex::default(),
+            source: Mutex::default(),
             images: ImageCounters::default(),
             seat: Mutex::default(),
             flight: Mutex::default(),

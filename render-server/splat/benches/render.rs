@@ -62,7 +62,7 @@ fn main() {
             let mut group = criterion.benchmark_group(format!("{}/{view}", case.name));
             for mut renderer in CpuRenderer::every(&case.splats) {
                 let mut image = [RgbdImage::default()];
-                group.bench_function(renderer.name(), |bencher| {
+                group.bench_function(renderer.name().into_owned(), |bencher| {
                     bencher.iter(|| renderer.render(&[], &[*camera], &mut image).map(|_| ()));
                 });
             }

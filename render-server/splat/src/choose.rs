@@ -197,6 +197,8 @@ mod trial {
 
     #[cfg(test)]
     mod tests {
+        use std::borrow::Cow;
+
         use super::*;
         use crate::{PassTimes, Placement, RenderError, Workload};
 
@@ -204,8 +206,8 @@ mod trial {
         struct Spoiling(CpuRenderer, fn(&mut RgbdImage, usize), usize);
 
         impl Rasterizer for Spoiling {
-            fn name(&self) -> String {
-                String::new()
+            fn name(&self) -> Cow<'_, str> {
+                "".into()
             }
 
             fn render(

@@ -1,11 +1,13 @@
 //! The one contract of all renderers: (scene, placements of its objects, cameras) -> images.
 
+use std::borrow::Cow;
+
 use crate::{Camera, InvalidCamera, Placement, RgbdImage};
 
 /// Draws a scene that it holds a packed copy of.
 pub trait Rasterizer: Send {
     /// Returns what it runs on, for reports: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
-    fn name(&self) -> String;
+    fn name(&self) -> Cow<'_, str>;
 
     /// Draws one image per camera, resizing each, and returns how long the passes took.
     /// `placements` has one entry per object of the scene.

@@ -5,6 +5,8 @@
 //! to 96 for its harmonics (0.74 GB for 5 M of degree 3), because packing takes seconds when the
 //! vehicle has none.
 
+use std::borrow::Cow;
+
 use crate::{
     Camera, CpuRenderer, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload,
 };
@@ -14,22 +16,21 @@ pub struct Resilient {
     active: Box<dyn Rasterizer>,
     /// Until it is needed.
     spare: Option<CpuRenderer>,
-    /// What was lost, and why.
-    lost: Option<String>,
+    /// What draws now, and what was lost and why.
+    renamed: Option<String>,
 }
 
 impl Resilient {
     /// Puts a processor's renderer of the same scene behind `first`.
     pub fn new(first: Box<dyn Rasterizer>, spare: CpuRenderer) -> Self {
-        Self { active: first, spare: Some(spare), lost: None }
+        Self { active: first, spare: Some(spare), renamed: None }
     }
 }
 
 impl Rasterizer for Resilient {
     /// Returns what draws now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
-    fn name(&self) -> String {
-        let name = self.active.name();
-        self.lost.as_ref().map_or(name.clone(), |lost| format!("{name}, for {lost}"))
+    fn name(&self) -> Cow<'_, str> {
+        self.renamed.as_deref().map_or_else(|| self.active.name(), Cow::Borrowed)
     }
 
     fn render(
@@ -40,8 +41,9 @@ impl Rasterizer for Resilient {
     ) -> Result<PassTimes, RenderError> {
         match self.active.render(placements, cameras, images) {
             Err(RenderError::Device(why)) if self.spare.is_some() => {
-                self.lost = Some(format!("{} is lost: {why}", self.active.name()));
                 if let Some(spare) = self.spare.take() {
+                    let (now, lost) = (spare.name(), self.active.name());
+                    self.renamed = Some(format!("{now}, for {lost} is lost: {why}"));
                     self.active = Box::new(spare);
                 }
                 self.active.render(placements, cameras, images)
@@ -70,7 +72,7 @@ mod tests {
     }
 
     impl Rasterizer for Failing {
-        fn name(&self) -> String {
+        fn name(&self) -> Cow<'_, str> {
             "gpu of glass".into()
         }
 

@@ -5,10 +5,10 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::drivers::vicon::ViconStream;
 
 fuzz_target!(|packets: Vec<&[u8]>| {
-    let mut source = ViconStream::new("vizflyt");
+    let mut source = ViconStream::new(&["vizflyt", "wasp"]);
     for (index, packet) in packets.into_iter().enumerate() {
         let now = ServerTime::from_ns(index as u64 * 5_000_000);
-        if let Some(measurement) = source.handle_packet(now, packet) {
+        for measurement in source.handle_packet(now, packet) {
             assert!(measurement.world_from_body.is_valid());
         }
         while source.next_warning().is_some() {}

@@ -133,6 +133,8 @@ impl Show {
             "--lifeline".into(),
             "--quic=127.0.0.1:0".into(),
             "--vicon=127.0.0.1:0".into(),
+            // The simulator's, whoever else the arena names.
+            "--vehicle=vizflyt".into(),
             format!("--http={page}").into(),
             format!("--renderer={}", args.renderer).into(),
         ];

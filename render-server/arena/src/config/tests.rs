@@ -161,3 +161,65 @@ fn cameras_are_bounded_and_named_apart() {
     assert!(many.validate().unwrap_err().to_string().contains("1 to 8"));
     assert!(ArenaConfig { cameras: vec![], ..arena }.validate().is_err());
 }
+
+/// The forest with a second camera and these vehicles.
+fn with_vehicles(vehicles: &str) -> Result<ArenaConfig, ConfigError> {
+    let camera = &FOREST[FOREST.find("[[cameras]]").unwrap()..FOREST.find("[[stages]]").unwrap()];
+    let rear = camera.replace("front", "rear");
+    ArenaConfig::parse(&format!("{FOREST}{rear}{vehicles}"))
+}
+
+#[test]
+fn each_vehicle_has_its_spawn_and_its_cameras() {
+    let vehicles = r#"
+[[vehicles]]
+name = "wasp"
+spawn = { position_m = [2.0, 1.0, 0.0], yaw_deg = 30.0 }
+cameras = ["rear"]
+[[vehicles]]
+name = "bee"
+"#;
+    let arena = with_vehicles(vehicles).unwrap();
+    assert_eq!(ArenaConfig::parse(&arena.to_toml().unwrap()).unwrap(), arena);
+    let flying = arena.flying(&[]).unwrap();
+    let names: Vec<_> = flying.iter().map(|vehicle| vehicle.name.as_str()).collect();
+    assert_eq!(names, ["wasp", "bee"]);
+    let [wasp, bee] = [0, 1].map(|index| arena.of_vehicle(&flying[index]));
+    assert_eq!((wasp.spawn.position_m.y, wasp.cameras.len()), (1.0, 1));
+    assert_eq!(wasp.cameras[0].name, "rear");
+    assert_eq!((bee.spawn, bee.cameras.len()), (arena.spawn, 2));
+    wasp.validate().unwrap();
+    // The command line has the last word; what the file says of a vehicle it names counts.
+    let chosen = arena.flying(&["fly".to_owned(), "wasp".to_owned()]).unwrap();
+    assert_eq!(chosen, [VehicleConfig::named("fly"), flying[0].clone()]);
+    let alone = ArenaConfig::parse(FOREST).unwrap().flying(&[]).unwrap();
+    assert_eq!(alone, [VehicleConfig::named("vizflyt")]);
+}
+
+#[test]
+fn vehicles_that_cannot_fly_are_refused() {
+    let check = |vehicle: &str, expected: &str| {
+        let error = with_vehicles(&format!("[[vehicles]]\n{vehicle}\n")).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error:?} lacks {expected:?}");
+    };
+    check("name = ''", "vehicles[0].name = \"\"");
+    check("name = 'abcdefghijklmnopqrstuvwxyz'", "at most 24 bytes");
+    check(
+        "name = 'a'\n[[vehicles]]\nname = 'a'",
+        "vehicles[1].name = \"a\": another has this name",
+    );
+    check(
+        "name = 'a'\ncameras = ['front', 'left']",
+        "vehicles[0].cameras = \"left\": is not among the [[cameras]]: front, rear",
+    );
+    check("name = 'a'\ncameras = ['rear', 'rear']", "vehicles[0].cameras = \"rear\": another has");
+    check("name = 'a'\ncameras = []", "or leave `cameras` out for all");
+    let outside = "spawn = { position_m = [0.0, 20.0, 0.0] }";
+    check(&format!("name = 'a'\n{outside}"), "vehicles[0].spawn.position_m = [0, 20, 0]: must be");
+    check("name = 'a'\nspawn = 3", "line");
+    let nine: Vec<_> = (0..9).map(|n| format!("name = '{n}'")).collect();
+    check(&nine.join("\n[[vehicles]]\n"), "vehicles = 9 of them");
+    let arena = ArenaConfig::parse(FOREST).unwrap();
+    let twice = arena.flying(&["a".to_owned(), "a".to_owned()]).unwrap_err().to_string();
+    assert!(twice.starts_with("--vehicle = \"a\": another has this name"), "{twice}");
+}

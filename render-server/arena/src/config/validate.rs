@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 use glam::DVec3;
 use vizflyt_protocol::messages::MAX_CAMERAS;
 
-use super::ArenaConfig;
+use super::{ArenaConfig, Spawn};
 
 /// Why an `arena.toml` is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -68,7 +68,7 @@ pub(super) fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError>
     Err(invalid(key, value, advice))
 }
 
-fn check_name<'a>(
+pub(super) fn check_name<'a>(
     key: &str,
     value: &'a str,
     taken: &mut HashSet<&'a str>,
@@ -102,6 +102,7 @@ impl ArenaConfig {
         self.check_fence_and_points()?;
         self.check_occupancy()?;
         self.check_cameras()?;
+        self.check_vehicles()?;
         self.check_stages()
     }
 
@@ -117,10 +118,21 @@ impl ArenaConfig {
             );
             return Err(invalid("geofence.max_m", fence.max_m, advice));
         }
-        check_position("spawn.position_m", self.spawn.position_m)?;
-        check_number("spawn.yaw_deg", self.spawn.yaw_deg, "degrees", -360.0..=360.0)?;
-        self.check_inside("spawn.position_m", self.spawn.position_m)?;
-        let top_m = self.spawn.position_m + DVec3::Z * self.takeoff_height_m;
+        self.check_spawn("spawn", self.spawn)?;
+        if let Some(goal) = &self.goal {
+            check_position("goal.position_m", goal.position_m)?;
+            check_number("goal.radius_m", goal.radius_m, "m", 0.01..=100.0)?;
+            self.check_inside("goal.position_m", goal.position_m)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn check_spawn(&self, key: &str, spawn: Spawn) -> Result<(), ConfigError> {
+        let position = format!("{key}.position_m");
+        check_position(&position, spawn.position_m)?;
+        check_number(&format!("{key}.yaw_deg"), spawn.yaw_deg, "degrees", -360.0..=360.0)?;
+        self.check_inside(&position, spawn.position_m)?;
+        let top_m = spawn.position_m + DVec3::Z * self.takeoff_height_m;
         if !self.fits_inside(top_m) {
             let advice = format!(
                 "the climb ends at {top_m}, where a body of {} m leaves the geofence; climb less \
@@ -128,11 +140,6 @@ impl ArenaConfig {
                 self.body_radius_m
             );
             return Err(invalid("takeoff_height_m", self.takeoff_height_m, advice));
-        }
-        if let Some(goal) = &self.goal {
-            check_position("goal.position_m", goal.position_m)?;
-            check_number("goal.radius_m", goal.radius_m, "m", 0.01..=100.0)?;
-            self.check_inside("goal.position_m", goal.position_m)?;
         }
         Ok(())
     }

@@ -20,6 +20,7 @@ pub(crate) fn arena() -> ArenaConfig {
         },
         limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
         occupancy: Occupancy { voxel_m: 0.1, ..Occupancy::default() },
+        vehicles: Vec::new(),
         cameras: Vec::new(),
         stages: Vec::new(),
     }

@@ -61,6 +61,7 @@ fn arena(site: &Site) -> ArenaConfig {
         limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        vehicles: Vec::new(),
         stages: Vec::new(),
     }
 }

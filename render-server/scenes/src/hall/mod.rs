@@ -143,6 +143,7 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         limits: Limits { max_speed_mps, max_acceleration_mps2: 6.0 },
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        vehicles: Vec::new(),
         stages: course.stages(),
     };
     Generated { splats, arena, truth: solids.into_volumes() }

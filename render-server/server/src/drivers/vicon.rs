@@ -1,4 +1,4 @@
-//! Vicon Tracker's UDP object stream: bytes in, the pose of one named object out. Sans-IO.
+//! Vicon Tracker's UDP object stream: bytes in, the poses of the named objects out. Sans-IO.
 //!
 //! Layout (Tracker 3 user guide, "UDP object stream"; little-endian, packed):
 //! ```text
@@ -25,6 +25,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::frame_clock::FrameClock;
 use super::{Measurement, SourceCounters};
+use crate::hub::MAX_VEHICLES;
 
 /// One object of a packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -120,27 +121,43 @@ fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
     })
 }
 
-/// Selects one object from the stream, keeps the counters, and notices what is wrong.
+/// Selects our vehicles from the stream, keeps the counters, and notices what is wrong.
 #[derive(Debug)]
 pub struct ViconStream {
-    object: String,
-    clock: FrameClock,
-    last_frame: Option<u32>,
-    counters: SourceCounters,
+    objects: Vec<Tracked>,
+    bad_packets: u64,
+    /// What the newest packet yielded.
+    measured: Vec<Measurement>,
     others: BTreeSet<String>,
     warned_of_others: bool,
     warned_of_bad: bool,
     warnings: Vec<String>,
 }
 
+/// One vehicle's object. Tracker counts all objects' frames together, but several simulators that
+/// send to one server each count their own.
+#[derive(Debug)]
+struct Tracked {
+    name: String,
+    clock: FrameClock,
+    last_frame: Option<u32>,
+    counters: SourceCounters,
+}
+
 impl ViconStream {
-    /// Makes a stream that yields the poses of `object`.
-    pub fn new(object: &str) -> Self {
-        Self {
-            object: object.to_owned(),
+    /// Makes a stream that yields the poses of the objects named, the first at index 0, and so on;
+    /// at most [`MAX_VEHICLES`].
+    pub fn new(names: &[&str]) -> Self {
+        let tracked = |name: &&str| Tracked {
+            name: (*name).to_owned(),
             clock: FrameClock::default(),
             last_frame: None,
             counters: SourceCounters::default(),
+        };
+        Self {
+            objects: names.iter().take(MAX_VEHICLES).map(tracked).collect(),
+            bad_packets: 0,
+            measured: Vec::with_capacity(MAX_VEHICLES),
             others: BTreeSet::new(),
             warned_of_others: false,
             warned_of_bad: false,
@@ -148,62 +165,63 @@ impl ViconStream {
         }
     }
 
-    /// Takes one UDP packet that arrived at `now`; returns the vehicle's pose if it is in it and
-    /// newer than the last.
-    pub fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> Option<Measurement> {
-        let mut found = None;
-        let wanted = self.object.as_bytes();
+    /// Takes one UDP packet that arrived at `now`; returns the poses of our vehicles that are in it
+    /// and newer than the last.
+    pub fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.measured.clear();
+        let mut found = [None; MAX_VEHICLES];
         let mut other = None;
-        let frame = match parse(bytes, |object| {
-            if object.name == wanted {
-                found = Some(object);
-            } else {
-                other = Some(object.name);
+        let parsed = parse(bytes, |object| {
+            let named = |tracked: &Tracked| tracked.name.as_bytes() == object.name;
+            match self.objects.iter().position(named) {
+                Some(vehicle) => found[vehicle] = Some(object),
+                None => other = Some(object.name),
             }
-        }) {
+        });
+        let frame = match parsed {
             Ok(frame) => frame,
             Err(error) => {
-                self.counters.bad_packets += 1;
-                if !self.warned_of_bad {
-                    self.warned_of_bad = true;
-                    self.warnings.push(format!(
-                        "vicon: {error}; is something other than Tracker's UDP object stream \
-                         sent to this port? (further bad packets are only counted)"
-                    ));
-                }
-                return None;
+                self.notice_bad(error);
+                return &[];
             }
         };
-        let Some(object) = found else {
+        if found.iter().all(Option::is_none) {
             self.notice_other(other);
-            return None;
-        };
-        if let Some(last) = self.last_frame {
-            let ahead = frame.wrapping_sub(last).cast_signed();
-            // A counter that falls back by more than any reordering is Tracker restarted.
-            if ahead <= 0 && ahead > -RESTART_FRAMES {
-                self.counters.stale_packets += 1;
-                return None;
-            }
-            if (2..RESTART_FRAMES).contains(&ahead) {
-                self.counters.lost_frames += (ahead - 1) as u64;
-            }
+            return &[];
         }
-        self.last_frame = Some(frame);
-        let Some(rotation) = object.rotation else {
-            self.counters.occluded += 1;
-            return None;
-        };
-        self.counters.poses += 1;
-        Some(Measurement {
-            stamp: self.clock.stamp(frame, now),
-            arrival: now,
-            world_from_body: Pose::new(object.p_world_m, rotation),
-        })
+        for (vehicle, (tracked, object)) in self.objects.iter_mut().zip(found).enumerate() {
+            let Some(object) = object else { continue };
+            if !tracked.is_next(frame) {
+                continue;
+            }
+            let Some(rotation) = object.rotation else {
+                tracked.counters.occluded += 1;
+                continue;
+            };
+            tracked.counters.poses += 1;
+            self.measured.push(Measurement {
+                vehicle,
+                stamp: tracked.clock.stamp(frame, now),
+                arrival: now,
+                world_from_body: Pose::new(object.p_world_m, rotation),
+            });
+        }
+        &self.measured
+    }
+
+    fn notice_bad(&mut self, error: ViconError) {
+        self.bad_packets += 1;
+        if !std::mem::replace(&mut self.warned_of_bad, true) {
+            self.warnings.push(format!(
+                "vicon: {error}; is something other than Tracker's UDP object stream sent to this \
+                 port? (further bad packets are only counted)"
+            ));
+        }
     }
 
     fn notice_other(&mut self, other: Option<&[u8]>) {
-        if self.counters.poses > 0 || self.warned_of_others {
+        let poses = self.objects.iter().any(|tracked| tracked.counters.poses > 0);
+        if poses || self.warned_of_others {
             return;
         }
         let Some(name) = other else { return };
@@ -211,12 +229,14 @@ impl ViconStream {
         if self.others.len() < MOST_NAMES {
             self.others.insert(String::from_utf8_lossy(name).into_owned());
         }
-        let names: Vec<_> = self.others.iter().map(|name| format!("'{name}'")).collect();
+        let quoted = |name: &String| format!("'{name}'");
+        let others: Vec<_> = self.others.iter().map(quoted).collect();
+        let ours: Vec<_> = self.objects.iter().map(|tracked| quoted(&tracked.name)).collect();
         self.warnings.push(format!(
-            "vicon: object {} streams, but '{wanted}' was asked for; rename the object in Tracker, \
-             or start the server with --vehicle",
-            names.join(", "),
-            wanted = self.object
+            "vicon: object {} streams, but {} was asked for; rename the object in Tracker, or start \
+             the server with --vehicle",
+            others.join(", "),
+            ours.join(", "),
         ));
     }
 
@@ -225,14 +245,29 @@ impl ViconStream {
         (!self.warnings.is_empty()).then(|| self.warnings.remove(0))
     }
 
-    /// Returns the counters.
-    pub fn counters(&self) -> SourceCounters {
-        self.counters
+    /// Returns the counters of a vehicle.
+    pub fn counters(&self, vehicle: usize) -> SourceCounters {
+        let own = self.objects.get(vehicle).map_or_else(SourceCounters::default, |t| t.counters);
+        SourceCounters { bad_packets: self.bad_packets, ..own }
     }
+}
 
-    /// Whether anything of the stream has ever parsed, be it another object.
-    pub fn heard(&self) -> bool {
-        self.counters != SourceCounters::default() || self.warned_of_others
+impl Tracked {
+    /// Takes the next frame's number; returns whether it is newer than the last, and counts.
+    fn is_next(&mut self, frame: u32) -> bool {
+        if let Some(last) = self.last_frame {
+            let ahead = frame.wrapping_sub(last).cast_signed();
+            // A counter that falls back by more than any reordering is Tracker restarted.
+            if ahead <= 0 && ahead > -RESTART_FRAMES {
+                self.counters.stale_packets += 1;
+                return false;
+            }
+            if (2..RESTART_FRAMES).contains(&ahead) {
+                self.counters.lost_frames += (ahead - 1) as u64;
+            }
+        }
+        self.last_frame = Some(frame);
+        true
     }
 }
 

@@ -27,8 +27,8 @@ pub struct ViconUdp {
 }
 
 impl ViconUdp {
-    /// Binds `address` and yields the poses of `object`.
-    pub fn bind(address: SocketAddr, object: &str) -> Result<Self> {
+    /// Binds `address`; no object is looked for yet.
+    pub fn bind(address: SocketAddr) -> Result<Self> {
         let open = || -> std::io::Result<UdpSocket> {
             let kind = Domain::for_address(address);
             let socket = Socket::new(kind, Type::DGRAM, Some(Protocol::UDP))?;
@@ -44,12 +44,19 @@ impl ViconUdp {
             address: socket.local_addr()?,
             socket,
             from: None,
-            stream: ViconStream::new(object),
+            stream: ViconStream::new(&[]),
             buffer: vec![0; 65536].into_boxed_slice(),
             heard: clock::now(),
             silence_warned: false,
             warnings: VecDeque::new(),
         })
+    }
+
+    /// Yields the poses of the objects named from now on, by their index.
+    #[must_use]
+    pub fn of(mut self, names: &[&str]) -> Self {
+        self.stream = ViconStream::new(names);
+        self
     }
 
     /// Returns where the stream must be sent.
@@ -79,18 +86,18 @@ impl ViconUdp {
 }
 
 impl PoseSource for ViconUdp {
-    fn receive(&mut self, timeout: Duration) -> Option<Measurement> {
+    fn receive(&mut self, timeout: Duration) -> &[Measurement] {
         // A zero time-out would mean "for ever" to the socket.
         let timeout = timeout.max(Duration::from_millis(1));
         if self.socket.set_read_timeout(Some(timeout)).is_err() {
-            return None;
+            return &[];
         }
         let received = self.socket.recv_from(&mut self.buffer[..]);
         let now = clock::now();
         // Errors are the time-out, or an ICMP complaint about something else: both mean no pose.
         let Ok((length, from)) = received else {
             self.notice_silence(now);
-            return None;
+            return &[];
         };
         self.heard = now;
         self.from = Some(from);
@@ -102,8 +109,8 @@ impl PoseSource for ViconUdp {
         self.warnings.pop_front().or_else(|| self.stream.next_warning())
     }
 
-    fn counters(&self) -> SourceCounters {
-        self.stream.counters()
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        self.stream.counters(vehicle)
     }
 }
 
@@ -120,7 +127,7 @@ mod tests {
 
     #[test]
     fn a_stream_over_a_real_socket_is_read_and_its_end_noticed() {
-        let mut source = ViconUdp::bind("127.0.0.1:0".parse().unwrap(), "v").unwrap();
+        let mut source = ViconUdp::bind("127.0.0.1:0".parse().unwrap()).unwrap().of(&["v"]);
         let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut bytes = vec![1, 0, 0, 0, 1, 0, 72, 0];
         bytes.extend_from_slice(b"v");
@@ -129,7 +136,7 @@ mod tests {
             bytes.extend_from_slice(&value.to_le_bytes());
         }
         sender.send_to(&bytes, source.address()).unwrap();
-        let pose = source.receive(Duration::from_secs(30)).unwrap();
+        let pose = source.receive(Duration::from_secs(30))[0];
         assert_eq!(pose.world_from_body.translation_m.x, 1.0);
         assert_eq!(source.next_warning(), None);
         // As if the last packet had come a second ago.

@@ -63,6 +63,7 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         },
         limits: Limits { max_speed_mps: 2.0, max_acceleration_mps2: 4.0 },
         occupancy: Occupancy::default(),
+        vehicles: Vec::new(),
         cameras: vec![CameraConfig::ahead(
             "front",
             [320, 240],

@@ -139,7 +139,7 @@ fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
     start_m.z += arena.takeoff_height_m;
     let welcome = Welcome {
         name: arena.name,
-        renderer: RendererInfo { name: rasterizer.name(), reason },
+        renderer: RendererInfo { name: rasterizer.name().into_owned(), reason },
         splats: splats.len(),
         start_m: start_m.to_array(),
         yaw_rad: arena.spawn.yaw_deg.to_radians(),

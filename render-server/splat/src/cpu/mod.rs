@@ -19,6 +19,7 @@ mod scene;
 mod simd;
 mod sort;
 
+use std::borrow::Cow;
 use std::time::Instant;
 
 pub use detail::Detail;
@@ -126,8 +127,8 @@ impl CpuRenderer {
 
 impl Rasterizer for CpuRenderer {
     /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`.
-    fn name(&self) -> String {
-        self.instructions.name().to_owned()
+    fn name(&self) -> Cow<'_, str> {
+        self.instructions.name().into()
     }
 
     fn render(

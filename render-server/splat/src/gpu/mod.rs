@@ -30,6 +30,7 @@ mod scene;
 mod sort;
 mod view;
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::time::Instant;
 
@@ -446,8 +447,8 @@ impl Refused {
 
 impl Rasterizer for GpuRenderer {
     /// Returns `gpu`, the adapter's name and the interface: `gpu llvmpipe (Vulkan)`.
-    fn name(&self) -> String {
-        self.name.clone()
+    fn name(&self) -> Cow<'_, str> {
+        self.name.as_str().into()
     }
 
     fn render(

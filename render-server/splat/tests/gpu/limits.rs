@@ -141,7 +141,7 @@ fn the_choice_says_why() {
         println!("{backend:?}: {} because {}", chosen.rasterizer.name(), chosen.reason);
         let image = draw(&mut *chosen.rasterizer, &camera);
         assert_alike(&format!("{backend:?}"), &image[0], &expected[0]);
-        (chosen.rasterizer.name(), chosen.reason)
+        (chosen.rasterizer.name().into_owned(), chosen.reason)
     };
     let (name, reason) = check(Backend::Cpu);
     assert!(name.starts_with("cpu ") && reason.starts_with("asked for"), "{name}: {reason}");

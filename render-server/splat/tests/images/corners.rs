@@ -290,7 +290,7 @@ pub(crate) fn check_stereo(make: renderers::Make<'_>) {
     let cameras = [eye(0.0, k), eye(BASE_M, k), eye(0.0, fisheye), eye(BASE_M, fisheye)];
     let splats = wall(Z_M);
     for mut renderer in make(Scene::from(&splats)) {
-        let name = renderer.name();
+        let name = renderer.name().into_owned();
         let mut together = vec![RgbdImage::default(); cameras.len()];
         renderer.render(&[], &cameras, &mut together).expect("valid cameras");
         for (camera, image) in cameras.iter().zip(&together) {

@@ -57,7 +57,7 @@ fn render_all(make: Make<'_>, splats: &Splats, camera: &Camera) -> Vec<(String, 
         let [image] = image;
         assert_eq!((image.width_px, image.height_px), size(camera));
         compare::assert_clean(&image);
-        images.push((renderer.name(), image));
+        images.push((renderer.name().into_owned(), image));
     }
     images
 }

@@ -1,5 +1,7 @@
 //! All renderers behind one contract, so that a check is written once.
 
+use std::borrow::Cow;
+
 use vizflyt_splat::{
     Camera, CpuRenderer, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, RigidObject,
     Scene, Splats, Workload, render_reference,
@@ -15,8 +17,8 @@ struct Reference {
 }
 
 impl Rasterizer for Reference {
-    fn name(&self) -> String {
-        "reference".to_owned()
+    fn name(&self) -> Cow<'_, str> {
+        "reference".into()
     }
 
     fn render(

@@ -22,12 +22,19 @@ fn at(ms: u64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000 + ms * 1_000_000)
 }
 
+/// Returns what a packet yields, at most one measurement.
+fn only(stream: &mut ViconStream, now: ServerTime, bytes: &[u8]) -> Option<Measurement> {
+    let measured = stream.handle_packet(now, bytes);
+    assert!(measured.len() <= 1, "{measured:?}");
+    measured.first().copied()
+}
+
 #[test]
 fn millimetres_become_metres_and_angles_a_rotation() {
     let yaw = std::f64::consts::FRAC_PI_2;
     let bytes = packet(7, &[("vizflyt", [1000.0, -2000.0, 1500.0, 0.0, 0.0, yaw])]);
     assert_eq!(bytes.len(), 5 + 75);
-    let pose = ViconStream::new("vizflyt").handle_packet(at(0), &bytes).unwrap();
+    let pose = only(&mut ViconStream::new(&["vizflyt"]), at(0), &bytes).unwrap();
     assert_eq!(pose.world_from_body.translation_m, DVec3::new(1.0, -2.0, 1.5));
     // A quarter turn to the left: the nose points along y.
     assert!((pose.world_from_body.rotate(DVec3::X) - DVec3::Y).length() < 1e-12);
@@ -57,13 +64,44 @@ fn the_named_object_is_found_among_several_with_padding_and_foreign_items() {
     bytes.extend_from_slice(&[9, 4, 0, 1, 2, 3, 4]); // an item of unknown id, 4 bytes
     bytes.extend_from_slice(&packet(1, &[("vizflyt", [5000.0, 0.0, 0.0, 0.0, 0.0, 0.0])])[5..]);
     bytes.resize(512, 0);
-    let pose = ViconStream::new("vizflyt").handle_packet(at(0), &bytes).unwrap();
+    let pose = only(&mut ViconStream::new(&["vizflyt"]), at(0), &bytes).unwrap();
     assert_eq!(pose.world_from_body.translation_m.x, 5.0);
 }
 
 fn check(bytes: &[u8], expected: &str) {
     let error = parse(bytes, |_| ()).unwrap_err();
     assert_eq!(error.to_string(), expected);
+}
+
+/// Returns (vehicle, x) of what a packet yields. [m]
+fn found(stream: &mut ViconStream, bytes: &[u8]) -> Vec<(usize, f64)> {
+    let line = |m: &Measurement| (m.vehicle, m.world_from_body.translation_m.x);
+    stream.handle_packet(at(0), bytes).iter().map(line).collect()
+}
+
+#[test]
+fn each_vehicle_gets_its_own_object_from_one_packet_or_several() {
+    let mut stream = ViconStream::new(&["wasp", "bee"]);
+    let x = |x_m: f64| [x_m * 1e3, 0.0, 0.0, 0.0, 0.0, 0.0];
+    let both = packet(1, &[("bee", x(2.0)), ("wand", x(9.0)), ("wasp", x(1.0))]);
+    assert_eq!(found(&mut stream, &both), [(0, 1.0), (1, 2.0)]);
+    // One unseen does not hold up the other, and each keeps its own count.
+    let hidden = packet(2, &[("bee", [0.0; 6]), ("wasp", x(1.0))]);
+    assert_eq!(found(&mut stream, &hidden), [(0, 1.0)]);
+    assert_eq!(found(&mut stream, &packet(3, &[("wasp", x(1.0))])), [(0, 1.0)]);
+    assert_eq!(found(&mut stream, &packet(3, &[("bee", x(2.0))])), [(1, 2.0)]);
+    assert_eq!(found(&mut stream, &packet(3, &[("bee", x(2.0))])), []);
+    // Simulators of their own count their own frames.
+    let mut apart = ViconStream::new(&["wasp", "bee"]);
+    for frame in 1..5 {
+        assert_eq!(found(&mut apart, &packet(1000 + frame, &[("wasp", x(1.0))])), [(0, 1.0)]);
+        assert_eq!(found(&mut apart, &packet(frame, &[("bee", x(2.0))])), [(1, 2.0)]);
+    }
+    assert_eq!(apart.counters(0), SourceCounters { poses: 4, ..SourceCounters::default() });
+    let counters = [0, 1].map(|vehicle| stream.counters(vehicle));
+    assert_eq!(counters.map(|c| (c.poses, c.occluded, c.stale_packets)), [(3, 0, 0), (2, 1, 1)]);
+    let all = counters[0].and(counters[1]);
+    assert_eq!((all.poses, all.occluded, all.lost_frames), (5, 1, 0));
 }
 
 #[test]
@@ -83,10 +121,10 @@ fn faults_are_named() {
 
 #[test]
 fn another_objects_name_stands_in_the_warning_once() {
-    let mut stream = ViconStream::new("vizflyt");
+    let mut stream = ViconStream::new(&["vizflyt"]);
     for frame in 0..10 {
         let bytes = packet(frame, &[("drone", [1.0; 6])]);
-        assert_eq!(stream.handle_packet(at(u64::from(frame)), &bytes), None);
+        assert_eq!(stream.handle_packet(at(u64::from(frame)), &bytes), []);
     }
     let warning = stream.next_warning().unwrap();
     assert!(
@@ -98,9 +136,9 @@ fn another_objects_name_stands_in_the_warning_once() {
 
 #[test]
 fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
-    let mut stream = ViconStream::new("v");
+    let mut stream = ViconStream::new(&["v"]);
     let mut feed = |frame: u32, values: [f64; 6]| {
-        stream.handle_packet(at(0), &packet(frame, &[("v", values)])).is_some()
+        !stream.handle_packet(at(0), &packet(frame, &[("v", values)])).is_empty()
     };
     assert!(feed(100_000, [1.0; 6]));
     assert!(!feed(100_000, [1.0; 6])); // twice
@@ -109,9 +147,9 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
     assert!(!feed(100_004, [0.0; 6])); // not seen
     assert!(feed(1, [1.0; 6])); // Tracker restarted
     assert!(feed(2, [1.0; 6]));
-    assert_eq!(stream.handle_packet(at(0), b"hello"), None);
+    assert_eq!(stream.handle_packet(at(0), b"hello"), []);
     assert_eq!(
-        stream.counters(),
+        stream.counters(0),
         SourceCounters {
             poses: 4,
             bad_packets: 1,
@@ -128,7 +166,7 @@ proptest! {
     #[test]
     fn any_bytes_parse_or_fail_cleanly(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
         let _ = parse(&bytes, |_| ());
-        let _ = ViconStream::new("v").handle_packet(at(0), &bytes);
+        let _ = ViconStream::new(&["v"]).handle_packet(at(0), &bytes);
     }
 
     /// Any one byte changed in a good packet never panics, and poses stay valid.
@@ -136,7 +174,7 @@ proptest! {
     fn poses_that_come_out_are_valid(at_byte in 0usize..80, value in any::<u8>()) {
         let mut bytes = packet(9, &[("v", [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])]);
         bytes[at_byte] = value;
-        if let Some(pose) = ViconStream::new("v").handle_packet(at(0), &bytes) {
+        for pose in ViconStream::new(&["v"]).handle_packet(at(0), &bytes) {
             prop_assert!(pose.world_from_body.is_valid());
         }
     }

@@ -1,0 +1,123 @@
+//! `[[vehicles]]`: who flies in the arena, each with its own start and cameras.
+
+use std::collections::HashSet;
+
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::MAX_CAMERAS;
+
+use super::validate::{ConfigError, check_name, invalid};
+use super::{ArenaConfig, Spawn};
+
+/// `[[vehicles]]`: one vehicle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VehicleConfig {
+    /// The name of its object in the localization system; at most 24 bytes.
+    pub name: String,
+    /// Where it stands at the start; the arena's `spawn` if it is not said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub spawn: Option<Spawn>,
+    /// Names of its cameras, in the order of their index on the wire; all if it is not said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cameras: Option<Vec<String>>,
+}
+
+impl VehicleConfig {
+    /// Returns a vehicle with all cameras at the arena's spawn.
+    pub fn named(name: &str) -> Self {
+        Self { name: name.to_owned(), spawn: None, cameras: None }
+    }
+}
+
+impl ArenaConfig {
+    /// Returns the vehicles that fly: those of `names`, as `[[vehicles]]` has them if it does;
+    /// without names, all of `[[vehicles]]`; without those, `vizflyt`.
+    ///
+    /// # Errors
+    /// [`ConfigError::Invalid`] for names that no vehicle can have, and for too many.
+    pub fn flying(&self, names: &[String]) -> Result<Vec<VehicleConfig>, ConfigError> {
+        let known = |name: &String| self.vehicles.iter().find(|vehicle| vehicle.name == *name);
+        let mut vehicles: Vec<_> = names
+            .iter()
+            .map(|name| known(name).cloned().unwrap_or_else(|| VehicleConfig::named(name)))
+            .collect();
+        if names.is_empty() {
+            vehicles.clone_from(&self.vehicles);
+        }
+        if vehicles.is_empty() {
+            vehicles.push(VehicleConfig::named(DEFAULT_NAME));
+        }
+        check_names(&vehicles, |_| "--vehicle".to_owned())?;
+        Ok(vehicles)
+    }
+
+    /// Returns the arena as one of its vehicles has it: with its spawn and its cameras, alone.
+    #[must_use]
+    pub fn of_vehicle(&self, vehicle: &VehicleConfig) -> Self {
+        let mut arena = self.clone();
+        arena.vehicles.clear();
+        arena.spawn = vehicle.spawn.unwrap_or(self.spawn);
+        if let Some(names) = &vehicle.cameras {
+            let named = |name: &String| self.cameras.iter().find(|camera| camera.name == *name);
+            arena.cameras = names.iter().filter_map(named).cloned().collect();
+        }
+        arena
+    }
+
+    pub(super) fn check_vehicles(&self) -> Result<(), ConfigError> {
+        check_names(&self.vehicles, |index| format!("vehicles[{index}].name"))?;
+        let known: Vec<_> = self.cameras.iter().map(|camera| camera.name.as_str()).collect();
+        for (index, vehicle) in self.vehicles.iter().enumerate() {
+            if let Some(cameras) = &vehicle.cameras {
+                let key = format!("vehicles[{index}].cameras");
+                let mut taken = HashSet::new();
+                for name in cameras {
+                    if !known.contains(&name.as_str()) {
+                        let advice = format!("is not among the [[cameras]]: {}", known.join(", "));
+                        return Err(invalid(key, format!("{name:?}"), advice));
+                    }
+                    check_name(&key, name, &mut taken)?;
+                }
+                if cameras.is_empty() {
+                    let advice = format!(
+                        "give 1 to {MAX_CAMERAS} names of [[cameras]], or leave `cameras` out for all"
+                    );
+                    return Err(invalid(key, "[]", advice));
+                }
+            }
+            if let Some(spawn) = vehicle.spawn {
+                self.check_spawn(&format!("vehicles[{index}].spawn"), spawn)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_names(
+    vehicles: &[VehicleConfig],
+    key: impl Fn(usize) -> String,
+) -> Result<(), ConfigError> {
+    if vehicles.len() > MAX_VEHICLES {
+        let advice = format!("one server serves at most {MAX_VEHICLES} vehicles; start another");
+        return Err(invalid("vehicles", format!("{} of them", vehicles.len()), advice));
+    }
+    let mut taken = HashSet::new();
+    for (index, vehicle) in vehicles.iter().enumerate() {
+        let (key, name) = (key(index), &vehicle.name);
+        check_name(&key, name, &mut taken)?;
+        if name.len() > MAX_OBJECT_BYTES || name.contains('\0') {
+            let advice = format!(
+                "a localization system's object has a name of at most {MAX_OBJECT_BYTES} bytes"
+            );
+            return Err(invalid(key, format!("{name:?}"), advice));
+        }
+    }
+    Ok(())
+}
+
+/// Vehicles that one server serves at most: a net holds no more.
+pub const MAX_VEHICLES: usize = 8;
+/// Bytes of a name in Vicon's UDP object stream.
+const MAX_OBJECT_BYTES: usize = 24;
+/// What the simulator and the examples call theirs.
+const DEFAULT_NAME: &str = "vizflyt";
