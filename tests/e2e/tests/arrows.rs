@@ -8,6 +8,7 @@ use cargo_metadata::{DependencyKind, MetadataCommand};
 const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-protocol", &[]),
     ("vizflyt-rgbd", &["vizflyt-protocol"]),
+    ("vizflyt-trust", &["vizflyt-protocol"]),
     ("vizflyt-splat", &["vizflyt-protocol"]),
     ("vizflyt-arena", &["vizflyt-protocol"]),
     ("vizflyt-simulator", &["vizflyt-protocol"]),
@@ -15,12 +16,22 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-avoid", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
-    ("vizflyt-server", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-splat", "vizflyt-arena"]),
-    ("vizflyt-runtime", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-sdk"]),
+    (
+        "vizflyt-server",
+        &[
+            "vizflyt-protocol",
+            "vizflyt-rgbd",
+            "vizflyt-trust",
+            "vizflyt-splat",
+            "vizflyt-arena",
+        ],
+    ),
+    ("vizflyt-runtime", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-trust", "vizflyt-sdk"]),
     (
         "vizflyt",
         &[
             "vizflyt-protocol",
+            "vizflyt-trust",
             "vizflyt-splat",
             "vizflyt-arena",
             "vizflyt-scenes",

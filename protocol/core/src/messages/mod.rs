@@ -12,6 +12,7 @@
 //! [`FromPlugin`]) use the same encoding over shared-memory queues.
 
 mod event;
+mod pairing;
 mod plugin;
 mod session;
 mod setpoint;
@@ -19,6 +20,7 @@ mod telemetry;
 mod timing;
 
 pub use event::{Event, EventKind};
+pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
     ArenaInfo, CameraInfo, ClockReply, ClockRequest, Hello, Limits, PoseSample, ToRuntime, ToServer,

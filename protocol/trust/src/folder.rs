@@ -1,0 +1,227 @@
+//! The keys folder: for its owner alone, and every file in it whole or absent.
+
+use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::process;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// Why keys cannot be used. Nothing is ever replaced silently.
+#[derive(Debug, thiserror::Error)]
+pub enum KeyError {
+    /// Neither `--keys` nor a home folder.
+    #[error("no folder for keys: neither XDG_CONFIG_HOME nor HOME is set; pass --keys DIR")]
+    NoHome,
+    /// Reading or writing failed.
+    #[error("{}: cannot {what}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// How it failed.
+        source: io::Error,
+    },
+    /// Others may read or write it.
+    #[error("{} is open to other users (mode {mode:03o}); run `chmod {fix} {}`, and make a new key if others had access", path.display(), path.display())]
+    Open {
+        /// The file or folder.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
+        /// What the mode should be.
+        fix: &'static str,
+    },
+    /// What the file holds is not what it should hold.
+    #[error("{}: {what}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, and what to do.
+        what: String,
+    },
+}
+
+/// A folder of keys and of those they are shared with.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct KeysFolder(PathBuf);
+
+impl KeysFolder {
+    /// Opens `path`, or the user's own folder (`$XDG_CONFIG_HOME/vizflyt`, `~/.config/vizflyt`),
+    /// and makes it if it is not there.
+    pub fn open(path: Option<&Path>) -> Result<Self, KeyError> {
+        let path = match path {
+            Some(path) => path.to_owned(),
+            None => user_folder(
+                std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from),
+                std::env::var_os("HOME").map(PathBuf::from),
+            )
+            .ok_or(KeyError::NoHome)?,
+        };
+        let io = |what, source| KeyError::Io { what, path: path.clone(), source };
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(&path)
+            .map_err(|error| io("make the folder for keys", error))?;
+        let mode = fs::metadata(&path).map_err(|error| io("look at it", error))?.mode() & 0o777;
+        if mode & 0o077 != 0 {
+            return Err(KeyError::Open { path, mode, fix: "700" });
+        }
+        Ok(Self(path))
+    }
+
+    /// Returns the path of a file in it.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+
+    /// Reads a file; `None` if there is none.
+    pub fn read(&self, name: &str) -> Result<Option<String>, KeyError> {
+        let path = self.file(name);
+        let io = |what, source| KeyError::Io { what, path: path.clone(), source };
+        let file = match File::open(&path) {
+            Ok(file) => file,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(io("open it", error)),
+        };
+        let about = file.metadata().map_err(|error| io("look at it", error))?;
+        let mode = about.mode() & 0o777;
+        if mode & 0o077 != 0 {
+            return Err(KeyError::Open { path, mode, fix: "600" });
+        }
+        let mut text = String::new();
+        file.take(MOST_BYTES + 1)
+            .read_to_string(&mut text)
+            .map_err(|error| io("read it", error))?;
+        if text.len() as u64 > MOST_BYTES {
+            let what = format!("more than {MOST_BYTES} bytes; this is no file of ours");
+            return Err(KeyError::Damaged { path, what });
+        }
+        Ok(Some(text))
+    }
+
+    /// Replaces a file, or makes it: readers see the old text or the new, never a part.
+    pub fn write(&self, name: &str, text: &str) -> Result<(), KeyError> {
+        let draft = self.draft(name, text)?;
+        let path = self.file(name);
+        let moved = fs::rename(&draft, &path);
+        self.settle(path, &draft, moved)
+    }
+
+    /// Makes a file that must not be there yet; false if it is.
+    pub fn create(&self, name: &str, text: &str) -> Result<bool, KeyError> {
+        let draft = self.draft(name, text)?;
+        let path = self.file(name);
+        match fs::hard_link(&draft, &path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                let _ = fs::remove_file(&draft);
+                Ok(false)
+            }
+            linked => self.settle(path, &draft, linked).map(|()| true),
+        }
+    }
+
+    /// Writes a file beside the one that is meant.
+    fn draft(&self, name: &str, text: &str) -> Result<PathBuf, KeyError> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let path = self.file(&format!(".{name}.{}.{count}", process::id()));
+        let write = || {
+            let mut file = OpenOptions::new()
+                .write(true)
+                .create(true)
+                .truncate(true)
+                .mode(0o600)
+                .open(&path)?;
+            // Why: a file that was left there by a crash keeps its own mode.
+            file.set_permissions(fs::Permissions::from_mode(0o600))?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()
+        };
+        match write() {
+            Ok(()) => Ok(path),
+            Err(source) => {
+                let _ = fs::remove_file(&path);
+                Err(KeyError::Io { what: "write it", path, source })
+            }
+        }
+    }
+
+    fn settle(&self, path: PathBuf, draft: &Path, done: io::Result<()>) -> Result<(), KeyError> {
+        let _ = fs::remove_file(draft);
+        // The name, too, must survive a power cut.
+        done.and_then(|()| File::open(&self.0)?.sync_all()).map_err(|source| KeyError::Io {
+            what: "write it",
+            path,
+            source,
+        })
+    }
+}
+
+fn user_folder(config: Option<PathBuf>, home: Option<PathBuf>) -> Option<PathBuf> {
+    // A relative XDG_CONFIG_HOME is to be ignored (XDG Base Directory Specification).
+    let config = config.filter(|path| path.is_absolute());
+    let config = config
+        .or_else(|| home.filter(|path| path.is_absolute()).map(|path| path.join(".config")))?;
+    Some(config.join("vizflyt"))
+}
+
+/// No file of ours comes near.
+const MOST_BYTES: u64 = 1 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mode(path: &Path) -> u32 {
+        fs::metadata(path).unwrap().mode() & 0o777
+    }
+
+    #[test]
+    fn the_folder_and_its_files_are_the_owners_alone() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("a/keys");
+        let folder = KeysFolder::open(Some(&path)).unwrap();
+        assert_eq!(folder.read("x").unwrap(), None);
+        folder.write("x", "one").unwrap();
+        folder.write("x", "two").unwrap();
+        assert!(!folder.create("x", "three").unwrap());
+        assert!(folder.create("y", "four").unwrap());
+        assert_eq!(folder.read("x").unwrap().as_deref(), Some("two"));
+        assert_eq!(
+            (mode(&path), mode(&path.join("x")), mode(&path.join("y"))),
+            (0o700, 0o600, 0o600)
+        );
+        let mut names: Vec<_> =
+            fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        assert_eq!(names, ["x", "y"], "no draft stays");
+    }
+
+    #[test]
+    fn looser_permissions_are_an_error_that_says_what_to_do() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("keys");
+        let folder = KeysFolder::open(Some(&path)).unwrap();
+        folder.write("x", "one").unwrap();
+        fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o640)).unwrap();
+        let error = folder.read("x").unwrap_err().to_string();
+        assert!(error.contains("mode 640") && error.contains("chmod 600 "), "{error}");
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+        let error = KeysFolder::open(Some(&path)).unwrap_err().to_string();
+        assert!(error.contains("mode 755") && error.contains("chmod 700 "), "{error}");
+    }
+
+    #[test]
+    fn the_users_folder_follows_the_specification() {
+        let at = |config: Option<&str>, home: Option<&str>| {
+            user_folder(config.map(PathBuf::from), home.map(PathBuf::from))
+        };
+        assert_eq!(at(Some("/c"), Some("/h")), Some("/c/vizflyt".into()));
+        assert_eq!(at(Some("c"), Some("/h")), Some("/h/.config/vizflyt".into()));
+        assert_eq!(at(None, Some("/h")), Some("/h/.config/vizflyt".into()));
+        assert_eq!(at(None, None), None);
+    }
+}

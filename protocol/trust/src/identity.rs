@@ -1,0 +1,180 @@
+//! An identity: an Ed25519 key and its self-signed certificate, made once and kept.
+
+use std::str::FromStr;
+
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
+use rustls::sign::CertifiedKey;
+
+use crate::fingerprint::Fingerprint;
+use crate::folder::{KeyError, KeysFolder};
+
+/// Whose identity; one machine may be both.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Owner {
+    /// The render server.
+    Server,
+    /// The runtime, or another program that speaks to a server.
+    Runtime,
+}
+
+impl Owner {
+    /// Returns the file's name in the keys folder.
+    pub fn file(self) -> &'static str {
+        match self {
+            Self::Server => "server.key",
+            Self::Runtime => "runtime.key",
+        }
+    }
+}
+
+/// A certificate with its key.
+#[derive(Debug)]
+pub struct Identity {
+    /// DER.
+    pub certificate: CertificateDer<'static>,
+    /// PKCS#8.
+    pub key: PrivateKeyDer<'static>,
+}
+
+impl Clone for Identity {
+    fn clone(&self) -> Self {
+        Self { certificate: self.certificate.clone(), key: self.key.clone_key() }
+    }
+}
+
+impl Identity {
+    /// Returns the identity kept in `folder`; makes it at the first time.
+    ///
+    /// # Errors
+    /// A file that is there and cannot be used, for its permissions or its content, is an error:
+    /// a new key in its place would silently part the computer from all it is paired with.
+    pub fn keep(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
+        let name = owner.file();
+        if folder.read(name)?.is_none() {
+            let text = Self::make().map_err(|what| damaged(folder, owner, &what))?;
+            // Another process may have been first; then its key counts, and is read below.
+            folder.create(name, &text)?;
+        }
+        let text = folder.read(name)?.unwrap_or_default();
+        Self::parse(&text).map_err(|what| damaged(folder, owner, &what))
+    }
+
+    /// Makes a fresh one for this run only.
+    ///
+    /// # Errors
+    /// If the system gives no random numbers.
+    pub fn fleeting() -> Result<Self, String> {
+        Self::parse(&Self::make()?)
+    }
+
+    /// Returns who this is.
+    pub fn fingerprint(&self) -> Fingerprint {
+        Fingerprint::of(&self.certificate)
+    }
+
+    fn make() -> Result<String, String> {
+        let make = || {
+            let key = rcgen::KeyPair::generate_for(&rcgen::PKCS_ED25519)?;
+            let params = rcgen::CertificateParams::new(vec!["vizflyt".to_owned()])?;
+            Ok::<_, rcgen::Error>((params.self_signed(&key)?, key))
+        };
+        let (certificate, key) = make().map_err(|error| format!("cannot make a key: {error}"))?;
+        Ok(format!(
+            "{HEAD}{}\n{}{}",
+            Fingerprint::of(certificate.der()),
+            key.serialize_pem(),
+            certificate.pem()
+        ))
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let stated = text.lines().find_map(|line| line.strip_prefix(HEAD));
+        let stated = stated.ok_or("the line with the fingerprint is missing")?;
+        let stated = Fingerprint::from_str(stated.trim())?;
+        let certificate = CertificateDer::from_pem_slice(text.as_bytes())
+            .map_err(|error| format!("no certificate: {error}"))?;
+        let key = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes())
+            .map_err(|error| format!("no private key: {error}"))?;
+        if Fingerprint::of(&certificate) != stated {
+            return Err("the certificate is not the one the file was made with".to_owned());
+        }
+        let key = PrivateKeyDer::from(key);
+        let provider = rustls::crypto::ring::default_provider();
+        let chain = vec![certificate.clone()];
+        CertifiedKey::from_der(chain, key.clone_key(), &provider)
+            .map_err(|error| format!("key and certificate do not belong together: {error}"))?;
+        Ok(Self { certificate, key })
+    }
+}
+
+fn damaged(folder: &KeysFolder, owner: Owner, what: &str) -> KeyError {
+    let what =
+        format!("{what}; restore the file, or move it away to start with a new key and pair again");
+    KeyError::Damaged { path: folder.file(owner.file()), what }
+}
+
+/// First line of a file; text between PEM sections is for people (RFC 7468, section 2).
+const HEAD: &str = "VizFlyt key, keep it secret. SHA-256 of the certificate: ";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder() -> (tempfile::TempDir, KeysFolder) {
+        let root = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
+        (root, folder)
+    }
+
+    #[test]
+    fn an_identity_is_made_once_and_kept() {
+        let (_root, folder) = folder();
+        let first = Identity::keep(&folder, Owner::Server).unwrap();
+        let again = Identity::keep(&folder, Owner::Server).unwrap();
+        assert_eq!(first.fingerprint(), again.fingerprint());
+        assert_eq!(first.key, again.key);
+        let other = Identity::keep(&folder, Owner::Runtime).unwrap();
+        assert_ne!(first.fingerprint(), other.fingerprint());
+    }
+
+    #[test]
+    fn every_damage_is_an_error_and_leaves_the_file_alone() {
+        let (_root, folder) = folder();
+        Identity::keep(&folder, Owner::Server).unwrap();
+        let good = folder.read("server.key").unwrap().unwrap();
+        let other = Identity::make().unwrap();
+        let swapped = {
+            let cut = |text: &str| text.find("-----BEGIN CERT").unwrap();
+            format!("{}{}", &other[..cut(&other)], &good[cut(&good)..])
+        };
+        let mixed =
+            swapped.replacen(other.lines().next().unwrap(), good.lines().next().unwrap(), 1);
+        let half = &good[..good.len() / 2];
+        for bad in ["", "hello", half, &swapped, &mixed] {
+            folder.write("server.key", bad).unwrap();
+            let error = Identity::keep(&folder, Owner::Server).unwrap_err().to_string();
+            assert!(error.contains("server.key") && error.contains("move it away"), "{error}");
+            assert_eq!(folder.read("server.key").unwrap().as_deref(), Some(bad));
+        }
+    }
+
+    #[test]
+    fn a_flipped_letter_is_noticed() {
+        let good = Identity::make().unwrap();
+        let stated = Identity::parse(&good).unwrap();
+        for at in 0..good.len() {
+            let mut bytes = good.clone().into_bytes();
+            bytes[at] ^= 1;
+            let Ok(text) = String::from_utf8(bytes) else { continue };
+            // A letter of the prose may change; the identity may not.
+            if let Ok(found) = Identity::parse(&text) {
+                assert_eq!(
+                    (found.key, found.certificate),
+                    (stated.key.clone_key(), stated.certificate.clone()),
+                    "at {at}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! Pairing in memory: two honest sides, and those in between.
+
+use std::time::{Duration, Instant};
+
+use proptest::prelude::*;
+use vizflyt_protocol::messages::{FromApplicant, Grant, PairingProof, PairingShare, bounded};
+
+use super::*;
+use crate::Role;
+
+fn code(text: &str) -> Code {
+    text.parse().unwrap()
+}
+
+fn team() -> Grant {
+    Grant::Team { vehicles: heapless_one("ant") }
+}
+
+/// One name in the message's own kind of list.
+fn heapless_one<const N: usize>(name: &str) -> heapless::Vec<vizflyt_protocol::messages::Name, N> {
+    std::iter::once(bounded(name)).collect()
+}
+
+fn binding(connection: u8) -> Binding {
+    Binding {
+        client: Fingerprint::of(b"client"),
+        server: Fingerprint::of(b"server"),
+        exporter: [connection; 32],
+    }
+}
+
+struct Lab {
+    desk: Desk,
+    now: Instant,
+}
+
+/// What a client heard at the end.
+#[derive(Debug, PartialEq)]
+enum End {
+    Paired(Admitted),
+    Refused(Refusal),
+    /// The server's proof did not hold.
+    Deceived,
+}
+
+impl Lab {
+    fn open(text: &str) -> Self {
+        let mut lab = Self { desk: Desk::default(), now: Instant::now() };
+        assert!(lab.desk.open(lab.now, code(text), team()));
+        lab
+    }
+
+    fn begin(
+        &mut self,
+        message: &FromApplicant,
+        seen: &Binding,
+    ) -> Result<(Attempt, PairingShare), Refusal> {
+        self.desk.begin(self.now, message, seen)
+    }
+
+    /// Runs a client with `text` on a connection that the two ends may see differently.
+    fn pair(&mut self, text: &str, client_sees: Binding, server_sees: Binding) -> End {
+        let (applicant, message) = Applicant::begin(code(text), "jetson", client_sees);
+        let (attempt, share) = match self.begin(&message, &server_sees) {
+            Ok(begun) => begun,
+            Err(refusal) => return End::Refused(refusal),
+        };
+        let (confirming, message) = applicant.confirm(&share).unwrap();
+        match self.desk.confirm(self.now, attempt, &message) {
+            Ok(admitted) if confirming.is_proof(&admitted.proof) => End::Paired(admitted),
+            Ok(_) => End::Deceived,
+            Err(refusal) => End::Refused(refusal),
+        }
+    }
+
+    fn try_code(&mut self, text: &str) -> End {
+        self.pair(text, binding(1), binding(1))
+    }
+
+    fn is_open(&mut self) -> bool {
+        self.desk.state(self.now).is_some()
+    }
+}
+
+#[test]
+fn the_right_code_pairs_once() {
+    let mut lab = Lab::open("123456");
+    let state = lab.desk.state(lab.now).unwrap();
+    assert_eq!((state.left, state.tries_left, state.grant), (VALID, TRIES, team()));
+    assert!(!lab.desk.open(lab.now, code("000000"), Grant::Instructor), "one window at a time");
+    let End::Paired(admitted) = lab.try_code("123 456") else { panic!() };
+    assert_eq!(admitted.client.fingerprint, Fingerprint::of(b"client"));
+    assert_eq!((admitted.client.name.as_str(), admitted.client.role), ("jetson", Role::Team));
+    assert_eq!((admitted.client.vehicles, admitted.grant), (vec!["ant".to_owned()], team()));
+    assert!(!lab.is_open());
+    assert_eq!(lab.try_code("123456"), End::Refused(Refusal::Closed));
+}
+
+#[test]
+fn three_wrong_codes_shut_the_window() {
+    let mut lab = Lab::open("123456");
+    assert_eq!(lab.try_code("123457"), End::Refused(Refusal::Wrong { left: 2 }));
+    assert_eq!(lab.try_code("654321"), End::Refused(Refusal::Wrong { left: 1 }));
+    assert_eq!(lab.try_code("000000"), End::Refused(Refusal::Shut));
+    assert_eq!(lab.try_code("123456"), End::Refused(Refusal::Closed));
+    let mut lab = Lab::open("123456");
+    lab.try_code("123457");
+    assert!(matches!(lab.try_code("123456"), End::Paired(_)), "a slip of the finger is no harm");
+}
+
+#[test]
+fn tries_in_parallel_are_no_more_tries() {
+    let mut lab = Lab::open("123456");
+    let seen = binding(1);
+    let mut begun: Vec<_> = (0..9)
+        .map(|guess| {
+            let (applicant, message) = Applicant::begin(Code::from_number(guess), "jetson", seen);
+            (applicant, lab.begin(&message, &seen).unwrap())
+        })
+        .collect();
+    let ends: Vec<_> = begun
+        .drain(..)
+        .map(|(applicant, (attempt, share))| {
+            let (_, message) = applicant.confirm(&share).unwrap();
+            lab.desk.confirm(lab.now, attempt, &message).unwrap_err()
+        })
+        .collect();
+    assert_eq!(ends[..3], [Refusal::Wrong { left: 2 }, Refusal::Wrong { left: 1 }, Refusal::Shut]);
+    assert!(ends[3..].iter().all(|end| *end == Refusal::Closed), "{ends:?}");
+}
+
+#[test]
+fn a_code_expires_also_between_two_messages() {
+    let mut lab = Lab::open("123456");
+    let seen = binding(1);
+    let (applicant, message) = Applicant::begin(code("123456"), "jetson", seen);
+    let (attempt, share) = lab.begin(&message, &seen).unwrap();
+    let (_, message) = applicant.confirm(&share).unwrap();
+    lab.now += VALID - Duration::from_nanos(1);
+    assert!(lab.is_open());
+    lab.now += Duration::from_nanos(1);
+    assert!(!lab.is_open());
+    // Not even through the next window, should it have the same code.
+    assert!(lab.desk.open(lab.now, code("123456"), Grant::Instructor));
+    let end = lab.desk.confirm(lab.now, attempt, &message);
+    assert_eq!(end, Err(Refusal::Closed));
+}
+
+/// The man in the middle has his own certificate toward each side, so each connection has its own
+/// exporter; he passes every message on as it is.
+#[test]
+fn a_relay_between_two_connections_fails_with_the_right_code() {
+    let middle = Fingerprint::of(b"middle");
+    let toward_client = Binding { server: middle, ..binding(1) };
+    let toward_server = Binding { client: middle, ..binding(2) };
+    let mut lab = Lab::open("123456");
+    let end = lab.pair("123456", toward_client, toward_server);
+    assert_eq!(end, End::Refused(Refusal::Wrong { left: 2 }));
+    // Each part of the binding counts by itself.
+    for other in [
+        Binding { exporter: [2; 32], ..binding(1) },
+        Binding { client: middle, ..binding(1) },
+        Binding { server: middle, ..binding(1) },
+    ] {
+        let mut lab = Lab::open("123456");
+        let end = lab.pair("123456", binding(1), other);
+        assert_eq!(end, End::Refused(Refusal::Wrong { left: 2 }), "{other:?}");
+    }
+}
+
+/// He plays the server to the client, with a guess of the code, and gets one proof to check it on.
+#[test]
+fn a_false_server_that_guesses_wrong_convinces_nobody() {
+    let seen = Binding { server: Fingerprint::of(b"middle"), ..binding(1) };
+    let (applicant, message) = Applicant::begin(code("123456"), "jetson", seen);
+    let mut false_server = Lab::open("111111");
+    let (attempt, share) = false_server.begin(&message, &seen).unwrap();
+    let (confirming, message) = applicant.confirm(&share).unwrap();
+    let end = false_server.desk.confirm(false_server.now, attempt, &message);
+    assert_eq!(end, Err(Refusal::Wrong { left: 2 }), "his guess was wrong, and he knows only that");
+    // He answers all the same, echoing the client's proof, or anything else.
+    let FromApplicant::Confirm { proof } = message else { panic!() };
+    assert!(!confirming.is_proof(&proof), "the two proofs differ, so an echo is none");
+}
+
+#[test]
+fn what_was_recorded_is_of_no_use_later() {
+    let seen = binding(1);
+    let mut lab = Lab::open("123456");
+    let (applicant, begin) = Applicant::begin(code("123456"), "jetson", seen);
+    let (attempt, share) = lab.begin(&begin, &seen).unwrap();
+    let (confirming, confirm) = applicant.confirm(&share).unwrap();
+    let admitted = lab.desk.confirm(lab.now, attempt, &confirm).unwrap();
+    assert!(confirming.is_proof(&admitted.proof));
+    // The same window of code, the same fingerprints, even the same exporter: the server's half is
+    // new every time.
+    let mut lab = Lab::open("123456");
+    let (attempt, _) = lab.begin(&begin, &seen).unwrap();
+    let end = lab.desk.confirm(lab.now, attempt, &confirm);
+    assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
+    // And the server's old proof says nothing to a new client.
+    let (applicant, _) = Applicant::begin(code("123456"), "jetson", seen);
+    let (confirming, _) = applicant.confirm(&share).unwrap();
+    assert!(!confirming.is_proof(&admitted.proof));
+}
+
+#[test]
+fn messages_out_of_order_are_refused() {
+    let mut lab = Lab::open("123456");
+    let seen = binding(1);
+    let confirm = FromApplicant::Confirm { proof: [0; 32] };
+    assert_eq!(lab.begin(&confirm, &seen).err(), Some(Refusal::Foreign));
+    let (_, begin) = Applicant::begin(code("123456"), "jetson", seen);
+    let (attempt, _) = lab.begin(&begin, &seen).unwrap();
+    assert_eq!(lab.desk.confirm(lab.now, attempt, &begin), Err(Refusal::Foreign));
+    for name in ["", "a\nb", "\u{1b}[31m"] {
+        let begin = FromApplicant::Begin { name: bounded(name), share: [7; 32] };
+        assert_eq!(lab.begin(&begin, &seen).err(), Some(Refusal::Name), "{name:?}");
+    }
+    assert_eq!(lab.desk.state(lab.now).unwrap().tries_left, TRIES, "nothing was tried");
+}
+
+proptest! {
+    #[test]
+    fn any_other_code_name_or_half_fails(
+        right in 0..CODES, wrong in 0..CODES, flip in 0..256_usize, other in "[a-z]{1,8}",
+    ) {
+        prop_assume!(right != wrong && other != "jetson");
+        let (right, wrong) = (Code::from_number(right), Code::from_number(wrong));
+        let seen = binding(1);
+        // (the client's code, what is done to its first message, does it pair)
+        let tampered = |message: FromApplicant, kind: u8| match (message, kind) {
+            (FromApplicant::Begin { share, .. }, 1) => {
+                FromApplicant::Begin { name: bounded(&other), share }
+            }
+            (FromApplicant::Begin { name, mut share }, 2) => {
+                share[flip / 8] ^= 1 << (flip % 8);
+                FromApplicant::Begin { name, share }
+            }
+            (message, _) => message,
+        };
+        for (text, kind, pairs) in [(right, 0, true), (wrong, 0, false), (right, 1, false), (right, 2, false)] {
+            let mut lab = Lab::open(&right.to_string());
+            let (applicant, message) = Applicant::begin(text, "jetson", seen);
+            let Ok((attempt, share)) = lab.begin(&tampered(message, kind), &seen) else {
+                prop_assert!(kind == 2);
+                continue;
+            };
+            let (_, message) = applicant.confirm(&share).unwrap();
+            prop_assert_eq!(lab.desk.confirm(lab.now, attempt, &message).is_ok(), pairs);
+        }
+    }
+
+    #[test]
+    fn arbitrary_messages_neither_pair_nor_panic(share: PairingShare, proof: PairingProof) {
+        let mut lab = Lab::open("123456");
+        let seen = binding(1);
+        let begin = FromApplicant::Begin { name: bounded("x"), share };
+        if let Ok((attempt, _)) = lab.begin(&begin, &seen) {
+            let end = lab.desk.confirm(lab.now, attempt, &FromApplicant::Confirm { proof });
+            prop_assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
+        }
+        let (applicant, _) = Applicant::begin(code("123456"), "x", seen);
+        if let Some((confirming, _)) = applicant.confirm(&share) {
+            prop_assert!(!confirming.is_proof(&proof));
+        }
+    }
+
+    #[test]
+    fn codes_are_read_as_they_are_written(number in 0..CODES) {
+        let code = Code::from_number(number);
+        prop_assert_eq!(code.to_string().parse(), Ok(code));
+        prop_assert_eq!(format!("{number:06}").parse(), Ok(code));
+    }
+}
+
+#[test]
+fn codes_of_another_form_are_refused() {
+    for wrong in ["", "12345", "1234567", "12345a", "١٢٣٤٥٦"] {
+        assert!(wrong.parse::<Code>().is_err(), "{wrong}");
+    }
+    assert_eq!(format!("{:?}", code("123456")), "Code(..)", "not for logs");
+    let drawn: std::collections::BTreeSet<_> =
+        (0..50).map(|_| Code::random().unwrap().to_string()).collect();
+    assert!(drawn.len() > 40, "fifty draws of a million repeat rarely");
+}
