@@ -1,20 +1,23 @@
 //! The command line of `vizflyt fly`.
 
 use std::ffi::OsString;
+use std::fmt;
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::Args;
 
+use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
+
 use crate::link::udp::MavlinkAddress;
-use crate::stream::Fingerprint;
 
 /// Flies a plugin: images from the render server to it, its setpoints through the guard to the
 /// autopilot.
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Example:\n  vizflyt fly ./target/release/my-plugin --server 192.168.10.2:4433 \\\n    \
-                        --fingerprint 3f…9c --mavlink udpin:0.0.0.0:14550 --vehicle vizflyt\n\n\
+                        --mavlink udpin:0.0.0.0:14550 --vehicle vizflyt\n\n\
                         The vehicle lands when the plugin ends, hangs or is killed, when poses stop,\n\
                         and on Ctrl-C."
 )]
@@ -25,12 +28,9 @@ pub struct FlyArgs {
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT")]
     pub plugin_arguments: Vec<OsString>,
-    /// The render server's address
-    #[arg(long, value_name = "HOST:PORT", value_parser = resolve)]
-    pub server: SocketAddr,
-    /// SHA-256 of the server's certificate; the server prints it at start
-    #[arg(long, value_name = "HEX")]
-    pub fingerprint: Fingerprint,
+    /// The render server, and how it is known
+    #[command(flatten)]
+    pub server: ServerArgs,
     /// The autopilot: `udpin:ADDR:PORT` waits for it, `udpout:HOST:PORT` calls it
     #[arg(long, value_name = "ADDRESS", default_value = "udpin:0.0.0.0:14550")]
     pub mavlink: MavlinkAddress,
@@ -66,9 +66,68 @@ impl FlyArgs {
     }
 }
 
-fn resolve(text: &str) -> Result<SocketAddr, String> {
-    let mut found = text.to_socket_addrs().map_err(|error| format!("{text}: {error}"))?;
-    found.next().ok_or_else(|| format!("{text} has no address"))
+/// Which server, how this computer knows it, and who this computer is.
+#[derive(Args, Clone, Debug)]
+pub struct ServerArgs {
+    /// The render server's address; `vizflyt pair HOST:PORT` makes it known once
+    #[arg(long = "server", value_name = "HOST:PORT")]
+    pub at: ServerAddress,
+    /// SHA-256 of the server's certificate [default: the one this computer is paired with]
+    #[arg(long, value_name = "HEX")]
+    pub fingerprint: Option<Fingerprint>,
+    /// Folder of this computer's key and of servers.toml
+    /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
+    #[arg(long, value_name = "DIR")]
+    pub keys: Option<PathBuf>,
+}
+
+impl ServerArgs {
+    /// Returns who the server is and who we are.
+    ///
+    /// # Errors
+    /// A server that this computer is not paired with; keys that cannot be used.
+    pub fn known(&self) -> anyhow::Result<(Fingerprint, Identity)> {
+        let folder = KeysFolder::open(self.keys.as_deref())?;
+        let identity = Identity::keep(&folder, Owner::Runtime)?;
+        if let Some(fingerprint) = self.fingerprint {
+            return Ok((fingerprint, identity));
+        }
+        let resolved = self.at.address.to_string();
+        let known = Servers::read(&folder)?.fingerprint(&[&self.at.typed, &resolved]);
+        let fingerprint = known.ok_or_else(|| {
+            anyhow::anyhow!(
+                "this computer is not paired with the server {0}; run `vizflyt pair {0}` and type \
+                 the code from the server's page",
+                self.at
+            )
+        })?;
+        Ok((fingerprint, identity))
+    }
+}
+
+/// A server's address, as typed and as resolved.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServerAddress {
+    /// `HOST:PORT`.
+    pub typed: String,
+    /// The first address it has.
+    pub address: SocketAddr,
+}
+
+impl FromStr for ServerAddress {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let mut found = text.to_socket_addrs().map_err(|error| format!("{text}: {error}"))?;
+        let address = found.next().ok_or_else(|| format!("{text} has no address"))?;
+        Ok(Self { typed: text.to_owned(), address })
+    }
+}
+
+impl fmt::Display for ServerAddress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.typed)
+    }
 }
 
 #[cfg(test)]
@@ -90,8 +149,31 @@ mod tests {
         let tail = ["--mavlink", "udpin:127.0.0.1:0", "--", "plugin.py", "--gain=2"];
         let args = Program::try_parse_from(line.iter().chain(&tail)).unwrap().fly;
         assert_eq!(args.plugin_command(), ["python3", "plugin.py", "--gain=2"]);
-        assert_eq!(args.fingerprint, Fingerprint::of(b"x"));
+        assert_eq!(args.server.fingerprint, Some(Fingerprint::of(b"x")));
+        assert_eq!(args.server.at.address, ([127, 0, 0, 1], 4433).into());
         let wrong = Program::try_parse_from(line.iter().chain(&["--mavlink", "tcp:1"]));
         assert!(wrong.err().unwrap().to_string().contains("write udpin:"));
+    }
+
+    #[test]
+    fn a_server_is_known_by_pairing_or_by_hand() {
+        let root = tempfile::tempdir().unwrap();
+        let keys = root.path().join("keys");
+        let args = |fingerprint| ServerArgs {
+            at: "127.0.0.1:4433".parse().unwrap(),
+            fingerprint,
+            keys: Some(keys.clone()),
+        };
+        let error = args(None).known().err().unwrap().to_string();
+        assert!(error.contains("run `vizflyt pair 127.0.0.1:4433`"), "{error}");
+        let (one, two) = (Fingerprint::of(b"1"), Fingerprint::of(b"2"));
+        let folder = KeysFolder::open(Some(&keys)).unwrap();
+        let address = "127.0.0.1:4433".to_owned();
+        let server = vizflyt_trust::KnownServer { address, fingerprint: one };
+        Servers::add(&folder, server).unwrap();
+        let (found, identity) = args(None).known().unwrap();
+        let (given, same) = args(Some(two)).known().unwrap();
+        assert_eq!((found, given), (one, two));
+        assert_eq!(identity.fingerprint(), same.fingerprint());
     }
 }

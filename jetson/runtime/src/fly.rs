@@ -50,6 +50,7 @@ pub fn fly_command(
     args: &FlyArgs,
     plugin_command: Vec<std::ffi::OsString>,
 ) -> anyhow::Result<Outcome> {
+    let (fingerprint, identity) = args.server.known()?;
     let port = Arc::new(
         UdpPort::open(args.mavlink)
             .with_context(|| format!("{}: cannot open the socket", args.mavlink))?,
@@ -67,8 +68,9 @@ pub fn fly_command(
     let (to_server, outbox) = mpsc::channel(TO_SERVER);
     watch_signals(&tokio, sender.clone())?;
     let settings = StreamSettings {
-        server: args.server,
-        fingerprint: args.fingerprint,
+        server: args.server.at.address,
+        fingerprint,
+        identity,
         vehicle: bounded(&args.vehicle),
     };
     tokio.spawn(stream::run(settings, shared.clone(), outbox, tell_stream(sender.clone())));
@@ -178,7 +180,7 @@ fn print_ready(args: &FlyArgs, mavlink: SocketAddr, log: &FlightLog) {
         let mavlink = mavlink.to_string();
         print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
     } else {
-        print_line(&format!("waiting for server {} and an autopilot on {mavlink}", args.server));
+        print_line(&format!("waiting for server {} and an autopilot on {mavlink}", args.server.at));
     }
 }
 

@@ -47,6 +47,10 @@ pub enum KeyError {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KeysFolder(PathBuf);
 
+/// One state of a file: another inode, change time or size is another state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FileStamp([i128; 4]);
+
 impl KeysFolder {
     /// Opens `path`, or the user's own folder (`$XDG_CONFIG_HOME/vizflyt`, `~/.config/vizflyt`),
     /// and makes it if it is not there.
@@ -77,8 +81,28 @@ impl KeysFolder {
         self.0.join(name)
     }
 
-    /// Reads a file; `None` if there is none.
+    /// Reads a file that nobody else may write; `None` if there is none.
     pub fn read(&self, name: &str) -> Result<Option<String>, KeyError> {
+        self.read_as(name, 0o022)
+    }
+
+    /// Reads a file that nobody else may read or write; `None` if there is none.
+    pub fn read_secret(&self, name: &str) -> Result<Option<String>, KeyError> {
+        self.read_as(name, 0o077)
+    }
+
+    /// Returns what tells one state of a file from another; `None` if there is none.
+    pub fn stamp(&self, name: &str) -> Option<FileStamp> {
+        let about = fs::metadata(self.file(name)).ok()?;
+        Some(FileStamp([
+            about.ino() as i128,
+            i128::from(about.ctime()),
+            i128::from(about.ctime_nsec()),
+            i128::from(about.size()),
+        ]))
+    }
+
+    fn read_as(&self, name: &str, forbidden: u32) -> Result<Option<String>, KeyError> {
         let path = self.file(name);
         let io = |what, source| KeyError::Io { what, path: path.clone(), source };
         let file = match File::open(&path) {
@@ -88,7 +112,7 @@ impl KeysFolder {
         };
         let about = file.metadata().map_err(|error| io("look at it", error))?;
         let mode = about.mode() & 0o777;
-        if mode & 0o077 != 0 {
+        if mode & forbidden != 0 {
             return Err(KeyError::Open { path, mode, fix: "600" });
         }
         let mut text = String::new();
@@ -207,8 +231,11 @@ mod tests {
         let folder = KeysFolder::open(Some(&path)).unwrap();
         folder.write("x", "one").unwrap();
         fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o640)).unwrap();
-        let error = folder.read("x").unwrap_err().to_string();
+        assert!(folder.read("x").is_ok(), "what others may read is no secret, but not forged");
+        let error = folder.read_secret("x").unwrap_err().to_string();
         assert!(error.contains("mode 640") && error.contains("chmod 600 "), "{error}");
+        fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o620)).unwrap();
+        assert!(folder.read("x").unwrap_err().to_string().contains("mode 620"));
         fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
         let error = KeysFolder::open(Some(&path)).unwrap_err().to_string();
         assert!(error.contains("mode 755") && error.contains("chmod 700 "), "{error}");

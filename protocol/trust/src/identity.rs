@@ -51,12 +51,12 @@ impl Identity {
     /// a new key in its place would silently part the computer from all it is paired with.
     pub fn keep(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
         let name = owner.file();
-        if folder.read(name)?.is_none() {
+        if folder.read_secret(name)?.is_none() {
             let text = Self::make().map_err(|what| damaged(folder, owner, &what))?;
             // Another process may have been first; then its key counts, and is read below.
             folder.create(name, &text)?;
         }
-        let text = folder.read(name)?.unwrap_or_default();
+        let text = folder.read_secret(name)?.unwrap_or_default();
         Self::parse(&text).map_err(|what| damaged(folder, owner, &what))
     }
 

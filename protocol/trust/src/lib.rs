@@ -22,7 +22,7 @@ pub mod servers;
 pub mod tls;
 
 pub use fingerprint::Fingerprint;
-pub use folder::{KeyError, KeysFolder};
+pub use folder::{FileStamp, KeyError, KeysFolder};
 pub use identity::{Identity, Owner};
 pub use paired::{Client, Paired, Role};
 pub use servers::{KnownServer, Servers};

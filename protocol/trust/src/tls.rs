@@ -216,6 +216,24 @@ mod tests {
         assert!(shake(any.client_config(&two, b"y").unwrap(), server()).is_err(), "another ALPN");
     }
 
+    /// Shows the certificate of a paired client without its key.
+    #[derive(Debug)]
+    struct Thief(Arc<rustls::sign::CertifiedKey>);
+
+    impl rustls::client::ResolvesClientCert for Thief {
+        fn resolve(
+            &self,
+            _: &[&[u8]],
+            _: &[SignatureScheme],
+        ) -> Option<Arc<rustls::sign::CertifiedKey>> {
+            Some(self.0.clone())
+        }
+
+        fn has_certs(&self) -> bool {
+            true
+        }
+    }
+
     #[test]
     fn a_client_without_certificate_or_with_anothers_is_refused() {
         let [one, two, three] = [(); 3].map(|()| Identity::fleeting().unwrap());
@@ -230,21 +248,6 @@ mod tests {
         let server = || server_config(&one, &[]).unwrap();
         let error = shake(builder().with_no_client_auth(), server()).unwrap_err();
         assert!(error.contains("peer sent no certificates"), "{error}");
-        // The certificate of a paired client without its key.
-        #[derive(Debug)]
-        struct Thief(Arc<rustls::sign::CertifiedKey>);
-        impl rustls::client::ResolvesClientCert for Thief {
-            fn resolve(
-                &self,
-                _: &[&[u8]],
-                _: &[SignatureScheme],
-            ) -> Option<Arc<rustls::sign::CertifiedKey>> {
-                Some(self.0.clone())
-            }
-            fn has_certs(&self) -> bool {
-                true
-            }
-        }
         let key = provider().key_provider.load_private_key(three.key.clone_key()).unwrap();
         let stolen = rustls::sign::CertifiedKey::new(vec![two.certificate.clone()], key);
         let thief = builder().with_client_cert_resolver(Arc::new(Thief(Arc::new(stolen))));

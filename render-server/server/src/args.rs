@@ -72,6 +72,11 @@ pub struct ServeArgs {
     #[arg(long, value_name = "METRES", value_parser = scale)]
     pub scale: Option<f64>,
 
+    /// Folder of this server's key and of paired.toml, which says who may connect
+    /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
+    #[arg(long, value_name = "DIR")]
+    pub keys: Option<PathBuf>,
+
     /// Print JSON lines on standard output: ready, events, report
     #[arg(long)]
     pub json: bool,

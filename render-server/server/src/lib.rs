@@ -14,6 +14,7 @@ pub mod args;
 pub mod cameras;
 pub mod clock;
 pub mod dashboard;
+pub mod door;
 pub mod drawn;
 pub mod drivers;
 pub mod encode;

@@ -9,9 +9,11 @@ use glam::DVec2;
 use serde::Serialize;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
 use vizflyt_splat::{Chosen, Rasterizer, Splats};
+use vizflyt_trust::KeysFolder;
 
 use crate::args::ServeArgs;
 use crate::cameras::Cameras;
+use crate::door::Door;
 use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, ViconUdp};
 use crate::events::Origin;
@@ -22,7 +24,7 @@ use crate::render::choose;
 use crate::scene::{self, Scene};
 use crate::stats::Report;
 use crate::stop::Stop;
-use crate::transport::{self, Identity};
+use crate::transport;
 use crate::vehicle::Vehicle;
 use crate::{dashboard, encode, previews, tick};
 
@@ -58,6 +60,8 @@ struct Ready<'a> {
     http: String,
     vicon: SocketAddr,
     fingerprint: &'a str,
+    /// How many computers may connect.
+    paired: usize,
     /// Where the first vehicle is expected to start: x, y, z [m, world], yaw [deg].
     spawn: [f64; 4],
     vehicles: Vec<ReadyVehicle>,
@@ -88,8 +92,8 @@ impl ReadyVehicle {
 async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     stop.on_signals(args.lifeline)?;
     // Sockets first: a taken port is told before the scene is loaded.
-    let identity = Arc::new(Identity::generate()?);
-    let endpoint = transport::bind(args.quic, &identity, args.congestion)?;
+    let door = Arc::new(Door::open(KeysFolder::open(args.keys.as_deref())?)?);
+    let endpoint = transport::bind(args.quic, &door.identity, args.congestion)?;
     let quic = endpoint.local_addr().context("QUIC has no address")?;
     let listener = dashboard::bind(args.http).await?;
     let http = format!("http://{}", listener.local_addr().context("the page has no address")?);
@@ -112,7 +116,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     let names: Vec<_> = hub.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
     let threads = start_threads(args, &hub, rasterizer, twin.referees, vicon.of(&names))?;
 
-    let fingerprint = identity.fingerprint();
+    let fingerprint = door.identity.fingerprint().to_string();
     let vehicles = hub.vehicles.iter().zip(&twin.flying);
     let vehicles: Vec<_> =
         vehicles.map(|(vehicle, (_, arena))| ReadyVehicle::of(vehicle, arena)).collect();
@@ -124,6 +128,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
             http,
             vicon: vicon_address,
             fingerprint: &fingerprint,
+            paired: door.paired().clients.len(),
             spawn: vehicles.first().map_or([0.0; 4], |vehicle| vehicle.spawn),
             vehicles,
             arena: &twin.arena.name,
@@ -133,13 +138,18 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     );
 
     let page = tokio::spawn(dashboard::serve(hub.clone(), twin.map, twin.arena.stages, listener));
+    let rights = tokio::spawn({
+        let door = door.clone();
+        async move { door.follow().await }
+    });
     let mut printers = tokio::task::JoinSet::new();
     for vehicle in &hub.vehicles {
         let alone = hub.vehicles.len() == 1;
         printers.spawn(print_events(vehicle.clone(), alone, args.json));
     }
-    transport::serve(hub.clone(), endpoint, identity, args.congestion).await;
+    transport::serve(hub.clone(), endpoint, door, args.congestion).await;
     hub.outlet.shut();
+    rights.abort();
     page.abort();
     printers.shutdown().await;
     for thread in threads {
@@ -261,11 +271,9 @@ fn announce(json: bool, ready: &Ready<'_>) {
             [one] if one.name == "vizflyt" => String::new(),
             _ => format!(" --vehicle {}", vehicle.name),
         };
-        say(&format!(
-            "runtime      vizflyt fly PLUGIN --server {} --fingerprint {}{named}",
-            ready.quic, ready.fingerprint
-        ));
+        say(&format!("runtime      vizflyt fly PLUGIN --server HOST:{}{named}", ready.quic.port()));
     }
+    say(&format!("identity     {} ({} paired)", ready.fingerprint, ready.paired));
 }
 
 fn report(json: bool, report: &Report) {

@@ -18,13 +18,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
     (
         "vizflyt-server",
-        &[
-            "vizflyt-protocol",
-            "vizflyt-rgbd",
-            "vizflyt-trust",
-            "vizflyt-splat",
-            "vizflyt-arena",
-        ],
+        &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-trust", "vizflyt-splat", "vizflyt-arena"],
     ),
     ("vizflyt-runtime", &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-trust", "vizflyt-sdk"]),
     (

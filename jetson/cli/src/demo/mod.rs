@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! prepare   generate (or find) the scene: scene.ply, arena.toml, truth.json
+//! keys      pair server and runtime, for this demo only
 //! serve     start the render server; it says which ports it got
 //! fly       start the runtime with the plugin; it says which port waits for MAVLink
 //! sim       start the simulated lab: vehicle, autopilot, mocap
@@ -12,6 +13,7 @@
 //! them, listens, and ends them.
 
 mod child;
+mod keys;
 mod memory;
 mod prepare;
 mod report;
@@ -28,6 +30,7 @@ use serde_json::Value;
 use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
+use self::keys::Keys;
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
 use self::report::Parts;
@@ -80,6 +83,7 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     let (notices, inbox) = mpsc::channel();
     interrupt_notices(notices.clone())?;
     let stage = Stage::prepare(&args.scene, args.seed)?;
+    let keys = Keys::make()?;
     let mut show = Show {
         log_level: format!("--log-level={log_level}").into(),
         notices,
@@ -87,7 +91,7 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
         children: Vec::new(),
         parts: Parts::default(),
     };
-    let result = show.fly(args, &stage);
+    let result = show.fly(args, &stage, &keys);
     show.end();
     let log = match result {
         Ok(Flown::To { log }) => log,
@@ -124,11 +128,12 @@ struct Show {
 }
 
 impl Show {
-    fn fly(&mut self, args: &DemoArgs, stage: &Stage) -> Result<Flown> {
+    fn fly(&mut self, args: &DemoArgs, stage: &Stage, keys: &Keys) -> Result<Flown> {
         let page = format!("127.0.0.1:{}", args.port);
         let serve: Vec<OsString> = vec![
             "serve".into(),
             stage.arena.clone().into(),
+            keys.option(),
             "--json".into(),
             "--lifeline".into(),
             "--quic=127.0.0.1:0".into(),
@@ -152,13 +157,14 @@ impl Show {
             open_browser(&url);
         }
 
+        keys.note_server(&text(&server, "quic")?)?;
         let mut fly: Vec<OsString> = vec![
             "fly".into(),
             args.plugin.clone().into(),
             "--json".into(),
             "--lifeline".into(),
             format!("--server={}", text(&server, "quic")?).into(),
-            format!("--fingerprint={}", text(&server, "fingerprint")?).into(),
+            keys.option(),
             "--mavlink=udpin:127.0.0.1:0".into(),
             format!("--log={}", args.log.display()).into(),
         ];

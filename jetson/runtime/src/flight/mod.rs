@@ -346,7 +346,7 @@ impl Flight {
 
     fn connecting(&mut self, now: HostTime, link: &LinkView) {
         let missing = if self.arena.is_none() {
-            Some("no answer from the server; check --server and --fingerprint")
+            Some("no answer from the server; check --server")
         } else if !self.plugin_ready {
             Some("the plugin is not ready yet (`on_start` runs)")
         } else if !link.connected {

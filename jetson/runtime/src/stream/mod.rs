@@ -6,10 +6,10 @@
 //! one uni stream per image      ── ImageHeader + RGB-D ──▶ Mailbox, newest wins ──▶ images
 //! ```
 //! Runs on tokio. Any outage (1 s of silence, a server that restarts) ends in a new connection,
-//! tried for as long as the flight lasts. The server's certificate is pinned by its SHA-256.
+//! tried for as long as the flight lasts. Both sides show a certificate; each knows the other's by
+//! its SHA-256.
 
 mod mailbox;
-mod pinning;
 mod session;
 #[cfg(test)]
 mod tests;
@@ -25,9 +25,10 @@ use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, ToServer,
 };
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
+use vizflyt_trust::tls::Pin;
+use vizflyt_trust::{ALPN, Fingerprint, Identity};
 
 pub use mailbox::{Mailbox, ReceivedImage};
-pub use pinning::Fingerprint;
 
 /// Where the server is, and who we are.
 #[derive(Clone, Debug)]
@@ -36,6 +37,8 @@ pub struct StreamSettings {
     pub server: SocketAddr,
     /// SHA-256 of its certificate (DER).
     pub fingerprint: Fingerprint,
+    /// Who we are.
+    pub identity: Identity,
     /// The vehicle's name in the localization system.
     pub vehicle: Name,
 }
@@ -191,10 +194,10 @@ async fn connect(
     let retry = |what: &str, error: &dyn std::fmt::Display| {
         SessionEnd::Retry(format!("server {}: {what}: {error}", settings.server))
     };
-    let pin = pinning::Pin::new(settings.fingerprint);
+    let pin = Pin::to(settings.fingerprint);
     let endpoint = open(settings.server).map_err(|error| retry("socket", &error))?;
-    let config =
-        client_config(&pin).map_err(|error| SessionEnd::Final(format!("TLS set-up: {error}")))?;
+    let config = client_config(&pin, &settings.identity)
+        .map_err(|error| SessionEnd::Final(format!("TLS set-up: {error}")))?;
     let connecting = endpoint
         .connect_with(config, settings.server, "vizflyt")
         .map_err(|error| retry("address", &error))?;
@@ -202,8 +205,8 @@ async fn connect(
         Ok(connection) => Ok((endpoint, connection)),
         Err(error) => Err(match pin.mismatch() {
             Some(found) => SessionEnd::Final(format!(
-                "server {} shows another certificate, {found}; pass that as --fingerprint if it \
-                 is yours",
+                "server {} is another than the one this computer is paired with: it is {found}; if \
+                 that is yours, pair again",
                 settings.server
             )),
             None => retry("no connection", &error),
@@ -224,9 +227,8 @@ fn endpoint(server: SocketAddr) -> std::io::Result<Endpoint> {
     Endpoint::new(EndpointConfig::default(), None, socket.into(), Arc::new(quinn::TokioRuntime))
 }
 
-fn client_config(pin: &pinning::Pin) -> Result<ClientConfig, rustls::Error> {
-    let mut tls = pin.client_config()?;
-    tls.alpn_protocols = vec![b"vizflyt".to_vec()];
+fn client_config(pin: &Pin, identity: &Identity) -> Result<ClientConfig, rustls::Error> {
+    let tls = pin.client_config(identity, ALPN)?;
     let crypto = quinn::crypto::rustls::QuicClientConfig::try_from(tls)
         .map_err(|error| rustls::Error::General(error.to_string()))?;
     let mut config = ClientConfig::new(Arc::new(crypto));

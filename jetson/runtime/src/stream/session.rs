@@ -3,10 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::{Connection, RecvStream, SendStream};
+use quinn::{Connection, ConnectionError, RecvStream, SendStream, VarInt};
 use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
-use vizflyt_protocol::messages::{ClockRequest, Hello, ToRuntime, ToServer, bounded};
+use vizflyt_protocol::messages::{ClockRequest, Hello, ToRuntime, ToServer, bounded, close};
 use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, encode};
 use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
 use zerocopy::IntoBytes;
@@ -35,9 +35,18 @@ pub(super) async fn converse(
     tell: &(impl Fn(StreamEvent) + Send + Sync),
 ) -> SessionEnd {
     shared.clock.reset();
-    match converse_inner(settings, shared, connection, outbox, tell).await {
+    let end = match converse_inner(settings, shared, connection, outbox, tell).await {
         Ok(never) => match never {},
         Err(end) => end,
+    };
+    // What the server said on closing tells more than which of our calls failed first.
+    match connection.close_reason() {
+        Some(ConnectionError::ApplicationClosed(said))
+            if said.error_code == VarInt::from_u32(close::UNPAIRED) =>
+        {
+            SessionEnd::Final(String::from_utf8_lossy(&said.reason).into_owned())
+        }
+        _ => end,
     }
 }
 

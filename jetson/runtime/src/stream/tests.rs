@@ -3,7 +3,6 @@
 use std::sync::mpsc::{Receiver, channel};
 
 use quinn::{Connection, RecvStream, SendStream, ServerConfig};
-use rustls::pki_types::PrivatePkcs8KeyDer;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, Twist, Volume};
 use vizflyt_protocol::messages::{ClockReply, EventKind, Limits, Telemetry, ToRuntime, bounded};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
@@ -24,18 +23,9 @@ struct Server {
 
 impl Server {
     fn start() -> Self {
-        let key = rcgen::generate_simple_self_signed(vec!["vizflyt".into()]).unwrap();
-        let certificate = key.cert.der().clone();
-        let fingerprint = Fingerprint::of(&certificate);
-        let private = PrivatePkcs8KeyDer::from(key.signing_key.serialize_der()).into();
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let mut tls = rustls::ServerConfig::builder_with_provider(provider)
-            .with_protocol_versions(&[&rustls::version::TLS13])
-            .unwrap()
-            .with_no_client_auth()
-            .with_single_cert(vec![certificate], private)
-            .unwrap();
-        tls.alpn_protocols = vec![b"vizflyt".to_vec()];
+        let identity = Identity::fleeting().unwrap();
+        let fingerprint = identity.fingerprint();
+        let tls = vizflyt_trust::tls::server_config(&identity, &[ALPN]).unwrap();
         let crypto = quinn::crypto::rustls::QuicServerConfig::try_from(tls).unwrap();
         let config = ServerConfig::with_crypto(Arc::new(crypto));
         let endpoint = Endpoint::server(config, ([127, 0, 0, 1], 0).into()).unwrap();
@@ -132,6 +122,7 @@ impl Client {
         let settings = StreamSettings {
             server: server.endpoint.local_addr().unwrap(),
             fingerprint,
+            identity: Identity::fleeting().unwrap(),
             vehicle: bounded("vizflyt"),
         };
         let sender = std::sync::Mutex::new(sender);

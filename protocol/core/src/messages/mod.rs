@@ -32,6 +32,12 @@ pub use timing::{
     Waterfall,
 };
 
+/// Codes with which a server closes a connection and that a client acts on.
+pub mod close {
+    /// This computer is not paired with the server, or no longer.
+    pub const UNPAIRED: u32 = 5;
+}
+
 /// A short name: of a vehicle, a camera, a stage.
 pub type Name = heapless::String<32>;
 /// A sentence for a person.

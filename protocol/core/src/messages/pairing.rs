@@ -61,6 +61,7 @@ pub enum ToApplicant {
 
 /// What a pairing gives.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // Why: as above.
 pub enum Grant {
     /// Flying and watching these vehicles.
     Team {

@@ -1,24 +1,32 @@
-//! A connection from its first byte to its seat: preambles, `Hello`, and which vehicle, or why not.
+//! A connection from its first byte to its seat: who it is, preambles, `Hello`, and which vehicle,
+//! or why not.
+//!
+//! A client that is not paired is told how to pair, before a byte of it is read; one that is paired
+//! hears of no vehicle but those it may use.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{Connection, ConnectionError};
+use rustls::pki_types::CertificateDer;
 use tokio::time::timeout;
 use tracing::{info, warn};
 use vizflyt_protocol::messages::{ToRuntime, ToServer, bounded};
 use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_trust::{Client, Fingerprint};
 use zerocopy::IntoBytes;
 
 use super::control::{Ending, Incoming, Outbound, PATIENCE, gone};
-use super::{END, FOREIGN, REFUSED, session};
+use super::{END, FOREIGN, REFUSED, UNPAIRED, session};
+use crate::door::Door;
 use crate::hub::Hub;
 
 /// Speaks with one runtime until either side ends it.
-pub(super) async fn run(hub: Arc<Hub>, connection: Connection) {
+pub(super) async fn run(hub: Arc<Hub>, door: Arc<Door>, port: u16, connection: Connection) {
     let address = connection.remote_address();
     let (code, reason) = tokio::select! {
-        ending = talk(&hub, &connection) => ending,
+        ending = talk(&hub, &door, port, &connection) => ending,
         () = hub.stop.wait() => (END, "the server ends".to_owned()),
     };
     // What the other side said on closing tells more than which of our calls failed first.
@@ -29,7 +37,11 @@ pub(super) async fn run(hub: Arc<Hub>, connection: Connection) {
     connection.close(code, cut.as_bytes());
 }
 
-async fn talk(hub: &Arc<Hub>, connection: &Connection) -> Ending {
+async fn talk(hub: &Arc<Hub>, door: &Door, port: u16, connection: &Connection) -> Ending {
+    let Some(client) = peer(connection).and_then(|fingerprint| door.client(fingerprint)) else {
+        warn!("{}: not paired", connection.remote_address());
+        return (UNPAIRED, unpaired(connection, port));
+    };
     let opened = timeout(PATIENCE, async {
         let (send, mut recv) = connection.accept_bi().await.map_err(|error| gone(&error))?;
         let mut preamble = [0; Preamble::SIZE];
@@ -59,9 +71,19 @@ async fn talk(hub: &Arc<Hub>, connection: &Connection) -> Ending {
         Err(_) => return (FOREIGN, "no Hello came for 5 s".to_owned()),
     };
     let address = connection.remote_address();
-    let seat = hub.vehicle(&hello.vehicle).and_then(|vehicle| vehicle.sit(&hello, address));
+    let seat = permit(&client, &hello.vehicle)
+        .and_then(|()| hub.vehicle(&hello.vehicle))
+        .and_then(|vehicle| vehicle.sit(&hello, address));
     match seat {
-        Ok(seat) => Box::pin(session::fly(hub, connection, &hello, &seat, send, incoming)).await,
+        Ok(seat) => {
+            let flight = Box::pin(session::fly(hub, connection, &hello, &seat, send, incoming));
+            tokio::select! {
+                ending = flight => ending,
+                () = door.right_ends(client.fingerprint, &hello.vehicle) => {
+                    (UNPAIRED, format!("'{}' may no longer use '{}'", client.name, hello.vehicle))
+                }
+            }
+        }
         Err(reason) => {
             warn!("{address}: refused: {reason}");
             let mut out = Outbound::new(send);
@@ -73,6 +95,33 @@ async fn talk(hub: &Arc<Hub>, connection: &Connection) -> Ending {
             linger(connection, (REFUSED, reason)).await
         }
     }
+}
+
+/// Returns who is at the other end; TLS has made sure that it holds the key.
+fn peer(connection: &Connection) -> Option<Fingerprint> {
+    let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
+    chain.first().map(|certificate| Fingerprint::of(certificate))
+}
+
+fn unpaired(connection: &Connection, port: u16) -> String {
+    // The address by which the client reached us, as far as the system tells.
+    let host = match connection.local_ip().map(|ip| ip.to_canonical()) {
+        Some(IpAddr::V6(ip)) => format!("[{ip}]"),
+        Some(ip) => ip.to_string(),
+        None => "HOST".to_owned(),
+    };
+    format!(
+        "this computer is not paired with the server; run `vizflyt pair {host}:{port}` and type \
+         the code from the server's page"
+    )
+}
+
+fn permit(client: &Client, vehicle: &str) -> Result<(), String> {
+    if client.may_use(vehicle) {
+        return Ok(());
+    }
+    let own: Vec<_> = client.vehicles.iter().map(|name| format!("'{name}'")).collect();
+    Err(format!("'{}' may use {} here, not '{vehicle}'", client.name, own.join(", ")))
 }
 
 pub(super) fn why(error: &ConnectionError) -> String {

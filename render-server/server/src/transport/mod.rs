@@ -1,20 +1,18 @@
 //! QUIC to the runtime: one endpoint, one session per connection.
 //!
 //! ```text
-//! accept -> greeting: preambles, Hello -> Welcome | Refused
+//! accept -> greeting: who it is, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
 //! ```
 //! Settings and figures: docs/BENCHMARKS.md.
 
-mod certificate;
 mod control;
 mod greeting;
 mod images;
 mod lan;
 mod session;
 
-pub use certificate::{Identity, fingerprint};
 pub use lan::{Lan, LanConfig};
 
 use std::net::{IpAddr, SocketAddr};
@@ -30,7 +28,10 @@ use quinn::{
 };
 use socket2::{Domain, Protocol, Socket, Type};
 use tracing::{debug, warn};
+use vizflyt_protocol::messages::close;
+use vizflyt_trust::{ALPN, Identity, tls};
 
+use crate::door::Door;
 use crate::hub::Hub;
 
 /// Who decides how fast to send.
@@ -102,13 +103,9 @@ pub fn endpoint_config() -> Result<EndpointConfig> {
 }
 
 /// Accepts runtimes until the server stops.
-pub async fn serve(
-    hub: Arc<Hub>,
-    endpoint: Endpoint,
-    identity: Arc<Identity>,
-    congestion: Congestion,
-) {
+pub async fn serve(hub: Arc<Hub>, endpoint: Endpoint, door: Arc<Door>, congestion: Congestion) {
     let mut sessions = tokio::task::JoinSet::new();
+    let port = endpoint.local_addr().map_or(0, |address| address.port());
     loop {
         let incoming = tokio::select! {
             incoming = endpoint.accept() => incoming,
@@ -122,14 +119,14 @@ pub async fn serve(
             continue;
         }
         let chosen = congestion.toward(incoming.remote_address().ip());
-        let config = match server_config(&identity, chosen) {
+        let config = match server_config(&door.identity, chosen) {
             Ok(config) => Arc::new(config),
             Err(error) => {
                 warn!("{error:#}");
                 continue;
             }
         };
-        let hub = hub.clone();
+        let (hub, door) = (hub.clone(), door.clone());
         sessions.spawn(async move {
             let address = incoming.remote_address();
             let connection = match incoming.accept_with(config) {
@@ -137,7 +134,7 @@ pub async fn serve(
                 Err(error) => Err(error),
             };
             match connection {
-                Ok(connection) => Box::pin(greeting::run(hub, connection)).await,
+                Ok(connection) => Box::pin(greeting::run(hub, door, port, connection)).await,
                 Err(error) => debug!("{address}: no connection: {error}"),
             }
         });
@@ -150,14 +147,8 @@ pub async fn serve(
 
 /// Returns the settings of connections, with the certificate that runtimes pin.
 pub fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let mut tls = rustls::ServerConfig::builder_with_provider(provider)
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .context("TLS 1.3 is not available")?
-        .with_no_client_auth()
-        .with_single_cert(vec![identity.certificate.clone()], identity.key.clone_key())
-        .context("cannot use the server's certificate")?;
-    tls.alpn_protocols = vec![ALPN.to_vec()];
+    let tls =
+        tls::server_config(identity, &[ALPN]).context("cannot use the server's key for TLS")?;
     let quic = QuicServerConfig::try_from(tls).context("cannot use TLS for QUIC")?;
     let mut config = ServerConfig::with_crypto(Arc::new(quic));
     config.transport_config(Arc::new(transport_config(congestion)));
@@ -186,14 +177,13 @@ fn transport_config(congestion: Congestion) -> TransportConfig {
     config
 }
 
-/// The protocol's name in the TLS handshake.
-pub const ALPN: &[u8] = b"vizflyt";
 /// Close codes; the reason in words goes with them.
 const END: VarInt = VarInt::from_u32(0);
 const FOREIGN: VarInt = VarInt::from_u32(1);
 const REFUSED: VarInt = VarInt::from_u32(2);
 const SLOW: VarInt = VarInt::from_u32(3);
 const REPLACED: VarInt = VarInt::from_u32(4);
+const UNPAIRED: VarInt = VarInt::from_u32(close::UNPAIRED);
 /// Measured: 600 KB images from 2.7 to 1.8 ms, no packets lost in the socket.
 const SOCKET_BUFFER: usize = 4 << 20;
 /// Jumbo frames. [bytes]

@@ -17,10 +17,13 @@ use std::time::Duration;
 use glam::{Quat, Vec3};
 use quinn::{ClientConfig, Connection, Endpoint, RecvStream, SendStream, TransportConfig, VarInt};
 use serde_json::Value;
+use tempfile::TempDir;
 use vizflyt_protocol::messages::{ArenaInfo, Hello, ToRuntime, ToServer, bounded};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
 use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
 use vizflyt_splat::{Splats, ply};
+use vizflyt_trust::tls::Pin;
+use vizflyt_trust::{ALPN, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
 use zerocopy::IntoBytes;
 
 /// Bounds a test that fails; never part of a passing one's outcome.
@@ -76,17 +79,37 @@ pub struct Server {
     pub quic: SocketAddr,
     pub http: SocketAddr,
     pub vicon: SocketAddr,
-    pub fingerprint: String,
+    /// What it said when it was ready.
+    pub ready: Value,
+    /// An instructor's, paired before the start.
+    pub instructor: Identity,
+    keys: TempDir,
 }
 
 impl Server {
     /// Starts it on free ports and waits until it is ready.
     pub fn start(arena: &Path, more: &[&str]) -> Self {
+        Self::start_paired(arena, more, &[])
+    }
+
+    /// As [`Self::start`], with others paired than the instructor.
+    pub fn start_paired(arena: &Path, more: &[&str], others: &[vizflyt_trust::Client]) -> Self {
+        let keys = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&keys.path().join("keys"))).unwrap();
+        let instructor = Identity::fleeting().unwrap();
+        let client = client(&instructor, Role::Instructor, &[]);
+        for client in others.iter().cloned().chain([client]) {
+            Paired::add(&folder, client).unwrap();
+        }
+        // A test may bring a folder of its own.
+        let own_keys = (!more.iter().any(|option| option.starts_with("--keys")))
+            .then(|| format!("--keys={}", keys.path().join("keys").display()));
         let free = "127.0.0.1:0";
         let mut child = Command::new(env!("CARGO_BIN_EXE_vizflyt-server"))
             .arg(arena)
             .args(["--json", "--lifeline", "--quic", free, "--http", free, "--vicon", free])
             .args(more)
+            .args(own_keys)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -111,8 +134,20 @@ impl Server {
             quic: at("quic").parse().unwrap(),
             http: at("http").strip_prefix("http://").unwrap().parse().unwrap(),
             vicon: at("vicon").parse().unwrap(),
-            fingerprint: at("fingerprint"),
+            ready,
+            instructor,
+            keys,
         }
+    }
+
+    /// Returns the server's keys folder.
+    pub fn keys(&self) -> KeysFolder {
+        KeysFolder::open(Some(&self.keys.path().join("keys"))).unwrap()
+    }
+
+    /// Returns who the server is.
+    pub fn fingerprint(&self) -> Fingerprint {
+        Identity::keep(&self.keys(), Owner::Server).unwrap().fingerprint()
     }
 
     /// Returns the next line of standard output for which `wanted` yields something.
@@ -217,53 +252,6 @@ pub fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
     bytes
 }
 
-/// Accepts the one certificate whose fingerprint was printed.
-#[derive(Debug)]
-struct Pinned {
-    fingerprint: String,
-    provider: rustls::crypto::CryptoProvider,
-}
-
-impl rustls::client::danger::ServerCertVerifier for Pinned {
-    fn verify_server_cert(
-        &self,
-        certificate: &rustls::pki_types::CertificateDer<'_>,
-        _: &[rustls::pki_types::CertificateDer<'_>],
-        _: &rustls::pki_types::ServerName<'_>,
-        _: &[u8],
-        _: rustls::pki_types::UnixTime,
-    ) -> Result<rustls::client::danger::ServerCertVerified, rustls::Error> {
-        if vizflyt_server::transport::fingerprint(certificate) == self.fingerprint {
-            Ok(rustls::client::danger::ServerCertVerified::assertion())
-        } else {
-            Err(rustls::Error::General("not the pinned certificate".to_owned()))
-        }
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &rustls::pki_types::CertificateDer<'_>,
-        _: &rustls::DigitallySignedStruct,
-    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
-        Err(rustls::Error::General("TLS 1.2 is not spoken".to_owned()))
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &rustls::pki_types::CertificateDer<'_>,
-        signature: &rustls::DigitallySignedStruct,
-    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
-        let schemes = &self.provider.signature_verification_algorithms;
-        rustls::crypto::verify_tls13_signature(message, certificate, signature, schemes)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
-        self.provider.signature_verification_algorithms.supported_schemes()
-    }
-}
-
 /// A runtime's connection.
 pub struct Client {
     pub connection: Connection,
@@ -273,30 +261,33 @@ pub struct Client {
     endpoint: Endpoint,
 }
 
-/// Connects, without a word said yet.
-pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
-    connect_pinned(server.quic, &server.fingerprint, transport).await.map(|(_, c)| c)
+/// Returns an entry of `paired.toml`.
+pub fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizflyt_trust::Client {
+    vizflyt_trust::Client {
+        name: format!("{role:?}").to_lowercase(),
+        fingerprint: identity.fingerprint(),
+        role,
+        vehicles: vehicles.iter().map(ToString::to_string).collect(),
+    }
 }
 
-async fn connect_pinned(
-    address: SocketAddr,
-    fingerprint: &str,
+/// Connects, without a word said yet.
+pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
+    connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
+}
+
+/// As [`connect`], as somebody else.
+pub async fn connect_as(
+    server: &Server,
+    identity: &Identity,
     transport: TransportConfig,
 ) -> Result<(Endpoint, Connection), String> {
-    let provider = rustls::crypto::ring::default_provider();
-    let verifier = Pinned { fingerprint: fingerprint.to_owned(), provider: provider.clone() };
-    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::new(provider))
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .unwrap()
-        .dangerous()
-        .with_custom_certificate_verifier(Arc::new(verifier))
-        .with_no_client_auth();
-    tls.alpn_protocols = vec![vizflyt_server::transport::ALPN.to_vec()];
+    let tls = Pin::to(server.fingerprint()).client_config(identity, ALPN).unwrap();
     let quic = quinn::crypto::rustls::QuicClientConfig::try_from(tls).unwrap();
     let mut config = ClientConfig::new(Arc::new(quic));
     config.transport_config(Arc::new(transport));
     let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
-    let connecting = endpoint.connect_with(config, address, "vizflyt").unwrap();
+    let connecting = endpoint.connect_with(config, server.quic, "vizflyt").unwrap();
     let connection = connecting.await.map_err(|error| error.to_string())?;
     Ok((endpoint, connection))
 }
@@ -304,8 +295,17 @@ async fn connect_pinned(
 impl Client {
     /// Connects, exchanges preambles and says hello for `vehicle`.
     pub async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
-        let (endpoint, connection) =
-            connect_pinned(server.quic, &server.fingerprint, transport).await.unwrap();
+        Self::hello_as(server, &server.instructor, vehicle, transport).await
+    }
+
+    /// As [`Self::hello`], as somebody else who is paired.
+    pub async fn hello_as(
+        server: &Server,
+        identity: &Identity,
+        vehicle: &str,
+        transport: TransportConfig,
+    ) -> Self {
+        let (endpoint, connection) = connect_as(server, identity, transport).await.unwrap();
         let (mut send, mut recv) = connection.open_bi().await.unwrap();
         send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.unwrap();
         let mut theirs = [0; Preamble::SIZE];

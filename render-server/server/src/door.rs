@@ -1,0 +1,137 @@
+//! Who may come in: this server's identity, and the rights of those paired with it.
+//!
+//! `paired.toml` is read again whenever it changes, so that removing an entry ends that client's
+//! right and its connection. A file that cannot be read leaves the former rights as they are: a
+//! slip of the hand must not drop vehicles out of the air.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::{info, warn};
+use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
+
+/// What every way into the server asks.
+#[derive(Debug)]
+pub struct Door {
+    /// Who this server is.
+    pub identity: Identity,
+    folder: KeysFolder,
+    paired: watch::Sender<Arc<Paired>>,
+}
+
+impl Door {
+    /// Opens the keys folder; makes this server's identity at its first start.
+    ///
+    /// # Errors
+    /// Keys or a `paired.toml` that cannot be used.
+    pub fn open(folder: KeysFolder) -> Result<Self, KeyError> {
+        let identity = Identity::keep(&folder, Owner::Server)?;
+        let paired = watch::Sender::new(Arc::new(Paired::read(&folder)?));
+        Ok(Self { identity, folder, paired })
+    }
+
+    /// Returns who is paired.
+    pub fn paired(&self) -> Arc<Paired> {
+        self.paired.borrow().clone()
+    }
+
+    /// Returns the paired client of a fingerprint.
+    pub fn client(&self, fingerprint: Fingerprint) -> Option<Client> {
+        self.paired.borrow().client(fingerprint).cloned()
+    }
+
+    /// Completes when a client may no longer use a vehicle.
+    pub async fn right_ends(&self, fingerprint: Fingerprint, vehicle: &str) {
+        let mut paired = self.paired.subscribe();
+        let lost = |paired: &Arc<Paired>| {
+            !paired.client(fingerprint).is_some_and(|client| client.may_use(vehicle))
+        };
+        // An error means that the sender is gone; `self` holds it.
+        let _ = paired.wait_for(lost).await;
+    }
+
+    /// Follows `paired.toml`, for ever.
+    pub async fn follow(&self) {
+        let mut tick = interval(LOOK_EVERY);
+        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut taken = self.folder.stamp(Paired::FILE);
+        let mut seen = taken;
+        loop {
+            tick.tick().await;
+            let found = self.folder.stamp(Paired::FILE);
+            // Two looks alike: an editor that empties the file before it fills it is not believed.
+            if found == seen && found != taken {
+                taken = found;
+                self.reread();
+            }
+            seen = found;
+        }
+    }
+
+    fn reread(&self) {
+        match Paired::read(&self.folder) {
+            Ok(paired) => {
+                let changed = self.paired.send_if_modified(|known| {
+                    let changes = **known != paired;
+                    *known = Arc::new(paired);
+                    changes
+                });
+                if changed {
+                    info!("paired.toml has changed: {} paired", self.paired().clients.len());
+                }
+            }
+            Err(error) => warn!("{error}; the former rights stay until this is mended"),
+        }
+    }
+}
+
+/// Removing an entry counts after two of these.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vizflyt_trust::Role;
+
+    fn client(name: &str, vehicle: &str) -> Client {
+        Client {
+            name: name.to_owned(),
+            fingerprint: Fingerprint::of(name.as_bytes()),
+            role: Role::Team,
+            vehicles: vec![vehicle.to_owned()],
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_right_ends_with_its_entry_but_not_with_a_slip_of_the_hand() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
+        Paired::add(&folder, client("ants", "ant")).unwrap();
+        let door = Arc::new(Door::open(folder.clone()).unwrap());
+        let following = tokio::spawn({
+            let door = door.clone();
+            async move { door.follow().await }
+        });
+        let print = Fingerprint::of(b"ants");
+        let ending = tokio::spawn({
+            let door = door.clone();
+            async move { door.right_ends(print, "ant").await }
+        });
+        // A vehicle that is not its own: no right to begin with.
+        door.right_ends(print, "bee").await;
+
+        let good = folder.read(Paired::FILE).unwrap().unwrap();
+        folder.write(Paired::FILE, "[[client]").unwrap();
+        tokio::time::sleep(8 * LOOK_EVERY).await;
+        assert!(!ending.is_finished() && door.client(print).is_some());
+        folder.write(Paired::FILE, &good.replace("\"ant\"", "\"ant\", \"bee\"")).unwrap();
+        tokio::time::sleep(8 * LOOK_EVERY).await;
+        assert!(!ending.is_finished() && door.client(print).unwrap().may_use("bee"));
+        folder.write(Paired::FILE, "").unwrap();
+        ending.await.unwrap();
+        assert_eq!(door.client(print), None);
+        following.abort();
+    }
+}
