@@ -23,6 +23,7 @@ pub mod hub;
 pub mod mailbox;
 pub mod map;
 pub mod outlet;
+pub mod pace;
 pub mod previews;
 pub mod render;
 pub mod scene;
