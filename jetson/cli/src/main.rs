@@ -3,6 +3,7 @@
 
 mod bench;
 mod demo;
+mod pair;
 mod plugins;
 mod scene;
 
@@ -27,6 +28,7 @@ struct Cli {
 }
 
 #[derive(Subcommand, Debug)]
+#[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
 enum Command {
     /// Everything on this machine: generated scene, simulated vehicle, example plugin, page.
     Demo(demo::DemoArgs),
@@ -34,6 +36,8 @@ enum Command {
     Serve(vizflyt_server::ServeArgs),
     /// The runtime on the Jetson: flies a plugin.
     Fly(vizflyt_runtime::FlyArgs),
+    /// Makes this computer and a render server known to each other, once, by a short code.
+    Pair(pair::PairArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
     /// Makes scenes, looks at them, draws them.
@@ -73,6 +77,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Demo(args) => demo::run(&args, log_level),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => plugins::fly(&args),
+        Command::Pair(args) => pair::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),

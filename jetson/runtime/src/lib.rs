@@ -33,3 +33,4 @@ pub mod waterfall;
 pub use args::FlyArgs;
 pub use flight::{Outcome, OutcomeKind};
 pub use fly::{fly, fly_command};
+pub use stream::pair;

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::Args;
+use vizflyt_protocol::messages::{Grant, MAX_GRANTED, bounded};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
 use crate::render::RendererKind;
@@ -72,6 +73,10 @@ pub struct ServeArgs {
     #[arg(long, value_name = "METRES", value_parser = scale)]
     pub scale: Option<f64>,
 
+    /// Open a pairing at the start and print its code: `instructor`, or `team:VEHICLE`
+    #[arg(long, value_name = "ROLE", value_parser = grant)]
+    pub pair: Option<Grant>,
+
     /// Folder of this server's key and of paired.toml, which says who may connect
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
@@ -135,6 +140,24 @@ fn depth_bound(text: &str) -> Result<DepthBound, String> {
     DepthBound::new(k_per_m).ok_or_else(|| format!("{k_per_m} is outside 0.000001 to 0.1"))
 }
 
+/// Reads `instructor` or `team:VEHICLE[,VEHICLE...]`.
+pub(crate) fn grant(text: &str) -> Result<Grant, String> {
+    if text == "instructor" {
+        return Ok(Grant::Instructor);
+    }
+    let names = text.strip_prefix("team:").ok_or("write instructor, or team:VEHICLE")?;
+    let mut vehicles = heapless::Vec::new();
+    for name in names.split(',') {
+        if name.is_empty() || name.len() > 32 || name.chars().any(char::is_control) {
+            return Err(format!("'{name}' is no vehicle's name (1 to 32 bytes of text)"));
+        }
+        if vehicles.push(bounded(name)).is_err() {
+            return Err(format!("a team has {MAX_GRANTED} vehicles at most"));
+        }
+    }
+    Ok(Grant::Team { vehicles })
+}
+
 fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
 }
@@ -183,6 +206,9 @@ mod tests {
         );
         assert_eq!(options.depth_bound, DepthBound::new(0.002));
         assert_eq!(parse("a.toml --up z").unwrap().up, Up::Z);
+        assert_eq!(parse("a.toml --pair instructor").unwrap().pair, Some(Grant::Instructor));
+        let team = Grant::Team { vehicles: ["ant", "bee"].map(bounded).into_iter().collect() };
+        assert_eq!(parse("a.toml --pair team:ant,bee").unwrap().pair, Some(team));
         for wrong in [
             "a.toml --max-rate nan",
             "a.toml --max-rate 0",
@@ -191,6 +217,9 @@ mod tests {
             "a.toml --depth-error 0",
             "a.toml --depth-error 0.2",
             "a.toml --color 422",
+            "a.toml --pair boss",
+            "a.toml --pair team:",
+            "a.toml --pair team:a,b,c,d,e,f,g,h,i",
         ] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }

@@ -4,13 +4,18 @@
 //! right and its connection. A file that cannot be read leaves the former rights as they are: a
 //! slip of the hand must not drop vehicles out of the air.
 
-use std::sync::Arc;
-use std::time::Duration;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
+use vizflyt_protocol::messages::{FromApplicant, Grant, PairingShare};
+use vizflyt_trust::pairing::{Admitted, Attempt, Binding, Code, Desk, Refusal, WindowState};
 use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
+
+use crate::hub::lock;
 
 /// What every way into the server asks.
 #[derive(Debug)]
@@ -19,6 +24,9 @@ pub struct Door {
     pub identity: Identity,
     folder: KeysFolder,
     paired: watch::Sender<Arc<Paired>>,
+    desk: Mutex<Desk>,
+    /// What came of the newest attempt to pair.
+    pairing_news: watch::Sender<String>,
 }
 
 impl Door {
@@ -29,7 +37,8 @@ impl Door {
     pub fn open(folder: KeysFolder) -> Result<Self, KeyError> {
         let identity = Identity::keep(&folder, Owner::Server)?;
         let paired = watch::Sender::new(Arc::new(Paired::read(&folder)?));
-        Ok(Self { identity, folder, paired })
+        let (desk, pairing_news) = (Mutex::default(), watch::Sender::default());
+        Ok(Self { identity, folder, paired, desk, pairing_news })
     }
 
     /// Returns who is paired.
@@ -50,6 +59,78 @@ impl Door {
         };
         // An error means that the sender is gone; `self` holds it.
         let _ = paired.wait_for(lost).await;
+    }
+
+    /// Opens a pairing window with a fresh code.
+    ///
+    /// # Errors
+    /// A window that is open already; no random numbers.
+    pub fn open_pairing(&self, grant: Grant) -> Result<WindowState, String> {
+        let code = Code::random()?;
+        let now = Instant::now();
+        let mut desk = lock(&self.desk);
+        if !desk.open(now, code, grant) {
+            return Err("a pairing is open already; use its code, or close it".to_owned());
+        }
+        self.pairing_news.send_replace("waiting for the code".to_owned());
+        desk.state(now).ok_or_else(|| "the pairing closed at once".to_owned())
+    }
+
+    /// Returns the open pairing window.
+    pub fn pairing(&self) -> Option<WindowState> {
+        lock(&self.desk).state(Instant::now())
+    }
+
+    /// Closes the pairing window.
+    pub fn shut_pairing(&self) {
+        lock(&self.desk).shut();
+        self.pairing_news.send_replace("closed".to_owned());
+    }
+
+    /// Returns what comes of attempts to pair, newest wins.
+    pub fn pairing_news(&self) -> watch::Receiver<String> {
+        self.pairing_news.subscribe()
+    }
+
+    /// Takes the first message of a client that wants to be paired.
+    ///
+    /// # Errors
+    /// The reason to refuse.
+    pub fn begin_pairing(
+        &self,
+        message: &FromApplicant,
+        binding: &Binding,
+    ) -> Result<(Attempt, PairingShare), Refusal> {
+        lock(&self.desk).begin(Instant::now(), message, binding)
+    }
+
+    /// Takes its proof; if that is right, it is paired from now on.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn confirm_pairing(
+        &self,
+        attempt: Attempt,
+        message: &FromApplicant,
+        from: SocketAddr,
+    ) -> Result<Admitted, String> {
+        let admitted = lock(&self.desk).confirm(Instant::now(), attempt, message);
+        let admitted = admitted.map_err(|refusal| {
+            self.pairing_news.send_replace(format!("{from}: {refusal}"));
+            refusal.to_string()
+        })?;
+        match Paired::add(&self.folder, admitted.client.clone()) {
+            Ok(paired) => {
+                self.paired.send_replace(Arc::new(paired));
+                self.pairing_news.send_replace(format!("'{}' is paired", admitted.client.name));
+                Ok(admitted)
+            }
+            Err(error) => {
+                warn!("{error}");
+                self.pairing_news.send_replace(error.to_string());
+                Err("the server could not keep the pairing; its log says why".to_owned())
+            }
+        }
     }
 
     /// Follows `paired.toml`, for ever.

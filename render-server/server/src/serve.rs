@@ -8,6 +8,7 @@ use anyhow::{Context, Result};
 use glam::DVec2;
 use serde::Serialize;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
+use vizflyt_protocol::messages::Grant;
 use vizflyt_splat::{Chosen, Rasterizer, Splats};
 use vizflyt_trust::KeysFolder;
 
@@ -138,6 +139,9 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     );
 
     let page = tokio::spawn(dashboard::serve(hub.clone(), twin.map, twin.arena.stages, listener));
+    if let Some(grant) = &args.pair {
+        open_pairing(&door, grant, quic.port(), args.json)?;
+    }
     let rights = tokio::spawn({
         let door = door.clone();
         async move { door.follow().await }
@@ -157,6 +161,33 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
     report(args.json, &hub.report());
+    Ok(())
+}
+
+/// Opens the pairing that `--pair` asks for, and prints its code and what comes of it.
+fn open_pairing(door: &Arc<Door>, grant: &Grant, port: u16, json: bool) -> Result<()> {
+    let window = door.open_pairing(grant.clone()).map_err(anyhow::Error::msg)?;
+    if json {
+        line(&serde_json::json!({ "pairing": { "code": window.code.to_string() } }));
+    } else {
+        say(&format!(
+            "pairing      code {}, good for {} s: on the other computer `vizflyt pair HOST:{port}`",
+            window.code,
+            window.left.as_secs()
+        ));
+    }
+    let mut news = door.pairing_news();
+    news.mark_unchanged();
+    tokio::spawn(async move {
+        while news.changed().await.is_ok() {
+            let text = news.borrow_and_update().clone();
+            if json {
+                line(&serde_json::json!({ "pairing": { "news": text } }));
+            } else {
+                say(&format!("pairing      {text}"));
+            }
+        }
+    });
     Ok(())
 }
 

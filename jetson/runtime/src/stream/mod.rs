@@ -10,6 +10,7 @@
 //! its SHA-256.
 
 mod mailbox;
+mod pair;
 mod session;
 #[cfg(test)]
 mod tests;
@@ -29,6 +30,7 @@ use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity};
 
 pub use mailbox::{Mailbox, ReceivedImage};
+pub use pair::{NowPaired, pair};
 
 /// Where the server is, and who we are.
 #[derive(Clone, Debug)]

@@ -98,7 +98,7 @@ async fn talk(hub: &Arc<Hub>, door: &Door, port: u16, connection: &Connection) -
 }
 
 /// Returns who is at the other end; TLS has made sure that it holds the key.
-fn peer(connection: &Connection) -> Option<Fingerprint> {
+pub(super) fn peer(connection: &Connection) -> Option<Fingerprint> {
     let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
     chain.first().map(|certificate| Fingerprint::of(certificate))
 }
@@ -138,7 +138,7 @@ pub(super) fn why(error: &ConnectionError) -> String {
 }
 
 /// Gives the last words time to arrive: closing at once would discard them.
-async fn linger(connection: &Connection, ending: Ending) -> Ending {
+pub(super) async fn linger(connection: &Connection, ending: Ending) -> Ending {
     let _ = timeout(Duration::from_secs(2), connection.closed()).await;
     ending
 }

@@ -1,7 +1,9 @@
 //! QUIC to the runtime: one endpoint, one session per connection.
 //!
 //! ```text
-//! accept -> greeting: who it is, preambles, Hello -> Welcome | Refused
+//! accept -> limits: who may try at all; a few handshakes at once, unproved addresses prove themselves
+//!        -> pairing, if that is what it asks for; else
+//!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
 //! ```
@@ -11,28 +13,33 @@ mod control;
 mod greeting;
 mod images;
 mod lan;
+mod limits;
+mod pairing;
 mod session;
 
 pub use lan::{Lan, LanConfig};
 
 use std::net::{IpAddr, SocketAddr};
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use quinn::congestion::{BbrConfig, ControllerFactory, CubicConfig};
-use quinn::crypto::rustls::QuicServerConfig;
+use quinn::crypto::rustls::{HandshakeData, QuicServerConfig};
 use quinn::{
-    AckFrequencyConfig, Endpoint, EndpointConfig, MtuDiscoveryConfig, ServerConfig,
+    AckFrequencyConfig, Connection, Endpoint, EndpointConfig, MtuDiscoveryConfig, ServerConfig,
     TransportConfig, VarInt,
 };
 use socket2::{Domain, Protocol, Socket, Type};
+use tokio::sync::Semaphore;
 use tracing::{debug, warn};
 use vizflyt_protocol::messages::close;
-use vizflyt_trust::{ALPN, Identity, tls};
+use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 
+use self::limits::Limiter;
 use crate::door::Door;
-use crate::hub::Hub;
+use crate::hub::{Hub, lock};
 
 /// Who decides how fast to send.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -106,6 +113,7 @@ pub fn endpoint_config() -> Result<EndpointConfig> {
 pub async fn serve(hub: Arc<Hub>, endpoint: Endpoint, door: Arc<Door>, congestion: Congestion) {
     let mut sessions = tokio::task::JoinSet::new();
     let port = endpoint.local_addr().map_or(0, |address| address.port());
+    let strangers = Arc::new(Strangers::default());
     loop {
         let incoming = tokio::select! {
             incoming = endpoint.accept() => incoming,
@@ -113,12 +121,25 @@ pub async fn serve(hub: Arc<Hub>, endpoint: Endpoint, door: Arc<Door>, congestio
             () = hub.stop.wait() => None,
         };
         let Some(incoming) = incoming else { break };
+        let address = incoming.remote_address();
         if sessions.len() >= MOST_CONNECTIONS {
-            warn!("{} connections already: refused {}", sessions.len(), incoming.remote_address());
+            debug!("{} connections already: refused {address}", sessions.len());
             incoming.refuse();
             continue;
         }
-        let chosen = congestion.toward(incoming.remote_address().ip());
+        let Some(handshake) = strangers.handshake(address.ip()) else {
+            debug!("{address}: refused: too many attempts");
+            incoming.refuse();
+            continue;
+        };
+        // Under load an address must first show that packets reach it; that costs us no memory.
+        if handshake.under_way > RETRY_ABOVE && incoming.may_retry() {
+            if let Err(error) = incoming.retry() {
+                debug!("{address}: {error}");
+            }
+            continue;
+        }
+        let chosen = congestion.toward(address.ip());
         let config = match server_config(&door.identity, chosen) {
             Ok(config) => Arc::new(config),
             Err(error) => {
@@ -126,16 +147,30 @@ pub async fn serve(hub: Arc<Hub>, endpoint: Endpoint, door: Arc<Door>, congestio
                 continue;
             }
         };
-        let (hub, door) = (hub.clone(), door.clone());
+        let (hub, door, strangers) = (hub.clone(), door.clone(), strangers.clone());
         sessions.spawn(async move {
-            let address = incoming.remote_address();
             let connection = match incoming.accept_with(config) {
-                Ok(connecting) => connecting.await,
-                Err(error) => Err(error),
+                Ok(connecting) => tokio::time::timeout(HANDSHAKE_WITHIN, connecting).await,
+                Err(error) => Ok(Err(error)),
             };
-            match connection {
-                Ok(connection) => Box::pin(greeting::run(hub, door, port, connection)).await,
-                Err(error) => debug!("{address}: no connection: {error}"),
+            drop(handshake);
+            let connection = match connection {
+                Ok(Ok(connection)) => connection,
+                Ok(Err(error)) => return debug!("{address}: no connection: {error}"),
+                Err(_) => return debug!("{address}: the handshake took too long"),
+            };
+            let known = greeting::peer(&connection).is_some_and(|who| door.client(who).is_some());
+            let pairing = is_pairing(&connection);
+            if pairing || !known {
+                strangers.charge(address.ip());
+            }
+            if pairing {
+                let Ok(_place) = strangers.pairings.try_acquire() else {
+                    return connection.close(REFUSED, b"others are being paired; try again");
+                };
+                Box::pin(pairing::run(&door, &connection)).await;
+            } else {
+                Box::pin(greeting::run(hub, door, port, connection)).await;
             }
         });
     }
@@ -145,10 +180,60 @@ pub async fn serve(hub: Arc<Hub>, endpoint: Endpoint, door: Arc<Door>, congestio
     let _ = tokio::time::timeout(Duration::from_millis(300), endpoint.wait_idle()).await;
 }
 
+/// Whether a client has come to be paired.
+fn is_pairing(connection: &Connection) -> bool {
+    let data = connection.handshake_data().and_then(|data| data.downcast::<HandshakeData>().ok());
+    data.is_some_and(|data| data.protocol.as_deref() == Some(ALPN_PAIR))
+}
+
+/// What those cost who are not known yet.
+#[derive(Debug)]
+struct Strangers {
+    limiter: Mutex<Limiter>,
+    handshakes: Arc<AtomicUsize>,
+    pairings: Semaphore,
+}
+
+impl Default for Strangers {
+    fn default() -> Self {
+        let (limiter, handshakes) = (Mutex::default(), Arc::default());
+        Self { limiter, handshakes, pairings: Semaphore::new(MOST_PAIRINGS) }
+    }
+}
+
+/// A handshake under way; counts until it is dropped.
+struct Handshake {
+    /// How many are under way, this one too.
+    under_way: usize,
+    count: Arc<AtomicUsize>,
+}
+
+impl Strangers {
+    /// Begins a handshake with `address`, if it may have one.
+    fn handshake(&self, address: IpAddr) -> Option<Handshake> {
+        let count = self.handshakes.clone();
+        let under_way = count.fetch_add(1, Ordering::Relaxed) + 1;
+        // Counted from here on, so that every way out gives the place back.
+        let handshake = Handshake { under_way, count };
+        let may_try = lock(&self.limiter).may_try(Instant::now(), address);
+        (may_try && under_way <= MOST_HANDSHAKES).then_some(handshake)
+    }
+
+    fn charge(&self, address: IpAddr) {
+        lock(&self.limiter).charge(Instant::now(), address);
+    }
+}
+
+impl Drop for Handshake {
+    fn drop(&mut self) {
+        self.count.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 /// Returns the settings of connections, with the certificate that runtimes pin.
 pub fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
-    let tls =
-        tls::server_config(identity, &[ALPN]).context("cannot use the server's key for TLS")?;
+    let tls = tls::server_config(identity, &[ALPN, ALPN_PAIR])
+        .context("cannot use the server's key for TLS")?;
     let quic = QuicServerConfig::try_from(tls).context("cannot use TLS for QUIC")?;
     let mut config = ServerConfig::with_crypto(Arc::new(quic));
     config.transport_config(Arc::new(transport_config(congestion)));
@@ -188,6 +273,14 @@ const UNPAIRED: VarInt = VarInt::from_u32(close::UNPAIRED);
 const SOCKET_BUFFER: usize = 4 << 20;
 /// Jumbo frames. [bytes]
 const MOST_MTU: u16 = 9000;
+/// Handshakes under way at most: each costs some 10 KB and a signature, before we know whose it is.
+const MOST_HANDSHAKES: usize = 16;
+/// Conversations about pairing at a time; a person looks at one.
+const MOST_PAIRINGS: usize = 4;
+/// Above this many under way, addresses must prove themselves first (RFC 9000, section 8.1).
+const RETRY_ABOVE: usize = 4;
+/// Far more than a network of 50 ms and some loss needs.
+const HANDSHAKE_WITHIN: Duration = Duration::from_secs(4);
 /// A vehicle needs one; strangers must not exhaust memory.
 const MOST_CONNECTIONS: usize = 32;
 

@@ -1,0 +1,144 @@
+//! Pairs this computer with a server: carries [`vizflyt_trust::pairing`]'s messages, and keeps what
+//! came of it.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use quinn::{ClientConfig, Connection, ConnectionError, RecvStream, SendStream, VarInt};
+use tokio::time::timeout;
+use vizflyt_protocol::messages::{Grant, ToApplicant};
+use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
+use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_trust::pairing::{Applicant, Binding, Code, EXPORTER_LABEL};
+use vizflyt_trust::tls::Pin;
+use vizflyt_trust::{ALPN_PAIR, Fingerprint, Identity, KeysFolder, KnownServer, Owner, Servers};
+use zerocopy::IntoBytes;
+
+use crate::args::ServerAddress;
+
+/// What a pairing has given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NowPaired {
+    /// The server's, noted in `servers.toml`.
+    pub server: Fingerprint,
+    /// What this computer may do.
+    pub grant: Grant,
+}
+
+/// Pairs with the server that shows `code`; afterwards this computer connects without it.
+///
+/// # Errors
+/// A server that cannot be reached, refuses, or does not prove that it knows the code; keys that
+/// cannot be read or written.
+pub fn pair(
+    folder: &KeysFolder,
+    server: &ServerAddress,
+    code: Code,
+    name: &str,
+) -> Result<NowPaired> {
+    let identity = Identity::keep(folder, Owner::Runtime)?;
+    let tokio = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let paired = tokio.block_on(async {
+        timeout(WITHIN, connect(&identity, server, code, name))
+            .await
+            .unwrap_or_else(|_| bail!("server {server}: no answer within 15 s; check the address"))
+    })?;
+    let address = server.typed.clone();
+    Servers::add(folder, KnownServer { address, fingerprint: paired.server })?;
+    Ok(paired)
+}
+
+async fn connect(
+    identity: &Identity,
+    server: &ServerAddress,
+    code: Code,
+    name: &str,
+) -> Result<NowPaired> {
+    let pin = Pin::none();
+    let endpoint = super::endpoint(server.address).context("cannot open a socket")?;
+    let tls = pin.client_config(identity, ALPN_PAIR).context("TLS set-up")?;
+    let crypto = quinn::crypto::rustls::QuicClientConfig::try_from(tls)
+        .context("cannot use TLS for QUIC")?;
+    let config = ClientConfig::new(Arc::new(crypto));
+    let connection = endpoint
+        .connect_with(config, server.address, "vizflyt")
+        .with_context(|| format!("server {server}"))?
+        .await
+        .with_context(|| format!("server {server}: no connection"))?;
+    let result = converse(&connection, &pin, identity, code, name).await;
+    // What the server said on closing tells more than which of our calls failed first.
+    let result = result.map_err(|error| match connection.close_reason() {
+        Some(ConnectionError::ApplicationClosed(said)) if !said.reason.is_empty() => {
+            anyhow::anyhow!("{}", String::from_utf8_lossy(&said.reason))
+        }
+        _ => error,
+    });
+    connection.close(VarInt::from_u32(0), b"bye");
+    let _ = timeout(super::RETRY, endpoint.wait_idle()).await;
+    result.with_context(|| format!("server {server}"))
+}
+
+async fn converse(
+    connection: &Connection,
+    pin: &Pin,
+    identity: &Identity,
+    code: Code,
+    name: &str,
+) -> Result<NowPaired> {
+    let server = pin.found().context("the server showed no certificate")?;
+    let mut exporter = [0; 32];
+    if connection.export_keying_material(&mut exporter, EXPORTER_LABEL, &[]).is_err() {
+        bail!("the connection gives no key material");
+    }
+    let binding = Binding { client: identity.fingerprint(), server, exporter };
+    let (mut send, mut recv) = connection.open_bi().await?;
+    send.write_all(Preamble::of(Party::Runtime).as_bytes()).await?;
+    let mut preamble = [0; Preamble::SIZE];
+    let (applicant, begin) = Applicant::begin(code, name, binding);
+    write(&mut send, &begin).await?;
+    recv.read_exact(&mut preamble).await?;
+    Preamble::check(&preamble, Party::Runtime)?;
+
+    let mut deframer = Deframer::default();
+    let share = match read(&mut recv, &mut deframer).await? {
+        ToApplicant::Share { share } => share,
+        ToApplicant::Refused(why) => bail!("{why}"),
+        ToApplicant::Paired { .. } => bail!(OUT_OF_TURN),
+    };
+    let Some((confirming, confirm)) = applicant.confirm(&share) else { bail!(OUT_OF_TURN) };
+    write(&mut send, &confirm).await?;
+    match read(&mut recv, &mut deframer).await? {
+        ToApplicant::Paired { proof, grant } if confirming.is_proof(&proof) => {
+            Ok(NowPaired { server, grant })
+        }
+        ToApplicant::Paired { .. } => bail!(
+            "it does not know the code it should have shown: somebody may sit in between; do not \
+             use this network"
+        ),
+        ToApplicant::Refused(why) => bail!("{why}"),
+        ToApplicant::Share { .. } => bail!(OUT_OF_TURN),
+    }
+}
+
+async fn write(send: &mut SendStream, message: &impl serde::Serialize) -> Result<()> {
+    let mut buffer = [0; MAX_FRAMED];
+    Ok(send.write_all(encode(message, &mut buffer)).await?)
+}
+
+async fn read(recv: &mut RecvStream, deframer: &mut Deframer) -> Result<ToApplicant> {
+    loop {
+        if let Some(message) = deframer.next() {
+            return Ok(message?);
+        }
+        let mut bytes = [0; 128];
+        let count = recv.read(&mut bytes).await?.context("the server ended the conversation")?;
+        if deframer.push(&bytes[..count]) < count {
+            bail!(OUT_OF_TURN);
+        }
+    }
+}
+
+/// A connection and three messages, on a slow network.
+const WITHIN: Duration = Duration::from_secs(15);
+const OUT_OF_TURN: &str = "it does not pair as this version does; update the older of the two";

@@ -1,0 +1,62 @@
+//! Pairing: messages of both sides against both state machines, and the files that people edit.
+#![no_main]
+use std::time::Instant;
+
+use libfuzzer_sys::fuzz_target;
+use vizflyt_protocol::messages::{FromApplicant, Grant, ToApplicant};
+use vizflyt_protocol::packet::framing::{Deframer, FramingError};
+use vizflyt_trust::pairing::{Applicant, Binding, Code, Desk};
+use vizflyt_trust::{Fingerprint, Paired, Servers};
+
+fn messages<M: serde::de::DeserializeOwned>(mut bytes: &[u8]) -> Vec<M> {
+    let (mut deframer, mut found) = (Deframer::default(), Vec::new());
+    while !bytes.is_empty() {
+        bytes = &bytes[deframer.push(bytes)..];
+        while let Some(message) = deframer.next::<M>() {
+            match message {
+                Ok(message) => found.push(message),
+                Err(FramingError::TooLong(_)) => return found,
+                Err(FramingError::Body(_)) => {}
+            }
+        }
+    }
+    found
+}
+
+fuzz_target!(|bytes: &[u8]| {
+    let print = Fingerprint::of(b"x");
+    let binding = Binding { client: print, server: print, exporter: [0; 32] };
+    let code: Code = "123456".parse().unwrap();
+    let now = Instant::now();
+    let mut desk = Desk::default();
+    desk.open(now, code, Grant::Instructor);
+    let mut attempt = None;
+    for message in messages::<FromApplicant>(bytes) {
+        match attempt.take() {
+            // The code is in the code above, but a proof is a hash over a fresh half of ours.
+            Some(begun) => assert!(desk.confirm(now, begun, &message).is_err()),
+            None => attempt = desk.begin(now, &message, &binding).ok().map(|(begun, _)| begun),
+        }
+    }
+    let mut confirming = None;
+    for message in messages::<ToApplicant>(bytes) {
+        match message {
+            ToApplicant::Share { share } => {
+                let (applicant, _) = Applicant::begin(code, "x", binding);
+                confirming = applicant.confirm(&share).map(|(confirming, _)| confirming);
+            }
+            ToApplicant::Paired { proof, .. } => {
+                if let Some(confirming) = confirming.take() {
+                    assert!(!confirming.is_proof(&proof));
+                }
+            }
+            ToApplicant::Refused(_) => {}
+        }
+    }
+    if let Ok(text) = std::str::from_utf8(bytes) {
+        let _ = Paired::parse(text);
+        let _ = Servers::parse(text);
+        let _ = text.parse::<Code>();
+        let _ = text.parse::<Fingerprint>();
+    }
+});
