@@ -98,7 +98,7 @@ async fn the_right_code_pairs_once_and_for_good() {
     let Grant::Team { vehicles } = pair(server.quic, &jetson, code).await.unwrap() else {
         panic!()
     };
-    assert_eq!(vehicles.iter().map(|name| name.as_str()).collect::<Vec<_>>(), ["vizflyt"]);
+    assert_eq!(vehicles.iter().map(ToString::to_string).collect::<Vec<_>>(), ["vizflyt"]);
     let mut client =
         Client::hello_as(&server, &jetson, "vizflyt", TransportConfig::default()).await;
     assert!(matches!(client.next().await, ToRuntime::Welcome(_)));
