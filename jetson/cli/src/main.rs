@@ -6,6 +6,7 @@ mod demo;
 mod pair;
 mod plugins;
 mod scene;
+mod stats;
 
 use std::process::ExitCode;
 
@@ -44,6 +45,8 @@ enum Command {
     Scene(scene::SceneArgs),
     /// Measures how fast this machine draws.
     Bench(bench::BenchArgs),
+    /// Where images get their age, stage by stage, and why images were skipped.
+    Stats(stats::StatsArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
@@ -81,6 +84,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),
+        Command::Stats(args) => stats::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
     }
 }

@@ -568,6 +568,8 @@ impl Loop {
         self.report(now);
         self.report_timing(now);
         let (clock, arrived) = (self.control.shared.clock.state(now), self.arrived());
+        let whole = self.times.whole(now, clock, &arrived);
+        self.control.log.write(Channel::Timing, now, &whole);
         debug_assert_eq!(self.flight.phase(), FlightPhase::Landed);
         if let Some(side) = self.plugin.take() {
             if side.ipc.plugin_attached() {

@@ -18,6 +18,7 @@ use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use serde::Serialize;
 use serde_json::{Value, json};
+use vizflyt_protocol::messages::Timing;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::host_now;
 
@@ -197,6 +198,28 @@ impl Drop for FlightLog {
     }
 }
 
+/// Reads the times of a flight from its log: of the whole flight, or, where the runtime was killed
+/// in it, of its last seconds. `None` if the log has none.
+///
+/// # Errors
+/// If the file cannot be read or is no MCAP file.
+pub fn read_timing(path: &Path) -> mcap::McapResult<Option<Timing>> {
+    let bytes = std::fs::read(path)?;
+    // A killed runtime leaves a file without an end.
+    let options = mcap::read::Options::IgnoreEndMagic.into();
+    let messages = mcap::read::MessageStream::new_with_options(&bytes, options)?;
+    let mut found: Option<Timing> = None;
+    for message in messages.map_while(Result::ok) {
+        if message.channel.topic == Channel::Timing.names().0
+            && let Ok(timing) = serde_json::from_slice::<Timing>(&message.data)
+            && found.as_ref().is_none_or(|best| timing.seconds >= best.seconds)
+        {
+            found = Some(timing);
+        }
+    }
+    Ok(found)
+}
+
 /// Writes records until the log is dropped or the disk refuses.
 fn write_all(
     mut writer: Writer<BufWriter<File>>,
@@ -264,6 +287,7 @@ fn utc_name(time: SystemTime) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use vizflyt_protocol::messages::Arrivals;
 
     #[test]
     fn names_are_utc() {
@@ -294,6 +318,29 @@ mod tests {
         assert_eq!(last.channel.schema.as_ref().unwrap().encoding, "jsonschema");
         assert_eq!(&*last.data, br#"{"line":"hello"}"#);
         assert!(last.log_time > 1_600_000_000_000_000_000, "since 1970");
+    }
+
+    #[test]
+    fn the_times_of_the_whole_flight_are_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let log = FlightLog::open(folder.path());
+        let path = log.path().unwrap().to_owned();
+        for (seconds, images) in [(5.0, 1), (90.0, 2), (5.0, 3)] {
+            let mut timing = Timing { seconds, ..Timing::default() };
+            timing.waterfall.images = images;
+            timing.cameras.push(Arrivals { arrived: images, ..Arrivals::default() }).unwrap();
+            log.write(Channel::Timing, host_now(), &timing);
+        }
+        drop(log);
+        let found = read_timing(&path).unwrap().unwrap();
+        assert_eq!((found.seconds, found.waterfall.images), (90.0, 2));
+        assert_eq!(found.cameras[0].arrived, 2);
+        // Cut off, it has what was written before.
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        assert!(read_timing(&path).is_ok());
+        std::fs::write(&path, b"not a log").unwrap();
+        assert!(read_timing(&path).is_err());
     }
 
     #[test]

@@ -153,6 +153,13 @@ impl ImageTimes {
         Timing { seconds: RECENT_S as f32, waterfall, intervals, clock, cameras }
     }
 
+    /// Returns the report of times of the whole flight, as [`Self::timing`].
+    pub fn whole(&self, now: HostTime, clock: Option<ClockState>, arrived: &[Arrivals]) -> Timing {
+        let (waterfall, intervals) = self.waterfalls.flight();
+        let seconds = self.first_at.map_or(0.0, |first| now.seconds_since(first)) as f32;
+        Timing { seconds, waterfall, intervals, clock, cameras: self.arrivals(arrived) }
+    }
+
     /// Returns what became of images, by camera: what is known here, added to what `before` says
     /// of those that did not reach shared memory.
     pub fn arrivals(&self, before: &[Arrivals]) -> Bounded<Arrivals, MAX_CAMERAS> {

@@ -31,6 +31,8 @@ pub struct DrawnTick {
 pub struct DrawnImage {
     /// Whether there is one; everything else counts only then.
     pub fresh: bool,
+    /// Whether a runtime flew when it was drawn, so that it counts.
+    pub counted: bool,
     /// Index of the vehicle.
     pub vehicle: usize,
     /// Index into the vehicle's cameras.

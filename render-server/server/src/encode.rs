@@ -46,6 +46,7 @@ pub fn run(hub: &Arc<Hub>, ticks: &Ticks, options: EncodeOptions) {
                 continue;
             }
             if let Err(error) = stage.encode(hub, slot, together[vehicle]) {
+                hub.vehicles[vehicle].images.cameras[camera].failed(slot.counted);
                 let name = &hub.vehicles[vehicle].name;
                 warn!("{name}: camera {camera}: {error:#}; image {} is skipped", slot.seq);
             }
@@ -101,7 +102,9 @@ impl Stage {
         header.payload_len = (payload.len() as u32).into();
         header.encode_end_ns = end.as_ns().into();
         hub.stats.encode.add(start, end);
-        hub.outlet.send(Outgoing { vehicle, camera, header, payload });
+        if hub.outlet.send(Outgoing { vehicle, camera, header, payload }) {
+            hub.vehicles[vehicle].images.cameras[camera].handed(slot.counted);
+        }
         Ok(())
     }
 }

@@ -81,8 +81,7 @@ impl Hub {
 
     /// Returns the report over the whole run.
     pub fn report(&self) -> Report {
-        let images: Vec<_> = self.vehicles.iter().map(|vehicle| &vehicle.images).collect();
-        self.stats.report(&images, *lock(&self.source), &lock(&self.renderer))
+        self.stats.report(&self.vehicles, *lock(&self.source), &lock(&self.renderer))
     }
 }
 

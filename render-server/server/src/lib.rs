@@ -10,6 +10,7 @@
 //! which holds a [`vehicle::Vehicle`] each.
 //! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
 
+pub mod accounts;
 pub mod args;
 pub mod cameras;
 pub mod clock;

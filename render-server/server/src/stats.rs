@@ -1,17 +1,24 @@
 //! What the server measures of itself: time per stage, counts, peak memory.
 //!
 //! Stages bear the names of the tracing spans: `pose render encode send`. Each thread adds to its
-//! own [`Span`]; the page reads the recent past, the report the whole run.
+//! own [`Span`]; the page reads the recent past, the report the whole run. These are the times that
+//! the server *works*; what a stage adds to an image's age the runtime reports
+//! ([`vizflyt_protocol::messages::Timing`]), and [`Answer`] has both.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::histogram::Histogram;
+use vizflyt_protocol::messages::{StageTimes, Timing};
 use vizflyt_protocol::time::ServerTime;
 
+use crate::accounts::Account;
+use crate::clock;
 use crate::drivers::SourceCounters;
-use crate::hub::RendererInfo;
-use crate::vehicle::ImageCounters;
+use crate::hub::{Hub, RendererInfo};
+use crate::vehicle::{ImageCounters, Vehicle};
 
 /// Everything measured; shared by all threads.
 #[derive(Debug, Default)]
@@ -38,29 +45,14 @@ pub struct Span(Mutex<Samples>);
 struct Samples {
     recent: [f32; RECENT],
     next: usize,
-    /// Counts by logarithm of the duration, over the whole run.
-    buckets: Box<[u32; BUCKETS]>,
-    count: u64,
+    /// Of the whole run.
+    overall: Box<Histogram>,
 }
 
 impl Default for Span {
     fn default() -> Self {
-        Self(Mutex::new(Samples {
-            recent: [0.0; RECENT],
-            next: 0,
-            buckets: Box::new([0; BUCKETS]),
-            count: 0,
-        }))
+        Self(Mutex::new(Samples { recent: [0.0; RECENT], next: 0, overall: Box::default() }))
     }
-}
-
-/// Percentiles of a stage. [ms]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Percentiles {
-    /// Median. [ms]
-    pub p50: f32,
-    /// 99th percentile. [ms]
-    pub p99: f32,
 }
 
 impl Span {
@@ -70,8 +62,7 @@ impl Span {
         let next = samples.next;
         samples.recent[next] = ms as f32;
         samples.next = (next + 1) % RECENT;
-        samples.count += 1;
-        samples.buckets[bucket(ms)] += 1;
+        samples.overall.add(ms);
     }
 
     /// Adds the time from `start` to `end`.
@@ -80,10 +71,10 @@ impl Span {
     }
 
     /// Returns percentiles of the newest samples, a few seconds' worth.
-    pub fn recent(&self) -> Percentiles {
+    pub fn recent(&self) -> StageTimes {
         let (mut values, count) = {
             let samples = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            (samples.recent, samples.count.min(RECENT as u64) as usize)
+            (samples.recent, samples.overall.count().min(RECENT as u64) as usize)
         };
         let values = &mut values[..count];
         values.sort_unstable_by(f32::total_cmp);
@@ -91,34 +82,13 @@ impl Span {
             let index = (share * (count as f64 - 1.0)).round().max(0.0) as usize;
             values.get(index).copied().unwrap_or(0.0)
         };
-        Percentiles { p50: at(0.5), p99: at(0.99) }
+        StageTimes { p50: at(0.5), p90: at(0.9), p99: at(0.99), max: at(1.0) }
     }
 
-    /// Returns percentiles of the whole run, to within 2.5 %.
-    pub fn overall(&self) -> Percentiles {
-        let samples = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let at = |share: f64| {
-            let rank = (share * samples.count as f64).ceil().max(1.0) as u64;
-            let mut seen = 0;
-            for (index, count) in samples.buckets.iter().enumerate() {
-                seen += u64::from(*count);
-                if seen >= rank {
-                    return bucket_middle_ms(index) as f32;
-                }
-            }
-            0.0
-        };
-        Percentiles { p50: at(0.5), p99: at(0.99) }
+    /// Returns percentiles of the whole run, to within 1.6 %.
+    pub fn overall(&self) -> StageTimes {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).overall.times()
     }
-}
-
-fn bucket(ms: f64) -> usize {
-    let steps = (ms.max(LEAST_MS) / LEAST_MS).ln() / STEP.ln();
-    (steps as usize).min(BUCKETS - 1)
-}
-
-fn bucket_middle_ms(index: usize) -> f64 {
-    LEAST_MS * STEP.powf(index as f64 + 0.5)
 }
 
 /// Counts a rate over the last second. [Hz]
@@ -140,6 +110,110 @@ impl Rate {
     }
 }
 
+/// Everything known of one vehicle's images, as `GET /api/stats` tells it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Answer {
+    /// Whose.
+    pub vehicle: String,
+    /// The runtime that flies it, and where it is; absent if there is none.
+    pub runtime: Option<String>,
+    /// What the server's own stages take, of all vehicles. [ms]
+    pub server: ServerStages,
+    /// Where images get their age, by the runtime's newest report.
+    pub timing: Option<Timing>,
+    /// What became of them in this flight, by camera.
+    pub images: Vec<CameraAccount>,
+    /// How the connection fares.
+    pub connection: Option<Connection>,
+}
+
+/// Percentiles of the server's own stages. [ms]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ServerStages {
+    /// Arrival of a pose to the end of gate and referee.
+    pub pose: StageTimes,
+    /// Drawing all cameras of a tick.
+    pub render: StageTimes,
+    /// Quantising and encoding one image.
+    pub encode: StageTimes,
+    /// Handing an image over until the runtime has acknowledged all of it.
+    pub send: StageTimes,
+}
+
+/// The account of one camera.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraAccount {
+    /// Its name.
+    pub camera: String,
+    /// What became of its images.
+    #[serde(flatten)]
+    pub account: Account,
+}
+
+/// How a runtime's connection fares, from its start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Connection {
+    /// Round trip, smoothed. [ms]
+    pub rtt_ms: f64,
+    /// Bytes that may be unacknowledged. [bytes]
+    pub window: u64,
+    /// Largest packet. [bytes]
+    pub mtu: u16,
+    /// Packets sent.
+    pub packets_sent: u64,
+    /// Packets lost on the way; what they held was sent again.
+    pub packets_lost: u64,
+    /// Times that the congestion controller was told of congestion.
+    pub congestion_events: u64,
+    /// Bytes sent on the network, everything included. [bytes]
+    pub bytes_sent: u64,
+    /// How long it has lasted. [s]
+    pub seconds: f64,
+    /// Sent on average since it began. [Mbit/s]
+    pub mbit_s: f64,
+}
+
+impl Connection {
+    /// Returns how a connection that began at `since` fares.
+    pub fn of(connection: &quinn::Connection, since: ServerTime) -> Self {
+        let stats = connection.stats();
+        let seconds = clock::now().seconds_since(since);
+        let bytes_sent = stats.udp_tx.bytes;
+        Self {
+            rtt_ms: stats.path.rtt.as_secs_f64() * 1e3,
+            window: stats.path.cwnd,
+            mtu: stats.path.current_mtu,
+            packets_sent: stats.path.sent_packets,
+            packets_lost: stats.path.lost_packets,
+            congestion_events: stats.path.congestion_events,
+            bytes_sent,
+            seconds,
+            mbit_s: bytes_sent as f64 * 8e-6 / seconds.max(1e-3),
+        }
+    }
+}
+
+impl Answer {
+    /// Returns the figures of `vehicle` at this moment.
+    pub fn of(hub: &Hub, vehicle: &Vehicle) -> Self {
+        let runtime = vehicle.runtime();
+        let stats = &hub.stats;
+        Self {
+            vehicle: vehicle.name.as_str().to_owned(),
+            runtime: runtime.map(|runtime| format!("{} at {}", runtime.program, runtime.address)),
+            server: ServerStages {
+                pose: stats.pose.recent(),
+                render: stats.render.recent(),
+                encode: stats.encode.recent(),
+                send: stats.send.recent(),
+            },
+            timing: vehicle.timing.borrow().clone(),
+            images: vehicle.accounts(),
+            connection: vehicle.connection(),
+        }
+    }
+}
+
 /// The report printed when the server ends.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
@@ -155,6 +229,10 @@ pub struct Report {
     pub send_ms_p50: f32,
     /// 99th percentile. [ms]
     pub send_ms_p99: f32,
+    /// What the server's own stages took. [ms]
+    pub stages: ServerStages,
+    /// What became of the images of the last flight, by vehicle and camera.
+    pub images: BTreeMap<String, Vec<CameraAccount>>,
     /// Ticks drawn.
     pub ticks: u64,
     /// Ticks drawn that no one took before the next.
@@ -176,15 +254,15 @@ pub struct Report {
 }
 
 impl Stats {
-    /// Returns the report over the whole run; `images` are those of all vehicles.
+    /// Returns the report over the whole run.
     pub fn report(
         &self,
-        images: &[&ImageCounters],
+        vehicles: &[Arc<Vehicle>],
         source: SourceCounters,
         renderer: &RendererInfo,
     ) -> Report {
         let total = |counter: fn(&ImageCounters) -> &AtomicU64| -> u64 {
-            images.iter().map(|images| counter(images).load(Ordering::Relaxed)).sum()
+            vehicles.iter().map(|vehicle| counter(&vehicle.images).load(Ordering::Relaxed)).sum()
         };
         let (render, encode, send) =
             (self.render.overall(), self.encode.overall(), self.send.overall());
@@ -195,6 +273,11 @@ impl Stats {
             encode_ms_p99: encode.p99,
             send_ms_p50: send.p50,
             send_ms_p99: send.p99,
+            stages: ServerStages { pose: self.pose.overall(), render, encode, send },
+            images: vehicles
+                .iter()
+                .map(|vehicle| (vehicle.name.as_str().to_owned(), vehicle.accounts()))
+                .collect(),
             ticks: self.ticks.load(Ordering::Relaxed),
             ticks_skipped: self.ticks_skipped.load(Ordering::Relaxed),
             images_sent: total(|images| &images.sent),
@@ -221,12 +304,6 @@ fn parse_peak(status: &str) -> Option<f64> {
 
 /// Samples behind the page's figures: 4 s at 60 Hz.
 const RECENT: usize = 256;
-/// A microsecond. [ms]
-const LEAST_MS: f64 = 1e-3;
-/// Ratio of neighbouring buckets; half of it is the error of a percentile.
-const STEP: f64 = 1.05;
-/// 1.05^340 microseconds are 16 s.
-const BUCKETS: usize = 340;
 
 #[cfg(test)]
 mod tests {
@@ -235,13 +312,14 @@ mod tests {
     #[test]
     fn percentiles_are_those_of_the_samples() {
         let span = Span::default();
-        assert_eq!(span.recent(), Percentiles::default());
-        assert_eq!(span.overall(), Percentiles::default());
+        assert_eq!(span.recent(), StageTimes::default());
+        assert_eq!(span.overall(), StageTimes::default());
         for value in 1..=200 {
             span.add_ms(f64::from(value));
         }
         let recent = span.recent();
         assert!((recent.p50 - 100.0).abs() <= 1.0 && (recent.p99 - 198.0).abs() <= 1.0);
+        assert_eq!(recent.max, 200.0);
         let overall = span.overall();
         assert!((overall.p50 / 100.0 - 1.0).abs() < 0.03, "{overall:?}");
         assert!((overall.p99 / 198.0 - 1.0).abs() < 0.03, "{overall:?}");

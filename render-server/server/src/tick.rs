@@ -183,6 +183,7 @@ pub fn draw(
             if due.contains(&true) {
                 poses[vehicle] = None;
             }
+            let flies = hub.vehicles[vehicle].runtime().is_some();
             for (camera, slot) in slots.by_ref().take(set.configs.len()).enumerate() {
                 slot.fresh = due[camera];
                 let Some(sample) = sample.filter(|_| slot.fresh) else { continue };
@@ -195,6 +196,7 @@ pub fn draw(
                 });
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);
+                slot.counted = flies;
                 slot.seq = seq;
                 slot.pose = sample.stamp;
                 slot.world_from_body = Some(sample.world_from_body);
@@ -218,6 +220,9 @@ pub fn draw(
                 hub.stats.render.add(start, end);
                 if seq.is_multiple_of(NAME_TICKS) {
                     note_renderer(hub, renderer);
+                }
+                for slot in tick.slots.iter().filter(|slot| slot.fresh && slot.counted) {
+                    hub.vehicles[slot.vehicle].images.cameras[slot.camera].drew();
                 }
                 let skipped = ticks.publish(tick, hub.outlet.viewers() > 0);
                 hub.stats.ticks.fetch_add(1, Ordering::Relaxed);

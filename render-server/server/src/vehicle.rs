@@ -14,17 +14,19 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::{Notify, watch};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, PoseSample, Telemetry, Text, Timing,
-    bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, Hello, MAX_CAMERAS, Name, PoseSample,
+    Telemetry, Text, Timing, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
+use crate::accounts::{Ledger, Tally};
 use crate::cameras::{CameraSet, Cameras};
 use crate::clock;
 use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
 use crate::previews::Preview;
+use crate::stats::{CameraAccount, Connection};
 
 /// One vehicle in the arena.
 #[derive(Debug)]
@@ -55,6 +57,7 @@ pub struct Vehicle {
     pub images: ImageCounters,
     seat: Mutex<SeatState>,
     flight: Mutex<Flight>,
+    ledger: Mutex<Ledger>,
 }
 
 /// What became of a vehicle's images.
@@ -66,6 +69,8 @@ pub struct ImageCounters {
     pub late: AtomicU64,
     /// Bytes of images acknowledged.
     pub bytes: AtomicU64,
+    /// What became of each, by camera.
+    pub cameras: [Tally; MAX_CAMERAS],
 }
 
 /// How the present flight goes.
@@ -83,6 +88,8 @@ pub struct Flight {
 struct SeatState {
     sessions: u64,
     taken: Option<RuntimeInfo>,
+    /// The runtime's connection, and when it began.
+    connection: Option<(quinn::Connection, ServerTime)>,
     /// Index of the first event of the present flight.
     flight_start: u64,
     /// How many flights have begun; the pose thread starts its referee anew with each.
@@ -121,6 +128,7 @@ impl Vehicle {
             images: ImageCounters::default(),
             seat: Mutex::default(),
             flight: Mutex::default(),
+            ledger: Mutex::default(),
         }
     }
 
@@ -176,6 +184,30 @@ impl Vehicle {
         } else if phase == FlightPhase::Landed && flight.took_off.is_some() {
             flight.landed.get_or_insert(now);
         }
+    }
+
+    /// Takes the runtime's report of times.
+    pub fn report_timing(&self, timing: Timing) {
+        lock(&self.ledger).report(&timing.cameras);
+        self.timing.send_replace(Some(timing));
+    }
+
+    /// Returns what became of the images of the present flight, by camera.
+    pub fn accounts(&self) -> Vec<CameraAccount> {
+        let ledger = lock(&self.ledger);
+        let cameras = self.arena.cameras.iter().zip(&self.images.cameras).enumerate();
+        let account = |(index, (info, tally)): (usize, (&CameraInfo, &Tally))| CameraAccount {
+            camera: info.name.as_str().to_owned(),
+            account: ledger.account(index, tally),
+        };
+        cameras.map(account).collect()
+    }
+
+    /// Returns how the runtime's connection fares, if there is one.
+    pub fn connection(&self) -> Option<Connection> {
+        let state = self.lock_seat();
+        let (connection, since) = state.connection.as_ref()?;
+        Some(Connection::of(connection, *since))
     }
 
     /// Returns how the present flight goes.
@@ -244,6 +276,7 @@ impl Vehicle {
             state.flight_start = self.events.next_index();
             self.telemetry.send_replace(None);
             self.timing.send_replace(None);
+            lock(&self.ledger).begin(&self.images.cameras);
             lock(&self.trail).clear();
             *lock(&self.flight) = Flight::default();
         }
@@ -255,6 +288,7 @@ impl Vehicle {
             evicted: Arc::new(Notify::new()),
         };
         state.taken = Some(info.clone());
+        state.connection = None;
         Ok(Seat { vehicle: self.clone(), info, resumed, first_event: state.flight_start })
     }
 
@@ -288,6 +322,14 @@ impl Seat {
         self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
     }
 
+    /// Notes over which connection the runtime speaks.
+    pub fn speaks_over(&self, connection: &quinn::Connection) {
+        let mut state = self.vehicle.lock_seat();
+        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
+            state.connection = Some((connection.clone(), clock::now()));
+        }
+    }
+
     /// Completes when a newcomer has taken the seat.
     pub async fn evicted(&self) {
         self.info.evicted.notified().await;
@@ -299,6 +341,7 @@ impl Drop for Seat {
         let mut state = self.vehicle.lock_seat();
         if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
             state.taken = None;
+            state.connection = None;
         }
     }
 }

@@ -30,6 +30,18 @@ pub(crate) struct Report {
     pub age_ms_p99: f64,
     /// Time to draw all cameras of a tick, median. [ms]
     pub render_ms_p50: f64,
+    /// What each stage adds to the age, by name, as `p50`, `p90`, `p99`, `max`. [ms]
+    pub stages: Value,
+    /// Pose stamp to plugin callback, in the same way. [ms]
+    pub age: Value,
+    /// Pose stamp to the setpoint that carries the answer. [ms]
+    pub total: Value,
+    /// Times between an image at the plugin and the next: `times` and `bins`.
+    pub intervals: Value,
+    /// The server's clock by the runtime's.
+    pub clock: Value,
+    /// What became of the images drawn for the runtime, by vehicle and camera.
+    pub images: Value,
     /// Mean speed in flight, by the simulator's truth. [m/s]
     pub mean_speed_mps: f64,
     /// Greatest speed, by the simulator's truth. [m/s]
@@ -98,6 +110,12 @@ impl Parts {
             age_ms_p50: number(&self.runtime, "age_ms_p50"),
             age_ms_p99: number(&self.runtime, "age_ms_p99"),
             render_ms_p50: number(&self.server, "render_ms_p50"),
+            stages: self.runtime["stages"].clone(),
+            age: self.runtime["age"].clone(),
+            total: self.runtime["total"].clone(),
+            intervals: self.runtime["intervals"].clone(),
+            clock: self.runtime["clock"].clone(),
+            images: self.server["images"].clone(),
             mean_speed_mps: number(&self.simulator, "mean_speed_mps"),
             max_speed_mps: number(&self.simulator, "max_speed_mps"),
             min_clearance_m: self.simulator["min_clearance_m"].as_f64(),
@@ -131,7 +149,7 @@ impl Report {
             "{outcome}{reason}\n\
              \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
              \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, drawn in {render:.1} ms ({renderer})\n\
-             \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms\n\
+             \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms; to the setpoint {setpoint:.1} ms\n\
              \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n\
              \x20 memory      {memory:.0} MB at most, all processes together\n\
              \x20 log         {log}",
@@ -147,6 +165,7 @@ impl Report {
             renderer = self.renderer,
             p50 = self.age_ms_p50,
             p99 = self.age_ms_p99,
+            setpoint = self.total["p50"].as_f64().unwrap_or(0.0),
             setpoints = self.setpoints_sent,
             packets = self.mavlink_packets,
             memory = self.peak_rss_mb,

@@ -6,7 +6,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use vizflyt_arena::config::{CameraConfig, StageConfig};
 use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
-use vizflyt_protocol::messages::{Event, Telemetry};
+use vizflyt_protocol::messages::{Event, StageTimes, Telemetry};
 use vizflyt_protocol::time::ServerTime;
 
 use super::Page;
@@ -16,7 +16,7 @@ use crate::drivers::SourceCounters;
 use crate::events::{Entry, Origin};
 use crate::hub::{RendererInfo, lock};
 use crate::map::Obstacles;
-use crate::stats::{Percentiles, Rate};
+use crate::stats::Rate;
 
 /// Server to page.
 #[derive(Debug, Serialize)]
@@ -82,9 +82,9 @@ pub(super) struct State {
     pose: Option<PoseLine>,
     runtime: Option<RuntimeLine>,
     report: Option<Telemetry>,
-    render: Percentiles,
-    encode: Percentiles,
-    send: Percentiles,
+    render: StageTimes,
+    encode: StageTimes,
+    send: StageTimes,
     renderer: RendererInfo,
     render_hz: f64,
     stream_hz: f64,

@@ -5,6 +5,7 @@
 //! GET /ws          WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins
 //! GET /api/map     the top view: a JPEG drawn at the start
+//! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtime
 //! GET /api/cameras          the cameras of this moment, JSON
 //! PUT /api/cameras/NAME     a whole camera, by the keys of `[[cameras]]`; from the next tick on
@@ -16,6 +17,7 @@
 mod cameras;
 mod messages;
 pub(crate) mod origin;
+mod stats;
 mod viewer;
 
 use std::net::SocketAddr;
@@ -87,6 +89,7 @@ fn router(page: Arc<Page>) -> Router {
         .route("/cameras.js", get(async || file("text/javascript; charset=utf-8", CAMERAS)))
         .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/api/map", get(map))
+        .route("/api/stats", get(stats::get))
         .route("/api/estop", post(estop))
         .route("/api/cameras", get(cameras::list))
         .route("/api/cameras/{name}", put(cameras::put).patch(cameras::patch))

@@ -100,6 +100,7 @@ async fn send(
         vehicle.images.bytes.fetch_add(image.payload.len() as u64, Ordering::Relaxed);
     } else {
         vehicle.images.late.fetch_add(1, Ordering::Relaxed);
+        vehicle.images.cameras[image.camera].late();
     }
     trace!(camera = image.camera, delivered, ms = end.seconds_since(start) * 1e3, "send");
     hub.outlet.recycle(image.payload);

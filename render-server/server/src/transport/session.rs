@@ -33,6 +33,7 @@ pub(super) async fn fly(
     // Control goes out before images.
     let _ = send.set_priority(1);
     let (clock_sender, clock_requests) = mpsc::channel(CLOCK_QUEUE);
+    seat.speaks_over(connection);
     let outlet = images::Lane::open(hub.clone(), vehicle.clone(), connection.clone(), seat.info.id);
     let ending = tokio::select! {
         ending = down(seat, send, clock_requests) => ending,
@@ -142,7 +143,7 @@ async fn up(
                 seat.vehicle.report(report);
             }
             ToServer::Timing(timing) => {
-                seat.vehicle.timing.send_replace(Some(timing));
+                seat.vehicle.report_timing(timing);
             }
             ToServer::Event(event) => {
                 seat.vehicle.log(Origin::Page, event);
