@@ -1,5 +1,5 @@
 //! The flight from first contact to disarming: a sans-IO state machine that ties guard, link and
-//! plugin together. [`control`](crate::control) drives it at 50 to 100 Hz.
+//! plugin together. [`control`](crate::control) drives it at 50 to 200 Hz.
 //!
 //! ```text
 //! Connecting ──▶ Preparing ──▶ TakingOff ──▶ Flying ◀──▶ Holding
@@ -240,7 +240,7 @@ impl Flight {
         }
     }
 
-    /// Does what is due at `now`; 50 to 100 Hz, see [`crate::steering`].
+    /// Does what is due at `now`; 50 to 200 Hz, see [`crate::steering`].
     pub fn tick(&mut self, now: HostTime, link: &LinkView) -> Orders {
         if link.connected {
             self.connected_at = now;

@@ -1,6 +1,6 @@
 //! The last word on every setpoint. Pure: state, `now` and what is known in; one command out.
 //!
-//! Called at 50 to 100 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
+//! Called at 50 to 200 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
 //! 1. a landing, once begun, is never taken back;
 //! 2. deadlines: a pose older than 0.5 s or no setpoint for 0.5 s holds, 2 s lands;
 //! 3. what the plugin asks becomes a velocity in world axes (positions by a braking profile,

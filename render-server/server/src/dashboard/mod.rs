@@ -87,6 +87,7 @@ fn router(page: Arc<Page>) -> Router {
         .route("/app.js", get(async || file("text/javascript; charset=utf-8", APP)))
         .route("/map.js", get(async || file("text/javascript; charset=utf-8", MAP)))
         .route("/cameras.js", get(async || file("text/javascript; charset=utf-8", CAMERAS)))
+        .route("/waterfall.js", get(async || file("text/javascript; charset=utf-8", WATERFALL)))
         .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/api/map", get(map))
         .route("/api/stats", get(stats::get))
@@ -158,6 +159,7 @@ const STYLE: &str = include_str!("page/style.css");
 const APP: &str = include_str!("page/app.js");
 const CAMERAS: &str = include_str!("page/cameras.js");
 const MAP: &str = include_str!("page/map.js");
+const WATERFALL: &str = include_str!("page/waterfall.js");
 pub(crate) const ICON: &str = include_str!("page/icon.svg");
 
 /// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.

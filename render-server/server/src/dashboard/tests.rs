@@ -2,7 +2,7 @@ use super::*;
 
 #[test]
 fn the_page_refers_only_to_files_that_are_served() {
-    for wanted in ["/style.css", "/app.js", "/icon.svg"] {
+    for wanted in ["/style.css", "/app.js", "/waterfall.js", "/icon.svg"] {
         assert!(INDEX.contains(wanted), "{wanted}");
     }
     assert!(
@@ -27,6 +27,25 @@ fn every_field_of_the_cameras_panel_is_in_the_form() {
         }
     }
     assert!(found > 20, "{found}");
+}
+
+/// The timing panel knows every stage and every reason, and the edges that the runtime counts by.
+#[test]
+fn the_timing_panel_speaks_the_words_of_the_reports() {
+    for stage in vizflyt_protocol::messages::Stage::ALL {
+        assert!(WATERFALL.contains(&format!("  {}: \"", stage.name())), "{}", stage.name());
+    }
+    for (reason, _) in crate::accounts::Skipped::default().each() {
+        assert!(WATERFALL.contains(&format!("  {reason}: \"")), "{reason}");
+    }
+    let edges = vizflyt_protocol::messages::INTERVAL_EDGES_MS.map(|edge| edge.to_string());
+    assert!(WATERFALL.contains(&format!("[{}]", edges.join(", "))));
+    for id in ["timing", "timing-body"] {
+        assert!(
+            WATERFALL.contains(&format!("(\"{id}\")")) && INDEX.contains(&format!("id=\"{id}\""))
+        );
+    }
+    assert!(WATERFALL.contains("/api/stats"));
 }
 
 /// Every element that the script looks up by its id is on the page.
