@@ -205,6 +205,9 @@ impl Drop for FlightLog {
 /// If the file cannot be read or is no MCAP file.
 pub fn read_timing(path: &Path) -> mcap::McapResult<Option<Timing>> {
     let bytes = std::fs::read(path)?;
+    if !bytes.starts_with(mcap::MAGIC) {
+        return Err(mcap::McapError::BadMagic);
+    }
     // A killed runtime leaves a file without an end.
     let options = mcap::read::Options::IgnoreEndMagic.into();
     let messages = mcap::read::MessageStream::new_with_options(&bytes, options)?;
