@@ -72,7 +72,7 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
 fn cameras_are_listed_and_changed_by_our_own_page_only() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
-    let (status, answer) = http(server.http, "GET /api/cameras HTTP/1.1");
+    let (status, answer) = http(server.http, "GET /api/vehicles/vizflyt/cameras HTTP/1.1");
     let cameras = answer.split_once("\r\n\r\n").unwrap().1;
     let cameras: serde_json::Value = serde_json::from_str(cameras).unwrap();
     assert_eq!(
@@ -85,7 +85,7 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
     let fx_px = arena["cameras"][0]["intrinsics"]["fx_px"].as_f64();
     assert_eq!(fx_px.map(f64::round), Some(80.0));
     let put = |name: &str, body: &str| {
-        send_json(server.http, &format!("PUT /api/cameras/{name}"), None, body)
+        send_json(server.http, &format!("PUT /api/vehicles/vizflyt/cameras/{name}"), None, body)
     };
     let good =
         r#"{"width_px": 64, "height_px": 48, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}"#;
@@ -108,8 +108,15 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
         assert!(found == status && text.contains(expected), "{found} {text}");
     }
     let stranger = Some("http://evil.example");
-    assert_eq!(send_json(server.http, "PUT /api/cameras/front", stranger, good).0, 403);
-    assert_eq!(http(server.http, "PUT /api/cameras/front HTTP/1.1\r\nContent-Length: 0").0, 403);
+    assert_eq!(
+        send_json(server.http, "PUT /api/vehicles/vizflyt/cameras/front", stranger, good).0,
+        403
+    );
+    assert_eq!(
+        http(server.http, "PUT /api/vehicles/vizflyt/cameras/front HTTP/1.1\r\nContent-Length: 0")
+            .0,
+        403
+    );
 }
 
 #[tokio::test]

@@ -311,7 +311,8 @@ async fn a_camera_that_changes_while_flying_loses_no_image() {
                      "horizontal_fov_deg": {fov_deg}, "tilt_deg": {tilt_deg}}}"#
             );
             let http = server.http;
-            let patch = move || send_json(http, "PATCH /api/cameras/front", None, &json);
+            let patch =
+                move || send_json(http, "PATCH /api/vehicles/vizflyt/cameras/front", None, &json);
             let (status, body) = tokio::task::spawn_blocking(patch).await.unwrap();
             assert_eq!(status, 200, "{body}");
             let (index, camera) = client

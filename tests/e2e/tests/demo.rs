@@ -184,13 +184,14 @@ fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
     let mut demo = file.demo(&["--seed", "7", "--seconds", "90"]);
     let url = page_url(&mut demo);
     demo.wait_for(FLYING, AIRBORNE);
-    let cameras = http(&url, "GET /api/cameras");
+    let cameras = http(&url, "GET /api/vehicles/vizflyt/cameras");
     assert!(cameras.contains("\"name\":\"front\""), "{cameras}");
     let change = r#"{"width_px": 400, "height_px": 200, "horizontal_fov_deg": 100}"#;
-    let response = http_body(&url, "PATCH /api/cameras/front", change);
+    let response = http_body(&url, "PATCH /api/vehicles/vizflyt/cameras/front", change);
     assert!(response.starts_with("HTTP/1.1 200"), "{response}");
     demo.wait_for("camera front is now 400x200 px", AIRBORNE);
-    let response = http_body(&url, "PATCH /api/cameras/front", r#"{"near_m": -1}"#);
+    let response =
+        http_body(&url, "PATCH /api/vehicles/vizflyt/cameras/front", r#"{"near_m": -1}"#);
     assert!(response.starts_with("HTTP/1.1 400") && response.contains("near_m"), "{response}");
     let code = demo.wait(FLIGHT);
     let report = file.read();

@@ -11,54 +11,63 @@ use axum::response::{IntoResponse, Response};
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::messages::EventKind;
 
-use super::{Page, messages, origin, refuse};
-use crate::cameras::ChangeError;
+use super::{Page, messages, origin, refuse, vehicle};
+use crate::cameras::{Cameras, ChangeError};
 
 /// Answers with all cameras.
-pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
-    let set = page.hub.vehicles[0].cameras.newest();
+pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>) -> Response {
+    let vehicle = match vehicle(&page, &name) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
+    let set = vehicle.cameras.newest();
     Json(set.configs.iter().map(messages::camera_keys).collect::<Vec<_>>()).into_response()
 }
 
 /// Replaces a camera.
 pub(super) async fn put(
     State(page): State<Arc<Page>>,
-    Path(name): Path<String>,
+    Path((vehicle, name)): Path<(String, String)>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    change(&page, &headers, body, |json| page.hub.vehicles[0].cameras.put(&name, json))
+    change(&page, &vehicle, &headers, body, |cameras, json| cameras.put(&name, json))
 }
 
 /// Changes a camera.
 pub(super) async fn patch(
     State(page): State<Arc<Page>>,
-    Path(name): Path<String>,
+    Path((vehicle, name)): Path<(String, String)>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    change(&page, &headers, body, |json| page.hub.vehicles[0].cameras.patch(&name, json))
+    change(&page, &vehicle, &headers, body, |cameras, json| cameras.patch(&name, json))
 }
 
 fn change(
     page: &Page,
+    name: &str,
     headers: &HeaderMap,
     body: Result<Bytes, BytesRejection>,
-    apply: impl FnOnce(&[u8]) -> Result<CameraConfig, ChangeError>,
+    apply: impl FnOnce(&Cameras, &[u8]) -> Result<CameraConfig, ChangeError>,
 ) -> Response {
     if let Err(refusal) = origin::check(headers) {
         return refuse(&refusal);
     }
+    let vehicle = match vehicle(page, name) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
     let body = match body {
         Ok(body) => body,
         Err(rejection) => return rejection.into_response(),
     };
-    let before = page.hub.vehicles[0].cameras.newest();
-    match apply(&body) {
+    let before = vehicle.cameras.newest();
+    match apply(&vehicle.cameras, &body) {
         Ok(camera) => {
             // The same again is no news.
-            if !Arc::ptr_eq(&before, &page.hub.vehicles[0].cameras.newest()) {
-                page.hub.vehicles[0].tell(EventKind::Note, &describe(&camera));
+            if !Arc::ptr_eq(&before, &vehicle.cameras.newest()) {
+                vehicle.tell(EventKind::Note, &describe(&camera));
             }
             Json(messages::camera_keys(&camera)).into_response()
         }

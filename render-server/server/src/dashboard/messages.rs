@@ -17,12 +17,13 @@ use crate::events::{Entry, Origin};
 use crate::hub::{RendererInfo, lock};
 use crate::map::Obstacles;
 use crate::stats::Rate;
+use crate::vehicle::Vehicle;
 
 /// Server to page.
 #[derive(Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(super) enum Message<'a> {
-    Arena(Arena<'a>),
+    Arena(Box<Arena<'a>>),
     /// The cameras, after one was changed.
     Cameras {
         cameras: Vec<CameraLine>,
@@ -43,6 +44,8 @@ pub(super) struct Arena<'a> {
     boot: String,
     name: &'a str,
     vehicle: &'a str,
+    /// All vehicles' names.
+    vehicles: Vec<&'a str>,
     fence: &'a Volume,
     goal_m: Option<[f64; 3]>,
     goal_radius_m: f64,
@@ -122,18 +125,32 @@ struct RuntimeLine {
 #[derive(Debug, Default)]
 pub(crate) struct Rates {
     ticks: Rate,
+    vehicles: Vec<VehicleRates>,
+}
+
+/// Rates of one vehicle.
+#[derive(Debug, Default)]
+struct VehicleRates {
     images: Rate,
     bytes: Rate,
     poses: Rate,
 }
 
-pub(super) fn arena(page: &Page) -> Message<'_> {
-    let vehicle = &page.hub.vehicles[0];
+impl Rates {
+    /// Returns those of this many vehicles.
+    pub(super) fn of(vehicles: usize) -> Self {
+        let vehicles = std::iter::repeat_with(VehicleRates::default).take(vehicles).collect();
+        Self { ticks: Rate::default(), vehicles }
+    }
+}
+
+pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a Vehicle) -> Message<'a> {
     let info = &vehicle.arena;
-    Message::Arena(Arena {
+    Message::Arena(Box::new(Arena {
         boot: page.boot.as_ns().to_string(),
         name: &info.name,
         vehicle: &vehicle.name,
+        vehicles: page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect(),
         fence: &info.geofence,
         goal_m: info.goal_m.map(|goal| goal.to_array()),
         goal_radius_m: info.goal_radius_m,
@@ -145,7 +162,7 @@ pub(super) fn arena(page: &Page) -> Message<'_> {
         map_max_m: page.map.max_m,
         obstacles: &page.map.obstacles,
         stages: &page.stages,
-    })
+    }))
 }
 
 pub(super) fn cameras(set: &CameraSet) -> Message<'static> {
@@ -186,12 +203,12 @@ pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
     Message::Events { events: entries.into_iter().map(line).collect() }
 }
 
-pub(super) fn state(page: &Page) -> Message<'static> {
+pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
     let hub = &page.hub;
-    let vehicle = &hub.vehicles[0];
+    let rates = &page.rates.vehicles[vehicle.index];
     let now = clock::now();
     let flight = vehicle.flight();
-    let source = *lock(&hub.source);
+    let source = *lock(&vehicle.source);
     let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
     let stats = &hub.stats;
     Message::State(Box::new(State {
@@ -211,11 +228,11 @@ pub(super) fn state(page: &Page) -> Message<'static> {
         send: stats.send.recent(),
         renderer: lock(&hub.renderer).clone(),
         render_hz: page.rates.ticks.of(total(&stats.ticks), now),
-        stream_hz: page.rates.images.of(total(&vehicle.images.sent), now),
-        stream_mbit_s: page.rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
+        stream_hz: rates.images.of(total(&vehicle.images.sent), now),
+        stream_mbit_s: rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
         images_late: total(&vehicle.images.late),
         source,
-        source_hz: page.rates.poses.of(source.poses, now),
+        source_hz: rates.poses.of(source.poses, now),
         flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
         landed: flight.landed.is_some(),
         outcome: flight

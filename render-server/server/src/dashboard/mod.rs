@@ -2,14 +2,18 @@
 //!
 //! ```text
 //! GET /            the page (no framework, nothing fetched from elsewhere)
-//! GET /ws          WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
-//!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins
+//! GET /ws?vehicle=V   WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
+//!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
+//!                  vehicle, if none is named
 //! GET /api/map     the top view: a JPEG drawn at the start
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
-//! POST /api/estop  EmergencyStop to the runtime
-//! GET /api/cameras          the cameras of this moment, JSON
-//! PUT /api/cameras/NAME     a whole camera, by the keys of `[[cameras]]`; from the next tick on
-//! PATCH /api/cameras/NAME   as PUT, but only what is given changes
+//! POST /api/estop  EmergencyStop to the runtimes of all vehicles
+//! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
+//! POST /api/vehicles/V/estop          EmergencyStop to its runtime
+//! GET /api/vehicles/V/cameras         its cameras of this moment, JSON
+//! PUT /api/vehicles/V/cameras/NAME    a whole camera, by the keys of `[[cameras]]`; from the next
+//!                                     tick on
+//! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
 //! ```
 //! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
 //! nobody. Only pages of the same origin may watch or stop ([`origin`]).
@@ -18,6 +22,7 @@ mod cameras;
 mod messages;
 pub(crate) mod origin;
 mod stats;
+mod vehicles;
 mod viewer;
 
 use std::net::SocketAddr;
@@ -25,10 +30,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use axum::Router;
-use axum::extract::{DefaultBodyLimit, State, WebSocketUpgrade};
+use axum::extract::{DefaultBodyLimit, Query, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post, put};
+use serde::Deserialize;
 use tokio::net::TcpListener;
 use tracing::warn;
 use vizflyt_arena::config::StageConfig;
@@ -36,6 +42,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::hub::Hub;
 use crate::map::Map;
+use crate::vehicle::Vehicle;
 
 /// What the page's handlers share.
 #[derive(Debug)]
@@ -71,7 +78,7 @@ pub async fn serve(
     listener: TcpListener,
 ) -> Result<()> {
     let stop = hub.stop.clone();
-    let (boot, rates) = (crate::clock::now(), messages::Rates::default());
+    let (boot, rates) = (crate::clock::now(), messages::Rates::of(hub.vehicles.len()));
     let page = Arc::new(Page { hub, map, stages, boot, rates });
     // Dropped at the stop rather than drained: WebSockets would drain for ever.
     tokio::select! {
@@ -91,9 +98,11 @@ fn router(page: Arc<Page>) -> Router {
         .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/api/map", get(map))
         .route("/api/stats", get(stats::get))
-        .route("/api/estop", post(estop))
-        .route("/api/cameras", get(cameras::list))
-        .route("/api/cameras/{name}", put(cameras::put).patch(cameras::patch))
+        .route("/api/estop", post(vehicles::stop_all))
+        .route("/api/vehicles", get(vehicles::list))
+        .route("/api/vehicles/{vehicle}/estop", post(vehicles::stop))
+        .route("/api/vehicles/{vehicle}/cameras", get(cameras::list))
+        .route("/api/vehicles/{vehicle}/cameras/{name}", put(cameras::put).patch(cameras::patch))
         .route("/ws", get(watch))
         // A camera takes some hundred bytes.
         .layer(DefaultBodyLimit::max(16 << 10))
@@ -120,31 +129,41 @@ async fn map(State(page): State<Arc<Page>>) -> Response {
     response
 }
 
-async fn estop(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
-    if let Err(refusal) = origin::check(&headers) {
-        return refuse(&refusal);
-    }
-    if page.hub.vehicles[0].emergency_stop("the page") {
-        (StatusCode::ACCEPTED, "the runtime lands the vehicle").into_response()
-    } else {
-        (StatusCode::CONFLICT, "no runtime is connected: nobody to land the vehicle")
-            .into_response()
-    }
+/// Returns the vehicle of this name, or the answer that there is none.
+pub(crate) fn vehicle<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<Vehicle>, Box<Response>> {
+    let found = page.hub.vehicles.iter().find(|vehicle| vehicle.name == name);
+    found.ok_or_else(|| {
+        let names: Vec<_> = page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect();
+        let text = format!("there is no vehicle '{name}'; there are {}", names.join(", "));
+        Box::new((StatusCode::NOT_FOUND, text).into_response())
+    })
+}
+
+/// What `/ws` is asked for.
+#[derive(Debug, Deserialize)]
+struct Watched {
+    vehicle: Option<String>,
 }
 
 async fn watch(
     State(page): State<Arc<Page>>,
+    Query(watched): Query<Watched>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
 ) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
+    let named = watched.vehicle.map(|name| vehicle(&page, &name).cloned());
+    let vehicle = match named.unwrap_or_else(|| Ok(page.hub.vehicles[0].clone())) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
     match upgrade {
         // Viewers have nothing to say: a byte limit keeps a hostile one small.
         Ok(upgrade) => upgrade
             .max_message_size(1024)
-            .on_upgrade(async move |socket| viewer::run(page, socket).await),
+            .on_upgrade(async move |socket| viewer::run(page, vehicle, socket).await),
         Err(rejection) => rejection.into_response(),
     }
 }

@@ -9,6 +9,7 @@ fn the_page_refers_only_to_files_that_are_served() {
         APP.contains("\"/map.js\"")
             && APP.contains("\"/cameras.js\"")
             && APP.contains("/api/estop")
+            && APP.contains("/api/vehicles")
             && MAP.contains("/api/map")
     );
 }

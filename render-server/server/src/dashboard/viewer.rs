@@ -13,32 +13,33 @@ use tracing::debug;
 use super::{Page, messages};
 use crate::hub::lock;
 use crate::previews::Preview;
+use crate::vehicle::Vehicle;
 
 /// Counts a viewer for as long as it lives.
-struct Presence<'a>(&'a Page);
+struct Presence<'a>(&'a Page, usize);
 
 impl<'a> Presence<'a> {
-    fn new(page: &'a Page) -> Self {
-        page.hub.outlet.viewer_came(0);
-        Self(page)
+    fn new(page: &'a Page, vehicle: &Vehicle) -> Self {
+        page.hub.outlet.viewer_came(vehicle.index);
+        Self(page, vehicle.index)
     }
 }
 
 impl Drop for Presence<'_> {
     fn drop(&mut self) {
-        self.0.hub.outlet.viewer_left(0);
+        self.0.hub.outlet.viewer_left(self.1);
     }
 }
 
-/// Tells one viewer everything until it leaves, stalls, or the server stops.
-pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
+/// Tells one viewer everything of a vehicle until it leaves, stalls, or the server stops.
+pub(super) async fn run(page: Arc<Page>, vehicle: Arc<Vehicle>, mut socket: WebSocket) {
     if page.hub.outlet.viewers() >= MOST_VIEWERS {
         debug!("page: {MOST_VIEWERS} viewers already");
         return;
     }
-    let presence = Presence::new(&page);
+    let presence = Presence::new(&page, &vehicle);
     tokio::select! {
-        _ = tell(&page, &mut socket) => {}
+        _ = tell(&page, &vehicle, &mut socket) => {}
         () = page.hub.stop.wait() => {}
     }
     drop(presence);
@@ -46,16 +47,15 @@ pub(super) async fn run(page: Arc<Page>, mut socket: WebSocket) {
 }
 
 /// Returns `None` when the viewer is gone.
-async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
-    let hub = &page.hub.vehicles[0];
-    let mut log = hub.events.subscribe();
-    let mut cameras = hub.cameras.subscribe();
-    let (entries, mut cursor) = hub.events.newest(HISTORY);
-    send_json(socket, &messages::arena(page)).await?;
-    let points = lock(&hub.trail).points.clone();
+async fn tell(page: &Page, vehicle: &Vehicle, socket: &mut WebSocket) -> Option<()> {
+    let mut log = vehicle.events.subscribe();
+    let mut cameras = vehicle.cameras.subscribe();
+    let (entries, mut cursor) = vehicle.events.newest(HISTORY);
+    send_json(socket, &messages::arena(page, vehicle)).await?;
+    let points = lock(&vehicle.trail).points.clone();
     send_json(socket, &messages::Message::Trail { points: &points }).await?;
     send_json(socket, &messages::events(page, entries)).await?;
-    let mut previews: Vec<_> = hub.previews.iter().map(watch::Sender::subscribe).collect();
+    let mut previews: Vec<_> = vehicle.previews.iter().map(watch::Sender::subscribe).collect();
     for preview in &mut previews {
         preview.mark_changed();
     }
@@ -70,7 +70,7 @@ async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
             },
             _ = log.changed() => {
                 log.mark_unchanged();
-                let entries = match hub.events.read(&mut cursor) {
+                let entries = match vehicle.events.read(&mut cursor) {
                     Ok(entries) => entries,
                     Err(lagged) => {
                         cursor = lagged.oldest;
@@ -86,7 +86,7 @@ async fn tell(page: &Page, socket: &mut WebSocket) -> Option<()> {
                 send_json(socket, &messages::cameras(&newest)).await?;
             }
             _ = tick.tick() => {
-                send_json(socket, &messages::state(page)).await?;
+                send_json(socket, &messages::state(page, vehicle)).await?;
                 // Polled with the state rather than awaited: one picture per turn at most, and
                 // whatever was drawn meanwhile is skipped.
                 for (index, preview) in previews.iter_mut().enumerate() {

@@ -319,7 +319,16 @@ impl Client {
 
     /// Connects and is welcomed.
     pub async fn welcomed(server: &Server, transport: TransportConfig) -> (Self, ArenaInfo) {
-        let mut client = Self::hello(server, "vizflyt", transport).await;
+        Self::welcomed_to(server, "vizflyt", transport).await
+    }
+
+    /// As [`Self::welcomed`], to another vehicle.
+    pub async fn welcomed_to(
+        server: &Server,
+        vehicle: &str,
+        transport: TransportConfig,
+    ) -> (Self, ArenaInfo) {
+        let mut client = Self::hello(server, vehicle, transport).await;
         match client.next().await {
             ToRuntime::Welcome(arena) => (client, arena),
             other => panic!("not welcomed: {other:?}"),
@@ -425,11 +434,16 @@ pub struct Socket(TcpStream);
 impl Socket {
     /// Opens it as a page of `origin` would; the status if the server declines.
     pub fn open(address: SocketAddr, origin: &str) -> Result<Self, u16> {
+        Self::open_at(address, origin, "/ws")
+    }
+
+    /// As [`Self::open`], with another path and query.
+    pub fn open_at(address: SocketAddr, origin: &str, path: &str) -> Result<Self, u16> {
         let mut stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         write!(
             stream,
-            "GET /ws HTTP/1.1\r\nHost: {address}\r\nOrigin: {origin}\r\nConnection: Upgrade\r\n\
+            "GET {path} HTTP/1.1\r\nHost: {address}\r\nOrigin: {origin}\r\nConnection: Upgrade\r\n\
              Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
              Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
         )

@@ -7,7 +7,9 @@ import { TopView } from "/map.js";
 const $ = (id) => document.getElementById(id);
 const view = new TopView($("map"));
 const form = new CameraForm($("camera-form"), $("camera-said"));
-const shown = { pose: null, state: null, camera: 0, cameras: [], boot: null, events: new Set(), outcome: null };
+/** The vehicle asked for; the first one, if none is. */
+const wanted = new URLSearchParams(location.search).get("vehicle");
+const shown = { vehicle: null, pose: null, state: null, camera: 0, cameras: [], boot: null, events: new Set(), outcome: null };
 
 // ---- theme -------------------------------------------------------------------------------
 const wantsLight = matchMedia("(prefers-color-scheme: light)");
@@ -24,19 +26,26 @@ $("theme").addEventListener("click", () => {
 applyTheme();
 
 // ---- stop --------------------------------------------------------------------------------
-async function stop() {
-  $("estop").dataset.pressed = "";
+const api = () => `/api/vehicles/${encodeURIComponent(shown.vehicle)}`;
+
+/** Stops the vehicle shown, or all of them. */
+async function stop(all = false) {
+  const button = $(all ? "estop-all" : "estop");
+  button.dataset.pressed = "";
   say("stopping");
   try {
-    const answer = await fetch("/api/estop", { method: "POST" });
+    // Before the page knows whose it is, the button stops whoever flies.
+    const where = all || shown.vehicle == null ? "/api/estop" : `${api()}/estop`;
+    const answer = await fetch(where, { method: "POST" });
     say(await answer.text());
     if (!answer.ok) banner("warn", "Not stopped", $("said").textContent);
   } catch {
     banner("bad", "Not stopped", "the server cannot be reached: use the pilot's transmitter");
   }
-  setTimeout(() => delete $("estop").dataset.pressed, 400);
+  setTimeout(() => delete button.dataset.pressed, 400);
 }
-$("estop").addEventListener("click", stop);
+$("estop").addEventListener("click", () => stop());
+$("estop-all").addEventListener("click", () => stop(true));
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
   // Space on another focused control is that control's own.
@@ -54,9 +63,12 @@ function say(text) {
 // ---- the connection ----------------------------------------------------------------------
 let wait_ms = 250;
 function connect() {
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+  const which = wanted == null ? "" : `?vehicle=${encodeURIComponent(wanted)}`;
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${which}`);
+  let opened = false;
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
+    opened = true;
     wait_ms = 250;
     link("good", "live");
     delete document.body.dataset.stale;
@@ -65,10 +77,40 @@ function connect() {
   socket.onclose = () => {
     link("bad", "server gone, reconnecting");
     document.body.dataset.stale = "";
+    if (!opened && wanted != null) missing();
     setTimeout(connect, wait_ms);
     wait_ms = Math.min(3000, wait_ms * 1.6);
   };
 }
+/** Tells it if the vehicle asked for is not among those served. */
+async function missing() {
+  try {
+    const vehicles = await (await fetch("/api/vehicles")).json();
+    const names = vehicles.map((vehicle) => vehicle.name);
+    if (names.includes(wanted)) return;
+    link("warn", "no such vehicle");
+    showVehicles(names, null);
+    banner("warn", `No vehicle '${wanted}'`, `here fly ${names.join(", ")}`);
+  } catch {
+    // The server is gone: that is told already.
+  }
+}
+
+/** Shows the vehicles to choose from, if there are several, or the one chosen is not there. */
+function showVehicles(names, current) {
+  const list = $("vehicles");
+  const options = names.map((name) => new Option(name, name, false, name === current));
+  if (current == null) options.unshift(new Option("choose a vehicle", "", true, true));
+  list.replaceChildren(...options);
+  list.hidden = options.length < 2;
+  $("vehicle").hidden = !list.hidden;
+  $("estop-all").hidden = names.length < 2;
+  put("estop-what", names.length < 2 || current == null ? "" : current);
+}
+$("vehicles").addEventListener("change", ({ target }) => {
+  if (target.value) location.search = `?vehicle=${encodeURIComponent(target.value)}`;
+});
+
 function link(tone, text) {
   $("link").dataset.tone = tone;
   $("link-text").textContent = text;
@@ -87,7 +129,10 @@ function hearArena(arena) {
     $("events").replaceChildren();
     $("outcome").hidden = true;
   }
-  document.title = `${arena.name} · VizFlyt`;
+  shown.vehicle = arena.vehicle;
+  form.vehicle = api();
+  document.title = `${arena.vehicle} · ${arena.name} · VizFlyt`;
+  showVehicles(arena.vehicles, arena.vehicle);
   $("arena").textContent = arena.name;
   $("vehicle").textContent = arena.vehicle;
   $("speed-top").textContent = `${Math.max(1, arena.max_speed_mps)} m/s`;

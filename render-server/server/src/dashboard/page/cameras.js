@@ -8,6 +8,8 @@ const LENS = { "brown-conrady": ["k1", "k2", "p1", "p2", "k3"], "kannala-brandt"
 export class CameraForm {
   constructor(form, said) {
     [this.form, this.said, this.camera] = [form, said, null];
+    /** Where the vehicle is: `/api/vehicles/NAME`. */
+    this.vehicle = null;
     form.model.addEventListener("change", () => this.showModel());
     form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -15,7 +17,7 @@ export class CameraForm {
     });
   }
 
-  /** Shows a camera, as `/api/cameras` has it; `again` leaves what is being typed. */
+  /** Shows a camera, as `/api/vehicles/NAME/cameras` has it; `again` leaves what is being typed. */
   show(camera, again) {
     const same = this.camera?.name === camera?.name;
     this.camera = camera;
@@ -64,7 +66,7 @@ export class CameraForm {
     if (!this.camera) return;
     let text, good = false;
     try {
-      const answer = await fetch(`/api/cameras/${encodeURIComponent(this.camera.name)}`, {
+      const answer = await fetch(`${this.vehicle}/cameras/${encodeURIComponent(this.camera.name)}`, {
         method: "PUT",
         headers: { "content-type": "application/json" },
         body: JSON.stringify(this.read()),

@@ -1,0 +1,83 @@
+//! The vehicles over HTTP: who they are, and the stop buttons.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use vizflyt_protocol::messages::FlightPhase;
+
+use super::{Page, origin, refuse, vehicle};
+use crate::vehicle::Vehicle;
+
+/// A vehicle in the list.
+#[derive(Debug, Serialize)]
+pub(super) struct VehicleLine {
+    name: String,
+    phase: FlightPhase,
+    /// Which program flies it.
+    runtime: Option<String>,
+    cameras: Vec<String>,
+}
+
+impl VehicleLine {
+    pub(super) fn of(vehicle: &Arc<Vehicle>) -> Self {
+        let cameras = vehicle.cameras.newest();
+        Self {
+            name: vehicle.name.to_string(),
+            phase: vehicle.phase(),
+            runtime: vehicle.runtime().map(|runtime| runtime.program.to_string()),
+            cameras: cameras.configs.iter().map(|camera| camera.name.clone()).collect(),
+        }
+    }
+}
+
+/// Answers with all vehicles.
+pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
+    Json(page.hub.vehicles.iter().map(VehicleLine::of).collect::<Vec<_>>()).into_response()
+}
+
+/// Stops every vehicle.
+pub(super) async fn stop_all(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    press(&page.hub.vehicles)
+}
+
+/// Stops one vehicle.
+pub(super) async fn stop(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    match vehicle(&page, &name) {
+        Ok(vehicle) => press(std::slice::from_ref(vehicle)),
+        Err(none) => *none,
+    }
+}
+
+/// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
+/// flight is told.
+fn press(vehicles: &[Arc<Vehicle>]) -> Response {
+    let (obey, absent): (Vec<_>, Vec<_>) =
+        vehicles.iter().partition(|vehicle| vehicle.emergency_stop("the page"));
+    let names = |vehicles: &[&Arc<Vehicle>]| {
+        vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect::<Vec<_>>().join(", ")
+    };
+    let status = if obey.is_empty() { StatusCode::CONFLICT } else { StatusCode::ACCEPTED };
+    let text = match (&*obey, &*absent) {
+        ([_], []) => "the runtime lands the vehicle".to_owned(),
+        (obey, []) => format!("the runtimes land {}", names(obey)),
+        ([], _) => "no runtime is connected: nobody to land the vehicle".to_owned(),
+        (obey, absent) => {
+            format!("the runtimes land {}; no runtime flies {}", names(obey), names(absent))
+        }
+    };
+    (status, text).into_response()
+}
