@@ -9,7 +9,7 @@
 //! ```
 //! Budget of the pose thread: 20 us a pose, at 200 Hz for each vehicle, bounded by the referee's
 //! swept query. The render thread is bounded by the renderer; it allocates nothing once every
-//! buffer has been used (tests/allocations.rs). Both are plain threads: tokio's timers are a millisecond
+//! buffer has been used (tests/allocation.rs). Both are plain threads: tokio's timers are a millisecond
 //! late, and drawing would block its workers.
 
 use std::sync::Arc;

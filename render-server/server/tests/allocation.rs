@@ -1,0 +1,173 @@
+//! The render thread allocates nothing once every buffer has been used: two vehicles, four
+//! cameras, of which some ticks are encoded, some skipped, and all passed on to the previews.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::borrow::Cow;
+use std::cell::Cell;
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::{DQuat, DVec3};
+use vizflyt_arena::ArenaConfig;
+use vizflyt_protocol::geometry::{Pose, Twist};
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_server::cameras::Cameras;
+use vizflyt_server::drawn::Ticks;
+use vizflyt_server::hub::{Hub, RendererInfo};
+use vizflyt_server::mailbox::Mailbox;
+use vizflyt_server::stop::Stop;
+use vizflyt_server::tick::{self, Poses};
+use vizflyt_server::vehicle::Vehicle;
+use vizflyt_splat::{Camera, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload};
+
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
+// without destructor, so it allocates nothing.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+const ARENA: &str = r#"
+name = "two"
+scene = "scene.ply"
+body_radius_m = 0.12
+takeoff_height_m = 1.2
+spawn = { position_m = [0, 0, 0] }
+geofence = { min_m = [-5, -5, -0.5], max_m = [5, 5, 4] }
+limits = { max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }
+[[cameras]]
+name = "front"
+width_px = 64
+height_px = 48
+horizontal_fov_deg = 90.0
+position_m = [0, 0, 0]
+[[cameras]]
+name = "rear"
+width_px = 32
+height_px = 24
+horizontal_fov_deg = 90.0
+position_m = [0, 0, 0]
+rate_hz = 300.0
+"#;
+
+/// Draws nothing, but makes images of the size; and does the other threads' part between two ticks:
+/// brings the next poses, encodes some ticks, and makes previews.
+struct Everyone {
+    hub: Arc<Hub>,
+    newest: Arc<Mailbox<Poses>>,
+    ticks: Arc<Ticks>,
+    calls: u64,
+    images: usize,
+    /// Allocations of this thread up to the end of the warm-up.
+    warm: usize,
+}
+
+impl Everyone {
+    fn poses(at: u64) -> Poses {
+        let sample = PoseSample {
+            stamp: ServerTime::from_ns(at),
+            world_from_body: Pose::new(DVec3::Z, DQuat::IDENTITY),
+            twist: Twist::default(),
+            resets: 0,
+        };
+        let mut poses = Poses::default();
+        // Now and then one vehicle is not seen.
+        poses[0] = Some(sample);
+        poses[1] = (!at.is_multiple_of(7)).then_some(sample);
+        poses
+    }
+}
+
+impl Rasterizer for Everyone {
+    fn name(&self) -> Cow<'_, str> {
+        "nothing".into()
+    }
+
+    fn render(
+        &mut self,
+        _: &[Placement],
+        cameras: &[Camera],
+        images: &mut [RgbdImage],
+    ) -> Result<PassTimes, RenderError> {
+        for (camera, image) in cameras.iter().zip(images) {
+            image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
+        }
+        self.calls += 1;
+        self.images += cameras.len();
+        match self.calls {
+            WARM_UP => self.warm = ALLOCATIONS.with(Cell::get),
+            TICKS => self.hub.stop.set(),
+            _ => {}
+        }
+        if self.calls.is_multiple_of(3)
+            && let Some(tick) = self.ticks.take(Duration::ZERO)
+        {
+            self.ticks.pass_on(tick, true);
+        }
+        if self.calls.is_multiple_of(2)
+            && let Some(tick) = self.ticks.take_spent(Duration::ZERO)
+        {
+            self.ticks.recycle(tick);
+        }
+        self.newest.put(Self::poses(self.calls));
+        Ok(PassTimes::default())
+    }
+
+    fn workload(&self) -> Workload {
+        Workload::default()
+    }
+}
+
+const WARM_UP: u64 = 60;
+const TICKS: u64 = 360;
+
+#[test]
+fn drawing_allocates_nothing_once_it_is_warm() {
+    let arena = ArenaConfig::parse(ARENA).unwrap();
+    let vehicle =
+        |index, name| Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()));
+    let vehicles = vec![vehicle(0, "wasp"), vehicle(1, "bee")];
+    let hub = Arc::new(Hub::new(vehicles, RendererInfo::default(), Stop::default()));
+    hub.outlet.viewer_came(0);
+    hub.outlet.viewer_came(1);
+    vizflyt_server::hub::lock(&hub.renderer).name = "nothing".to_owned();
+    let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(Ticks::default()));
+    newest.put(Everyone::poses(1));
+    let mut everyone = Everyone {
+        hub: hub.clone(),
+        newest: newest.clone(),
+        ticks: ticks.clone(),
+        calls: 0,
+        images: 0,
+        warm: 0,
+    };
+    tick::draw(&hub, &mut everyone, &newest, &ticks, 1000.0);
+    let allocated = ALLOCATIONS.with(Cell::get) - everyone.warm;
+    assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);
+    // Leaving the function frees, which is not counted.
+    assert_eq!(allocated, 0, "in {} ticks", TICKS - WARM_UP);
+}
