@@ -108,6 +108,17 @@ impl Identity {
     }
 }
 
+/// Returns a fresh secret of 128 random bits, as 32 letters and digits.
+///
+/// # Errors
+/// If the system gives no random numbers.
+pub fn secret() -> Result<String, String> {
+    let mut bytes = [0; 16];
+    let random = rustls::crypto::ring::default_provider().secure_random;
+    random.fill(&mut bytes).map_err(|_| "the system gives no random numbers".to_owned())?;
+    Ok(format!("{:032x}", u128::from_le_bytes(bytes)))
+}
+
 fn damaged(folder: &KeysFolder, owner: Owner, what: &str) -> KeyError {
     let what =
         format!("{what}; restore the file, or move it away to start with a new key and pair again");

@@ -77,6 +77,11 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ROLE", value_parser = grant)]
     pub pair: Option<Grant>,
 
+    /// Print the addresses, with keys, by which other computers open the page; printed anyway if
+    /// --http is not this computer alone
+    #[arg(long)]
+    pub print_page_keys: bool,
+
     /// Folder of this server's key and of paired.toml, which says who may connect
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]

@@ -22,7 +22,8 @@ use crate::hub::lock;
 pub struct Door {
     /// Who this server is.
     pub identity: Identity,
-    folder: KeysFolder,
+    /// Where everything is kept.
+    pub folder: KeysFolder,
     paired: watch::Sender<Arc<Paired>>,
     desk: Mutex<Desk>,
     /// What came of the newest attempt to pair.
@@ -90,6 +91,11 @@ impl Door {
     /// Returns what comes of attempts to pair, newest wins.
     pub fn pairing_news(&self) -> watch::Receiver<String> {
         self.pairing_news.subscribe()
+    }
+
+    /// Returns what came of the newest attempt to pair.
+    pub fn newest_pairing_news(&self) -> String {
+        self.pairing_news.borrow().clone()
     }
 
     /// Takes the first message of a client that wants to be paired.

@@ -14,6 +14,7 @@ use vizflyt_trust::KeysFolder;
 
 use crate::args::ServeArgs;
 use crate::cameras::Cameras;
+use crate::dashboard::PageKeys;
 use crate::door::Door;
 use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, ViconUdp};
@@ -126,7 +127,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         &Ready {
             ready: "server",
             quic,
-            http,
+            http: http.clone(),
             vicon: vicon_address,
             fingerprint: &fingerprint,
             paired: door.paired().clients.len(),
@@ -138,7 +139,18 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         },
     );
 
-    let page = tokio::spawn(dashboard::serve(hub.clone(), twin.map, twin.arena.stages, listener));
+    let page_keys = PageKeys::keep(&door.folder, &names)?;
+    if args.print_page_keys || !args.http.ip().is_loopback() {
+        print_page_keys(&page_keys, &http, &names, args.json);
+    }
+    let page = tokio::spawn(dashboard::serve(
+        hub.clone(),
+        door.clone(),
+        page_keys,
+        twin.map,
+        twin.arena.stages,
+        listener,
+    ));
     if let Some(grant) = &args.pair {
         open_pairing(&door, grant, quic.port(), args.json)?;
     }
@@ -162,6 +174,19 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     }
     report(args.json, &hub.report());
     Ok(())
+}
+
+/// Prints the addresses by which others open the page.
+fn print_page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool) {
+    // Bound to all addresses, none of which is more right than another.
+    let page = http.replace("//0.0.0.0:", "//HOST:").replace("//[::]:", "//HOST:");
+    for (whose, link) in keys.links(&page, names) {
+        if json {
+            line(&serde_json::json!({ "page_key": { "for": whose, "link": link } }));
+        } else {
+            say(&format!("page key     {link} ({whose})"));
+        }
+    }
 }
 
 /// Opens the pairing that `--pair` asks for, and prints its code and what comes of it.

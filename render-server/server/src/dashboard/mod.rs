@@ -15,15 +15,24 @@
 //!                                     tick on
 //! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
 //! ```
+//! Whoever is not on this computer needs a key, for everything but the page's own files ([`access`]):
+//! ```text
+//! GET /enter?key=K     exchanges a key for a cookie
+//! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`pairing`])
+//! ```
 //! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
 //! nobody. Only pages of the same origin may watch or stop ([`origin`]).
 
+mod access;
 mod cameras;
 mod messages;
 pub(crate) mod origin;
+mod pairing;
 mod stats;
 mod vehicles;
 mod viewer;
+
+pub use access::PageKeys;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -32,6 +41,7 @@ use anyhow::{Context, Result};
 use axum::Router;
 use axum::extract::{DefaultBodyLimit, Query, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post, put};
 use serde::Deserialize;
@@ -40,6 +50,7 @@ use tracing::warn;
 use vizflyt_arena::config::StageConfig;
 use vizflyt_protocol::time::ServerTime;
 
+use crate::door::Door;
 use crate::hub::Hub;
 use crate::map::Map;
 use crate::vehicle::Vehicle;
@@ -54,6 +65,10 @@ pub(crate) struct Page {
     /// When the server started; differs from start to start, so that a page notices a new server.
     pub(crate) boot: ServerTime,
     pub(crate) rates: messages::Rates,
+    /// Who may see and do what.
+    keys: PageKeys,
+    /// Who may connect, and pairing.
+    door: Arc<Door>,
 }
 
 /// Binds the page's address.
@@ -63,8 +78,8 @@ pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
     })?;
     if !address.ip().is_loopback() {
         warn!(
-            "the page is open to everyone who reaches {address}, stop button included; \
-             use --http 127.0.0.1:8080 to keep it to this computer"
+            "the page at {address} asks for keys, but plain HTTP lets everyone on that network read \
+             them; use --http 127.0.0.1:8080 to keep it to this computer"
         );
     }
     Ok(listener)
@@ -73,16 +88,19 @@ pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
 /// Serves the page until the server stops.
 pub async fn serve(
     hub: Arc<Hub>,
+    door: Arc<Door>,
+    keys: PageKeys,
     map: Map,
     stages: Vec<StageConfig>,
     listener: TcpListener,
 ) -> Result<()> {
     let stop = hub.stop.clone();
     let (boot, rates) = (crate::clock::now(), messages::Rates::of(hub.vehicles.len()));
-    let page = Arc::new(Page { hub, map, stages, boot, rates });
+    let page = Arc::new(Page { hub, map, stages, boot, rates, keys, door });
+    let router = router(page).into_make_service_with_connect_info::<SocketAddr>();
     // Dropped at the stop rather than drained: WebSockets would drain for ever.
     tokio::select! {
-        served = axum::serve(listener, router(page)) => served.context("the page's server failed"),
+        served = axum::serve(listener, router) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
     }
 }
@@ -103,7 +121,12 @@ fn router(page: Arc<Page>) -> Router {
         .route("/api/vehicles/{vehicle}/estop", post(vehicles::stop))
         .route("/api/vehicles/{vehicle}/cameras", get(cameras::list))
         .route("/api/vehicles/{vehicle}/cameras/{name}", put(cameras::put).patch(cameras::patch))
+        .route("/pairing.js", get(async || file("text/javascript; charset=utf-8", PAIRING)))
+        .route("/api/pairing", get(pairing::standing).post(pairing::open).delete(pairing::shut))
+        .route("/enter", get(access::enter))
         .route("/ws", get(watch))
+        // Also before routes that are not there: what exists is nobody's business.
+        .layer(middleware::from_fn_with_state(page.clone(), access::guard))
         // A camera takes some hundred bytes.
         .layer(DefaultBodyLimit::max(16 << 10))
         .with_state(page)
@@ -177,6 +200,7 @@ const INDEX: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
 const APP: &str = include_str!("page/app.js");
 const CAMERAS: &str = include_str!("page/cameras.js");
+const PAIRING: &str = include_str!("page/pairing.js");
 const MAP: &str = include_str!("page/map.js");
 const WATERFALL: &str = include_str!("page/waterfall.js");
 pub(crate) const ICON: &str = include_str!("page/icon.svg");

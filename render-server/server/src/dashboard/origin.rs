@@ -29,8 +29,18 @@ pub(crate) enum Refusal {
 
 /// Checks the headers of a request that acts or watches.
 pub(crate) fn check(headers: &HeaderMap) -> Result<(), Refusal> {
-    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    check_as(headers, name.trim())
+    check_as(headers, own_name().trim())
+}
+
+/// Checks only that a request addresses this computer by a name of its own; a browser sends no
+/// `Origin` with what a page reads from where it came from.
+pub(crate) fn check_host(headers: &HeaderMap) -> Result<(), Refusal> {
+    let host = only(headers, &header::HOST).ok_or(Refusal::Missing("Host"))?;
+    check_name(host, own_name().trim())
+}
+
+fn own_name() -> String {
+    std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default()
 }
 
 fn check_as(headers: &HeaderMap, own_name: &str) -> Result<(), Refusal> {
@@ -40,6 +50,10 @@ fn check_as(headers: &HeaderMap, own_name: &str) -> Result<(), Refusal> {
     if from.is_none_or(|from| !from.eq_ignore_ascii_case(host)) {
         return Err(Refusal::Foreign { origin: origin.to_owned(), host: host.to_owned() });
     }
+    check_name(host, own_name)
+}
+
+fn check_name(host: &str, own_name: &str) -> Result<(), Refusal> {
     let name = without_port(host);
     let bare = name.trim_start_matches('[').trim_end_matches(']');
     let own = |candidate: &str| {

@@ -2,7 +2,7 @@ use super::*;
 
 #[test]
 fn the_page_refers_only_to_files_that_are_served() {
-    for wanted in ["/style.css", "/app.js", "/waterfall.js", "/icon.svg"] {
+    for wanted in ["/style.css", "/app.js", "/waterfall.js", "/pairing.js", "/icon.svg"] {
         assert!(INDEX.contains(wanted), "{wanted}");
     }
     assert!(
@@ -11,6 +11,7 @@ fn the_page_refers_only_to_files_that_are_served() {
             && APP.contains("/api/estop")
             && APP.contains("/api/vehicles")
             && MAP.contains("/api/map")
+            && PAIRING.contains("/api/pairing")
     );
 }
 

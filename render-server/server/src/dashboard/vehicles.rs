@@ -2,13 +2,14 @@
 
 use std::sync::Arc;
 
-use axum::Json;
+use axum::{Extension, Json};
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use vizflyt_protocol::messages::FlightPhase;
 
+use super::access::Viewer;
 use super::{Page, origin, refuse, vehicle};
 use crate::vehicle::Vehicle;
 
@@ -34,9 +35,13 @@ impl VehicleLine {
     }
 }
 
-/// Answers with all vehicles.
-pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
-    Json(page.hub.vehicles.iter().map(VehicleLine::of).collect::<Vec<_>>()).into_response()
+/// Answers with all vehicles that the viewer may see.
+pub(super) async fn list(
+    State(page): State<Arc<Page>>,
+    Extension(viewer): Extension<Viewer>,
+) -> Response {
+    let seen = page.hub.vehicles.iter().filter(|vehicle| viewer.may_see(&vehicle.name));
+    Json(seen.map(VehicleLine::of).collect::<Vec<_>>()).into_response()
 }
 
 /// Stops every vehicle.
