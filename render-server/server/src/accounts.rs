@@ -142,11 +142,14 @@ impl Skipped {
 impl Account {
     /// Joins what the server counted with what the runtime reported before that.
     pub fn of(server: Counts, runtime: Arrivals) -> Self {
-        let arrived = runtime.arrived.min(server.handed);
-        let on_the_way = server.handed - arrived;
+        // An image counts as handed over when its last byte is; it may arrive a moment before.
+        let most = server.drawn.saturating_sub(server.failed);
+        let handed = server.handed.max(runtime.arrived).min(most);
+        let arrived = runtime.arrived.min(handed);
+        let on_the_way = handed - arrived;
         let late = server.late.min(on_the_way);
         let skipped = Skipped {
-            no_room: server.drawn.saturating_sub(server.handed + server.failed),
+            no_room: most - handed,
             failed: server.failed,
             late,
             stale: runtime.stale,
