@@ -26,7 +26,7 @@ pub(crate) struct StatsArgs {
     /// A flight's log; without it a running server is asked
     #[arg(value_name = "FLIGHT.mcap", conflicts_with_all = ["page", "vehicle", "watch"])]
     flight: Option<PathBuf>,
-    /// The server's page
+    /// The server's page; from another computer the link with its key, as the server prints it
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
     page: String,
     /// The vehicle; the server's first one without
@@ -103,8 +103,10 @@ fn parse(json: &str) -> Result<Answer> {
 
 /// Gets `path` from the page at `url`; returns status and body.
 fn get(url: &str, path: &str) -> Result<(u16, String)> {
-    let host = url.strip_prefix("http://").unwrap_or(url).trim_end_matches('/');
-    if host.contains('/') {
+    let host = url.strip_prefix("http://").unwrap_or(url);
+    let (host, key) = host.split_once("/enter?key=").unwrap_or((host, ""));
+    let host = host.trim_end_matches('/');
+    if host.contains('/') || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
         bail!("'{url}' is not the address of a page; write http://HOST:PORT");
     }
     let with_port = if host.rsplit(']').next().is_some_and(|tail| tail.contains(':')) {
@@ -124,8 +126,12 @@ fn get(url: &str, path: &str) -> Result<(u16, String)> {
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     // HTTP/1.0: the answer ends with the connection.
-    write!(stream, "GET {path} HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n")
-        .with_context(no_server)?;
+    let cookie = if key.is_empty() { String::new() } else { format!("Cookie: {COOKIE}={key}\r\n") };
+    write!(
+        stream,
+        "GET {path} HTTP/1.0\r\nHost: {host}\r\n{cookie}Accept: application/json\r\n\r\n"
+    )
+    .with_context(no_server)?;
     let mut answer = String::new();
     stream.take(MOST_BYTES).read_to_string(&mut answer).with_context(no_server)?;
     let (head, body) = answer.split_once("\r\n\r\n").with_context(no_server)?;
@@ -302,6 +308,8 @@ const REASONS: [(&str, &str); 8] = [
     ("unasked", "a newer one was decoded before the plugin, idle, had asked"),
     ("overrun", "a newer one was decoded while the plugin was still at an earlier one"),
 ];
+/// What the page keeps a key in.
+const COOKIE: &str = "vizflyt_key";
 /// Columns of the longest bar.
 const BAR: f32 = 40.0;
 /// A server on the other side of the lab answers within this.
@@ -379,6 +387,8 @@ mod tests {
         let error = get("http://127.0.0.1:1", "/").unwrap_err();
         assert!(error.to_string().contains("no server answers at http://127.0.0.1:1"), "{error}");
         let error = get("http://127.0.0.1:1/page", "/").unwrap_err();
+        assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
+        let error = get("http://127.0.0.1:1/enter?key=a\r\nb", "/").unwrap_err();
         assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
                        "images": [], "connection": null}"#;
