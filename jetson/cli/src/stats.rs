@@ -240,7 +240,7 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
         clock.drift_ppm,
         clock.drift_bound_ppm
     );
-    if clock.steps + u32::try_from(clamped + out_of_bound).unwrap_or(u32::MAX) > 0 {
+    if clock.steps > 0 || clamped > 0 || out_of_bound > 0 {
         let _ = writeln!(
             out,
             "            was set {} times; {clamped} images seemed to arrive before they were sent, by \
