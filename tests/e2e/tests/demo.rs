@@ -114,7 +114,8 @@ fn check_timing(report: &Value) {
         assert!(number(&times["max"]) > 0.0, "{stage}: {report:#}");
         assert!(number(&times["p50"]) <= number(&times["p99"]), "{stage}: {report:#}");
     }
-    assert!(number(&report["total"]["p50"]) > number(&report["age"]["p50"]));
+    // Of other images: only those in the air are answered by a setpoint.
+    assert!(number(&report["total"]["p50"]) > 0.0 && number(&report["age"]["p50"]) > 0.0);
     // Server and runtime read the same clock here.
     let clock = &report["clock"];
     let off_ms = number(&clock["offset_ns"]).abs() * 1e-6;
