@@ -26,7 +26,7 @@ pub(crate) struct StatsArgs {
     /// A flight's log; without it a running server is asked
     #[arg(value_name = "FLIGHT.mcap", conflicts_with_all = ["page", "vehicle", "watch"])]
     flight: Option<PathBuf>,
-    /// The server's page; from another computer the link with its key, as the server prints it
+    /// The server's page
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
     page: String,
     /// The vehicle; the server's first one without
@@ -103,10 +103,8 @@ fn parse(json: &str) -> Result<Answer> {
 
 /// Gets `path` from the page at `url`; returns status and body.
 fn get(url: &str, path: &str) -> Result<(u16, String)> {
-    let host = url.strip_prefix("http://").unwrap_or(url);
-    let (host, key) = host.split_once("/enter?key=").unwrap_or((host, ""));
-    let host = host.trim_end_matches('/');
-    if host.contains('/') || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
+    let host = url.strip_prefix("http://").unwrap_or(url).trim_end_matches('/');
+    if host.contains('/') {
         bail!("'{url}' is not the address of a page; write http://HOST:PORT");
     }
     let with_port = if host.rsplit(']').next().is_some_and(|tail| tail.contains(':')) {
@@ -126,12 +124,8 @@ fn get(url: &str, path: &str) -> Result<(u16, String)> {
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     // HTTP/1.0: the answer ends with the connection.
-    let cookie = if key.is_empty() { String::new() } else { format!("Cookie: {COOKIE}={key}\r\n") };
-    write!(
-        stream,
-        "GET {path} HTTP/1.0\r\nHost: {host}\r\n{cookie}Accept: application/json\r\n\r\n"
-    )
-    .with_context(no_server)?;
+    write!(stream, "GET {path} HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n")
+        .with_context(no_server)?;
     let mut answer = String::new();
     stream.take(MOST_BYTES).read_to_string(&mut answer).with_context(no_server)?;
     let (head, body) = answer.split_once("\r\n\r\n").with_context(no_server)?;
@@ -240,7 +234,7 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
         clock.drift_ppm,
         clock.drift_bound_ppm
     );
-    if clock.steps > 0 || clamped > 0 || out_of_bound > 0 {
+    if clock.steps + u32::try_from(clamped + out_of_bound).unwrap_or(u32::MAX) > 0 {
         let _ = writeln!(
             out,
             "            was set {} times; {clamped} images seemed to arrive before they were sent, by \
@@ -308,8 +302,6 @@ const REASONS: [(&str, &str); 8] = [
     ("unasked", "a newer one was decoded before the plugin, idle, had asked"),
     ("overrun", "a newer one was decoded while the plugin was still at an earlier one"),
 ];
-/// What the page keeps a key in.
-const COOKIE: &str = "vizflyt_key";
 /// Columns of the longest bar.
 const BAR: f32 = 40.0;
 /// A server on the other side of the lab answers within this.
@@ -387,8 +379,6 @@ mod tests {
         let error = get("http://127.0.0.1:1", "/").unwrap_err();
         assert!(error.to_string().contains("no server answers at http://127.0.0.1:1"), "{error}");
         let error = get("http://127.0.0.1:1/page", "/").unwrap_err();
-        assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
-        let error = get("http://127.0.0.1:1/enter?key=a\r\nb", "/").unwrap_err();
         assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
                        "images": [], "connection": null}"#;

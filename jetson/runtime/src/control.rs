@@ -22,11 +22,10 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
-use tokio::sync::mpsc;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
     ArenaInfo, Arrivals, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, MAX_CAMERAS,
-    PoseSample, Setpoint, Telemetry, ToPlugin, ToServer, YawTarget, bounded,
+    PoseSample, Setpoint, Telemetry, ToPlugin, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
@@ -41,7 +40,7 @@ use crate::log::{Channel, FlightLog};
 use crate::report::Counters;
 use crate::stats::ImageTimes;
 use crate::steering::Steering;
-use crate::stream::{Shared, StreamEvent};
+use crate::stream::{Outbox, Shared, StreamEvent};
 use crate::supervisor::{PluginEvent, Stream, Supervisor};
 
 /// Something another thread tells the control loop.
@@ -87,7 +86,7 @@ pub struct Control {
     /// Clock and mailbox of the stream.
     pub shared: Shared,
     /// To the server.
-    pub to_server: mpsc::Sender<ToServer>,
+    pub to_server: Arc<Outbox>,
     /// The log.
     pub log: FlightLog,
     /// Prints events as JSON.
@@ -395,7 +394,7 @@ impl Loop {
         self.control.log.write(Channel::PluginOutput, now, &record);
         let stamp = self.control.shared.clock.to_server(now);
         let event = Event { stamp, kind: EventKind::PluginOutput, text: bounded(line) };
-        self.send(ToServer::Event(event));
+        self.control.to_server.tell(event);
     }
 
     // ---- the plugin ----
@@ -489,7 +488,7 @@ impl Loop {
             let event = Event { stamp, kind: notice.kind, text };
             tracing::info!(target: "flight", "{}", notice.text);
             self.publish_event(now, &event);
-            self.send(ToServer::Event(event));
+            self.control.to_server.tell(event);
         }
     }
 
@@ -510,11 +509,6 @@ impl Loop {
         }
     }
 
-    fn send(&self, message: ToServer) {
-        // Full: the server is away. Reports are stale by the time it is back.
-        let _ = self.control.to_server.try_send(message);
-    }
-
     fn report(&mut self, now: HostTime) {
         let replaced = self.control.shared.mailbox.replaced();
         let telemetry = Telemetry {
@@ -526,14 +520,14 @@ impl Loop {
             mavlink_packets: self.link.packets(),
         };
         self.control.log.write(Channel::Telemetry, now, &telemetry);
-        self.send(ToServer::Telemetry(telemetry));
+        self.control.to_server.report(telemetry);
     }
 
     fn report_timing(&mut self, now: HostTime) {
         let clock = self.control.shared.clock.state(now);
         let timing = self.times.timing(now, clock, &self.arrived());
         self.control.log.write(Channel::Timing, now, &timing);
-        self.send(ToServer::Timing(timing));
+        self.control.to_server.report_timing(timing);
     }
 
     /// Returns what became of images before they reached shared memory, by camera.

@@ -8,14 +8,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
-use vizflyt_protocol::messages::bounded;
+use vizflyt_protocol::messages::{Purpose, bounded};
 
 use crate::args::FlyArgs;
 use crate::control::{Control, Happening, QUEUE, print_line};
@@ -23,10 +22,10 @@ use crate::flight::{FlightSettings, Outcome};
 use crate::link::udp::{Partner, UdpPort};
 use crate::log::FlightLog;
 use crate::report::Report;
-use crate::stream::{self, Mailbox, ServerClock, Shared, StreamEvent, StreamSettings};
+use crate::stream::{self, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
 
-/// Messages to the server that wait at most: some seconds of telemetry and a burst of output.
-const TO_SERVER: usize = 256;
+/// How long the last events may take to reach the server.
+const GOODBYE: Duration = Duration::from_millis(500);
 /// Exit status when a second signal cuts the landing short: 128 + SIGINT, as shells have it.
 const CUT_SHORT: i32 = 130;
 
@@ -65,15 +64,19 @@ pub fn fly_command(
 
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let shared = Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
-    let (to_server, outbox) = mpsc::channel(TO_SERVER);
+    let to_server = Arc::new(Outbox::default());
     watch_signals(&tokio, sender.clone())?;
     let settings = StreamSettings {
         server: args.server.at.address,
         fingerprint,
         identity,
         vehicle: bounded(&args.vehicle),
+        purpose: Purpose::Fly,
+        program: bounded(concat!("vizflyt-runtime ", env!("CARGO_PKG_VERSION"))),
     };
-    tokio.spawn(stream::run(settings, shared.clone(), outbox, tell_stream(sender.clone())));
+    let outbox = Arc::clone(&to_server);
+    let talk = stream::run(settings, shared.clone(), to_server, tell_stream(sender.clone()));
+    let talk = tokio.spawn(talk);
     print_ready(args, port.local_addr()?, &log);
 
     let control = Control {
@@ -82,7 +85,7 @@ pub fn fly_command(
         port,
         partner: Partner::new(args.mavlink, Instant::now()),
         shared,
-        to_server,
+        to_server: Arc::clone(&outbox),
         log,
         json: args.json,
     };
@@ -92,8 +95,10 @@ pub fn fly_command(
     let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
     report.log = flown.log.path().map(|path| path.display().to_string());
     drop(flown.log);
-    // The stream task says goodbye to the server on its way out.
-    tokio.shutdown_timeout(std::time::Duration::from_millis(300));
+    // The stream ends when the server has heard every event, and says goodbye on its way out.
+    outbox.close();
+    let _ = tokio.block_on(async { tokio::time::timeout(GOODBYE, talk).await });
+    tokio.shutdown_background();
     print_outcome(args, &report);
     if let Some(file) = &args.report {
         let text = serde_json::to_string_pretty(&report)?;
@@ -163,14 +168,15 @@ fn watch_stdin(sender: SyncSender<Happening>) -> std::io::Result<()> {
     Ok(())
 }
 
-fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) + Send + Sync {
+fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) -> bool + Send + Sync {
     move |event| {
         let is_pose = matches!(event, StreamEvent::Pose(..));
-        // Poses are many and stale soon. The rest must arrive; the queue is long enough for a
-        // stalled loop to take it before the network's own buffers fill.
-        if sender.try_send(Happening::Stream(event)).is_err() && !is_pose {
-            tracing::error!("control loop stalled; an event of the server was lost");
+        // Poses are many and stale soon. An event that finds no room is told again by the server.
+        let taken = sender.try_send(Happening::Stream(event)).is_ok();
+        if !taken && !is_pose {
+            tracing::error!("the control loop is stalled");
         }
+        taken
     }
 }
 

@@ -9,7 +9,7 @@
 
 use vizflyt_protocol::histogram::Histogram;
 use vizflyt_protocol::messages::{INTERVAL_EDGES_MS, Intervals, Stage, Stages, Waterfall};
-use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::HostTime;
 use zerocopy::byteorder::little_endian::U64;
 
@@ -50,7 +50,12 @@ enum Causality {
 impl Stamps {
     /// Takes the server's stamps of an image whose pose was measured at `pose`, and when its first
     /// byte came, its last byte came, and it was decoded. Trusts the clocks for now.
-    pub fn of(header: &ImageHeader, pose: HostTime, own: [HostTime; 3]) -> Self {
+    pub fn of(
+        header: &ImageHeader,
+        trailer: &ImageTrailer,
+        pose: HostTime,
+        own: [HostTime; 3],
+    ) -> Self {
         let [receive_first, receive, decode_end] = own;
         let mut last = pose;
         // All of them are off by the same as the pose. One that the server did not set is zero:
@@ -67,8 +72,8 @@ impl Stamps {
             pose,
             render_start: host(header.render_start_ns),
             render_end: host(header.render_end_ns),
-            encode_end: host(header.encode_end_ns),
-            send: host(header.send_ns),
+            encode_end: host(trailer.encode_end_ns),
+            send: host(trailer.send_ns),
             receive_first,
             receive,
             decode_end,
@@ -301,8 +306,8 @@ mod tests {
         let mut header = ImageHeader::new(1, 3, stamp, &k, &Pose::IDENTITY, &Pose::IDENTITY);
         header.render_start_ns = 78_000.into();
         header.render_end_ns = 80_000.into();
-        header.send_ns = 85_000.into();
-        let found = Stamps::of(&header, us(100), [us(110), us(111), us(112)]);
+        let trailer = ImageTrailer::new(0, ServerTime::ZERO, ServerTime::from_ns(85_000));
+        let found = Stamps::of(&header, &trailer, us(100), [us(110), us(111), us(112)]);
         let host = |us_: u64| us(100 + us_);
         assert_eq!((found.camera, found.pose), (3, us(100)));
         assert_eq!([found.render_start, found.render_end], [host(1), host(3)]);

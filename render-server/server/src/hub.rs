@@ -20,6 +20,8 @@ use crate::vehicle::Vehicle;
 /// Shared state of all vehicles in one arena.
 #[derive(Debug)]
 pub struct Hub {
+    /// Drawn by lot at the start: a runtime tells by it that the server was restarted.
+    pub boot: u64,
     /// The vehicles served, each at its index; at least one, at most [`MAX_VEHICLES`].
     pub vehicles: Vec<Arc<Vehicle>>,
     /// Which renderer draws, and why; it may give way to another in flight.
@@ -48,6 +50,7 @@ impl Hub {
     pub fn new(vehicles: Vec<Vehicle>, renderer: RendererInfo, stop: Stop) -> Self {
         let cameras: Vec<_> = vehicles.iter().map(|vehicle| vehicle.previews.len()).collect();
         Self {
+            boot: lot(),
             vehicles: vehicles.into_iter().map(Arc::new).collect(),
             renderer: Mutex::new(renderer),
             stop,
@@ -83,6 +86,13 @@ impl Hub {
     pub fn report(&self) -> Report {
         self.stats.report(&self.vehicles, *lock(&self.source), &lock(&self.renderer))
     }
+}
+
+/// Returns a number that no other run has drawn, as good as certainly; never 0.
+fn lot() -> u64 {
+    use std::hash::{BuildHasher, RandomState};
+    // Keyed by the system's randomness.
+    RandomState::new().hash_one(std::process::id()) | 1
 }
 
 /// Locks, also where a thread has panicked: every value kept here is valid at any time.

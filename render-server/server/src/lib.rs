@@ -12,6 +12,7 @@
 
 pub mod accounts;
 pub mod args;
+mod berth;
 pub mod cameras;
 pub mod clock;
 pub mod dashboard;
@@ -29,6 +30,7 @@ pub mod previews;
 pub mod render;
 pub mod scene;
 mod serve;
+pub mod slices;
 pub mod stats;
 pub mod stop;
 pub mod tick;

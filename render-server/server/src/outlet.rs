@@ -1,38 +1,35 @@
 //! Who wants images at this moment, and the way out to them.
 //!
-//! A runtime's session opens its vehicle's way out; for each camera at most K images may be in flight
-//! (handed to the transport, not yet acknowledged). Viewers of the page are counted. The render
-//! thread rests while nobody wants anything; the encode thread takes the newest drawn tick only
-//! when a camera has room, so that what waits is always the newest, and nothing is encoded that
-//! could not leave. Buffers come back through [`Outlet::recycle`].
+//! A vehicle's images go to its runtime and to any number of watchers, at most [`MOST_WATCHERS`].
+//! For each camera at most K images may be in flight to each of them (handed to the transport, not
+//! yet acknowledged). The encode thread takes the newest drawn tick only when someone has room, so
+//! that what waits is always the newest, and nothing is encoded that could not leave; an image is
+//! encoded once, for all who have room ([`Outlet::begin`]).
+//!
+//! Watchers never delay the runtime: while one flies, its watchers get the images that it gets.
+//! Only if it has had no room for [`STALLED_S`] are images encoded for them alone.
+//!
+//! Viewers of the page are counted. The render thread rests while nobody wants anything.
 
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::mpsc;
-use vizflyt_protocol::messages::MAX_CAMERAS;
+use bytes::Bytes;
+use vizflyt_protocol::messages::{MAX_CAMERAS, Purpose};
 use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::ServerTime;
 
+pub use crate::berth::{Berth, Part};
+use crate::clock;
 use crate::hub::MAX_VEHICLES;
-
-/// One encoded image on its way to the session.
-#[derive(Debug)]
-pub struct Outgoing {
-    /// Index of the vehicle.
-    pub vehicle: usize,
-    /// Index into the vehicle's cameras.
-    pub camera: usize,
-    /// Goes before the bitstream.
-    pub header: ImageHeader,
-    /// The bitstream.
-    pub payload: Vec<u8>,
-}
 
 /// What the encode thread may do now.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// By vehicle and camera: the session has room for an image.
+    /// By vehicle and camera: someone has room for an image.
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
+    /// By vehicle and camera: the runtime has room for an image.
+    pub fly: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
     /// No runtime wants anything, but a page does: drawn ticks go on to the previews.
     pub pass_on: bool,
 }
@@ -49,7 +46,6 @@ impl Wanted {
 pub struct Outlet {
     state: Mutex<State>,
     changed: Condvar,
-    buffers: Mutex<Vec<Vec<u8>>>,
 }
 
 #[derive(Debug, Default)]
@@ -62,26 +58,88 @@ struct State {
 #[derive(Debug, Default)]
 struct Way {
     cameras: usize,
-    session: Option<Session>,
+    subscribers: Vec<Subscriber>,
     viewers: u32,
 }
 
-impl Way {
-    fn session(&mut self, id: u64) -> Option<&mut Session> {
-        self.session.as_mut().filter(|session| session.id == id)
+/// A session that gets images.
+#[derive(Debug)]
+struct Subscriber {
+    id: u64,
+    purpose: Purpose,
+    allowed: u32,
+    cameras: Vec<Berths>,
+}
+
+/// The images of one camera in flight to one subscriber.
+#[derive(Debug)]
+struct Berths {
+    all: Vec<Arc<Berth>>,
+    /// Bit per place that is taken.
+    taken: u8,
+    /// When the last free place was taken.
+    full_since: ServerTime,
+}
+
+/// The places of a subscriber's images, by camera, [`MOST_IN_FLIGHT`] of each.
+pub type Places = Vec<Vec<Arc<Berth>>>;
+
+/// An image on its way to all who had room when it began. Reused from image to image.
+#[derive(Debug, Default)]
+pub struct Broadcast {
+    vehicle: usize,
+    camera: usize,
+    to: Vec<(u64, usize, Arc<Berth>)>,
+}
+
+impl Broadcast {
+    /// Whether nobody had room.
+    pub fn is_empty(&self) -> bool {
+        self.to.is_empty()
     }
 
-    fn is_wanted(&self) -> bool {
-        self.session.is_some() || self.viewers > 0
+    /// Hands the next bytes of bitstream to everyone.
+    pub fn push(&self, bytes: &Bytes) {
+        for (.., berth) in &self.to {
+            berth.push(bytes.clone());
+        }
     }
 }
 
-#[derive(Debug)]
-struct Session {
-    id: u64,
-    allowed: u32,
-    in_flight: [u32; MAX_CAMERAS],
-    images: mpsc::UnboundedSender<Outgoing>,
+impl Way {
+    fn subscriber(&mut self, id: u64) -> Option<&mut Subscriber> {
+        self.subscribers.iter_mut().find(|subscriber| subscriber.id == id)
+    }
+
+    fn is_wanted(&self) -> bool {
+        !self.subscribers.is_empty() || self.viewers > 0
+    }
+
+    fn has_watcher(&self) -> bool {
+        self.subscribers.iter().any(|subscriber| subscriber.purpose == Purpose::Watch)
+    }
+
+    /// Returns whether an image of this camera may be encoded for the runtime, and for anyone.
+    fn room(&self, camera: usize, now: ServerTime) -> (bool, bool) {
+        let has_room = |subscriber: &Subscriber| subscriber.room(camera).is_some();
+        let is_watcher = |subscriber: &&Subscriber| subscriber.purpose == Purpose::Watch;
+        let watchers = self.subscribers.iter().filter(is_watcher).any(has_room);
+        let runtime = self.subscribers.iter().find(|s| s.purpose == Purpose::Fly);
+        let Some(runtime) = runtime else { return (false, watchers) };
+        let fly = has_room(runtime);
+        let stalled = |berths: &Berths| now.seconds_since(berths.full_since) > STALLED_S;
+        let is_stalled = !fly && runtime.cameras.get(camera).is_some_and(stalled);
+        (fly, fly || (watchers && is_stalled))
+    }
+}
+
+impl Subscriber {
+    /// Returns the number of a free place.
+    fn room(&self, camera: usize) -> Option<usize> {
+        let berths = self.cameras.get(camera)?;
+        let free = (!berths.taken).trailing_zeros() as usize;
+        (berths.taken.count_ones() < self.allowed && free < berths.all.len()).then_some(free)
+    }
 }
 
 impl Outlet {
@@ -90,78 +148,93 @@ impl Outlet {
     pub fn new(cameras: &[usize]) -> Self {
         let way = |&cameras: &usize| Way { cameras: cameras.min(MAX_CAMERAS), ..Way::default() };
         let vehicles = cameras.iter().take(MAX_VEHICLES).map(way).collect();
-        Self {
-            state: Mutex::new(State { vehicles, closed: false }),
-            changed: Condvar::new(),
-            buffers: Mutex::default(),
-        }
+        Self { state: Mutex::new(State { vehicles, closed: false }), changed: Condvar::new() }
     }
 
-    /// Lets images flow to session `id` of a vehicle, at most `allowed` in flight per camera, in place of any
-    /// earlier session. The channel holds no more than that, for the count bounds it.
-    pub fn open(&self, vehicle: usize, id: u64, allowed: u32) -> mpsc::UnboundedReceiver<Outgoing> {
-        let (images, receiver) = mpsc::unbounded_channel();
-        let session = Session { id, allowed, in_flight: [0; MAX_CAMERAS], images };
-        self.lock().vehicles[vehicle].session = Some(session);
+    /// Lets images flow to session `id` of a vehicle, at most `allowed` in flight per camera; a
+    /// runtime takes the place of an earlier one. Returns where they will be.
+    pub fn open(&self, vehicle: usize, id: u64, purpose: Purpose, allowed: u32) -> Places {
+        let mut state = self.lock();
+        let way = &mut state.vehicles[vehicle];
+        if purpose == Purpose::Fly {
+            way.subscribers.retain(|subscriber| subscriber.purpose != Purpose::Fly);
+        }
+        let places = |_| (0..MOST_IN_FLIGHT).map(|_| Arc::default()).collect::<Vec<_>>();
+        let all: Places = (0..way.cameras).map(places).collect();
+        let berths = |all| Berths { all, taken: 0, full_since: ServerTime::ZERO };
+        let cameras = all.iter().cloned().map(berths).collect();
+        way.subscribers.push(Subscriber { id, purpose, allowed, cameras });
+        drop(state);
         self.changed.notify_all();
-        receiver
+        all
     }
 
     /// Stops the flow to session `id` of a vehicle.
     pub fn close(&self, vehicle: usize, id: u64) {
-        self.lock().vehicles[vehicle].session.take_if(|session| session.id == id);
+        self.lock().vehicles[vehicle].subscribers.retain(|subscriber| subscriber.id != id);
+        self.changed.notify_all();
     }
 
     /// Sets how many images of each camera session `id` of a vehicle may have in flight.
     pub fn allow(&self, vehicle: usize, id: u64, allowed: u32) {
-        if let Some(session) = self.lock().vehicles[vehicle].session(id) {
-            session.allowed = allowed;
+        if let Some(subscriber) = self.lock().vehicles[vehicle].subscriber(id) {
+            subscriber.allowed = allowed;
         }
         self.changed.notify_all();
     }
 
-    /// Hands an image to the session; returns whether there is one.
-    pub fn send(&self, image: Outgoing) -> bool {
+    /// Begins an image of a vehicle's camera, which leaves with this priority, to all watchers with
+    /// room, and to the runtime if it has and `to_runtime`. [`Self::end`] comes after it.
+    pub fn begin(
+        &self,
+        (vehicle, camera): (usize, usize),
+        header: ImageHeader,
+        priority: i32,
+        to_runtime: bool,
+        broadcast: &mut Broadcast,
+    ) {
+        broadcast.to.clear();
+        (broadcast.vehicle, broadcast.camera) = (vehicle, camera);
         let mut state = self.lock();
-        let refused = match &mut state.vehicles[image.vehicle].session {
-            Some(session) => {
-                session.in_flight[image.camera] += 1;
-                session.images.send(image).err().map(|error| error.0)
+        let Some(way) = state.vehicles.get_mut(vehicle) else { return };
+        for subscriber in &mut way.subscribers {
+            if subscriber.purpose == Purpose::Fly && !to_runtime {
+                continue;
             }
-            None => Some(image),
-        };
-        drop(state);
-        match refused {
-            Some(image) => {
-                self.recycle(image.payload);
-                false
+            let Some(free) = subscriber.room(camera) else { continue };
+            let berths = &mut subscriber.cameras[camera];
+            berths.taken |= 1 << free;
+            if berths.taken.count_ones() >= subscriber.allowed {
+                berths.full_since = clock::now();
             }
-            None => true,
+            berths.all[free].begin(header, priority);
+            broadcast.to.push((subscriber.id, free, berths.all[free].clone()));
         }
     }
 
-    /// Tells that an image of session `id` of a vehicle is no longer in flight.
-    pub fn landed(&self, vehicle: usize, id: u64, camera: usize) {
-        if let Some(session) = self.lock().vehicles[vehicle].session(id) {
-            session.in_flight[camera] = session.in_flight[camera].saturating_sub(1);
+    /// Ends the image: all its bytes were handed over, or with `None` no more will come.
+    pub fn end(&self, broadcast: &mut Broadcast, encode_end: Option<ServerTime>) {
+        let (vehicle, camera) = (broadcast.vehicle, broadcast.camera);
+        for (id, place, berth) in broadcast.to.drain(..) {
+            if berth.end(encode_end) {
+                self.free(vehicle, camera, id, place);
+            }
+        }
+    }
+
+    /// Tells that nothing more of the image in a place of session `id` will be sent: it was
+    /// acknowledged or given up.
+    pub fn landed(&self, vehicle: usize, camera: usize, id: u64, place: usize, berth: &Berth) {
+        if berth.let_go() {
+            self.free(vehicle, camera, id, place);
+        }
+    }
+
+    fn free(&self, vehicle: usize, camera: usize, id: u64, place: usize) {
+        if let Some(subscriber) = self.lock().vehicles[vehicle].subscriber(id) {
+            subscriber.cameras[camera].taken &= !(1 << place);
         }
         self.changed.notify_all();
-    }
-
-    /// Returns an empty buffer to encode into.
-    pub fn buffer(&self) -> Vec<u8> {
-        let mut buffers = self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut buffer = buffers.pop().unwrap_or_default();
-        buffer.clear();
-        buffer
-    }
-
-    /// Gives a buffer back.
-    pub fn recycle(&self, buffer: Vec<u8>) {
-        let mut buffers = self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
-        if buffers.len() < MOST_BUFFERS {
-            buffers.push(buffer);
-        }
     }
 
     /// Counts a viewer of a vehicle's page until [`Self::viewer_left`].
@@ -204,27 +277,29 @@ impl Outlet {
         wanted
     }
 
-    /// Waits at most `timeout` until an image may be encoded: a session has room for one, or there
-    /// is none but a page that wants previews. Returns for whom.
+    /// Waits at most `timeout` until an image may be encoded: someone has room for one, or there is
+    /// nobody but a page that wants previews. Returns for whom.
     pub fn wait_for_room(&self, timeout: Duration) -> Wanted {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
         loop {
-            let now = Instant::now();
             let mut wanted = Wanted::default();
             let ways = &state.vehicles;
             wanted.pass_on = ways.iter().any(|way| way.viewers > 0)
-                && ways.iter().all(|way| way.session.is_none());
+                && ways.iter().all(|way| way.subscribers.is_empty());
+            let stamp = clock::now();
             for (vehicle, way) in ways.iter().enumerate() {
-                let Some(session) = &way.session else { continue };
                 for camera in 0..way.cameras {
-                    wanted.stream[vehicle][camera] = session.in_flight[camera] < session.allowed;
+                    (wanted.fly[vehicle][camera], wanted.stream[vehicle][camera]) =
+                        way.room(camera, stamp);
                 }
             }
-            if state.closed || wanted.anything() || now >= deadline {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if state.closed || wanted.anything() || left.is_zero() {
                 return if state.closed { Wanted::default() } else { wanted };
             }
-            let left = deadline.saturating_duration_since(now);
+            // Nobody wakes us when a runtime has stalled for long enough.
+            let left = if ways.iter().any(Way::has_watcher) { left.min(GLANCE) } else { left };
             state =
                 self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
         }
@@ -242,45 +317,51 @@ impl Outlet {
     }
 }
 
-/// More than K of every camera of a usual vehicle.
-const MOST_BUFFERS: usize = 16;
+/// 100 ms of round trip at 70 Hz; more would only queue.
+pub const MOST_IN_FLIGHT: u32 = 8;
+/// A class that looks on; each costs a connection and its share of the network.
+pub const MOST_WATCHERS: usize = 8;
+/// The transport gives an image up after as long. [s]
+const STALLED_S: f64 = 0.15;
+/// How late a stalled runtime is noticed at most.
+const GLANCE: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
-    use vizflyt_protocol::time::ServerTime;
 
     const LONG: Duration = Duration::from_secs(30);
     const NOT_YET: Duration = Duration::from_millis(1);
 
-    fn image(outlet: &Outlet, camera: usize) -> Outgoing {
+    fn header(camera: usize) -> ImageHeader {
         let k = Intrinsics::from_horizontal_fov(4, 3, 1.0);
-        let header = ImageHeader::new(
-            1,
-            camera as u8,
-            ServerTime::ZERO,
-            &k,
-            &Pose::IDENTITY,
-            &Pose::IDENTITY,
-        );
-        Outgoing { vehicle: 0, camera, header, payload: outlet.buffer() }
+        let body_from_cam = Pose::IDENTITY;
+        let pose = ServerTime::ZERO;
+        ImageHeader::new(1, camera as u8, pose, &k, &body_from_cam, &Pose::IDENTITY)
+    }
+
+    /// Encodes an image of vehicle 0; returns to how many it goes.
+    fn send(outlet: &Outlet, camera: usize) -> usize {
+        let mut broadcast = Broadcast::default();
+        outlet.begin((0, camera), header(camera), 0, true, &mut broadcast);
+        broadcast.push(&Bytes::from_static(b"slice"));
+        let count = broadcast.to.len();
+        outlet.end(&mut broadcast, Some(ServerTime::from_ns(9)));
+        count
     }
 
     #[test]
     fn at_most_k_images_of_each_camera_are_in_flight() {
         let outlet = Outlet::new(&[2]);
         assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
-        let mut images = outlet.open(0, 7, 2);
-        assert!(outlet.send(image(&outlet, 0)));
-        assert!(outlet.send(image(&outlet, 0)));
+        let places = outlet.open(0, 7, Purpose::Fly, 2);
+        assert_eq!((send(&outlet, 0), send(&outlet, 0), send(&outlet, 0)), (1, 1, 0));
         let wanted = outlet.wait_for_room(LONG);
         assert_eq!(wanted.stream[0][..2], [false, true], "camera 1 is not held up by camera 0");
-        outlet.send(image(&outlet, 1));
-        outlet.send(image(&outlet, 1));
+        assert_eq!((send(&outlet, 1), send(&outlet, 1)), (1, 1));
         assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
-        assert_eq!(images.try_recv().unwrap().camera, 0);
-        outlet.landed(0, 7, 0);
+        outlet.landed(0, 0, 7, 1, &places[0][1]);
         assert_eq!(outlet.wait_for_room(LONG).stream[0][..2], [true, false]);
         outlet.allow(0, 7, 3);
         assert_eq!(outlet.wait_for_room(LONG).stream[0][..2], [true, true]);
@@ -289,17 +370,62 @@ mod tests {
     #[test]
     fn an_old_session_does_not_disturb_a_new_one() {
         let outlet = Outlet::new(&[1]);
-        let _old = outlet.open(0, 1, 1);
-        outlet.send(image(&outlet, 0));
-        let _new = outlet.open(0, 2, 1);
-        outlet.send(image(&outlet, 0));
-        outlet.landed(0, 1, 0);
+        let old = outlet.open(0, 1, Purpose::Fly, 1);
+        send(&outlet, 0);
+        let new = outlet.open(0, 2, Purpose::Fly, 1);
+        send(&outlet, 0);
+        outlet.landed(0, 0, 1, 0, &old[0][0]);
         outlet.close(0, 1);
         assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
-        outlet.landed(0, 2, 0);
+        outlet.landed(0, 0, 2, 0, &new[0][0]);
         assert!(outlet.wait_for_room(LONG).stream[0][0]);
         outlet.close(0, 2);
-        assert!(!outlet.send(image(&outlet, 0)));
+        assert_eq!(send(&outlet, 0), 0);
+    }
+
+    #[tokio::test]
+    async fn an_image_goes_out_while_it_is_being_made_and_to_all_at_once() {
+        let outlet = Outlet::new(&[1]);
+        let places = [(1, Purpose::Fly), (2, Purpose::Watch), (3, Purpose::Watch)]
+            .map(|(id, purpose)| outlet.open(0, id, purpose, 1));
+        let mut broadcast = Broadcast::default();
+        outlet.begin((0, 0), header(0), -3, true, &mut broadcast);
+        let slice = Bytes::from(vec![1; 100]);
+        broadcast.push(&slice);
+        for places in &places {
+            assert_eq!(places[0][0].image().await, (header(0), -3));
+            let Part::Bytes(bytes) = places[0][0].part().await else { panic!("no bytes") };
+            assert_eq!(bytes.as_ptr(), slice.as_ptr(), "not a copy");
+        }
+        // One gives up before the end: its place is free only when the encoder is done with it.
+        outlet.landed(0, 0, 1, 0, &places[0][0][0]);
+        assert!(!outlet.wait_for_room(NOT_YET).fly[0][0]);
+        broadcast.push(&slice);
+        outlet.end(&mut broadcast, None);
+        assert!(outlet.wait_for_room(LONG).fly[0][0]);
+        assert!(matches!(places[1][0][0].part().await, Part::Bytes(_)));
+        assert_eq!(places[1][0][0].part().await, Part::Cut);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn watchers_get_what_the_runtime_gets_unless_it_has_stalled() {
+        let outlet = Outlet::new(&[1]);
+        let watcher = outlet.open(0, 2, Purpose::Watch, 1);
+        let wanted = outlet.wait_for_room(LONG);
+        assert!(wanted.stream[0][0] && !wanted.fly[0][0], "nobody flies");
+        let runtime = outlet.open(0, 1, Purpose::Fly, 1);
+        assert_eq!(send(&outlet, 0), 2);
+        // The watcher is slow: the runtime does not wait for it.
+        outlet.landed(0, 0, 1, 0, &runtime[0][0]);
+        assert!(outlet.wait_for_room(LONG).fly[0][0]);
+        assert_eq!(send(&outlet, 0), 1);
+        // The runtime is slow: nothing is encoded for the watcher alone.
+        outlet.landed(0, 0, 2, 0, &watcher[0][0]);
+        assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default());
+        tokio::time::advance(Duration::from_millis(200)).await;
+        let wanted = outlet.wait_for_room(LONG);
+        assert!(wanted.stream[0][0] && !wanted.fly[0][0]);
+        assert_eq!(send(&outlet, 0), 1);
     }
 
     #[test]
@@ -309,9 +435,9 @@ mod tests {
         outlet.viewer_came(0);
         assert!(outlet.wait_for_interest(LONG)[0]);
         assert!(outlet.wait_for_room(LONG).pass_on && outlet.watched()[0]);
-        let images = outlet.open(0, 1, 0);
+        let places = outlet.open(0, 1, Purpose::Fly, 0);
         assert_eq!(outlet.wait_for_room(NOT_YET), Wanted::default(), "no room, and no ticks lost");
-        drop(images);
+        drop(places);
         outlet.close(0, 1);
         assert!(outlet.wait_for_room(LONG).pass_on);
         outlet.viewer_left(0);

@@ -14,8 +14,8 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::{Notify, watch};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, Hello, MAX_CAMERAS, Name, PoseSample,
-    Telemetry, Text, Timing, bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, HeardEvents, Hello, MAX_CAMERAS, Name,
+    PoseSample, Telemetry, Text, Timing, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -25,6 +25,7 @@ use crate::clock;
 use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
+use crate::outlet::MOST_WATCHERS;
 use crate::previews::Preview;
 use crate::stats::{CameraAccount, Connection};
 
@@ -92,6 +93,11 @@ struct SeatState {
     connection: Option<(quinn::Connection, ServerTime)>,
     /// Index of the first event of the present flight.
     flight_start: u64,
+    /// Drawn by lot by the runtime that sits, or sat last.
+    boot: u64,
+    /// What was heard of its events.
+    heard: HeardEvents,
+    watchers: usize,
     /// How many flights have begun; the pose thread starts its referee anew with each.
     flights: u64,
 }
@@ -251,8 +257,9 @@ impl Vehicle {
     /// Gives the seat of the vehicle to a runtime.
     ///
     /// A runtime that has been silent for [`SILENT_S`] loses it to the newcomer: it is the same
-    /// one after an outage, or it is dead. If the former flight was under way, the newcomer is
-    /// told everything since that flight's start, so that no collision is lost with a connection.
+    /// one after an outage, or it is dead. If the former flight was under way, or the newcomer is
+    /// the runtime of that flight, it is told every event since that flight's start that it has not
+    /// heard, so that no collision is lost with a connection. Otherwise a new flight begins.
     ///
     /// # Errors
     /// The reason to refuse, for a person.
@@ -270,7 +277,8 @@ impl Vehicle {
             first.evicted.notify_one();
         }
         state.sessions += 1;
-        let resumed = self.under_way();
+        let resumed = self.under_way() || state.boot == hello.boot;
+        state.boot = hello.boot;
         if !resumed {
             state.flights += 1;
             state.flight_start = self.events.next_index();
@@ -289,7 +297,34 @@ impl Vehicle {
         };
         state.taken = Some(info.clone());
         state.connection = None;
-        Ok(Seat { vehicle: self.clone(), info, resumed, first_event: state.flight_start })
+        let heard_events = state.heard;
+        let first_event = state.flight_start;
+        Ok(Seat {
+            vehicle: self.clone(),
+            info,
+            resumed,
+            first_event,
+            boot: hello.boot,
+            heard_events,
+        })
+    }
+
+    /// Lets someone watch.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn watch(self: &Arc<Self>) -> Result<WatcherSeat, String> {
+        let mut state = self.lock_seat();
+        if state.watchers >= MOST_WATCHERS {
+            return Err(format!(
+                "vehicle '{}' has {MOST_WATCHERS} watchers already; end one first",
+                self.name
+            ));
+        }
+        state.watchers += 1;
+        state.sessions += 1;
+        let (id, first_event) = (state.sessions, state.flight_start);
+        Ok(WatcherSeat { vehicle: self.clone(), id, first_event })
     }
 
     /// Whether a flight had begun and not ended when its runtime was last heard.
@@ -314,9 +349,35 @@ pub struct Seat {
     pub resumed: bool,
     /// The first event to tell.
     pub first_event: u64,
+    /// Tells this runtime's events from those of another run.
+    boot: u64,
+    /// What had been heard of the runtime's events.
+    pub heard_events: HeardEvents,
+}
+
+/// The right to watch the vehicle; given back when dropped.
+#[derive(Debug)]
+pub struct WatcherSeat {
+    /// Which vehicle.
+    pub vehicle: Arc<Vehicle>,
+    /// Session number.
+    pub id: u64,
+    /// The first event to tell.
+    pub first_event: u64,
+}
+
+impl Drop for WatcherSeat {
+    fn drop(&mut self) {
+        self.vehicle.lock_seat().watchers -= 1;
+    }
 }
 
 impl Seat {
+    /// Takes note of the runtime's event `seq`; returns whether it is new.
+    pub fn hear(&self, seq: u64) -> bool {
+        self.vehicle.lock_seat().heard.hear(self.boot, seq)
+    }
+
     /// Notes that the runtime has been heard at `now`.
     pub fn heard(&self, now: ServerTime) {
         self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
@@ -399,7 +460,7 @@ pub(crate) mod tests {
     use super::*;
     use glam::{DQuat, DVec3};
     use vizflyt_protocol::geometry::{Pose, Twist, Volume};
-    use vizflyt_protocol::messages::Limits;
+    use vizflyt_protocol::messages::{Limits, Purpose};
 
     pub(crate) fn named(index: usize, name: &str) -> Vehicle {
         let arena = ArenaInfo {
@@ -421,8 +482,14 @@ pub(crate) mod tests {
         Arc::new(named(0, "vizflyt"))
     }
 
-    fn hello() -> Hello {
-        Hello { vehicle: bounded("vizflyt"), program: bounded("runtime 0.1") }
+    fn hello(boot: u64) -> Hello {
+        Hello {
+            vehicle: bounded("vizflyt"),
+            purpose: Purpose::Fly,
+            program: bounded("runtime 0.1"),
+            boot,
+            heard_events: HeardEvents::default(),
+        }
     }
 
     fn address() -> SocketAddr {
@@ -432,28 +499,28 @@ pub(crate) mod tests {
     #[test]
     fn one_vehicle_has_one_runtime() {
         let vehicle = vehicle();
-        let first = vehicle.sit(&hello(), address()).unwrap();
-        let refusal = vehicle.sit(&hello(), address()).unwrap_err();
+        let first = vehicle.sit(&hello(1), address()).unwrap();
+        let refusal = vehicle.sit(&hello(2), address()).unwrap_err();
         assert_eq!(
             refusal,
             "vehicle 'vizflyt' is flown by runtime 0.1 at 127.0.0.1:9; stop that runtime first"
         );
         drop(first);
         assert!(vehicle.runtime().is_none());
-        assert!(vehicle.sit(&hello(), address()).is_ok());
+        assert!(vehicle.sit(&hello(3), address()).is_ok());
     }
 
     #[tokio::test]
     async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
         let vehicle = vehicle();
         vehicle.tell(EventKind::Note, "before the flight");
-        let first = vehicle.sit(&hello(), address()).unwrap();
+        let first = vehicle.sit(&hello(4), address()).unwrap();
         assert_eq!((first.first_event, first.resumed, vehicle.flights()), (1, false, 1));
         vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
         vehicle.tell(EventKind::EmergencyStop, "stop");
         // As if it had last been heard two seconds ago.
         first.heard(clock::now().plus_seconds(-2.0));
-        let second = vehicle.sit(&hello(), address()).unwrap();
+        let second = vehicle.sit(&hello(5), address()).unwrap();
         first.evicted().await;
         assert_eq!((second.first_event, second.resumed, vehicle.flights()), (1, true, 1));
         drop(first);
@@ -462,9 +529,40 @@ pub(crate) mod tests {
         // After the landing the next runtime begins a new flight.
         assert!(vehicle.flight().outcome.is_some_and(|event| event.text == "stop"));
         vehicle.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
-        let third = vehicle.sit(&hello(), address()).unwrap();
+        let third = vehicle.sit(&hello(6), address()).unwrap();
         assert_eq!((third.first_event, third.resumed, vehicle.flights()), (2, false, 2));
         assert!(vehicle.flight().outcome.is_none() && vehicle.telemetry.borrow().is_none());
+    }
+
+    #[test]
+    fn the_same_runtime_goes_on_with_its_flight_and_tells_each_event_once() {
+        let vehicle = vehicle();
+        let first = vehicle.sit(&hello(7), address()).unwrap();
+        assert!(first.hear(1) && first.hear(2) && !first.hear(1));
+        drop(first);
+        // An outage on the ground; the stop button is pressed meanwhile.
+        vehicle.tell(EventKind::EmergencyStop, "stop");
+        let second = vehicle.sit(&hello(7), address()).unwrap();
+        assert_eq!((second.first_event, second.resumed, vehicle.flights()), (0, true, 1));
+        assert_eq!(second.heard_events, HeardEvents { boot: 7, seq: 2 });
+        assert!(!second.hear(2) && second.hear(3));
+        drop(second);
+        // Another run of the runtime: a new flight, and its events count anew.
+        let third = vehicle.sit(&hello(8), address()).unwrap();
+        assert_eq!((third.first_event, third.resumed, vehicle.flights()), (1, false, 2));
+        assert_eq!(third.heard_events.of(8), 0);
+        assert!(third.hear(1));
+    }
+
+    #[test]
+    fn watchers_are_bounded_and_leave_room_behind() {
+        let vehicle = vehicle();
+        let mut watchers: Vec<_> = (0..MOST_WATCHERS).map(|_| vehicle.watch().unwrap()).collect();
+        let refusal = vehicle.watch().unwrap_err();
+        assert!(refusal.starts_with("vehicle 'vizflyt' has 8 watchers already"), "{refusal}");
+        assert!(vehicle.sit(&hello(1), address()).is_ok(), "the runtime's seat is another");
+        watchers.pop();
+        assert!(vehicle.watch().is_ok());
     }
 
     #[test]

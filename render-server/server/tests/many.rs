@@ -101,7 +101,7 @@ fn assert_steady(headers: &[ImageHeader]) {
 
 fn emergency(message: ToRuntime) -> Option<Event> {
     match message {
-        ToRuntime::Event(event) => (event.kind == EventKind::EmergencyStop).then_some(event),
+        ToRuntime::Event { event, .. } => (event.kind == EventKind::EmergencyStop).then_some(event),
         _ => None,
     }
 }
@@ -139,12 +139,7 @@ async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
 
     for (vehicle, client) in clients.iter_mut().enumerate() {
         for _ in 0..20 {
-            let pose = client
-                .until(|message| match message {
-                    ToRuntime::Pose(pose) => Some(pose),
-                    _ => None,
-                })
-                .await;
+            let pose = client.pose().await;
             let x_m = pose.world_from_body.translation_m.x;
             assert!(is_of(vehicle, x_m), "vehicle {vehicle} hears of a pose at x = {x_m}");
         }

@@ -142,7 +142,7 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
     assert_eq!(press(&own).0, 202);
     let event = client
         .until(|message| match message {
-            ToRuntime::Event(event) => Some(event),
+            ToRuntime::Event { event, .. } => Some(event),
             _ => None,
         })
         .await;

@@ -45,8 +45,8 @@ async fn a_stranger_hears_how_to_pair_and_nothing_else() {
     assert_eq!((heard.frame_rx.stream, heard.frame_rx.datagram), (0, 0), "not a byte was told");
 
     // The one who is paired flies on, undisturbed.
-    let (mut client, _) = Client::welcomed(&server, usual()).await;
-    client.until(|message| matches!(message, ToRuntime::Pose(_)).then_some(())).await;
+    let (client, _) = Client::welcomed(&server, usual()).await;
+    client.pose().await;
 }
 
 #[tokio::test]
@@ -66,7 +66,7 @@ async fn a_team_flies_its_own_vehicle_and_no_other() {
     }
     // It did not even disturb the one that flies.
     flying.say(&ToServer::Telemetry(Telemetry::default())).await;
-    flying.until(|message| matches!(message, ToRuntime::Pose(_)).then_some(())).await;
+    flying.pose().await;
 }
 
 #[tokio::test]

@@ -6,13 +6,14 @@ use std::sync::atomic::Ordering;
 
 use quinn::{TransportConfig, VarInt};
 use support::{
-    Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, send_json, write_arena,
+    Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, hello, send_json, write_arena,
 };
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{
-    ClockRequest, EventKind, FlightPhase, Telemetry, ToRuntime, ToServer,
+    ClockRequest, Event, EventKind, FlightPhase, HeardEvents, Hello, Purpose, Telemetry, ToRuntime,
+    ToServer, bounded,
 };
-use vizflyt_protocol::packet::Preamble;
+use vizflyt_protocol::packet::{ImageHeader, Preamble};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{Decoder, peek};
 
@@ -30,17 +31,14 @@ async fn images_follow_the_poses() {
 
     let (mut seq, mut pose_ns) = (0, 0);
     for _ in 0..20 {
-        let (header, payload) = client.image().await;
+        let (header, payload, trailer) = client.whole_image().await;
         // Streams may finish out of order, but the stamps within an image never do.
-        let stamps = [
-            header.pose_ns,
-            header.render_start_ns,
-            header.render_end_ns,
-            header.encode_end_ns,
-            header.send_ns,
-        ]
-        .map(zerocopy::byteorder::little_endian::U64::get);
+        let stamps = [header.pose_ns, header.render_start_ns, header.render_end_ns]
+            .map(zerocopy::byteorder::little_endian::U64::get);
         assert!(stamps.is_sorted(), "{stamps:?}");
+        // The first byte may leave before the last is made, or after.
+        let ends = [trailer.send_ns.get(), trailer.encode_end_ns.get()];
+        assert!(ends.iter().all(|&end| end >= stamps[2]), "{stamps:?} {ends:?}");
         assert!(header.seq.get() > seq || header.pose_ns.get() < pose_ns);
         (seq, pose_ns) = (header.seq.get(), header.pose_ns.get());
         // Drawn from a pose that was sent, through the camera's extrinsics.
@@ -72,12 +70,7 @@ async fn images_follow_the_poses() {
     assert!(reply.answered.as_ns() > pose_ns);
     let mut last_ns = 0;
     for _ in 0..20 {
-        let pose = client
-            .until(|message| match message {
-                ToRuntime::Pose(pose) => Some(pose),
-                _ => None,
-            })
-            .await;
+        let pose = client.pose().await;
         assert!(pose.stamp.as_ns() > last_ns);
         last_ns = pose.stamp.as_ns();
     }
@@ -151,14 +144,10 @@ async fn a_runtime_that_reads_no_images_stalls_nobody_and_then_gets_the_newest()
     // One stream at a time, and none accepted: images cannot leave.
     let mut transport = usual();
     transport.max_concurrent_uni_streams(VarInt::from_u32(1));
-    let (mut client, _) = Client::welcomed(&server, transport).await;
-    let pose = |message| match message {
-        ToRuntime::Pose(pose) => Some(pose),
-        _ => None,
-    };
+    let (client, _) = Client::welcomed(&server, transport).await;
     let mut stalled_until_ns = 0;
     for _ in 0..100 {
-        stalled_until_ns = client.until(pose).await.stamp.as_ns();
+        stalled_until_ns = client.pose().await.stamp.as_ns();
     }
     // The first stream was filled at the start; whatever comes after it is fresh.
     let mut stream = client.connection.accept_uni().await.unwrap();
@@ -185,25 +174,29 @@ async fn at_most_k_images_are_in_flight_until_the_deadline() {
     let mut transport = usual();
     transport.stream_receive_window(VarInt::from_u32(512));
     let (client, _) = Client::welcomed(&server, transport).await;
-    let mut sent_ns = Vec::new();
+    let (mut drawn_ns, mut seen_ns) = (Vec::new(), Vec::new());
     let mut streams = Vec::new();
-    while sent_ns.len() < 8 {
+    while drawn_ns.len() < 8 {
         let mut stream = tokio::time::timeout(PATIENCE, client.connection.accept_uni())
             .await
             .expect("another image after the deadline of the last")
             .unwrap();
-        let mut bytes = [0; vizflyt_protocol::packet::ImageHeader::SIZE];
+        let mut bytes = [0; ImageHeader::SIZE];
         // Reset before its header was read: as good as not seen.
         if stream.read_exact(&mut bytes).await.is_ok() {
-            let (header, _) = vizflyt_protocol::packet::ImageHeader::parse(&bytes).unwrap();
-            sent_ns.push(header.send_ns.get());
+            let (header, _) = ImageHeader::parse(&bytes).unwrap();
+            drawn_ns.push(header.render_end_ns.get());
+            // The same clock on the same machine.
+            seen_ns.push(vizflyt_server::clock::now().as_ns());
         }
         streams.push(stream);
     }
-    sent_ns.sort_unstable();
-    // K is 2 on loopback: the third image leaves only when the first is reset, after 150 ms.
-    for pair in sent_ns.windows(3) {
-        assert!(pair[2] - pair[0] >= 150_000_000, "{sent_ns:?}");
+    // K is 2 on loopback: the third image leaves only when the first is reset, 150 ms after it was
+    // sent, and so more after it was drawn.
+    drawn_ns.sort_unstable();
+    seen_ns.sort_unstable();
+    for (drawn, seen) in drawn_ns.iter().zip(&seen_ns[2..]) {
+        assert!(seen - drawn >= 150_000_000, "{drawn_ns:?} {seen_ns:?}");
     }
 }
 
@@ -240,7 +233,7 @@ async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
     client.say(&ToServer::Telemetry(flying)).await;
     emitter.pause(true);
     let lost = |message| match message {
-        ToRuntime::Event(event) => {
+        ToRuntime::Event { event, .. } => {
             matches!(event.kind, EventKind::PoseLost { .. }).then_some(event)
         }
         _ => None,
@@ -260,10 +253,159 @@ async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
     emitter.pause(false);
     again
         .until(|message| match message {
-            ToRuntime::Event(event) => (event.kind == EventKind::PoseRegained).then_some(()),
+            ToRuntime::Event { event, .. } => (event.kind == EventKind::PoseRegained).then_some(()),
             _ => None,
         })
         .await;
+}
+
+/// Failed before: the server told the whole flight's events again.
+#[tokio::test]
+async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let emitter = Emitter::start(server.vicon, "vizflyt");
+    let (boot, mut heard) = (4711, HeardEvents::default());
+    let hello = |heard_events| Hello { boot, heard_events, ..hello("vizflyt", Purpose::Fly) };
+    let event = |message| match message {
+        ToRuntime::Event { seq, event } => Some((seq, event)),
+        _ => None,
+    };
+    let note = |text: &str| Event {
+        stamp: vizflyt_protocol::time::ServerTime::ZERO,
+        kind: EventKind::Note,
+        text: bounded(text),
+    };
+    let mut client = Client::greet(&server, hello(heard), usual()).await;
+    let welcome = client.welcome().await;
+    assert_eq!(welcome.heard_events.of(boot), 0);
+    client.image().await;
+    let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
+    client.say(&ToServer::Telemetry(flying)).await;
+    for (seq, text) in [(1, "one"), (2, "two"), (2, "two"), (1, "one")] {
+        client.say(&ToServer::Event { seq, event: note(text) }).await;
+    }
+    client.until(|message| (message == ToRuntime::Heard(2)).then_some(())).await;
+    emitter.pause(true);
+    let (seq, lost) = client.until(event).await;
+    assert!(matches!(lost.kind, EventKind::PoseLost { .. }));
+    assert!(heard.hear(welcome.boot, seq));
+    client.close().await;
+    emitter.pause(false);
+    // Back in flight: what it has heard is not told again, what it has not is.
+    let mut client = loop {
+        let mut client = Client::greet(&server, hello(heard), usual()).await;
+        if let ToRuntime::Welcome(again) = client.next().await {
+            assert_eq!((again.boot, again.heard_events.of(boot)), (welcome.boot, 2));
+            break client;
+        }
+    };
+    let (next, back) = client.until(event).await;
+    assert!(next > seq && back.kind == EventKind::PoseRegained, "{back:?}");
+    client.say(&ToServer::Event { seq: 2, event: note("two") }).await;
+    client.say(&ToServer::Event { seq: 3, event: note("three") }).await;
+    client.until(|message| (message == ToRuntime::Heard(3)).then_some(())).await;
+    let page = server.http;
+    let log = tokio::task::spawn_blocking(move || {
+        let mut socket = support::Socket::open(page, &format!("http://{page}")).unwrap();
+        let mut texts = Vec::new();
+        while !texts.iter().any(|text| text == "three") {
+            let events = socket.message("events");
+            for line in events["events"].as_array().unwrap() {
+                texts.extend(line["text"].as_str().map(ToOwned::to_owned));
+            }
+        }
+        texts
+    });
+    let log = log.await.unwrap();
+    for text in ["one", "two", "three"] {
+        assert_eq!(log.iter().filter(|found| *found == text).count(), 1, "{text}: {log:?}");
+    }
+}
+
+#[tokio::test]
+async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &["--max-rate", "20"]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    // Alone it is served, though nobody flies.
+    let mut watcher = Client::watching(&server, usual()).await;
+    let (header, payload) = watcher.image().await;
+    assert_eq!(peek(&payload).unwrap().width, header.width_px.get());
+    watcher.pose().await;
+    // What it says does not count, and it takes nobody's seat.
+    let landed = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
+    watcher.say(&ToServer::Telemetry(landed)).await;
+    let (runtime, _) = Client::welcomed(&server, usual()).await;
+    // One that reads nothing, beside the two that do.
+    let mut transport = usual();
+    transport.max_concurrent_uni_streams(VarInt::from_u32(1));
+    let _stalled = Client::watching(&server, transport).await;
+    let mut seen: std::collections::BTreeMap<u64, Vec<u8>> = std::collections::BTreeMap::new();
+    let mut same = 0;
+    for _ in 0..40 {
+        let (header, payload) = runtime.image().await;
+        seen.insert(header.seq.get(), payload);
+        let (header, payload) = watcher.image().await;
+        if let Some(first) = seen.get(&header.seq.get()) {
+            assert!(*first == payload, "encoded once for both");
+            same += 1;
+        }
+    }
+    assert!(same >= 20, "{same} of 40 images went to both");
+    // Eight at most; the others go on.
+    let mut others = Vec::new();
+    for _ in 2..8 {
+        others.push(Client::watching(&server, usual()).await);
+    }
+    let mut ninth = Client::greet(&server, hello("vizflyt", Purpose::Watch), usual()).await;
+    let ToRuntime::Refused(why) = ninth.next().await else { panic!("not refused") };
+    assert!(why.contains("8 watchers already"), "{why}");
+    runtime.image().await;
+}
+
+#[tokio::test]
+async fn a_camera_that_is_blocked_holds_up_no_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let rear = r#"priority = 5
+[[cameras]]
+name = "rear"
+width_px = 160
+height_px = 120
+horizontal_fov_deg = 90.0
+position_m = [0.06, 0, 0.02]
+"#;
+    let server = Server::start(&write_arena(folder.path(), rear), &["--max-rate", "50"]);
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    // A header fits into the window, an image never does without being read.
+    let mut transport = usual();
+    transport.stream_receive_window(VarInt::from_u32(512));
+    let (client, _) = Client::welcomed(&server, transport).await;
+    // The front camera, which has the higher priority, is read no further than its header.
+    let (mut blocked, mut whole) = (Vec::new(), 0);
+    let mut first_ns = 0;
+    while whole < 40 {
+        let mut stream = client.connection.accept_uni().await.unwrap();
+        let mut bytes = [0; ImageHeader::SIZE];
+        let Ok(()) = stream.read_exact(&mut bytes).await else { continue };
+        let (header, _) = ImageHeader::parse(&bytes).unwrap();
+        if header.camera == 0 {
+            blocked.push(stream);
+            continue;
+        }
+        if stream.read_to_end(1 << 22).await.is_ok() {
+            whole += 1;
+            if first_ns == 0 {
+                first_ns = header.render_end_ns.get();
+            }
+        }
+    }
+    // Of the front camera two images in 150 ms were begun, and none was acknowledged: had the rear
+    // one waited for it, it would have had as few.
+    assert!(blocked.len() < 30, "{} images of the blocked camera", blocked.len());
+    drop(client);
+    let report = server.finish();
+    assert!(report["images_sent"].as_u64().unwrap() >= 38, "{report}");
 }
 
 #[tokio::test]
@@ -277,7 +419,7 @@ async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
         3.0 + f64::from(frame.clamp(100, 295) - 100) * 0.01
     });
     let collision = |message| match message {
-        ToRuntime::Event(event) => match event.kind {
+        ToRuntime::Event { event, .. } => match event.kind {
             EventKind::Collision { p_world_m, clearance_m } => Some((p_world_m, clearance_m)),
             _ => None,
         },

@@ -1,5 +1,7 @@
 //! What a renderer writes, and its integer forms for encoders.
 
+use core::ops::Range;
+
 /// Colour, depth, alpha and object ids of one camera; row-major, reused from image to image.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RgbdImage {
@@ -52,27 +54,61 @@ impl RgbdImage {
     /// Writes H x W x 3 bytes of RGB, clamped and rounded, to `out`, whose length and contents are
     /// replaced. Splats are trained on sRGB values, so these *are* sRGB values: no gamma is applied.
     pub fn write_rgb8(&self, out: &mut Vec<u8>) {
-        out.resize(self.rgb.len(), 0);
-        for (byte, &value) in out.iter_mut().zip(&self.rgb) {
-            // Clamped before the cast, in an order that vectorises; NaN becomes 0.
-            *byte = (value.max(0.0) * 255.0 + 0.5).min(255.0) as u8;
-        }
+        quantise_rgb(&self.rgb, out);
+    }
+
+    /// As [`Self::write_rgb8`], of some rows only.
+    ///
+    /// # Panics
+    /// If the image does not have these rows.
+    pub fn write_rgb8_rows(&self, rows: Range<u32>, out: &mut Vec<u8>) {
+        let pixels = self.pixels(rows);
+        quantise_rgb(&self.rgb[3 * pixels.start..3 * pixels.end], out);
     }
 
     /// Writes H x W depths in whole millimetres to `out`, whose length and contents are replaced:
     /// 0 where there is no return, that is where alpha is below [`Self::MIN_DEPTH_ALPHA`], where
     /// nothing was hit, or beyond 65.535 m, as REP 118 has it. [mm, cam]
     pub fn write_depth_mm(&self, kind: DepthKind, out: &mut Vec<u16>) {
-        let depth_m = match kind {
+        quantise_depth(self.depth_m(kind), &self.alpha, out);
+    }
+
+    /// As [`Self::write_depth_mm`], of some rows only.
+    ///
+    /// # Panics
+    /// If the image does not have these rows.
+    pub fn write_depth_mm_rows(&self, kind: DepthKind, rows: Range<u32>, out: &mut Vec<u16>) {
+        let pixels = self.pixels(rows);
+        quantise_depth(&self.depth_m(kind)[pixels.clone()], &self.alpha[pixels], out);
+    }
+
+    fn pixels(&self, rows: Range<u32>) -> Range<usize> {
+        let width = self.width_px as usize;
+        rows.start as usize * width..rows.end as usize * width
+    }
+
+    fn depth_m(&self, kind: DepthKind) -> &[f32] {
+        match kind {
             DepthKind::Median => &self.depth_median_m,
             DepthKind::Expected => &self.depth_expected_m,
-        };
-        out.resize(depth_m.len(), 0);
-        for ((mm, &depth_m), &alpha) in out.iter_mut().zip(depth_m).zip(&self.alpha) {
-            let rounded = depth_m * 1000.0 + 0.5;
-            let returned = alpha >= Self::MIN_DEPTH_ALPHA && rounded < 65536.0;
-            *mm = if returned { rounded as u16 } else { 0 };
         }
+    }
+}
+
+fn quantise_rgb(rgb: &[f32], out: &mut Vec<u8>) {
+    out.resize(rgb.len(), 0);
+    for (byte, &value) in out.iter_mut().zip(rgb) {
+        // Clamped before the cast, in an order that vectorises; NaN becomes 0.
+        *byte = (value.max(0.0) * 255.0 + 0.5).min(255.0) as u8;
+    }
+}
+
+fn quantise_depth(depth_m: &[f32], alpha: &[f32], out: &mut Vec<u16>) {
+    out.resize(depth_m.len(), 0);
+    for ((mm, &depth_m), &alpha) in out.iter_mut().zip(depth_m).zip(alpha) {
+        let rounded = depth_m * 1000.0 + 0.5;
+        let returned = alpha >= RgbdImage::MIN_DEPTH_ALPHA && rounded < 65536.0;
+        *mm = if returned { rounded as u16 } else { 0 };
     }
 }
 
@@ -104,5 +140,29 @@ mod tests {
         assert_eq!(mm, [1234, 0, 2001, 65535, 0, 0, 0]);
         image.write_depth_mm(DepthKind::Expected, &mut mm);
         assert_eq!(mm, [3000, 0, 3000, 3000, 3000, 3000, 3000]);
+    }
+
+    #[test]
+    fn rows_are_cut_from_the_whole() {
+        let mut image = RgbdImage::default();
+        image.resize(5, 4);
+        for (n, value) in image.rgb.iter_mut().enumerate() {
+            *value = n as f32 / 100.0;
+        }
+        image.alpha.fill(1.0);
+        for (n, depth_m) in image.depth_median_m.iter_mut().enumerate() {
+            *depth_m = n as f32;
+        }
+        let (mut rgb, mut mm, mut rows_rgb, mut rows_mm) =
+            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        image.write_rgb8(&mut rgb);
+        image.write_depth_mm(DepthKind::Median, &mut mm);
+        for rows in [0..4, 1..3, 3..4, 2..2] {
+            let pixels = 5 * rows.start as usize..5 * rows.end as usize;
+            image.write_rgb8_rows(rows.clone(), &mut rows_rgb);
+            image.write_depth_mm_rows(DepthKind::Median, rows, &mut rows_mm);
+            assert_eq!(rows_rgb, rgb[3 * pixels.start..3 * pixels.end]);
+            assert_eq!(rows_mm, mm[pixels]);
+        }
     }
 }

@@ -21,7 +21,7 @@ fn check_refused(args: &[&str], texts: &[&str]) {
 
 #[test]
 fn every_command_has_help() {
-    for command in ["demo", "serve", "fly", "pair", "sim", "scene", "bench", "stats"] {
+    for command in ["demo", "serve", "fly", "pair", "sim", "scene", "bench"] {
         let output = run(&[command, "--help"]);
         assert!(output.status.success(), "{command}");
         assert!(output.stdout.len() > 200, "{command} --help is a stub");
@@ -60,14 +60,4 @@ fn mistakes_are_explained() {
     let arena = folder.path().join("arena.toml");
     std::fs::write(&arena, "name = \"x\"\nscene = 5\n").unwrap();
     check_refused(&["serve", arena.to_str().unwrap()], &["line 2", "scene"]);
-}
-
-#[test]
-fn stats_say_what_is_missing() {
-    check_refused(&["stats", "--page", "http://127.0.0.1:1"], &["no server answers", "--page"]);
-    check_refused(&["stats", "/no/such.mcap"], &["cannot read /no/such.mcap"]);
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("not-a-log.mcap");
-    std::fs::write(&path, "hello").unwrap();
-    check_refused(&["stats", path.to_str().unwrap()], &["not-a-log.mcap"]);
 }

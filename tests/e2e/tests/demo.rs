@@ -5,21 +5,17 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
-use vizflyt_e2e::{Demo, alive, descendants, vizflyt};
+use vizflyt_e2e::{Demo, alive, descendants};
 
 /// Loading, baking, arming and climbing, on a loaded machine.
 const AIRBORNE: Duration = Duration::from_secs(90);
 /// A whole flight.
 const FLIGHT: Duration = Duration::from_mins(4);
-/// An image's way, as documented.
-const STAGES: [&str; 9] =
-    ["pose", "render", "encode", "send", "receive", "decode", "handover", "plugin", "setpoint"];
 /// Printed when the plugin has the vehicle.
 const FLYING: &str = "plugin flies";
 
@@ -100,42 +96,8 @@ fn the_forest_is_flown_and_reported() {
         assert!(report[figure].as_f64().is_some_and(|value| value > 0.0), "{figure}: {report:#}");
     }
     assert!(report["renderer"].as_str().unwrap().starts_with("cpu"));
-    check_timing(&report);
     let log = std::fs::metadata(report["log"].as_str().unwrap()).unwrap();
     assert!(log.len() > 10_000, "the log has {} bytes", log.len());
-}
-
-/// Every stage has its time, the clocks are one, every drawn image is accounted for, and the log
-/// tells the same.
-fn check_timing(report: &Value) {
-    let number = |value: &Value| value.as_f64().unwrap_or_else(|| panic!("{report:#}"));
-    for stage in STAGES {
-        let times = &report["stages"][stage];
-        assert!(number(&times["max"]) > 0.0, "{stage}: {report:#}");
-        assert!(number(&times["p50"]) <= number(&times["p99"]), "{stage}: {report:#}");
-    }
-    // Of other images: only those in the air are answered by a setpoint.
-    assert!(number(&report["total"]["p50"]) > 0.0 && number(&report["age"]["p50"]) > 0.0);
-    // Server and runtime read the same clock here.
-    let clock = &report["clock"];
-    let off_ms = number(&clock["offset_ns"]).abs() * 1e-6;
-    assert!(off_ms <= number(&clock["error_bound_ms"]), "{clock:#}");
-    let intervals = report["intervals"]["bins"].as_array().unwrap();
-    let intervals: u64 = intervals.iter().map(|bin| bin.as_u64().unwrap()).sum();
-    assert_eq!(intervals + 1, report["images_delivered"].as_u64().unwrap());
-    let account = &report["images"]["vizflyt"][0];
-    let count = |value: &Value| value.as_u64().unwrap_or_else(|| panic!("{report:#}"));
-    let skipped: u64 = account["skipped"].as_object().unwrap().values().map(count).sum();
-    let ended = count(&account["delivered"]) + skipped;
-    assert_eq!(ended + count(&account["under_way"]), count(&account["drawn"]), "{account:#}");
-    // The runtime's last second may not have reached the server.
-    let delivered = report["images_delivered"].as_u64().unwrap();
-    assert!((1..=delivered).contains(&count(&account["delivered"])), "{account:#}");
-    let told =
-        Command::new(vizflyt()).args(["stats", report["log"].as_str().unwrap()]).output().unwrap();
-    let told = String::from_utf8(told.stdout).unwrap();
-    assert!(told.contains(&format!("{} images in ", report["images_delivered"])), "{told}");
-    assert!(STAGES.iter().all(|stage| told.contains(stage)), "{told}");
 }
 
 /// At least 18 of 20 generated forests are flown without touching the true geometry, at 2 m/s or

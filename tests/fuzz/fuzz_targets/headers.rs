@@ -1,12 +1,18 @@
 //! Image and observation headers from a network and from shared memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_protocol::packet::{ImageHeader, ObservationHeader};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, ObservationHeader};
 
 fuzz_target!(|bytes: &[u8]| {
     if let Ok((header, _)) = ImageHeader::parse(bytes) {
         assert!(header.intrinsics().validate().is_ok());
         assert!(header.world_from_cam().is_valid());
+        assert!(header.most_payload() >= 8 * header.intrinsics().pixels() as u64);
+    }
+    if let Some(trailer) = bytes.first_chunk::<{ ImageTrailer::SIZE }>()
+        && let Ok(found) = ImageTrailer::parse(trailer, bytes.len() as u64)
+    {
+        assert_eq!(u64::from(found.payload_len.get()), bytes.len() as u64);
     }
     // Shared memory is aligned; the fuzzer's bytes are not.
     let mut words = vec![0u64; bytes.len().div_ceil(8)];

@@ -1,97 +1,352 @@
-//! Newest wins: at most one image per camera waits for decoding.
+//! Images on their way from the network to the decoder, piece by piece; newest wins.
+//!
+//! ```text
+//! receiver tasks: open, push, push, ... end ──▶ Mailbox ──▶ decode thread: next, next, ...
+//!                 (a piece is the bitstream's header or one slice)
+//! ```
+//! So decoding overlaps with receiving, and with encoding at the other end. Policy, per camera:
+//! - One image is decoded at a time. Once all its bytes have come it is decoded to its end.
+//! - It is dropped when a newer one has come whole while some of its own bytes have not: they are
+//!   being sent again, and the newer image is there. It is not dropped merely because a newer one
+//!   is under way: on a lossy link that would deliver nothing.
+//! - After it comes the newest that has come whole, else the oldest under way, which is nearest to
+//!   its end. Whole ones older than that are dropped.
+//! - Among cameras the earliest tick goes first.
+//!
+//! Pieces circulate: nothing is allocated per image in the steady state. The lock is held for a few
+//! words; nobody decodes or reads from the network under it.
 
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Condvar, Mutex, PoisonError};
-use std::time::Duration;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
-use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::HostTime;
 
-/// An image as received.
-#[derive(Clone, Debug)]
-pub struct ReceivedImage {
+/// What is known of an image when its first bytes have come.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Arrival {
+    /// Which connection it came over, counted from 1: a server that restarted counts ticks anew.
+    pub session: u64,
     /// Who, when, from where.
     pub header: ImageHeader,
-    /// The RGB-D bitstream.
-    pub payload: Vec<u8>,
     /// The pose's stamp on this computer's clock.
     pub pose: HostTime,
-    /// When the first byte had come.
+    /// When the first byte had come. [host]
     pub first: HostTime,
-    /// When the last byte had come.
+}
+
+impl Arrival {
+    fn age_key(&self) -> (u64, u64) {
+        (self.session, self.header.seq.get())
+    }
+}
+
+/// What is known of an image when its last bytes have come.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Whole {
+    /// What the server knew at the end.
+    pub trailer: ImageTrailer,
+    /// When the last byte had come. [host]
     pub received: HostTime,
 }
 
-/// The images that wait.
+/// What the decoder does next for a camera.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(clippy::large_enum_variant)] // Why: boxing would allocate per image.
+pub enum Step {
+    /// An image begins.
+    Begin(Arrival),
+    /// Its next piece: the bitstream's header first, then slice by slice. Give it back with
+    /// [`Mailbox::recycle`].
+    Piece(Vec<u8>),
+    /// All its pieces have been given.
+    End(Whole),
+    /// No more of it will come.
+    Drop,
+}
+
+/// An image that a receiver has opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ticket {
+    camera: usize,
+    id: u64,
+}
+
+/// How the images of a camera have fared since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Fates {
+    /// Those that came whole.
+    pub arrivals: Arrivals,
+    /// Gave way to newer ones, whole or not.
+    pub replaced: u64,
+    /// Cut off, late or nonsense.
+    pub lost: u64,
+    /// Bytes of bitstream that came. [bytes]
+    pub bytes: u64,
+}
+
+/// The images that wait or are under way.
 #[derive(Debug, Default)]
 pub struct Mailbox {
-    slots: Mutex<[Option<ReceivedImage>; MAX_CAMERAS]>,
-    filled: Condvar,
-    replaced: AtomicU64,
-    /// What became of images so far, by camera.
-    arrivals: Mutex<[Arrivals; MAX_CAMERAS]>,
+    inner: Mutex<Inner>,
+    changed: Condvar,
+    sessions: AtomicU64,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    lanes: [Lane; MAX_CAMERAS],
+    opened: u64,
+    spare_pieces: Vec<Vec<u8>>,
+    spare_queues: Vec<VecDeque<Vec<u8>>>,
+}
+
+#[derive(Debug, Default)]
+struct Lane {
+    images: Vec<Image>,
+    /// The image that the decoder has begun, and was not told the end of.
+    decoding: Option<u64>,
+    fates: Fates,
+}
+
+#[derive(Debug)]
+struct Image {
+    id: u64,
+    arrival: Arrival,
+    pieces: VecDeque<Vec<u8>>,
+    end: Option<Whole>,
 }
 
 impl Mailbox {
-    /// Puts an image in place of an older one of its camera. One older than what waits is
-    /// dropped: streams may overtake each other.
-    pub fn offer(&self, image: ReceivedImage) {
-        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(slot) = slots.get_mut(usize::from(image.header.camera)) else { return };
-        let camera = usize::from(image.header.camera);
-        self.note(camera, |counts| counts.arrived += 1);
-        match slot {
-            // By pose too: a server that restarted counts from the start again.
-            Some(waiting)
-                if waiting.header.seq.get() >= image.header.seq.get()
-                    && waiting.pose >= image.pose =>
-            {
-                self.note(camera, |counts| counts.stale += 1);
-                self.replaced.fetch_add(1, Ordering::Relaxed);
+    /// Returns the number of a new connection.
+    pub fn session(&self) -> u64 {
+        self.sessions.fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// Opens an image; `None` if it is of no possible camera, one that is newer has come whole
+    /// already, or too many are under way.
+    pub fn open(&self, arrival: &Arrival) -> Option<Ticket> {
+        let mut inner = self.lock();
+        let inner = &mut *inner;
+        let camera = usize::from(arrival.header.camera);
+        let lane = inner.lanes.get_mut(camera)?;
+        let newer_is_whole =
+            |image: &Image| image.end.is_some() && image.arrival.age_key() >= arrival.age_key();
+        if lane.images.iter().any(newer_is_whole) {
+            lane.fates.replaced += 1;
+            return None;
+        }
+        if lane.images.len() >= MOST_UNDER_WAY {
+            lane.fates.lost += 1;
+            return None;
+        }
+        inner.opened += 1;
+        let (id, pieces) = (inner.opened, inner.spare_queues.pop().unwrap_or_default());
+        lane.images.push(Image { id, arrival: *arrival, pieces, end: None });
+        self.changed.notify_one();
+        Some(Ticket { camera, id })
+    }
+
+    /// Takes an image's next piece and leaves an empty buffer in its place; returns whether more of
+    /// the image is wanted.
+    pub fn push(&self, ticket: Ticket, piece: &mut Vec<u8>) -> bool {
+        let mut inner = self.lock();
+        let inner = &mut *inner;
+        let lane = &mut inner.lanes[ticket.camera];
+        let Some(image) = lane.images.iter_mut().find(|image| image.id == ticket.id) else {
+            return false;
+        };
+        lane.fates.bytes += piece.len() as u64;
+        let mut spare = inner.spare_pieces.pop().unwrap_or_default();
+        spare.clear();
+        image.pieces.push_back(std::mem::replace(piece, spare));
+        self.changed.notify_one();
+        true
+    }
+
+    /// Ends an image: whole, or `None` if no more of it will come.
+    pub fn end(&self, ticket: Ticket, whole: Option<Whole>) {
+        let mut inner = self.lock();
+        let inner = &mut *inner;
+        let lane = &mut inner.lanes[ticket.camera];
+        let Some(at) = lane.images.iter().position(|image| image.id == ticket.id) else { return };
+        if whole.is_some() {
+            lane.images[at].end = whole;
+            lane.fates.arrivals.arrived += 1;
+        } else {
+            lane.fates.lost += 1;
+            let image = lane.images.swap_remove(at);
+            keep(&mut inner.spare_pieces, &mut inner.spare_queues, image.pieces);
+        }
+        self.changed.notify_one();
+    }
+
+    /// Returns the next thing to do and for which camera; `None` if there is nothing for `timeout`.
+    /// An image that has not come whole is begun only if `may_begin` says so.
+    pub fn next(
+        &self,
+        timeout: Duration,
+        may_begin: impl Fn(&ImageHeader) -> bool,
+    ) -> Option<(usize, Step)> {
+        let deadline = Instant::now() + timeout;
+        let mut inner = self.lock();
+        loop {
+            if let Some(found) = inner.step(&may_begin) {
+                return Some(found);
             }
-            slot => {
-                if slot.replace(image).is_some() {
-                    self.note(camera, |counts| counts.superseded += 1);
-                    self.replaced.fetch_add(1, Ordering::Relaxed);
-                }
-                self.filled.notify_one();
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return None;
             }
+            inner =
+                self.changed.wait_timeout(inner, left).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 
-    /// Takes the waiting image of the earliest tick; `None` if none comes within `timeout`.
-    pub fn take(&self, timeout: Duration) -> Option<ReceivedImage> {
-        let slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-        let (mut slots, _) = self
-            .filled
-            .wait_timeout_while(slots, timeout, |slots| slots.iter().all(Option::is_none))
-            .unwrap_or_else(PoisonError::into_inner);
-        slots
-            .iter_mut()
-            .filter(|slot| slot.is_some())
-            .min_by_key(|slot| slot.as_ref().map(|image| image.header.seq.get()))?
-            .take()
+    /// Gives up the image of a camera that was begun: nothing of it is given any more.
+    pub fn give_up(&self, camera: usize) {
+        let mut inner = self.lock();
+        let inner = &mut *inner;
+        let Some(lane) = inner.lanes.get_mut(camera) else { return };
+        let decoding = lane.decoding.take();
+        if let Some(at) = lane.images.iter().position(|image| Some(image.id) == decoding) {
+            let image = lane.images.swap_remove(at);
+            keep(&mut inner.spare_pieces, &mut inner.spare_queues, image.pieces);
+        }
     }
 
-    /// Counts what became of an image of a camera.
+    /// Takes back the memory of a piece.
+    pub fn recycle(&self, piece: Vec<u8>) {
+        let mut inner = self.lock();
+        if inner.spare_pieces.len() < MOST_SPARES {
+            inner.spare_pieces.push(piece);
+        }
+    }
+
+    /// Counts what became of an image of a camera that came whole.
     pub fn note(&self, camera: usize, count: impl FnOnce(&mut Arrivals)) {
-        let mut arrivals = self.arrivals.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(counts) = arrivals.get_mut(camera) {
-            count(counts);
+        if let Some(lane) = self.lock().lanes.get_mut(camera) {
+            count(&mut lane.fates.arrivals);
         }
     }
 
-    /// Returns what became of images before they reached shared memory, by camera.
+    /// Returns what became of images that came whole before they reached shared memory, by camera.
     pub fn arrivals(&self) -> [Arrivals; MAX_CAMERAS] {
-        *self.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
+        self.fates().map(|fates| fates.arrivals)
     }
 
     /// Returns how many images gave way to newer ones.
     pub fn replaced(&self) -> u64 {
-        self.replaced.load(Ordering::Relaxed)
+        self.lock().lanes.iter().map(|lane| lane.fates.replaced).sum()
+    }
+
+    /// Returns how the images of each camera have fared.
+    pub fn fates(&self) -> [Fates; MAX_CAMERAS] {
+        let inner = self.lock();
+        std::array::from_fn(|camera| inner.lanes[camera].fates)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // Why: nothing panics while the lock is held.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+impl Inner {
+    fn step(&mut self, may_begin: &impl Fn(&ImageHeader) -> bool) -> Option<(usize, Step)> {
+        let Self { lanes, spare_pieces, spare_queues, .. } = self;
+        for (camera, lane) in lanes.iter_mut().enumerate() {
+            let dropped = lane.supersede(|pieces| keep(spare_pieces, spare_queues, pieces));
+            if dropped {
+                return Some((camera, Step::Drop));
+            }
+        }
+        let (_, camera, at) = lanes
+            .iter()
+            .enumerate()
+            .filter_map(|(camera, lane)| {
+                let at = lane.due(may_begin)?;
+                Some((lane.images[at].arrival.age_key(), camera, at))
+            })
+            .min()?;
+        let lane = &mut lanes[camera];
+        let image = &mut lane.images[at];
+        if lane.decoding.is_none() {
+            lane.decoding = Some(image.id);
+            return Some((camera, Step::Begin(image.arrival)));
+        }
+        if let Some(piece) = image.pieces.pop_front() {
+            return Some((camera, Step::Piece(piece)));
+        }
+        // `due` has seen to it that there is one or the other.
+        let whole = image.end?;
+        lane.decoding = None;
+        let image = lane.images.swap_remove(at);
+        keep(spare_pieces, spare_queues, image.pieces);
+        Some((camera, Step::End(whole)))
+    }
+}
+
+impl Lane {
+    /// Drops what has given way to a newer image that has come whole; returns whether that was the
+    /// one being decoded, or that one was cut off.
+    fn supersede(&mut self, mut keep: impl FnMut(VecDeque<Vec<u8>>)) -> bool {
+        let whole = self.images.iter().filter(|image| image.end.is_some());
+        if let Some(newest) = whole.map(|image| image.arrival.age_key()).max() {
+            let mut at = 0;
+            while at < self.images.len() {
+                let image = &self.images[at];
+                let finishing = image.end.is_some() && self.decoding == Some(image.id);
+                // One that waits and has not come whole may yet be of use to nobody: the newest is
+                // decoded before it could be.
+                if image.arrival.age_key() < newest && !finishing {
+                    self.fates.replaced += 1;
+                    self.fates.arrivals.superseded += u64::from(image.end.is_some());
+                    keep(self.images.swap_remove(at).pieces);
+                } else {
+                    at += 1;
+                }
+            }
+        }
+        let gone = |id: u64| !self.images.iter().any(|image| image.id == id);
+        self.decoding.take_if(|id| gone(*id)).is_some()
+    }
+
+    /// Returns the place of the image of which something can be done now.
+    fn due(&self, may_begin: &impl Fn(&ImageHeader) -> bool) -> Option<usize> {
+        if let Some(id) = self.decoding {
+            let at = self.images.iter().position(|image| image.id == id)?;
+            let image = &self.images[at];
+            return (!image.pieces.is_empty() || image.end.is_some()).then_some(at);
+        }
+        let oldest = |at: &usize| self.images[*at].arrival.age_key();
+        let candidate = |at: &usize| {
+            let image = &self.images[*at];
+            image.end.is_some() || may_begin(&image.arrival.header)
+        };
+        (0..self.images.len()).filter(candidate).min_by_key(oldest)
+    }
+}
+
+fn keep(
+    spare_pieces: &mut Vec<Vec<u8>>,
+    spare_queues: &mut Vec<VecDeque<Vec<u8>>>,
+    mut pieces: VecDeque<Vec<u8>>,
+) {
+    let room = MOST_SPARES.saturating_sub(spare_pieces.len());
+    spare_pieces.extend(pieces.drain(..).take(room));
+    if spare_queues.len() < MOST_UNDER_WAY * MAX_CAMERAS {
+        spare_queues.push(pieces);
+    }
+}
+
+/// The server keeps at most 8 in flight; more is a faulty peer.
+const MOST_UNDER_WAY: usize = 8;
+/// Pieces of a few images of every camera at the usual four slices.
+const MOST_SPARES: usize = 128;
 
 #[cfg(test)]
 mod tests {
@@ -99,40 +354,134 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
     use vizflyt_protocol::time::ServerTime;
 
-    fn image(camera: u8, seq: u64) -> ReceivedImage {
+    fn arrival(camera: u8, seq: u64) -> Arrival {
         let k = Intrinsics::from_horizontal_fov(32, 24, 1.5);
-        ReceivedImage {
-            header: ImageHeader::new(
-                seq,
-                camera,
-                ServerTime::ZERO,
-                &k,
-                &Pose::IDENTITY,
-                &Pose::IDENTITY,
-            ),
-            payload: Vec::new(),
+        let body_from_cam = Pose::IDENTITY;
+        let pose = ServerTime::ZERO;
+        Arrival {
+            session: 1,
+            header: ImageHeader::new(seq, camera, pose, &k, &body_from_cam, &Pose::IDENTITY),
             pose: HostTime::ZERO,
             first: HostTime::ZERO,
-            received: HostTime::ZERO,
         }
     }
 
-    #[test]
-    fn the_newest_of_each_camera_waits_and_the_earliest_tick_goes_first() {
-        let mailbox = Mailbox::default();
-        assert!(mailbox.take(Duration::ZERO).is_none());
-        for (camera, seq) in [(0, 1), (1, 1), (0, 3), (0, 2), (1, 2)] {
-            mailbox.offer(image(camera, seq));
+    fn whole() -> Whole {
+        let trailer = ImageTrailer::new(0, ServerTime::ZERO, ServerTime::ZERO);
+        Whole { trailer, received: HostTime::ZERO }
+    }
+
+    /// Everything the decoder would do now: camera and `B7` begin, `2` a piece, `E` end, `D` drop.
+    fn steps(mailbox: &Mailbox) -> String {
+        let mut found = Vec::new();
+        while let Some((camera, step)) = mailbox.next(Duration::ZERO, |_| true) {
+            found.push(match step {
+                Step::Begin(arrival) => format!("{camera}B{}", arrival.header.seq),
+                Step::Piece(piece) => format!("{camera}{}", piece[0]),
+                Step::End(_) => format!("{camera}E"),
+                Step::Drop => format!("{camera}D"),
+            });
         }
-        let taken: Vec<_> = std::iter::from_fn(|| mailbox.take(Duration::ZERO))
-            .map(|image| (image.header.camera, image.header.seq.get()))
-            .collect();
-        assert_eq!(taken, [(1, 2), (0, 3)]);
+        found.join(" ")
+    }
+
+    fn push(mailbox: &Mailbox, ticket: Ticket, piece: u8) -> bool {
+        mailbox.push(ticket, &mut vec![piece])
+    }
+
+    #[test]
+    fn an_image_is_decoded_as_it_arrives() {
+        let mailbox = Mailbox::default();
+        let image = mailbox.open(&arrival(0, 7)).unwrap();
+        assert_eq!(steps(&mailbox), "0B7");
+        assert!(push(&mailbox, image, 1));
+        assert_eq!(steps(&mailbox), "01");
+        assert!(push(&mailbox, image, 2) && push(&mailbox, image, 3));
+        mailbox.end(image, Some(whole()));
+        assert_eq!(steps(&mailbox), "02 03 0E");
+        assert!(!push(&mailbox, image, 4), "it is gone");
+        let arrivals = Arrivals { arrived: 1, ..Arrivals::default() };
+        assert_eq!(mailbox.fates()[0], Fates { arrivals, bytes: 3, ..Fates::default() });
+    }
+
+    #[test]
+    fn a_newer_image_wins_only_when_it_has_come_whole() {
+        let mailbox = Mailbox::default();
+        let old = mailbox.open(&arrival(0, 7)).unwrap();
+        push(&mailbox, old, 1);
+        assert_eq!(steps(&mailbox), "0B7 01");
+        let new = mailbox.open(&arrival(0, 8)).unwrap();
+        push(&mailbox, new, 2);
+        assert_eq!(steps(&mailbox), "", "the older one goes on");
+        mailbox.end(new, Some(whole()));
+        assert_eq!(steps(&mailbox), "0D 0B8 02 0E");
+        assert!(!push(&mailbox, old, 3), "and its receiver learns it");
+        assert_eq!(mailbox.replaced(), 1);
+        assert!(mailbox.open(&arrival(0, 8)).is_some(), "nothing waits any more");
+    }
+
+    #[test]
+    fn an_image_that_has_come_whole_is_decoded_to_its_end() {
+        let mailbox = Mailbox::default();
+        let old = mailbox.open(&arrival(0, 7)).unwrap();
+        push(&mailbox, old, 1);
+        mailbox.end(old, Some(whole()));
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| true), Some((0, Step::Begin(_)))));
+        for seq in 8..11 {
+            let new = mailbox.open(&arrival(0, seq)).unwrap();
+            push(&mailbox, new, seq as u8);
+            mailbox.end(new, Some(whole()));
+        }
+        assert!(mailbox.open(&arrival(0, 9)).is_none(), "10 has come whole");
+        assert_eq!(steps(&mailbox), "01 0E 0B10 010 0E");
         assert_eq!(mailbox.replaced(), 3);
-        let [front, rear, ..] = mailbox.arrivals();
-        assert_eq!((front.arrived, front.stale, front.superseded), (3, 1, 1));
-        assert_eq!((rear.arrived, rear.stale, rear.superseded), (2, 0, 1));
-        mailbox.offer(image(200, 1));
-        assert!(mailbox.take(Duration::ZERO).is_none(), "there is no camera 200");
+        let arrivals = mailbox.arrivals()[0];
+        assert_eq!((arrivals.arrived, arrivals.superseded), (4, 2));
+    }
+
+    #[test]
+    fn one_that_is_cut_off_is_dropped_and_the_next_begins() {
+        let mailbox = Mailbox::default();
+        let old = mailbox.open(&arrival(0, 7)).unwrap();
+        push(&mailbox, old, 1);
+        assert_eq!(steps(&mailbox), "0B7 01");
+        let new = mailbox.open(&arrival(0, 8)).unwrap();
+        mailbox.end(old, None);
+        assert_eq!(steps(&mailbox), "0D 0B8");
+        mailbox.give_up(0);
+        assert!(!push(&mailbox, new, 1));
+        assert_eq!(mailbox.fates()[0].lost, 1);
+        assert_eq!(steps(&mailbox), "");
+    }
+
+    #[test]
+    fn cameras_do_not_wait_for_each_other_and_the_earliest_tick_goes_first() {
+        let mailbox = Mailbox::default();
+        let tickets: Vec<_> =
+            [(0, 3), (1, 2)].map(|(c, seq)| mailbox.open(&arrival(c, seq)).unwrap()).into();
+        push(&mailbox, tickets[0], 5);
+        assert_eq!(steps(&mailbox), "1B2 0B3 05", "camera 1 stalls, camera 0 does not");
+        assert!(mailbox.open(&arrival(200, 1)).is_none(), "there is no camera 200");
+        // One that must wait is begun once it is whole.
+        mailbox.end(tickets[0], Some(whole()));
+        let next = mailbox.open(&arrival(0, 4)).unwrap();
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, Step::End(_)))));
+        assert_eq!(mailbox.next(Duration::ZERO, |_| false), None);
+        mailbox.end(next, Some(whole()));
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, Step::Begin(_)))));
+    }
+
+    #[test]
+    fn a_restarted_servers_images_are_newer_and_a_flood_is_bounded() {
+        let mailbox = Mailbox::default();
+        assert_eq!((mailbox.session(), mailbox.session()), (1, 2));
+        let old = mailbox.open(&arrival(0, 1000)).unwrap();
+        mailbox.end(old, Some(whole()));
+        let restarted = Arrival { session: 2, ..arrival(0, 1) };
+        let new = mailbox.open(&restarted).unwrap();
+        mailbox.end(new, Some(whole()));
+        assert_eq!(steps(&mailbox), "0B1 0E");
+        let opened = (0..50).filter(|seq| mailbox.open(&arrival(0, 2000 + seq)).is_some());
+        assert_eq!(opened.count(), MOST_UNDER_WAY);
     }
 }

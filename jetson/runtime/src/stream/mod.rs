@@ -1,16 +1,20 @@
 //! The QUIC link to the render server: poses, events and images down, telemetry up.
 //!
 //! ```text
-//! control stream (bi, ordered)  ── Pose 100 Hz, Event, Clock ──▶ control loop
-//!                               ◀─ Hello, Clock, Telemetry 10 Hz, Event ──
-//! one uni stream per image      ── ImageHeader + RGB-D ──▶ Mailbox, newest wins ──▶ images
+//! datagrams                     ── Pose 100 Hz, newest wins ──▶ control loop
+//! control stream (bi, ordered)  ── Event, Camera, Clock ──▶ control loop
+//!                               ◀─ Hello, Clock, Telemetry 10 Hz, Event ── Outbox
+//! one uni stream per image      ── header, slices, trailer ──▶ Mailbox, newest wins ──▶ images
 //! ```
 //! Runs on tokio. Any outage (1 s of silence, a server that restarts) ends in a new connection,
-//! tried for as long as the flight lasts. Both sides show a certificate; each knows the other's by
-//! its SHA-256.
+//! tried for as long as the flight lasts. Events are numbered and acknowledged both ways: after an
+//! outage what is missing is told again, and nothing twice. Both sides show a certificate; each
+//! knows the other's by its SHA-256.
 
 mod mailbox;
+mod outbox;
 mod pair;
+mod receive;
 mod session;
 #[cfg(test)]
 mod tests;
@@ -21,15 +25,15 @@ use std::time::Duration;
 
 use quinn::{AckFrequencyConfig, ClientConfig, Endpoint, EndpointConfig, TransportConfig, VarInt};
 use socket2::{Domain, Protocol, Socket, Type};
-use tokio::sync::mpsc;
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, ToServer,
+    ArenaInfo, CameraInfo, ClockState, Event, HeardEvents, Name, PoseSample, Purpose, Text,
 };
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity};
 
-pub use mailbox::{Mailbox, ReceivedImage};
+pub use mailbox::{Arrival, Fates, Mailbox, Step, Ticket, Whole};
+pub use outbox::Outbox;
 pub use pair::{NowPaired, pair};
 
 /// Where the server is, and who we are.
@@ -43,6 +47,10 @@ pub struct StreamSettings {
     pub identity: Identity,
     /// The vehicle's name in the localization system.
     pub vehicle: Name,
+    /// To fly it, or to watch.
+    pub purpose: Purpose,
+    /// This program and its version, for the server's page and log.
+    pub program: Text,
 }
 
 /// What the server's side tells the control loop.
@@ -125,16 +133,22 @@ const SOCKET_BUFFER: usize = 4 << 20;
 /// Receive window of one stream: the largest image comes without waiting for credit. [bytes]
 const STREAM_WINDOW: u32 = 4 << 20;
 /// Images the server may have under way; it keeps to fewer itself.
-const IMAGES_AT_ONCE: u32 = 16;
+const IMAGES_AT_ONCE: u32 = 64;
+/// Bytes of all streams that wait to be read: so much a hostile server can make us hold. [bytes]
+const RECEIVE_WINDOW: u32 = 32 << 20;
+/// A few poses; when more wait, the oldest go. [bytes]
+const POSES_WAITING: usize = 4096;
 /// Pause before a new connection.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// Talks to the server until the flight ends (the caller drops the task).
+/// Talks to the server until `outbox` is closed and all its events are heard, or the caller drops
+/// the task. `tell` returns whether it took the event: one that it did not take is told again, on a
+/// new connection.
 pub async fn run(
     settings: StreamSettings,
     shared: Shared,
-    outbox: mpsc::Receiver<ToServer>,
-    tell: impl Fn(StreamEvent) + Send + Sync,
+    outbox: Arc<Outbox>,
+    tell: impl Fn(StreamEvent) -> bool + Send + Sync,
 ) {
     run_over(endpoint, settings, shared, outbox, tell).await;
 }
@@ -145,15 +159,16 @@ pub async fn run_over(
     open: impl Fn(SocketAddr) -> std::io::Result<Endpoint>,
     settings: StreamSettings,
     shared: Shared,
-    mut outbox: mpsc::Receiver<ToServer>,
-    tell: impl Fn(StreamEvent) + Send + Sync,
+    outbox: Arc<Outbox>,
+    tell: impl Fn(StreamEvent) -> bool + Send + Sync,
 ) {
+    let mut past = Past { boot: lot(), heard: HeardEvents::default(), welcomed: false };
     let mut last = String::new();
     loop {
         let error = match connect(&open, &settings).await {
             Ok((endpoint, connection)) => {
-                let error =
-                    session::converse(&settings, &shared, &connection, &mut outbox, &tell).await;
+                let with = session::With { settings: &settings, shared: &shared, outbox: &outbox };
+                let error = session::converse(&with, &mut past, &connection, &tell).await;
                 connection.close(VarInt::from_u32(0), b"bye");
                 // Lets the close travel, so that the server frees the vehicle at once.
                 let _ = tokio::time::timeout(RETRY, endpoint.wait_idle()).await;
@@ -162,22 +177,39 @@ pub async fn run_over(
             Err(error) => error,
         };
         match error {
+            SessionEnd::Done => return,
             SessionEnd::Final(why) => {
                 tell(StreamEvent::Refused(why));
                 return;
             }
             SessionEnd::Retry(why) => {
                 // Once per cause, not five times a second.
-                if why != last {
+                if why != last || std::mem::take(&mut past.welcomed) {
                     tell(StreamEvent::Down(why.clone()));
                     last = why;
                 }
             }
         }
         tokio::time::sleep(RETRY).await;
-        // Reports that piled up meanwhile are stale; events are few and kept by the log.
-        while outbox.try_recv().is_ok() {}
     }
+}
+
+/// What outlives a connection.
+#[derive(Clone, Copy, Debug)]
+struct Past {
+    /// Tells our events from those of another run.
+    boot: u64,
+    /// What we have heard of the server's events.
+    heard: HeardEvents,
+    /// The server welcomed us since the last outage was told.
+    welcomed: bool,
+}
+
+/// Returns a number that no other run has drawn, as good as certainly; never 0.
+fn lot() -> u64 {
+    use std::hash::{BuildHasher, RandomState};
+    // Keyed by the system's randomness.
+    RandomState::new().hash_one(std::process::id()) | 1
 }
 
 /// Why a conversation ended.
@@ -187,6 +219,8 @@ enum SessionEnd {
     Retry(String),
     /// It will not.
     Final(String),
+    /// All has been said.
+    Done,
 }
 
 async fn connect(
@@ -248,6 +282,8 @@ fn transport() -> TransportConfig {
         .max_concurrent_uni_streams(VarInt::from_u32(IMAGES_AT_ONCE))
         .max_concurrent_bidi_streams(VarInt::from_u32(0))
         .stream_receive_window(VarInt::from_u32(STREAM_WINDOW))
+        .receive_window(VarInt::from_u32(RECEIVE_WINDOW))
+        .datagram_receive_buffer_size(Some(POSES_WAITING))
         .send_window(2 << 20)
         .ack_frequency_config(Some(acks))
         .keep_alive_interval(Some(Duration::from_secs(1)))

@@ -1,19 +1,20 @@
 //! One connection: handshake, then messages both ways and images, until it fails.
 
-use std::sync::Arc;
+use std::convert::Infallible;
 use std::time::Duration;
 
 use quinn::{Connection, ConnectionError, RecvStream, SendStream, VarInt};
-use tokio::sync::{Semaphore, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
-use vizflyt_protocol::messages::{ClockRequest, Hello, ToRuntime, ToServer, bounded, close};
-use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
+use vizflyt_protocol::messages::{
+    ClockRequest, Datagram, Hello, ToRuntime, ToServer, Welcome, close,
+};
+use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, decode_body, encode};
+use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_protocol::time::ServerTime;
 use zerocopy::IntoBytes;
 
+use super::{Outbox, Past, SessionEnd, Shared, StreamEvent, StreamSettings, receive};
 use crate::clock;
-
-use super::{IMAGES_AT_ONCE, ReceivedImage, SessionEnd, Shared, StreamEvent, StreamSettings};
 
 /// Nothing from the server for this long: connect anew.
 const SILENCE: Duration = Duration::from_secs(1);
@@ -23,30 +24,35 @@ const CLOCK_FAST: Duration = Duration::from_millis(250);
 const CLOCK_SLOW: Duration = Duration::from_secs(1);
 /// Requests at the start that fill the filter's window.
 const CLOCK_FIRST: u32 = 8;
-/// An image that has not come whole after this long is given up; it would be stale.
-const IMAGE_WITHIN: Duration = Duration::from_millis(500);
+
+/// What every conversation is led with.
+pub(super) struct With<'a> {
+    pub(super) settings: &'a StreamSettings,
+    pub(super) shared: &'a Shared,
+    pub(super) outbox: &'a Outbox,
+}
 
 /// Converses until the connection fails; returns why.
 pub(super) async fn converse(
-    settings: &StreamSettings,
-    shared: &Shared,
+    with: &With<'_>,
+    past: &mut Past,
     connection: &Connection,
-    outbox: &mut mpsc::Receiver<ToServer>,
-    tell: &(impl Fn(StreamEvent) + Send + Sync),
+    tell: &(impl Fn(StreamEvent) -> bool + Send + Sync),
 ) -> SessionEnd {
-    shared.clock.reset();
-    let end = match converse_inner(settings, shared, connection, outbox, tell).await {
+    with.shared.clock.reset();
+    let end = match converse_inner(with, past, connection, tell).await {
         Ok(never) => match never {},
         Err(end) => end,
     };
     // What the server said on closing tells more than which of our calls failed first.
-    match connection.close_reason() {
-        Some(ConnectionError::ApplicationClosed(said))
+    match (connection.close_reason(), end) {
+        (Some(ConnectionError::ApplicationClosed(said)), _)
             if said.error_code == VarInt::from_u32(close::UNPAIRED) =>
         {
             SessionEnd::Final(String::from_utf8_lossy(&said.reason).into_owned())
         }
-        _ => end,
+        (Some(error), SessionEnd::Retry(_)) => lost(error),
+        (_, end) => end,
     }
 }
 
@@ -54,69 +60,57 @@ fn lost(error: impl std::fmt::Display) -> SessionEnd {
     SessionEnd::Retry(format!("connection to the server lost: {error}"))
 }
 
-async fn converse_inner(
-    settings: &StreamSettings,
-    shared: &Shared,
+async fn converse_inner<T: Fn(StreamEvent) -> bool>(
+    with: &With<'_>,
+    past: &mut Past,
     connection: &Connection,
-    outbox: &mut mpsc::Receiver<ToServer>,
-    tell: &(impl Fn(StreamEvent) + Send + Sync),
-) -> Result<std::convert::Infallible, SessionEnd> {
+    tell: &T,
+) -> Result<Infallible, SessionEnd> {
     let (mut send, mut receive) = connection.open_bi().await.map_err(lost)?;
     send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.map_err(lost)?;
     let hello = Hello {
-        vehicle: settings.vehicle.clone(),
-        program: bounded(concat!("vizflyt-runtime ", env!("CARGO_PKG_VERSION"))),
+        vehicle: with.settings.vehicle.clone(),
+        purpose: with.settings.purpose,
+        program: with.settings.program.clone(),
+        boot: past.boot,
+        heard_events: past.heard,
     };
     write(&mut send, &ToServer::Hello(hello)).await?;
-    let mut preamble = [0; Preamble::SIZE];
-    timeout(2 * SILENCE, receive.read_exact(&mut preamble))
-        .await
-        .map_err(|_| SessionEnd::Retry("the server does not answer".into()))?
-        .map_err(lost)?;
-    match Preamble::check(&preamble, Party::Runtime) {
-        Ok(Party::Server) => {}
-        Ok(other) => {
-            return Err(SessionEnd::Final(format!("the other side is a {}", other.name())));
-        }
-        Err(error) => return Err(SessionEnd::Final(error.to_string())),
-    }
+    check_preamble(&mut receive).await?;
 
-    let images = Arc::new(Semaphore::new(IMAGES_AT_ONCE as usize));
+    receive::start(connection, with.shared);
+    let mut listener = Listener { with, past, tell, server: None, newest_pose: ServerTime::ZERO };
     let mut deframer = Box::new(Deframer::default());
     let mut chunk = vec![0; MAX_FRAMED];
-    let mut clock = interval(CLOCK_FAST);
-    clock.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut ticks = interval(CLOCK_FAST);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let (mut heard, mut asked, mut asked_count) = (Instant::now(), Instant::now(), 0);
     loop {
         tokio::select! {
             read = receive.read(&mut chunk) => {
                 let len = read.map_err(lost)?.ok_or_else(|| lost("the server closed it"))?;
                 heard = Instant::now();
-                let mut bytes = &chunk[..len];
+                let (mut bytes, before) = (&chunk[..len], listener.past.heard);
                 while !bytes.is_empty() {
                     bytes = &bytes[deframer.push(bytes)..];
                     while let Some(message) = deframer.next::<ToRuntime>() {
-                        take(message, shared, tell)?;
+                        listener.take(message)?;
                     }
                 }
-            }
-            message = outbox.recv() => match message {
-                Some(message) => write(&mut send, &message).await?,
-                // The flight is over.
-                None => return Err(SessionEnd::Final("done".into())),
-            },
-            stream = connection.accept_uni() => {
-                let stream = stream.map_err(lost)?;
-                // The transport bounds concurrent streams; this bounds what we buffer of them.
-                if let Ok(permit) = Arc::clone(&images).try_acquire_owned() {
-                    let shared = shared.clone();
-                    tokio::spawn(async move {
-                        receive_image(stream, &shared).await;
-                        drop(permit);
-                    });
+                if listener.past.heard != before {
+                    write(&mut send, &ToServer::Heard(listener.past.heard.seq)).await?;
                 }
             }
-            _ = clock.tick() => {
+            datagram = connection.read_datagram() => {
+                let datagram = datagram.map_err(lost)?;
+                heard = Instant::now();
+                listener.take_datagram(&datagram);
+            }
+            message = with.outbox.next(), if listener.server.is_some() => match message {
+                Some(message) => write(&mut send, &message).await?,
+                None => return Err(SessionEnd::Done),
+            },
+            _ = ticks.tick() => {
                 if heard.elapsed() > SILENCE {
                     return Err(SessionEnd::Retry("the server has been silent for 1 s".into()));
                 }
@@ -130,59 +124,88 @@ async fn converse_inner(
     }
 }
 
-/// Acts on one message.
-fn take(
-    message: Result<ToRuntime, FramingError>,
-    shared: &Shared,
-    tell: &impl Fn(StreamEvent),
-) -> Result<(), SessionEnd> {
-    match message {
-        Ok(ToRuntime::Welcome(arena)) => tell(StreamEvent::Welcome(Box::new(arena))),
-        // Another runtime may be leaving: try again.
-        Ok(ToRuntime::Refused(why)) => {
-            return Err(SessionEnd::Retry(format!("the server refuses: {why}")));
-        }
-        Ok(ToRuntime::Clock(reply)) => {
-            shared.clock.update(reply.sent, reply.answered, clock::now());
-        }
-        Ok(ToRuntime::Pose(sample)) => {
-            // Before the first clock exchange a pose cannot be placed in time.
-            if let Some(stamp) = shared.clock.to_host(sample.stamp) {
-                tell(StreamEvent::Pose(sample, stamp));
-            }
-        }
-        Ok(ToRuntime::Event(event)) => tell(StreamEvent::Event(event)),
-        Ok(ToRuntime::Camera { index, camera }) => {
-            tell(StreamEvent::Camera(index, Box::new(camera)));
-        }
-        Err(error @ FramingError::Body(_)) => tracing::warn!("server: {error}"),
-        Err(error @ FramingError::TooLong(_)) => return Err(lost(error)),
+async fn check_preamble(receive: &mut RecvStream) -> Result<(), SessionEnd> {
+    let mut preamble = [0; Preamble::SIZE];
+    timeout(2 * SILENCE, receive.read_exact(&mut preamble))
+        .await
+        .map_err(|_| SessionEnd::Retry("the server does not answer".into()))?
+        .map_err(lost)?;
+    match Preamble::check(&preamble, Party::Runtime) {
+        Ok(Party::Server) => Ok(()),
+        Ok(other) => Err(SessionEnd::Final(format!("the other side is a {}", other.name()))),
+        Err(error) => Err(SessionEnd::Final(error.to_string())),
     }
-    Ok(())
+}
+
+/// Acts on what the server says.
+struct Listener<'a, T> {
+    with: &'a With<'a>,
+    past: &'a mut Past,
+    tell: &'a T,
+    /// The server's `boot`, once it has welcomed us.
+    server: Option<u64>,
+    newest_pose: ServerTime,
+}
+
+impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
+    fn take(&mut self, message: Result<ToRuntime, FramingError>) -> Result<(), SessionEnd> {
+        match message {
+            Ok(ToRuntime::Welcome(Welcome { boot, heard_events, arena })) => {
+                (self.server, self.past.welcomed) = (Some(boot), true);
+                self.with.outbox.resume(heard_events.of(self.past.boot));
+                self.hand(StreamEvent::Welcome(Box::new(arena)))?;
+            }
+            // Another runtime may be leaving: try again.
+            Ok(ToRuntime::Refused(why)) => {
+                return Err(SessionEnd::Retry(format!("the server refuses: {why}")));
+            }
+            Ok(ToRuntime::Clock(reply)) => {
+                self.with.shared.clock.update(reply.sent, reply.answered, clock::now());
+            }
+            Ok(ToRuntime::Event { seq, event }) => {
+                let Some(boot) = self.server else { return Err(lost("an event before Welcome")) };
+                let mut heard = self.past.heard;
+                if heard.hear(boot, seq) {
+                    self.hand(StreamEvent::Event(event))?;
+                    self.past.heard = heard;
+                }
+            }
+            Ok(ToRuntime::Heard(seq)) => self.with.outbox.heard(seq),
+            Ok(ToRuntime::Camera { index, camera }) => {
+                self.hand(StreamEvent::Camera(index, Box::new(camera)))?;
+            }
+            Err(error @ FramingError::Body(_)) => tracing::warn!("server: {error}"),
+            Err(error @ FramingError::TooLong(_)) => return Err(lost(error)),
+        }
+        Ok(())
+    }
+
+    /// What is not taken is told again on the next connection.
+    fn hand(&self, event: StreamEvent) -> Result<(), SessionEnd> {
+        if (self.tell)(event) {
+            Ok(())
+        } else {
+            Err(SessionEnd::Retry("this runtime is too busy to listen".into()))
+        }
+    }
+
+    /// A pose that is not newer than the newest was overtaken on its way: it is dropped.
+    fn take_datagram(&mut self, bytes: &[u8]) {
+        let Ok(Datagram::Pose(sample)) = decode_body(bytes) else {
+            return tracing::debug!("server: a datagram of {} bytes does not decode", bytes.len());
+        };
+        if self.server.is_none() || sample.stamp <= self.newest_pose || !sample.is_valid() {
+            return;
+        }
+        // Before the first clock exchange a pose cannot be placed in time.
+        if let Some(stamp) = self.with.shared.clock.to_host(sample.stamp) {
+            self.newest_pose = sample.stamp;
+            (self.tell)(StreamEvent::Pose(sample, stamp));
+        }
+    }
 }
 
 async fn write(send: &mut SendStream, message: &ToServer) -> Result<(), SessionEnd> {
     let mut buffer = [0; MAX_FRAMED];
     send.write_all(encode(message, &mut buffer)).await.map_err(lost)
-}
-
-/// Receives one image into the mailbox. One that is cut off, late or nonsense is dropped: the
-/// next one comes in a moment.
-async fn receive_image(mut stream: RecvStream, shared: &Shared) {
-    let image = async {
-        let mut bytes = [0; ImageHeader::SIZE];
-        stream.read_exact(&mut bytes).await.ok()?;
-        let first = clock::now();
-        let (header, _) = ImageHeader::parse(&bytes)
-            .inspect_err(|error| tracing::debug!("image dropped: {error}"))
-            .ok()?;
-        // Bounded by `parse`.
-        let mut payload = vec![0; header.payload_len.get() as usize];
-        stream.read_exact(&mut payload).await.ok()?;
-        Some((header, payload, first))
-    };
-    let Ok(Some((header, payload, first))) = timeout(IMAGE_WITHIN, image).await else { return };
-    let received = clock::now();
-    let Some(pose) = shared.clock.to_host(header.pose_stamp()) else { return };
-    shared.mailbox.offer(ReceivedImage { header, payload, pose, first, received });
 }

@@ -4,9 +4,13 @@ use std::sync::mpsc::{Receiver, channel};
 
 use quinn::{Connection, RecvStream, SendStream, ServerConfig};
 use vizflyt_protocol::geometry::{Intrinsics, Pose, Twist, Volume};
-use vizflyt_protocol::messages::{ClockReply, EventKind, Limits, Telemetry, ToRuntime, bounded};
-use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
+use vizflyt_protocol::messages::{
+    ClockReply, Datagram, EventKind, Hello, Limits, Telemetry, ToRuntime, ToServer, Welcome,
+    bounded,
+};
+use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode, encode_body};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, Party, Preamble};
+use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::host_now;
 use zerocopy::IntoBytes;
@@ -45,11 +49,19 @@ impl Server {
 
     /// Accepts one runtime and welcomes it.
     async fn welcome(&self) -> Peer {
+        self.welcome_as(BOOT, |_| 0).await.0
+    }
+
+    /// Accepts one runtime and welcomes it as the run `boot` of a server, which has heard of the
+    /// runtime's events what `heard` says.
+    async fn welcome_as(&self, boot: u64, heard: impl Fn(&Hello) -> u64) -> (Peer, Hello) {
         let mut peer = self.accept(Preamble::of(Party::Server)).await;
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
-        assert_eq!(hello.vehicle, "vizflyt");
-        peer.say(&ToRuntime::Welcome(arena())).await;
-        peer
+        assert_eq!((hello.vehicle.as_str(), hello.purpose), ("vizflyt", Purpose::Fly));
+        let heard_events = HeardEvents { boot: hello.boot, seq: heard(&hello) };
+        let welcome = Welcome { boot, heard_events, arena: arena() };
+        peer.say(&ToRuntime::Welcome(welcome)).await;
+        (peer, hello)
     }
 }
 
@@ -76,6 +88,30 @@ impl Peer {
         }
     }
 
+    /// Returns the runtime's next event.
+    async fn event(&mut self) -> Option<(u64, Event)> {
+        loop {
+            if let ToServer::Event { seq, event } = self.next_but_clock().await? {
+                return Some((seq, event));
+            }
+        }
+    }
+
+    async fn tell(&mut self, seq: u64, text: &str) {
+        self.say(&ToRuntime::Event { seq, event: note(text) }).await;
+    }
+
+    /// Returns when the runtime acknowledges the event `seq`.
+    async fn heard(&mut self, seq: u64) {
+        while self.next_but_clock().await != Some(ToServer::Heard(seq)) {}
+    }
+
+    fn pose(&self, pose: &PoseSample) {
+        let mut buffer = [0; MAX_FRAMED];
+        let bytes = encode_body(&Datagram::Pose(*pose), &mut buffer).to_vec();
+        self.connection.send_datagram(bytes.into()).unwrap();
+    }
+
     /// Answers clock requests until something else comes.
     async fn next_but_clock(&mut self) -> Option<ToServer> {
         loop {
@@ -92,6 +128,8 @@ impl Peer {
     }
 }
 
+/// Of the usual server.
+const BOOT: u64 = 77;
 const AHEAD_NS: u64 = 100_000_000_000;
 
 fn arena() -> ArenaInfo {
@@ -108,28 +146,32 @@ fn arena() -> ArenaInfo {
     }
 }
 
+fn note(text: &str) -> Event {
+    Event { stamp: ServerTime::ZERO, kind: EventKind::Note, text: bounded(text) }
+}
+
 struct Client {
     events: Receiver<StreamEvent>,
-    outbox: mpsc::Sender<ToServer>,
+    outbox: Arc<Outbox>,
     shared: Shared,
 }
 
 impl Client {
     fn start(server: &Server, fingerprint: Fingerprint) -> Self {
         let (sender, events) = channel();
-        let (outbox, outgoing) = mpsc::channel(16);
+        let outbox = Arc::new(Outbox::default());
         let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
         let settings = StreamSettings {
             server: server.endpoint.local_addr().unwrap(),
             fingerprint,
             identity: Identity::fleeting().unwrap(),
             vehicle: bounded("vizflyt"),
+            purpose: Purpose::Fly,
+            program: bounded("test"),
         };
         let sender = std::sync::Mutex::new(sender);
-        let tell = move |event| {
-            let _ = sender.lock().unwrap().send(event);
-        };
-        tokio::spawn(run(settings, shared.clone(), outgoing, tell));
+        let tell = move |event| sender.lock().unwrap().send(event).is_ok();
+        tokio::spawn(run(settings, shared.clone(), Arc::clone(&outbox), tell));
         Self { events, outbox, shared }
     }
 
@@ -154,7 +196,7 @@ async fn a_conversation_and_an_image() {
     assert!(matches!(client.next(), StreamEvent::Welcome(a) if *a == arena()));
 
     // The first message that is no clock request; by then the clocks are related.
-    client.outbox.send(ToServer::Telemetry(Telemetry::default())).await.unwrap();
+    client.outbox.report(Telemetry::default());
     while client.shared.clock.to_host(ServerTime::from_ns(AHEAD_NS)).is_none() {
         let got = tokio::time::timeout(Duration::from_millis(50), peer.next_but_clock()).await;
         assert!(got.is_err() || matches!(got, Ok(Some(ToServer::Telemetry(_)))));
@@ -162,32 +204,164 @@ async fn a_conversation_and_an_image() {
     let stamp = ServerTime::from_ns(host_now().as_ns() + AHEAD_NS);
     let pose =
         PoseSample { stamp, world_from_body: Pose::IDENTITY, twist: Twist::default(), resets: 2 };
-    peer.say(&ToRuntime::Pose(pose)).await;
+    peer.pose(&pose);
     let StreamEvent::Pose(found, host) = client.next() else { panic!("no pose") };
     assert_eq!(found, pose);
     assert!(host_now().seconds_since(host).abs() < 5.0, "on our clock: {host:?}");
     let event = Event { stamp, kind: EventKind::EmergencyStop, text: bounded("stop") };
-    peer.say(&ToRuntime::Event(event.clone())).await;
+    peer.say(&ToRuntime::Event { seq: 1, event: event.clone() }).await;
     assert!(matches!(client.next(), StreamEvent::Event(found) if found == event));
 
     let k = Intrinsics::from_horizontal_fov(64, 48, 1.5);
-    let mut header = ImageHeader::new(9, 0, stamp, &k, &Pose::IDENTITY, &Pose::IDENTITY);
-    let payload: Vec<u8> = (0..20_000).map(|n| n as u8).collect();
-    header.payload_len = (payload.len() as u32).into();
+    let header = ImageHeader::new(9, 0, stamp, &k, &Pose::IDENTITY, &Pose::IDENTITY);
+    let (rgb, depth_mm) = (vec![9; 64 * 48 * 3], vec![1234; 64 * 48]);
+    let view = RgbdView { width: 64, height: 48, rgb: &rgb, depth_mm: &depth_mm };
+    let mut payload = Vec::new();
+    Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
+    let trailer = ImageTrailer::new(payload.len() as u32, stamp, stamp);
     for cut in [true, false] {
         let mut stream = peer.connection.open_uni().await.unwrap();
         stream.write_all(header.as_bytes()).await.unwrap();
         let end = if cut { 100 } else { payload.len() };
         stream.write_all(&payload[..end]).await.unwrap();
+        if !cut {
+            stream.write_all(trailer.as_bytes()).await.unwrap();
+        }
         stream.finish().unwrap();
+        // One after the other, so that the second is not taken for the older one.
+        let _ = stream.stopped().await;
     }
     // Nonsense on a stream harms nobody.
     let mut stream = peer.connection.open_uni().await.unwrap();
     stream.write_all(&[7; 500]).await.unwrap();
     stream.finish().unwrap();
-    let image = tokio::task::block_in_place(|| client.shared.mailbox.take(WAIT)).unwrap();
-    assert_eq!((image.header, image.payload), (header, payload));
-    assert!(image.received >= image.pose || host_now().seconds_since(image.pose) < 5.0);
+    let (mut found, mut whole) = (Vec::new(), None);
+    let mut dropped = 0;
+    while whole.is_none() {
+        let next = || client.shared.mailbox.next(WAIT, |_| true);
+        match tokio::task::block_in_place(next).unwrap().1 {
+            Step::Begin(arrival) => {
+                assert_eq!(arrival.header, header);
+                assert!(arrival.first >= arrival.pose);
+                found.clear();
+            }
+            Step::Piece(piece) => found.extend_from_slice(&piece),
+            Step::Drop => dropped += 1,
+            Step::End(end) => whole = Some(end),
+        }
+    }
+    assert_eq!((found, whole.unwrap().trailer), (payload, trailer));
+    let fates = client.shared.mailbox.fates()[0];
+    assert!(dropped <= 1);
+    assert_eq!((fates.arrivals.arrived, fates.lost + fates.replaced), (1, 1));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pose_that_was_overtaken_is_dropped() {
+    let server = Server::start();
+    let client = Client::start(&server, server.fingerprint);
+    let mut peer = server.welcome().await;
+    assert!(matches!(client.next(), StreamEvent::Welcome(_)));
+    while client.shared.clock.to_host(ServerTime::from_ns(AHEAD_NS)).is_none() {
+        let wait = Duration::from_millis(20);
+        let _ = tokio::time::timeout(wait, peer.next_but_clock()).await;
+    }
+    let pose = |ns: u64| PoseSample {
+        stamp: ServerTime::from_ns(AHEAD_NS + ns),
+        world_from_body: Pose::IDENTITY,
+        twist: Twist::default(),
+        resets: 0,
+    };
+    let mut poison = pose(9);
+    poison.twist.linear_mps.x = f64::NAN;
+    peer.connection.send_datagram(vec![0xff; 40].into()).unwrap();
+    for sample in [poison, pose(5), pose(3), pose(5), pose(8)] {
+        peer.pose(&sample);
+    }
+    let next = || match client.next() {
+        StreamEvent::Pose(sample, _) => sample.stamp.as_ns() - AHEAD_NS,
+        other => panic!("{other:?} is no pose"),
+    };
+    assert_eq!((next(), next()), (5, 8));
+}
+
+/// Failed before: whatever was told while the server was away was thrown away, and the server told
+/// everything since the flight's start again.
+#[tokio::test(flavor = "multi_thread")]
+async fn events_survive_an_outage_both_ways_and_come_once() {
+    let server = Server::start();
+    let client = Client::start(&server, server.fingerprint);
+    let (mut peer, hello) = server.welcome_as(BOOT, |_| 0).await;
+    assert!(matches!(client.next(), StreamEvent::Welcome(_)));
+    assert_eq!(hello.heard_events, HeardEvents::default());
+    client.outbox.tell(note("one"));
+    client.outbox.tell(note("two"));
+    assert_eq!(peer.event().await.unwrap(), (1, note("one")));
+    assert_eq!(peer.event().await.unwrap(), (2, note("two")));
+    // Only the first is acknowledged before the outage; the second was heard all the same.
+    peer.say(&ToRuntime::Heard(1)).await;
+    for (seq, text) in [(4, "four"), (9, "nine")] {
+        peer.tell(seq, text).await;
+        assert!(matches!(client.next(), StreamEvent::Event(event) if event == note(text)));
+    }
+    peer.heard(9).await;
+    peer.connection.close(VarInt::from_u32(1), b"outage");
+    assert!(matches!(client.next(), StreamEvent::Down(_)));
+    client.outbox.tell(note("three"));
+    client.outbox.report(Telemetry::default());
+
+    let (mut peer, again) = server.welcome_as(BOOT, |_| 2).await;
+    assert!(matches!(client.next(), StreamEvent::Welcome(_)));
+    assert_eq!((again.boot, again.heard_events), (hello.boot, HeardEvents { boot: BOOT, seq: 9 }));
+    // A server that tells something twice is heard once.
+    peer.tell(9, "nine").await;
+    peer.tell(10, "ten").await;
+    assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("ten")));
+    assert_eq!(peer.event().await.unwrap(), (3, note("three")));
+    // The server is restarted: it has heard nothing, and numbers its events anew.
+    peer.connection.close(VarInt::from_u32(1), b"restart");
+    assert!(matches!(client.next(), StreamEvent::Down(_)));
+    let (mut peer, _) = server.welcome_as(BOOT + 1, |_| 0).await;
+    assert!(matches!(client.next(), StreamEvent::Welcome(_)));
+    assert_eq!(peer.event().await.unwrap(), (3, note("three")), "what nobody acknowledged");
+    peer.tell(1, "first").await;
+    assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("first")));
+    // It ends when the last event is heard.
+    client.outbox.close();
+    peer.say(&ToRuntime::Heard(3)).await;
+    while peer.next_but_clock().await.is_some() {}
+    peer.connection.closed().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_event_that_found_no_room_is_told_again() {
+    let server = Server::start();
+    let (sender, events) = channel();
+    let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
+    let settings = StreamSettings {
+        server: server.endpoint.local_addr().unwrap(),
+        fingerprint: server.fingerprint,
+        identity: Identity::fleeting().unwrap(),
+        vehicle: bounded("vizflyt"),
+        purpose: Purpose::Fly,
+        program: bounded("test"),
+    };
+    let (sender, refused) = (Mutex::new(sender), std::sync::atomic::AtomicBool::new(false));
+    // The control loop is stalled when the event comes for the first time.
+    let tell = move |event| {
+        let is_event = matches!(event, StreamEvent::Event(_));
+        let stalled = is_event && !refused.swap(true, std::sync::atomic::Ordering::Relaxed);
+        !stalled && sender.lock().unwrap().send(event).is_ok()
+    };
+    tokio::spawn(run(settings, shared, Arc::default(), tell));
+    let mut peer = server.welcome().await;
+    peer.tell(1, "stop").await;
+    let (mut again, hello) = server.welcome_as(BOOT, |_| 0).await;
+    assert_eq!(hello.heard_events.of(BOOT), 0);
+    again.tell(1, "stop").await;
+    let wait = || events.recv_timeout(WAIT).unwrap();
+    while !matches!(tokio::task::block_in_place(wait), StreamEvent::Event(e) if e == note("stop")) {
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -235,8 +409,8 @@ async fn after_an_outage_or_a_silence_it_connects_anew() {
     let mut third = server.welcome().await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
     drop(silent);
-    client.outbox.send(ToServer::Telemetry(Telemetry::default())).await.unwrap();
-    assert!(matches!(third.next_but_clock().await, Some(ToServer::Telemetry(_))));
+    client.outbox.report(Telemetry::default());
+    while !matches!(third.next_but_clock().await, Some(ToServer::Telemetry(_))) {}
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -5,8 +5,14 @@
 //! 1. each side sends its [`crate::packet::Preamble`] and checks the other's;
 //! 2. the runtime sends [`ToServer::Hello`]; the server answers [`ToRuntime::Welcome`] or
 //!    [`ToRuntime::Refused`];
-//! 3. then poses, events, changed cameras and clock replies flow down; telemetry, events and clock
+//! 3. then events, changed cameras and clock replies flow down; telemetry, events and clock
 //!    requests up.
+//!
+//! Events are numbered from 1 by who makes them, and acknowledged with `Heard`. Each side says at
+//! the start what it has heard of the other ([`HeardEvents`]), so that after an outage whatever is
+//! missing is told again, and nothing twice.
+//!
+//! Poses come as datagrams ([`Datagram`]): a lost one holds up nothing, the newest by stamp counts.
 //!
 //! Each message is framed by [`crate::packet::framing`]. Plugin messages ([`ToPlugin`],
 //! [`FromPlugin`]) use the same encoding over shared-memory queues.
@@ -23,7 +29,8 @@ pub use event::{Event, EventKind};
 pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
-    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Hello, Limits, PoseSample, ToRuntime, ToServer,
+    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, Limits,
+    PoseSample, Purpose, ToRuntime, ToServer, Welcome,
 };
 pub use setpoint::{Axes, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};

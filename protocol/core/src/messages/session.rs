@@ -7,13 +7,65 @@ use super::{Event, MAX_CAMERAS, Name, Telemetry, Text, Timing};
 use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 use crate::time::{HostTime, ServerTime};
 
-/// First message of a runtime.
+/// What a client is there for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Purpose {
+    /// Flies the vehicle: gets all, reports, tells events. One at a time.
+    #[default]
+    Fly,
+    /// Watches it: gets images, poses and events; what it tells but clock requests is ignored.
+    Watch,
+}
+
+/// First message of a client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Hello {
-    /// The vehicle this runtime flies: the object's name in the localization system.
+    /// The vehicle that it flies or watches: the object's name in the localization system.
     pub vehicle: Name,
+    /// What it is there for.
+    pub purpose: Purpose,
     /// The program and its version, for the page and the log.
     pub program: Text,
+    /// Drawn by lot when the program started: tells its events from those of another run.
+    pub boot: u64,
+    /// What it has heard of the server's events before.
+    pub heard_events: HeardEvents,
+}
+
+/// Accepts a client.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Welcome {
+    /// Drawn by lot when the server started: another one means that it was restarted.
+    pub boot: u64,
+    /// What the server has heard of this client's events before.
+    pub heard_events: HeardEvents,
+    /// What it must know of the arena.
+    pub arena: ArenaInfo,
+}
+
+/// How far one side has heard the other's events.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HeardEvents {
+    /// Whose they were: the other side's `boot`; 0 is nobody's.
+    pub boot: u64,
+    /// Number of the newest; 0 is none.
+    pub seq: u64,
+}
+
+impl HeardEvents {
+    /// Returns the newest number heard of the run `boot`; 0 of any other.
+    pub fn of(&self, boot: u64) -> u64 {
+        if self.boot == boot { self.seq } else { 0 }
+    }
+
+    /// Takes note of an event of the run `boot`; returns whether it is new.
+    pub fn hear(&mut self, boot: u64, seq: u64) -> bool {
+        let is_new = seq > self.of(boot);
+        if is_new {
+            *self = Self { boot, seq };
+        }
+        is_new
+    }
 }
 
 /// Asks the server's clock. The runtime sends one a second, four times as often at the start.
@@ -32,7 +84,7 @@ pub struct ClockReply {
     pub answered: ServerTime,
 }
 
-/// Runtime to server.
+/// Client to server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: the largest comes once a second, and there is no heap.
 pub enum ToServer {
@@ -43,25 +95,37 @@ pub enum ToServer {
     /// Reports. 10 Hz.
     Telemetry(Telemetry),
     /// Something the page should show.
-    Event(Event),
+    Event {
+        /// Its number among this client's events, rising.
+        seq: u64,
+        /// What.
+        event: Event,
+    },
+    /// Every event of the server up to this number has been heard.
+    Heard(u64),
     /// Reports where images get their age. 1 Hz.
     Timing(Timing),
 }
 
-/// Server to runtime.
+/// Server to client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: `Welcome` comes once, and there is no heap to box it on.
 pub enum ToRuntime {
-    /// Accepts the runtime.
-    Welcome(ArenaInfo),
+    /// Accepts the client.
+    Welcome(Welcome),
     /// Declines it, with the reason in a sentence that says what to do.
     Refused(Text),
     /// Tells the time.
     Clock(ClockReply),
-    /// The vehicle's pose. At most 100 Hz.
-    Pose(PoseSample),
     /// Something happened.
-    Event(Event),
+    Event {
+        /// Its number among this server's events, rising; not every number is for every client.
+        seq: u64,
+        /// What.
+        event: Event,
+    },
+    /// Every event of this client up to this number has been heard.
+    Heard(u64),
     /// A camera was changed while flying. Images drawn with it may come before this does: each
     /// says itself how it was drawn.
     Camera {
@@ -70,6 +134,14 @@ pub enum ToRuntime {
         /// The camera as it is from now on; its name stays.
         camera: CameraInfo,
     },
+}
+
+/// Server to client, unordered, possibly lost; [`crate::packet::framing::encode_body`] without a
+/// length.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Datagram {
+    /// The vehicle's pose. At most 100 Hz; the newest by stamp counts.
+    Pose(PoseSample),
 }
 
 /// The vehicle's pose as localized and fused by the server.
@@ -83,6 +155,14 @@ pub struct PoseSample {
     pub twist: Twist,
     /// Raised by one whenever the pose jumped for another reason than motion.
     pub resets: u8,
+}
+
+impl PoseSample {
+    /// Whether every number in it is one to work with.
+    pub fn is_valid(&self) -> bool {
+        let Twist { linear_mps, angular_radps } = self.twist;
+        self.world_from_body.is_valid() && linear_mps.is_finite() && angular_radps.is_finite()
+    }
 }
 
 /// One camera that the server draws.
@@ -127,4 +207,20 @@ pub struct ArenaInfo {
     pub time_limit_s: f64,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_event_of_a_run_is_new_once() {
+        let mut heard = HeardEvents::default();
+        assert!(heard.hear(7, 1) && heard.hear(7, 4));
+        assert!(!heard.hear(7, 1) && !heard.hear(7, 4));
+        assert_eq!((heard.of(7), heard.of(8)), (4, 0));
+        // The other side was restarted and counts anew.
+        assert!(heard.hear(8, 1));
+        assert_eq!((heard.of(7), heard.of(8)), (0, 1));
+    }
 }

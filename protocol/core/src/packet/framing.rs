@@ -120,25 +120,28 @@ mod tests {
         }
     }
 
+    fn welcome() -> Welcome {
+        let heard_events = HeardEvents { boot: u64::MAX, seq: u64::MAX };
+        Welcome { boot: u64::MAX, heard_events, arena: widest_arena() }
+    }
+
     fn messages() -> Vec<ToRuntime> {
         std::vec![
-            ToRuntime::Welcome(widest_arena()),
+            ToRuntime::Welcome(welcome()),
             ToRuntime::Refused(bounded(&"why ".repeat(99))),
             ToRuntime::Clock(ClockReply {
                 sent: HostTime::from_ns(u64::MAX),
                 answered: ServerTime::from_ns(1),
             }),
-            ToRuntime::Pose(PoseSample {
-                stamp: ServerTime::from_ns(7),
-                world_from_body: Pose::IDENTITY,
-                twist: Twist::default(),
-                resets: 3,
-            }),
-            ToRuntime::Event(Event {
-                stamp: ServerTime::from_ns(8),
-                kind: EventKind::Collision { p_world_m: DVec3::ONE, clearance_m: -0.01 },
-                text: bounded("collision"),
-            }),
+            ToRuntime::Heard(u64::MAX),
+            ToRuntime::Event {
+                seq: u64::MAX,
+                event: Event {
+                    stamp: ServerTime::from_ns(8),
+                    kind: EventKind::Collision { p_world_m: DVec3::ONE, clearance_m: -0.01 },
+                    text: bounded("collision"),
+                },
+            },
         ]
     }
 
@@ -182,7 +185,7 @@ mod tests {
     #[test]
     fn the_widest_messages_fit() {
         let mut buffer = [0; MAX_FRAMED];
-        assert!(encode(&ToRuntime::Welcome(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
+        assert!(encode(&ToRuntime::Welcome(welcome()), &mut buffer).len() < MAX_FRAMED / 2);
         assert!(encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
         let telemetry = ToServer::Telemetry(Telemetry::default());
         assert!(encode(&telemetry, &mut buffer).len() < 1024);
@@ -215,5 +218,15 @@ mod tests {
         let message = ToServer::Timing(timing);
         assert!(encode(&message, &mut buffer).len() < 1536);
         assert_eq!(decode_body(encode_body(&message, &mut buffer)), Ok(message));
+        let pose = PoseSample {
+            stamp: ServerTime::from_ns(u64::MAX),
+            world_from_body: Pose::new(DVec3::splat(1.1), DQuat::from_rotation_x(0.4)),
+            twist: Twist { linear_mps: DVec3::splat(2.2), angular_radps: DVec3::splat(3.3) },
+            resets: 3,
+        };
+        // Far below the smallest packet of QUIC, 1200 bytes.
+        let datagram = encode_body(&Datagram::Pose(pose), &mut buffer);
+        assert!(datagram.len() < 200);
+        assert_eq!(decode_body(datagram), Ok(Datagram::Pose(pose)));
     }
 }

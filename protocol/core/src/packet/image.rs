@@ -1,4 +1,5 @@
-//! The header in front of every image on its own unidirectional QUIC stream.
+//! What frames every image on its own unidirectional QUIC stream: a header with all that is known
+//! when drawing has ended, the bitstream as it is made, slice by slice, and a trailer.
 
 use glam::{DQuat, DVec3};
 use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
@@ -8,7 +9,8 @@ use crate::PROTOCOL_VERSION;
 use crate::geometry::{Body, Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 use crate::time::ServerTime;
 
-/// Who, when, from where; then `payload_len` bytes of RGB-D bitstream (`vizflyt-rgbd`).
+/// Who, when, from where. The RGB-D bitstream (`vizflyt-rgbd`) follows as it is made, then an
+/// [`ImageTrailer`], then the stream ends.
 ///
 /// Stamps are on the server's clock. Depth in the payload is camera z in units of
 /// `depth_unit_m`, 0 where there is no return (REP 118).
@@ -33,10 +35,6 @@ pub struct ImageHeader {
     pub render_start_ns: U64,
     /// Rendering ended. [ns, server]
     pub render_end_ns: U64,
-    /// Encoding ended. [ns, server]
-    pub encode_end_ns: U64,
-    /// Handed to the transport. [ns, server]
-    pub send_ns: U64,
     /// Camera position. [m, world]
     pub translation_m: [F64; 3],
     /// Camera to world rotation, xyzw.
@@ -55,8 +53,6 @@ pub struct ImageHeader {
     pub height_px: U32,
     /// Metres per unit of depth; 0.001.
     pub depth_unit_m: F64,
-    /// Bytes of bitstream that follow.
-    pub payload_len: U32,
     /// The cameras whose images leave together with this one, bit by index: a receiver that has
     /// them all need not wait for cameras of another rate. 0 is not known.
     pub together: U32,
@@ -80,9 +76,6 @@ pub enum InvalidImageHeader {
     /// Pose or depth unit not finite, or quaternion not unit.
     #[error("image header: camera pose or depth unit is not a number to work with")]
     Pose,
-    /// Payload larger than any image of this size can need.
-    #[error("image header: payload of {0} bytes is more than its size can need")]
-    Payload(u32),
 }
 
 impl ImageHeader {
@@ -111,8 +104,6 @@ impl ImageHeader {
             exposure_ns: pose.as_ns().into(),
             render_start_ns: 0.into(),
             render_end_ns: 0.into(),
-            encode_end_ns: 0.into(),
-            send_ns: 0.into(),
             translation_m: world_from_cam.translation_m.to_array().map(F64::new),
             rotation_xyzw: world_from_cam.rotation.to_array().map(F64::new),
             mount_m: body_from_cam.translation_m.to_array().map(F64::new),
@@ -122,7 +113,6 @@ impl ImageHeader {
             width_px: k.width_px.into(),
             height_px: k.height_px.into(),
             depth_unit_m: F64::new(0.001),
-            payload_len: 0.into(),
             together: 0.into(),
         }
     }
@@ -143,12 +133,14 @@ impl ImageHeader {
         if !(posed && (1e-6..=1.0).contains(&unit_m)) {
             return Err(InvalidImageHeader::Pose);
         }
-        // Eight bytes a pixel and some overhead exceed every mode of the bitstream.
-        let most = 8 * header.intrinsics().pixels() as u64 + 65536;
-        if u64::from(header.payload_len.get()) > most {
-            return Err(InvalidImageHeader::Payload(header.payload_len.get()));
-        }
         Ok((header, rest))
+    }
+
+    /// Returns the most bytes of bitstream that an image of this size can need: a receiver gives up
+    /// on more.
+    pub fn most_payload(&self) -> u64 {
+        // Eight bytes a pixel and some overhead exceed every mode of the bitstream.
+        8 * u64::from(self.width_px.get()) * u64::from(self.height_px.get()) + 65536
     }
 
     /// Returns the camera's intrinsics.
@@ -188,6 +180,74 @@ impl ImageHeader {
     }
 }
 
+/// What was known only when the last byte of the bitstream had been made; it ends the stream.
+///
+/// No checksum: QUIC authenticates every packet.
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
+)]
+#[repr(C)]
+pub struct ImageTrailer {
+    magic: [u8; 4],
+    /// Bytes of bitstream between header and trailer.
+    pub payload_len: U32,
+    /// Encoding ended. [ns, server]
+    pub encode_end_ns: U64,
+    /// The first byte was handed to the transport, while the rest was still being made.
+    /// [ns, server]
+    pub send_ns: U64,
+}
+
+/// Why bytes are no image trailer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidImageTrailer {
+    /// Wrong magic: the image was cut short, or more follows than it announced.
+    #[error("the image does not end with a trailer")]
+    Foreign,
+    /// What came is not as long as what was sent.
+    #[error("image trailer: {said} bytes were sent, {came} came")]
+    Length {
+        /// Bytes of bitstream by the trailer.
+        said: u32,
+        /// Bytes of bitstream received.
+        came: u64,
+    },
+}
+
+impl ImageTrailer {
+    /// Bytes on the wire.
+    pub const SIZE: usize = size_of::<Self>();
+    const MAGIC: [u8; 4] = *b"VZIE";
+
+    /// Makes the trailer of a bitstream of so many bytes.
+    pub fn new(payload_len: u32, encode_end: ServerTime, send: ServerTime) -> Self {
+        Self {
+            magic: Self::MAGIC,
+            payload_len: payload_len.into(),
+            encode_end_ns: encode_end.as_ns().into(),
+            send_ns: send.as_ns().into(),
+        }
+    }
+
+    /// Reads the trailer of an image of which `came` bytes of bitstream were received.
+    pub fn parse(bytes: &[u8; Self::SIZE], came: u64) -> Result<Self, InvalidImageTrailer> {
+        let Ok(trailer) = Self::read_from_bytes(bytes) else {
+            return Err(InvalidImageTrailer::Foreign);
+        };
+        if trailer.magic != Self::MAGIC {
+            return Err(InvalidImageTrailer::Foreign);
+        }
+        let said = trailer.payload_len.get();
+        if u64::from(said) != came {
+            return Err(InvalidImageTrailer::Length { said, came });
+        }
+        Ok(trailer)
+    }
+}
+
+// The layout is a contract between the two ends.
+const _: () = assert!(ImageHeader::SIZE == 252 && ImageTrailer::SIZE == 24);
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -222,15 +282,56 @@ mod tests {
         h.mount_m[1] = F64::new(f64::NAN);
         assert_eq!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Pose));
         let mut h = header();
-        h.payload_len = u32::MAX.into();
-        assert!(matches!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Payload(_))));
-        let mut h = header();
         h.width_px = 0.into();
         assert!(matches!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Intrinsics(_))));
         assert_eq!(ImageHeader::parse(&[0; 20]), Err(InvalidImageHeader::Short(20)));
     }
 
+    #[test]
+    fn a_trailer_that_does_not_fit_is_refused() {
+        let trailer = ImageTrailer::new(7, ServerTime::from_ns(3), ServerTime::from_ns(2));
+        let mut bytes = [0; ImageTrailer::SIZE];
+        bytes.copy_from_slice(trailer.as_bytes());
+        let short = InvalidImageTrailer::Length { said: 7, came: 6 };
+        assert_eq!(ImageTrailer::parse(&bytes, 6), Err(short));
+        bytes[3] = b'M';
+        assert_eq!(ImageTrailer::parse(&bytes, 7), Err(InvalidImageTrailer::Foreign));
+    }
+
     proptest! {
+        #[test]
+        fn headers_survive_the_wire(
+            seq: u64, camera: u8, pose: u64, exposure: u64, start: u64, end: u64, together: u32,
+            width in 1u32..9000, height in 1u32..9000, fov in 0.2f64..2.5,
+        ) {
+            let k = Intrinsics::from_horizontal_fov(width, height, fov);
+            let mount = crate::geometry::body_from_forward_cam(DVec3::Y, 0.1);
+            let pose = ServerTime::from_ns(pose);
+            let mut sent = ImageHeader::new(seq, camera, pose, &k, &mount, &Pose::IDENTITY);
+            (sent.exposure_ns, sent.together) = (exposure.into(), together.into());
+            (sent.render_start_ns, sent.render_end_ns) = (start.into(), end.into());
+            match ImageHeader::parse(sent.as_bytes()) {
+                Ok((found, rest)) => prop_assert!(found == sent && rest.is_empty()),
+                Err(_) => prop_assert!(width.max(height) > Intrinsics::MAX_SIDE_PX),
+            }
+            let pixels = u64::from(width) * u64::from(height);
+            prop_assert!(sent.most_payload() > 8 * pixels);
+        }
+
+        #[test]
+        fn trailers_survive_the_wire(len: u32, end: u64, send: u64) {
+            let sent = ImageTrailer::new(len, ServerTime::from_ns(end), ServerTime::from_ns(send));
+            let bytes = sent.as_bytes().first_chunk().unwrap();
+            prop_assert_eq!(ImageTrailer::parse(bytes, len.into()), Ok(sent));
+        }
+
+        #[test]
+        fn any_trailer_parses_or_fails_cleanly(bytes: [u8; ImageTrailer::SIZE], came: u64) {
+            if let Ok(trailer) = ImageTrailer::parse(&bytes, came) {
+                prop_assert_eq!(trailer.as_bytes(), &bytes);
+            }
+        }
+
         #[test]
         fn any_bytes_parse_or_fail_cleanly(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
             let _ = ImageHeader::parse(&bytes);

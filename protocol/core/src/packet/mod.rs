@@ -5,7 +5,7 @@ mod image;
 mod observation;
 mod preamble;
 
-pub use image::{ImageHeader, InvalidImageHeader};
+pub use image::{ImageHeader, ImageTrailer, InvalidImageHeader, InvalidImageTrailer};
 pub use observation::{
     CameraHeader, InvalidObservation, ObservationHeader, ObservationLayout, PLANE_ALIGN,
 };

@@ -73,7 +73,7 @@ impl Preamble {
     /// let error = Preamble::check(&bytes, Party::Runtime).unwrap_err();
     /// # extern crate std;
     /// # use std::string::ToString;
-    /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime 2"));
+    /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime 3"));
     /// ```
     pub fn check(bytes: &[u8; Self::SIZE], me: Party) -> Result<Party, PreambleError> {
         let Ok(theirs) = Self::read_from_bytes(bytes) else {
@@ -133,19 +133,19 @@ mod tests {
 
     #[test]
     fn the_older_side_is_named() {
-        check(*b"VZFL\x02\x00\x01\x00", Party::Runtime, Ok(Party::Server));
+        check(*b"VZFL\x03\x00\x01\x00", Party::Runtime, Ok(Party::Server));
         check(
-            *b"VZFL\x03\x00\x01\x00",
+            *b"VZFL\x04\x00\x01\x00",
             Party::Runtime,
-            Err("server speaks protocol 3, this runtime 2: update the runtime"),
+            Err("server speaks protocol 4, this runtime 3: update the runtime"),
         );
         check(
             *b"VZFL\x00\x00\x02\x00",
             Party::Server,
-            Err("runtime speaks protocol 0, this server 2: update the runtime"),
+            Err("runtime speaks protocol 0, this server 3: update the runtime"),
         );
         let stranger = "the other side does not speak VizFlyt; check the address and port";
         check(*b"HTTP/1.1", Party::Server, Err(stranger));
-        check(*b"VZFL\x02\x00\x09\x00", Party::Server, Err(stranger));
+        check(*b"VZFL\x03\x00\x09\x00", Party::Server, Err(stranger));
     }
 }

@@ -29,6 +29,7 @@ use super::validate::{ConfigError, check_number, check_position, invalid};
 /// yaw_deg = 90.0
 /// near_m = 0.1
 /// rate_hz = 30.0
+/// priority = 1
 /// "#;
 /// let camera: vizflyt_arena::config::CameraConfig = toml::from_str(text).unwrap();
 /// assert_eq!(camera.intrinsics().cx_px, 322.5);
@@ -81,6 +82,9 @@ pub struct CameraConfig {
     /// It is drawn at most so often; absent is as often as the server draws. [Hz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
+    /// When the network is short, the images of cameras with a higher number go first.
+    #[serde(default, skip_serializing_if = "is_normal")]
+    pub priority: i32,
 }
 
 /// `distortion`: a lens, with the coefficients as OpenCV prints them; those not given are 0.
@@ -161,6 +165,7 @@ impl CameraConfig {
             roll_deg: 0.0,
             near_m: Self::NEAR_M,
             rate_hz: None,
+            priority: 0,
         }
     }
 
@@ -280,6 +285,11 @@ fn is_default_near(near_m: &f64) -> bool {
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
 fn is_zero(value: &f64) -> bool {
     *value == 0.0
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+fn is_normal(priority: &i32) -> bool {
+    *priority == 0
 }
 
 /// A camera further from the body than this is a typing error. [m]

@@ -12,7 +12,7 @@ use quinn::{Connection, ConnectionError};
 use rustls::pki_types::CertificateDer;
 use tokio::time::timeout;
 use tracing::{info, warn};
-use vizflyt_protocol::messages::{ToRuntime, ToServer, bounded};
+use vizflyt_protocol::messages::{Purpose, ToRuntime, ToServer, bounded};
 use vizflyt_protocol::packet::{Party, Preamble};
 use vizflyt_trust::{Client, Fingerprint};
 use zerocopy::IntoBytes;
@@ -21,6 +21,7 @@ use super::control::{Ending, Incoming, Outbound, PATIENCE, gone};
 use super::{END, FOREIGN, REFUSED, UNPAIRED, session};
 use crate::door::Door;
 use crate::hub::Hub;
+use crate::vehicle::{Seat, WatcherSeat};
 
 /// Speaks with one runtime until either side ends it.
 pub(super) async fn run(hub: Arc<Hub>, door: Arc<Door>, port: u16, connection: Connection) {
@@ -71,14 +72,27 @@ async fn talk(hub: &Arc<Hub>, door: &Door, port: u16, connection: &Connection) -
         Err(_) => return (FOREIGN, "no Hello came for 5 s".to_owned()),
     };
     let address = connection.remote_address();
-    let seat = permit(&client, &hello.vehicle)
-        .and_then(|()| hub.vehicle(&hello.vehicle))
-        .and_then(|vehicle| vehicle.sit(&hello, address));
+    let seat = permit(&client, &hello.vehicle).and_then(|()| hub.vehicle(&hello.vehicle)).and_then(
+        |vehicle| match hello.purpose {
+            Purpose::Fly => vehicle.sit(&hello, address).map(|seat| Chair::Fly(Box::new(seat))),
+            Purpose::Watch => vehicle.watch().map(Chair::Watch),
+        },
+    );
     match seat {
-        Ok(seat) => {
-            let flight = Box::pin(session::fly(hub, connection, &hello, &seat, send, incoming));
+        Ok(chair) => {
+            let stay = async {
+                match &chair {
+                    Chair::Fly(seat) => {
+                        Box::pin(session::fly(hub, connection, &hello, seat, send, incoming)).await
+                    }
+                    Chair::Watch(seat) => {
+                        Box::pin(session::watch(hub, connection, &hello, seat, send, incoming))
+                            .await
+                    }
+                }
+            };
             tokio::select! {
-                ending = flight => ending,
+                ending = stay => ending,
                 () = door.right_ends(client.fingerprint, &hello.vehicle) => {
                     (UNPAIRED, format!("'{}' may no longer use '{}'", client.name, hello.vehicle))
                 }
@@ -122,6 +136,12 @@ fn permit(client: &Client, vehicle: &str) -> Result<(), String> {
     }
     let own: Vec<_> = client.vehicles.iter().map(|name| format!("'{name}'")).collect();
     Err(format!("'{}' may use {} here, not '{vehicle}'", client.name, own.join(", ")))
+}
+
+/// What a client may do.
+enum Chair {
+    Fly(Box<Seat>),
+    Watch(WatcherSeat),
 }
 
 pub(super) fn why(error: &ConnectionError) -> String {

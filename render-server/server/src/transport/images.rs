@@ -1,34 +1,46 @@
-//! Images to one runtime: a stream each, few in flight, reset past a deadline.
+//! Images to one subscriber: a stream each, few in flight, reset past a deadline.
 //!
 //! In flight means handed to the transport and not yet acknowledged. Measured: resetting an older
 //! stream whenever a newer image is ready starves an overloaded link altogether; waiting for room
 //! with the newest image, and resetting only past [`DEADLINE`], delivers what the link carries.
+//!
+//! One task per place of the outlet, made when the subscriber comes or its K grows: it writes an
+//! image's slices as the encoder makes them, without a copy, and none waits for another camera's.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use quinn::Connection;
-use tokio::sync::mpsc;
+use quinn::{Connection, SendStream};
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::trace;
+use vizflyt_protocol::messages::Purpose;
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use zerocopy::IntoBytes;
 
 use super::{END, VarInt};
 use crate::clock;
 use crate::hub::Hub;
-use crate::outlet::Outgoing;
+use crate::outlet::{Berth, MOST_IN_FLIGHT, Part, Places};
 use crate::stats::Rate;
 use crate::vehicle::Vehicle;
 
 /// The way of images to one session; closes the outlet when dropped.
 pub(super) struct Lane {
+    way: Way,
+    places: Places,
+    allowed: u32,
+}
+
+/// What every sender knows.
+#[derive(Clone)]
+struct Way {
     hub: Arc<Hub>,
     vehicle: Arc<Vehicle>,
     connection: Connection,
     id: u64,
-    images: mpsc::UnboundedReceiver<Outgoing>,
+    purpose: Purpose,
 }
 
 impl Lane {
@@ -38,33 +50,45 @@ impl Lane {
         vehicle: Arc<Vehicle>,
         connection: Connection,
         id: u64,
+        purpose: Purpose,
     ) -> Self {
         let allowed = in_flight(connection.min_rtt(), USUAL_RATE_HZ);
-        let images = hub.outlet.open(vehicle.index, id, allowed);
-        Self { hub, vehicle, connection, id, images }
+        let places = hub.outlet.open(vehicle.index, id, purpose, allowed);
+        Self { way: Way { hub, vehicle, connection, id, purpose }, places, allowed }
     }
 
     /// Sends images until the connection ends.
     pub(super) async fn run(mut self) -> (VarInt, String) {
-        let mut sending = JoinSet::new();
+        let mut senders = JoinSet::new();
+        self.spawn(&mut senders, 0);
         let rate = Rate::default();
         let mut every_second = interval(Duration::from_secs(1));
         every_second.set_missed_tick_behavior(MissedTickBehavior::Skip);
         loop {
             tokio::select! {
-                image = self.images.recv() => match image {
-                    Some(image) => {
-                        let (hub, vehicle) = (self.hub.clone(), self.vehicle.clone());
-                        sending.spawn(send(hub, vehicle, self.connection.clone(), self.id, image));
-                    }
-                    None => return (END, "images go to another session".to_owned()),
-                },
-                _ = sending.join_next(), if !sending.is_empty() => {}
+                _ = senders.join_next() => {
+                    return (END, "a sender of images has failed".to_owned());
+                }
                 _ = every_second.tick() => {
-                    let ticks = self.hub.stats.ticks.load(Ordering::Relaxed);
+                    let Way { hub, vehicle, connection, id, .. } = &self.way;
+                    let ticks = hub.stats.ticks.load(Ordering::Relaxed);
                     let hz = rate.of(ticks, clock::now()).max(USUAL_RATE_HZ);
-                    let allowed = in_flight(self.connection.min_rtt(), hz);
-                    self.hub.outlet.allow(self.vehicle.index, self.id, allowed);
+                    let allowed = in_flight(connection.min_rtt(), hz);
+                    let before = self.allowed;
+                    self.allowed = before.max(allowed);
+                    self.spawn(&mut senders, before);
+                    hub.outlet.allow(vehicle.index, *id, allowed);
+                }
+            }
+        }
+    }
+
+    /// Starts the senders of the places from `before` to what is allowed, of every camera.
+    fn spawn(&self, senders: &mut JoinSet<()>, before: u32) {
+        for (camera, berths) in self.places.iter().enumerate() {
+            for (place, berth) in berths.iter().enumerate() {
+                if (before..self.allowed).contains(&(place as u32)) {
+                    senders.spawn(send(self.way.clone(), camera, place, berth.clone()));
                 }
             }
         }
@@ -73,7 +97,7 @@ impl Lane {
 
 impl Drop for Lane {
     fn drop(&mut self) {
-        self.hub.outlet.close(self.vehicle.index, self.id);
+        self.way.hub.outlet.close(self.way.vehicle.index, self.way.id);
     }
 }
 
@@ -83,58 +107,76 @@ fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
     1 + (spanned as u32).clamp(1, MOST_IN_FLIGHT - 1)
 }
 
-async fn send(
-    hub: Arc<Hub>,
-    vehicle: Arc<Vehicle>,
-    connection: Connection,
-    session: u64,
-    mut image: Outgoing,
-) {
-    let start = clock::now();
-    image.header.send_ns = start.as_ns().into();
-    let delivered = deliver(&connection, &[image.header.as_bytes(), &image.payload]).await;
-    let end = clock::now();
-    if delivered {
-        hub.stats.send.add(start, end);
-        vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
-        vehicle.images.bytes.fetch_add(image.payload.len() as u64, Ordering::Relaxed);
-    } else {
-        vehicle.images.late.fetch_add(1, Ordering::Relaxed);
-        vehicle.images.cameras[image.camera].late();
+/// Sends the images that come to one place, for ever.
+async fn send(way: Way, camera: usize, place: usize, berth: Arc<Berth>) {
+    let Way { hub, vehicle, connection, id, purpose } = &way;
+    loop {
+        let (header, priority) = berth.image().await;
+        let start = clock::now();
+        let delivered = deliver(connection, &berth, &header, priority).await;
+        let end = clock::now();
+        // Figures are the runtime's: a watcher far away says nothing of the flight.
+        if *purpose == Purpose::Fly {
+            if let Some(len) = delivered {
+                hub.stats.send.add(start, end);
+                vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
+                vehicle.images.bytes.fetch_add(len, Ordering::Relaxed);
+            } else {
+                vehicle.images.late.fetch_add(1, Ordering::Relaxed);
+                vehicle.images.cameras[camera].late();
+            }
+        }
+        let ms = end.seconds_since(start) * 1e3;
+        trace!(camera, delivered = delivered.is_some(), ms, "send");
+        hub.outlet.landed(vehicle.index, camera, *id, place, &berth);
     }
-    trace!(camera = image.camera, delivered, ms = end.seconds_since(start) * 1e3, "send");
-    hub.outlet.recycle(image.payload);
-    hub.outlet.landed(vehicle.index, session, image.camera);
 }
 
-/// Sends `parts` on a stream of their own; returns whether all was acknowledged in time.
-async fn deliver(connection: &Connection, parts: &[&[u8]]) -> bool {
-    let Ok(Ok(mut stream)) = timeout(DEADLINE, connection.open_uni()).await else {
-        return false;
-    };
-    let whole = async {
-        for part in parts {
-            stream.write_all(part).await.ok()?;
-        }
-        stream.finish().ok()?;
-        // `None` inside is "acknowledged"; a code is "the runtime does not want it".
-        stream.stopped().await.ok()?.is_none().then_some(())
-    };
-    if let Ok(delivered) = timeout(DEADLINE, whole).await {
-        delivered.is_some()
-    } else {
+/// Sends an image on a stream of its own; returns its bytes of bitstream if all was acknowledged in
+/// time.
+async fn deliver(
+    connection: &Connection,
+    berth: &Berth,
+    header: &ImageHeader,
+    priority: i32,
+) -> Option<u64> {
+    let mut stream = timeout(DEADLINE, connection.open_uni()).await.ok()?.ok()?;
+    // Fails only if the stream has ended already.
+    let _ = stream.set_priority(priority);
+    let delivered = timeout(DEADLINE, write(&mut stream, berth, header)).await;
+    let delivered = delivered.ok().flatten();
+    if delivered.is_none() {
         // Fails only if it is finished and acknowledged after all.
         let _ = stream.reset(VarInt::from_u32(0));
-        false
     }
+    delivered
+}
+
+async fn write(stream: &mut SendStream, berth: &Berth, header: &ImageHeader) -> Option<u64> {
+    let send = clock::now();
+    stream.write_all(header.as_bytes()).await.ok()?;
+    let mut len = 0;
+    let encode_end = loop {
+        match berth.part().await {
+            Part::Bytes(bytes) => {
+                len += bytes.len() as u64;
+                stream.write_chunk(bytes).await.ok()?;
+            }
+            Part::End { encode_end } => break encode_end,
+            Part::Cut => return None,
+        }
+    };
+    let trailer = ImageTrailer::new(u32::try_from(len).ok()?, encode_end, send);
+    stream.write_all(trailer.as_bytes()).await.ok()?;
+    stream.finish().ok()?;
+    // `None` inside is "acknowledged"; a code is "the other side does not want it".
+    stream.stopped().await.ok()?.is_none().then_some(len)
 }
 
 /// Older than this, an image helps no pilot, and its retransmissions delay newer ones.
 const DEADLINE: Duration = Duration::from_millis(150);
 /// What a vehicle's camera is drawn at on a small machine; K never assumes less. [Hz]
 const USUAL_RATE_HZ: f64 = 60.0;
-/// 100 ms of round trip at 70 Hz; more would only queue.
-const MOST_IN_FLIGHT: u32 = 8;
 
 #[cfg(test)]
 mod tests {

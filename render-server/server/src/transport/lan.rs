@@ -18,6 +18,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quinn::congestion::{Controller, ControllerFactory};
+use quinn_proto::RttEstimator;
 
 /// Makes [`Lan`] controllers.
 #[derive(Clone, Copy, Debug)]
@@ -28,14 +29,15 @@ pub struct LanConfig {
 
 impl Default for LanConfig {
     fn default() -> Self {
-        // A gigabit's worth of 8 ms; measured best up to 1 ms of round trip.
+        // A gigabit's worth of 8 ms; measured best up to 1 ms of round trip. Longer round trips
+        // get more, see `PER_US`.
         Self { window: 1 << 20 }
     }
 }
 
 impl ControllerFactory for LanConfig {
     fn build(self: Arc<Self>, now: Instant, _mtu: u16) -> Box<dyn Controller> {
-        Box::new(Lan { base: self.window, last_ack: now, waiting: false })
+        Box::new(Lan { base: self.window, last_ack: now, waiting: false, min_rtt: Duration::ZERO })
     }
 }
 
@@ -47,16 +49,27 @@ pub struct Lan {
     last_ack: Instant,
     /// Whether anything sent since then awaits acknowledgement.
     waiting: bool,
+    /// Shortest round trip so far.
+    min_rtt: Duration,
 }
 
 impl Lan {
     fn window_at(&self, now: Instant) -> u64 {
+        let base = self.usual();
         if !self.waiting {
-            return self.base;
+            return base;
         }
         let silent = now.saturating_duration_since(self.last_ack);
         let steps = (silent.as_millis() / GROWTH_EVERY.as_millis()) as u64;
-        self.base + (steps * GROWTH).min(MOST_GROWTH)
+        base + (steps * GROWTH).min(MOST_GROWTH)
+    }
+
+    /// Returns the window while acknowledgements come: what is under way in a round trip, and the
+    /// base for what waits at its ends.
+    fn usual(&self) -> u64 {
+        let beyond = self.min_rtt.saturating_sub(SHORT);
+        let more = beyond.as_micros() as u64 * PER_US;
+        self.base + more.min(MOST_MORE)
     }
 }
 
@@ -66,6 +79,10 @@ impl Controller for Lan {
             self.waiting = true;
             self.last_ack = now;
         }
+    }
+
+    fn on_ack(&mut self, _: Instant, _: Instant, _: u64, _: bool, rtt: &RttEstimator) {
+        self.min_rtt = rtt.min();
     }
 
     fn on_end_acks(
@@ -101,6 +118,12 @@ impl Controller for Lan {
     }
 }
 
+/// Up to this round trip the base was measured best.
+const SHORT: Duration = Duration::from_millis(1);
+/// At 20 ms 3 MB were measured best: 2 MB more for 19 ms, a gigabit nearly. [bytes/us]
+const PER_US: u64 = 110;
+/// The transport's send window ends what is gained: 4 MB in all. [bytes]
+const MOST_MORE: u64 = 3 << 20;
 /// Two images of 100 KB. [bytes]
 const GROWTH: u64 = 200 << 10;
 /// Longer than any round trip of a LAN with its acknowledgement delay.
@@ -116,10 +139,23 @@ mod tests {
         start + Duration::from_millis(ms)
     }
 
+    fn lan(start: Instant, min_rtt: Duration) -> Lan {
+        Lan { base: 1 << 20, last_ack: start, waiting: false, min_rtt }
+    }
+
+    #[test]
+    fn the_window_grows_with_the_round_trip() {
+        let now = Instant::now();
+        let window = |ms| lan(now, Duration::from_millis(ms)).window_at(now);
+        assert_eq!((window(0), window(1)), (1 << 20, 1 << 20));
+        assert!((2_900_000..3_300_000).contains(&window(20)), "{}", window(20));
+        assert_eq!(window(500), 4 << 20);
+    }
+
     #[test]
     fn loss_changes_nothing_and_silence_opens_the_window() {
         let start = Instant::now();
-        let mut lan = Lan { base: 1 << 20, last_ack: start, waiting: false };
+        let mut lan = lan(start, Duration::from_micros(300));
         assert_eq!(lan.window_at(after(start, 10_000)), 1 << 20, "idle is not silence");
         lan.on_sent(after(start, 1000), 1200, 1);
         lan.on_congestion_event(after(start, 1001), start, true, 500_000);

@@ -251,8 +251,9 @@ fn transport_config(congestion: Congestion) -> TransportConfig {
         .max_concurrent_uni_streams(VarInt::from_u32(0)) // a runtime sends no images
         .stream_receive_window(VarInt::from_u32(256 << 10)) // telemetry is small
         .receive_window(VarInt::from_u32(256 << 10))
-        .send_window(3 << 20) // the default of 10 MB would queue stale images
-        .datagram_receive_buffer_size(None)
+        .send_window(4 << 20) // the default of 10 MB would queue stale images
+        .datagram_receive_buffer_size(Some(POSES_WAITING)) // none: and quinn would send none
+        .datagram_send_buffer_size(POSES_WAITING)
         .max_idle_timeout(Some(VarInt::from_u32(5_000).into()))
         .keep_alive_interval(Some(Duration::from_secs(1)))
         .ack_frequency_config(Some(ack))
@@ -281,6 +282,8 @@ const MOST_PAIRINGS: usize = 4;
 const RETRY_ABOVE: usize = 4;
 /// Far more than a network of 50 ms and some loss needs.
 const HANDSHAKE_WITHIN: Duration = Duration::from_secs(4);
+/// A few poses; when more wait for the network, the oldest go. [bytes]
+const POSES_WAITING: usize = 1024;
 /// A vehicle needs one; strangers must not exhaust memory.
 const MOST_CONNECTIONS: usize = 32;
 

@@ -1,11 +1,15 @@
-//! The talk with one runtime, from its seat to its last byte.
+//! The talk with one client, from its seat to its last byte.
 
 use std::sync::Arc;
 
 use quinn::{Connection, SendStream};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch as cell};
 use tracing::{debug, info};
-use vizflyt_protocol::messages::{ClockReply, ClockRequest, Hello, ToRuntime, ToServer};
+use vizflyt_protocol::messages::{
+    ClockReply, ClockRequest, Datagram, HeardEvents, Hello, PoseSample, Purpose, ToRuntime,
+    ToServer, Welcome,
+};
+use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::ServerTime;
 
 use super::control::{Ending, Incoming, Outbound, gone};
@@ -15,7 +19,7 @@ use crate::cameras::CameraSet;
 use crate::clock;
 use crate::events::Origin;
 use crate::hub::Hub;
-use crate::vehicle::{Seat, Vehicle};
+use crate::vehicle::{Seat, Vehicle, WatcherSeat};
 
 /// Serves the runtime that took `seat` until either side ends it.
 pub(super) async fn fly(
@@ -30,72 +34,142 @@ pub(super) async fn fly(
     let again = if seat.resumed { ", and resumes its flight" } else { "" };
     info!("{address}: {} flies '{}'{again}", hello.program, hello.vehicle);
     vehicle.note(&format!("{} at {address} connected{again}", hello.program));
-    // Control goes out before images.
-    let _ = send.set_priority(1);
-    let (clock_sender, clock_requests) = mpsc::channel(CLOCK_QUEUE);
     seat.speaks_over(connection);
-    let outlet = images::Lane::open(hub.clone(), vehicle.clone(), connection.clone(), seat.info.id);
+    let talk = Talk {
+        hub,
+        vehicle,
+        connection,
+        first_event: seat.first_event.max(hello.heard_events.of(hub.boot)),
+        heard_events: seat.heard_events,
+    };
     let ending = tokio::select! {
-        ending = down(seat, send, clock_requests) => ending,
-        ending = up(seat, incoming, clock_sender) => ending,
-        ending = outlet.run() => ending,
+        ending = talk.run(seat.info.id, Purpose::Fly, Some(seat), send, incoming) => ending,
         () = seat.evicted() => {
             (REPLACED, "a newer runtime took over after a second of silence".to_owned())
         }
-        error = connection.closed() => gone(&error),
     };
     let reason = connection.close_reason().map_or_else(|| ending.1.clone(), |error| why(&error));
     vehicle.note(&format!("the runtime at {address} is gone: {reason}"));
     ending
 }
 
-/// Server to runtime: events first, then changed cameras, clock replies, and the newest pose.
-async fn down(
-    seat: &Seat,
+/// Serves a watcher until either side ends it.
+pub(super) async fn watch(
+    hub: &Arc<Hub>,
+    connection: &Connection,
+    hello: &Hello,
+    seat: &WatcherSeat,
     send: SendStream,
-    mut clock_requests: mpsc::Receiver<ClockRequest>,
+    incoming: Incoming,
 ) -> Ending {
-    let vehicle = &*seat.vehicle;
-    let mut out = Outbound::new(send);
-    let mut poses = vehicle.pose.subscribe();
-    let mut log = vehicle.events.subscribe();
-    log.mark_changed();
-    let mut cursor = seat.first_event;
-    let mut cameras = vehicle.cameras.subscribe();
-    let mut told = cameras.borrow_and_update().clone();
-    if let Err(ending) = out.write(&ToRuntime::Welcome(vehicle.welcome(&told))).await {
-        return ending;
+    info!("{}: {} watches '{}'", connection.remote_address(), hello.program, hello.vehicle);
+    let talk = Talk {
+        hub,
+        vehicle: &seat.vehicle,
+        connection,
+        first_event: seat.first_event.max(hello.heard_events.of(hub.boot)),
+        heard_events: HeardEvents::default(),
+    };
+    Box::pin(talk.run(seat.id, Purpose::Watch, None, send, incoming)).await
+}
+
+/// A conversation with one client.
+struct Talk<'a> {
+    hub: &'a Arc<Hub>,
+    vehicle: &'a Arc<Vehicle>,
+    connection: &'a Connection,
+    first_event: u64,
+    heard_events: HeardEvents,
+}
+
+impl Talk<'_> {
+    async fn run(
+        &self,
+        id: u64,
+        purpose: Purpose,
+        seat: Option<&Seat>,
+        send: SendStream,
+        incoming: Incoming,
+    ) -> Ending {
+        // Control goes out before images.
+        let _ = send.set_priority(i32::MAX);
+        let (clock_sender, clock_requests) = mpsc::channel(CLOCK_QUEUE);
+        let (heard_sender, heard) = cell::channel(0);
+        let (hub, vehicle) = (self.hub.clone(), self.vehicle.clone());
+        let lane = images::Lane::open(hub, vehicle, self.connection.clone(), id, purpose);
+        tokio::select! {
+            ending = self.down(send, clock_requests, heard) => ending,
+            ending = up(seat, incoming, &clock_sender, &heard_sender) => ending,
+            ending = lane.run() => ending,
+            error = self.connection.closed() => gone(&error),
+        }
     }
-    let mut last_pose = ServerTime::ZERO;
-    loop {
-        let written = tokio::select! {
-            biased;
-            _ = log.changed() => {
-                log.mark_unchanged();
-                tell(vehicle, &mut out, &mut cursor).await
-            }
-            _ = cameras.changed() => {
-                let newest = cameras.borrow_and_update().clone();
-                let before = std::mem::replace(&mut told, newest);
-                tell_cameras(&mut out, &before, &told).await
-            }
-            Some(request) = clock_requests.recv() => {
-                let reply = ClockReply { sent: request.sent, answered: clock::now() };
-                out.write(&ToRuntime::Clock(reply)).await
-            }
-            _ = poses.changed() => {
-                let newest = *poses.borrow_and_update();
-                match newest {
-                    Some(pose) if pose.stamp.seconds_since(last_pose) >= POSE_EVERY_S => {
-                        last_pose = pose.stamp;
-                        out.write(&ToRuntime::Pose(pose)).await
-                    }
-                    _ => Ok(()),
-                }
-            }
-        };
-        if let Err(ending) = written {
+
+    /// Server to client: events first, then what was heard of its own, changed cameras, clock
+    /// replies, and the newest pose.
+    async fn down(
+        &self,
+        send: SendStream,
+        mut clock_requests: mpsc::Receiver<ClockRequest>,
+        mut heard: cell::Receiver<u64>,
+    ) -> Ending {
+        let vehicle = &**self.vehicle;
+        let mut out = Outbound::new(send);
+        let mut poses = vehicle.pose.subscribe();
+        let mut log = vehicle.events.subscribe();
+        log.mark_changed();
+        let mut cursor = self.first_event;
+        let mut cameras = vehicle.cameras.subscribe();
+        let mut told = cameras.borrow_and_update().clone();
+        let (boot, heard_events) = (self.hub.boot, self.heard_events);
+        let welcome = Welcome { boot, heard_events, arena: vehicle.welcome(&told) };
+        if let Err(ending) = out.write(&ToRuntime::Welcome(welcome)).await {
             return ending;
+        }
+        let mut last_pose = ServerTime::ZERO;
+        loop {
+            let written = tokio::select! {
+                biased;
+                _ = log.changed() => {
+                    log.mark_unchanged();
+                    tell(vehicle, &mut out, &mut cursor).await
+                }
+                Ok(()) = heard.changed() => {
+                    let seq = *heard.borrow_and_update();
+                    out.write(&ToRuntime::Heard(seq)).await
+                }
+                _ = cameras.changed() => {
+                    let newest = cameras.borrow_and_update().clone();
+                    let before = std::mem::replace(&mut told, newest);
+                    tell_cameras(&mut out, &before, &told).await
+                }
+                Some(request) = clock_requests.recv() => {
+                    let reply = ClockReply { sent: request.sent, answered: clock::now() };
+                    out.write(&ToRuntime::Clock(reply)).await
+                }
+                _ = poses.changed() => {
+                    let newest = *poses.borrow_and_update();
+                    if let Some(pose) = newest
+                        && pose.stamp.seconds_since(last_pose) >= POSE_EVERY_S
+                    {
+                        last_pose = pose.stamp;
+                        self.tell_pose(&pose);
+                    }
+                    Ok(())
+                }
+            };
+            if let Err(ending) = written {
+                return ending;
+            }
+        }
+    }
+
+    /// Poses are datagrams: a lost one holds up nothing.
+    fn tell_pose(&self, pose: &PoseSample) {
+        let mut buffer = [0; MAX_FRAMED];
+        let bytes = encode_body(&Datagram::Pose(*pose), &mut buffer);
+        if let Err(error) = self.connection.send_datagram(bytes::Bytes::copy_from_slice(bytes)) {
+            debug!("{}: pose not sent: {error}", self.connection.remote_address());
         }
     }
 }
@@ -104,7 +178,8 @@ async fn tell(vehicle: &Vehicle, out: &mut Outbound, cursor: &mut u64) -> Result
     let entries = vehicle.events.read(cursor).map_err(|lagged| (SLOW, lagged.to_string()))?;
     for entry in entries {
         if entry.origin == Origin::Server {
-            out.write(&ToRuntime::Event(entry.event)).await?;
+            let (seq, event) = (entry.index + 1, entry.event);
+            out.write(&ToRuntime::Event { seq, event }).await?;
         }
     }
     Ok(())
@@ -124,31 +199,37 @@ async fn tell_cameras(
     Ok(())
 }
 
-/// Runtime to server.
+/// Client to server; a watcher, who has no seat, is heard asking the time only.
 async fn up(
-    seat: &Seat,
+    seat: Option<&Seat>,
     mut incoming: Incoming,
-    clock_requests: mpsc::Sender<ClockRequest>,
+    clock_requests: &mpsc::Sender<ClockRequest>,
+    heard: &cell::Sender<u64>,
 ) -> Ending {
     loop {
         let message = match incoming.next().await {
             Ok(message) => message,
             Err(ending) => return ending,
         };
-        seat.heard(clock::now());
-        match message {
+        if let Some(seat) = seat {
+            seat.heard(clock::now());
+        }
+        match (message, seat) {
             // A full queue means that replies cannot leave; a late reply would mislead anyway.
-            ToServer::Clock(request) => drop(clock_requests.try_send(request)),
-            ToServer::Telemetry(report) => {
-                seat.vehicle.report(report);
-            }
-            ToServer::Timing(timing) => {
+            (ToServer::Clock(request), _) => drop(clock_requests.try_send(request)),
+            (ToServer::Telemetry(report), Some(seat)) => seat.vehicle.report(report),
+            (ToServer::Timing(timing), Some(seat)) => {
                 seat.vehicle.report_timing(timing);
             }
-            ToServer::Event(event) => {
-                seat.vehicle.log(Origin::Page, event);
+            (ToServer::Event { seq, event }, Some(seat)) => {
+                if seat.hear(seq) {
+                    seat.vehicle.log(Origin::Page, event);
+                }
+                heard.send_modify(|newest| *newest = seq.max(*newest));
             }
-            ToServer::Hello(_) => debug!("a second Hello is ignored"),
+            (ToServer::Heard(seq), _) => debug!("events up to {seq} were heard"),
+            (ToServer::Hello(_), _) => debug!("a second Hello is ignored"),
+            (_, None) => debug!("a watcher has nothing to tell"),
         }
     }
 }

@@ -9,7 +9,7 @@ use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -18,9 +18,12 @@ use glam::{Quat, Vec3};
 use quinn::{ClientConfig, Connection, Endpoint, RecvStream, SendStream, TransportConfig, VarInt};
 use serde_json::Value;
 use tempfile::TempDir;
-use vizflyt_protocol::messages::{ArenaInfo, Hello, ToRuntime, ToServer, bounded};
-use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{ImageHeader, Party, Preamble};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Datagram, HeardEvents, Hello, PoseSample, Purpose, ToRuntime, ToServer, Welcome,
+    bounded,
+};
+use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, decode_body, encode};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, Party, Preamble};
 use vizflyt_splat::{Splats, ply};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
@@ -271,6 +274,18 @@ pub fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizflyt_tru
     }
 }
 
+/// Returns what a client that has just been started says first.
+pub fn hello(vehicle: &str, purpose: Purpose) -> Hello {
+    static BOOTS: AtomicU64 = AtomicU64::new(1);
+    Hello {
+        vehicle: bounded(vehicle),
+        purpose,
+        program: bounded("test 1"),
+        boot: BOOTS.fetch_add(1, Ordering::Relaxed),
+        heard_events: HeardEvents::default(),
+    }
+}
+
 /// Connects, without a word said yet.
 pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
     connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
@@ -293,7 +308,8 @@ pub async fn connect_as(
 }
 
 impl Client {
-    /// Connects, exchanges preambles and says hello for `vehicle`.
+    /// Connects, exchanges preambles and says hello for `vehicle`, as a runtime that has just been
+    /// started.
     pub async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
         Self::hello_as(server, &server.instructor, vehicle, transport).await
     }
@@ -305,6 +321,20 @@ impl Client {
         vehicle: &str,
         transport: TransportConfig,
     ) -> Self {
+        Self::greet_as(server, identity, hello(vehicle, Purpose::Fly), transport).await
+    }
+
+    /// Connects, exchanges preambles and says `hello`.
+    pub async fn greet(server: &Server, hello: Hello, transport: TransportConfig) -> Self {
+        Self::greet_as(server, &server.instructor, hello, transport).await
+    }
+
+    async fn greet_as(
+        server: &Server,
+        identity: &Identity,
+        hello: Hello,
+        transport: TransportConfig,
+    ) -> Self {
         let (endpoint, connection) = connect_as(server, identity, transport).await.unwrap();
         let (mut send, mut recv) = connection.open_bi().await.unwrap();
         send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.unwrap();
@@ -312,7 +342,6 @@ impl Client {
         recv.read_exact(&mut theirs).await.unwrap();
         assert_eq!(Preamble::check(&theirs, Party::Runtime), Ok(Party::Server));
         let mut client = Self { connection, send, recv, deframer: Deframer::default(), endpoint };
-        let hello = Hello { vehicle: bounded(vehicle), program: bounded("test 1") };
         client.say(&ToServer::Hello(hello)).await;
         client
     }
@@ -329,10 +358,31 @@ impl Client {
         transport: TransportConfig,
     ) -> (Self, ArenaInfo) {
         let mut client = Self::hello(server, vehicle, transport).await;
-        match client.next().await {
-            ToRuntime::Welcome(arena) => (client, arena),
+        let arena = client.welcome().await.arena;
+        (client, arena)
+    }
+
+    /// Connects as a watcher and is welcomed.
+    pub async fn watching(server: &Server, transport: TransportConfig) -> Self {
+        let hello = hello("vizflyt", Purpose::Watch);
+        let mut client = Self::greet(server, hello, transport).await;
+        client.welcome().await;
+        client
+    }
+
+    pub async fn welcome(&mut self) -> Welcome {
+        match self.next().await {
+            ToRuntime::Welcome(welcome) => welcome,
             other => panic!("not welcomed: {other:?}"),
         }
+    }
+
+    /// Returns the next pose.
+    pub async fn pose(&self) -> PoseSample {
+        let datagram = tokio::time::timeout(PATIENCE, self.connection.read_datagram());
+        let bytes = datagram.await.expect("a pose").expect("the connection lives");
+        let Datagram::Pose(pose) = decode_body(&bytes).unwrap();
+        pose
     }
 
     pub async fn say(&mut self, message: &ToServer) {
@@ -371,13 +421,20 @@ impl Client {
 
     /// Returns the next image stream that was not reset, whole.
     pub async fn image(&self) -> (ImageHeader, Vec<u8>) {
+        let (header, payload, _) = self.whole_image().await;
+        (header, payload)
+    }
+
+    /// As [`Self::image`], with its trailer.
+    pub async fn whole_image(&self) -> (ImageHeader, Vec<u8>, ImageTrailer) {
         tokio::time::timeout(PATIENCE, async {
             loop {
                 let mut stream = self.connection.accept_uni().await.expect("an image stream");
                 let Ok(bytes) = stream.read_to_end(1 << 22).await else { continue };
-                let (header, payload) = ImageHeader::parse(&bytes).unwrap();
-                assert_eq!(payload.len(), header.payload_len.get() as usize);
-                return (header, payload.to_vec());
+                let (header, rest) = ImageHeader::parse(&bytes).unwrap();
+                let (payload, trailer) = rest.split_last_chunk().unwrap();
+                let trailer = ImageTrailer::parse(trailer, payload.len() as u64).unwrap();
+                return (header, payload.to_vec(), trailer);
             }
         })
         .await

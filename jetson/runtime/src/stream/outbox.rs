@@ -1,0 +1,201 @@
+//! What the runtime has to tell the server: the newest report, and every event until the server has
+//! acknowledged it, through any number of connections.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+use vizflyt_protocol::messages::{Event, EventKind, Telemetry, Timing, ToServer};
+
+/// Reports and events on their way to the server.
+#[derive(Debug, Default)]
+pub struct Outbox {
+    inner: Mutex<Inner>,
+    changed: Notify,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    report: Option<Telemetry>,
+    timing: Option<Timing>,
+    /// Not yet acknowledged, oldest first.
+    events: VecDeque<(u64, Event)>,
+    /// Number of the newest event made.
+    made: u64,
+    /// Number of the newest event written on the present connection.
+    written: u64,
+    closed: bool,
+}
+
+/// What there is to write now.
+#[allow(clippy::large_enum_variant)] // Why: it is taken apart at once.
+enum Next {
+    Say(ToServer),
+    Wait,
+    End,
+}
+
+impl Outbox {
+    /// Events kept at most, as many as the server's log keeps. Past that the oldest line that the
+    /// plugin printed goes, and only if there is none the oldest event.
+    pub const KEPT: usize = 4096;
+
+    /// Puts a report in place of an older one.
+    pub fn report(&self, report: Telemetry) {
+        self.lock().report = Some(report);
+        self.changed.notify_one();
+    }
+
+    /// Puts a report of where images get their age in place of an older one.
+    pub fn report_timing(&self, timing: Timing) {
+        self.lock().timing = Some(timing);
+        self.changed.notify_one();
+    }
+
+    /// Tells an event.
+    pub fn tell(&self, event: Event) {
+        let mut inner = self.lock();
+        inner.made += 1;
+        let seq = inner.made;
+        inner.events.push_back((seq, event));
+        if inner.events.len() > Self::KEPT {
+            let is_line = |(_, event): &(u64, Event)| event.kind == EventKind::PluginOutput;
+            let at = inner.events.iter().position(is_line).unwrap_or(0);
+            if let Some((seq, event)) = inner.events.remove(at) {
+                tracing::warn!(
+                    "the server is away for too long: event {seq} is lost: {}",
+                    event.text
+                );
+            }
+        }
+        drop(inner);
+        self.changed.notify_one();
+    }
+
+    /// Says that nothing follows: the flight is over.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_one();
+    }
+
+    /// Begins on a new connection, whose server has heard events up to number `heard`. An old report
+    /// is stale.
+    pub(super) fn resume(&self, heard: u64) {
+        let mut inner = self.lock();
+        inner.forget(heard);
+        inner.written = heard;
+        (inner.report, inner.timing) = (None, None);
+    }
+
+    /// Takes note that the server has heard events up to number `seq`.
+    pub(super) fn heard(&self, seq: u64) {
+        self.lock().forget(seq);
+        self.changed.notify_one();
+    }
+
+    /// Returns the next message, events first; `None` once it is closed and all events are heard.
+    pub(super) async fn next(&self) -> Option<ToServer> {
+        loop {
+            match self.lock().take() {
+                Next::Say(message) => return Some(message),
+                Next::End => return None,
+                Next::Wait => {}
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // Why: nothing panics while the lock is held.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inner {
+    fn forget(&mut self, heard: u64) {
+        while self.events.front().is_some_and(|&(seq, _)| seq <= heard) {
+            self.events.pop_front();
+        }
+    }
+
+    fn take(&mut self) -> Next {
+        let at = self.events.partition_point(|&(seq, _)| seq <= self.written);
+        if let Some((seq, event)) = self.events.get(at).cloned() {
+            self.written = seq;
+            return Next::Say(ToServer::Event { seq, event });
+        }
+        if let Some(report) = self.report.take() {
+            return Next::Say(ToServer::Telemetry(report));
+        }
+        if let Some(timing) = self.timing.take() {
+            return Next::Say(ToServer::Timing(timing));
+        }
+        if self.closed && self.events.is_empty() { Next::End } else { Next::Wait }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vizflyt_protocol::messages::bounded;
+    use vizflyt_protocol::time::ServerTime;
+
+    fn event(kind: EventKind, text: &str) -> Event {
+        Event { stamp: ServerTime::ZERO, kind, text: bounded(text) }
+    }
+
+    /// Everything that would be written now: events by number, `R` a report, `-` the end.
+    fn written(outbox: &Outbox) -> String {
+        let mut found = Vec::new();
+        loop {
+            let next = outbox.lock().take();
+            found.push(match next {
+                Next::Say(ToServer::Event { seq, .. }) => seq.to_string(),
+                Next::Say(_) => "R".to_owned(),
+                Next::End => "-".to_owned(),
+                Next::Wait => break,
+            });
+            if found.last().is_some_and(|last| last == "-") {
+                break;
+            }
+        }
+        found.join(" ")
+    }
+
+    #[test]
+    fn events_are_told_until_they_are_heard_and_no_longer() {
+        let outbox = Outbox::default();
+        outbox.report(Telemetry::default());
+        outbox.report(Telemetry::default());
+        for _ in 0..3 {
+            outbox.tell(event(EventKind::Note, "n"));
+        }
+        assert_eq!(written(&outbox), "1 2 3 R");
+        outbox.heard(1);
+        // The connection is lost; the server had heard one more than it could acknowledge.
+        outbox.report(Telemetry::default());
+        outbox.tell(event(EventKind::Note, "made meanwhile"));
+        outbox.resume(2);
+        assert_eq!(written(&outbox), "3 4");
+        // A server that was restarted has heard nothing of us; what was acknowledged stays so.
+        outbox.resume(0);
+        assert_eq!(written(&outbox), "3 4");
+        outbox.close();
+        assert_eq!(written(&outbox), "", "4 has not been heard");
+        outbox.heard(4);
+        assert_eq!(written(&outbox), "-");
+    }
+
+    #[test]
+    fn a_talkative_plugin_loses_its_own_lines_first() {
+        let outbox = Outbox::default();
+        outbox.tell(event(EventKind::EmergencyStop, "stop"));
+        for _ in 0..Outbox::KEPT + 10 {
+            outbox.tell(event(EventKind::PluginOutput, "line"));
+        }
+        let inner = outbox.lock();
+        assert_eq!(inner.events.len(), Outbox::KEPT);
+        assert_eq!(inner.events[0].1.kind, EventKind::EmergencyStop);
+        assert_eq!(inner.events[1].0, 13);
+    }
+}

@@ -1,0 +1,184 @@
+//! Image streams into the mailbox, piece by piece as they arrive.
+//!
+//! A few tasks live as long as the connection and wait for the next stream; there is always one
+//! that waits, so no image waits for another. Bytes are copied once, from the transport's packets
+//! into a piece of the mailbox; nothing of ours is allocated per image in the steady state.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use quinn::{Connection, ReadExactError, RecvStream, VarInt};
+use tokio::time::timeout;
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_rgbd::{HEADER_BYTES, Info, SLICE_HEADER_BYTES, peek, slice_len};
+
+use super::mailbox::{Arrival, Ticket, Whole};
+use super::{IMAGES_AT_ONCE, Shared};
+use crate::clock;
+
+/// An image that has not come whole after this long is given up; it would be stale. The server
+/// gives up after 150 ms.
+const IMAGE_WITHIN: Duration = Duration::from_millis(500);
+/// A buffer grows by so much ahead of the bytes that have come, whatever length a peer announces.
+/// [bytes]
+const GROWTH: usize = 64 << 10;
+
+/// Why an image was given up.
+#[derive(Debug, thiserror::Error)]
+enum Lost {
+    #[error("{0}")]
+    Cut(#[from] ReadExactError),
+    #[error("{0}")]
+    Header(#[from] vizflyt_protocol::packet::InvalidImageHeader),
+    #[error("{0}")]
+    Bitstream(#[from] vizflyt_rgbd::DecodeError),
+    #[error("{0}")]
+    Trailer(#[from] vizflyt_protocol::packet::InvalidImageTrailer),
+    #[error("more bytes than an image of its size can need")]
+    Long,
+    #[error("its bitstream is of another size than its header")]
+    Size,
+    #[error("it came before the server's clock was known")]
+    Clock,
+    #[error("a newer image came first")]
+    Stale,
+}
+
+/// Receives images until the connection ends. Returns at once; tasks go on.
+pub(super) fn start(connection: &Connection, shared: &Shared) {
+    let receivers = Receivers {
+        connection: connection.clone(),
+        shared: shared.clone(),
+        session: shared.mailbox.session(),
+        waiting: Arc::default(),
+        all: Arc::default(),
+    };
+    receivers.spawn();
+}
+
+#[derive(Clone)]
+struct Receivers {
+    connection: Connection,
+    shared: Shared,
+    session: u64,
+    /// Receivers that wait for a stream.
+    waiting: Arc<AtomicUsize>,
+    all: Arc<AtomicUsize>,
+}
+
+impl Receivers {
+    fn spawn(&self) {
+        self.all.fetch_add(1, Ordering::Relaxed);
+        self.waiting.fetch_add(1, Ordering::Relaxed);
+        tokio::spawn(self.clone().run());
+    }
+
+    async fn run(self) {
+        let mut piece = Vec::new();
+        while let Ok(mut stream) = self.connection.accept_uni().await {
+            let was_last = self.waiting.fetch_sub(1, Ordering::Relaxed) == 1;
+            if was_last && self.all.load(Ordering::Relaxed) < IMAGES_AT_ONCE as usize {
+                self.spawn();
+            }
+            self.receive(&mut stream, &mut piece).await;
+            self.waiting.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Receives one image. One that is cut off, late or nonsense is dropped: the next one comes in
+    /// a moment.
+    async fn receive(&self, stream: &mut RecvStream, piece: &mut Vec<u8>) {
+        let mut ticket = None;
+        let result = timeout(IMAGE_WITHIN, self.pieces(stream, piece, &mut ticket)).await;
+        let why = match result {
+            Ok(Ok(whole)) => {
+                if let Some(ticket) = ticket {
+                    self.shared.mailbox.end(ticket, Some(whole));
+                }
+                return;
+            }
+            Ok(Err(lost)) => lost.to_string(),
+            Err(_) => "it did not come whole within 500 ms".to_owned(),
+        };
+        if let Some(ticket) = ticket {
+            self.shared.mailbox.end(ticket, None);
+        }
+        // Fails only if it has ended, or was stopped already.
+        let _ = stream.stop(VarInt::from_u32(0));
+        tracing::debug!("image dropped: {why}");
+    }
+
+    async fn pieces(
+        &self,
+        stream: &mut RecvStream,
+        piece: &mut Vec<u8>,
+        ticket: &mut Option<Ticket>,
+    ) -> Result<Whole, Lost> {
+        let mut head = [0; ImageHeader::SIZE];
+        stream.read_exact(&mut head).await?;
+        let first = clock::now();
+        let (header, _) = ImageHeader::parse(&head)?;
+        let pose = self.shared.clock.to_host(header.pose_stamp()).ok_or(Lost::Clock)?;
+        let arrival = Arrival { session: self.session, header, pose, first };
+        let ticket = *ticket.insert(self.shared.mailbox.open(&arrival).ok_or(Lost::Stale)?);
+
+        let most = header.most_payload();
+        let mut came = 0;
+        piece.clear();
+        read(stream, piece, HEADER_BYTES).await?;
+        let info = peek(piece)?;
+        if (info.width, info.height) != (header.width_px.get(), header.height_px.get()) {
+            return Err(Lost::Size);
+        }
+        read(stream, piece, info.header_len).await?;
+        self.push(ticket, piece, &mut came)?;
+        self.slices(stream, piece, ticket, &info, most, &mut came).await?;
+
+        let mut tail = [0; ImageTrailer::SIZE];
+        stream.read_exact(&mut tail).await?;
+        let trailer = ImageTrailer::parse(&tail, came)?;
+        Ok(Whole { trailer, received: clock::now() })
+    }
+
+    async fn slices(
+        &self,
+        stream: &mut RecvStream,
+        piece: &mut Vec<u8>,
+        ticket: Ticket,
+        info: &Info,
+        most: u64,
+        came: &mut u64,
+    ) -> Result<(), Lost> {
+        for _ in 0..info.slices {
+            piece.clear();
+            read(stream, piece, SLICE_HEADER_BYTES).await?;
+            let len = slice_len(piece).ok_or(Lost::Long)?;
+            if came.saturating_add(len) > most {
+                return Err(Lost::Long);
+            }
+            read(stream, piece, len as usize).await?;
+            self.push(ticket, piece, came)?;
+        }
+        Ok(())
+    }
+
+    fn push(&self, ticket: Ticket, piece: &mut Vec<u8>, came: &mut u64) -> Result<(), Lost> {
+        *came += piece.len() as u64;
+        if self.shared.mailbox.push(ticket, piece) { Ok(()) } else { Err(Lost::Stale) }
+    }
+}
+
+/// Reads until `piece` holds `len` bytes.
+async fn read(
+    stream: &mut RecvStream,
+    piece: &mut Vec<u8>,
+    len: usize,
+) -> Result<(), ReadExactError> {
+    while piece.len() < len {
+        let start = piece.len();
+        piece.resize(len.min(start + GROWTH), 0);
+        stream.read_exact(&mut piece[start..]).await?;
+    }
+    Ok(())
+}
