@@ -15,8 +15,9 @@ const NAMES: [&str; 4] = ["wasp", "bee", "ant", "fly"];
 const fn start_m(vehicle: usize) -> f64 {
     -2.0 - 4.0 * vehicle as f64
 }
-/// Slow enough that even a loaded machine draws, encodes and sends every tick.
-const SLOWLY: [&str; 2] = ["--max-rate", "20"];
+/// Slow enough that even a loaded machine draws, encodes and sends most ticks; fast enough that it
+/// cannot if anything waits 100 ms for a client.
+const SLOWLY: [&str; 2] = ["--max-rate", "40"];
 
 /// Width of camera 0 or 1 of a vehicle, by which its images are known. [px]
 fn width_px(vehicle: usize, camera: usize) -> u32 {

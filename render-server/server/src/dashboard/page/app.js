@@ -305,7 +305,7 @@ function hearState(state) {
   put("renderer", `renderer: ${state.renderer.name} (${state.renderer.reason})`);
   put("runtime", state.runtime ? `${state.runtime.program} at ${state.runtime.address}` : "no runtime connected");
 
-  const hint = !pose ? "waiting for the first pose of the vehicle" : !state.runtime && !state.landed ? "waiting for a runtime: vizflyt fly PLUGIN --server …" : "";
+  const hint = !pose ? "waiting for the first pose of the vehicle" : !state.runtime && !state.landed ? `waiting for a runtime: vizflyt fly PLUGIN --vehicle ${shown.vehicle} --server …` : "";
   $("hint").hidden = !hint;
   put("hint", hint);
 
