@@ -1,0 +1,111 @@
+//! An image on its way from the renderer's pixels to the transport allocates nothing of ours once
+//! the buffers have their size: quantised, encoded, handed to two subscribers, acknowledged.
+//! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::pin::pin;
+use std::task::{Context, Poll, Waker};
+
+use glam::DVec3;
+use vizflyt_arena::config::CameraConfig;
+use vizflyt_protocol::geometry::Pose;
+use vizflyt_protocol::messages::Purpose;
+use vizflyt_rgbd::{ColorMode, EncodeOptions};
+use vizflyt_server::cameras::Cameras;
+use vizflyt_server::drawn::DrawnImage;
+use vizflyt_server::outlet::{Outlet, Part, Places};
+use vizflyt_server::slices::Packer;
+
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
+// without destructor, so it allocates nothing.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// Returns what is there already.
+fn now<T>(future: impl Future<Output = T>) -> T {
+    match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
+        Poll::Ready(value) => value,
+        Poll::Pending => panic!("nothing has come"),
+    }
+}
+
+/// Takes an image as the transport would, and lets go of it; returns its bytes of bitstream.
+fn take(outlet: &Outlet, id: u64, places: &Places) -> usize {
+    let berth = &places[0][0];
+    now(berth.image());
+    let mut len = 0;
+    loop {
+        match now(berth.part()) {
+            Part::Bytes(bytes) => len += bytes.len(),
+            Part::End { .. } => break,
+            Part::Cut => panic!("cut off"),
+        }
+    }
+    outlet.landed(0, 0, id, 0, berth);
+    len
+}
+
+#[test]
+fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
+    let camera = "name = 'front'\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
+                  position_m = [0, 0, 0]";
+    let camera: CameraConfig = toml::from_str(camera).unwrap();
+    let mut slot = DrawnImage {
+        fresh: true,
+        world_from_body: Some(Pose::new(DVec3::Z, glam::DQuat::IDENTITY)),
+        set: Some(Cameras::new(vec![camera]).newest()),
+        ..DrawnImage::default()
+    };
+    slot.image.resize(320, 240);
+    slot.image.alpha.fill(1.0);
+    let outlet = Outlet::new(&[1]);
+    let runtime = outlet.open(0, 1, Purpose::Fly, 2);
+    let watcher = outlet.open(0, 2, Purpose::Watch, 2);
+    let options = EncodeOptions { color_mode: ColorMode::Lossless, ..EncodeOptions::default() };
+    let mut packer = Packer::new(options);
+    let mut turn = |round: usize| {
+        for (n, value) in slot.image.rgb.iter_mut().enumerate() {
+            *value = ((n * 31 + round) % 200) as f32 / 255.0;
+        }
+        for (n, depth_m) in slot.image.depth_median_m.iter_mut().enumerate() {
+            *depth_m = ((n * 7919 + round) % 9000) as f32 / 1000.0;
+        }
+        slot.seq += 1;
+        let before = ALLOCATIONS.get();
+        assert!(packer.send(&outlet, &slot, 1).unwrap().is_some());
+        let sent = [take(&outlet, 1, &runtime), take(&outlet, 2, &watcher)];
+        let allocations = ALLOCATIONS.get() - before;
+        assert!(sent[0] > 50_000 && sent[0] == sent[1], "{sent:?}");
+        allocations
+    };
+    assert!((0..4).map(&mut turn).sum::<usize>() > 0, "the counter counts");
+    for round in 4..20 {
+        assert_eq!(turn(round), 0, "image {round}");
+    }
+}
