@@ -6,7 +6,7 @@
 //!                               ◀─ Hello, Clock, Telemetry 10 Hz, Event ── Outbox
 //! one uni stream per image      ── header, slices, trailer ──▶ Mailbox, newest wins ──▶ images
 //! ```
-//! Runs on tokio. Any outage (1 s of silence, a server that restarts) ends in a new connection,
+//! Runs on tokio. Any outage (3 s of silence, a server that restarts) ends in a new connection,
 //! tried for as long as the flight lasts. Events are numbered and acknowledged both ways: after an
 //! outage what is missing is told again, and nothing twice. Both sides show a certificate; each
 //! knows the other's by its SHA-256.

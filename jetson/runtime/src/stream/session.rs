@@ -16,8 +16,10 @@ use zerocopy::IntoBytes;
 use super::{Outbox, Past, SessionEnd, Shared, StreamEvent, StreamSettings, receive};
 use crate::clock;
 
-/// Nothing from the server for this long: connect anew.
-const SILENCE: Duration = Duration::from_secs(1);
+/// Nothing from the server for this long: connect anew. Longer than a blackout of two seconds: a
+/// connection that lives on has the newest image through 15 ms after it, a new one would be in the
+/// middle of its handshake's time-outs. A server that was restarted says so itself.
+const SILENCE: Duration = Duration::from_secs(3);
 /// The clock is asked this often: four times a second at the start and when the server is
 /// silent, else once.
 const CLOCK_FAST: Duration = Duration::from_millis(250);
@@ -112,9 +114,9 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
             },
             _ = ticks.tick() => {
                 if heard.elapsed() > SILENCE {
-                    return Err(SessionEnd::Retry("the server has been silent for 1 s".into()));
+                    return Err(SessionEnd::Retry("the server has been silent for 3 s".into()));
                 }
-                let silent = heard.elapsed() >= SILENCE / 4;
+                let silent = heard.elapsed() >= CLOCK_FAST;
                 if asked_count < CLOCK_FIRST || silent || asked.elapsed() >= CLOCK_SLOW {
                     (asked, asked_count) = (Instant::now(), asked_count + 1);
                     write(&mut send, &ToServer::Clock(ClockRequest { sent: clock::now() })).await?;
@@ -126,7 +128,7 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
 
 async fn check_preamble(receive: &mut RecvStream) -> Result<(), SessionEnd> {
     let mut preamble = [0; Preamble::SIZE];
-    timeout(2 * SILENCE, receive.read_exact(&mut preamble))
+    timeout(SILENCE, receive.read_exact(&mut preamble))
         .await
         .map_err(|_| SessionEnd::Retry("the server does not answer".into()))?
         .map_err(lost)?;

@@ -1,0 +1,287 @@
+//! A network in memory: two directions of one path, each impaired as told, by seeded chance.
+
+use std::collections::{HashMap, VecDeque};
+use std::fmt;
+use std::io::{self, IoSliceMut};
+use std::net::SocketAddr;
+use std::ops::Range;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use quinn::udp::{EcnCodepoint, RecvMeta, Transmit};
+use quinn::{AsyncUdpSocket, UdpPoller};
+use tokio::time::Instant;
+
+use crate::world::{World, lock};
+
+/// What one direction does to packets.
+#[derive(Clone, Debug)]
+pub(crate) struct Impairment {
+    /// Time from end to end. [s]
+    pub(crate) delay: Duration,
+    /// Added by chance, up to this; packets keep their order.
+    pub(crate) jitter: Duration,
+    /// Share of packets lost, each by itself.
+    pub(crate) loss: f64,
+    /// Share of packets that come twice.
+    pub(crate) duplicate: f64,
+    /// Share of packets held back by [`HELD_BACK`], so that later ones overtake them.
+    pub(crate) reorder: f64,
+    /// Speed. [bit/s]
+    pub(crate) bandwidth_bps: u64,
+    /// Bytes that wait for the bottleneck at most; more are lost.
+    pub(crate) queue: usize,
+    /// Largest IP packet; larger ones are lost, as where nothing answers.
+    pub(crate) mtu: usize,
+    /// When nothing comes through, since the start.
+    pub(crate) blackouts: Vec<Range<Duration>>,
+}
+
+impl Default for Impairment {
+    /// A gigabit cable through one switch.
+    fn default() -> Self {
+        Self {
+            delay: Duration::from_micros(100),
+            jitter: Duration::ZERO,
+            loss: 0.0,
+            duplicate: 0.0,
+            reorder: 0.0,
+            bandwidth_bps: 1_000_000_000,
+            queue: 1 << 20,
+            mtu: 1500,
+            blackouts: Vec::new(),
+        }
+    }
+}
+
+/// How long a reordered packet waits.
+pub(crate) const HELD_BACK: Duration = Duration::from_millis(2);
+/// Network cards gather packets that long before they wake the processor.
+const GATHER: Duration = Duration::from_micros(20);
+/// IPv4 and UDP.
+const HEADERS: usize = 28;
+
+/// One direction.
+struct Direction {
+    does: Impairment,
+    chance: Chance,
+    /// When the bottleneck has sent all it was given.
+    busy: Instant,
+    /// Arrival of the newest packet that kept its order.
+    newest: Instant,
+}
+
+impl Direction {
+    /// Returns when a packet of `len` bytes arrives: never, once or twice.
+    fn arrivals(&mut self, start: Instant, now: Instant, len: usize) -> [Option<Instant>; 2] {
+        let (does, chance) = (&self.does, &mut self.chance);
+        // Always as many draws, so that one setting does not change another's chances.
+        let [lost, twice, late, jitter] = [(); 4].map(|()| chance.next());
+        let len = len + HEADERS;
+        let dark = does.blackouts.iter().any(|range| range.contains(&(now - start)));
+        let waiting = self.busy.saturating_duration_since(now);
+        let queued = waiting.as_secs_f64() * does.bandwidth_bps as f64 / 8.0;
+        if len > does.mtu || dark || lost < does.loss || queued + len as f64 > does.queue as f64 {
+            return [None; 2];
+        }
+        let wire = Duration::from_secs_f64(8.0 * len as f64 / does.bandwidth_bps as f64);
+        self.busy = self.busy.max(now) + wire;
+        let mut at = self.busy + does.delay + does.jitter.mul_f64(jitter);
+        if late < does.reorder {
+            at += HELD_BACK;
+        } else {
+            at = at.max(self.newest);
+            self.newest = at;
+        }
+        let gather = GATHER.as_nanos() as u64;
+        let since = ((at - start).as_nanos() as u64).next_multiple_of(gather);
+        let at = start + Duration::from_nanos(since);
+        [Some(at), (twice < does.duplicate).then_some(at + GATHER)]
+    }
+}
+
+/// The path between one server and its runtimes.
+pub(crate) struct Network {
+    world: Arc<World>,
+    start: Instant,
+    server: SocketAddr,
+    inboxes: Mutex<HashMap<SocketAddr, Arc<Inbox>>>,
+    down: Mutex<Direction>,
+    up: Mutex<Direction>,
+}
+
+impl Network {
+    /// Makes a network around the address of the server.
+    pub(crate) fn new(
+        world: Arc<World>,
+        seed: u64,
+        server: SocketAddr,
+        down: Impairment,
+        up: Impairment,
+    ) -> Arc<Self> {
+        let start = Instant::now();
+        let direction = |does, seed| {
+            Mutex::new(Direction { does, chance: Chance(seed), busy: start, newest: start })
+        };
+        let (down, up) = (direction(down, 2 * seed), direction(up, 2 * seed + 1));
+        Arc::new(Self { world, start, server, inboxes: Mutex::default(), down, up })
+    }
+
+    /// Returns a socket; whatever had its address hears nothing any more.
+    pub(crate) fn socket(self: &Arc<Self>, address: SocketAddr) -> Arc<Socket> {
+        let inbox = Arc::new(Inbox::default());
+        lock(&self.inboxes).insert(address, inbox.clone());
+        Arc::new(Socket { network: self.clone(), address: Mutex::new(address), inbox })
+    }
+
+    fn carry(&self, from: SocketAddr, to: SocketAddr, ecn: Option<EcnCodepoint>, bytes: &[u8]) {
+        let direction = if to == self.server { &self.up } else { &self.down };
+        let arrivals = lock(direction).arrivals(self.start, Instant::now(), bytes.len());
+        let Some(inbox) = lock(&self.inboxes).get(&to).cloned() else { return };
+        for at in arrivals.into_iter().flatten() {
+            let packet = Packet { from, ecn, bytes: bytes.to_vec() };
+            let inbox = inbox.clone();
+            self.world.plan(at, move || inbox.put(packet));
+        }
+    }
+}
+
+impl fmt::Debug for Network {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Network").finish_non_exhaustive()
+    }
+}
+
+struct Packet {
+    from: SocketAddr,
+    ecn: Option<EcnCodepoint>,
+    bytes: Vec<u8>,
+}
+
+/// What has arrived at a socket.
+#[derive(Default)]
+struct Inbox(Mutex<(VecDeque<Packet>, Option<Waker>)>);
+
+impl Inbox {
+    fn put(&self, packet: Packet) {
+        let mut inbox = lock(&self.0);
+        inbox.0.push_back(packet);
+        if let Some(waker) = inbox.1.take() {
+            waker.wake();
+        }
+    }
+}
+
+/// One end of the network.
+pub(crate) struct Socket {
+    network: Arc<Network>,
+    address: Mutex<SocketAddr>,
+    inbox: Arc<Inbox>,
+}
+
+impl Socket {
+    /// Speaks from another address, as after a change of network or a rebound NAT; what is on
+    /// its way to the old one is lost.
+    pub(crate) fn move_to(&self, address: SocketAddr) {
+        let mut inboxes = lock(&self.network.inboxes);
+        inboxes.remove(&std::mem::replace(&mut *lock(&self.address), address));
+        inboxes.insert(address, self.inbox.clone());
+    }
+
+    /// Neither sends nor hears any more, as when its process is killed.
+    pub(crate) fn kill(&self) {
+        let mut inboxes = lock(&self.network.inboxes);
+        let address = *lock(&self.address);
+        if inboxes.get(&address).is_some_and(|inbox| Arc::ptr_eq(inbox, &self.inbox)) {
+            inboxes.remove(&address);
+        }
+    }
+
+    fn lives(&self) -> bool {
+        let inboxes = lock(&self.network.inboxes);
+        inboxes.values().any(|inbox| Arc::ptr_eq(inbox, &self.inbox))
+    }
+}
+
+impl fmt::Debug for Socket {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Socket").field(&*lock(&self.address)).finish()
+    }
+}
+
+impl AsyncUdpSocket for Socket {
+    fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
+        Box::pin(Writable)
+    }
+
+    fn try_send(&self, transmit: &Transmit) -> io::Result<()> {
+        if self.lives() {
+            let from = *lock(&self.address);
+            let segment = transmit.segment_size.unwrap_or(transmit.contents.len()).max(1);
+            for bytes in transmit.contents.chunks(segment) {
+                self.network.carry(from, transmit.destination, transmit.ecn, bytes);
+            }
+        }
+        Ok(())
+    }
+
+    fn poll_recv(
+        &self,
+        cx: &mut Context,
+        buffers: &mut [IoSliceMut<'_>],
+        meta: &mut [RecvMeta],
+    ) -> Poll<io::Result<usize>> {
+        let mut inbox = lock(&self.inbox.0);
+        let mut count = 0;
+        for (buffer, meta) in buffers.iter_mut().zip(meta) {
+            let Some(packet) = inbox.0.pop_front() else { break };
+            let len = packet.bytes.len().min(buffer.len());
+            buffer[..len].copy_from_slice(&packet.bytes[..len]);
+            *meta = RecvMeta { addr: packet.from, len, stride: len, ecn: packet.ecn, dst_ip: None };
+            count += 1;
+        }
+        if count == 0 {
+            inbox.1 = Some(cx.waker().clone());
+            return Poll::Pending;
+        }
+        Poll::Ready(Ok(count))
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        Ok(*lock(&self.address))
+    }
+
+    fn max_transmit_segments(&self) -> usize {
+        10
+    }
+
+    fn may_fragment(&self) -> bool {
+        false
+    }
+}
+
+/// There is always room: what is too much, the path drops.
+#[derive(Debug)]
+struct Writable;
+
+impl UdpPoller for Writable {
+    fn poll_writable(self: Pin<&mut Self>, _: &mut Context) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}
+
+/// Seeded chance (SplitMix64: Steele, Lea and Flood, OOPSLA 2014).
+pub(crate) struct Chance(pub(crate) u64);
+
+impl Chance {
+    /// Returns a number from 0 up to, not including, 1.
+    pub(crate) fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}

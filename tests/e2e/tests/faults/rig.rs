@@ -1,0 +1,419 @@
+//! A server and a runtime, the real ones, over the network in memory; and what is noted there.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bytes::Bytes;
+use glam::DVec3;
+use quinn::{Endpoint, EndpointConfig, TokioRuntime};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
+use vizflyt_arena::config::CameraConfig;
+use vizflyt_protocol::geometry::{Intrinsics, Pose, Twist, Volume};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseSample, Purpose, Telemetry, bounded,
+};
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
+use vizflyt_runtime::stream::{
+    Mailbox, Outbox, ServerClock, Shared, Step, StreamEvent, StreamSettings, run_over,
+};
+use vizflyt_server::cameras::Cameras;
+use vizflyt_server::clock;
+use vizflyt_server::door::Door;
+use vizflyt_server::events::Origin;
+use vizflyt_server::hub::{Hub, RendererInfo};
+use vizflyt_server::outlet::Broadcast;
+use vizflyt_server::stop::Stop;
+use vizflyt_server::transport::{self, Congestion};
+use vizflyt_server::vehicle::Vehicle;
+use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
+
+use crate::network::{Chance, Network, Socket};
+use crate::world::lock;
+
+/// Makes a bitstream of 640x480 120 KB long. [mm]
+const DEPTH_NOISE_MM: f64 = 6.0;
+/// Where the server is.
+pub(crate) const SERVER: &str = "10.0.0.1:4433";
+
+/// What the images are.
+#[derive(Clone, Debug)]
+pub(crate) struct Source {
+    /// Images a second. [Hz]
+    pub(crate) rate_hz: u32,
+    /// Encoded images, one after the other, again and again.
+    pub(crate) payloads: Arc<Vec<Bytes>>,
+    /// Their size. [px]
+    pub(crate) size_px: [u32; 2],
+    /// Time between events of the server.
+    pub(crate) event_every: Duration,
+}
+
+impl Source {
+    /// Returns images of 640x480 at 60 Hz, 120 KB each.
+    pub(crate) fn vga() -> Self {
+        let (size_px, event_every) = ([640, 480], Duration::from_millis(300));
+        Self { rate_hz: 60, payloads: payloads(size_px), size_px, event_every }
+    }
+
+    /// Returns images of 160x120 at 100 Hz, 8 KB each, and few events: the log of those grows, to a
+    /// bound.
+    pub(crate) fn small() -> Self {
+        let (size_px, event_every) = ([160, 120], Duration::from_secs(100));
+        Self { rate_hz: 100, payloads: payloads(size_px), size_px, event_every }
+    }
+}
+
+fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
+    let mut chance = Chance(1);
+    let payload = |_| {
+        // Flat colour and noisy depth: integer coding alone, so that every machine makes the same
+        // number of bytes.
+        let rgb = vec![128; (width * height * 3) as usize];
+        let noise = |_| 2000 + (chance.next() * DEPTH_NOISE_MM) as u16;
+        let depth_mm: Vec<u16> = (0..width * height).map(noise).collect();
+        let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
+        let mut payload = Vec::new();
+        Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
+        Bytes::from(payload)
+    };
+    Arc::new((0..4).map(payload).collect())
+}
+
+/// What came of it all.
+#[derive(Debug, Default)]
+pub(crate) struct Notes {
+    /// Stamps of images drawn.
+    pub(crate) drawn: Vec<ServerTime>,
+    /// Pose stamp and arrival of each image taken.
+    pub(crate) images: Vec<(ServerTime, ServerTime)>,
+    /// Age of each pose on its arrival. [s]
+    pub(crate) poses_s: Vec<f64>,
+    /// By process of the runtime: how often each event of the server came, by its number.
+    pub(crate) events_down: Vec<BTreeMap<u32, u32>>,
+    /// The same of the runtime's events, by all processes of the server.
+    pub(crate) events_up: BTreeMap<u32, u32>,
+    /// Events told by the server.
+    pub(crate) told_down: u32,
+    /// Events told by the runtime.
+    pub(crate) told_up: u32,
+    /// Times that the runtime lost its connection.
+    pub(crate) downs: Vec<String>,
+}
+
+/// The server's process.
+pub(crate) struct Server {
+    pub(crate) hub: Arc<Hub>,
+    socket: Arc<Socket>,
+    tasks: Vec<JoinHandle<()>>,
+}
+
+/// The keys of both, paired; a restart keeps them.
+pub(crate) struct Keys {
+    folder: KeysFolder,
+    runtime: Identity,
+    _root: tempfile::TempDir,
+}
+
+impl Keys {
+    /// Makes them.
+    pub(crate) fn make() -> Self {
+        let root = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
+        let runtime = Identity::keep(&folder, Owner::Runtime).unwrap();
+        let client = Client {
+            name: "team".to_owned(),
+            fingerprint: runtime.fingerprint(),
+            role: Role::Team,
+            vehicles: vec!["vizflyt".to_owned()],
+        };
+        Paired::add(&folder, client).unwrap();
+        Self { folder, runtime, _root: root }
+    }
+
+    fn door(&self) -> Arc<Door> {
+        Arc::new(Door::open(self.folder.clone()).unwrap())
+    }
+}
+
+impl Server {
+    /// Starts it.
+    pub(crate) fn start(
+        network: &Arc<Network>,
+        keys: &Keys,
+        congestion: Congestion,
+        source: &Source,
+        notes: &Arc<Mutex<Notes>>,
+    ) -> Self {
+        let arena = ArenaInfo {
+            name: bounded("virtual"),
+            geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+            limits: Limits { max_speed_mps: 3.0, max_acceleration_mps2: 4.0 },
+            body_radius_m: 0.1,
+            takeoff_height_m: 1.0,
+            goal_m: None,
+            goal_radius_m: 1.0,
+            time_limit_s: 0.0,
+            cameras: [].into_iter().collect(),
+        };
+        let camera = CameraConfig {
+            name: "front".to_owned(),
+            width_px: source.size_px[0],
+            height_px: source.size_px[1],
+            horizontal_fov_deg: Some(90.0),
+            ..serde_json::from_str(
+                r#"{"name":"front","width_px":1,"height_px":1,"position_m":[0,0,0]}"#,
+            )
+            .unwrap()
+        };
+        let cameras = Cameras::new(vec![camera]);
+        let stop = Stop::default();
+        let vehicle = Vehicle::new(0, "vizflyt", arena, cameras);
+        let hub = Arc::new(Hub::new(vec![vehicle], RendererInfo::default(), stop));
+        let socket = network.socket(SERVER.parse().unwrap());
+        let door = keys.door();
+        let config = transport::server_config(&door.identity, congestion).unwrap();
+        let endpoint = Endpoint::new_with_abstract_socket(
+            seeded(transport::endpoint_config(&door.identity).unwrap(), 1),
+            Some(config),
+            socket.clone(),
+            Arc::new(TokioRuntime),
+        )
+        .unwrap();
+        let tasks = vec![
+            tokio::spawn(transport::serve(hub.clone(), endpoint, door, congestion)),
+            tokio::spawn(draw(hub.clone(), source.clone(), notes.clone())),
+            tokio::spawn(localize(hub.clone())),
+            tokio::spawn(happen(hub.clone(), source.clone(), notes.clone())),
+        ];
+        Self { hub, socket, tasks }
+    }
+
+    /// Ends it as SIGKILL does: without a word.
+    pub(crate) fn kill(&self, notes: &Mutex<Notes>) {
+        self.note_events(notes);
+        self.socket.kill();
+        for task in &self.tasks {
+            task.abort();
+        }
+    }
+
+    /// Notes how often each event of the runtime came.
+    pub(crate) fn note_events(&self, notes: &Mutex<Notes>) {
+        let mut cursor = 0;
+        let found = self.hub.vehicles[0].events.read(&mut cursor).unwrap();
+        let mut notes = lock(notes);
+        for entry in found.iter().filter(|entry| entry.origin == Origin::Page) {
+            if let Some(number) = number(&entry.event) {
+                *notes.events_up.entry(number).or_default() += 1;
+            }
+        }
+    }
+}
+
+fn seeded(mut config: EndpointConfig, seed: u8) -> EndpointConfig {
+    config.rng_seed(Some([seed; 32]));
+    config
+}
+
+/// Draws and hands out images as the render and encode threads do: newest wins, none while K are
+/// in flight.
+async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
+    let period = Duration::from_secs(1) / source.rate_hz;
+    let k = Intrinsics::from_horizontal_fov(source.size_px[0], source.size_px[1], 1.5);
+    let mut due = Instant::now();
+    let (mut seq, mut newest, mut broadcast) = (0, None, Broadcast::default());
+    // The encode thread waits on a condition; here it looks every millisecond.
+    let mut look = interval(Duration::from_millis(1));
+    look.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    loop {
+        if Instant::now() >= due {
+            due += period;
+            seq += 1;
+            let now = clock::now();
+            lock(&notes).drawn.push(now);
+            newest = Some((seq, now));
+        }
+        let room = hub.outlet.wait_for_room(Duration::ZERO).fly[0][0];
+        if room && let Some((seq, pose)) = newest.take() {
+            let identity = (Pose::IDENTITY, Pose::IDENTITY);
+            let header = ImageHeader::new(seq, 0, pose, &k, &identity.0, &identity.1);
+            hub.outlet.begin((0, 0), header, 0, true, &mut broadcast);
+            broadcast.push(&source.payloads[seq as usize % source.payloads.len()]);
+            hub.outlet.end(&mut broadcast, Some(clock::now()));
+        }
+        tokio::select! {
+            biased;
+            () = sleep_until(due) => {}
+            _ = look.tick(), if newest.is_some() => {}
+        }
+    }
+}
+
+/// Poses, 200 Hz.
+async fn localize(hub: Arc<Hub>) {
+    let mut tick = interval(Duration::from_millis(5));
+    loop {
+        tick.tick().await;
+        hub.vehicles[0].pose.send_replace(Some(PoseSample {
+            stamp: clock::now(),
+            world_from_body: Pose::IDENTITY,
+            twist: Twist::default(),
+            resets: 0,
+        }));
+    }
+}
+
+/// Events, from when the first runtime has come: what was before a flight concerns nobody.
+async fn happen(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
+    let mut tick = interval(source.event_every);
+    let mut flown = false;
+    loop {
+        tick.tick().await;
+        flown |= hub.vehicles[0].runtime().is_some();
+        if !flown {
+            continue;
+        }
+        let number = {
+            let mut notes = lock(&notes);
+            notes.told_down += 1;
+            notes.told_down - 1
+        };
+        hub.vehicles[0].tell(EventKind::Note, &text(number));
+    }
+}
+
+fn text(number: u32) -> String {
+    format!("event {number}")
+}
+
+fn number(event: &Event) -> Option<u32> {
+    event.text.strip_prefix("event ")?.parse().ok()
+}
+
+/// The runtime's process.
+pub(crate) struct Runtime {
+    pub(crate) socket: Arc<Mutex<Option<Arc<Socket>>>>,
+    tasks: Vec<JoinHandle<()>>,
+}
+
+impl Runtime {
+    /// Starts it at an address; each new connection speaks from the next port.
+    pub(crate) fn start(
+        network: &Arc<Network>,
+        keys: &Keys,
+        address: SocketAddr,
+        notes: &Arc<Mutex<Notes>>,
+    ) -> Self {
+        let shared =
+            Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
+        lock(notes).events_down.push(BTreeMap::new());
+        let outbox = Arc::new(Outbox::default());
+        let settings = StreamSettings {
+            server: SERVER.parse().unwrap(),
+            fingerprint: keys.door().identity.fingerprint(),
+            identity: keys.runtime.clone(),
+            vehicle: bounded("vizflyt"),
+            purpose: Purpose::Fly,
+            program: bounded("faults"),
+        };
+        let socket = Arc::new(Mutex::new(None));
+        let (network, opened, port) = (network.clone(), socket.clone(), Mutex::new(address.port()));
+        let open = move |_| {
+            *lock(&port) += 1;
+            let at = SocketAddr::new(address.ip(), *lock(&port));
+            let socket = network.socket(at);
+            *lock(&opened) = Some(socket.clone());
+            let config = seeded(EndpointConfig::default(), 2);
+            Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(TokioRuntime))
+        };
+        let noted = notes.clone();
+        let tell = move |event| {
+            let mut notes = lock(&noted);
+            match event {
+                StreamEvent::Pose(sample, _) => {
+                    notes.poses_s.push(clock::now().seconds_since(sample.stamp));
+                }
+                StreamEvent::Event(event) => {
+                    if let Some(number) = number(&event) {
+                        let newest = notes.events_down.last_mut().unwrap();
+                        *newest.entry(number).or_default() += 1;
+                    }
+                }
+                StreamEvent::Down(why) => notes.downs.push(why),
+                StreamEvent::Refused(why) => panic!("refused: {why}"),
+                StreamEvent::Welcome(_) | StreamEvent::Camera(..) => {}
+            }
+            true
+        };
+        let tasks = vec![
+            tokio::spawn(run_over(open, settings, shared.clone(), outbox.clone(), tell)),
+            tokio::spawn(take(shared, notes.clone())),
+            tokio::spawn(report(outbox, notes.clone())),
+        ];
+        Self { socket, tasks }
+    }
+
+    /// Speaks from another address from now on.
+    pub(crate) fn move_to(&self, address: SocketAddr) {
+        if let Some(socket) = &*lock(&self.socket) {
+            socket.move_to(address);
+        }
+    }
+
+    /// Ends it as SIGKILL does: without a word.
+    pub(crate) fn kill(&self) {
+        if let Some(socket) = &*lock(&self.socket) {
+            socket.kill();
+        }
+        for task in &self.tasks {
+            task.abort();
+        }
+    }
+}
+
+/// Takes images as the decoder does.
+async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
+    let mut look = interval(Duration::from_millis(1));
+    let mut drawn = ServerTime::ZERO;
+    loop {
+        look.tick().await;
+        while let Some((_, step)) = shared.mailbox.next(Duration::ZERO, |_| true) {
+            match step {
+                // As the decoder does with what was overtaken on its way.
+                Step::Begin(arrival) if arrival.header.pose_stamp() <= drawn => {
+                    shared.mailbox.give_up(0);
+                }
+                Step::Begin(arrival) => drawn = arrival.header.pose_stamp(),
+                Step::Piece(piece) => shared.mailbox.recycle(piece),
+                Step::End(whole) => {
+                    let received = ServerTime::from_ns(whole.received.as_ns());
+                    lock(&notes).images.push((drawn, received));
+                }
+                Step::Drop => {}
+            }
+        }
+    }
+}
+
+/// Telemetry at 10 Hz, an event every 700 ms.
+async fn report(outbox: Arc<Outbox>, notes: Arc<Mutex<Notes>>) {
+    let mut tick = interval(Duration::from_millis(100));
+    for count in 0_u64.. {
+        tick.tick().await;
+        outbox.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
+        if count % 7 == 6 {
+            let number = {
+                let mut notes = lock(&notes);
+                notes.told_up += 1;
+                notes.told_up - 1
+            };
+            let (stamp, text) = (clock::now(), bounded(&text(number)));
+            outbox.tell(Event { stamp, kind: EventKind::Note, text });
+        }
+    }
+}
