@@ -1,28 +1,15 @@
-//! `vizflyt bench`: how fast this machine draws.
+//! `vizflyt bench render`: how fast this machine draws.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::{Args, Subcommand};
+use clap::Args;
 use serde::Serialize;
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
-
-/// Measures this machine.
-#[derive(Args, Debug)]
-pub(crate) struct BenchArgs {
-    #[command(subcommand)]
-    command: BenchCommand,
-}
-
-#[derive(Subcommand, Debug)]
-enum BenchCommand {
-    Render(RenderArgs),
-}
 
 /// Draws a scene many times over; prints milliseconds per image and pass.
 #[derive(Args, Debug)]
@@ -33,7 +20,7 @@ Examples:
   vizflyt bench render room.ply --camera cam.json
   vizflyt bench render room.ply --camera a.json --camera b.json --size 640x480 --json
   vizflyt bench render forest/arena.toml --camera cam.json --renderer cpu --images 200")]
-struct RenderArgs {
+pub(super) struct RenderArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
     /// The camera, as for `vizflyt scene render`; may be given several times
@@ -89,16 +76,15 @@ struct Work {
     pairs: usize,
 }
 
-/// Runs `vizflyt bench`.
-pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
-    let BenchCommand::Render(args) = args.command;
-    let figures = measure(&args)?;
+/// Runs `vizflyt bench render`.
+pub(super) fn run(args: &RenderArgs) -> Result<()> {
+    let figures = measure(args)?;
     if args.json {
         println!("{}", serde_json::to_string_pretty(&figures)?);
     } else {
         print(&figures);
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 fn measure(args: &RenderArgs) -> Result<Figures> {

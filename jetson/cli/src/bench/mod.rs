@@ -1,0 +1,31 @@
+//! `vizflyt bench`: how fast this machine draws and streams.
+
+mod render;
+mod stream;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+
+/// Measures this machine.
+#[derive(Args, Debug)]
+pub(crate) struct BenchArgs {
+    #[command(subcommand)]
+    command: BenchCommand,
+}
+
+#[derive(Subcommand, Debug)]
+enum BenchCommand {
+    Render(render::RenderArgs),
+    Stream(stream::StreamArgs),
+}
+
+/// Runs `vizflyt bench`.
+pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
+    match args.command {
+        BenchCommand::Render(args) => render::run(&args)?,
+        BenchCommand::Stream(args) => stream::run(&args)?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
