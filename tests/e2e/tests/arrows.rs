@@ -25,6 +25,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         "vizflyt",
         &[
             "vizflyt-protocol",
+            "vizflyt-rgbd",
             "vizflyt-trust",
             "vizflyt-splat",
             "vizflyt-arena",
