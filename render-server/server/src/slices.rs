@@ -23,6 +23,7 @@ use crate::outlet::{Broadcast, Outlet};
 #[derive(Debug)]
 pub struct Packer {
     encoder: Encoder,
+    options: EncodeOptions,
     rgb: Vec<u8>,
     depth_mm: Vec<u16>,
     scratch: Vec<u8>,
@@ -37,6 +38,7 @@ impl Packer {
     pub fn new(options: EncodeOptions) -> Self {
         Self {
             encoder: Encoder::new(options),
+            options,
             rgb: Vec::new(),
             depth_mm: Vec::new(),
             scratch: Vec::new(),
@@ -48,7 +50,7 @@ impl Packer {
 
     /// Changes what the next image is encoded with.
     pub fn set_options(&mut self, options: EncodeOptions) {
-        self.encoder.set_options(options);
+        self.options = options;
     }
 
     /// Encodes the image of `slot` and hands it over; `together` are the cameras of its vehicle
@@ -94,6 +96,8 @@ impl Packer {
         let mut buffer = self.buffer();
         let mut len = 0;
         self.scratch.clear();
+        let slices = (width * height / LEAST_SLICE_PIXELS).clamp(1, self.options.slices.into());
+        self.encoder.set_options(EncodeOptions { slices: slices as u8, ..self.options });
         // The header leaves with the first slice: alone it would only wake the other end.
         let info = self.encoder.start(width, height, parts, &mut self.scratch)?;
         for slice in 0..info.slices {
@@ -130,6 +134,9 @@ impl Packer {
     }
 }
 
+/// A slice is three wake-ups on its way: below a quarter of 640x480 they cost more than the overlap
+/// gains. [px]
+const LEAST_SLICE_PIXELS: u32 = 320 * 240;
 /// A small image; larger ones teach the packer their size. [bytes]
 const LEAST_BUFFER: usize = 64 << 10;
 /// Eight cameras of four vehicles with two images each in flight.
