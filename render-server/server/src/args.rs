@@ -7,6 +7,7 @@ use clap::Args;
 use vizflyt_protocol::messages::{Grant, MAX_GRANTED, bounded};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
+use crate::pace::Adapt;
 use crate::render::RendererKind;
 use crate::scene::Up;
 use crate::transport::Congestion;
@@ -64,6 +65,11 @@ pub struct ServeArgs {
     /// Congestion control of the image stream
     #[arg(long, value_enum, default_value_t)]
     pub congestion: Congestion,
+
+    /// What may be lowered when a runtime's link is too slow for its images: quality before rate, rate
+    /// before size
+    #[arg(long, value_enum, default_value_t)]
+    pub adapt: Adapt,
 
     /// Bare scene only: the scene's axis that points up
     #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
@@ -201,7 +207,8 @@ mod tests {
         let args =
             parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
         assert_eq!((args.up, args.scale), (Up::NegY, Some(0.2)));
-        assert_eq!(args.congestion, Congestion::Bbr);
+        assert_eq!((args.congestion, args.adapt), (Congestion::Bbr, Adapt::Auto));
+        assert_eq!(parse("a.toml --adapt none").unwrap().adapt, Adapt::None);
         assert_eq!(args.encode_options(), EncodeOptions::default());
         let args = parse("a.toml --color 420 --depth small --depth-error 0.002").unwrap();
         let options = args.encode_options();

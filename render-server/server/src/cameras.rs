@@ -26,6 +26,38 @@ impl CameraSet {
         let infos = configs.iter().map(CameraConfig::info).collect();
         Self { configs, infos }
     }
+
+    /// Returns the cameras with images of a `by`-th of their width and height, and the same view.
+    fn shrunk(&self, by: u32) -> Self {
+        let mut shrunk = self.clone();
+        for info in &mut shrunk.infos {
+            info.intrinsics = info.intrinsics.shrunk(by);
+        }
+        shrunk
+    }
+}
+
+/// The cameras of one vehicle as they are drawn: smaller than they are where the link is too slow.
+#[derive(Debug, Default)]
+pub struct DrawnCameras {
+    of: Arc<CameraSet>,
+    by: u32,
+    shrunk: Arc<CameraSet>,
+}
+
+impl DrawnCameras {
+    /// Returns `newest` with images of a `by`-th of their width and height; made anew only when
+    /// either changes.
+    pub fn follow(&mut self, newest: Arc<CameraSet>, by: u32) -> Arc<CameraSet> {
+        if by <= 1 {
+            return newest;
+        }
+        if self.by != by || !Arc::ptr_eq(&self.of, &newest) {
+            self.shrunk = Arc::new(newest.shrunk(by));
+            (self.of, self.by) = (newest, by);
+        }
+        self.shrunk.clone()
+    }
 }
 
 /// The cameras, shared by all threads.
@@ -168,6 +200,19 @@ mod tests {
     fn refused(result: Result<CameraConfig, ChangeError>, expected: &str) {
         let error = result.unwrap_err().to_string();
         assert!(error.contains(expected), "'{error}' lacks '{expected}'");
+    }
+
+    #[test]
+    fn a_slow_link_gets_smaller_images_of_the_same_view() {
+        let cameras = Cameras::new(vec![CameraConfig::ahead("a", [640, 480], 90.0, DVec3::ZERO)]);
+        let (newest, mut drawn) = (cameras.newest(), DrawnCameras::default());
+        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 1), &newest));
+        let half = drawn.follow(newest.clone(), 2);
+        let (k, full) = (half.infos[0].intrinsics, newest.infos[0].intrinsics);
+        assert_eq!((k.width_px, k.height_px, k.fx_px), (320, 240, full.fx_px / 2.0));
+        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 2), &half), "made once");
+        assert_eq!(drawn.follow(newest.clone(), 3).infos[0].intrinsics.width_px, 213);
+        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 1), &newest), "and back");
     }
 
     #[test]

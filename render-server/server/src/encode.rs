@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tracing::warn;
+use vizflyt_protocol::messages::MAX_CAMERAS;
 use vizflyt_rgbd::EncodeOptions;
 
 use crate::drawn::Ticks;
@@ -17,6 +18,8 @@ use crate::slices::Packer;
 pub fn run(hub: &Arc<Hub>, ticks: &Ticks, options: EncodeOptions) {
     let mut packer = Packer::new(options);
     let mut order: Vec<usize> = Vec::new();
+    // Images of each camera so far, where the link has no room for all.
+    let mut turns = [[0u32; MAX_CAMERAS]; MAX_VEHICLES];
     while !hub.stop.is_set() {
         let wanted = hub.outlet.wait_for_room(PATIENCE);
         if !wanted.anything() {
@@ -27,6 +30,13 @@ pub fn run(hub: &Arc<Hub>, ticks: &Ticks, options: EncodeOptions) {
         order.clear();
         order.extend((0..tick.slots.len()).filter(|&index| tick.slots[index].fresh));
         order.sort_by_key(|&index| std::cmp::Reverse(tick.slots[index].seq));
+        // A slow link gets one of so many images; watchers get what the runtime gets.
+        order.retain(|&index| {
+            let slot = &tick.slots[index];
+            let turn = &mut turns[slot.vehicle][slot.camera];
+            *turn = turn.wrapping_add(1);
+            turn.is_multiple_of(hub.vehicles[slot.vehicle].level().keep_one_in)
+        });
         let mut together = [0u32; MAX_VEHICLES];
         for &index in &order {
             let slot = &tick.slots[index];
@@ -40,6 +50,7 @@ pub fn run(hub: &Arc<Hub>, ticks: &Ticks, options: EncodeOptions) {
             if !wanted.stream[vehicle][camera] {
                 continue;
             }
+            packer.set_options(hub.vehicles[vehicle].level().options(&options));
             match packer.send(&hub.outlet, slot, together[vehicle]) {
                 Ok(Some((start, end))) => {
                     hub.stats.encode.add(start, end);

@@ -13,6 +13,7 @@ pub use vizflyt_arena::config::MAX_VEHICLES;
 
 use crate::drivers::SourceCounters;
 use crate::outlet::Outlet;
+use crate::pace::Adapt;
 use crate::stats::{Report, Stats};
 use crate::stop::Stop;
 use crate::vehicle::Vehicle;
@@ -32,6 +33,8 @@ pub struct Hub {
     pub stats: Stats,
     /// Who wants images.
     pub outlet: Outlet,
+    /// What may be lowered toward a runtime whose link is too slow.
+    pub adapt: Adapt,
     /// What the localization delivered, of all vehicles.
     pub source: Mutex<SourceCounters>,
 }
@@ -56,6 +59,7 @@ impl Hub {
             stop,
             stats: Stats::default(),
             outlet: Outlet::new(&cameras),
+            adapt: Adapt::default(),
             source: Mutex::default(),
         }
     }

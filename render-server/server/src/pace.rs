@@ -19,6 +19,7 @@
 //! that did not last, unless the room is [`AMPLE`]. Without any acknowledgement (an outage) the level stays for [`OUTAGE_S`].
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::time::Duration;
 
 use vizflyt_protocol::time::ServerTime;
@@ -27,7 +28,7 @@ use vizflyt_rgbd::{ColorMode, DepthBound, EncodeOptions};
 /// What may be lowered when a link is too slow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Adapt {
-    /// `quality` to private and loopback addresses, `all` to all others.
+    /// `none` on this computer, `quality` to private addresses, `all` to all others.
     #[default]
     Auto,
     /// Nothing: images are as asked for, or do not come.
@@ -41,14 +42,16 @@ pub enum Adapt {
 }
 
 impl Adapt {
-    /// Returns what it means toward a peer on the lab's network, or elsewhere.
+    /// Returns what it means toward a peer at `address`.
     ///
-    /// A plugin of the lab is written for its camera: there rate and size stay, and a cable that
-    /// is too slow even so shows as skipped images. A remote one is better served by fewer and
-    /// smaller images than by late ones.
-    pub fn toward(self, is_near: bool) -> Self {
+    /// On one computer there is no link, only processors that may be busy. A plugin of the lab is
+    /// written for its camera: there rate and size stay, and a cable that is too slow even so shows
+    /// as skipped images. A remote one is better served by fewer and smaller images than by late
+    /// ones.
+    pub fn toward(self, address: IpAddr) -> Self {
         match self {
-            Self::Auto if is_near => Self::Quality,
+            Self::Auto if address.to_canonical().is_loopback() => Self::None,
+            Self::Auto if is_near(address) => Self::Quality,
             Self::Auto => Self::All,
             chosen => chosen,
         }
@@ -65,6 +68,14 @@ impl Adapt {
     }
 }
 
+/// Whether `address` is this computer's or of a private network.
+pub fn is_near(address: IpAddr) -> bool {
+    match address.to_canonical() {
+        IpAddr::V4(v4) => v4.is_loopback() || v4.is_private() || v4.is_link_local(),
+        IpAddr::V6(v6) => v6.is_loopback() || v6.is_unique_local() || v6.is_unicast_link_local(),
+    }
+}
+
 /// How images are made at one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
@@ -78,9 +89,9 @@ pub struct Level {
     pub keep_one_in: u32,
     /// Width and height are divided by this.
     pub shrink: u32,
-    /// Bytes of an image, as a share of level 0's: measured on renders of captured scenes at
-    /// 640x480, docs/guides/network.md.
-    share: f64,
+    /// Bytes of an image, as a share of level 0's: about what renders of captured scenes take. A
+    /// wrong share costs a second change, as what follows is measured.
+    pub share: f64,
     name: &'static str,
 }
 
@@ -114,8 +125,13 @@ impl Level {
     }
 }
 
+/// Returns the level of this number, 0 being the best; the smallest, if there are fewer.
+pub fn level(index: usize) -> &'static Level {
+    &LEVELS[index.min(LEVELS.len() - 1)]
+}
+
 /// From the best to the smallest.
-static LEVELS: [Level; 7] = {
+pub static LEVELS: [Level; 7] = {
     const FULL: Level = Level {
         quality: 100,
         half_colour: false,

@@ -113,7 +113,9 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     let vehicles = twin.flying.iter().enumerate().map(|(index, (name, arena))| {
         Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()))
     });
-    let hub = Arc::new(Hub::new(vehicles.collect(), renderer, stop.clone()));
+    let mut hub = Hub::new(vehicles.collect(), renderer, stop.clone());
+    hub.adapt = args.adapt;
+    let hub = Arc::new(hub);
     let renderer = lock(&hub.renderer).clone();
     let names: Vec<_> = hub.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
     let threads = start_threads(args, &hub, rasterizer, twin.referees, vicon.of(&names))?;

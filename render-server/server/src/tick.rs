@@ -24,7 +24,7 @@ use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS, PoseSample};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::{Camera, Rasterizer, RgbdImage};
 
-use crate::cameras::CameraSet;
+use crate::cameras::{CameraSet, DrawnCameras};
 use crate::clock;
 use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, SourceCounters};
@@ -143,6 +143,7 @@ pub fn draw(
     let schedule = Schedule::new(max_rate_hz, Instant::now());
     let mut schedules = vec![schedule; hub.vehicles.len()];
     let mut sets: Vec<Arc<CameraSet>> = Vec::with_capacity(MAX_VEHICLES);
+    let mut drawn_cameras: [DrawnCameras; MAX_VEHICLES] = Default::default();
     let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS);
     // The renderer wants the images of the cameras that are due side by side.
     let mut images: Vec<RgbdImage> = Vec::new();
@@ -155,7 +156,9 @@ pub fn draw(
             continue;
         }
         sets.clear();
-        sets.extend(hub.vehicles.iter().map(|vehicle| vehicle.cameras.newest()));
+        sets.extend(hub.vehicles.iter().zip(&mut drawn_cameras).map(|(vehicle, drawn)| {
+            drawn.follow(vehicle.cameras.newest(), vehicle.level().shrink)
+        }));
         let now = Instant::now();
         let ready = (0..sets.len()).filter(|&index| wanted[index] && poses[index].is_some());
         let next = ready.map(|index| schedules[index].next(&sets[index].configs, now)).min();

@@ -9,7 +9,7 @@
 //! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
 
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::{Notify, watch};
@@ -26,6 +26,7 @@ use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
 use crate::outlet::MOST_WATCHERS;
+use crate::pace::{self, Level};
 use crate::previews::Preview;
 use crate::stats::{CameraAccount, Connection};
 
@@ -56,6 +57,8 @@ pub struct Vehicle {
     pub source: Mutex<SourceCounters>,
     /// Its images on their way.
     pub images: ImageCounters,
+    /// How its images are made, by what its runtime's link carries: number of a [`pace::level`].
+    pub level: AtomicUsize,
     seat: Mutex<SeatState>,
     flight: Mutex<Flight>,
     ledger: Mutex<Ledger>,
@@ -132,10 +135,16 @@ impl Vehicle {
             trail: Mutex::default(),
             source: Mutex::default(),
             images: ImageCounters::default(),
+            level: AtomicUsize::new(0),
             seat: Mutex::default(),
             flight: Mutex::default(),
             ledger: Mutex::default(),
         }
+    }
+
+    /// Returns how its images are made now.
+    pub fn level(&self) -> &'static Level {
+        pace::level(self.level.load(Ordering::Relaxed))
     }
 
     /// Returns what a runtime is told of the arena, with the cameras `set`.

@@ -57,6 +57,30 @@ impl Intrinsics {
         }
     }
 
+    /// Returns the same view in a `by`-th of the width and height, at least one pixel each.
+    ///
+    /// ```
+    /// use vizflyt_protocol::geometry::Intrinsics;
+    /// let half = Intrinsics::from_horizontal_fov(640, 480, 1.2).shrunk(2);
+    /// assert_eq!(half, Intrinsics::from_horizontal_fov(320, 240, 1.2));
+    /// ```
+    pub fn shrunk(&self, by: u32) -> Self {
+        let by = by.max(1);
+        let (width_px, height_px) = ((self.width_px / by).max(1), (self.height_px / by).max(1));
+        // Pixels are continuous from the outer corner: everything scales with the size.
+        let across = f64::from(width_px) / f64::from(self.width_px);
+        let down = f64::from(height_px) / f64::from(self.height_px);
+        Self {
+            width_px,
+            height_px,
+            fx_px: self.fx_px * across,
+            fy_px: self.fy_px * down,
+            cx_px: self.cx_px * across,
+            cy_px: self.cy_px * down,
+            distortion: self.distortion,
+        }
+    }
+
     /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.width_px as usize * self.height_px as usize

@@ -4,25 +4,29 @@
 //! stream whenever a newer image is ready starves an overloaded link altogether; waiting for room
 //! with the newest image, and resetting only past [`DEADLINE`], delivers what the link carries.
 //!
+//! How each image fared tells [`crate::pace`] what the link carries.
+//!
 //! One task per place of the outlet, made when the subscriber comes or its K grows: it writes an
 //! image's slices as the encoder makes them, without a copy, and none waits for another camera's.
 
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use quinn::{Connection, SendStream};
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::trace;
-use vizflyt_protocol::messages::Purpose;
+use vizflyt_protocol::messages::{EventKind, Purpose};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_protocol::time::ServerTime;
 use zerocopy::IntoBytes;
 
 use super::{END, VarInt};
 use crate::clock;
-use crate::hub::Hub;
+use crate::hub::{Hub, lock};
 use crate::outlet::{Berth, MOST_IN_FLIGHT, Part, Places};
+use crate::pace::{DECIDE_EVERY, Landing, Pace};
 use crate::stats::Rate;
 use crate::vehicle::Vehicle;
 
@@ -40,7 +44,8 @@ struct Way {
     vehicle: Arc<Vehicle>,
     connection: Connection,
     id: u64,
-    purpose: Purpose,
+    /// The runtime's; a watcher far away says nothing of the flight.
+    pace: Option<Arc<Mutex<Pace>>>,
 }
 
 impl Lane {
@@ -54,7 +59,10 @@ impl Lane {
     ) -> Self {
         let allowed = in_flight(connection.min_rtt(), USUAL_RATE_HZ);
         let places = hub.outlet.open(vehicle.index, id, purpose, allowed);
-        Self { way: Way { hub, vehicle, connection, id, purpose }, places, allowed }
+        let adapt = hub.adapt.toward(connection.remote_address().ip());
+        let pace = (purpose == Purpose::Fly).then(|| Arc::new(Mutex::new(Pace::new(adapt))));
+        vehicle.level.store(0, Ordering::Relaxed);
+        Self { way: Way { hub, vehicle, connection, id, pace }, places, allowed }
     }
 
     /// Sends images until the connection ends.
@@ -64,6 +72,9 @@ impl Lane {
         let rate = Rate::default();
         let mut every_second = interval(Duration::from_secs(1));
         every_second.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let drawn_rate = Rate::default();
+        let mut decide = interval(DECIDE_EVERY);
+        decide.set_missed_tick_behavior(MissedTickBehavior::Skip);
         loop {
             tokio::select! {
                 _ = senders.join_next() => {
@@ -79,6 +90,11 @@ impl Lane {
                     self.spawn(&mut senders, before);
                     hub.outlet.allow(vehicle.index, *id, allowed);
                 }
+                _ = decide.tick() => {
+                    let drawn = self.way.vehicle.images.cameras.iter();
+                    let drawn = drawn.map(|tally| tally.counts().drawn).sum();
+                    self.way.decide(drawn_rate.of(drawn, clock::now()));
+                }
             }
         }
     }
@@ -91,6 +107,18 @@ impl Lane {
                     senders.spawn(send(self.way.clone(), camera, place, berth.clone()));
                 }
             }
+        }
+    }
+}
+
+impl Way {
+    /// Lowers or raises how images are made; `wanted_hz` are drawn, of all cameras.
+    fn decide(&self, wanted_hz: f64) {
+        let Some(pace) = &self.pace else { return };
+        let change = lock(pace).decide(clock::now(), wanted_hz);
+        if let Some(change) = change {
+            self.vehicle.level.store(change.to, Ordering::Relaxed);
+            self.vehicle.tell(EventKind::Note, &change.text());
         }
     }
 }
@@ -109,68 +137,92 @@ fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
 
 /// Sends the images that come to one place, for ever.
 async fn send(way: Way, camera: usize, place: usize, berth: Arc<Berth>) {
-    let Way { hub, vehicle, connection, id, purpose } = &way;
+    let Way { hub, vehicle, connection, id, pace } = &way;
     loop {
         let (header, priority) = berth.image().await;
         let start = clock::now();
-        let delivered = deliver(connection, &berth, &header, priority).await;
+        let mut sent = Sent { bytes: 0, encode_end: None };
+        let delivered = deliver(connection, &berth, &header, priority, &mut sent).await;
         let end = clock::now();
-        // Figures are the runtime's: a watcher far away says nothing of the flight.
-        if *purpose == Purpose::Fly {
-            if let Some(len) = delivered {
+        // Figures are the runtime's.
+        if let Some(pace) = pace {
+            if delivered {
                 hub.stats.send.add(start, end);
                 vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
-                vehicle.images.bytes.fetch_add(len, Ordering::Relaxed);
+                vehicle.images.bytes.fetch_add(sent.bytes as u64, Ordering::Relaxed);
             } else {
                 vehicle.images.late.fetch_add(1, Ordering::Relaxed);
                 vehicle.images.cameras[camera].late();
             }
+            lock(pace).landed(&Landing {
+                bytes: sent.bytes,
+                // The encoder's time is not the link's.
+                handed: sent.encode_end.unwrap_or(start),
+                ended: end,
+                delivered,
+                min_rtt: connection.min_rtt(),
+            });
         }
         let ms = end.seconds_since(start) * 1e3;
-        trace!(camera, delivered = delivered.is_some(), ms, "send");
+        trace!(camera, delivered, ms, "send");
         hub.outlet.landed(vehicle.index, camera, *id, place, &berth);
     }
 }
 
-/// Sends an image on a stream of its own; returns its bytes of bitstream if all was acknowledged in
-/// time.
+/// How far an image has come.
+struct Sent {
+    /// Of its bitstream.
+    bytes: usize,
+    /// Once it is known.
+    encode_end: Option<ServerTime>,
+}
+
+/// Sends an image on a stream of its own; returns whether all was acknowledged in time.
 async fn deliver(
     connection: &Connection,
     berth: &Berth,
     header: &ImageHeader,
     priority: i32,
-) -> Option<u64> {
-    let mut stream = timeout(DEADLINE, connection.open_uni()).await.ok()?.ok()?;
+    sent: &mut Sent,
+) -> bool {
+    let Ok(Ok(mut stream)) = timeout(DEADLINE, connection.open_uni()).await else {
+        return false;
+    };
     // Fails only if the stream has ended already.
     let _ = stream.set_priority(priority);
-    let delivered = timeout(DEADLINE, write(&mut stream, berth, header)).await;
-    let delivered = delivered.ok().flatten();
-    if delivered.is_none() {
+    let delivered = timeout(DEADLINE, write(&mut stream, berth, header, sent)).await;
+    let delivered = delivered.ok().flatten().is_some();
+    if !delivered {
         // Fails only if it is finished and acknowledged after all.
         let _ = stream.reset(VarInt::from_u32(0));
     }
     delivered
 }
 
-async fn write(stream: &mut SendStream, berth: &Berth, header: &ImageHeader) -> Option<u64> {
+async fn write(
+    stream: &mut SendStream,
+    berth: &Berth,
+    header: &ImageHeader,
+    sent: &mut Sent,
+) -> Option<()> {
     let send = clock::now();
     stream.write_all(header.as_bytes()).await.ok()?;
-    let mut len = 0;
     let encode_end = loop {
         match berth.part().await {
             Part::Bytes(bytes) => {
-                len += bytes.len() as u64;
+                sent.bytes += bytes.len();
                 stream.write_chunk(bytes).await.ok()?;
             }
             Part::End { encode_end } => break encode_end,
             Part::Cut => return None,
         }
     };
-    let trailer = ImageTrailer::new(u32::try_from(len).ok()?, encode_end, send);
+    sent.encode_end = Some(encode_end);
+    let trailer = ImageTrailer::new(u32::try_from(sent.bytes).ok()?, encode_end, send);
     stream.write_all(trailer.as_bytes()).await.ok()?;
     stream.finish().ok()?;
     // `None` inside is "acknowledged"; a code is "the other side does not want it".
-    stream.stopped().await.ok()?.is_none().then_some(len)
+    stream.stopped().await.ok()?.is_none().then_some(())
 }
 
 /// Older than this, an image helps no pilot, and its retransmissions delay newer ones.

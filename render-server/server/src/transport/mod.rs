@@ -42,6 +42,7 @@ use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 use self::limits::Limiter;
 use crate::door::Door;
 use crate::hub::{Hub, lock};
+use crate::pace::is_near;
 
 /// Who decides how fast to send.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -60,14 +61,8 @@ pub enum Congestion {
 impl Congestion {
     /// Returns what suits a peer at `address`.
     fn toward(self, address: IpAddr) -> Self {
-        let near = match address.to_canonical() {
-            IpAddr::V4(v4) => v4.is_loopback() || v4.is_private() || v4.is_link_local(),
-            IpAddr::V6(v6) => {
-                v6.is_loopback() || v6.is_unique_local() || v6.is_unicast_link_local()
-            }
-        };
         match self {
-            Self::Auto if near => Self::Lan,
+            Self::Auto if is_near(address) => Self::Lan,
             Self::Auto => Self::Cubic,
             chosen => chosen,
         }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -27,6 +28,7 @@ use vizflyt_server::door::Door;
 use vizflyt_server::events::Origin;
 use vizflyt_server::hub::{Hub, RendererInfo};
 use vizflyt_server::outlet::Broadcast;
+use vizflyt_server::pace::{self, Adapt};
 use vizflyt_server::stop::Stop;
 use vizflyt_server::transport::{self, Congestion};
 use vizflyt_server::vehicle::Vehicle;
@@ -37,6 +39,8 @@ use crate::world::lock;
 
 /// Makes a bitstream of 640x480 120 KB long. [mm]
 const DEPTH_NOISE_MM: f64 = 6.0;
+/// Different images of a level.
+const IMAGES: usize = 4;
 /// Where the server is.
 pub(crate) const SERVER: &str = "10.0.0.1:4433";
 
@@ -45,32 +49,40 @@ pub(crate) const SERVER: &str = "10.0.0.1:4433";
 pub(crate) struct Source {
     /// Images a second. [Hz]
     pub(crate) rate_hz: u32,
-    /// Encoded images, one after the other, again and again.
+    /// Encoded images, [`IMAGES`] of each level of the pace, one after the other, again and again.
     pub(crate) payloads: Arc<Vec<Bytes>>,
     /// Their size. [px]
     pub(crate) size_px: [u32; 2],
     /// Time between events of the server.
     pub(crate) event_every: Duration,
+    /// What may be lowered on a slow link.
+    pub(crate) adapt: Adapt,
 }
 
 impl Source {
     /// Returns images of 640x480 at 60 Hz, 120 KB each.
     pub(crate) fn vga() -> Self {
         let (size_px, event_every) = ([640, 480], Duration::from_millis(300));
-        Self { rate_hz: 60, payloads: payloads(size_px), size_px, event_every }
+        Self { rate_hz: 60, payloads: payloads(size_px), size_px, event_every, adapt: Adapt::None }
     }
 
     /// Returns images of 160x120 at 100 Hz, 8 KB each, and few events: the log of those grows, to a
     /// bound.
     pub(crate) fn small() -> Self {
         let (size_px, event_every) = ([160, 120], Duration::from_secs(100));
-        Self { rate_hz: 100, payloads: payloads(size_px), size_px, event_every }
+        Self { rate_hz: 100, payloads: payloads(size_px), size_px, event_every, adapt: Adapt::None }
     }
+}
+
+/// Returns the width of images at a level of the pace: its share of the bytes is one of columns.
+fn columns(width: u32, level: usize) -> u32 {
+    (f64::from(width) * pace::level(level).share) as u32
 }
 
 fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
     let mut chance = Chance(1);
-    let payload = |_| {
+    let payload = |level: usize| {
+        let width = columns(width, level / IMAGES);
         // Flat colour and noisy depth: integer coding alone, so that every machine makes the same
         // number of bytes.
         let rgb = vec![128; (width * height * 3) as usize];
@@ -81,7 +93,7 @@ fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
         Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
         Bytes::from(payload)
     };
-    Arc::new((0..4).map(payload).collect())
+    Arc::new((0..pace::LEVELS.len() * IMAGES).map(payload).collect())
 }
 
 /// What came of it all.
@@ -173,7 +185,9 @@ impl Server {
         let cameras = Cameras::new(vec![camera]);
         let stop = Stop::default();
         let vehicle = Vehicle::new(0, "vizflyt", arena, cameras);
-        let hub = Arc::new(Hub::new(vec![vehicle], RendererInfo::default(), stop));
+        let mut hub = Hub::new(vec![vehicle], RendererInfo::default(), stop);
+        hub.adapt = source.adapt;
+        let hub = Arc::new(hub);
         let socket = network.socket(SERVER.parse().unwrap());
         let door = keys.door();
         let config = transport::server_config(&door.identity, congestion).unwrap();
@@ -224,7 +238,6 @@ fn seeded(mut config: EndpointConfig, seed: u8) -> EndpointConfig {
 /// in flight.
 async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
     let period = Duration::from_secs(1) / source.rate_hz;
-    let k = Intrinsics::from_horizontal_fov(source.size_px[0], source.size_px[1], 1.5);
     let mut due = Instant::now();
     let (mut seq, mut newest, mut broadcast) = (0, None, Broadcast::default());
     // The encode thread waits on a condition; here it looks every millisecond.
@@ -236,14 +249,20 @@ async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
             seq += 1;
             let now = clock::now();
             lock(&notes).drawn.push(now);
-            newest = Some((seq, now));
+            hub.vehicles[0].images.cameras[0].drew();
+            if seq % u64::from(hub.vehicles[0].level().keep_one_in) == 0 {
+                newest = Some((seq, now));
+            }
         }
         let room = hub.outlet.wait_for_room(Duration::ZERO).fly[0][0];
         if room && let Some((seq, pose)) = newest.take() {
+            let level = hub.vehicles[0].level.load(Ordering::Relaxed);
+            let [width, height] = source.size_px;
+            let k = Intrinsics::from_horizontal_fov(columns(width, level), height, 1.5);
             let identity = (Pose::IDENTITY, Pose::IDENTITY);
             let header = ImageHeader::new(seq, 0, pose, &k, &identity.0, &identity.1);
             hub.outlet.begin((0, 0), header, 0, true, &mut broadcast);
-            broadcast.push(&source.payloads[seq as usize % source.payloads.len()]);
+            broadcast.push(&source.payloads[level * IMAGES + seq as usize % IMAGES]);
             hub.outlet.end(&mut broadcast, Some(clock::now()));
         }
         tokio::select! {

@@ -8,6 +8,7 @@ use std::time::Duration;
 use tokio::time::{Instant, sleep_until};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::clock;
+use vizflyt_server::pace::Adapt;
 use vizflyt_server::transport::Congestion;
 
 use crate::memory;
@@ -321,6 +322,18 @@ pub(crate) fn cases() -> Vec<Case> {
             let path = Impairment { bandwidth_bps, queue: 256 << 10, ..near() };
             add(&format!("{mbit} Mbit/s"), congestion, path, Script::Nothing);
         }
+    }
+    for (mbit, adapt, what) in [
+        (50, Adapt::None, "50 Mbit/s, as is"),
+        (50, Adapt::Quality, "50 Mbit/s, lower quality"),
+        (20, Adapt::Quality, "20 Mbit/s, lower quality"),
+        (20, Adapt::All, "20 Mbit/s, lower all"),
+        (5, Adapt::All, "5 Mbit/s, lower all"),
+    ] {
+        let path = Impairment { bandwidth_bps: mbit * 1_000_000, queue: 256 << 10, ..near() };
+        let source = Source { adapt, ..source.clone() };
+        let (name, script) = (format!("{what}, lan"), Script::Nothing);
+        all.push(Case { name, congestion: Lan, path, script, source });
     }
     all
 }
