@@ -145,16 +145,16 @@ pub static LEVELS: [Level; 7] = {
         quality: 60,
         half_colour: true,
         depth_k: Some(0.001),
-        share: 0.39,
+        share: 0.42,
         name: "JPEG 4:2:0 quality 60, depth within 0.001 z²",
         ..FULL
     };
     [
         FULL,
-        Level { quality: 85, share: 0.87, name: "JPEG quality 85", ..FULL },
+        Level { quality: 85, share: 0.86, name: "JPEG quality 85", ..FULL },
         Level {
             quality: 80,
-            share: 0.45,
+            share: 0.48,
             name: "JPEG 4:2:0 quality 80, depth within 0.001 z²",
             ..LOW
         },
@@ -164,7 +164,7 @@ pub static LEVELS: [Level; 7] = {
         Level {
             keep_one_in: 3,
             shrink: 2,
-            share: 0.12,
+            share: 0.15,
             name: "quality 60, every third image, half width and height",
             ..LOW
         },

@@ -1,5 +1,6 @@
-//! `vizflyt bench`: how fast this machine draws and streams.
+//! `vizflyt bench`: how fast this machine draws and streams, and what its images need.
 
+mod bandwidth;
 mod render;
 mod stream;
 
@@ -17,6 +18,7 @@ pub(crate) struct BenchArgs {
 
 #[derive(Subcommand, Debug)]
 enum BenchCommand {
+    Bandwidth(bandwidth::BandwidthArgs),
     Render(render::RenderArgs),
     Stream(stream::StreamArgs),
 }
@@ -24,6 +26,7 @@ enum BenchCommand {
 /// Runs `vizflyt bench`.
 pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
     match args.command {
+        BenchCommand::Bandwidth(args) => bandwidth::run(&args)?,
         BenchCommand::Render(args) => render::run(&args)?,
         BenchCommand::Stream(args) => stream::run(&args)?,
     }
