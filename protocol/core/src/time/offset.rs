@@ -105,7 +105,7 @@ impl<Local: Clock, Remote: Clock> OffsetFilter<Local, Remote> {
     pub fn offset_ns(&self, at: Stamp<Local>) -> Option<i64> {
         let fit = self.fit?;
         let drifted_ns = fit.drift * since(at.as_ns(), fit.at_ns);
-        Some(fit.offset_ns.wrapping_add(drifted_ns as i64))
+        Some(fit.offset_ns.wrapping_add(libm::round(drifted_ns) as i64))
     }
 
     /// Returns the bound of the offset's error at `at`: about half the best round trip when
@@ -143,7 +143,7 @@ impl<Local: Clock, Remote: Clock> OffsetFilter<Local, Remote> {
         let fit = self.fit?;
         let then_ns = fit.at_ns.wrapping_add(fit.offset_ns as u64);
         let drifted_ns = since(remote.as_ns(), then_ns) * (fit.drift / (1.0 + fit.drift));
-        let offset_ns = fit.offset_ns.wrapping_add(drifted_ns as i64);
+        let offset_ns = fit.offset_ns.wrapping_add(libm::round(drifted_ns) as i64);
         Some(Stamp::from_ns(remote.as_ns().wrapping_sub(offset_ns as u64)))
     }
 
@@ -215,7 +215,7 @@ fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
     }
     Some(Fit {
         at_ns: newest.received_ns,
-        offset_ns: base_ns.cast_signed().wrapping_add((0.5 * (low + high)) as i64),
+        offset_ns: base_ns.cast_signed().wrapping_add(libm::round(0.5 * (low + high)) as i64),
         error_ns: 0.5 * (high - low),
         drift: 0.5 * (least + most),
         drift_error: 0.5 * (most - least) + WANDER,
