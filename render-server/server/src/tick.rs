@@ -86,8 +86,7 @@ pub fn poses(
             hub.stats.pose.add(measured.arrival, clock::now());
         }
         if believed.iter().any(Option::is_some) {
-            // What nobody took of the others is still their newest.
-            newest.put_over(believed, |poses, old| merge(old, poses));
+            publish(newest, believed);
         }
         let judged_at = judged_at.unwrap_or_else(clock::now);
         let mut all = SourceCounters::default();
@@ -241,6 +240,16 @@ pub fn draw(
     }
 }
 
+/// Puts `believed` where the render thread takes it from; what it has not taken yet of vehicles
+/// without a new pose is still their newest.
+fn publish(newest: &Mailbox<Poses>, believed: Poses) {
+    newest.put_over(believed, |poses, older| {
+        for (pose, older) in poses.iter_mut().zip(older) {
+            *pose = pose.or(*older);
+        }
+    });
+}
+
 /// Takes the poses of `newer` into `poses`, where there are any.
 fn merge(newer: &Poses, poses: &mut Poses) {
     for (pose, newer) in poses.iter_mut().zip(newer) {
@@ -320,6 +329,7 @@ const BACKGROUND: [f32; 3] = [0.0; 3];
 mod tests {
     use super::*;
     use glam::DVec3;
+    use vizflyt_protocol::geometry::{Pose, Twist};
 
     fn cameras(rates_hz: &[Option<f64>]) -> Vec<CameraConfig> {
         let camera = |&rate_hz| {
@@ -368,6 +378,31 @@ mod tests {
             let taken = schedule.take(&pair, now);
             assert_eq!(taken[0], taken[1]);
         }
+    }
+
+    #[test]
+    fn what_waits_for_the_render_thread_is_every_vehicles_newest() {
+        let poses = |at_ns: [Option<u64>; 3]| {
+            let mut poses = Poses::default();
+            for (pose, at_ns) in poses.iter_mut().zip(at_ns) {
+                *pose = at_ns.map(|ns| PoseSample {
+                    stamp: ServerTime::from_ns(ns),
+                    world_from_body: Pose::IDENTITY,
+                    twist: Twist::default(),
+                    resets: 0,
+                });
+            }
+            poses
+        };
+        let stamps = |poses: &Poses| poses.map(|pose| pose.map(|pose| pose.stamp.as_ns()));
+        let newest = Mailbox::default();
+        publish(&newest, poses([Some(1), Some(2), None]));
+        publish(&newest, poses([Some(3), None, None]));
+        publish(&newest, poses([None, None, Some(4)]));
+        let mut taken = newest.take(Duration::ZERO).unwrap();
+        assert_eq!(stamps(&taken)[..4], [Some(3), Some(2), Some(4), None]);
+        merge(&poses([None, Some(5), None]), &mut taken);
+        assert_eq!(stamps(&taken)[..4], [Some(3), Some(5), Some(4), None]);
     }
 
     #[test]

@@ -130,14 +130,24 @@ fn a_gigabit_is_never_lowered() {
 
 #[test]
 fn quality_goes_first_then_rate_then_size() {
-    let reached = |mbit: f64| {
-        let mut link = Bottleneck::new(Adapt::All, 266e3, 60.0, 0.002);
-        link.run(60.0, mbit * 1e6);
-        assert!(link.share(20.0) > 0.95, "{mbit} Mbit/s: {}", link.share(20.0));
-        link.pace.index()
-    };
-    let levels = [200.0, 140.0, 100.0, 64.0, 40.0, 25.0, 15.0, 8.0].map(reached);
-    assert_eq!(levels, [0, 1, 2, 3, 4, 5, 6, 6]);
+    const FULL_BYTES: f64 = 266e3;
+    const RATE_HZ: f64 = 60.0;
+    for index in 0..LEVELS.len() {
+        // A link just fast enough for the level of this number, from above and from below; from
+        // above only, where the better level needs so little more that it would be kept.
+        let load = LEVELS[index].load();
+        let close = index > 0 && LEVELS[index - 1].load() * RAISE < 1.05 * load * MOST;
+        let capacity = if close { 1.02 * load / AIM } else { 1.03 * load / RAISE };
+        let bps = capacity * 8.0 * FULL_BYTES * RATE_HZ;
+        let mut link = Bottleneck::new(Adapt::All, FULL_BYTES, RATE_HZ, 0.002);
+        link.run(60.0, bps);
+        assert_eq!(link.pace.index(), index, "{:.0} Mbit/s", bps / 1e6);
+        assert!(link.share(20.0) > 0.95, "{:.0} Mbit/s: {}", bps / 1e6, link.share(20.0));
+    }
+    let order: Vec<_> = LEVELS.iter().map(|level| (level.shrink, level.keep_one_in)).collect();
+    assert!(order.is_sorted(), "rate goes before size");
+    let full_rate = LEVELS.iter().take_while(|level| level.keep_one_in == 1).count();
+    assert!(LEVELS[full_rate..].iter().all(|level| level.quality == LEVELS[full_rate - 1].quality));
 }
 
 #[test]
