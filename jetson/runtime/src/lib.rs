@@ -16,6 +16,7 @@
 
 pub mod args;
 pub mod clock;
+pub mod config;
 pub mod control;
 pub mod flight;
 pub mod fly;

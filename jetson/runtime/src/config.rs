@@ -1,0 +1,251 @@
+//! `jetson.toml`: which lab this computer belongs to, and how far a flight may go here.
+//!
+//! ```toml
+//! [server]                            # without this section `vizflyt fly` flies the simulated lab
+//! address = "192.168.10.2:4433"
+//!
+//! [vehicle]
+//! name = "vizflyt"
+//! mavlink = "udpin:0.0.0.0:14550"
+//!
+//! [limits]                            # of these and the arena's, the stricter wins
+//! max_speed_mps = 2.0
+//!
+//! [plugin]
+//! path = "/home/team/first"
+//! ```
+//! Text comes in through [`JetsonConfig::parse`], which refuses unknown keys (it names the nearest
+//! known one) and values that cannot work. The command line goes before the file. Nothing is
+//! resolved or opened here: a host name in the file is looked up when it is used.
+
+mod strict;
+#[cfg(test)]
+mod tests;
+
+use std::fmt::Display;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use vizflyt_trust::Fingerprint;
+
+pub use strict::{StrictError, parse_strict};
+
+/// The whole of `jetson.toml`. Every section may be absent.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct JetsonConfig {
+    /// The render server; with it, `vizflyt fly` flies the real lab.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub server: Option<ServerConfig>,
+    /// The vehicle this computer sits on.
+    pub vehicle: VehicleConfig,
+    /// Limits of this vehicle; the arena has its own, and the stricter wins.
+    pub limits: LimitsConfig,
+    /// The plugin and what it may use.
+    pub plugin: PluginConfig,
+}
+
+/// `[server]`: the render server.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ServerConfig {
+    /// `HOST:PORT`.
+    pub address: String,
+    /// SHA-256 of its certificate; without it, the one this computer is paired with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fingerprint: Option<Fingerprint>,
+    /// Folder of this computer's key and of `servers.toml`; without it the user's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub keys: Option<PathBuf>,
+}
+
+/// `[vehicle]`: the vehicle this computer sits on.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VehicleConfig {
+    /// Its name in the localization system.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Its autopilot: `udpin:ADDR:PORT` or `udpout:HOST:PORT`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mavlink: Option<String>,
+}
+
+/// `[limits]`: what the guard keeps to beyond the arena's own limits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LimitsConfig {
+    /// Greatest speed. [m/s]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_speed_mps: Option<f64>,
+    /// Greatest acceleration. [m/s^2]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_acceleration_mps2: Option<f64>,
+    /// Greatest lean. [deg]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_tilt_deg: Option<f64>,
+    /// Greatest height of the body's centre. [m, world]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_altitude_m: Option<f64>,
+}
+
+/// `[plugin]`: the plugin and what it may use.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PluginConfig {
+    /// What `vizflyt fly` flies if it is not told: a folder, a `.py`, a program, a built-in's name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub path: Option<PathBuf>,
+}
+
+/// Why a `jetson.toml` is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{path}: {why}", path = .path.display())]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// The system's reason.
+        why: std::io::Error,
+    },
+    /// Syntax, type, absent or unknown key.
+    #[error(transparent)]
+    Toml(#[from] StrictError),
+    /// A value that cannot work.
+    #[error("{key} = {value}: {advice}")]
+    Invalid {
+        /// Where in the file: `limits.max_speed_mps`.
+        key: &'static str,
+        /// What it says.
+        value: String,
+        /// What is wrong and what to do.
+        advice: String,
+    },
+    /// What is wrong in which file.
+    #[error("{path}: {error}", path = .path.display())]
+    In {
+        /// Which.
+        path: PathBuf,
+        /// What.
+        error: Box<Self>,
+    },
+}
+
+impl JetsonConfig {
+    /// Returns what `text` says, if it can work.
+    ///
+    /// # Errors
+    /// [`ConfigError::Toml`] with line and column, [`ConfigError::Invalid`] with the key.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let config: Self = parse_strict(text)?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Returns what the file says. Paths in it are relative to its folder.
+    ///
+    /// # Errors
+    /// As [`JetsonConfig::parse`], with the path; [`ConfigError::Unreadable`].
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|why| ConfigError::Unreadable { path: path.to_owned(), why })?;
+        let mut config = Self::parse(&text)
+            .map_err(|error| ConfigError::In { path: path.to_owned(), error: Box::new(error) })?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        if let Some(keys) = config.server.as_mut().and_then(|server| server.keys.as_mut()) {
+            *keys = folder.join(&*keys);
+        }
+        // A bare name may be a built-in: it stays as it is.
+        if let Some(plugin) = &mut config.plugin.path
+            && plugin.components().count() > 1
+        {
+            *plugin = folder.join(&*plugin);
+        }
+        Ok(config)
+    }
+
+    /// Returns the text of a `jetson.toml` that parses to the same value.
+    ///
+    /// # Errors
+    /// If a path in it is not UTF-8.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self)
+    }
+
+    fn validate(&self) -> Result<(), ConfigError> {
+        if let Some(server) = &self.server {
+            check_host_port("server.address", &server.address, &server.address)?;
+        }
+        if let Some(name) = &self.vehicle.name
+            && !(1..=MAX_NAME_BYTES).contains(&name.len())
+        {
+            return Err(invalid("vehicle.name", quoted(name), "give 1 to 32 bytes"));
+        }
+        if let Some(address) = &self.vehicle.mavlink {
+            let host_port =
+                address.strip_prefix("udpin:").or_else(|| address.strip_prefix("udpout:"));
+            let host_port = host_port.ok_or_else(|| {
+                let advice = "write \"udpin:0.0.0.0:14550\" or \"udpout:HOST:PORT\"";
+                invalid("vehicle.mavlink", quoted(address), advice)
+            })?;
+            check_host_port("vehicle.mavlink", address, host_port)?;
+        }
+        let limits = &self.limits;
+        check("limits.max_speed_mps", limits.max_speed_mps, "m/s", 0.1..=30.0)?;
+        check("limits.max_acceleration_mps2", limits.max_acceleration_mps2, "m/s^2", 0.1..=50.0)?;
+        check("limits.max_tilt_deg", limits.max_tilt_deg, "deg", 5.0..=80.0)?;
+        check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0)
+    }
+}
+
+/// Returns the file that counts where none is named: `./jetson.toml`, the user's, the computer's.
+pub fn find() -> Option<PathBuf> {
+    let home = std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
+    // A relative XDG_CONFIG_HOME is to be ignored (XDG Base Directory Specification).
+    let user = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|p| p.is_absolute());
+    let folders = [Some(PathBuf::from(".")), user.or(home).map(|c| c.join("vizflyt"))];
+    folders
+        .into_iter()
+        .flatten()
+        .chain([PathBuf::from("/etc/vizflyt")])
+        .map(|folder| folder.join("jetson.toml"))
+        .find(|path| path.is_file())
+}
+
+/// Bytes of [`vizflyt_protocol::messages::Name`].
+const MAX_NAME_BYTES: usize = 32;
+
+fn invalid(key: &'static str, value: impl Display, advice: impl Into<String>) -> ConfigError {
+    ConfigError::Invalid { key, value: value.to_string(), advice: advice.into() }
+}
+
+fn quoted(text: &str) -> String {
+    format!("{text:?}")
+}
+
+fn check(
+    key: &'static str,
+    value: Option<f64>,
+    unit: &str,
+    range: RangeInclusive<f64>,
+) -> Result<(), ConfigError> {
+    match value {
+        Some(value) if !range.contains(&value) => {
+            let (low, high) = range.into_inner();
+            Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn check_host_port(key: &'static str, value: &str, host_port: &str) -> Result<(), ConfigError> {
+    let is_good = host_port.rsplit_once(':').is_some_and(|(host, port)| {
+        !host.is_empty() && !host.contains(char::is_whitespace) && port.parse::<u16>().is_ok()
+    });
+    if is_good {
+        return Ok(());
+    }
+    Err(invalid(key, quoted(value), "it needs a host and a port, as in 192.168.10.2:4433"))
+}

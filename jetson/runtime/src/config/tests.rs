@@ -1,0 +1,160 @@
+use super::*;
+use proptest::prelude::*;
+
+/// Parses `text`, expects a refusal that contains every part.
+fn check_refused(text: &str, parts: &[&str]) {
+    let error = JetsonConfig::parse(text).expect_err(text).to_string();
+    for part in parts {
+        assert!(error.contains(part), "{text:?} does not say {part:?}: {error}");
+    }
+    assert!(!error.contains('\n'), "one sentence: {error}");
+}
+
+#[test]
+fn an_empty_file_is_the_simulated_lab() {
+    let config = JetsonConfig::parse("").unwrap();
+    assert_eq!(config, JetsonConfig::default());
+    assert!(config.server.is_none());
+}
+
+#[test]
+fn the_example_of_the_module_is_read() {
+    let text = include_str!("../config.rs");
+    let example: String = text
+        .lines()
+        .skip_while(|line| *line != "//! ```toml")
+        .skip(1)
+        .take_while(|line| *line != "//! ```")
+        .map(|line| line.trim_start_matches("//!").to_owned() + "\n")
+        .collect();
+    let config = JetsonConfig::parse(&example).unwrap();
+    assert_eq!(config.server.unwrap().address, "192.168.10.2:4433");
+    assert_eq!(config.limits.max_speed_mps, Some(2.0));
+    assert!(config.plugin.path.is_some() && config.vehicle.mavlink.is_some());
+}
+
+#[test]
+fn mistakes_are_explained() {
+    check_refused("[limit]\n", &["line 1, column 2", "'limit'", "did you mean 'limits'"]);
+    check_refused(
+        "[limits]\nmax_sped_mps = 2\n",
+        &["line 2, column 1", "'max_sped_mps'", "did you mean 'max_speed_mps'"],
+    );
+    check_refused("[server]\nadress = \"a:1\"\n", &["did you mean 'address'"]);
+    check_refused(
+        "[vehicle]\ncolour = 1\n",
+        &["unknown key 'colour'", "known here: name, mavlink"],
+    );
+    check_refused("[server]\n", &["address"]);
+    check_refused("[server]\naddress = \"lab\"\n", &["server.address = \"lab\"", "a port"]);
+    check_refused("[vehicle]\nmavlink = \"tcp:1\"\n", &["vehicle.mavlink", "udpin:"]);
+    check_refused("[vehicle]\nmavlink = \"udpin:x\"\n", &["vehicle.mavlink", "a port"]);
+    check_refused("[vehicle]\nname = \"\"\n", &["vehicle.name", "1 to 32 bytes"]);
+    for value in ["0", "-1", "nan", "inf", "1e9"] {
+        let text = format!("[limits]\nmax_speed_mps = {value}\n");
+        check_refused(&text, &["limits.max_speed_mps", "from 0.1 to 30 m/s"]);
+    }
+    check_refused("[limits]\nmax_speed_mps = \"2\"\n", &["line 2", "string"]);
+    check_refused("[limits\n", &["line 1"]);
+}
+
+#[test]
+fn a_file_is_named_and_its_paths_are_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("jetson.toml");
+    let error = JetsonConfig::read(&path).unwrap_err().to_string();
+    assert!(error.contains("jetson.toml"), "{error}");
+    std::fs::write(&path, "[plugins]\n").unwrap();
+    let error = JetsonConfig::read(&path).unwrap_err().to_string();
+    assert!(error.contains("jetson.toml: line 1") && error.contains("'plugin'"), "{error}");
+    let text = "[server]\naddress = \"a:1\"\nkeys = \"keys\"\n[plugin]\npath = \"my/first\"\n";
+    std::fs::write(&path, text).unwrap();
+    let config = JetsonConfig::read(&path).unwrap();
+    assert_eq!(config.server.unwrap().keys, Some(folder.path().join("keys")));
+    assert_eq!(config.plugin.path, Some(folder.path().join("my/first")));
+    std::fs::write(&path, "[plugin]\npath = \"avoid\"\n").unwrap();
+    assert_eq!(JetsonConfig::read(&path).unwrap().plugin.path, Some("avoid".into()));
+}
+
+#[test]
+fn distances_are_those_of_levenshtein() {
+    let check = |a, b, expected| assert_eq!(strict::distance(a, b), expected, "{a} {b}");
+    check("", "", 0);
+    check("kitten", "sitting", 3);
+    check("abc", "", 3);
+    check("", "abc", 3);
+    check("flaw", "lawn", 2);
+}
+
+fn config() -> impl Strategy<Value = JetsonConfig> {
+    let text = "[ -~]{1,32}";
+    let fingerprint = any::<Vec<u8>>().prop_map(|bytes| Fingerprint::of(&bytes));
+    let server =
+        ("[a-z0-9.]{1,20}", any::<u16>(), prop::option::of(fingerprint), prop::option::of(text));
+    let server = server.prop_map(|(host, port, fingerprint, keys)| ServerConfig {
+        address: format!("{host}:{port}"),
+        fingerprint,
+        keys: keys.map(PathBuf::from),
+    });
+    let mavlink = ("udp(in|out)", any::<u16>());
+    let mavlink = mavlink.prop_map(|(kind, port)| format!("{kind}:127.0.0.1:{port}"));
+    let vehicle = (prop::option::of(text), prop::option::of(mavlink))
+        .prop_map(|(name, mavlink)| VehicleConfig { name, mavlink });
+    let limit = || prop::option::of(5.0..30.0);
+    let limits = (limit(), limit(), limit(), limit()).prop_map(|(v, a, tilt, z)| LimitsConfig {
+        max_speed_mps: v,
+        max_acceleration_mps2: a,
+        max_tilt_deg: tilt,
+        max_altitude_m: z,
+    });
+    let plugin =
+        prop::option::of(text).prop_map(|path| PluginConfig { path: path.map(PathBuf::from) });
+    (prop::option::of(server), vehicle, limits, plugin).prop_map(
+        |(server, vehicle, limits, plugin)| JetsonConfig { server, vehicle, limits, plugin },
+    )
+}
+
+/// Returns every key of a written file as `(section, key)`.
+fn keys(text: &str) -> Vec<(String, String)> {
+    let table: toml::Table = text.parse().unwrap();
+    let inner = |(section, value): (&String, &toml::Value)| {
+        let keys = value.as_table().into_iter().flat_map(toml::Table::keys);
+        keys.map(|key| (section.clone(), key.clone())).collect::<Vec<_>>()
+    };
+    table.iter().flat_map(inner).collect()
+}
+
+proptest! {
+    #[test]
+    fn what_is_written_is_read(config in config()) {
+        let text = config.to_toml().unwrap();
+        prop_assert_eq!(JetsonConfig::parse(&text).unwrap(), config);
+    }
+
+    /// Every key, with any one letter replaced, is refused, and the answer names it.
+    #[test]
+    fn a_misspelt_key_is_named(
+        config in config(),
+        which in any::<prop::sample::Index>(),
+        at in any::<prop::sample::Index>(),
+    ) {
+        let text = config.to_toml().unwrap();
+        let keys = keys(&text);
+        prop_assume!(!keys.is_empty());
+        let (section, key) = which.get(&keys);
+        let at = at.index(key.len());
+        let misspelt = format!("{}Z{}", &key[..at], &key[at + 1..]);
+        let (before, after) = text.split_once(&format!("[{section}]\n")).unwrap();
+        let after = format!("\n{after}").replacen(&format!("\n{key} = "), &format!("\n{misspelt} = "), 1);
+        let error = JetsonConfig::parse(&format!("{before}[{section}]\n{after}")).unwrap_err();
+        let expected = format!("'{misspelt}'; did you mean '{key}'");
+        prop_assert!(error.to_string().contains(&expected), "{}", error);
+    }
+
+    #[test]
+    fn any_text_is_read_or_refused(text in "\\PC*|(\\[(server|limits|[a-z]*)\\]\n([a-z_]+ = [0-9\"a-z.]*\n)*)*") {
+        if let Ok(config) = JetsonConfig::parse(&text) {
+            prop_assert_eq!(JetsonConfig::parse(&config.to_toml().unwrap()).unwrap(), config);
+        }
+    }
+}
