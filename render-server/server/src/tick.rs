@@ -86,7 +86,7 @@ pub fn poses(
             hub.stats.pose.add(measured.arrival, clock::now());
         }
         if believed.iter().any(Option::is_some) {
-            publish(newest, believed);
+            publish(newest, &believed);
         }
         let judged_at = judged_at.unwrap_or_else(clock::now);
         let mut all = SourceCounters::default();
@@ -242,8 +242,8 @@ pub fn draw(
 
 /// Puts `believed` where the render thread takes it from; what it has not taken yet of vehicles
 /// without a new pose is still their newest.
-fn publish(newest: &Mailbox<Poses>, believed: Poses) {
-    newest.put_over(believed, |poses, older| {
+fn publish(newest: &Mailbox<Poses>, believed: &Poses) {
+    newest.put_over(*believed, |poses, older| {
         for (pose, older) in poses.iter_mut().zip(older) {
             *pose = pose.or(*older);
         }
@@ -396,9 +396,9 @@ mod tests {
         };
         let stamps = |poses: &Poses| poses.map(|pose| pose.map(|pose| pose.stamp.as_ns()));
         let newest = Mailbox::default();
-        publish(&newest, poses([Some(1), Some(2), None]));
-        publish(&newest, poses([Some(3), None, None]));
-        publish(&newest, poses([None, None, Some(4)]));
+        publish(&newest, &poses([Some(1), Some(2), None]));
+        publish(&newest, &poses([Some(3), None, None]));
+        publish(&newest, &poses([None, None, Some(4)]));
         let mut taken = newest.take(Duration::ZERO).unwrap();
         assert_eq!(stamps(&taken)[..4], [Some(3), Some(2), Some(4), None]);
         merge(&poses([None, Some(5), None]), &mut taken);
