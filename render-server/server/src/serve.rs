@@ -151,6 +151,7 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         page_keys,
         twin.map,
         twin.arena.stages,
+        quic.port(),
         listener,
     ));
     if let Some(grant) = &args.pair {

@@ -69,6 +69,8 @@ pub(crate) struct Page {
     keys: PageKeys,
     /// Who may connect, and pairing.
     door: Arc<Door>,
+    /// Where runtimes connect.
+    quic_port: u16,
 }
 
 /// Binds the page's address.
@@ -92,11 +94,12 @@ pub async fn serve(
     keys: PageKeys,
     map: Map,
     stages: Vec<StageConfig>,
+    quic_port: u16,
     listener: TcpListener,
 ) -> Result<()> {
     let stop = hub.stop.clone();
     let (boot, rates) = (crate::clock::now(), messages::Rates::of(hub.vehicles.len()));
-    let page = Arc::new(Page { hub, map, stages, boot, rates, keys, door });
+    let page = Arc::new(Page { hub, map, stages, boot, rates, keys, door, quic_port });
     let router = router(page).into_make_service_with_connect_info::<SocketAddr>();
     // Dropped at the stop rather than drained: WebSockets would drain for ever.
     tokio::select! {

@@ -21,6 +21,8 @@ struct Standing {
     open: Option<Open>,
     /// What came of the newest attempt.
     news: String,
+    /// Where the other computer finds us.
+    port: u16,
 }
 
 #[derive(Debug, Serialize)]
@@ -93,7 +95,8 @@ fn tell(page: &Page) -> Response {
         tries_left: window.tries_left,
     });
     let mut response =
-        Json(Standing { open, news: page.door.newest_pairing_news() }).into_response();
+        Json(Standing { open, news: page.door.newest_pairing_news(), port: page.quic_port })
+            .into_response();
     let no_store = axum::http::HeaderValue::from_static("no-store");
     response.headers_mut().insert(axum::http::header::CACHE_CONTROL, no_store);
     response

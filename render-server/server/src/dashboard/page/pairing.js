@@ -16,24 +16,29 @@ const right = make("select", { id: "pair-right" });
 const code = make("output", { className: "pair-code" });
 const news = make("p", { className: "muted" });
 news.setAttribute("role", "status");
-const begin = make("button", { type: "button", textContent: "show a code" });
-const end = make("button", { type: "button", className: "ghost", textContent: "close" });
+const command = make("kbd");
+const begin = make("button", { type: "button", className: "ghost worded", textContent: "show a code" });
+const end = make("button", { type: "button", className: "ghost worded", textContent: "close" });
 const dialog = make(
   "dialog",
   { className: "panel pairing" },
   make("h2", { textContent: "pair a computer" }),
   make("label", {}, "it shall fly and watch ", right),
   code,
-  make("p", { className: "muted", textContent: "On the other computer: vizflyt pair HOST:PORT, and type the code." }),
+  make("p", { className: "muted" }, "On the other computer run ", command, " and type the code."),
   news,
-  make("p", {}, begin, " ", end),
+  make("p", { className: "choices" }, begin, end),
 );
 document.body.append(dialog);
 
 let timer = 0;
 let opened = false;
 
-function show({ open, news: text }) {
+// From another computer this one is not `localhost`; what it is called there, a person knows.
+const host = /^(localhost|127\.|\[::1\])/.test(location.hostname) ? "HOST" : location.hostname;
+
+function show({ open, news: text, port }) {
+  command.textContent = `vizflyt pair ${host}:${port}`;
   opened = open != null;
   code.textContent = opened ? open.code : "";
   news.textContent = opened
@@ -84,7 +89,7 @@ dialog.addEventListener("keydown", (event) => event.stopPropagation());
 // Whoever may not pair does not see the button.
 const known = await fetch("/api/pairing");
 if (known.ok) {
-  const button = make("button", { type: "button", className: "ghost", textContent: "pair a computer" });
+  const button = make("button", { type: "button", className: "ghost worded", textContent: "pair a computer" });
   button.addEventListener("click", openDialog);
   document.querySelector("footer").append(button);
 } else if (known.status === 401) {
