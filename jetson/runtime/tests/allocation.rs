@@ -1,0 +1,130 @@
+//! An image on its way from the network to the plugin's shared memory allocates nothing of ours
+//! once the buffers have their size: into the mailbox, decoded in place, published. iceoryx2 makes one
+//! small one.
+//! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::Arc;
+use std::time::Duration;
+
+use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::messages::{CameraInfo, bounded};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_protocol::time::{HostTime, ServerTime};
+use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, peek, slice_len};
+use vizflyt_runtime::images::ImagePublisher;
+use vizflyt_runtime::stream::{Arrival, Mailbox, Whole};
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
+use vizflyt_sdk::{Observation, ObservationWriter, host_now};
+
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
+// without destructor, so it allocates nothing.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.with(|count| count.set(count.get() + 1));
+        // SAFETY: the caller's contract is the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+const SIZE: (u32, u32) = (64, 48);
+
+/// Returns an image's bitstream in the pieces that the receiver cuts it into.
+fn pieces() -> Vec<Vec<u8>> {
+    let (width, height) = SIZE;
+    let pixels = (width * height) as usize;
+    let rgb: Vec<u8> = (0..3 * pixels).map(|n| (n * 7 % 251) as u8).collect();
+    let depth_mm: Vec<u16> = (0..pixels).map(|n| 2000 + (n % 300) as u16).collect();
+    let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
+    let mut bytes = Vec::new();
+    let options = EncodeOptions { color_mode: ColorMode::Lossless, ..EncodeOptions::default() };
+    Encoder::new(options).encode(&view, &mut bytes).unwrap();
+    let header_len = peek(&bytes).unwrap().header_len;
+    let (head, mut rest) = bytes.split_at(header_len);
+    let mut pieces = vec![head.to_vec()];
+    while !rest.is_empty() {
+        let (slice, after) = rest.split_at(slice_len(rest).unwrap() as usize);
+        pieces.push(slice.to_vec());
+        rest = after;
+    }
+    pieces
+}
+
+#[test]
+fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
+    let (width, height) = SIZE;
+    let camera = CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(width, height, 1.5),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    };
+    let cameras = vec![camera.clone()];
+    let service = unique_service();
+    let runtime = RuntimeEnd::create(&service, ObservationWriter::len_for(&cameras)).unwrap();
+    let plugin = PluginEnd::open(&service).unwrap();
+    let mut publisher = ImagePublisher::new(Arc::new(runtime), cameras, Arc::default());
+    let mailbox = Mailbox::default();
+    let (pieces, session) = (pieces(), mailbox.session());
+    let len = pieces.iter().map(Vec::len).sum::<usize>() as u32;
+    // The receiver's own buffer; the mailbox leaves an empty one in its place.
+    let mut piece = Vec::new();
+    let mut publish = |seq: u64| {
+        let stamp = ServerTime::from_ns(seq * 10_000_000);
+        let (k, mount) = (&camera.intrinsics, &camera.body_from_cam);
+        let mut header = ImageHeader::new(seq, 0, stamp, k, mount, &Pose::IDENTITY);
+        header.together = 1.into();
+        let pose = HostTime::from_ns(stamp.as_ns());
+        let arrival = Arrival { session, header, pose, first: host_now() };
+        let ticket = mailbox.open(&arrival).unwrap();
+        for bytes in &pieces {
+            piece.clear();
+            piece.extend_from_slice(bytes);
+            assert!(mailbox.push(ticket, &mut piece));
+        }
+        let trailer = ImageTrailer::new(len, stamp, stamp);
+        mailbox.end(ticket, Some(Whole { trailer, received: host_now() }));
+        let mut published = 0;
+        let mut tell = |_| published += 1;
+        while publisher.step(&mailbox, Duration::ZERO, &mut tell).unwrap() {}
+        published
+    };
+    let names = [bounded("front")];
+    let mut count = 0;
+    for seq in 1..=60 {
+        let before = ALLOCATIONS.get();
+        let published = publish(seq);
+        let allocations = ALLOCATIONS.get() - before;
+        assert_eq!(published, 1, "image {seq}");
+        let sample = plugin.observation().unwrap().expect("the plugin sees it");
+        let seen = Observation::from_bytes(sample.bytes(), &names).unwrap();
+        assert_eq!(seen.camera("front").unwrap().seq, seq);
+        // Buffers of all sizes have been everywhere after some turns.
+        if seq > 20 {
+            count += allocations;
+        }
+    }
+    // iceoryx2 boxes the handle of the memory that it lends.
+    assert!(count <= 40, "{count} allocations in 40 images");
+}
