@@ -15,25 +15,26 @@
 use std::ffi::OsString;
 use std::io::Write;
 use std::net::SocketAddr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
+use std::sync::{Arc, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use glam::DVec3;
 use serde_json::json;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
     ArenaInfo, Arrivals, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, MAX_CAMERAS,
-    PoseSample, Setpoint, Telemetry, ToPlugin, YawTarget, bounded,
+    PoseSample, Telemetry, ToPlugin, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
-use vizflyt_sdk::{ObservationWriter, Vehicle, host_now};
+use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle, host_now};
 
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
-use crate::images::{ImagePublisher, Published, SharedVehicle};
+use crate::images::{ImagePublisher, Published, SharedSenses};
 use crate::link::udp::{Partner, UdpPort};
 use crate::link::{Link, LinkEvent};
 use crate::log::{Channel, FlightLog};
@@ -54,7 +55,7 @@ pub enum Happening {
     /// An observation is about to reach the plugin.
     Published(Published),
     /// The plugin says something.
-    FromPlugin(FromPlugin),
+    FromPlugin(Box<FromPlugin>),
     /// The plugin's process.
     Plugin(PluginEvent),
     /// A person wants it to end.
@@ -123,13 +124,13 @@ struct Loop {
     link: Link,
     flight: Flight,
     plugin: Option<PluginSide>,
-    vehicle: SharedVehicle,
+    senses: SharedSenses,
     times: ImageTimes,
     published: u64,
     image_seq: u64,
     image_size_px: (u32, u32),
     setpoints_sent: u64,
-    last_setpoint: Setpoint,
+    v_setpoint_mps: DVec3,
     steering: Steering,
     ticks: u64,
 }
@@ -145,13 +146,13 @@ impl Control {
             link: Link::new(now),
             flight: Flight::new(settings, now),
             plugin: None,
-            vehicle: SharedVehicle::default(),
+            senses: SharedSenses::default(),
             times: ImageTimes::default(),
             published: 0,
             image_seq: 0,
             image_size_px: (0, 0),
             setpoints_sent: 0,
-            last_setpoint: Setpoint::Hold,
+            v_setpoint_mps: DVec3::ZERO,
             steering: Steering::new(now),
             ticks: 0,
         };
@@ -256,6 +257,7 @@ impl Loop {
             Happening::Mavlink(bytes, from) => {
                 if self.control.partner.heard(from, Instant::now()) {
                     self.link.handle_input(now, &bytes);
+                    self.sense();
                 }
             }
             Happening::Stream(event) => self.take_stream(now, event),
@@ -279,7 +281,7 @@ impl Loop {
                     }),
                 );
             }
-            Happening::FromPlugin(message) => self.take_plugin(now, message),
+            Happening::FromPlugin(message) => self.take_plugin(now, *message),
             Happening::Plugin(PluginEvent::Line(stream, line)) => {
                 self.take_line(now, stream, &line);
             }
@@ -330,15 +332,16 @@ impl Loop {
     fn take_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         self.link.vision(now, &sample.world_from_body, stamp, sample.resets);
         self.flight.handle(now, Input::Pose(Fix::of(sample, stamp)));
-        let battery = f64::from(self.link.state().battery_fraction);
-        let vehicle = Vehicle {
-            stamp,
-            world_from_body: sample.world_from_body,
-            v_world_mps: sample.twist.linear_mps,
-            omega_body_radps: sample.twist.angular_radps,
-            battery_fraction: (battery >= 0.0).then_some(battery),
-        };
-        *self.vehicle.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(vehicle);
+        if self.gives_ground_truth() {
+            let vehicle = Vehicle {
+                stamp,
+                attitude: sample.world_from_body.rotation,
+                omega_body_radps: sample.twist.angular_radps,
+                world_from_body: Some(sample.world_from_body),
+                v_world_mps: Some(sample.twist.linear_mps),
+            };
+            self.senses.lock().unwrap_or_else(PoisonError::into_inner).vehicle = Some(vehicle);
+        }
         self.control.log.write(
             Channel::Pose,
             stamp,
@@ -353,6 +356,39 @@ impl Loop {
         );
     }
 
+    /// Whether the course lets the plugin know where the vehicle is. Before it is known, nothing is
+    /// let out.
+    fn gives_ground_truth(&self) -> bool {
+        self.plugin.as_ref().is_some_and(|side| side.arena.ground_truth)
+    }
+
+    /// Passes on what the autopilot has told of battery, IMU and attitude.
+    fn sense(&mut self) {
+        let state = self.link.state();
+        let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
+        let withheld = self.plugin.is_some() && !self.gives_ground_truth();
+        let mut senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
+        senses.battery = Battery {
+            fraction: (fraction >= 0.0).then_some(fraction),
+            voltage_v: (voltage_v > 0.0).then_some(voltage_v),
+        };
+        let newest = |imu: Option<&ImuSample>| imu.map(|sample| sample.stamp);
+        if newest(self.link.imu().back()) != newest(senses.imu.last()) {
+            senses.imu.clear();
+            senses.imu.extend(self.link.imu());
+        }
+        // Where the course gives the pose, attitude comes with it.
+        if let (true, Some(stamp)) = (withheld, self.link.attitude_at()) {
+            senses.vehicle = Some(Vehicle {
+                stamp,
+                attitude: state.world_from_body,
+                omega_body_radps: state.omega_body_radps,
+                world_from_body: None,
+                v_world_mps: None,
+            });
+        }
+    }
+
     fn take_plugin(&mut self, now: HostTime, message: FromPlugin) {
         match message {
             FromPlugin::Ready { name } => {
@@ -361,13 +397,12 @@ impl Loop {
             }
             FromPlugin::Answer { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
-                self.flight.handle(now, Input::Answered { seq, setpoint });
-                if let Some(setpoint) = setpoint {
-                    self.last_setpoint = setpoint;
+                let asked = json!({"seq": seq, "setpoint": &setpoint});
+                self.control.log.write(Channel::Asked, returned, &asked);
+                if setpoint.is_some() {
                     self.steering.answered();
                 }
-                let asked = json!({"seq": seq, "setpoint": setpoint});
-                self.control.log.write(Channel::Asked, returned, &asked);
+                self.flight.handle(now, Input::Answered { seq, setpoint });
                 self.control.log.write(
                     Channel::Image,
                     returned,
@@ -439,7 +474,7 @@ impl Loop {
         stop: &Arc<AtomicBool>,
     ) -> Vec<JoinHandle<()>> {
         let cameras = arena.cameras.to_vec();
-        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.vehicle));
+        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses));
         let mailbox = Arc::clone(&self.control.shared.mailbox);
         let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
         let images = spawn("images", move || {
@@ -459,7 +494,7 @@ impl Loop {
                     thread::sleep(Duration::from_millis(1));
                 }
                 while let Ok(Some(message)) = ipc.receive() {
-                    let _ = sender.send(Happening::FromPlugin(message));
+                    let _ = sender.send(Happening::FromPlugin(Box::new(message)));
                 }
             }
         });
@@ -503,7 +538,7 @@ impl Loop {
         if let Some(side) = &self.plugin
             && side.started
             && side.ipc.plugin_attached()
-            && let Err(error) = side.ipc.send(&ToPlugin::Event(event.clone()))
+            && let Err(error) = side.ipc.send(&ToPlugin::Event(for_plugin(event, &side.arena)))
         {
             tracing::debug!("plugin: {error}");
         }
@@ -515,7 +550,7 @@ impl Loop {
             phase: self.flight.phase(),
             vehicle: *self.link.state(),
             images: self.times.last_second(now, self.published, replaced),
-            setpoint: self.last_setpoint,
+            v_setpoint_mps: self.v_setpoint_mps,
             setpoints_sent: self.setpoints_sent,
             mavlink_packets: self.link.packets(),
         };
@@ -538,7 +573,7 @@ impl Loop {
 
     fn log_sent(&mut self, now: HostTime, setpoint: &GuidedSetpoint) {
         let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return };
-        self.last_setpoint = Setpoint::velocity(v_mps, setpoint.yaw);
+        self.v_setpoint_mps = v_mps;
         let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
             YawTarget::Angle(yaw_rad) => (Some(yaw_rad), None),
             YawTarget::Rate(rate_radps) => (None, Some(rate_radps)),
@@ -592,6 +627,18 @@ impl Loop {
         };
         Flown { outcome, times: self.times, counters, log: self.control.log }
     }
+}
+
+/// Returns the event as the plugin may know it: without the place where the course withholds it.
+fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
+    let mut event = event.clone();
+    if !arena.ground_truth
+        && let EventKind::Collision { p_world_m, .. } | EventKind::Geofence { p_world_m, .. } =
+            &mut event.kind
+    {
+        *p_world_m = DVec3::ZERO;
+    }
+    event
 }
 
 fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Option<JoinHandle<()>> {

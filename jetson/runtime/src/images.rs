@@ -24,14 +24,26 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{DecodeError, Decoder, ImageMut, Info};
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 use vizflyt_sdk::{
-    ImageStamps, ObservationTooLarge, ObservationWriter, PlanesMut, Vehicle, host_now,
+    Battery, ImageStamps, ImuSample, ObservationTooLarge, ObservationWriter, PlanesMut, Vehicle,
+    host_now,
 };
 
 use crate::stream::{Arrival, Mailbox, Step, Whole};
 use crate::waterfall::Stamps;
 
-/// The vehicle's newest state, for the plugin's eyes.
-pub type SharedVehicle = Arc<Mutex<Option<Vehicle>>>;
+/// What the plugin may know beside images, as of now. What the course withholds is never in it.
+#[derive(Clone, Debug, Default)]
+pub struct Senses {
+    /// The vehicle.
+    pub vehicle: Option<Vehicle>,
+    /// Its battery.
+    pub battery: Battery,
+    /// The newest IMU samples, oldest first.
+    pub imu: Vec<ImuSample>,
+}
+
+/// Who learns of it writes, who publishes images reads.
+pub type SharedSenses = Arc<Mutex<Senses>>;
 
 /// An observation that went to the plugin.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,7 +64,7 @@ pub struct Published {
 pub struct ImagePublisher {
     ipc: Arc<RuntimeEnd>,
     cameras: Vec<CameraInfo>,
-    vehicle: SharedVehicle,
+    senses: SharedSenses,
     lanes: Vec<Lane>,
     seq: u64,
     /// Counts memory lent.
@@ -99,12 +111,12 @@ impl UnderWay {
 
 impl ImagePublisher {
     /// Makes one for these cameras (at most 8); what an image says of its camera later counts more.
-    pub fn new(ipc: Arc<RuntimeEnd>, cameras: Vec<CameraInfo>, vehicle: SharedVehicle) -> Self {
+    pub fn new(ipc: Arc<RuntimeEnd>, cameras: Vec<CameraInfo>, senses: SharedSenses) -> Self {
         Self {
             ipc,
             lanes: cameras.iter().map(|_| Lane::default()).collect(),
             cameras,
-            vehicle,
+            senses,
             seq: 0,
             homes: 0,
             under_way: None,
@@ -289,11 +301,13 @@ impl ImagePublisher {
         if done.there == 0 {
             return Ok(());
         }
-        let vehicle = *self.vehicle.lock().unwrap_or_else(PoisonError::into_inner);
-        if let (Some(vehicle), Ok(mut writer)) =
-            (vehicle, ObservationWriter::resume(done.memory.memory(), &self.cameras))
-        {
-            writer.vehicle(&vehicle);
+        if let Ok(mut writer) = ObservationWriter::resume(done.memory.memory(), &self.cameras) {
+            let senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(vehicle) = &senses.vehicle {
+                writer.vehicle(vehicle);
+            }
+            writer.battery(&senses.battery);
+            writer.imu(&senses.imu);
         }
         // Told first: the answer must not overtake it.
         tell(done.published.clone());

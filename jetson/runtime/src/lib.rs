@@ -10,7 +10,8 @@
 //! ```
 //! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
 //! [`supervisor`] (the plugin's process), [`control`] (the loop that owns the rest), [`flight`]
-//! (phases and outcome, pure), [`guard`] (the last word, pure), [`link`] (MAVLink, sans-IO),
+//! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
+//! pure), [`link`] (MAVLink, sans-IO),
 //! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
 //! [`report`]. [`fly()`] starts it all.
 
@@ -29,6 +30,7 @@ pub mod stats;
 pub mod steering;
 pub mod stream;
 pub mod supervisor;
+pub mod trajectory;
 pub mod waterfall;
 
 pub use args::FlyArgs;

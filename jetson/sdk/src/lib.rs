@@ -39,7 +39,8 @@ pub use vizflyt_protocol as protocol;
 
 pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 pub use vizflyt_protocol::messages::{
-    ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint, YawTarget,
+    ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Path, PathYaw, Piece,
+    Setpoint, Trajectory, Waypoint, YawTarget,
 };
 pub use vizflyt_protocol::time::HostTime;
 
@@ -48,7 +49,7 @@ pub use clock::host_now;
 pub use memory::{
     ImageStamps, ObservationBuffer, ObservationTooLarge, ObservationWriter, PlanesMut,
 };
-pub use observation::{CameraImage, Observation, Vehicle};
+pub use observation::{Battery, CameraImage, ImuSample, Observation, Vehicle};
 pub use run::{attach, run};
 
 /// The plugin in the project's README compiles.

@@ -2,11 +2,11 @@
 //! replays. The mirror of [`observation`](crate::Observation).
 
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Name};
-use vizflyt_protocol::packet::{ObservationHeader, ObservationLayout};
+use vizflyt_protocol::packet::{ImuRecord, MAX_IMU, ObservationHeader, ObservationLayout};
 use vizflyt_protocol::time::HostTime;
 use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 
-use crate::observation::{Observation, Vehicle};
+use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 
 /// When an image's pose was measured, when it was ready, and which tick made it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -135,16 +135,40 @@ impl<'m> ObservationWriter<'m> {
         ObservationHeader::mut_from_prefix(self.memory).expect("checked in `new`").0
     }
 
-    /// Fills in the vehicle's state.
+    /// Fills in what the plugin may know of the vehicle; what is `None` stays zero.
     pub fn vehicle(&mut self, vehicle: &Vehicle) {
         let header = self.header();
-        header.flags |= ObservationHeader::HAS_VEHICLE;
+        header.flags |= ObservationHeader::HAS_ATTITUDE;
         header.vehicle_ns = vehicle.stamp.as_ns();
-        header.position_m = vehicle.world_from_body.translation_m.to_array();
-        header.rotation_xyzw = vehicle.world_from_body.rotation.to_array();
-        header.velocity_mps = vehicle.v_world_mps.to_array();
+        header.rotation_xyzw = vehicle.attitude.to_array();
         header.angular_radps = vehicle.omega_body_radps.to_array();
-        header.battery_fraction = vehicle.battery_fraction.unwrap_or(-1.0);
+        if let (Some(pose), Some(v_world_mps)) = (vehicle.world_from_body, vehicle.v_world_mps) {
+            header.flags |= ObservationHeader::HAS_POSE;
+            header.position_m = pose.translation_m.to_array();
+            header.velocity_mps = v_world_mps.to_array();
+        }
+    }
+
+    /// Fills in the battery's state.
+    pub fn battery(&mut self, battery: &Battery) {
+        let header = self.header();
+        header.battery_fraction = battery.fraction.unwrap_or(-1.0);
+        header.battery_v = battery.voltage_v.unwrap_or(0.0);
+    }
+
+    /// Fills in IMU samples, oldest first; of more than 64 the first ones.
+    pub fn imu<'s>(&mut self, samples: impl IntoIterator<Item = &'s ImuSample>) {
+        let header = self.header();
+        header.imu_count = 0;
+        for (record, sample) in header.imu.iter_mut().zip(samples) {
+            *record = ImuRecord {
+                stamp_ns: sample.stamp.as_ns(),
+                accel_mps2: sample.accel_mps2.to_array().map(|value| value as f32),
+                gyro_radps: sample.gyro_radps.to_array().map(|value| value as f32),
+            };
+            header.imu_count += 1;
+        }
+        debug_assert!(header.imu_count as usize <= MAX_IMU);
     }
 
     /// Returns the planes of camera `index`, of the size in its [`CameraInfo`], to be decoded
@@ -241,9 +265,19 @@ impl ObservationBuffer {
         ObservationWriter { memory: self.blocks.as_mut_bytes(), layout }
     }
 
-    /// Fills in the vehicle's state.
+    /// Fills in what the plugin may know of the vehicle.
     pub fn set_vehicle(&mut self, vehicle: &Vehicle) {
         self.writer().vehicle(vehicle);
+    }
+
+    /// Fills in the battery's state.
+    pub fn set_battery(&mut self, battery: &Battery) {
+        self.writer().battery(battery);
+    }
+
+    /// Fills in IMU samples, oldest first; of more than 64 the first ones.
+    pub fn set_imu(&mut self, samples: &[ImuSample]) {
+        self.writer().imu(samples);
     }
 
     /// Fills in the image of camera `index` by `fill`; does nothing if there is no such camera.
@@ -299,12 +333,20 @@ mod tests {
         assert_eq!(buffer.observation().cameras().count(), 0);
         let vehicle = Vehicle {
             stamp: HostTime::from_ns(5),
-            world_from_body: Pose::new(DVec3::ONE, DQuat::from_rotation_z(0.5)),
-            v_world_mps: DVec3::Y,
+            attitude: DQuat::from_rotation_z(0.5),
             omega_body_radps: DVec3::Z,
-            battery_fraction: Some(0.5),
+            world_from_body: Some(Pose::new(DVec3::ONE, DQuat::from_rotation_z(0.5))),
+            v_world_mps: Some(DVec3::Y),
         };
         buffer.set_vehicle(&vehicle);
+        let battery = Battery { fraction: Some(0.5), voltage_v: None };
+        buffer.set_battery(&battery);
+        let imu = |ns| ImuSample {
+            stamp: HostTime::from_ns(ns),
+            accel_mps2: DVec3::new(0.0, 0.5, 9.75),
+            gyro_radps: DVec3::X,
+        };
+        buffer.set_imu(&[imu(10), imu(20), imu(30)]);
         let stamps =
             ImageStamps { seq: 3, pose: HostTime::from_ns(7), ready: HostTime::from_ns(9) };
         buffer.set_image(1, stamps, |planes| {
@@ -317,6 +359,11 @@ mod tests {
 
         let observation = buffer.observation();
         assert_eq!(observation.vehicle(), Some(vehicle));
+        assert_eq!(observation.battery(), battery);
+        assert_eq!(observation.imu().collect::<Vec<_>>(), [imu(10), imu(20), imu(30)]);
+        let later = observation.with_imu_after(HostTime::from_ns(20));
+        assert_eq!(later.imu().collect::<Vec<_>>(), [imu(30)]);
+        assert_eq!(later.newest_imu(), Some(HostTime::from_ns(30)));
         assert_eq!(observation.stamp(), HostTime::from_ns(7));
         assert!(observation.camera("front").is_none(), "it has no image yet");
         let rear = observation.camera("rear").unwrap();
@@ -334,6 +381,31 @@ mod tests {
             buffer.observation().vehicle().is_none()
                 && buffer.observation().cameras().next().is_none()
         );
+    }
+
+    /// What the course withholds is nowhere in the plugin's memory, not just hidden by the API.
+    #[test]
+    fn what_is_withheld_is_not_in_memory() {
+        let secret = 1234.5678_f64;
+        let holds = |buffer: &ObservationBuffer| {
+            let bytes = buffer.as_bytes();
+            bytes.windows(8).any(|window| window == secret.to_le_bytes())
+        };
+        let mut buffer = ObservationBuffer::new(&[camera("front", 5, 3)]);
+        let mut vehicle = Vehicle {
+            stamp: HostTime::from_ns(5),
+            attitude: DQuat::from_rotation_z(0.5),
+            omega_body_radps: DVec3::Z,
+            world_from_body: Some(Pose::new(DVec3::splat(secret), DQuat::IDENTITY)),
+            v_world_mps: Some(DVec3::splat(secret)),
+        };
+        buffer.set_vehicle(&vehicle);
+        assert!(holds(&buffer));
+        buffer.clear(1);
+        assert!(!holds(&buffer), "clearing leaves nothing behind");
+        (vehicle.world_from_body, vehicle.v_world_mps) = (None, None);
+        buffer.set_vehicle(&vehicle);
+        assert_eq!(buffer.observation().vehicle(), Some(vehicle));
     }
 
     #[test]
@@ -377,11 +449,12 @@ mod tests {
     proptest! {
         /// Whatever a header says, a view stays within its bytes or is refused.
         #[test]
-        fn poisoned_headers_never_reach_outside(at in 0usize..1168, value in any::<u8>()) {
+        fn poisoned_headers_never_reach_outside(at in 0usize..size_of::<ObservationHeader>(), value in any::<u8>()) {
             let mut buffer = ObservationBuffer::new(&[camera("front", 8, 6)]);
             buffer.set_image(0, ImageStamps::default(), |planes| planes.rgb.fill(9));
             buffer.blocks.as_mut_bytes()[at] = value;
             if let Ok(observation) = Observation::from_bytes(buffer.as_bytes(), &[]) {
+                prop_assert!(observation.imu().count() <= MAX_IMU);
                 for image in observation.cameras() {
                     let pixels = image.width_px as usize * image.height_px as usize;
                     prop_assert_eq!(image.rgb.len(), 3 * pixels);

@@ -1,9 +1,9 @@
 //! What a plugin sees: typed views of shared memory, without a copy.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 use vizflyt_protocol::messages::Name;
-use vizflyt_protocol::packet::{CameraHeader, InvalidObservation, ObservationHeader};
+use vizflyt_protocol::packet::{CameraHeader, ImuRecord, InvalidObservation, ObservationHeader};
 use vizflyt_protocol::time::HostTime;
 use zerocopy::FromBytes;
 
@@ -16,21 +16,45 @@ pub struct Observation<'a> {
     header: &'a ObservationHeader,
     bytes: &'a [u8],
     names: &'a [Name],
+    /// IMU samples up to here were in an earlier observation.
+    imu_after: HostTime,
 }
 
-/// The vehicle's state as localized, if the course lets plugins know it.
+/// What is known of the vehicle: its attitude always, pose and velocity where the course allows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vehicle {
     /// When this was true. [host]
     pub stamp: HostTime,
-    /// Position and attitude. [m, world]
-    pub world_from_body: Pose<World, Body>,
-    /// Velocity. [m/s, world]
-    pub v_world_mps: DVec3,
+    /// Attitude: rotates vectors from body to world axes. The localized one where the course
+    /// gives the pose, else the autopilot's estimate.
+    pub attitude: DQuat,
     /// Angular velocity. [rad/s, body]
     pub omega_body_radps: DVec3,
-    /// Battery left, 0 to 1; `None` if unknown.
-    pub battery_fraction: Option<f64>,
+    /// Position and attitude as localized; `None` where the course withholds them
+    /// ([`ArenaInfo::ground_truth`](crate::ArenaInfo::ground_truth)). [m, world]
+    pub world_from_body: Option<Pose<World, Body>>,
+    /// Velocity; `None` where `world_from_body` is. [m/s, world]
+    pub v_world_mps: Option<DVec3>,
+}
+
+/// One reading of the autopilot's accelerometer and gyroscope.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ImuSample {
+    /// When it was measured. [host]
+    pub stamp: HostTime,
+    /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
+    pub accel_mps2: DVec3,
+    /// Angular velocity. [rad/s, body]
+    pub gyro_radps: DVec3,
+}
+
+/// The battery, as the autopilot measures it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Battery {
+    /// What is left, 0 to 1; `None` if the autopilot does not know.
+    pub fraction: Option<f64>,
+    /// Voltage; `None` if it is not measured. [V]
+    pub voltage_v: Option<f64>,
 }
 
 /// One camera's RGB-D image. Row-major; row 0 is the top.
@@ -67,7 +91,12 @@ impl<'a> Observation<'a> {
     /// outside themselves.
     pub fn from_bytes(bytes: &'a [u8], names: &'a [Name]) -> Result<Self, InvalidObservation> {
         let header = ObservationHeader::parse(bytes)?;
-        Ok(Self { header, bytes, names })
+        Ok(Self { header, bytes, names, imu_after: HostTime::ZERO })
+    }
+
+    /// Leaves those IMU samples out that are not younger than `stamp`: the reader has had them.
+    pub fn with_imu_after(self, stamp: HostTime) -> Self {
+        Self { imu_after: stamp, ..self }
     }
 
     /// Returns the observation's number in this flight; numbers missing were skipped.
@@ -99,16 +128,46 @@ impl<'a> Observation<'a> {
             .filter_map(move |(index, camera)| image(bytes, names.get(index), camera))
     }
 
-    /// Returns the vehicle's state; `None` where the course withholds it or none is known yet.
+    /// Returns what is known of the vehicle; `None` before anything is.
     pub fn vehicle(&self) -> Option<Vehicle> {
         let header = self.header;
+        let world_from_body = header.world_from_body();
         Some(Vehicle {
-            world_from_body: header.world_from_body()?,
             stamp: HostTime::from_ns(header.vehicle_ns),
-            v_world_mps: DVec3::from(header.velocity_mps),
+            attitude: header.attitude()?,
             omega_body_radps: DVec3::from(header.angular_radps),
-            battery_fraction: (header.battery_fraction >= 0.0).then_some(header.battery_fraction),
+            world_from_body,
+            v_world_mps: world_from_body.map(|_| DVec3::from(header.velocity_mps)),
         })
+    }
+
+    /// Returns the IMU samples since the image that the plugin got before this one, oldest first;
+    /// at most the newest 64 (0.6 s at 100 Hz).
+    pub fn imu(&self) -> impl Iterator<Item = ImuSample> + use<'a> {
+        let after_ns = self.imu_after.as_ns();
+        self.header.imu().iter().filter(move |record| record.stamp_ns > after_ns).map(sample)
+    }
+
+    /// Returns when the newest IMU sample was measured, had before or not. [host]
+    pub fn newest_imu(&self) -> Option<HostTime> {
+        self.header.imu().last().map(|record| HostTime::from_ns(record.stamp_ns))
+    }
+
+    /// Returns the battery's state.
+    pub fn battery(&self) -> Battery {
+        let (fraction, voltage_v) = (self.header.battery_fraction, self.header.battery_v);
+        Battery {
+            fraction: (fraction >= 0.0).then_some(fraction),
+            voltage_v: (voltage_v > 0.0).then_some(voltage_v),
+        }
+    }
+}
+
+fn sample(record: &ImuRecord) -> ImuSample {
+    ImuSample {
+        stamp: HostTime::from_ns(record.stamp_ns),
+        accel_mps2: DVec3::from(record.accel_mps2.map(f64::from)),
+        gyro_radps: DVec3::from(record.gyro_radps.map(f64::from)),
     }
 }
 

@@ -9,6 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use vizflyt_protocol::messages::{FromPlugin, Name, ToPlugin, bounded};
+use vizflyt_protocol::time::HostTime;
 
 use crate::autonomy::Autonomy;
 use crate::clock::host_now;
@@ -78,6 +79,7 @@ enum End {
 fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> {
     // `None` until the runtime said what the plugin flies in.
     let mut names: Option<Vec<Name>> = None;
+    let mut imu_had = HostTime::ZERO;
     let mut heard = Instant::now();
     loop {
         if end.wait(RUNTIME_GONE_AFTER / 4)? {
@@ -105,7 +107,8 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
         // The runtime validated nothing for us: a bad observation is its bug, and skipped.
         let Ok(observation) = Observation::from_bytes(sample.bytes(), names) else { continue };
         let entered = host_now();
-        let setpoint = plugin.on_image(&observation);
+        let setpoint = plugin.on_image(&observation.with_imu_after(imu_had));
+        imu_had = observation.newest_imu().unwrap_or(imu_had);
         let seq = observation.seq();
         end.send(&FromPlugin::Answer { seq, entered, returned: host_now(), setpoint })?;
     }

@@ -35,6 +35,12 @@ pub struct ArenaConfig {
     /// From take-off; 0 is none. [s]
     #[serde(default)]
     pub time_limit_s: f64,
+    /// Whether plugins get the vehicle's pose and velocity; if not said, they do.
+    #[serde(default = "yes")]
+    pub ground_truth: bool,
+    /// Whether plugins may fly by attitude rates; if not said, they may not.
+    #[serde(default)]
+    pub attitude_rate: bool,
     /// Where the vehicle stands at the start.
     pub spawn: Spawn,
     /// Where the flight shall end; without one it ends with the last stage.
@@ -191,9 +197,16 @@ impl ArenaConfig {
             goal_m: self.goal.map(|goal| goal.position_m),
             goal_radius_m: self.goal.map_or(0.0, |goal| goal.radius_m),
             time_limit_s: self.time_limit_s,
+            ground_truth: self.ground_truth,
+            attitude_rate: self.attitude_rate,
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
         }
     }
+}
+
+/// What `ground_truth` is if not said: a course withholds it on purpose.
+fn yes() -> bool {
+    true
 }
 
 #[cfg(test)]

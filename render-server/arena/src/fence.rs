@@ -66,7 +66,7 @@ mod tests {
 
     fn verdict(p: [f64; 3], v: [f64; 3]) -> FenceVerdict {
         let room = Volume::aabb(DVec3::ZERO, DVec3::new(10.0, 4.0, 3.0));
-        let limits = Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 };
+        let limits = Limits::new(6.0, 8.0);
         check(&room, &limits, 0.1, p.into(), v.into()).verdict
     }
 

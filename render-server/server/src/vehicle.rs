@@ -475,12 +475,14 @@ pub(crate) mod tests {
         let arena = ArenaInfo {
             name: bounded("test"),
             geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
-            limits: Limits { max_speed_mps: 1.0, max_acceleration_mps2: 1.0 },
+            limits: Limits::new(1.0, 1.0),
             body_radius_m: 0.1,
             takeoff_height_m: 1.0,
             goal_m: None,
             goal_radius_m: 1.0,
             time_limit_s: 0.0,
+            ground_truth: true,
+            attitude_rate: false,
             cameras: [].into_iter().collect(),
         };
         let cameras = Cameras::new(Vec::new());

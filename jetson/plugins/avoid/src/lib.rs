@@ -20,8 +20,8 @@ pub mod steer;
 
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::{
-    ArenaInfo, Autonomy, CameraImage, Event, EventKind, HostTime, Observation, Pose, Setpoint,
-    Vehicle, World, YawTarget,
+    ArenaInfo, Autonomy, Body, CameraImage, Event, EventKind, HostTime, Observation, Pose,
+    Setpoint, Vehicle, World, YawTarget,
 };
 
 use field::{Field, Surroundings};
@@ -51,7 +51,7 @@ impl Autonomy for Avoid {
 
     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
         // Without a pose there is no way to a goal: no answer, and the guard holds, then lands.
-        let vehicle = obs.vehicle()?;
+        let vehicle = Located::of(&obs.vehicle()?)?;
         let camera = obs.camera("front").or_else(|| obs.cameras().next())?;
         self.decide(&vehicle, &camera)
     }
@@ -63,8 +63,27 @@ impl Autonomy for Avoid {
     }
 }
 
+/// A vehicle that knows where it is.
+struct Located {
+    stamp: HostTime,
+    world_from_body: Pose<World, Body>,
+    v_world_mps: DVec3,
+    omega_body_radps: DVec3,
+}
+
+impl Located {
+    fn of(vehicle: &Vehicle) -> Option<Self> {
+        Some(Self {
+            stamp: vehicle.stamp,
+            world_from_body: vehicle.world_from_body?,
+            v_world_mps: vehicle.v_world_mps?,
+            omega_body_radps: vehicle.omega_body_radps,
+        })
+    }
+}
+
 impl Avoid {
-    fn decide(&mut self, vehicle: &Vehicle, camera: &CameraImage<'_>) -> Option<Setpoint> {
+    fn decide(&mut self, vehicle: &Located, camera: &CameraImage<'_>) -> Option<Setpoint> {
         let arena = self.arena.as_ref()?;
         let Some(goal_m) = arena.goal_m.filter(|_| !self.finished) else {
             return Some(Setpoint::Hold);
@@ -131,7 +150,7 @@ impl Avoid {
 
 /// Returns the image with the pose its camera had: the vehicle's state is newer (or older) than
 /// the image by some milliseconds, over which it moved and turned at a steady rate.
-fn view_of<'a>(vehicle: &Vehicle, camera: &CameraImage<'a>) -> View<'a> {
+fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
     let ahead_s = camera.stamp.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
     let then: Pose<World, _> = Pose::new(
         vehicle.world_from_body.translation_m + vehicle.v_world_mps * ahead_s,

@@ -13,12 +13,14 @@ fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 },
-        limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
+        limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         goal_m,
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
+        ground_truth: true,
+        attitude_rate: false,
         cameras: [front].into_iter().collect(),
     }
 }
@@ -28,10 +30,10 @@ const GOAL_M: DVec3 = DVec3::new(30.0, 0.0, 1.2);
 fn vehicle(p_m: DVec3, ms: u64) -> Vehicle {
     Vehicle {
         stamp: HostTime::from_ns(ms * 1_000_000),
-        world_from_body: Pose::new(p_m, DQuat::IDENTITY),
-        v_world_mps: DVec3::ZERO,
+        attitude: DQuat::IDENTITY,
         omega_body_radps: DVec3::ZERO,
-        battery_fraction: None,
+        world_from_body: Some(Pose::new(p_m, DQuat::IDENTITY)),
+        v_world_mps: Some(DVec3::ZERO),
     }
 }
 

@@ -19,7 +19,9 @@ mod tests;
 use std::collections::VecDeque;
 
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
-use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Setpoint,
+};
 use vizflyt_protocol::time::HostTime;
 
 use crate::guard::{
@@ -39,6 +41,7 @@ pub struct FlightSettings {
 
 /// What happens around the flight.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)] // Why: handed on by value at once, never stored.
 pub enum Input {
     /// The server said what we fly in.
     Arena(Box<ArenaInfo>),
@@ -148,8 +151,8 @@ pub struct Flight {
     disarmed_at: Option<HostTime>,
     connected_at: HostTime,
     reminded_at: Option<HostTime>,
-    /// Since when all setpoints have been refused.
-    refused_at: Option<HostTime>,
+    /// Why all setpoints are being refused.
+    refused: Option<InvalidSetpoint>,
     landed_at: Option<HostTime>,
     notices: VecDeque<Notice>,
 }
@@ -178,7 +181,7 @@ impl Flight {
             disarmed_at: None,
             connected_at: now,
             reminded_at: None,
-            refused_at: None,
+            refused: None,
             landed_at: None,
             notices: VecDeque::new(),
         }
@@ -215,10 +218,7 @@ impl Flight {
         match input {
             Input::Arena(arena) => self.handle_arena(now, arena),
             Input::Pose(fix) => {
-                if fix.p_world_m.is_finite()
-                    && fix.v_world_mps.is_finite()
-                    && fix.yaw_rad.is_finite()
-                {
+                if fix.is_valid() {
                     self.fix = Some(fix);
                 }
             }
@@ -328,17 +328,19 @@ impl Flight {
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
             self.unanswered = None;
         }
-        let (Some(guard), Some(setpoint), None) = (&mut self.guard, setpoint, &self.outcome) else {
-            return;
-        };
-        if guard.ask(now, setpoint) {
-            self.taken = Some(seq);
-            self.refused_at = None;
-        } else if self.refused_at.is_none() {
+        let (Some(guard), None) = (&mut self.guard, &self.outcome) else { return };
+        let Some(setpoint) = setpoint else { return guard.answered(now) };
+        match guard.ask(now, setpoint) {
+            Ok(()) => {
+                self.taken = Some(seq);
+                self.refused = None;
+            }
             // Once per series; the hold and the landing that follow name it again.
-            self.refused_at = Some(now);
-            let text = format!("setpoint refused: a number in it is not finite: {setpoint:?}");
-            self.notice(EventKind::Note, text);
+            Err(fault) if self.refused.is_none() => {
+                self.refused = Some(fault);
+                self.notice(EventKind::Note, format!("setpoint refused: {fault}"));
+            }
+            Err(_) => {}
         }
     }
 
@@ -615,8 +617,8 @@ impl Flight {
                 format!("the plugin has not answered image {seq} for {silent_s:.1} s")
             }
             None if self.sees_nothing(now) => "no image has come from the server".into(),
-            None if self.refused_at.is_some() => {
-                "the plugin's setpoints are not finite numbers".into()
+            None if let Some(fault) = self.refused => {
+                format!("the plugin's setpoints are refused: {fault}")
             }
             None => "the plugin answers images without a setpoint".into(),
         }

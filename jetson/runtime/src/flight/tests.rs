@@ -1,6 +1,6 @@
 //! The flight on a virtual clock, with a vehicle that does as it is told.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{Limits, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
@@ -9,7 +9,8 @@ use super::*;
 use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
 
 /// What the plugin does with an image.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
+#[allow(clippy::large_enum_variant)] // Why: there is one.
 enum Answers {
     Never,
     Without,
@@ -35,12 +36,14 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0)),
-        limits: Limits { max_speed_mps: 3.0, max_acceleration_mps2: 5.0 },
+        limits: Limits::new(3.0, 5.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
         goal_m: None,
         goal_radius_m: 1.0,
         time_limit_s: 30.0,
+        ground_truth: true,
+        attitude_rate: false,
         cameras: heapless::Vec::new(),
     }
 }
@@ -87,14 +90,14 @@ impl Script {
                     stamp: self.now.plus_ns(-10_000_000),
                     p_world_m: self.p_m,
                     v_world_mps: self.v_mps,
-                    yaw_rad: 0.0,
+                    rotation: DQuat::IDENTITY,
                 };
                 self.flight.handle(self.now, Input::Pose(fix));
             }
             if self.images && self.flight.arena.is_some() {
                 self.seq += 1;
                 self.flight.handle(self.now, Input::ImagePublished { seq: self.seq });
-                let setpoint = match self.answers {
+                let setpoint = match self.answers.clone() {
                     Answers::Never => None,
                     Answers::Without => Some(None),
                     Answers::With(setpoint) => Some(Some(setpoint)),

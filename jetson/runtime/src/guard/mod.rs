@@ -4,7 +4,8 @@
 //! 1. a landing, once begun, is never taken back;
 //! 2. deadlines: a pose older than 0.5 s or no setpoint for 0.5 s holds, 2 s lands;
 //! 3. what the plugin asks becomes a velocity in world axes (positions by a braking profile,
-//!    accelerations by integration); numbers that are not finite were refused at [`Guard::ask`];
+//!    accelerations by integration, attitude rates by the acceleration that the attitude means,
+//!    trajectories by a moving point); numbers that are not finite were refused at [`Guard::ask`];
 //! 4. speed limit, acceleration limit, then the geofence: never faster towards a face than the
 //!    vehicle can stop before it.
 //!
@@ -17,8 +18,12 @@ mod tests;
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Volume, wrap_pi, yaw_of};
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
-use vizflyt_protocol::messages::{ArenaInfo, Axes, PoseSample, Setpoint, YawTarget};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Axes, InvalidSetpoint, Path, PoseSample, Setpoint, YawTarget,
+};
 use vizflyt_protocol::time::HostTime;
+
+use crate::trajectory::{Follower, Start};
 
 use fence::Fence;
 
@@ -31,8 +36,8 @@ pub struct Fix {
     pub p_world_m: DVec3,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
-    /// Heading from world x, counter-clockwise. [rad]
-    pub yaw_rad: f64,
+    /// Attitude: body to world.
+    pub rotation: DQuat,
 }
 
 /// What the guard sends on.
@@ -105,8 +110,31 @@ const MAX_YAW_RATE_RADPS: f64 = std::f64::consts::PI;
 const POSITION_GAIN_PER_S: f64 = 0.8;
 /// Speed at which a held vehicle returns to its point. [m/s]
 const RETURN_MPS: f64 = 0.5;
+/// Fastest rotation that attitude rates are taken at: two turns a second. [rad/s]
+const MAX_RATE_RADPS: f64 = 4.0 * std::f64::consts::PI;
+/// Greatest tilt that attitude rates lead to: a little past it the thrust that carries the vehicle
+/// is twice its weight. [rad]
+const MOST_TILT_RAD: f64 = 1.0;
+/// Thrust over weight that is taken at most; small quadrotors have 2 to 5.
+const MOST_THRUST: f64 = 4.0;
+/// Standard gravity, ISO 80000-3. [m/s^2]
+const GRAVITY_MPS2: f64 = 9.80665;
 /// Longest time between two ticks that counts; after a stall the slew limit must not open. [s]
 const LONGEST_TICK_S: f64 = 0.1;
+
+/// A setpoint that counts from where the vehicle was when it was taken, or from the one before.
+#[derive(Clone, Debug, Default)]
+enum Resolved {
+    /// Not yet, or nothing to resolve.
+    #[default]
+    Nothing,
+    /// A place to go to. [m, world]
+    Point(DVec3),
+    /// A path being followed.
+    Path(Box<Follower>),
+    /// The attitude that rates have led to: body to world.
+    Attitude(DQuat),
+}
 
 /// The guard of one flight.
 #[derive(Clone, Debug)]
@@ -122,6 +150,11 @@ pub struct Guard {
     kept_yaw_rad: Option<f64>,
     hold_point_m: Option<DVec3>,
     asked: Option<Setpoint>,
+    /// What `asked` became once the vehicle's place was known.
+    resolved: Resolved,
+    /// Where the vehicle was when the plugin took over. [m, world]
+    take_off_z_m: f64,
+    attitude_rate_allowed: bool,
     /// When the newest setpoint came, or the plugin took over.
     asked_at: HostTime,
     ticked_at: HostTime,
@@ -142,10 +175,13 @@ impl Guard {
             max_speed_mps: arena.limits.max_speed_mps,
             max_acceleration_mps2: arena.limits.max_acceleration_mps2,
             v_command_mps: fix.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
-            yaw: YawTarget::Angle(fix.yaw_rad),
-            kept_yaw_rad: Some(fix.yaw_rad),
+            yaw: YawTarget::Angle(fix.yaw_rad()),
+            kept_yaw_rad: Some(fix.yaw_rad()),
             hold_point_m: None,
             asked: None,
+            resolved: Resolved::Nothing,
+            take_off_z_m: fix.p_world_m.z,
+            attitude_rate_allowed: arena.attitude_rate,
             asked_at: now,
             ticked_at: now,
             ending_until: None,
@@ -153,15 +189,44 @@ impl Guard {
         }
     }
 
-    /// Takes what the plugin asks for at `now`. Returns whether it was taken: a setpoint with a
-    /// number that is not finite is refused, and does not count against the deadline.
-    pub fn ask(&mut self, now: HostTime, setpoint: Setpoint) -> bool {
-        if !setpoint.is_finite() {
-            return false;
+    /// Takes what the plugin asks for at `now`.
+    ///
+    /// # Errors
+    /// Why it is refused, as for a number that is not finite; it then does not count against the
+    /// deadline.
+    pub fn ask(&mut self, now: HostTime, setpoint: Setpoint) -> Result<(), InvalidSetpoint> {
+        setpoint.check()?;
+        let setpoint = bounded(setpoint);
+        if matches!(setpoint, Setpoint::AttitudeRate { .. }) && !self.attitude_rate_allowed {
+            return Err(InvalidSetpoint::AttitudeRate);
         }
-        self.asked = Some(bounded(setpoint));
+        let goes_on = match (&setpoint, &self.resolved, &self.asked) {
+            (Setpoint::Trajectory(new), Resolved::Path(follower), _) => {
+                *new == *follower.trajectory()
+            }
+            (Setpoint::AttitudeRate { .. }, Resolved::Attitude(_), _)
+            | (Setpoint::TakeOff, _, Some(Setpoint::TakeOff)) => true,
+            _ => false,
+        };
+        if !goes_on {
+            self.resolved = Resolved::Nothing;
+        }
+        self.asked = Some(setpoint);
         self.asked_at = now;
-        true
+        Ok(())
+    }
+
+    /// Takes note that the plugin answered an image at `now` without a setpoint: a trajectory that
+    /// is not over stays in force.
+    pub fn answered(&mut self, now: HostTime) {
+        let is_under_way = match (&self.asked, &self.resolved) {
+            (Some(Setpoint::Trajectory(_)), Resolved::Path(follower)) => !follower.is_over(),
+            (Some(Setpoint::Trajectory(_)), _) => true,
+            _ => false,
+        };
+        if is_under_way {
+            self.asked_at = now;
+        }
     }
 
     /// Lands now. Final.
@@ -184,7 +249,13 @@ impl Guard {
                 self.landing = Some(reason);
                 return (Passed::Land, stance);
             }
-            Stance::Holding(reason) => self.hold(fix, reason),
+            Stance::Holding(reason) => {
+                if let Resolved::Attitude(_) = self.resolved {
+                    // It went its own way meanwhile.
+                    self.resolved = Resolved::Nothing;
+                }
+                self.hold(fix, reason)
+            }
             Stance::Passing => {
                 self.hold_point_m = None;
                 self.wanted(fix, dt_s)
@@ -262,19 +333,94 @@ impl Guard {
     fn wanted(&mut self, fix: &Fix, dt_s: f64) -> DVec3 {
         let in_world = |v: DVec3, axes: Axes| match axes {
             Axes::World => v,
-            Axes::Heading => DQuat::from_rotation_z(fix.yaw_rad) * v,
+            Axes::Heading => DQuat::from_rotation_z(fix.yaw_rad()) * v,
+            Axes::Body => fix.rotation * v,
         };
-        let (v_target, yaw) = match self.asked.unwrap_or_default() {
-            Setpoint::Hold | Setpoint::Land => (DVec3::ZERO, YawTarget::Keep),
-            Setpoint::Velocity { v_mps, axes, yaw } => (in_world(v_mps, axes), yaw),
-            Setpoint::Position { p_world_m, yaw } => (self.towards(fix, p_world_m), yaw),
-            Setpoint::Acceleration { a_mps2, axes, yaw } => {
-                let a = in_world(a_mps2, axes).clamp_length_max(self.max_acceleration_mps2);
-                (self.v_command_mps + a * dt_s, yaw)
+        let (v_target, yaw) = match self.asked.as_ref() {
+            None | Some(Setpoint::Hold | Setpoint::Land) => (DVec3::ZERO, YawTarget::Keep),
+            Some(&Setpoint::Velocity { v_mps, axes, yaw }) => (in_world(v_mps, axes), yaw),
+            Some(&Setpoint::Position { p_world_m, yaw }) => (self.towards(fix, p_world_m), yaw),
+            Some(&Setpoint::Acceleration { a_mps2, axes, yaw }) => {
+                (self.accelerated(in_world(a_mps2, axes), dt_s), yaw)
+            }
+            Some(&Setpoint::Offset { d_m, axes, yaw }) => {
+                let p_m = self.point_or(fix.p_world_m + in_world(d_m, axes));
+                (self.towards(fix, p_m), yaw)
+            }
+            Some(&Setpoint::TakeOff) => {
+                let p_m = self.point_or(fix.p_world_m.with_z(self.take_off_z_m));
+                (self.towards(fix, p_m), YawTarget::Keep)
+            }
+            Some(&Setpoint::AttitudeRate { omega_body_radps, thrust }) => {
+                self.rotated(fix, omega_body_radps, thrust, dt_s)
+            }
+            Some(Setpoint::Trajectory(trajectory)) => {
+                if !matches!(self.resolved, Resolved::Path(_)) {
+                    let start = Start { p_world_m: fix.p_world_m, rotation: fix.rotation };
+                    let follower = Follower::new(trajectory.clone(), &start);
+                    self.resolved = Resolved::Path(Box::new(follower));
+                }
+                self.follow(fix, dt_s)
             }
         };
         self.turn(fix, yaw);
         v_target
+    }
+
+    /// Returns the point that the setpoint in force was resolved to; `p_m` if this is its first
+    /// tick. [m, world]
+    fn point_or(&mut self, p_m: DVec3) -> DVec3 {
+        if let Resolved::Point(resolved_m) = self.resolved {
+            return resolved_m;
+        }
+        self.resolved = Resolved::Point(p_m);
+        p_m
+    }
+
+    /// Returns the velocity that an acceleration of `a_mps2` leads to. [m/s, world]
+    fn accelerated(&self, a_mps2: DVec3, dt_s: f64) -> DVec3 {
+        self.v_command_mps + a_mps2.clamp_length_max(self.max_acceleration_mps2) * dt_s
+    }
+
+    /// Turns the attitude kept for it by the rates, at most [`MOST_TILT_RAD`] from level; returns
+    /// the velocity that it and the thrust lead to, and its heading. [m/s, world]
+    fn rotated(
+        &mut self,
+        fix: &Fix,
+        omega_body_radps: DVec3,
+        thrust: f64,
+        dt_s: f64,
+    ) -> (DVec3, YawTarget) {
+        let attitude = match self.resolved {
+            Resolved::Attitude(attitude) => attitude,
+            _ => fix.rotation,
+        };
+        let turn = omega_body_radps.clamp_length_max(MAX_RATE_RADPS) * dt_s;
+        let turned = (attitude * DQuat::from_scaled_axis(turn)).normalize();
+        let up = turned * DVec3::Z;
+        let excess_rad = up.angle_between(DVec3::Z) - MOST_TILT_RAD;
+        let back = up.cross(DVec3::Z).try_normalize();
+        let attitude = match back {
+            Some(axis) if excess_rad > 0.0 => DQuat::from_axis_angle(axis, excess_rad) * turned,
+            _ => turned,
+        };
+        self.resolved = Resolved::Attitude(attitude);
+        let lift_mps2 = thrust.clamp(0.0, MOST_THRUST) * GRAVITY_MPS2;
+        let a_mps2 = attitude * DVec3::Z * lift_mps2 - DVec3::Z * GRAVITY_MPS2;
+        (self.accelerated(a_mps2, dt_s), YawTarget::Angle(yaw_of(attitude)))
+    }
+
+    /// Returns the velocity that follows the path, and the heading on it. [m/s, world]
+    fn follow(&mut self, fix: &Fix, dt_s: f64) -> (DVec3, YawTarget) {
+        let limits = (self.max_speed_mps, self.max_acceleration_mps2);
+        let (reference, is_over) = match &mut self.resolved {
+            Resolved::Path(follower) => {
+                (follower.advance(fix.p_world_m, limits, dt_s), follower.is_over())
+            }
+            _ => return (DVec3::ZERO, YawTarget::Keep),
+        };
+        let v_mps = reference.v_world_mps + self.towards(fix, reference.p_world_m);
+        (v_mps, if is_over { YawTarget::Keep } else { reference.yaw })
     }
 
     /// Sets the heading to send; it is never left open, as ArduCopter would then turn the nose
@@ -287,7 +433,7 @@ impl Guard {
                 YawTarget::Rate(rate_radps.clamp(-MAX_YAW_RATE_RADPS, MAX_YAW_RATE_RADPS))
             }
             YawTarget::Keep => {
-                let yaw_rad = kept_yaw_rad.unwrap_or(fix.yaw_rad);
+                let yaw_rad = kept_yaw_rad.unwrap_or(fix.yaw_rad());
                 self.kept_yaw_rad = Some(yaw_rad);
                 YawTarget::Angle(yaw_rad)
             }
@@ -314,8 +460,21 @@ impl Fix {
             stamp,
             p_world_m: sample.world_from_body.translation_m,
             v_world_mps: sample.twist.linear_mps,
-            yaw_rad: yaw_of(sample.world_from_body.rotation),
+            rotation: sample.world_from_body.rotation,
         }
+    }
+
+    /// Returns the heading from world x, counter-clockwise. [rad]
+    pub fn yaw_rad(&self) -> f64 {
+        yaw_of(self.rotation)
+    }
+
+    /// Whether every number in it is one to work with.
+    pub fn is_valid(&self) -> bool {
+        self.p_world_m.is_finite()
+            && self.v_world_mps.is_finite()
+            && self.rotation.is_finite()
+            && self.rotation.length_squared() > 0.5
     }
 }
 
@@ -324,7 +483,28 @@ impl Fix {
 fn bounded(setpoint: Setpoint) -> Setpoint {
     let bound = |v: DVec3| v.clamp(DVec3::splat(-1e6), DVec3::splat(1e6));
     match setpoint {
-        Setpoint::Hold | Setpoint::Land => setpoint,
+        Setpoint::Hold | Setpoint::Land | Setpoint::TakeOff => setpoint,
+        Setpoint::AttitudeRate { omega_body_radps, thrust } => {
+            Setpoint::AttitudeRate { omega_body_radps: bound(omega_body_radps), thrust }
+        }
+        Setpoint::Offset { d_m, axes, yaw } => Setpoint::Offset { d_m: bound(d_m), axes, yaw },
+        Setpoint::Trajectory(mut trajectory) => {
+            match &mut trajectory.path {
+                Path::Waypoints(points) => {
+                    for point in points {
+                        point.p_m = bound(point.p_m);
+                        point.speed_mps = point.speed_mps.min(1e6);
+                    }
+                }
+                Path::Polynomial(pieces) => {
+                    for piece in pieces {
+                        piece.seconds = piece.seconds.min(1e6);
+                        piece.coefficients = piece.coefficients.map(bound);
+                    }
+                }
+            }
+            Setpoint::Trajectory(trajectory)
+        }
         Setpoint::Position { p_world_m, yaw } => {
             Setpoint::Position { p_world_m: bound(p_world_m), yaw }
         }

@@ -10,12 +10,14 @@ fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> Ar
     ArenaInfo {
         name: bounded("test"),
         geofence,
-        limits: Limits { max_speed_mps, max_acceleration_mps2 },
+        limits: Limits::new(max_speed_mps, max_acceleration_mps2),
         body_radius_m: 0.12,
         takeoff_height_m: 1.0,
         goal_m: None,
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
+        ground_truth: true,
+        attitude_rate: false,
         cameras: heapless::Vec::new(),
     }
 }
@@ -53,7 +55,8 @@ impl Vehicle {
     }
 
     fn fix(&self, stamp: HostTime) -> Fix {
-        Fix { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, yaw_rad: self.yaw_rad }
+        let rotation = DQuat::from_rotation_z(self.yaw_rad);
+        Fix { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, rotation }
     }
 }
 
@@ -128,7 +131,7 @@ proptest! {
         for (setpoint, ticks) in asked {
             for _ in 0..ticks {
                 tick += 1;
-                guard.ask(time(tick), setpoint);
+                let _ = guard.ask(time(tick), setpoint.clone());
                 // The pose is 20 ms old, as over a network.
                 let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick - 1)));
                 let Passed::Guided(guided) = passed else {
@@ -160,7 +163,7 @@ proptest! {
         // Holding is reachable from anywhere, and it stops.
         for _ in 0..300 {
             tick += 1;
-            guard.ask(time(tick), Setpoint::Hold);
+            guard.ask(time(tick), Setpoint::Hold).unwrap();
             let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick)));
             prop_assert!(matches!(stance, Stance::Holding(HoldReason::Asked)), "{stance:?}");
             let Passed::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) = passed
@@ -169,7 +172,7 @@ proptest! {
         }
         prop_assert!(vehicle.v_mps.length() < 0.1, "{}", vehicle.v_mps);
         // So is landing.
-        guard.ask(time(tick), Setpoint::Land);
+        guard.ask(time(tick), Setpoint::Land).unwrap();
         let (passed, _) = guard.tick(time(tick + 1), &vehicle.fix(time(tick + 1)));
         prop_assert_eq!(passed, Passed::Land);
     }
@@ -198,7 +201,7 @@ fn passed_velocity(passed: Passed) -> DVec3 {
 #[test]
 fn silence_holds_then_lands() {
     let mut guard = guard();
-    guard.ask(time(1), velocity(DVec3::X));
+    guard.ask(time(1), velocity(DVec3::X)).unwrap();
     let stance = |guard: &mut Guard, tick| guard.tick(time(tick), &at_rest(tick)).1;
     assert_eq!(stance(&mut guard, 2), Stance::Passing);
     assert_eq!(stance(&mut guard, 26), Stance::Passing, "0.5 s");
@@ -206,7 +209,7 @@ fn silence_holds_then_lands() {
     assert_eq!(stance(&mut guard, 101), Stance::Holding(HoldReason::NoSetpoint), "2 s");
     assert!(matches!(stance(&mut guard, 102), Stance::Landing(LandReason::NoSetpoint(_))));
     // Latched: a plugin that comes back is not obeyed any more.
-    guard.ask(time(103), velocity(DVec3::X));
+    guard.ask(time(103), velocity(DVec3::X)).unwrap();
     assert_eq!(guard.tick(time(103), &at_rest(103)).0, Passed::Land);
 }
 
@@ -222,9 +225,11 @@ fn a_plugin_that_never_answers_is_landed() {
 fn numbers_that_are_not_finite_do_not_count() {
     let mut guard = guard();
     for tick in 1..=27 {
-        assert!(!guard.ask(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))));
+        assert!(guard.ask(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))).is_err());
         assert!(
-            !guard.ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0)))
+            guard
+                .ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0)))
+                .is_err()
         );
     }
     assert_eq!(guard.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
@@ -234,7 +239,7 @@ fn numbers_that_are_not_finite_do_not_count() {
 fn a_stale_pose_holds_then_lands() {
     let mut guard = guard();
     for tick in 1..=102 {
-        guard.ask(time(tick), velocity(DVec3::X));
+        guard.ask(time(tick), velocity(DVec3::X)).unwrap();
         let (passed, stance) = guard.tick(time(tick), &at_rest(1));
         match tick {
             1..=26 => assert_eq!(stance, Stance::Passing),
@@ -250,7 +255,7 @@ fn a_stale_pose_holds_then_lands() {
 #[test]
 fn outside_the_fence_it_lands() {
     let mut guard = guard();
-    guard.ask(time(1), velocity(DVec3::X));
+    guard.ask(time(1), velocity(DVec3::X)).unwrap();
     let out = Fix { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
     let (_, stance) = guard.tick(time(1), &out);
     assert!(
@@ -263,11 +268,14 @@ fn heading_axes_turn_with_the_nose() {
     let mut guard = guard();
     let mut v = DVec3::ZERO;
     for tick in 1..100 {
-        let north = Fix { yaw_rad: std::f64::consts::FRAC_PI_2, ..at_rest(tick) };
-        guard.ask(
-            time(tick),
-            Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::Heading, yaw: YawTarget::Keep },
-        );
+        let north =
+            Fix { rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2), ..at_rest(tick) };
+        guard
+            .ask(
+                time(tick),
+                Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::Heading, yaw: YawTarget::Keep },
+            )
+            .unwrap();
         v = passed_velocity(guard.tick(time(tick), &north).0);
     }
     assert!((v - DVec3::Y).length() < 1e-9, "{v}");
@@ -277,8 +285,11 @@ fn heading_axes_turn_with_the_nose() {
 fn keep_keeps_the_heading_of_the_moment() {
     let mut guard = guard();
     let yaw_after = |guard: &mut Guard, tick, yaw, yaw_rad| {
-        guard.ask(time(tick), Setpoint::velocity(DVec3::X, yaw));
-        match guard.tick(time(tick), &Fix { yaw_rad, ..at_rest(tick) }).0 {
+        guard.ask(time(tick), Setpoint::velocity(DVec3::X, yaw)).unwrap();
+        match guard
+            .tick(time(tick), &Fix { rotation: DQuat::from_rotation_z(yaw_rad), ..at_rest(tick) })
+            .0
+        {
             Passed::Guided(guided) => guided.yaw,
             Passed::Land => panic!("landed"),
         }
@@ -303,7 +314,7 @@ fn a_point_is_reached_and_held() {
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let p_world_m = DVec3::new(3.0, -1.5, 1.0);
     for tick in 1..800 {
-        guard.ask(time(tick), Setpoint::Position { p_world_m, yaw: YawTarget::Keep });
+        guard.ask(time(tick), Setpoint::Position { p_world_m, yaw: YawTarget::Keep }).unwrap();
         let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
         vehicle.fly(v);
     }
@@ -315,7 +326,7 @@ fn it_slides_along_a_wall_rather_than_stopping() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(-4.0, 0.0, 2.0), 4.0);
     for tick in 1..200 {
-        guard.ask(time(tick), velocity(DVec3::new(1.0, 3.0, 0.0)));
+        guard.ask(time(tick), velocity(DVec3::new(1.0, 3.0, 0.0))).unwrap();
         let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
         vehicle.fly(v);
     }
@@ -327,7 +338,7 @@ fn it_slides_along_a_wall_rather_than_stopping() {
 fn an_orderly_end_brakes_before_it_lands() {
     let mut guard = guard();
     let moving = |tick, v| Fix { v_world_mps: DVec3::X * v, ..at_rest(tick) };
-    guard.ask(time(1), velocity(DVec3::X * 2.0));
+    guard.ask(time(1), velocity(DVec3::X * 2.0)).unwrap();
     guard.tick(time(1), &moving(1, 2.0));
     guard.brake_and_land(time(2));
     let (passed, stance) = guard.tick(time(2), &moving(2, 2.0));
@@ -347,7 +358,7 @@ fn landing_is_final() {
     let mut guard = guard();
     guard.land();
     for tick in 1..50 {
-        guard.ask(time(tick), velocity(DVec3::X));
+        guard.ask(time(tick), velocity(DVec3::X)).unwrap();
         let (passed, stance) = guard.tick(time(tick), &at_rest(tick));
         assert_eq!((passed, stance), (Passed::Land, Stance::Landing(LandReason::Ordered)));
     }

@@ -23,6 +23,7 @@ pub mod udp;
 
 use std::collections::VecDeque;
 
+use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::dialect::{
     COMMAND_ACK_DATA, COMMAND_LONG_DATA, EkfStatusFlags, HEARTBEAT_DATA, MavAutopilot, MavCmd,
@@ -31,11 +32,13 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::mavlink::{
     CopterMode, GuidedSetpoint, MAX_PACKET, MavHeader, Packet, StreamDecoder,
-    attitude_from_mavlink, encode, guided_to_mavlink, local_position_from_mavlink,
-    vision_to_mavlink,
+    attitude_from_mavlink, encode, guided_to_mavlink, highres_imu_from_mavlink,
+    local_position_from_mavlink, raw_imu_from_mavlink, vision_to_mavlink,
 };
 use vizflyt_protocol::messages::VehicleState;
+use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{Autopilot, AutopilotTime, Host, HostTime, OffsetFilter};
+use vizflyt_sdk::ImuSample;
 
 use commands::{Answer, Command, Commands, Patience};
 pub use events::{LinkEvent, advice};
@@ -97,8 +100,9 @@ const TEXT_BELONGS_S: f64 = 3.0;
 const TEXTS: usize = 8;
 
 /// Messages we ask for, and how often. (id, period) [us]
-const INTERVALS: [(u32, f32); 4] = [
+const INTERVALS: [(u32, f32); 5] = [
     (30, 20_000.0),   // ATTITUDE
+    (27, 10_000.0),   // RAW_IMU: 4 kB/s, which a serial link still carries
     (32, 20_000.0),   // LOCAL_POSITION_NED
     (193, 200_000.0), // EKF_STATUS_REPORT
     (1, 500_000.0),   // SYS_STATUS
@@ -118,6 +122,12 @@ pub struct Link {
     autopilot: Option<(u8, u8)>,
     heard_at: HostTime,
     state: VehicleState,
+    /// When the attitude in `state` was true.
+    attitude_at: Option<HostTime>,
+    /// The newest IMU samples, oldest first.
+    imu: VecDeque<ImuSample>,
+    /// HIGHRES_IMU comes: RAW_IMU, the same in whole numbers, is left aside.
+    imu_is_fine: bool,
     clock: OffsetFilter<Host, Autopilot>,
     boot_ms: u32,
     origin_set: bool,
@@ -145,6 +155,9 @@ impl Link {
             autopilot: None,
             heard_at: now,
             state: VehicleState { battery_fraction: -1.0, ..VehicleState::default() },
+            attitude_at: None,
+            imu: VecDeque::new(),
+            imu_is_fine: false,
             clock: OffsetFilter::default(),
             boot_ms: 0,
             origin_set: false,
@@ -238,6 +251,16 @@ impl Link {
         &self.state
     }
 
+    /// Returns when the attitude in [`Self::state`] was true; `None` if none has come. [host]
+    pub fn attitude_at(&self) -> Option<HostTime> {
+        self.attitude_at
+    }
+
+    /// Returns the newest IMU samples, oldest first; at most [`MAX_IMU`].
+    pub fn imu(&self) -> &VecDeque<ImuSample> {
+        &self.imu
+    }
+
     /// Whether the autopilot's heartbeats come.
     pub fn is_connected(&self) -> bool {
         self.autopilot.is_some()
@@ -304,6 +327,8 @@ impl Link {
                 if rotation.is_finite() && omega_body_radps.is_finite() {
                     self.state.world_from_body = rotation;
                     self.state.omega_body_radps = omega_body_radps;
+                    let boot_ns = u64::from(message.time_boot_ms) * 1_000_000;
+                    self.attitude_at = Some(self.measured_at(now, boot_ns));
                 }
             }
             MavMessage::LOCAL_POSITION_NED(message) => {
@@ -313,6 +338,13 @@ impl Link {
                     self.state.p_world_m = p_world_m;
                     self.state.v_world_mps = v_world_mps;
                 }
+            }
+            MavMessage::RAW_IMU(message) if !self.imu_is_fine => {
+                self.handle_imu(now, message.time_usec, raw_imu_from_mavlink(message));
+            }
+            MavMessage::HIGHRES_IMU(message) => {
+                self.imu_is_fine = true;
+                self.handle_imu(now, message.time_usec, highres_imu_from_mavlink(message));
             }
             MavMessage::SYS_STATUS(message) => self.handle_sys_status(message),
             MavMessage::EKF_STATUS_REPORT(message) => self.ekf = message.flags,
@@ -357,6 +389,9 @@ impl Link {
         self.prearm_ok = None;
         self.took_off = false;
         self.boot_ms = 0;
+        self.attitude_at = None;
+        self.imu.clear();
+        self.imu_is_fine = false;
         self.clock = OffsetFilter::default();
         self.intervals_left = INTERVALS.len();
         self.commands.abandon();
@@ -368,6 +403,28 @@ impl Link {
             self.forget();
         }
         self.boot_ms = boot_ms;
+    }
+
+    fn handle_imu(&mut self, now: HostTime, boot_us: u64, (accel, gyro): (DVec3, DVec3)) {
+        if !(accel.is_finite() && gyro.is_finite()) {
+            return;
+        }
+        let stamp = self.measured_at(now, boot_us.saturating_mul(1000));
+        // Readers tell new samples by their stamps, so these must rise.
+        if self.imu.back().is_some_and(|newest| newest.stamp >= stamp) {
+            return;
+        }
+        if self.imu.len() == MAX_IMU {
+            self.imu.pop_front();
+        }
+        self.imu.push_back(ImuSample { stamp, accel_mps2: accel, gyro_radps: gyro });
+    }
+
+    /// Returns when something was measured of which the autopilot says so on its clock; `now` as
+    /// long as that clock is not known, and never later.
+    fn measured_at(&self, now: HostTime, boot_ns: u64) -> HostTime {
+        let at = self.clock.to_local(AutopilotTime::from_ns(boot_ns));
+        at.filter(|&at| now.seconds_since(at).abs() < SECOND_S).map_or(now, |at| at.min(now))
     }
 
     fn handle_sys_status(&mut self, message: &SYS_STATUS_DATA) {

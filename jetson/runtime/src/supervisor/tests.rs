@@ -138,12 +138,14 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-        limits: Limits { max_speed_mps: 3.0, max_acceleration_mps2: 4.0 },
+        limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
         goal_m: None,
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
+        ground_truth: true,
+        attitude_rate: false,
         cameras: cameras().into_iter().collect(),
     }
 }

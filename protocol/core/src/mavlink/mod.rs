@@ -22,7 +22,8 @@ pub use setpoint::{
     GuidedMotion, GuidedSetpoint, UnsupportedSetpoint, guided_from_mavlink, guided_to_mavlink,
 };
 pub use state::{
-    attitude_from_mavlink, attitude_to_mavlink, local_position_from_mavlink,
-    local_position_to_mavlink, vision_from_mavlink, vision_to_mavlink,
+    attitude_from_mavlink, attitude_to_mavlink, highres_imu_from_mavlink,
+    local_position_from_mavlink, local_position_to_mavlink, raw_imu_from_mavlink,
+    vision_from_mavlink, vision_to_mavlink,
 };
 pub use stream::{MAX_PACKET, Packet, StreamDecoder, StreamStats, encode};

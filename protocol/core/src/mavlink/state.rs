@@ -1,9 +1,12 @@
-//! Poses and attitudes to and from MAVLink: VISION_POSITION_ESTIMATE (102), ATTITUDE (30),
-//! LOCAL_POSITION_NED (32).
+//! Poses, attitudes and IMU samples to and from MAVLink: VISION_POSITION_ESTIMATE (102),
+//! ATTITUDE (30), LOCAL_POSITION_NED (32), RAW_IMU (27), HIGHRES_IMU (105).
 
 use glam::{DQuat, DVec3, EulerRot};
 
-use super::dialect::{ATTITUDE_DATA, LOCAL_POSITION_NED_DATA, VISION_POSITION_ESTIMATE_DATA};
+use super::dialect::{
+    ATTITUDE_DATA, HIGHRES_IMU_DATA, LOCAL_POSITION_NED_DATA, RAW_IMU_DATA,
+    VISION_POSITION_ESTIMATE_DATA,
+};
 use super::frames::{
     body_from_frd, frd_from_body, ned_from_world, ned_rotation_from_world, world_from_ned,
     world_rotation_from_ned,
@@ -137,6 +140,38 @@ pub fn local_position_from_mavlink(message: &LOCAL_POSITION_NED_DATA) -> (DVec3,
     let vector = |x: f32, y: f32, z: f32| world_from_ned(DVec3::new(x.into(), y.into(), z.into()));
     (vector(message.x, message.y, message.z), vector(message.vx, message.vy, message.vz))
 }
+
+/// Reads RAW_IMU: specific force [m/s^2, body] and angular velocity [rad/s, body].
+///
+/// MAVLink leaves its units open; ArduCopter sends mG and mrad/s (GCS_MAVLINK::send_raw_imu).
+///
+/// ```
+/// use glam::DVec3;
+/// use vizflyt_protocol::mavlink::{dialect::RAW_IMU_DATA, raw_imu_from_mavlink};
+/// // Level and at rest, turning right at 0.5 rad/s: gravity is felt upwards, -z in FRD.
+/// let message = RAW_IMU_DATA { zacc: -1000, zgyro: 500, ..Default::default() };
+/// let (accel_mps2, gyro_radps) = raw_imu_from_mavlink(&message);
+/// assert_eq!((accel_mps2, gyro_radps), (DVec3::Z * 9.80665, DVec3::Z * -0.5));
+/// ```
+pub fn raw_imu_from_mavlink(message: &RAW_IMU_DATA) -> (DVec3, DVec3) {
+    let vector = |x: i16, y: i16, z: i16| body_from_frd(DVec3::new(x.into(), y.into(), z.into()));
+    (
+        vector(message.xacc, message.yacc, message.zacc) * (GRAVITY_MPS2 / 1000.0),
+        vector(message.xgyro, message.ygyro, message.zgyro) / 1000.0,
+    )
+}
+
+/// Reads HIGHRES_IMU: specific force [m/s^2, body] and angular velocity [rad/s, body].
+pub fn highres_imu_from_mavlink(message: &HIGHRES_IMU_DATA) -> (DVec3, DVec3) {
+    let vector = |x: f32, y: f32, z: f32| body_from_frd(DVec3::new(x.into(), y.into(), z.into()));
+    (
+        vector(message.xacc, message.yacc, message.zacc),
+        vector(message.xgyro, message.ygyro, message.zgyro),
+    )
+}
+
+/// Standard gravity, ISO 80000-3. [m/s^2]
+const GRAVITY_MPS2: f64 = 9.80665;
 
 #[cfg(test)]
 mod tests {

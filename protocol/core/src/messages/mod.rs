@@ -24,6 +24,7 @@ mod session;
 mod setpoint;
 mod telemetry;
 mod timing;
+mod trajectory;
 
 pub use event::{Event, EventKind};
 pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
@@ -32,11 +33,14 @@ pub use session::{
     ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, Limits,
     PoseSample, Purpose, ToRuntime, ToServer, Welcome,
 };
-pub use setpoint::{Axes, Setpoint, YawTarget};
+pub use setpoint::{Axes, InvalidSetpoint, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};
 pub use timing::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Stages, Timing,
     Waterfall,
+};
+pub use trajectory::{
+    COEFFICIENTS, MAX_PIECES, MAX_WAYPOINTS, Path, PathYaw, Piece, Trajectory, Waypoint,
 };
 
 /// Codes with which a server closes a connection and that a client acts on.

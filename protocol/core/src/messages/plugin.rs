@@ -19,6 +19,7 @@ pub enum ToPlugin {
 
 /// Plugin to runtime. Ordered, never lost.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)] // Why: there is no heap here to box a trajectory on.
 pub enum FromPlugin {
     /// `on_start` returned; the plugin waits for images.
     Ready {

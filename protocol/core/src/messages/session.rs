@@ -184,6 +184,44 @@ pub struct Limits {
     pub max_speed_mps: f64,
     /// Greatest acceleration; also what the guard counts on for stopping. [m/s^2]
     pub max_acceleration_mps2: f64,
+    /// Greatest tilt from level; without it the acceleration alone limits tilt. [deg]
+    pub max_tilt_deg: Option<f64>,
+    /// Greatest height of the body's centre; without it the geofence alone limits height.
+    /// [m, world]
+    pub max_altitude_m: Option<f64>,
+}
+
+impl Limits {
+    /// Makes limits of speed [m/s] and acceleration [m/s^2] only.
+    pub const fn new(max_speed_mps: f64, max_acceleration_mps2: f64) -> Self {
+        Self { max_speed_mps, max_acceleration_mps2, max_tilt_deg: None, max_altitude_m: None }
+    }
+
+    /// Returns limits that keep both: of each limit the stricter.
+    ///
+    /// ```
+    /// use vizflyt_protocol::messages::Limits;
+    /// let arena = Limits { max_tilt_deg: Some(30.0), ..Limits::new(3.0, 8.0) };
+    /// let vehicle = Limits { max_altitude_m: Some(2.5), ..Limits::new(5.0, 4.0) };
+    /// let both = arena.stricter(&vehicle);
+    /// assert_eq!((both.max_speed_mps, both.max_acceleration_mps2), (3.0, 4.0));
+    /// assert_eq!((both.max_tilt_deg, both.max_altitude_m), (Some(30.0), Some(2.5)));
+    /// ```
+    #[must_use]
+    pub fn stricter(&self, other: &Self) -> Self {
+        // A NaN must not win over a limit, nor vanish: `check` refuses it where it is used.
+        let least = |a: f64, b: f64| if a.is_nan() || a < b { a } else { b };
+        let least_of = |a: Option<f64>, b: Option<f64>| match (a, b) {
+            (Some(a), Some(b)) => Some(least(a, b)),
+            (a, b) => a.or(b),
+        };
+        Self {
+            max_speed_mps: least(self.max_speed_mps, other.max_speed_mps),
+            max_acceleration_mps2: least(self.max_acceleration_mps2, other.max_acceleration_mps2),
+            max_tilt_deg: least_of(self.max_tilt_deg, other.max_tilt_deg),
+            max_altitude_m: least_of(self.max_altitude_m, other.max_altitude_m),
+        }
+    }
 }
 
 /// What a runtime must know of the arena to fly in it.
@@ -205,6 +243,11 @@ pub struct ArenaInfo {
     pub goal_radius_m: f64,
     /// From take-off; 0 is none. [s]
     pub time_limit_s: f64,
+    /// Whether plugins get the vehicle's pose and velocity. Where not, they are not in the plugin
+    /// process's memory at all.
+    pub ground_truth: bool,
+    /// Whether plugins may ask for [`Setpoint::AttitudeRate`](super::Setpoint::AttitudeRate).
+    pub attitude_rate: bool,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
 }

@@ -3,8 +3,6 @@
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use super::Setpoint;
-
 /// Where a flight stands.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -73,8 +71,8 @@ pub struct Telemetry {
     pub vehicle: VehicleState,
     /// The images.
     pub images: ImageStats,
-    /// The newest setpoint after the guard.
-    pub setpoint: Setpoint,
+    /// What was asked of the autopilot last, after the guard. [m/s, world]
+    pub v_setpoint_mps: DVec3,
     /// Setpoints sent to the autopilot since the start.
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received since the start.

@@ -110,12 +110,18 @@ mod tests {
                 half_m: DVec3::splat(2.2),
                 rotation: DQuat::from_rotation_x(0.4),
             },
-            limits: Limits { max_speed_mps: 5.5, max_acceleration_mps2: 6.6 },
+            limits: Limits {
+                max_tilt_deg: Some(30.0),
+                max_altitude_m: Some(3.3),
+                ..Limits::new(5.5, 6.6)
+            },
             body_radius_m: 0.12,
             takeoff_height_m: 1.3,
             goal_m: Some(DVec3::splat(9.9)),
             goal_radius_m: 1.0,
             time_limit_s: 99.0,
+            ground_truth: true,
+            attitude_rate: true,
             cameras: core::iter::repeat_n(camera, MAX_CAMERAS).collect(),
         }
     }
@@ -187,6 +193,28 @@ mod tests {
         let mut buffer = [0; MAX_FRAMED];
         assert!(encode(&ToRuntime::Welcome(welcome()), &mut buffer).len() < MAX_FRAMED / 2);
         assert!(encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
+        let piece = Piece { seconds: 1.1, coefficients: [DVec3::splat(1.1); COEFFICIENTS] };
+        let way = Waypoint { p_m: DVec3::splat(1.1), speed_mps: 1.1 };
+        let paths = [
+            Path::Polynomial(core::iter::repeat_n(piece, MAX_PIECES).collect()),
+            Path::Waypoints(core::iter::repeat_n(way, MAX_WAYPOINTS).collect()),
+        ];
+        for path in paths {
+            let trajectory = Trajectory {
+                id: u32::MAX,
+                axes: Axes::Body,
+                path,
+                yaw: PathYaw::Target(YawTarget::Angle(1.1)),
+            };
+            let message = FromPlugin::Answer {
+                seq: u64::MAX,
+                entered: HostTime::from_ns(u64::MAX),
+                returned: HostTime::from_ns(u64::MAX),
+                setpoint: Some(Setpoint::Trajectory(trajectory)),
+            };
+            assert!(encode_body(&message, &mut buffer).len() < MAX_FRAMED / 2);
+            assert_eq!(decode_body(encode_body(&message, &mut buffer)), Ok(message));
+        }
         let telemetry = ToServer::Telemetry(Telemetry::default());
         assert!(encode(&telemetry, &mut buffer).len() < 1024);
         let times = StageTimes { p50: 1e9, p90: 1e9, p99: 1e9, max: 1e9 };

@@ -7,6 +7,7 @@ mod preamble;
 
 pub use image::{ImageHeader, ImageTrailer, InvalidImageHeader, InvalidImageTrailer};
 pub use observation::{
-    CameraHeader, InvalidObservation, ObservationHeader, ObservationLayout, PLANE_ALIGN,
+    CameraHeader, ImuRecord, InvalidObservation, MAX_IMU, ObservationHeader, ObservationLayout,
+    PLANE_ALIGN,
 };
 pub use preamble::{Party, Preamble, PreambleError};

@@ -3,6 +3,8 @@
 //! `ObservationHeader`, then for each camera its RGB plane (H x W x 3 bytes) and its depth plane
 //! (H x W u16 of millimetres), each at a 64-byte boundary. Little-endian, fixed offsets: the C
 //! header for other languages mirrors this file.
+//!
+//! What the course withholds (pose, velocity) is not written: those bytes are zero.
 
 use glam::{DQuat, DVec3};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -45,6 +47,22 @@ pub struct CameraHeader {
     reserved: u32,
 }
 
+/// Most IMU samples in one observation: 0.6 s at 100 Hz, so that a plugin that skips images for as
+/// long as the guard lets it still gets every sample.
+pub const MAX_IMU: usize = 64;
+
+/// One reading of the autopilot's accelerometer and gyroscope.
+#[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
+#[repr(C)]
+pub struct ImuRecord {
+    /// When it was measured. [ns, host]
+    pub stamp_ns: u64,
+    /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
+    pub accel_mps2: [f32; 3],
+    /// Angular velocity. [rad/s, body]
+    pub gyro_radps: [f32; 3],
+}
+
 /// Head of an observation: the vehicle, and where the cameras' planes lie.
 #[derive(Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
@@ -53,32 +71,39 @@ pub struct ObservationHeader {
     version: u16,
     /// Cameras in use, from the front of `cameras`.
     pub camera_count: u8,
-    /// Bit 0: `position`, `velocity` and `rotation` of the vehicle are filled in.
+    /// [`Self::HAS_ATTITUDE`] and [`Self::HAS_POSE`].
     pub flags: u8,
     /// Bytes of header and planes together.
     pub total_len: u32,
-    reserved: u32,
+    /// Samples in use, from the front of `imu`.
+    pub imu_count: u32,
     /// Counts observations of this runtime.
     pub seq: u64,
     /// When the vehicle's state below was true. [ns, host]
     pub vehicle_ns: u64,
-    /// Position. [m, world]
+    /// Position, with [`Self::HAS_POSE`]. [m, world]
     pub position_m: [f64; 3],
-    /// Velocity. [m/s, world]
+    /// Velocity, with [`Self::HAS_POSE`]. [m/s, world]
     pub velocity_mps: [f64; 3],
-    /// Body to world rotation, xyzw.
+    /// Body to world rotation, xyzw, with [`Self::HAS_ATTITUDE`].
     pub rotation_xyzw: [f64; 4],
-    /// Angular velocity. [rad/s, body]
+    /// Angular velocity, with [`Self::HAS_ATTITUDE`]. [rad/s, body]
     pub angular_radps: [f64; 3],
     /// Battery left, 0 to 1; negative if unknown.
     pub battery_fraction: f64,
+    /// Battery voltage; 0 if unknown. [V]
+    pub battery_v: f64,
+    /// The newest IMU samples, oldest first. Those that came with the former observation are
+    /// there again: a reader that skipped it misses none, and tells new ones by their stamps.
+    pub imu: [ImuRecord; MAX_IMU],
     /// The cameras.
     pub cameras: [CameraHeader; MAX_CAMERAS],
 }
 
 // The layout is a contract with other languages and processes.
 const _: () = assert!(size_of::<CameraHeader>() == 176);
-const _: () = assert!(size_of::<ObservationHeader>() == 144 + 176 * MAX_CAMERAS);
+const _: () = assert!(size_of::<ImuRecord>() == 32);
+const _: () = assert!(size_of::<ObservationHeader>() == 152 + 32 * MAX_IMU + 176 * MAX_CAMERAS);
 
 /// Where the planes of a set of images lie.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -119,6 +144,9 @@ pub enum InvalidObservation {
         "observation is not of protocol {PROTOCOL_VERSION}: rebuild the plugin with this runtime's SDK"
     )]
     Foreign,
+    /// More IMU samples than there is room for.
+    #[error("observation names {0} IMU samples; there is room for {MAX_IMU}")]
+    Imu(u32),
     /// A plane lies outside the memory.
     #[error("camera {0} of the observation lies outside its memory")]
     Plane(usize),
@@ -126,8 +154,10 @@ pub enum InvalidObservation {
 
 impl ObservationHeader {
     const MAGIC: [u8; 4] = *b"VZOB";
-    /// Bit of `flags`: the vehicle's state is filled in.
-    pub const HAS_VEHICLE: u8 = 1;
+    /// Bit of `flags`: the vehicle's rotation and angular velocity are filled in.
+    pub const HAS_ATTITUDE: u8 = 1;
+    /// Bit of `flags`: so are its position and velocity.
+    pub const HAS_POSE: u8 = 2;
 
     /// Makes an empty header for `camera_count` cameras and `total_len` bytes.
     pub fn new(seq: u64, camera_count: u8, total_len: u32) -> Self {
@@ -137,7 +167,7 @@ impl ObservationHeader {
             camera_count,
             flags: 0,
             total_len,
-            reserved: 0,
+            imu_count: 0,
             seq,
             vehicle_ns: 0,
             position_m: [0.0; 3],
@@ -145,6 +175,8 @@ impl ObservationHeader {
             rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
             angular_radps: [0.0; 3],
             battery_fraction: -1.0,
+            battery_v: 0.0,
+            imu: [ImuRecord::default(); MAX_IMU],
             cameras: [CameraHeader::default(); MAX_CAMERAS],
         }
     }
@@ -158,6 +190,9 @@ impl ObservationHeader {
         }
         if usize::from(header.camera_count) > MAX_CAMERAS {
             return Err(InvalidObservation::Plane(header.camera_count.into()));
+        }
+        if header.imu_count as usize > MAX_IMU {
+            return Err(InvalidObservation::Imu(header.imu_count));
         }
         for (index, camera) in header.cameras[..header.camera_count.into()].iter().enumerate() {
             let pixels = u64::from(camera.width_px) * u64::from(camera.height_px);
@@ -174,10 +209,20 @@ impl ObservationHeader {
         Ok(header)
     }
 
+    /// Returns the vehicle's attitude, body to world, if it is known.
+    pub fn attitude(&self) -> Option<DQuat> {
+        (self.flags & Self::HAS_ATTITUDE != 0).then(|| DQuat::from_array(self.rotation_xyzw))
+    }
+
     /// Returns the vehicle's pose, if the course lets the plugin know it.
     pub fn world_from_body(&self) -> Option<Pose<World, Body>> {
-        (self.flags & Self::HAS_VEHICLE != 0)
-            .then(|| Pose::new(DVec3::from(self.position_m), DQuat::from_array(self.rotation_xyzw)))
+        let attitude = self.attitude().filter(|_| self.flags & Self::HAS_POSE != 0)?;
+        Some(Pose::new(DVec3::from(self.position_m), attitude))
+    }
+
+    /// Returns the IMU samples there are, oldest first.
+    pub fn imu(&self) -> &[ImuRecord] {
+        &self.imu[..(self.imu_count as usize).min(MAX_IMU)]
     }
 }
 
@@ -253,6 +298,9 @@ mod tests {
         h.cameras[0].width_px = u32::MAX;
         h.cameras[0].height_px = u32::MAX;
         assert_eq!(ObservationHeader::parse(&memory(&h).0), Err(InvalidObservation::Plane(0)));
+        let mut h = header(30, 20);
+        h.imu_count = MAX_IMU as u32 + 1;
+        assert_eq!(ObservationHeader::parse(&memory(&h).0), Err(InvalidObservation::Imu(65)));
         assert!(ObservationHeader::parse(&[0; 64]).is_err());
     }
 

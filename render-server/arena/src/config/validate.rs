@@ -99,6 +99,12 @@ impl ArenaConfig {
         check_number("limits.max_speed_mps", self.limits.max_speed_mps, "m/s", 0.01..=30.0)?;
         let acceleration = self.limits.max_acceleration_mps2;
         check_number("limits.max_acceleration_mps2", acceleration, "m/s^2", 0.1..=50.0)?;
+        if let Some(tilt_deg) = self.limits.max_tilt_deg {
+            check_number("limits.max_tilt_deg", tilt_deg, "degrees", 1.0..=90.0)?;
+        }
+        if let Some(altitude_m) = self.limits.max_altitude_m {
+            check_number("limits.max_altitude_m", altitude_m, "m", 0.1..=100.0)?;
+        }
         self.check_fence_and_points()?;
         self.check_occupancy()?;
         self.check_cameras()?;

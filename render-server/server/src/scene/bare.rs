@@ -55,13 +55,15 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         body_radius_m: BODY_RADIUS_M,
         takeoff_height_m: TAKEOFF_HEIGHT_M,
         time_limit_s: 0.0,
+        ground_truth: true,
+        attitude_rate: false,
         spawn: Spawn { position_m: spawn, yaw_deg: yaw_rad.to_degrees().round() },
         goal: None,
         geofence: Geofence {
             min_m: DVec3::new(min_m.x, min_m.y, -0.5),
             max_m: DVec3::new(max_m.x, max_m.y, max_m.z.max(TAKEOFF_HEIGHT_M + 1.0)),
         },
-        limits: Limits { max_speed_mps: 2.0, max_acceleration_mps2: 4.0 },
+        limits: Limits::new(2.0, 4.0),
         occupancy: Occupancy::default(),
         vehicles: Vec::new(),
         cameras: vec![CameraConfig::ahead(

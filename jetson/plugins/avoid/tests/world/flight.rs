@@ -8,7 +8,7 @@ use vizflyt_sdk::protocol::geometry::{body_from_forward_cam, wrap_pi};
 use vizflyt_sdk::protocol::messages::bounded;
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, CameraInfo, HostTime, ImageStamps, Intrinsics, Limits, ObservationBuffer,
-    Pose, Setpoint, Vehicle, Volume, YawTarget,
+    Pose, Setpoint, Vehicle, Volume, World, YawTarget,
 };
 
 use super::camera::{self, Faults};
@@ -93,12 +93,14 @@ pub(crate) fn arena() -> ArenaInfo {
             half_m: DVec3::new(21.5, 7.0, 2.25),
             rotation: DQuat::IDENTITY,
         },
-        limits: Limits { max_speed_mps: 6.0, max_acceleration_mps2: 8.0 },
+        limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         goal_m: Some(GOAL_M),
         goal_radius_m: 1.0,
         time_limit_s: 60.0,
+        ground_truth: true,
+        attitude_rate: false,
         cameras: [small_camera()].into_iter().collect(),
     }
 }
@@ -145,7 +147,7 @@ pub(crate) fn fly(
             let stamps = ImageStamps { seq: tick, pose: pictured.stamp, ready: body.stamp };
             let front = &arena.cameras[0];
             buffer.set_image(0, stamps, |planes| {
-                let world_from_cam = pictured.vehicle().world_from_body * front.body_from_cam;
+                let world_from_cam = pictured.world_from_body() * front.body_from_cam;
                 camera::render(
                     volumes,
                     &front.intrinsics,
@@ -156,7 +158,7 @@ pub(crate) fn fly(
                 );
             });
             if let Some(answer) = plugin.on_image(&buffer.observation()) {
-                assert!(answer.is_finite(), "{answer:?}");
+                assert_eq!(answer.check(), Ok(()), "{answer:?}");
                 pending.push_back((now_s + conditions.setpoint_delay_s, answer));
             }
         }
@@ -221,13 +223,17 @@ impl Body {
         DQuat::from_mat3(&DMat3::from_cols(left.cross(up), left, up))
     }
 
+    fn world_from_body(&self) -> Pose<World, vizflyt_sdk::Body> {
+        Pose::new(self.p_m, self.attitude())
+    }
+
     pub(crate) fn vehicle(&self) -> Vehicle {
         Vehicle {
             stamp: self.stamp,
-            world_from_body: Pose::new(self.p_m, self.attitude()),
-            v_world_mps: self.v_mps,
+            attitude: self.attitude(),
             omega_body_radps: self.omega_body_radps,
-            battery_fraction: None,
+            world_from_body: Some(self.world_from_body()),
+            v_world_mps: Some(self.v_mps),
         }
     }
 
