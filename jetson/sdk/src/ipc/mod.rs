@@ -12,6 +12,7 @@
 //! The runtime creates the services under a prefix of its own and hands it to the plugin as
 //! `--vizflyt-service PREFIX`, so that two flights on one computer never meet.
 
+mod offer;
 mod plugin;
 mod runtime;
 #[cfg(test)]
@@ -22,7 +23,7 @@ use std::time::Duration;
 
 use iceoryx2::node::Node;
 use iceoryx2::port::SendError;
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
@@ -35,6 +36,7 @@ use serde::de::DeserializeOwned;
 use vizflyt_protocol::packet::framing::{self, MAX_FRAMED};
 use vizflyt_protocol::packet::{PLANE_ALIGN, PreambleError};
 
+pub use offer::{Offer, offers};
 pub use plugin::{ObservationSample, PluginEnd};
 pub use runtime::{LoanedObservation, RuntimeEnd};
 
@@ -83,15 +85,23 @@ type Ipc = ipc_threadsafe::Service;
 
 /// Messages that wait in a queue at most. A plugin that leaves as many events unread is hung.
 const QUEUE_DEPTH: usize = 128;
+/// Observations that a plugin may borrow at once: the one of the call, one that it keeps from call to
+/// call, and room to receive a third.
+pub const BORROWED_OBSERVATIONS: usize = 3;
 /// Attribute of the observation service that carries the protocol version.
 const PROTOCOL_KEY: &str = "vizflyt_protocol";
+
+/// Returns the folder of this user's runtimes and plugins.
+fn user_folder() -> String {
+    format!("/tmp/vizflyt-{}/", nix::unistd::geteuid())
+}
 
 /// Files of iceoryx2 live under a folder and a prefix of the user's own, so that users never trip
 /// over each other's permissions. All flights of one user share them, so that the next one
 /// reclaims what a killed one left behind.
 fn config() -> Result<Config, IpcError> {
     let mut config = Config::default();
-    let root = format!("/tmp/vizflyt-{}/", nix::unistd::geteuid());
+    let root = user_folder();
     let root = Path::new(root.as_bytes()).map_err(IpcError::transport("naming its folder"))?;
     config.global.set_root_path(&root);
     let prefix = format!("vizflyt{}_", nix::unistd::geteuid());
@@ -154,6 +164,10 @@ fn receive<M: DeserializeOwned>(queue: &Subscriber<Ipc, [u8], ()>) -> Result<Opt
 /// Waits until the other side notifies, `timeout` at most; returns whether it did. Notifications
 /// that came before count, so none is missed between looking and waiting.
 fn wait(listener: &Listener<Ipc>, timeout: Duration) -> Result<bool, IpcError> {
-    let woken = listener.timed_wait(|_| (), timeout);
-    Ok(woken.map_err(IpcError::transport("waiting"))? > 0)
+    match listener.timed_wait(|_| (), timeout) {
+        Ok(woken) => Ok(woken > 0),
+        // A signal, as Ctrl-C, is for whoever handles it.
+        Err(ListenerWaitError::InterruptSignal) => Ok(false),
+        Err(error) => Err(IpcError::transport("waiting")(error)),
+    }
 }

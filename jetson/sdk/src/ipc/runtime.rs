@@ -15,7 +15,10 @@ use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
 use vizflyt_protocol::packet::framing::MAX_FRAMED;
 
-use super::{Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive, send, slices, wait};
+use super::{
+    BORROWED_OBSERVATIONS, Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive, send,
+    slices, wait,
+};
 
 /// The runtime's end of the shared memory. All calls return at once, but for [`Self::wait`]; a
 /// plugin that hangs never blocks them.
@@ -62,7 +65,7 @@ impl RuntimeEnd {
         let observations = slices(&node, prefix, "observation")?
             .enable_safe_overflow(true)
             .subscriber_max_buffer_size(1)
-            .subscriber_max_borrowed_samples(2)
+            .subscriber_max_borrowed_samples(BORROWED_OBSERVATIONS)
             .history_size(0)
             .max_publishers(1)
             .max_subscribers(2)

@@ -1,0 +1,63 @@
+"""Write a drone's autonomy in Python; fly it in a photorealistic world.
+
+A plugin is a class with one method that matters::
+
+    import vizflyt
+
+    class Creep(vizflyt.Plugin):
+        def on_image(self, obs):
+            front = obs.camera("front")
+            if front is None:                                # no image yet
+                return None
+            ahead_m = front.depth_m(front.width_px // 2, front.height_px // 2) or 9.0
+            return vizflyt.Setpoint.velocity([min(max(ahead_m - 2.0, 0.0), 1.0), 0, 0], axes="heading")
+
+    if __name__ == "__main__":
+        vizflyt.run(Creep)
+
+Frames: ``world`` is x east, y north, z up; ``body`` is x forward, y left, z up; ``cam`` is x right,
+y down, z forward. Units are SI, and names end in them: ``_m _mps _rad _radps _ns _px``. Times are
+nanoseconds of ``time.monotonic_ns()``. Rotations are quaternions xyzw.
+
+Images are read-only numpy arrays that lie in shared memory: nothing is copied. To draw into one, or
+to keep it for long, take a ``.copy()``.
+"""
+
+from ._plugin import Plugin
+from ._run import HeldImagesWarning, run
+from ._vizflyt import (
+    ArenaInfo,
+    CameraImage,
+    CameraInfo,
+    Event,
+    Intrinsics,
+    Limits,
+    Observation,
+    ObservationBuffer,
+    Pose,
+    Rehearsal,
+    Setpoint,
+    Vehicle,
+    Volume,
+    __version__,
+)
+
+__all__ = [
+    "ArenaInfo",
+    "CameraImage",
+    "CameraInfo",
+    "Event",
+    "HeldImagesWarning",
+    "Intrinsics",
+    "Limits",
+    "Observation",
+    "ObservationBuffer",
+    "Plugin",
+    "Pose",
+    "Rehearsal",
+    "Setpoint",
+    "Vehicle",
+    "Volume",
+    "__version__",
+    "run",
+]

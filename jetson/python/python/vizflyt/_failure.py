@@ -1,0 +1,66 @@
+"""What went wrong in a plugin, in one sentence that begins with the student's own line."""
+
+from __future__ import annotations
+
+import linecache
+import os
+import sysconfig
+from types import TracebackType
+
+_OURS = os.path.dirname(os.path.abspath(__file__))
+# Where other people's code lives.
+_LIBRARIES = tuple(
+    os.path.abspath(path) + os.sep
+    for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    if (path := sysconfig.get_path(name))
+)
+
+
+def sentence(error: BaseException, method: str) -> str:
+    """Returns the sentence for the runtime: place, what, and the line itself.
+
+    ``my_plugin.py:12 in on_image: ZeroDivisionError: division by zero (speed = 1 / x)``
+    """
+    if isinstance(error, KeyboardInterrupt):
+        return "the plugin was interrupted (Ctrl-C)"
+    what = type(error).__name__
+    said = " ".join(str(error).split())
+    if isinstance(error, SystemExit):
+        what, said = "the plugin called exit", f"status {error.code or 0}"
+    if isinstance(error, SyntaxError) and error.filename:
+        # Its own place says more than the import that met it.
+        return f"{os.path.basename(error.filename)}:{error.lineno}: {what}: {error.msg}"
+    told = f"{what}: {said}" if said else what
+    own = _own_line(error.__traceback__)
+    if own is None:
+        return f"in {method}: {told}"
+    path, line, function = own
+    source = linecache.getline(path, line).strip()
+    inside = function if function == method else f"{function}, called from {method}"
+    return f"{os.path.basename(path)}:{line} in {inside}: {told}" + (f" ({source})" if source else "")
+
+
+def without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
+    """Returns the traceback from the student's first line on."""
+    at = traceback
+    while at is not None and _path(at).startswith(_OURS + os.sep):
+        at = at.tb_next
+    # Where there is nothing but ours, ours says what there is to say.
+    return at or traceback
+
+
+def _own_line(traceback: TracebackType | None) -> tuple[str, int, str] | None:
+    """Returns file, line and function of the innermost frame that is the student's."""
+    own = None
+    while traceback is not None:
+        path = _path(traceback)
+        if not path.startswith((_OURS + os.sep, "<frozen", *_LIBRARIES)):
+            own = (path, traceback.tb_lineno, traceback.tb_frame.f_code.co_name)
+        traceback = traceback.tb_next
+    return own
+
+
+def _path(traceback: TracebackType) -> str:
+    name = traceback.tb_frame.f_code.co_filename
+    # `<stdin>` and a notebook's cell are no files.
+    return name if name.startswith("<") else os.path.abspath(name)

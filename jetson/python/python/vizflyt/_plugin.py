@@ -1,0 +1,39 @@
+"""The one class a plugin derives from."""
+
+from __future__ import annotations
+
+from ._vizflyt import ArenaInfo, Event, Observation, Setpoint
+
+
+class Plugin:
+    """A plugin: it sees images and says where to fly.
+
+    All methods are called from one thread, one at a time, in this order: ``on_start`` once, then
+    ``on_image`` and ``on_event`` as they come, then ``on_stop`` once.
+
+    The runtime's guard has the last word: it limits speed and acceleration, keeps the vehicle in the
+    geofence, refuses numbers that are not finite, and holds (after 0.5 s) and lands (after 2 s) if no
+    setpoint comes.
+    """
+
+    def on_start(self, info: ArenaInfo) -> None:
+        """Called once before the first image and before take-off, with what there is to know of the
+        arena: goal, cameras, limits. Load models here; the vehicle waits on the ground.
+        """
+
+    def on_image(self, obs: Observation) -> Setpoint | None:
+        """Called with the newest image; those that came during the last call are skipped.
+
+        Returns where to fly. ``None`` leaves the former setpoint in force until its deadline, so a
+        plugin that always returns ``None`` holds and then lands. Images come from before take-off
+        on; answers count once the vehicle has reached its take-off height.
+        """
+        raise NotImplementedError
+
+    def on_event(self, event: Event) -> None:
+        """Called between images when something happened: a stage passed, a collision, a new phase of
+        flight.
+        """
+
+    def on_stop(self) -> None:
+        """Called once at the end of the flight. ``run`` returns afterwards."""

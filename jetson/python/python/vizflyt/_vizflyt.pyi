@@ -1,0 +1,555 @@
+# Signatures are written here by hand; docstrings are copied from the compiled module by
+# tests/python/stub.py --write.
+from __future__ import annotations
+from collections.abc import Sequence
+from typing import Any, Final, Literal, SupportsFloat, final
+import numpy as np
+import numpy.typing as npt
+
+__version__: Final[str]
+PROTOCOL_VERSION: Final[int]
+_Frame = Literal["world", "body", "cam"]
+_Axes = Literal["world", "heading"]
+_Vector = npt.ArrayLike
+_F64 = npt.NDArray[np.float64]
+
+@final
+class ArenaInfo:
+    """What a plugin must know of the arena it flies in.
+
+    `ArenaInfo(goal_m=[5, 0, 1], ...)` makes one, for tests; every keyword has a default.
+    """
+
+    def __new__(
+        cls,
+        *,
+        name: str = "test",
+        geofence: Volume | None = None,
+        limits: Limits | None = None,
+        body_radius_m: float = 0.12,
+        takeoff_height_m: float = 1.0,
+        goal_m: _Vector | None = None,
+        goal_radius_m: float = 1.0,
+        time_limit_s: float = 0.0,
+        cameras: Sequence[CameraInfo] = ...,
+    ) -> ArenaInfo: ...
+    @property
+    def name(self) -> str:
+        """The arena's name."""
+
+    @property
+    def geofence(self) -> Volume:
+        """Keep-in volume of the body's surface. [world]"""
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of motion."""
+
+    @property
+    def body_radius_m(self) -> float:
+        """Radius of the sphere that encloses the vehicle. [m]"""
+
+    @property
+    def takeoff_height_m(self) -> float:
+        """Height above the start to which the runtime climbs before the plugin flies. [m]"""
+
+    @property
+    def goal_m(self) -> _F64 | None:
+        """Where the flight shall end: shape (3,), float64; None if the course has no goal. [m, world]"""
+
+    @property
+    def goal_radius_m(self) -> float:
+        """How near counts as reached. [m]"""
+
+    @property
+    def time_limit_s(self) -> float:
+        """From take-off; 0 is none. [s]"""
+
+    @property
+    def cameras(self) -> list[CameraInfo]:
+        """The vehicle's cameras."""
+
+@final
+class CameraInfo:
+    """One camera of the vehicle.
+
+    `CameraInfo(name, intrinsics, body_from_cam=None)` makes one, for tests; without a mounting it looks
+    along the nose.
+    """
+
+    def __new__(
+        cls, name: str, intrinsics: Intrinsics, body_from_cam: Pose | None = None
+    ) -> CameraInfo: ...
+    @property
+    def name(self) -> str:
+        """What `obs.camera(name)` calls it."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Size, focal lengths, principal point, lens."""
+
+    @property
+    def body_from_cam(self) -> Pose:
+        """How it is mounted."""
+
+@final
+class Limits:
+    """Limits that the guard enforces whatever a plugin asks."""
+
+    def __new__(cls, *, max_speed_mps: float, max_acceleration_mps2: float) -> Limits: ...
+    @property
+    def max_speed_mps(self) -> float:
+        """Greatest speed. [m/s]"""
+
+    @property
+    def max_acceleration_mps2(self) -> float:
+        """Greatest acceleration; also what the guard counts on for stopping. [m/s^2]"""
+
+@final
+class Observation:
+    """The vehicle and its cameras' images at one moment.
+
+    Images lie in shared memory and are not copied. Those you keep beyond `on_image` stay as they are; keep
+    more than the newest two and later ones are copied, with a warning.
+    """
+
+    @property
+    def seq(self) -> int:
+        """The observation's number in this flight; numbers missing were skipped."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the newest image's pose was measured. [ns, `time.monotonic_ns()`]"""
+
+    def camera(self, name: str) -> CameraImage | None:
+        """Returns the image of the camera of this name; None if it has none yet.
+
+        Raises LookupError if the vehicle has no such camera.
+        """
+
+    @property
+    def cameras(self) -> list[CameraImage]:
+        """The images there are, in the order of the arena's cameras."""
+
+    @property
+    def vehicle(self) -> Vehicle | None:
+        """What is known of the vehicle; None before anything is."""
+
+    @property
+    def battery(self) -> float | None:
+        """Battery left, 0 to 1; None if unknown."""
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether the images are copies, because the plugin keeps too many earlier ones."""
+
+@final
+class CameraImage:
+    """One camera's RGB-D image. Row 0 is the top; index arrays as [y, x]."""
+
+    @property
+    def name(self) -> str:
+        """The camera's name in `arena.toml`: 'front'."""
+
+    @property
+    def seq(self) -> int:
+        """Tick of the server that made the image; equal for all cameras of a tick."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the pose that the image shows was measured. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def ready_ns(self) -> int:
+        """When the runtime had the decoded image. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def width_px(self) -> int:
+        """Width. [px]"""
+
+    @property
+    def height_px(self) -> int:
+        """Height. [px]"""
+
+    @property
+    def rgb(self) -> npt.NDArray[np.uint8]:
+        """Colour: a read-only view of shape (H, W, 3), uint8, sRGB, in the order red, green, blue.
+
+        OpenCV shows it right after `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
+        """
+
+    @property
+    def depth(self) -> npt.NDArray[np.float32]:
+        """Depth along the optical axis: read-only, shape (H, W), float32; 0 is no return. [m, cam]
+
+        Converted from `depth_mm` when asked for the first time (0.1 ms at 640x480).
+        """
+
+    @property
+    def depth_mm(self) -> npt.NDArray[np.uint16]:
+        """Depth along the optical axis: a read-only view of shape (H, W), uint16; 0 is no return. [mm, cam]"""
+
+    def depth_m(self, x_px: int, y_px: int) -> float | None:
+        """Returns the depth at column x, row y; None where there is no return. [m, cam]
+
+        Raises IndexError outside the image.
+        """
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Size, focal lengths, principal point, lens."""
+
+    @property
+    def body_from_cam(self) -> Pose:
+        """How the camera is mounted."""
+
+@final
+class Vehicle:
+    """What is known of the vehicle.
+
+    `Vehicle(world_from_body, v_world_mps, omega_body_radps, stamp_ns=0, ...)` makes one, for tests.
+    """
+
+    def __new__(
+        cls,
+        world_from_body: Pose,
+        v_world_mps: _Vector | None = None,
+        omega_body_radps: _Vector | None = None,
+        *,
+        stamp_ns: int = 0,
+        battery_fraction: float | None = None,
+    ) -> Vehicle: ...
+    @property
+    def stamp_ns(self) -> int:
+        """When this was true. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def world_from_body(self) -> Pose:
+        """Position and attitude. [m, world]"""
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading: angle of the nose from world x, counter-clockwise. [rad, world]"""
+
+    @property
+    def p_world_m(self) -> _F64:
+        """Position: shape (3,), float64. [m, world]"""
+
+    @property
+    def v_world_mps(self) -> _F64:
+        """Velocity: shape (3,), float64. [m/s, world]"""
+
+    @property
+    def omega_body_radps(self) -> _F64:
+        """Angular velocity: shape (3,), float64. [rad/s, body]"""
+
+    @property
+    def battery_fraction(self) -> float | None:
+        """Battery left, 0 to 1; None if unknown."""
+
+@final
+class Setpoint:
+    """What a plugin asks of the vehicle; the newest one holds until the guard's deadline of 0.5 s.
+
+    `yaw` is where the nose shall point: an angle from world x, counter-clockwise [rad]. `yaw_rate` is how
+    fast it shall turn, counter-clockwise [rad/s]. Without either the heading stays.
+
+    `axes` are those in which a vector is given: 'world' (x east, y north, z up) or 'heading' (x along the
+    nose, y left, z up, levelled: ahead never means into the floor).
+    """
+
+    @property
+    def kind(self) -> str:
+        """What it asks for: 'hold', 'velocity', ..."""
+
+    @staticmethod
+    def hold() -> Setpoint:
+        """Stop and stay."""
+
+    @staticmethod
+    def land() -> Setpoint:
+        """Come down here and disarm."""
+
+    @staticmethod
+    def position(
+        p_world_m: _Vector,
+        *,
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Fly to a point (3,) and stay. [m, world]"""
+
+    @staticmethod
+    def velocity(
+        v_mps: _Vector,
+        *,
+        axes: _Axes = "world",
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Fly at a velocity (3,). [m/s, axes]"""
+
+    @staticmethod
+    def acceleration(
+        a_mps2: _Vector,
+        *,
+        axes: _Axes = "world",
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Accelerate (3,), gravity already compensated: zero keeps the velocity. [m/s^2, axes]"""
+
+@final
+class Event:
+    """One occurrence of the flight.
+
+    `Event(kind, text, stamp_ns=0, **details)` makes one, for tests.
+    """
+
+    def __new__(cls, kind: str, text: str = "", *, stamp_ns: int = 0, **details: Any) -> Event: ...
+    @property
+    def kind(self) -> str:
+        """What happened: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
+        'emergency_stop', 'phase', 'plugin_failed' or 'note'.
+        """
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """What belongs to the kind, by name: `{'seconds': 12.4}` of 'finished', `{'phase': 'flying'}` of 'phase',
+        `{'index': 0, 'name': 'gate'}` of 'stage', `{'p_world_m': [...], 'clearance_m': ...}` of 'collision'.
+        """
+
+    @property
+    def text(self) -> str:
+        """One sentence for a person."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When, on the server's clock. [ns]"""
+
+@final
+class Pose:
+    """A rigid transform that knows its two frames: `world_from_body` takes body coordinates to world
+    coordinates, and is the pose of the body in the world.
+
+    Frames are 'world' (x east, y north, z up), 'body' (x forward, y left, z up) and 'cam' (x right,
+    y down, z forward). Composing is `@`, and works only where the frames meet:
+    `world_from_body @ body_from_cam`.
+
+    `Pose(into, from_, translation_m, rotation_xyzw)` makes one, for tests.
+    """
+
+    def __new__(
+        cls,
+        into: _Frame,
+        from_: _Frame,
+        translation_m: _Vector,
+        rotation_xyzw: _Vector | None = None,
+    ) -> Pose: ...
+    @property
+    def translation_m(self) -> _F64:
+        """Origin of the right frame in the left one: shape (3,), float64. [m]"""
+
+    @property
+    def rotation_xyzw(self) -> _F64:
+        """Unit quaternion x, y, z, w: shape (4,), float64."""
+
+    @property
+    def rotation_matrix(self) -> _F64:
+        """Rotation as a matrix: shape (3, 3), float64."""
+
+    @property
+    def matrix(self) -> _F64:
+        """The whole transform as a homogeneous matrix: shape (4, 4), float64."""
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading: angle of the right frame's x axis about z, from x, counter-clockwise. [rad]"""
+
+    def inverse(self) -> Pose:
+        """Returns the transform the other way round."""
+
+    def transform_point(self, points_m: npt.ArrayLike) -> _F64:
+        """Takes a point (3,) or points (N, 3) from the right frame to the left one. [m]"""
+
+    def rotate(self, vectors: npt.ArrayLike) -> _F64:
+        """Takes a direction or velocity (3,), or many (N, 3), from the right frame to the left one."""
+
+    def __matmul__(self, other: Pose) -> Pose: ...
+
+@final
+class Intrinsics:
+    """Size, focal lengths, principal point and lens of a camera.
+
+    Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, its centre is (0.5, 0.5).
+    """
+
+    def __new__(
+        cls, width_px: int, height_px: int, fx_px: float, fy_px: float, cx_px: float, cy_px: float
+    ) -> Intrinsics: ...
+    @staticmethod
+    def from_horizontal_fov(width_px: int, height_px: int, fov_rad: float) -> Intrinsics:
+        """Makes a camera with square pixels, a centred principal point and this field of view. [px, rad]"""
+
+    @property
+    def width_px(self) -> int:
+        """Image width. [px]"""
+
+    @property
+    def height_px(self) -> int:
+        """Image height. [px]"""
+
+    @property
+    def fx_px(self) -> float:
+        """Focal length along x. [px]"""
+
+    @property
+    def fy_px(self) -> float:
+        """Focal length along y. [px]"""
+
+    @property
+    def cx_px(self) -> float:
+        """Principal point, x; the image's centre is `width_px / 2`. [px]"""
+
+    @property
+    def cy_px(self) -> float:
+        """Principal point, y. [px]"""
+
+    @property
+    def distortion_model(self) -> Literal["none", "brown_conrady", "kannala_brandt"]:
+        """The lens: 'none', 'brown_conrady' (OpenCV's usual model) or 'kannala_brandt' (its fisheye)."""
+
+    @property
+    def distortion(self) -> _F64:
+        """The lens's coefficients in OpenCV's order: shape (0,), (5,) or (4,), float64."""
+
+    @property
+    def matrix(self) -> _F64:
+        """The camera matrix: shape (3, 3), float64. [px]"""
+
+    @property
+    def opencv_matrix(self) -> _F64:
+        """The camera matrix for OpenCV, whose (0, 0) is the centre of the top-left pixel: half a pixel less.
+        Shape (3, 3), float64. [px]
+        """
+
+    def project(self, p_cam_m: npt.ArrayLike) -> _F64:
+        """Returns where a point (3,) [m, cam] lies in the image: shape (2,) [px]; of points (N, 3), shape (N, 2).
+        NaN for what lies behind the camera or out of the lens's reach.
+        """
+
+@final
+class Volume:
+    """A solid in the world frame: sphere, box, capsule or half space."""
+
+    @staticmethod
+    def sphere(center_m: _Vector, radius_m: float) -> Volume:
+        """Makes a sphere. [m, world]"""
+
+    @staticmethod
+    def aabb(min_m: _Vector, max_m: _Vector) -> Volume:
+        """Makes a box from two opposite corners, its sides along the axes. [m, world]"""
+
+    def signed_distance_m(self, p_world_m: npt.ArrayLike) -> Any:
+        """Returns how far a point (3,), or each of points (N, 3), is from the surface: negative inside.
+        A float or shape (N,), float64. [m, world]
+        """
+
+@final
+class ObservationBuffer:
+    """Observations made by hand: for a plugin's own tests and for notebooks.
+
+    `ObservationBuffer([CameraInfo(...)])` has planes for these cameras.
+    """
+
+    def __new__(cls, cameras: Sequence[CameraInfo]) -> ObservationBuffer: ...
+    def clear(self, seq: int = 0) -> None:
+        """Empties it and numbers it."""
+
+    def set_vehicle(self, vehicle: Vehicle) -> None:
+        """Fills in what is known of the vehicle."""
+
+    def set_image(
+        self,
+        name: str,
+        rgb: npt.NDArray[np.uint8] | None = None,
+        depth_mm: npt.NDArray[np.uint16] | None = None,
+        *,
+        seq: int = 0,
+        stamp_ns: int = 0,
+        ready_ns: int | None = None,
+    ) -> None:
+        """Fills in a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16; black and without
+        returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
+        """
+
+    def observation(self) -> Observation:
+        """Returns what a plugin would see."""
+
+@final
+class Rehearsal:
+    """A runtime without a flight: plays the runtime's part for a plugin that runs on another thread, or in
+    another process, attached to `service`. With `waiting`, `vizflyt.run` finds it by itself.
+    """
+
+    def __new__(cls, cameras: Sequence[CameraInfo], *, waiting: bool = False) -> Rehearsal: ...
+    @property
+    def service(self) -> str:
+        """What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`."""
+
+    @property
+    def is_attached(self) -> bool:
+        """Whether a plugin has attached: from then on messages reach it."""
+
+    def start(self, info: ArenaInfo) -> None:
+        """Tells the plugin what it flies in."""
+
+    def note(self, text: str) -> None:
+        """Tells it an event of kind 'note'."""
+
+    def finish(self, seconds: float) -> None:
+        """Tells it that the goal was reached after so many seconds."""
+
+    def stop(self) -> None:
+        """Tells it to end."""
+
+    def heartbeat(self) -> None:
+        """Shows it that the runtime lives; `receive` does so too. At least twice a second."""
+
+    def publish(self, buffer: ObservationBuffer) -> None:
+        """Hands it the buffer's images, through shared memory."""
+
+    def receive(
+        self, timeout_s: float = 10.0
+    ) -> tuple[Literal["ready", "answer", "failed"], int, Any, int] | None:
+        """Waits for what the plugin says: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
+        ('failed', 0, reason, 0); None if it says nothing for so long. [s]
+        """
+
+@final
+class PluginEnd:
+    """Not for plugins: what `vizflyt.run` is made of."""
+
+    def __new__(cls, service: str) -> PluginEnd: ...
+    def wait(self, timeout_s: float) -> bool:
+        """Waits until the runtime notifies, `timeout_s` at most; returns whether it did."""
+
+    def receive(self) -> tuple[Literal["start", "event", "stop"], Any] | None:
+        """Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
+        or None if there is none.
+        """
+
+    def observation(self) -> Observation | None:
+        """Returns the newest observation, if there is one not taken yet."""
+
+    def ready(self, name: str) -> None:
+        """Tells that `on_start` has returned."""
+
+    def answer(self, seq: int, entered_ns: int, setpoint: Setpoint | None) -> None:
+        """Sends the answer to one observation."""
+
+    def failed(self, reason: str) -> None:
+        """Tells that the plugin gives up, and why; leaves the runtime a moment to read it."""
+
+def waiting_services() -> list[str]:
+    """Returns the services of this user's runtimes that wait for a plugin, the longest waiting first."""

@@ -1,0 +1,198 @@
+//! What a plugin flies in.
+
+use numpy::PyArray1;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
+use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, bounded};
+use vizflyt_sdk::{ArenaInfo as SdkArenaInfo, CameraInfo as SdkCameraInfo, Limits as SdkLimits};
+use vizflyt_sdk::{Body, Cam};
+
+use crate::arguments::{array3, vector};
+use crate::geometry::{Intrinsics, Pose, Volume};
+
+/// One camera of the vehicle.
+///
+/// `CameraInfo(name, intrinsics, body_from_cam=None)` makes one, for tests; without a mounting it looks
+/// along the nose.
+#[pyclass(frozen, module = "vizflyt", from_py_object)]
+#[derive(Clone, PartialEq)]
+pub(crate) struct CameraInfo(pub(crate) SdkCameraInfo);
+
+#[pymethods]
+impl CameraInfo {
+    #[new]
+    #[pyo3(signature = (name, intrinsics, body_from_cam = None))]
+    fn make(name: &str, intrinsics: Intrinsics, body_from_cam: Option<Pose>) -> PyResult<Self> {
+        let body_from_cam = match body_from_cam {
+            Some(pose) => pose.typed::<Body, Cam>("body", "cam")?,
+            None => body_from_forward_cam(DVec3::ZERO, 0.0),
+        };
+        Ok(Self(SdkCameraInfo { name: bounded(name), intrinsics: intrinsics.0, body_from_cam }))
+    }
+
+    /// What `obs.camera(name)` calls it.
+    #[getter]
+    fn name(&self) -> &str {
+        &self.0.name
+    }
+
+    /// Size, focal lengths, principal point, lens.
+    #[getter]
+    fn intrinsics(&self) -> Intrinsics {
+        Intrinsics(self.0.intrinsics)
+    }
+
+    /// How it is mounted.
+    #[getter]
+    fn body_from_cam(&self) -> Pose {
+        Pose::new("body", "cam", &self.0.body_from_cam)
+    }
+
+    fn __repr__(&self) -> String {
+        let k = &self.0.intrinsics;
+        format!("CameraInfo({:?}, {}x{} px)", self.0.name.as_str(), k.width_px, k.height_px)
+    }
+}
+
+/// Limits that the guard enforces whatever a plugin asks.
+#[pyclass(frozen, module = "vizflyt", from_py_object)]
+#[derive(Clone, PartialEq)]
+pub(crate) struct Limits(SdkLimits);
+
+#[pymethods]
+impl Limits {
+    #[new]
+    #[pyo3(signature = (*, max_speed_mps, max_acceleration_mps2))]
+    fn make(max_speed_mps: f64, max_acceleration_mps2: f64) -> Self {
+        Self(SdkLimits { max_speed_mps, max_acceleration_mps2 })
+    }
+
+    /// Greatest speed. [m/s]
+    #[getter]
+    fn max_speed_mps(&self) -> f64 {
+        self.0.max_speed_mps
+    }
+
+    /// Greatest acceleration; also what the guard counts on for stopping. [m/s^2]
+    #[getter]
+    fn max_acceleration_mps2(&self) -> f64 {
+        self.0.max_acceleration_mps2
+    }
+
+    fn __repr__(&self) -> String {
+        format!("{:?}", self.0)
+    }
+}
+
+/// What a plugin must know of the arena it flies in.
+///
+/// `ArenaInfo(goal_m=[5, 0, 1], ...)` makes one, for tests; every keyword has a default.
+#[pyclass(frozen, module = "vizflyt")]
+#[derive(Clone, PartialEq)]
+pub(crate) struct ArenaInfo(pub(crate) SdkArenaInfo);
+
+#[pymethods]
+impl ArenaInfo {
+    #[new]
+    #[pyo3(signature = (
+        *, name = "test", geofence = None, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
+        goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, cameras = Vec::new()
+    ))]
+    #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
+    fn make(
+        name: &str,
+        geofence: Option<Volume>,
+        limits: Option<Limits>,
+        body_radius_m: f64,
+        takeoff_height_m: f64,
+        goal_m: Option<&Bound<'_, PyAny>>,
+        goal_radius_m: f64,
+        time_limit_s: f64,
+        cameras: Vec<CameraInfo>,
+    ) -> PyResult<Self> {
+        if cameras.len() > MAX_CAMERAS {
+            return Err(PyValueError::new_err(format!(
+                "a vehicle has at most {MAX_CAMERAS} cameras, not {}",
+                cameras.len()
+            )));
+        }
+        let everywhere = vizflyt_sdk::Volume::Sphere { center_m: DVec3::ZERO, radius_m: 1000.0 };
+        let usual = SdkLimits { max_speed_mps: 5.0, max_acceleration_mps2: 5.0 };
+        Ok(Self(SdkArenaInfo {
+            name: bounded(name),
+            geofence: geofence.map_or(everywhere, |volume| volume.0),
+            limits: limits.map_or(usual, |limits| limits.0),
+            body_radius_m,
+            takeoff_height_m,
+            goal_m: goal_m.map(|goal_m| vector(goal_m, "goal_m")).transpose()?,
+            goal_radius_m,
+            time_limit_s,
+            cameras: cameras.into_iter().map(|camera| camera.0).collect(),
+        }))
+    }
+
+    /// The arena's name.
+    #[getter]
+    fn name(&self) -> &str {
+        &self.0.name
+    }
+
+    /// Keep-in volume of the body's surface. [world]
+    #[getter]
+    fn geofence(&self) -> Volume {
+        Volume(self.0.geofence)
+    }
+
+    /// Limits of motion.
+    #[getter]
+    fn limits(&self) -> Limits {
+        Limits(self.0.limits)
+    }
+
+    /// Radius of the sphere that encloses the vehicle. [m]
+    #[getter]
+    fn body_radius_m(&self) -> f64 {
+        self.0.body_radius_m
+    }
+
+    /// Height above the start to which the runtime climbs before the plugin flies. [m]
+    #[getter]
+    fn takeoff_height_m(&self) -> f64 {
+        self.0.takeoff_height_m
+    }
+
+    /// Where the flight shall end: shape (3,), float64; None if the course has no goal. [m, world]
+    #[getter]
+    fn goal_m<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
+        self.0.goal_m.map(|goal_m| array3(py, goal_m))
+    }
+
+    /// How near counts as reached. [m]
+    #[getter]
+    fn goal_radius_m(&self) -> f64 {
+        self.0.goal_radius_m
+    }
+
+    /// From take-off; 0 is none. [s]
+    #[getter]
+    fn time_limit_s(&self) -> f64 {
+        self.0.time_limit_s
+    }
+
+    /// The vehicle's cameras.
+    #[getter]
+    fn cameras(&self) -> Vec<CameraInfo> {
+        self.0.cameras.iter().cloned().map(CameraInfo).collect()
+    }
+
+    fn __repr__(&self) -> String {
+        let cameras: Vec<&str> = self.0.cameras.iter().map(|camera| camera.name.as_str()).collect();
+        format!(
+            "ArenaInfo({:?}, goal_m={:?}, cameras={cameras:?})",
+            self.0.name.as_str(),
+            self.0.goal_m.map(|goal_m| goal_m.to_array())
+        )
+    }
+}

@@ -1,0 +1,126 @@
+//! Observations made by hand: for a plugin's own tests and for notebooks.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use numpy::{PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::exceptions::PyLookupError;
+use pyo3::prelude::*;
+use vizflyt_sdk::protocol::messages::Name;
+use vizflyt_sdk::{
+    CameraInfo as SdkCameraInfo, HostTime, ImageStamps, ObservationBuffer as SdkBuffer,
+};
+
+use crate::arena::CameraInfo;
+use crate::arguments::wrong_type;
+use crate::observation::{Observation, Vehicle};
+use crate::shared_memory::Memory;
+
+/// Observations made by hand: for a plugin's own tests and for notebooks.
+///
+/// `ObservationBuffer([CameraInfo(...)])` has planes for these cameras.
+#[pyclass(frozen, module = "vizflyt")]
+pub(crate) struct ObservationBuffer {
+    cameras: Vec<SdkCameraInfo>,
+    names: Arc<[Name]>,
+    buffer: Mutex<SdkBuffer>,
+}
+
+impl ObservationBuffer {
+    /// Returns the cameras it has planes for.
+    pub(crate) fn cameras(&self) -> &[SdkCameraInfo] {
+        &self.cameras
+    }
+
+    /// Lets `f` read the bytes.
+    pub(crate) fn with_bytes<T>(&self, f: impl FnOnce(&[u8]) -> T) -> T {
+        f(self.buffer.lock().unwrap_or_else(PoisonError::into_inner).as_bytes())
+    }
+}
+
+#[pymethods]
+impl ObservationBuffer {
+    #[new]
+    fn make(cameras: Vec<CameraInfo>) -> Self {
+        let cameras: Vec<_> = cameras.into_iter().map(|camera| camera.0).collect();
+        let names = cameras.iter().map(|camera| camera.name.clone()).collect();
+        let buffer = Mutex::new(SdkBuffer::new(&cameras));
+        Self { cameras, names, buffer }
+    }
+
+    /// Empties it and numbers it.
+    #[pyo3(signature = (seq = 0))]
+    fn clear(&self, seq: u64) {
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).clear(seq);
+    }
+
+    /// Fills in what is known of the vehicle.
+    fn set_vehicle(&self, vehicle: Vehicle) {
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_vehicle(&vehicle.0);
+    }
+
+    /// Fills in a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16; black and without
+    /// returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
+    #[pyo3(signature = (name, rgb = None, depth_mm = None, *, seq = 0, stamp_ns = 0, ready_ns = None))]
+    #[allow(clippy::too_many_arguments)] // Why: keywords, most of them.
+    fn set_image(
+        &self,
+        name: &str,
+        rgb: Option<&Bound<'_, PyAny>>,
+        depth_mm: Option<&Bound<'_, PyAny>>,
+        seq: u64,
+        stamp_ns: u64,
+        ready_ns: Option<u64>,
+    ) -> PyResult<()> {
+        let index = self.cameras.iter().position(|camera| camera.name == name);
+        let index = index.ok_or_else(|| {
+            PyLookupError::new_err(format!("this buffer was made without a camera '{name}'"))
+        })?;
+        let k = &self.cameras[index].intrinsics;
+        let (height, width) = (k.height_px as usize, k.width_px as usize);
+        let rgb = rgb.map(|given| rgb_plane(given, height, width)).transpose()?;
+        let depth = depth_mm.map(|given| depth_plane(given, height, width)).transpose()?;
+        let stamps = ImageStamps {
+            seq,
+            pose: HostTime::from_ns(stamp_ns),
+            ready: HostTime::from_ns(ready_ns.unwrap_or(stamp_ns)),
+        };
+        let mut buffer = self.buffer.lock().unwrap_or_else(PoisonError::into_inner);
+        buffer.set_image(index, stamps, |planes| {
+            match rgb {
+                Some(rgb) => planes.rgb.copy_from_slice(&rgb),
+                None => planes.rgb.fill(0),
+            }
+            match depth {
+                Some(depth) => planes.depth_mm.copy_from_slice(&depth),
+                None => planes.depth_mm.fill(0),
+            }
+        });
+        Ok(())
+    }
+
+    /// Returns what a plugin would see.
+    fn observation(&self, py: Python<'_>) -> PyResult<Observation> {
+        let memory = self.with_bytes(|bytes| Memory::copied(bytes, Arc::clone(&self.names)));
+        Observation::new(py, memory)
+    }
+}
+
+fn rgb_plane(given: &Bound<'_, PyAny>, height: usize, width: usize) -> PyResult<Vec<u8>> {
+    let wanted = format!("a uint8 array of shape ({height}, {width}, 3)");
+    let array: PyReadonlyArray3<'_, u8> =
+        given.extract().map_err(|_| wrong_type(given, "rgb", &wanted))?;
+    if array.shape() != [height, width, 3] {
+        return Err(wrong_type(given, "rgb", &wanted));
+    }
+    Ok(array.as_array().iter().copied().collect())
+}
+
+fn depth_plane(given: &Bound<'_, PyAny>, height: usize, width: usize) -> PyResult<Vec<u16>> {
+    let wanted = format!("a uint16 array of shape ({height}, {width}), in millimetres");
+    let array: PyReadonlyArray2<'_, u16> =
+        given.extract().map_err(|_| wrong_type(given, "depth_mm", &wanted))?;
+    if array.shape() != [height, width] {
+        return Err(wrong_type(given, "depth_mm", &wanted));
+    }
+    Ok(array.as_array().iter().copied().collect())
+}

@@ -1,0 +1,48 @@
+//! The Python face of the SDK: `vizflyt._vizflyt`, which the package `vizflyt` re-exports.
+//!
+//! Conversion only: what a plugin sees and answers is defined by `vizflyt-sdk`, and stays there.
+//! Images are read-only numpy arrays that lie in the runtime's shared memory; see
+//! [`shared_memory`]. The main loop, which calls the student's methods, is Python itself
+//! (`python/vizflyt/_run.py`), so that debuggers and tracebacks see nothing strange.
+
+mod arena;
+mod arguments;
+mod buffer;
+mod event;
+mod geometry;
+mod observation;
+mod plugin_end;
+mod rehearsal;
+mod setpoint;
+mod shared_memory;
+
+use pyo3::prelude::*;
+
+/// Everything of the package `vizflyt` that is compiled.
+#[pymodule]
+mod _vizflyt {
+    #[pymodule_export]
+    use crate::arena::{ArenaInfo, CameraInfo, Limits};
+    #[pymodule_export]
+    use crate::buffer::ObservationBuffer;
+    #[pymodule_export]
+    use crate::event::Event;
+    #[pymodule_export]
+    use crate::geometry::{Intrinsics, Pose, Volume};
+    #[pymodule_export]
+    use crate::observation::{CameraImage, Observation, Vehicle};
+    #[pymodule_export]
+    use crate::plugin_end::{PluginEnd, waiting_services};
+    #[pymodule_export]
+    use crate::rehearsal::Rehearsal;
+    #[pymodule_export]
+    use crate::setpoint::Setpoint;
+
+    use super::{Bound, PyModule, PyModuleMethods, PyResult};
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+        module.add("PROTOCOL_VERSION", vizflyt_sdk::protocol::PROTOCOL_VERSION)
+    }
+}

@@ -1,0 +1,335 @@
+//! What a plugin sees.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
+use pyo3::exceptions::{PyIndexError, PyLookupError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use vizflyt_sdk::{Body, Cam};
+use vizflyt_sdk::{
+    CameraImage as SdkCameraImage, HostTime, Intrinsics as SdkIntrinsics,
+    Observation as SdkObservation, Pose as SdkPose, Vehicle as SdkVehicle,
+};
+
+use vizflyt_sdk::protocol::geometry::yaw_of;
+
+use crate::arguments::{array3, vector};
+use crate::geometry::{Intrinsics, Pose};
+use crate::shared_memory::{Memory, depth_array, rgb_array};
+
+/// The vehicle and its cameras' images at one moment.
+///
+/// Images lie in shared memory and are not copied. Those you keep beyond `on_image` stay as they are; keep
+/// more than the newest two and later ones are copied, with a warning.
+#[pyclass(frozen, module = "vizflyt")]
+pub(crate) struct Observation {
+    memory: Arc<Memory>,
+    /// The observation's number in this flight; numbers missing were skipped.
+    #[pyo3(get)]
+    seq: u64,
+    /// When the newest image's pose was measured. [ns, `time.monotonic_ns()`]
+    #[pyo3(get)]
+    stamp_ns: u64,
+    vehicle: Option<Py<Vehicle>>,
+    images: Vec<Py<CameraImage>>,
+}
+
+/// One camera's RGB-D image. Row 0 is the top; index arrays as [y, x].
+#[pyclass(frozen, module = "vizflyt")]
+pub(crate) struct CameraImage {
+    memory: Arc<Memory>,
+    rgb_at: usize,
+    depth_at: usize,
+    /// The camera's name in `arena.toml`: 'front'.
+    #[pyo3(get)]
+    name: String,
+    /// Tick of the server that made the image; equal for all cameras of a tick.
+    #[pyo3(get)]
+    seq: u64,
+    /// When the pose that the image shows was measured. [ns, `time.monotonic_ns()`]
+    #[pyo3(get)]
+    stamp_ns: u64,
+    /// When the runtime had the decoded image. [ns, `time.monotonic_ns()`]
+    #[pyo3(get)]
+    ready_ns: u64,
+    intrinsics: SdkIntrinsics,
+    body_from_cam: SdkPose<Body, Cam>,
+    /// Made when asked for the first time.
+    depth: PyOnceLock<Py<PyArray2<f32>>>,
+}
+
+/// What is known of the vehicle.
+///
+/// `Vehicle(world_from_body, v_world_mps, omega_body_radps, stamp_ns=0, ...)` makes one, for tests.
+#[pyclass(frozen, module = "vizflyt", from_py_object)]
+#[derive(Clone)]
+pub(crate) struct Vehicle(pub(crate) SdkVehicle);
+
+impl Observation {
+    /// Reads the observation that lies in `memory`.
+    ///
+    /// # Errors
+    /// If there is none in it.
+    pub(crate) fn new(py: Python<'_>, memory: Memory) -> PyResult<Self> {
+        let memory = Arc::new(memory);
+        let seen = SdkObservation::from_bytes(memory.bytes(), &memory.names)
+            .map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let images = seen
+            .cameras()
+            .map(|image| Py::new(py, CameraImage::new(&memory, &image)))
+            .collect::<PyResult<_>>()?;
+        let vehicle = seen.vehicle().map(|vehicle| Py::new(py, Vehicle(vehicle))).transpose()?;
+        let (seq, stamp_ns) = (seen.seq(), seen.stamp().as_ns());
+        Ok(Self { memory, seq, stamp_ns, vehicle, images })
+    }
+}
+
+#[pymethods]
+impl Observation {
+    /// Returns the image of the camera of this name; None if it has none yet.
+    ///
+    /// Raises LookupError if the vehicle has no such camera.
+    fn camera(&self, py: Python<'_>, name: &str) -> PyResult<Option<Py<CameraImage>>> {
+        if let Some(image) = self.images.iter().find(|image| image.get().name == name) {
+            return Ok(Some(image.clone_ref(py)));
+        }
+        if self.memory.names.iter().any(|known| known == name) {
+            return Ok(None);
+        }
+        let known: Vec<String> =
+            self.memory.names.iter().map(|known| format!("'{known}'")).collect();
+        Err(PyLookupError::new_err(format!(
+            "there is no camera '{name}'; this vehicle has {}",
+            if known.is_empty() { "none".to_owned() } else { known.join(", ") }
+        )))
+    }
+
+    /// The images there are, in the order of the arena's cameras.
+    #[getter]
+    fn cameras(&self, py: Python<'_>) -> Vec<Py<CameraImage>> {
+        self.images.iter().map(|image| image.clone_ref(py)).collect()
+    }
+
+    /// What is known of the vehicle; None before anything is.
+    #[getter]
+    fn vehicle(&self, py: Python<'_>) -> Option<Py<Vehicle>> {
+        self.vehicle.as_ref().map(|vehicle| vehicle.clone_ref(py))
+    }
+
+    /// Battery left, 0 to 1; None if unknown.
+    #[getter]
+    fn battery(&self) -> Option<f64> {
+        self.vehicle.as_ref().and_then(|vehicle| vehicle.get().0.battery_fraction)
+    }
+
+    /// Whether the images are copies, because the plugin keeps too many earlier ones.
+    #[getter]
+    fn is_copy(&self) -> bool {
+        self.memory.is_copy()
+    }
+
+    fn __repr__(&self) -> String {
+        let cameras: Vec<&str> =
+            self.images.iter().map(|image| image.get().name.as_str()).collect();
+        let vehicle = if self.vehicle.is_some() { "with" } else { "without" };
+        format!("Observation(seq={}, cameras={cameras:?}, {vehicle} vehicle)", self.seq)
+    }
+}
+
+impl CameraImage {
+    /// Returns the memory that it keeps alive and unchanged.
+    pub(crate) fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    fn new(memory: &Arc<Memory>, image: &SdkCameraImage<'_>) -> Self {
+        let start = memory.bytes().as_ptr() as usize;
+        Self {
+            memory: Arc::clone(memory),
+            rgb_at: image.rgb.as_ptr() as usize - start,
+            depth_at: image.depth_mm.as_ptr() as usize - start,
+            name: image.name.to_owned(),
+            seq: image.seq,
+            stamp_ns: image.stamp.as_ns(),
+            ready_ns: image.ready.as_ns(),
+            intrinsics: image.intrinsics,
+            body_from_cam: image.body_from_cam,
+            depth: PyOnceLock::new(),
+        }
+    }
+
+    fn shape(&self) -> (usize, usize) {
+        (self.intrinsics.height_px as usize, self.intrinsics.width_px as usize)
+    }
+
+    fn depth_plane(&self) -> Range<usize> {
+        self.depth_at..self.depth_at + 2 * self.intrinsics.pixels()
+    }
+}
+
+#[pymethods]
+impl CameraImage {
+    /// Colour: a read-only view of shape (H, W, 3), uint8, sRGB, in the order red, green, blue.
+    ///
+    /// OpenCV shows it right after `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
+    #[getter]
+    fn rgb<'py>(slf: &Bound<'py, Self>) -> Bound<'py, PyArray3<u8>> {
+        let image = slf.get();
+        rgb_array(slf, image.rgb_at, image.shape())
+    }
+
+    /// Depth along the optical axis: a read-only view of shape (H, W), uint16; 0 is no return. [mm, cam]
+    #[getter]
+    fn depth_mm<'py>(slf: &Bound<'py, Self>) -> Bound<'py, PyArray2<u16>> {
+        let image = slf.get();
+        depth_array(slf, image.depth_at, image.shape())
+    }
+
+    /// Depth along the optical axis: read-only, shape (H, W), float32; 0 is no return. [m, cam]
+    ///
+    /// Converted from `depth_mm` when asked for the first time (0.1 ms at 640x480).
+    #[getter]
+    fn depth(&self, py: Python<'_>) -> Py<PyArray2<f32>> {
+        let make = || {
+            let (height, width) = self.shape();
+            let millimetres = &self.memory.bytes()[self.depth_plane()];
+            // Divided, not multiplied by 0.001, so that 2500 mm is 2.5 m to the last bit.
+            let metres: Vec<f32> = millimetres
+                .as_chunks::<2>()
+                .0
+                .iter()
+                .map(|&depth_mm| f32::from(u16::from_ne_bytes(depth_mm)) / 1000.0)
+                .collect();
+            let array = numpy::ndarray::Array2::from_shape_vec((height, width), metres)
+                .expect("one number per pixel");
+            let array = PyArray2::from_owned_array(py, array);
+            array.readwrite().make_nonwriteable();
+            array.unbind()
+        };
+        self.depth.get_or_init(py, make).clone_ref(py)
+    }
+
+    /// Returns the depth at column x, row y; None where there is no return. [m, cam]
+    ///
+    /// Raises IndexError outside the image.
+    fn depth_m(&self, x_px: usize, y_px: usize) -> PyResult<Option<f64>> {
+        let (height, width) = self.shape();
+        if x_px >= width || y_px >= height {
+            return Err(PyIndexError::new_err(format!(
+                "pixel x {x_px}, y {y_px} lies outside the image of {width} x {height} px"
+            )));
+        }
+        let at = self.depth_at + 2 * (y_px * width + x_px);
+        let bytes = &self.memory.bytes()[at..at + 2];
+        let depth_mm = u16::from_ne_bytes([bytes[0], bytes[1]]);
+        Ok((depth_mm > 0).then(|| f64::from(depth_mm) / 1000.0))
+    }
+
+    /// Width. [px]
+    #[getter]
+    fn width_px(&self) -> u32 {
+        self.intrinsics.width_px
+    }
+
+    /// Height. [px]
+    #[getter]
+    fn height_px(&self) -> u32 {
+        self.intrinsics.height_px
+    }
+
+    /// Size, focal lengths, principal point, lens.
+    #[getter]
+    fn intrinsics(&self) -> Intrinsics {
+        Intrinsics(self.intrinsics)
+    }
+
+    /// How the camera is mounted.
+    #[getter]
+    fn body_from_cam(&self) -> Pose {
+        Pose::new("body", "cam", &self.body_from_cam)
+    }
+
+    fn __repr__(&self) -> String {
+        let (height, width) = self.shape();
+        format!("CameraImage({:?}, {width}x{height} px, seq={})", self.name, self.seq)
+    }
+}
+
+#[pymethods]
+impl Vehicle {
+    #[new]
+    #[pyo3(signature = (
+        world_from_body, v_world_mps = None, omega_body_radps = None, *, stamp_ns = 0,
+        battery_fraction = None
+    ))]
+    fn make(
+        world_from_body: Pose,
+        v_world_mps: Option<&Bound<'_, PyAny>>,
+        omega_body_radps: Option<&Bound<'_, PyAny>>,
+        stamp_ns: u64,
+        battery_fraction: Option<f64>,
+    ) -> PyResult<Self> {
+        let or_zero = |value: Option<&Bound<'_, PyAny>>, name| {
+            value.map_or(Ok(vizflyt_sdk::glam::DVec3::ZERO), |value| vector(value, name))
+        };
+        Ok(Self(SdkVehicle {
+            stamp: HostTime::from_ns(stamp_ns),
+            world_from_body: world_from_body.typed("world", "body")?,
+            v_world_mps: or_zero(v_world_mps, "v_world_mps")?,
+            omega_body_radps: or_zero(omega_body_radps, "omega_body_radps")?,
+            battery_fraction,
+        }))
+    }
+
+    /// When this was true. [ns, `time.monotonic_ns()`]
+    #[getter]
+    fn stamp_ns(&self) -> u64 {
+        self.0.stamp.as_ns()
+    }
+
+    /// Position and attitude. [m, world]
+    #[getter]
+    fn world_from_body(&self) -> Pose {
+        Pose::new("world", "body", &self.0.world_from_body)
+    }
+
+    /// Heading: angle of the nose from world x, counter-clockwise. [rad, world]
+    #[getter]
+    fn yaw_rad(&self) -> f64 {
+        yaw_of(self.0.world_from_body.rotation)
+    }
+
+    /// Position: shape (3,), float64. [m, world]
+    #[getter]
+    fn p_world_m<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array3(py, self.0.world_from_body.translation_m)
+    }
+
+    /// Velocity: shape (3,), float64. [m/s, world]
+    #[getter]
+    fn v_world_mps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array3(py, self.0.v_world_mps)
+    }
+
+    /// Angular velocity: shape (3,), float64. [rad/s, body]
+    #[getter]
+    fn omega_body_radps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array3(py, self.0.omega_body_radps)
+    }
+
+    /// Battery left, 0 to 1; None if unknown.
+    #[getter]
+    fn battery_fraction(&self) -> Option<f64> {
+        self.0.battery_fraction
+    }
+
+    fn __repr__(&self) -> String {
+        let (p, v) = (self.0.world_from_body.translation_m, self.0.v_world_mps);
+        format!(
+            "Vehicle(p_world_m=[{:.3}, {:.3}, {:.3}], v_world_mps=[{:.3}, {:.3}, {:.3}])",
+            p.x, p.y, p.z, v.x, v.y, v.z
+        )
+    }
+}

@@ -1,0 +1,120 @@
+//! The plugin's end of the shared memory, as the main loop uses it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
+use pyo3::prelude::*;
+use vizflyt_sdk::HostTime;
+use vizflyt_sdk::host_now;
+use vizflyt_sdk::ipc::{IpcError, PluginEnd as SdkPluginEnd};
+use vizflyt_sdk::protocol::messages::{FromPlugin, Name, ToPlugin, bounded};
+
+use crate::arena::ArenaInfo;
+use crate::event::Event;
+use crate::observation::Observation;
+use crate::setpoint::Setpoint;
+use crate::shared_memory::Lender;
+
+/// Not for plugins: what `vizflyt.run` is made of.
+#[pyclass(frozen, module = "vizflyt._vizflyt")]
+pub(crate) struct PluginEnd {
+    end: SdkPluginEnd,
+    lender: Lender,
+    names: Mutex<Arc<[Name]>>,
+}
+
+/// What a process that ends has not been read by then is lost with its memory. The runtime reads within a
+/// millisecond, on a busy computer within some tens.
+const LAST_WORDS: Duration = Duration::from_millis(200);
+
+#[pymethods]
+impl PluginEnd {
+    /// Attaches to the runtime that made `service`.
+    #[new]
+    fn open(py: Python<'_>, service: &str) -> PyResult<Self> {
+        let end =
+            py.detach(|| SdkPluginEnd::open(service)).map_err(|error| not_attached(&error))?;
+        let names = Mutex::new(Arc::from(Vec::new()));
+        Ok(Self { end, lender: Lender::default(), names })
+    }
+
+    /// Waits until the runtime notifies, `timeout_s` at most; returns whether it did.
+    fn wait(&self, py: Python<'_>, timeout_s: f64) -> PyResult<bool> {
+        let timeout = Duration::try_from_secs_f64(timeout_s).unwrap_or_default();
+        let woken = py.detach(|| self.end.wait(timeout)).map_err(|error| lost(&error))?;
+        py.check_signals()?;
+        Ok(woken)
+    }
+
+    /// Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
+    /// or None if there is none.
+    fn receive(&self, py: Python<'_>) -> PyResult<Option<(&'static str, Py<PyAny>)>> {
+        Ok(match self.end.receive().map_err(|error| lost(&error))? {
+            None => None,
+            Some(ToPlugin::Start(info)) => {
+                *self.names.lock().unwrap_or_else(PoisonError::into_inner) =
+                    info.cameras.iter().map(|camera| camera.name.clone()).collect();
+                Some(("start", Py::new(py, ArenaInfo(info))?.into_any()))
+            }
+            Some(ToPlugin::Event(event)) => {
+                Some(("event", Py::new(py, Event::new(py, &event)?)?.into_any()))
+            }
+            Some(ToPlugin::Stop) => Some(("stop", py.None())),
+        })
+    }
+
+    /// Returns the newest observation, if there is one not taken yet.
+    fn observation(&self, py: Python<'_>) -> PyResult<Option<Observation>> {
+        let Some(sample) = self.end.observation().map_err(|error| lost(&error))? else {
+            return Ok(None);
+        };
+        let names = Arc::clone(&self.names.lock().unwrap_or_else(PoisonError::into_inner));
+        let memory = py.detach(|| self.lender.take(sample, names));
+        // A bad observation is the runtime's bug, and skipped.
+        Ok(Observation::new(py, memory).ok())
+    }
+
+    /// Tells that `on_start` has returned.
+    fn ready(&self, name: &str) -> PyResult<()> {
+        self.send(&FromPlugin::Ready { name: bounded(name) })
+    }
+
+    /// Sends the answer to one observation.
+    #[pyo3(signature = (seq, entered_ns, setpoint))]
+    fn answer(&self, seq: u64, entered_ns: u64, setpoint: Option<Setpoint>) -> PyResult<()> {
+        self.send(&FromPlugin::Answer {
+            seq,
+            entered: HostTime::from_ns(entered_ns),
+            returned: host_now(),
+            setpoint: setpoint.map(|setpoint| setpoint.0),
+        })
+    }
+
+    /// Tells that the plugin gives up, and why; leaves the runtime a moment to read it.
+    fn failed(&self, py: Python<'_>, reason: &str) -> PyResult<()> {
+        self.send(&FromPlugin::Failed { reason: bounded(reason) })?;
+        py.detach(|| std::thread::sleep(LAST_WORDS));
+        Ok(())
+    }
+}
+
+impl PluginEnd {
+    fn send(&self, message: &FromPlugin) -> PyResult<()> {
+        self.end.send(message).map_err(|error| lost(&error))
+    }
+}
+
+fn not_attached(error: &IpcError) -> PyErr {
+    PyConnectionError::new_err(error.to_string())
+}
+
+fn lost(error: &IpcError) -> PyErr {
+    PyRuntimeError::new_err(error.to_string())
+}
+
+/// Returns the services of this user's runtimes that wait for a plugin, the longest waiting first.
+#[pyfunction]
+pub(crate) fn waiting_services() -> Vec<String> {
+    vizflyt_sdk::ipc::offers()
+}

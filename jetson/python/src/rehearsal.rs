@@ -1,0 +1,141 @@
+//! A runtime without a flight: tests and notebooks play its part.
+
+use std::time::Duration;
+
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use vizflyt_sdk::ipc::{IpcError, Offer, RuntimeEnd, unique_service};
+use vizflyt_sdk::protocol::messages::{
+    Event as SdkEvent, EventKind, FromPlugin, ToPlugin, bounded,
+};
+use vizflyt_sdk::protocol::time::ServerTime;
+use vizflyt_sdk::{ObservationWriter, host_now};
+
+use crate::arena::{ArenaInfo, CameraInfo};
+use crate::buffer::ObservationBuffer;
+use crate::setpoint::Setpoint;
+
+/// A runtime without a flight: plays the runtime's part for a plugin that runs on another thread, or in
+/// another process, attached to `service`. With `waiting`, `vizflyt.run` finds it by itself.
+#[pyclass(frozen, module = "vizflyt")]
+pub(crate) struct Rehearsal {
+    end: RuntimeEnd,
+    /// What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`.
+    #[pyo3(get)]
+    service: String,
+    /// Stands as long as this lives.
+    _offer: Option<Offer>,
+}
+
+/// What a plugin said: (what, number of the observation, setpoint or words, entered [ns]).
+type Said = (&'static str, u64, Py<PyAny>, u64);
+
+#[pymethods]
+impl Rehearsal {
+    #[new]
+    #[pyo3(signature = (cameras, *, waiting = false))]
+    fn make(cameras: Vec<CameraInfo>, waiting: bool) -> PyResult<Self> {
+        let cameras: Vec<_> = cameras.into_iter().map(|camera| camera.0).collect();
+        let service = unique_service();
+        let len = ObservationWriter::len_for(&cameras);
+        let end = RuntimeEnd::create(&service, len).map_err(|error| failed(&error))?;
+        let offer = waiting.then(|| Offer::make(&service)).transpose()?;
+        Ok(Self { end, service, _offer: offer })
+    }
+
+    /// Whether a plugin has attached: from then on messages reach it.
+    #[getter]
+    fn is_attached(&self) -> bool {
+        self.end.plugin_attached()
+    }
+
+    /// Tells the plugin what it flies in.
+    fn start(&self, info: &ArenaInfo) -> PyResult<()> {
+        self.send(&ToPlugin::Start(info.0.clone()))
+    }
+
+    /// Tells it an event of kind 'note'.
+    fn note(&self, text: &str) -> PyResult<()> {
+        let stamp = ServerTime::from_ns(host_now().as_ns());
+        self.send(&ToPlugin::Event(SdkEvent { stamp, kind: EventKind::Note, text: bounded(text) }))
+    }
+
+    /// Tells it that the goal was reached after so many seconds.
+    fn finish(&self, seconds: f64) -> PyResult<()> {
+        let stamp = ServerTime::from_ns(host_now().as_ns());
+        let kind = EventKind::Finished { seconds };
+        self.send(&ToPlugin::Event(SdkEvent { stamp, kind, text: bounded("finished") }))
+    }
+
+    /// Tells it to end.
+    fn stop(&self) -> PyResult<()> {
+        self.send(&ToPlugin::Stop)
+    }
+
+    /// Shows it that the runtime lives; `receive` does so too. At least twice a second.
+    fn heartbeat(&self) {
+        self.end.heartbeat();
+    }
+
+    /// Hands it the buffer's images, through shared memory.
+    fn publish(&self, buffer: &ObservationBuffer) -> PyResult<()> {
+        let mut loan = self
+            .end
+            .loan(ObservationWriter::len_for(buffer.cameras()))
+            .map_err(|error| failed(&error))?;
+        buffer.with_bytes(|bytes| {
+            let memory = loan.memory();
+            let len = memory.len().min(bytes.len());
+            memory[..len].copy_from_slice(&bytes[..len]);
+        });
+        self.end.publish(loan).map_err(|error| failed(&error))
+    }
+
+    /// Waits for what the plugin says: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
+    /// ('failed', 0, reason, 0); None if it says nothing for so long. [s]
+    #[pyo3(signature = (timeout_s = 10.0))]
+    fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<Said>> {
+        let deadline =
+            std::time::Instant::now() + Duration::try_from_secs_f64(timeout_s).unwrap_or_default();
+        loop {
+            if let Some(message) = self.end.receive().map_err(|error| failed(&error))? {
+                return said(py, message).map(Some);
+            }
+            let left = deadline.saturating_duration_since(std::time::Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            // Short, so that Ctrl-C is heard, and the plugin that we live.
+            let wait = left.min(Duration::from_millis(200));
+            py.detach(|| self.end.wait(wait)).map_err(|error| failed(&error))?;
+            py.check_signals()?;
+            self.end.heartbeat();
+        }
+    }
+}
+
+impl Rehearsal {
+    fn send(&self, message: &ToPlugin) -> PyResult<()> {
+        self.end.send(message).map_err(|error| failed(&error))
+    }
+}
+
+fn said(py: Python<'_>, message: FromPlugin) -> PyResult<Said> {
+    Ok(match message {
+        FromPlugin::Ready { name } => ("ready", 0, name.into_pyobject(py)?.into_any().unbind(), 0),
+        FromPlugin::Answer { seq, entered, setpoint, .. } => {
+            let setpoint = match setpoint {
+                Some(setpoint) => Py::new(py, Setpoint(setpoint))?.into_any(),
+                None => py.None(),
+            };
+            ("answer", seq, setpoint, entered.as_ns())
+        }
+        FromPlugin::Failed { reason } => {
+            ("failed", 0, reason.into_pyobject(py)?.into_any().unbind(), 0)
+        }
+    })
+}
+
+fn failed(error: &IpcError) -> PyErr {
+    PyRuntimeError::new_err(error.to_string())
+}

@@ -1,0 +1,115 @@
+//! The memory behind an observation, and numpy arrays that lie in it.
+//!
+//! An array keeps its [`Memory`] alive through its base object, so whatever a plugin keeps stays what
+//! it was: the runtime does not write to memory that is borrowed. It can lend only
+//! [`BORROWED_OBSERVATIONS`] at once; when a plugin has kept all but the last of them, new ones are copied
+//! to memory of our own and given back at once ([`Lender::take`]).
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use numpy::ndarray::{ArrayView2, ArrayView3};
+use numpy::{PyArray2, PyArray3, PyArrayMethods};
+use pyo3::prelude::*;
+use vizflyt_sdk::ipc::{BORROWED_OBSERVATIONS, ObservationSample};
+use vizflyt_sdk::protocol::messages::Name;
+use zerocopy::{FromBytes, IntoBytes};
+
+use crate::observation::CameraImage;
+
+/// The bytes of one observation, wherever they lie.
+pub(crate) struct Memory {
+    bytes: Bytes,
+    /// The cameras' names, in the order of their index.
+    pub(crate) names: Arc<[Name]>,
+}
+
+// SAFETY: through `&Memory` a sample's payload can only be read, which is one dereference of a pointer
+// that never changes, to memory that nobody writes while it is borrowed. The sample itself is used
+// again only when it is dropped, by one thread; it is `Send`.
+unsafe impl Sync for Memory {}
+
+enum Bytes {
+    Shared {
+        sample: ObservationSample,
+        _loan: Loan,
+    },
+    /// In units of 8 bytes, which is what the layout needs to be aligned to.
+    Own(Vec<u64>),
+}
+
+/// Counts observations that are borrowed from the runtime.
+#[derive(Clone, Default)]
+pub(crate) struct Lender(Arc<AtomicUsize>);
+
+struct Loan(Arc<AtomicUsize>);
+
+impl Drop for Loan {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Lender {
+    /// Returns the memory of an observation; a copy if with this one all that can be borrowed is.
+    pub(crate) fn take(&self, sample: ObservationSample, names: Arc<[Name]>) -> Memory {
+        if self.0.load(Ordering::Relaxed) + 1 >= BORROWED_OBSERVATIONS {
+            return Memory::copied(sample.bytes(), names);
+        }
+        self.0.fetch_add(1, Ordering::Relaxed);
+        Memory { bytes: Bytes::Shared { sample, _loan: Loan(Arc::clone(&self.0)) }, names }
+    }
+}
+
+impl Memory {
+    /// Returns a copy of an observation's bytes.
+    pub(crate) fn copied(bytes: &[u8], names: Arc<[Name]>) -> Self {
+        let mut own = vec![0_u64; bytes.len().div_ceil(size_of::<u64>())];
+        own.as_mut_bytes()[..bytes.len()].copy_from_slice(bytes);
+        Self { bytes: Bytes::Own(own), names }
+    }
+
+    /// Returns the bytes; they neither move nor change.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        match &self.bytes {
+            Bytes::Shared { sample, .. } => sample.bytes(),
+            Bytes::Own(own) => own.as_bytes(),
+        }
+    }
+
+    /// Whether it is a copy.
+    pub(crate) fn is_copy(&self) -> bool {
+        matches!(self.bytes, Bytes::Own(_))
+    }
+}
+
+/// Returns the bytes of `memory` from `at` on as a read-only array (H, W, 3) whose base is `owner`.
+pub(crate) fn rgb_array<'py>(
+    owner: &Bound<'py, CameraImage>,
+    at: usize,
+    (height, width): (usize, usize),
+) -> Bound<'py, PyArray3<u8>> {
+    let plane = &owner.get().memory().bytes()[at..at + 3 * height * width];
+    let view = ArrayView3::from_shape((height, width, 3), plane).expect("sized above");
+    // SAFETY: `owner` becomes the array's base. It is frozen and owns the memory through an `Arc`,
+    // whose bytes neither move nor change while it lives: shared memory that is borrowed, or a
+    // vector nobody else has. The array is made read-only before anyone sees it.
+    let array = unsafe { PyArray3::borrow_from_array(&view, owner.clone().into_any()) };
+    array.readwrite().make_nonwriteable();
+    array
+}
+
+/// As [`rgb_array`], of 16-bit numbers (H, W).
+pub(crate) fn depth_array<'py>(
+    owner: &Bound<'py, CameraImage>,
+    at: usize,
+    (height, width): (usize, usize),
+) -> Bound<'py, PyArray2<u16>> {
+    let plane = &owner.get().memory().bytes()[at..at + 2 * height * width];
+    let plane = <[u16]>::ref_from_bytes(plane).expect("checked when parsed");
+    let view = ArrayView2::from_shape((height, width), plane).expect("sized above");
+    // SAFETY: as in `rgb_array`.
+    let array = unsafe { PyArray2::borrow_from_array(&view, owner.clone().into_any()) };
+    array.readwrite().make_nonwriteable();
+    array
+}
