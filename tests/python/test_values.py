@@ -55,6 +55,25 @@ def test_whatever_holds_three_numbers_is_a_vector(value):
             TypeError,
             "give yaw (where to look) or yaw_rate (how fast to turn), not both",
         ),
+        (
+            lambda: Setpoint.waypoints([[0, 0, 1], [1, 0, 1]], [1, 2, 3]),
+            ValueError,
+            "speed_mps must be one number, or 2: one per point, not a list of 3",
+        ),
+        (lambda: Setpoint.waypoints([[0, 0, 1]], 0.0), ValueError, "a waypoint's speed is 0 m/s"),
+        (lambda: Setpoint.waypoints([[0, 0, math.nan]]), ValueError, "not finite"),
+        (
+            lambda: Setpoint.waypoints(np.zeros((33, 3))),
+            ValueError,
+            "points_m has 33 points, and a path at most 32: send the rest, under another id",
+        ),
+        (
+            lambda: Setpoint.polynomial(1.0, np.zeros((1, 9, 3))),
+            ValueError,
+            "coefficients must be an array of shape (pieces, up to 8, 3), not a numpy.ndarray of shape (1, 9, 3)",
+        ),
+        (lambda: Setpoint.polynomial(-1.0, np.zeros((1, 4, 3))), ValueError, "a trajectory's piece lasts -1 s"),
+        (lambda: Setpoint.attitude_rate([0, 0, 0], "full"), TypeError, "thrust must be a number"),
         (lambda: Setpoint([1, 0, 0]), TypeError, "Setpoint.velocity([x, y, z])"),
         (lambda: Pose("ned", "body", [0, 0, 0]), ValueError, "'ned' is no frame; there are 'world'"),
         (
@@ -78,10 +97,16 @@ def test_setpoints_show_how_to_make_them():
         Setpoint.position([1, 2, 3], yaw=0.5),
         Setpoint.velocity([1, 0, 0.5], axes="heading", yaw_rate=-0.2),
         Setpoint.acceleration([0, 0, 1]),
+        Setpoint.take_off(),
+        Setpoint.offset([1, 0, 0], axes="body"),
+        Setpoint.attitude_rate([0, 0, 0.1], 1.1),
+        Setpoint.waypoints([[0, 0, 1], [1, 0, 1]], 0.5, id=3, yaw=0.1),
+        Setpoint.polynomial([1, 2], np.ones((2, 4, 3)), axes="heading"),
     ):
         assert eval(repr(setpoint)) == setpoint
     assert Setpoint.velocity([1, 0, 0]).kind == "velocity"
     assert Setpoint.hold() != Setpoint.land()
+    assert Setpoint.waypoints([0, 0, 1]) == Setpoint.waypoints([[0, 0, 1]], [1.0])
 
 
 def test_poses_compose_only_where_frames_meet():

@@ -43,6 +43,46 @@ def test_images_are_what_was_put_in():
     assert front.rgb.flags.c_contiguous and front.depth_mm.flags.c_contiguous
 
 
+def test_the_vehicle_is_known_as_far_as_the_course_lets_it():
+    buffer = vizflyt.ObservationBuffer([camera()])
+    obs = buffer.observation()
+    assert obs.vehicle is None and obs.imu == [] and obs.battery.fraction is None
+    half = 0.5**0.5
+    buffer.set_vehicle(vizflyt.Vehicle(attitude_xyzw=[0, 0, half, half], omega_body_radps=[0, 0, 1]))
+    buffer.set_battery(vizflyt.Battery(0.5, 11.1))
+    obs = buffer.observation()
+    assert obs.vehicle.yaw_rad == pytest.approx(np.pi / 2)
+    assert (obs.vehicle.omega_body_radps == [0, 0, 1]).all()
+    assert (obs.vehicle.world_from_body, obs.vehicle.p_world_m, obs.vehicle.v_world_mps) == (None,) * 3
+    assert (obs.battery.fraction, obs.battery.voltage_v) == (0.5, 11.1)
+    pose = vizflyt.Pose("world", "body", [1, 2, 3])
+    buffer.set_vehicle(vizflyt.Vehicle(pose, [4, 5, 6], stamp_ns=7))
+    vehicle = buffer.observation().vehicle
+    assert vehicle.world_from_body == pose and vehicle.stamp_ns == 7
+    assert (vehicle.p_world_m == [1, 2, 3]).all() and (vehicle.v_world_mps == [4, 5, 6]).all()
+
+
+def test_every_imu_sample_comes_once():
+    stage, seen = Stage(), []
+
+    class Listen(vizflyt.Plugin):
+        def on_image(self, obs):
+            seen.append([(s.stamp_ns, *s.accel_mps2, *s.gyro_radps) for s in obs.imu])
+
+    runner = stage.attach(Listen)
+    samples = [vizflyt.ImuSample([0, 0, n], [n, 0, 0], stamp_ns=n) for n in range(1, 8)]
+    for newest in (3, 5, 7):
+        stage.buffer.clear(newest)
+        # The newest four are always there: a reader that skips an observation misses none.
+        stage.buffer.set_imu(samples[max(newest - 4, 0) : newest])
+        stage.rehearsal.publish(stage.buffer)
+        assert stage.rehearsal.receive()[0] == "answer"
+    stage.rehearsal.stop()
+    assert runner.ended() is None
+    assert [[stamp for stamp, *_ in image] for image in seen] == [[1, 2, 3], [4, 5], [6, 7]]
+    assert seen[0][2] == (3, 0, 0, 3, 3, 0, 0)
+
+
 def test_a_camera_without_an_image_is_none_and_an_unknown_one_a_sentence():
     obs, *_ = observation()
     assert obs.camera("rear") is None

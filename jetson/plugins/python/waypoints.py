@@ -11,38 +11,40 @@ from vizflyt import Setpoint
 
 # Corners from the start, forward and left of where the nose pointed. [m]
 CORNERS_M = [(1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)]
-# Near enough to go on to the next. [m]
-REACHED_M = 0.15
+SPEED_MPS = 0.8
+# Near enough to a corner to count it. The path stops at its end only. [m]
+REACHED_M = 0.25
 
 
 class Waypoints(vizflyt.Plugin):
     def on_start(self, info):
         self.flying = False
-        self.waypoints_m = None
+        self.corners_m = None
 
     def on_event(self, event):
         if event.details.get("phase") == "flying":
             self.flying = True
 
     def on_image(self, obs):
-        if not self.flying:
-            return Setpoint.hold()
         vehicle = obs.vehicle
-        if vehicle is None or vehicle.p_world_m is None:
+        if not self.flying or vehicle is None:
+            return Setpoint.hold()
+        if vehicle.p_world_m is None:
             # Nothing to steer by: the guard holds, then lands.
             return None
         here_m = vehicle.p_world_m
-        if self.waypoints_m is None:
+        if self.corners_m is None:
             ahead = np.array([np.cos(vehicle.yaw_rad), np.sin(vehicle.yaw_rad), 0.0])
             left = np.array([-ahead[1], ahead[0], 0.0])
-            self.waypoints_m = [here_m + x * ahead + y * left for x, y in CORNERS_M]
-        if np.linalg.norm(self.waypoints_m[0] - here_m) < REACHED_M:
-            print("reached", np.round(self.waypoints_m.pop(0), 2))
-            if not self.waypoints_m:
-                self.waypoints_m = [here_m]
+            self.corners_m = [here_m + x * ahead + y * left for x, y in CORNERS_M]
+            # The runtime follows the path by itself; None, below, lets it go on.
+            return Setpoint.waypoints(self.corners_m, SPEED_MPS)
+        if np.linalg.norm(self.corners_m[0] - here_m) < REACHED_M:
+            print("reached", np.round(self.corners_m[0], 2))
+            if len(self.corners_m) == 1:
                 return Setpoint.land()
-        to_go_m = self.waypoints_m[0] - here_m
-        return Setpoint.position(self.waypoints_m[0], yaw=np.arctan2(to_go_m[1], to_go_m[0]))
+            self.corners_m.pop(0)
+        return None
 
 
 if __name__ == "__main__":

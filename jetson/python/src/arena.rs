@@ -64,9 +64,16 @@ pub(crate) struct Limits(SdkLimits);
 #[pymethods]
 impl Limits {
     #[new]
-    #[pyo3(signature = (*, max_speed_mps, max_acceleration_mps2))]
-    fn make(max_speed_mps: f64, max_acceleration_mps2: f64) -> Self {
-        Self(SdkLimits { max_speed_mps, max_acceleration_mps2 })
+    #[pyo3(signature = (
+        *, max_speed_mps, max_acceleration_mps2, max_tilt_deg = None, max_altitude_m = None
+    ))]
+    fn make(
+        max_speed_mps: f64,
+        max_acceleration_mps2: f64,
+        max_tilt_deg: Option<f64>,
+        max_altitude_m: Option<f64>,
+    ) -> Self {
+        Self(SdkLimits { max_speed_mps, max_acceleration_mps2, max_tilt_deg, max_altitude_m })
     }
 
     /// Greatest speed. [m/s]
@@ -79,6 +86,18 @@ impl Limits {
     #[getter]
     fn max_acceleration_mps2(&self) -> f64 {
         self.0.max_acceleration_mps2
+    }
+
+    /// Greatest tilt from level; None if the acceleration alone limits it. [deg]
+    #[getter]
+    fn max_tilt_deg(&self) -> Option<f64> {
+        self.0.max_tilt_deg
+    }
+
+    /// Greatest height of the body's centre; None if the geofence alone limits it. [m, world]
+    #[getter]
+    fn max_altitude_m(&self) -> Option<f64> {
+        self.0.max_altitude_m
     }
 
     fn __repr__(&self) -> String {
@@ -98,7 +117,8 @@ impl ArenaInfo {
     #[new]
     #[pyo3(signature = (
         *, name = "test", geofence = None, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
-        goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, cameras = Vec::new()
+        goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, ground_truth = true,
+        attitude_rate = false, cameras = Vec::new()
     ))]
     #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
     fn make(
@@ -110,6 +130,8 @@ impl ArenaInfo {
         goal_m: Option<&Bound<'_, PyAny>>,
         goal_radius_m: f64,
         time_limit_s: f64,
+        ground_truth: bool,
+        attitude_rate: bool,
         cameras: Vec<CameraInfo>,
     ) -> PyResult<Self> {
         if cameras.len() > MAX_CAMERAS {
@@ -119,7 +141,7 @@ impl ArenaInfo {
             )));
         }
         let everywhere = vizflyt_sdk::Volume::Sphere { center_m: DVec3::ZERO, radius_m: 1000.0 };
-        let usual = SdkLimits { max_speed_mps: 5.0, max_acceleration_mps2: 5.0 };
+        let usual = SdkLimits::new(5.0, 5.0);
         Ok(Self(SdkArenaInfo {
             name: bounded(name),
             geofence: geofence.map_or(everywhere, |volume| volume.0),
@@ -129,6 +151,8 @@ impl ArenaInfo {
             goal_m: goal_m.map(|goal_m| vector(goal_m, "goal_m")).transpose()?,
             goal_radius_m,
             time_limit_s,
+            ground_truth,
+            attitude_rate,
             cameras: cameras.into_iter().map(|camera| camera.0).collect(),
         }))
     }
@@ -179,6 +203,18 @@ impl ArenaInfo {
     #[getter]
     fn time_limit_s(&self) -> f64 {
         self.0.time_limit_s
+    }
+
+    /// Whether the plugin gets the vehicle's pose and velocity.
+    #[getter]
+    fn ground_truth(&self) -> bool {
+        self.0.ground_truth
+    }
+
+    /// Whether the plugin may ask for `Setpoint.attitude_rate`.
+    #[getter]
+    fn attitude_rate(&self) -> bool {
+        self.0.attitude_rate
     }
 
     /// The vehicle's cameras.

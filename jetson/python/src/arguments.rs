@@ -111,7 +111,8 @@ pub(crate) fn scalar(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyRe
     if number.is_finite() { Ok(number) } else { Err(not_finite(name, &[number])) }
 }
 
-fn numbers<'py>(
+/// Returns the numbers in a value called `name`, whatever their shape.
+pub(crate) fn numbers<'py>(
     value: &Bound<'py, PyAny>,
     name: &str,
     wanted: &str,
@@ -132,7 +133,8 @@ pub(crate) fn wrong_type(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> 
     PyTypeError::new_err(format!("{name} must be {wanted}, not {}", describe(value)))
 }
 
-fn wrong_shape(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyErr {
+/// Returns the error for an array of a shape that cannot be used.
+pub(crate) fn wrong_shape(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyErr {
     PyValueError::new_err(format!("{name} must be {wanted}, not {}", describe(value)))
 }
 

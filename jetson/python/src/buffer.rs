@@ -12,7 +12,7 @@ use vizflyt_sdk::{
 
 use crate::arena::CameraInfo;
 use crate::arguments::wrong_type;
-use crate::observation::{Observation, Vehicle};
+use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 use crate::shared_memory::Memory;
 
 /// Observations made by hand: for a plugin's own tests and for notebooks.
@@ -58,6 +58,18 @@ impl ObservationBuffer {
         self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_vehicle(&vehicle.0);
     }
 
+    /// Fills in the battery's state.
+    fn set_battery(&self, battery: Battery) {
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_battery(&battery.0);
+    }
+
+    /// Fills in the newest IMU samples, oldest first; those with stamps that a plugin has had already, it
+    /// does not get again.
+    fn set_imu(&self, samples: Vec<ImuSample>) {
+        let samples: Vec<_> = samples.into_iter().map(|sample| sample.0).collect();
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_imu(&samples);
+    }
+
     /// Fills in a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16; black and without
     /// returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
     #[pyo3(signature = (name, rgb = None, depth_mm = None, *, seq = 0, stamp_ns = 0, ready_ns = None))]
@@ -101,7 +113,7 @@ impl ObservationBuffer {
     /// Returns what a plugin would see.
     fn observation(&self, py: Python<'_>) -> PyResult<Observation> {
         let memory = self.with_bytes(|bytes| Memory::copied(bytes, Arc::clone(&self.names)));
-        Observation::new(py, memory)
+        Observation::new(py, memory, HostTime::ZERO)
     }
 }
 

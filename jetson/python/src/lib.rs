@@ -30,7 +30,7 @@ mod _vizflyt {
     #[pymodule_export]
     use crate::geometry::{Intrinsics, Pose, Volume};
     #[pymodule_export]
-    use crate::observation::{CameraImage, Observation, Vehicle};
+    use crate::observation::{Battery, CameraImage, ImuSample, Observation, Vehicle};
     #[pymodule_export]
     use crate::plugin_end::{PluginEnd, waiting_services};
     #[pymodule_export]

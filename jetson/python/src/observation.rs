@@ -7,15 +7,16 @@ use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::exceptions::{PyIndexError, PyLookupError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
-use vizflyt_sdk::{Body, Cam};
-use vizflyt_sdk::{
-    CameraImage as SdkCameraImage, HostTime, Intrinsics as SdkIntrinsics,
-    Observation as SdkObservation, Pose as SdkPose, Vehicle as SdkVehicle,
-};
-
+use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::yaw_of;
+use vizflyt_sdk::{
+    Battery as SdkBattery, CameraImage as SdkCameraImage, HostTime, ImuSample as SdkImuSample,
+    Intrinsics as SdkIntrinsics, Observation as SdkObservation, Pose as SdkPose,
+    Vehicle as SdkVehicle,
+};
+use vizflyt_sdk::{Body, Cam, World};
 
-use crate::arguments::{array3, vector};
+use crate::arguments::{array3, quaternion, vector};
 use crate::geometry::{Intrinsics, Pose};
 use crate::shared_memory::{Memory, depth_array, rgb_array};
 
@@ -33,6 +34,8 @@ pub(crate) struct Observation {
     #[pyo3(get)]
     stamp_ns: u64,
     vehicle: Option<Py<Vehicle>>,
+    imu: Vec<SdkImuSample>,
+    battery: SdkBattery,
     images: Vec<Py<CameraImage>>,
 }
 
@@ -62,27 +65,34 @@ pub(crate) struct CameraImage {
 
 /// What is known of the vehicle.
 ///
-/// `Vehicle(world_from_body, v_world_mps, omega_body_radps, stamp_ns=0, ...)` makes one, for tests.
+/// `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` makes one, for tests.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone)]
 pub(crate) struct Vehicle(pub(crate) SdkVehicle);
 
 impl Observation {
-    /// Reads the observation that lies in `memory`.
+    /// Reads the observation that lies in `memory`, without the IMU samples that the plugin has had.
     ///
     /// # Errors
     /// If there is none in it.
-    pub(crate) fn new(py: Python<'_>, memory: Memory) -> PyResult<Self> {
+    pub(crate) fn new(py: Python<'_>, memory: Memory, imu_after: HostTime) -> PyResult<Self> {
         let memory = Arc::new(memory);
         let seen = SdkObservation::from_bytes(memory.bytes(), &memory.names)
-            .map_err(|error| PyValueError::new_err(error.to_string()))?;
+            .map_err(|error| PyValueError::new_err(error.to_string()))?
+            .with_imu_after(imu_after);
         let images = seen
             .cameras()
             .map(|image| Py::new(py, CameraImage::new(&memory, &image)))
             .collect::<PyResult<_>>()?;
         let vehicle = seen.vehicle().map(|vehicle| Py::new(py, Vehicle(vehicle))).transpose()?;
+        let (imu, battery) = (seen.imu().collect(), seen.battery());
         let (seq, stamp_ns) = (seen.seq(), seen.stamp().as_ns());
-        Ok(Self { memory, seq, stamp_ns, vehicle, images })
+        Ok(Self { memory, seq, stamp_ns, vehicle, imu, battery, images })
+    }
+
+    /// Returns when its newest IMU sample was measured.
+    pub(crate) fn newest_imu(&self) -> Option<HostTime> {
+        self.imu.last().map(|sample| sample.stamp)
     }
 }
 
@@ -118,10 +128,17 @@ impl Observation {
         self.vehicle.as_ref().map(|vehicle| vehicle.clone_ref(py))
     }
 
-    /// Battery left, 0 to 1; None if unknown.
+    /// The autopilot's IMU samples since the image that the plugin got before this one, oldest first; at
+    /// most the newest 64 (0.6 s at 100 Hz).
     #[getter]
-    fn battery(&self) -> Option<f64> {
-        self.vehicle.as_ref().and_then(|vehicle| vehicle.get().0.battery_fraction)
+    fn imu(&self) -> Vec<ImuSample> {
+        self.imu.iter().copied().map(ImuSample).collect()
+    }
+
+    /// The battery's state.
+    #[getter]
+    fn battery(&self) -> Battery {
+        Battery(self.battery)
     }
 
     /// Whether the images are copies, because the plugin keeps too many earlier ones.
@@ -261,25 +278,33 @@ impl CameraImage {
 impl Vehicle {
     #[new]
     #[pyo3(signature = (
-        world_from_body, v_world_mps = None, omega_body_radps = None, *, stamp_ns = 0,
-        battery_fraction = None
+        world_from_body = None, v_world_mps = None, omega_body_radps = None, *, attitude_xyzw = None,
+        stamp_ns = 0
     ))]
     fn make(
-        world_from_body: Pose,
+        world_from_body: Option<Pose>,
         v_world_mps: Option<&Bound<'_, PyAny>>,
         omega_body_radps: Option<&Bound<'_, PyAny>>,
+        attitude_xyzw: Option<&Bound<'_, PyAny>>,
         stamp_ns: u64,
-        battery_fraction: Option<f64>,
     ) -> PyResult<Self> {
         let or_zero = |value: Option<&Bound<'_, PyAny>>, name| {
-            value.map_or(Ok(vizflyt_sdk::glam::DVec3::ZERO), |value| vector(value, name))
+            value.map_or(Ok(DVec3::ZERO), |value| vector(value, name))
         };
+        let world_from_body: Option<SdkPose<World, Body>> =
+            world_from_body.map(|pose| pose.typed("world", "body")).transpose()?;
+        let attitude = match (attitude_xyzw, &world_from_body) {
+            (Some(given), _) => quaternion(given, "attitude_xyzw")?,
+            (None, Some(pose)) => pose.rotation,
+            (None, None) => DQuat::IDENTITY,
+        };
+        let v_world_mps = or_zero(v_world_mps, "v_world_mps")?;
         Ok(Self(SdkVehicle {
             stamp: HostTime::from_ns(stamp_ns),
-            world_from_body: world_from_body.typed("world", "body")?,
-            v_world_mps: or_zero(v_world_mps, "v_world_mps")?,
+            attitude,
             omega_body_radps: or_zero(omega_body_radps, "omega_body_radps")?,
-            battery_fraction,
+            world_from_body,
+            v_world_mps: world_from_body.map(|_| v_world_mps),
         }))
     }
 
@@ -289,28 +314,17 @@ impl Vehicle {
         self.0.stamp.as_ns()
     }
 
-    /// Position and attitude. [m, world]
+    /// Attitude as a unit quaternion x, y, z, w that rotates vectors from body to world axes: shape (4,),
+    /// float64. The localized one where the course gives the pose, else the autopilot's estimate.
     #[getter]
-    fn world_from_body(&self) -> Pose {
-        Pose::new("world", "body", &self.0.world_from_body)
+    fn attitude_xyzw<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, &self.0.attitude.to_array())
     }
 
     /// Heading: angle of the nose from world x, counter-clockwise. [rad, world]
     #[getter]
     fn yaw_rad(&self) -> f64 {
-        yaw_of(self.0.world_from_body.rotation)
-    }
-
-    /// Position: shape (3,), float64. [m, world]
-    #[getter]
-    fn p_world_m<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array3(py, self.0.world_from_body.translation_m)
-    }
-
-    /// Velocity: shape (3,), float64. [m/s, world]
-    #[getter]
-    fn v_world_mps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array3(py, self.0.v_world_mps)
+        yaw_of(self.0.attitude)
     }
 
     /// Angular velocity: shape (3,), float64. [rad/s, body]
@@ -319,17 +333,117 @@ impl Vehicle {
         array3(py, self.0.omega_body_radps)
     }
 
-    /// Battery left, 0 to 1; None if unknown.
+    /// Position and attitude as localized; None where the course withholds them. [m, world]
     #[getter]
-    fn battery_fraction(&self) -> Option<f64> {
-        self.0.battery_fraction
+    fn world_from_body(&self) -> Option<Pose> {
+        self.0.world_from_body.map(|pose| Pose::new("world", "body", &pose))
+    }
+
+    /// Position: shape (3,), float64; None where the course withholds it. [m, world]
+    #[getter]
+    fn p_world_m<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
+        self.0.world_from_body.map(|pose| array3(py, pose.translation_m))
+    }
+
+    /// Velocity: shape (3,), float64; None where the course withholds it. [m/s, world]
+    #[getter]
+    fn v_world_mps<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
+        self.0.v_world_mps.map(|v_mps| array3(py, v_mps))
     }
 
     fn __repr__(&self) -> String {
-        let (p, v) = (self.0.world_from_body.translation_m, self.0.v_world_mps);
-        format!(
-            "Vehicle(p_world_m=[{:.3}, {:.3}, {:.3}], v_world_mps=[{:.3}, {:.3}, {:.3}])",
-            p.x, p.y, p.z, v.x, v.y, v.z
-        )
+        let yaw_rad = self.yaw_rad();
+        match (self.0.world_from_body, self.0.v_world_mps) {
+            (Some(pose), Some(v)) => {
+                let p = pose.translation_m;
+                format!(
+                    "Vehicle(p_world_m=[{:.3}, {:.3}, {:.3}], v_world_mps=[{:.3}, {:.3}, {:.3}], \
+                     yaw_rad={yaw_rad:.3})",
+                    p.x, p.y, p.z, v.x, v.y, v.z
+                )
+            }
+            _ => format!("Vehicle(yaw_rad={yaw_rad:.3}, without its pose)"),
+        }
+    }
+}
+
+/// One reading of the autopilot's accelerometer and gyroscope.
+///
+/// `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` makes one, for tests.
+#[pyclass(frozen, module = "vizflyt", from_py_object)]
+#[derive(Clone)]
+pub(crate) struct ImuSample(pub(crate) SdkImuSample);
+
+#[pymethods]
+impl ImuSample {
+    #[new]
+    #[pyo3(signature = (accel_mps2, gyro_radps, *, stamp_ns = 0))]
+    fn make(
+        accel_mps2: &Bound<'_, PyAny>,
+        gyro_radps: &Bound<'_, PyAny>,
+        stamp_ns: u64,
+    ) -> PyResult<Self> {
+        Ok(Self(SdkImuSample {
+            stamp: HostTime::from_ns(stamp_ns),
+            accel_mps2: vector(accel_mps2, "accel_mps2")?,
+            gyro_radps: vector(gyro_radps, "gyro_radps")?,
+        }))
+    }
+
+    /// When it was measured. [ns, `time.monotonic_ns()`]
+    #[getter]
+    fn stamp_ns(&self) -> u64 {
+        self.0.stamp.as_ns()
+    }
+
+    /// Specific force: shape (3,), float64; at rest and level +9.8 along z. [m/s^2, body]
+    #[getter]
+    fn accel_mps2<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array3(py, self.0.accel_mps2)
+    }
+
+    /// Angular velocity: shape (3,), float64. [rad/s, body]
+    #[getter]
+    fn gyro_radps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array3(py, self.0.gyro_radps)
+    }
+
+    fn __repr__(&self) -> String {
+        let (a, w) = (self.0.accel_mps2.to_array(), self.0.gyro_radps.to_array());
+        format!("ImuSample(accel_mps2={a:.3?}, gyro_radps={w:.4?})")
+    }
+}
+
+/// The battery, as the autopilot measures it.
+///
+/// `Battery(fraction=None, voltage_v=None)` makes one, for tests.
+#[pyclass(frozen, module = "vizflyt", from_py_object)]
+#[derive(Clone)]
+pub(crate) struct Battery(pub(crate) SdkBattery);
+
+#[pymethods]
+impl Battery {
+    #[new]
+    #[pyo3(signature = (fraction = None, voltage_v = None))]
+    fn make(fraction: Option<f64>, voltage_v: Option<f64>) -> Self {
+        Self(SdkBattery { fraction, voltage_v })
+    }
+
+    /// What is left, 0 to 1; None if the autopilot does not know.
+    #[getter]
+    fn fraction(&self) -> Option<f64> {
+        self.0.fraction
+    }
+
+    /// Voltage; None if it is not measured. [V]
+    #[getter]
+    fn voltage_v(&self) -> Option<f64> {
+        self.0.voltage_v
+    }
+
+    fn __repr__(&self) -> String {
+        let show = |value: Option<f64>| value.map_or("None".to_owned(), |value| value.to_string());
+        let (fraction, voltage_v) = (show(self.0.fraction), show(self.0.voltage_v));
+        format!("Battery(fraction={fraction}, voltage_v={voltage_v})")
     }
 }

@@ -1,5 +1,6 @@
 //! The plugin's end of the shared memory, as the main loop uses it.
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -22,6 +23,8 @@ pub(crate) struct PluginEnd {
     end: SdkPluginEnd,
     lender: Lender,
     names: Mutex<Arc<[Name]>>,
+    /// Newest IMU sample that the plugin has had. [ns, host]
+    imu_had: AtomicU64,
 }
 
 /// What a process that ends has not been read by then is lost with its memory. The runtime reads within a
@@ -36,7 +39,7 @@ impl PluginEnd {
         let end =
             py.detach(|| SdkPluginEnd::open(service)).map_err(|error| not_attached(&error))?;
         let names = Mutex::new(Arc::from(Vec::new()));
-        Ok(Self { end, lender: Lender::default(), names })
+        Ok(Self { end, lender: Lender::default(), names, imu_had: AtomicU64::default() })
     }
 
     /// Waits until the runtime notifies, `timeout_s` at most; returns whether it did.
@@ -71,8 +74,13 @@ impl PluginEnd {
         };
         let names = Arc::clone(&self.names.lock().unwrap_or_else(PoisonError::into_inner));
         let memory = py.detach(|| self.lender.take(sample, names));
+        let imu_had = HostTime::from_ns(self.imu_had.load(Ordering::Relaxed));
         // A bad observation is the runtime's bug, and skipped.
-        Ok(Observation::new(py, memory).ok())
+        let Ok(observation) = Observation::new(py, memory, imu_had) else { return Ok(None) };
+        if let Some(newest) = observation.newest_imu() {
+            self.imu_had.store(newest.as_ns(), Ordering::Relaxed);
+        }
+        Ok(Some(observation))
     }
 
     /// Tells that `on_start` has returned.

@@ -27,9 +27,11 @@ from ._plugin import Plugin
 from ._run import HeldImagesWarning, run
 from ._vizflyt import (
     ArenaInfo,
+    Battery,
     CameraImage,
     CameraInfo,
     Event,
+    ImuSample,
     Intrinsics,
     Limits,
     Observation,
@@ -44,10 +46,12 @@ from ._vizflyt import (
 
 __all__ = [
     "ArenaInfo",
+    "Battery",
     "CameraImage",
     "CameraInfo",
     "Event",
     "HeldImagesWarning",
+    "ImuSample",
     "Intrinsics",
     "Limits",
     "Observation",

@@ -9,7 +9,7 @@ import numpy.typing as npt
 __version__: Final[str]
 PROTOCOL_VERSION: Final[int]
 _Frame = Literal["world", "body", "cam"]
-_Axes = Literal["world", "heading"]
+_Axes = Literal["world", "heading", "body"]
 _Vector = npt.ArrayLike
 _F64 = npt.NDArray[np.float64]
 
@@ -31,6 +31,8 @@ class ArenaInfo:
         goal_m: _Vector | None = None,
         goal_radius_m: float = 1.0,
         time_limit_s: float = 0.0,
+        ground_truth: bool = True,
+        attitude_rate: bool = False,
         cameras: Sequence[CameraInfo] = ...,
     ) -> ArenaInfo: ...
     @property
@@ -66,6 +68,12 @@ class ArenaInfo:
         """From take-off; 0 is none. [s]"""
 
     @property
+    def ground_truth(self) -> bool:
+        """Whether the plugin gets the vehicle's pose and velocity."""
+    @property
+    def attitude_rate(self) -> bool:
+        """Whether the plugin may ask for `Setpoint.attitude_rate`."""
+    @property
     def cameras(self) -> list[CameraInfo]:
         """The vehicle's cameras."""
 
@@ -96,7 +104,20 @@ class CameraInfo:
 class Limits:
     """Limits that the guard enforces whatever a plugin asks."""
 
-    def __new__(cls, *, max_speed_mps: float, max_acceleration_mps2: float) -> Limits: ...
+    def __new__(
+        cls,
+        *,
+        max_speed_mps: float,
+        max_acceleration_mps2: float,
+        max_tilt_deg: float | None = None,
+        max_altitude_m: float | None = None,
+    ) -> Limits: ...
+    @property
+    def max_tilt_deg(self) -> float | None:
+        """Greatest tilt from level; None if the acceleration alone limits it. [deg]"""
+    @property
+    def max_altitude_m(self) -> float | None:
+        """Greatest height of the body's centre; None if the geofence alone limits it. [m, world]"""
     @property
     def max_speed_mps(self) -> float:
         """Greatest speed. [m/s]"""
@@ -136,9 +157,13 @@ class Observation:
         """What is known of the vehicle; None before anything is."""
 
     @property
-    def battery(self) -> float | None:
-        """Battery left, 0 to 1; None if unknown."""
-
+    def imu(self) -> list[ImuSample]:
+        """The autopilot's IMU samples since the image that the plugin got before this one, oldest first; at
+        most the newest 64 (0.6 s at 100 Hz).
+        """
+    @property
+    def battery(self) -> Battery:
+        """The battery's state."""
     @property
     def is_copy(self) -> bool:
         """Whether the images are copies, because the plugin keeps too many earlier ones."""
@@ -207,69 +232,108 @@ class CameraImage:
 class Vehicle:
     """What is known of the vehicle.
 
-    `Vehicle(world_from_body, v_world_mps, omega_body_radps, stamp_ns=0, ...)` makes one, for tests.
+    `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` makes one, for tests.
     """
 
     def __new__(
         cls,
-        world_from_body: Pose,
+        world_from_body: Pose | None = None,
         v_world_mps: _Vector | None = None,
         omega_body_radps: _Vector | None = None,
         *,
+        attitude_xyzw: _Vector | None = None,
         stamp_ns: int = 0,
-        battery_fraction: float | None = None,
     ) -> Vehicle: ...
     @property
     def stamp_ns(self) -> int:
         """When this was true. [ns, `time.monotonic_ns()`]"""
-
     @property
-    def world_from_body(self) -> Pose:
-        """Position and attitude. [m, world]"""
-
+    def attitude_xyzw(self) -> _F64:
+        """Attitude as a unit quaternion x, y, z, w that rotates vectors from body to world axes: shape (4,),
+        float64. The localized one where the course gives the pose, else the autopilot's estimate.
+        """
     @property
     def yaw_rad(self) -> float:
         """Heading: angle of the nose from world x, counter-clockwise. [rad, world]"""
-
-    @property
-    def p_world_m(self) -> _F64:
-        """Position: shape (3,), float64. [m, world]"""
-
-    @property
-    def v_world_mps(self) -> _F64:
-        """Velocity: shape (3,), float64. [m/s, world]"""
-
     @property
     def omega_body_radps(self) -> _F64:
         """Angular velocity: shape (3,), float64. [rad/s, body]"""
-
     @property
-    def battery_fraction(self) -> float | None:
-        """Battery left, 0 to 1; None if unknown."""
+    def world_from_body(self) -> Pose | None:
+        """Position and attitude as localized; None where the course withholds them. [m, world]"""
+    @property
+    def p_world_m(self) -> _F64 | None:
+        """Position: shape (3,), float64; None where the course withholds it. [m, world]"""
+    @property
+    def v_world_mps(self) -> _F64 | None:
+        """Velocity: shape (3,), float64; None where the course withholds it. [m/s, world]"""
+
+@final
+class ImuSample:
+    """One reading of the autopilot's accelerometer and gyroscope.
+
+    `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` makes one, for tests.
+    """
+
+    def __new__(
+        cls, accel_mps2: _Vector, gyro_radps: _Vector, *, stamp_ns: int = 0
+    ) -> ImuSample: ...
+    @property
+    def stamp_ns(self) -> int:
+        """When it was measured. [ns, `time.monotonic_ns()`]"""
+    @property
+    def accel_mps2(self) -> _F64:
+        """Specific force: shape (3,), float64; at rest and level +9.8 along z. [m/s^2, body]"""
+    @property
+    def gyro_radps(self) -> _F64:
+        """Angular velocity: shape (3,), float64. [rad/s, body]"""
+
+@final
+class Battery:
+    """The battery, as the autopilot measures it.
+
+    `Battery(fraction=None, voltage_v=None)` makes one, for tests.
+    """
+
+    def __new__(
+        cls, fraction: float | None = None, voltage_v: float | None = None
+    ) -> Battery: ...
+    @property
+    def fraction(self) -> float | None:
+        """What is left, 0 to 1; None if the autopilot does not know."""
+    @property
+    def voltage_v(self) -> float | None:
+        """Voltage; None if it is not measured. [V]"""
 
 @final
 class Setpoint:
     """What a plugin asks of the vehicle; the newest one holds until the guard's deadline of 0.5 s.
 
     `yaw` is where the nose shall point: an angle from world x, counter-clockwise [rad]. `yaw_rate` is how
-    fast it shall turn, counter-clockwise [rad/s]. Without either the heading stays.
+    fast it shall turn, counter-clockwise [rad/s]. Without either the heading stays; on a path the nose
+    points into the direction of travel.
 
-    `axes` are those in which a vector is given: 'world' (x east, y north, z up) or 'heading' (x along the
-    nose, y left, z up, levelled: ahead never means into the floor).
+    `axes` are those in which a vector is given: 'world' (x east, y north, z up), 'heading' (x along the
+    nose, y left, z up, levelled: ahead never means into the floor) or 'body' (x forward, y left, z up, as
+    the vehicle is tilted at the moment).
     """
 
     @property
     def kind(self) -> str:
-        """What it asks for: 'hold', 'velocity', ..."""
-
+        """What it asks for: 'hold', 'land', 'take_off', 'position', 'offset', 'velocity', 'acceleration',
+        'attitude_rate' or 'trajectory'.
+        """
     @staticmethod
     def hold() -> Setpoint:
         """Stop and stay."""
-
     @staticmethod
     def land() -> Setpoint:
         """Come down here and disarm."""
-
+    @staticmethod
+    def take_off() -> Setpoint:
+        """Go straight up or down to the height at which the plugin took over after take-off. (The runtime
+        takes off by itself as soon as the plugin answers images.)
+        """
     @staticmethod
     def position(
         p_world_m: _Vector,
@@ -278,7 +342,17 @@ class Setpoint:
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
         """Fly to a point (3,) and stay. [m, world]"""
-
+    @staticmethod
+    def offset(
+        d_m: _Vector,
+        *,
+        axes: _Axes = "world",
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Fly to a point (3,) given from where the vehicle is when the runtime takes this, and stay: for
+        plugins that do not know their position. [m, axes]
+        """
     @staticmethod
     def velocity(
         v_mps: _Vector,
@@ -288,7 +362,6 @@ class Setpoint:
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
         """Fly at a velocity (3,). [m/s, axes]"""
-
     @staticmethod
     def acceleration(
         a_mps2: _Vector,
@@ -298,6 +371,44 @@ class Setpoint:
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
         """Accelerate (3,), gravity already compensated: zero keeps the velocity. [m/s^2, axes]"""
+    @staticmethod
+    def attitude_rate(omega_body_radps: _Vector, thrust: SupportsFloat) -> Setpoint:
+        """Turn at body rates (3,) [rad/s, body] under a thrust, of all motors together over the vehicle's
+        weight: 1 carries it when level. Only where the course allows it (`ArenaInfo.attitude_rate`).
+        """
+    @staticmethod
+    def waypoints(
+        points_m: npt.ArrayLike,
+        speed_mps: npt.ArrayLike = 1.0,
+        *,
+        id: int = 0,
+        axes: _Axes = "world",
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Follow straight lines through up to 32 points (N, 3) [m, axes], at most at `speed_mps` (one number,
+        or one per point for the way to it) [m/s], and stay at the last.
+
+        The runtime follows it as long as the plugin answers images, with None or the same path again. A
+        path of another `id` starts anew. With axes 'heading' or 'body' the points count from where the
+        vehicle is when the runtime takes the path.
+        """
+    @staticmethod
+    def polynomial(
+        seconds: npt.ArrayLike,
+        coefficients: npt.ArrayLike,
+        *,
+        id: int = 0,
+        axes: _Axes = "world",
+        yaw: SupportsFloat | None = None,
+        yaw_rate: SupportsFloat | None = None,
+    ) -> Setpoint:
+        """Follow up to 8 polynomial pieces, one after the other: piece i lasts `seconds[i]` [s], and after t
+        seconds of it the position is the sum of `coefficients[i, k] * t**k`. `coefficients` has the shape
+        (pieces, up to 8, 3). [m/s^k, axes]
+
+        Otherwise as `waypoints`.
+        """
 
 @final
 class Event:
@@ -469,6 +580,12 @@ class ObservationBuffer:
     def set_vehicle(self, vehicle: Vehicle) -> None:
         """Fills in what is known of the vehicle."""
 
+    def set_battery(self, battery: Battery) -> None:
+        """Fills in the battery's state."""
+    def set_imu(self, samples: Sequence[ImuSample]) -> None:
+        """Fills in the newest IMU samples, oldest first; those with stamps that a plugin has had already, it
+        does not get again.
+        """
     def set_image(
         self,
         name: str,
