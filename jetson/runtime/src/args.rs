@@ -8,6 +8,7 @@ use std::str::FromStr;
 
 use clap::Args;
 
+use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
 
 use crate::link::udp::MavlinkAddress;
@@ -49,6 +50,9 @@ pub struct FlyArgs {
     /// Gives up if not in the air after this long; 0 waits for ever
     #[arg(long, value_name = "SECONDS", default_value_t = 120.0)]
     pub ready_within: f64,
+    /// This vehicle's own limits, from `jetson.toml`
+    #[arg(skip = Limits::NONE)]
+    pub limits: Limits,
     /// Prints one JSON object per line for programs, instead of lines for people
     #[arg(long)]
     pub json: bool,

@@ -27,6 +27,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::Fingerprint;
 
 pub use strict::{StrictError, parse_strict};
@@ -88,6 +89,18 @@ pub struct LimitsConfig {
     /// Greatest height of the body's centre. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_altitude_m: Option<f64>,
+}
+
+impl From<LimitsConfig> for Limits {
+    /// What is not set does not limit.
+    fn from(config: LimitsConfig) -> Self {
+        Self {
+            max_speed_mps: config.max_speed_mps.unwrap_or(f64::INFINITY),
+            max_acceleration_mps2: config.max_acceleration_mps2.unwrap_or(f64::INFINITY),
+            max_tilt_deg: config.max_tilt_deg,
+            max_altitude_m: config.max_altitude_m,
+        }
+    }
 }
 
 /// `[plugin]`: the plugin and what it may use.

@@ -297,7 +297,9 @@ impl Loop {
 
     fn take_stream(&mut self, now: HostTime, event: StreamEvent) {
         match event {
-            StreamEvent::Welcome(arena) => {
+            StreamEvent::Welcome(mut arena) => {
+                // The plugin gets the limits that it is flown within.
+                self.control.settings.tighten(&mut arena);
                 tracing::info!("server: arena {}", arena.name);
                 self.flight.handle(now, Input::Arena(arena.clone()));
                 if self.plugin.is_none() && self.flight.outcome().is_none() {

@@ -81,7 +81,11 @@ pub fn fly_command(
 
     let control = Control {
         plugin_command,
-        settings: FlightSettings { ready_within_s: args.ready_within, time_limit_s: args.seconds },
+        settings: FlightSettings {
+            ready_within_s: args.ready_within,
+            time_limit_s: args.seconds,
+            limits: args.limits,
+        },
         port,
         partner: Partner::new(args.mavlink, Instant::now()),
         shared,

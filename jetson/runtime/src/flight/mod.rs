@@ -20,7 +20,7 @@ use std::collections::VecDeque;
 
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Setpoint,
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, Setpoint,
 };
 use vizflyt_protocol::time::HostTime;
 
@@ -37,6 +37,15 @@ pub struct FlightSettings {
     pub ready_within_s: f64,
     /// Land this long after take-off, whatever the arena allows; 0 leaves it to the arena. [s]
     pub time_limit_s: f64,
+    /// This vehicle's own limits; of them and the arena's, the stricter wins.
+    pub limits: Limits,
+}
+
+impl FlightSettings {
+    /// Tightens an arena's limits to this vehicle's own.
+    pub fn tighten(&self, arena: &mut ArenaInfo) {
+        arena.limits = arena.limits.stricter(&self.limits);
+    }
 }
 
 /// What happens around the flight.
@@ -270,7 +279,8 @@ impl Flight {
 
     // ---- inputs ----
 
-    fn handle_arena(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
+    fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
+        self.settings.tighten(&mut arena);
         if let Err(why) = crate::guard::check_arena(&arena) {
             return self.end_now(now, OutcomeKind::Error, why);
         }

@@ -5,10 +5,15 @@ use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{Limits, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
 
+use vizflyt_protocol::mavlink::GuidedMotion;
+
 use super::*;
 use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
 
 /// What the plugin does with an image.
+/// The vehicle's own limits: slower than the arena, otherwise laxer.
+const OWN: Limits = Limits::new(0.1, 50.0);
+
 #[derive(Clone)]
 #[allow(clippy::large_enum_variant)] // Why: there is one.
 enum Answers {
@@ -51,7 +56,7 @@ fn arena() -> ArenaInfo {
 impl Script {
     fn new() -> Self {
         let now = HostTime::from_ns(1_000_000_000);
-        let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0 };
+        let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: OWN };
         Self {
             flight: Flight::new(settings, now),
             now,
@@ -383,4 +388,16 @@ fn a_server_that_comes_back_with_another_arena_ends_it() {
     let broken = ArenaInfo { takeoff_height_m: f64::NAN, ..arena() };
     script.flight.handle(script.now, Input::Arena(Box::new(broken)));
     assert!(script.flight.outcome().unwrap().reason.contains("takeoff_height_m"));
+}
+
+#[test]
+fn the_stricter_limit_wins() {
+    // The plugin asks for 0.2 m/s, the arena allows 3, the vehicle 0.1.
+    let mut script = Script::flying();
+    script.run(1.0);
+    let Some(GuidedSetpoint { motion: GuidedMotion::Velocity(v_mps), .. }) = script.orders.setpoint
+    else {
+        panic!("{:?}", script.orders)
+    };
+    assert!((v_mps.length() - 0.1).abs() < 1e-9, "{v_mps}");
 }

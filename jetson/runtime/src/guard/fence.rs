@@ -1,13 +1,17 @@
-//! The geofence with stopping distance: how fast the vehicle may approach each face.
+//! The geofence with stopping distance: how fast the vehicle may approach each face, and the
+//! ceiling that `max_altitude_m` is.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::messages::ArenaInfo;
 
 /// The keep-in volume, shrunk by the body and a margin.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Fence {
     volume: Volume,
     body_radius_m: f64,
+    /// Greatest height of the body's centre, if there is one. [m, world]
+    ceiling_m: Option<f64>,
     /// Acceleration that the stopping distance counts on, per face. [m/s^2]
     stopping_mps2: f64,
 }
@@ -26,8 +30,13 @@ const KEPT_SHARE: f64 = 0.9;
 const BACK_MPS: f64 = 0.5;
 
 impl Fence {
-    pub(super) fn new(volume: Volume, body_radius_m: f64, max_acceleration_mps2: f64) -> Self {
-        Self { volume, body_radius_m, stopping_mps2: STOPPING_SHARE * max_acceleration_mps2 }
+    pub(super) fn new(arena: &ArenaInfo, max_acceleration_mps2: f64) -> Self {
+        Self {
+            volume: arena.geofence,
+            body_radius_m: arena.body_radius_m,
+            ceiling_m: arena.limits.max_altitude_m,
+            stopping_mps2: STOPPING_SHARE * max_acceleration_mps2,
+        }
     }
 
     /// Returns how far the body's surface is outside; negative inside. [m]
@@ -35,8 +44,8 @@ impl Fence {
         self.volume.signed_distance_m(p_m) + self.body_radius_m
     }
 
-    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence. Motion
-    /// along a face is left as it is. [m/s, world]
+    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence or the
+    /// ceiling. Motion along a face is left as it is. [m/s, world]
     pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
         match self.volume {
             // Each face on its own, so that the vehicle can slide along two into a corner.
@@ -50,7 +59,11 @@ impl Fence {
                     // A room narrower than its margins leaves no speed that suits both faces.
                     v[axis] = if least > most { 0.0 } else { v[axis].clamp(least, most) };
                 }
-                rotation * v
+                let v = rotation * v;
+                let below = self.below_ceiling(p_m, v);
+                // Less climb changes the way towards the walls only of a room that leans.
+                let leans = (rotation * DVec3::Z).z.abs() < 1.0 - 1e-9;
+                if leans && below != v { self.shorten(p_m, below) } else { below }
             }
             // One face: the nearest. Then the whole stopping path, as faces may curve.
             volume => {
@@ -58,9 +71,15 @@ impl Fence {
                 let free_m = -self.outside_m(p_m) - MARGIN_M;
                 let most = self.approach_mps(free_m);
                 let v = v_mps + outward * (most - v_mps.dot(outward)).min(0.0);
-                self.shorten(p_m, v)
+                self.shorten(p_m, self.below_ceiling(p_m, v))
             }
         }
+    }
+
+    /// Returns `v_mps` without a climb that would not end below the ceiling. [m/s, world]
+    fn below_ceiling(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+        let most = self.ceiling_m.map(|ceiling_m| self.approach_mps(ceiling_m - MARGIN_M - p_m.z));
+        v_mps.with_z(v_mps.z.min(most.unwrap_or(f64::INFINITY)))
     }
 
     /// Returns the greatest speed towards a face that is `free_m` away from which the vehicle

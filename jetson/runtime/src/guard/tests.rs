@@ -1,6 +1,8 @@
 use glam::{DQuat, DVec3};
 use proptest::prelude::*;
-use vizflyt_protocol::messages::{ArenaInfo, Limits, bounded};
+use vizflyt_protocol::messages::{
+    ArenaInfo, COEFFICIENTS, Limits, PathYaw, Piece, Trajectory, Waypoint, bounded,
+};
 
 use super::*;
 
@@ -17,7 +19,7 @@ fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> Ar
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
-        attitude_rate: false,
+        attitude_rate: true,
         cameras: heapless::Vec::new(),
     }
 }
@@ -32,6 +34,8 @@ struct Vehicle {
     v_mps: DVec3,
     yaw_rad: f64,
     max_acceleration_mps2: f64,
+    /// What it did in the last tick. [m/s^2]
+    a_mps2: DVec3,
     delayed: std::collections::VecDeque<DVec3>,
 }
 
@@ -43,7 +47,8 @@ const LAG_S: f64 = 0.12;
 impl Vehicle {
     fn new(p_m: DVec3, max_acceleration_mps2: f64) -> Self {
         let delayed = [DVec3::ZERO; DELAY_TICKS].into();
-        Self { p_m, v_mps: DVec3::ZERO, yaw_rad: 0.3, max_acceleration_mps2, delayed }
+        let (v_mps, a_mps2) = (DVec3::ZERO, DVec3::ZERO);
+        Self { p_m, v_mps, yaw_rad: 0.3, max_acceleration_mps2, a_mps2, delayed }
     }
 
     fn fly(&mut self, v_command_mps: DVec3) {
@@ -52,6 +57,12 @@ impl Vehicle {
         let a = ((v_command_mps - self.v_mps) / LAG_S).clamp_length_max(self.max_acceleration_mps2);
         self.p_m += self.v_mps * TICK_S + 0.5 * a * TICK_S * TICK_S;
         self.v_mps += a * TICK_S;
+        self.a_mps2 = a;
+    }
+
+    /// Angle of its thrust from upright.
+    fn tilt_deg(&self) -> f64 {
+        (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).angle_between(DVec3::Z).to_degrees()
     }
 
     fn fix(&self, stamp: HostTime) -> Fix {
@@ -84,15 +95,45 @@ fn setpoint() -> impl Strategy<Value = Setpoint> {
             number().prop_map(YawTarget::Rate),
         ]
     };
-    let axes = || prop_oneof![Just(Axes::World), Just(Axes::Heading)];
+    let axes = || prop_oneof![Just(Axes::World), Just(Axes::Heading), Just(Axes::Body)];
     prop_oneof![
         1 => Just(Setpoint::Hold),
+        1 => Just(Setpoint::TakeOff),
         2 => (vector(), yaw()).prop_map(|(p_world_m, yaw)| Setpoint::Position { p_world_m, yaw }),
         4 => (vector(), axes(), yaw())
             .prop_map(|(v_mps, axes, yaw)| Setpoint::Velocity { v_mps, axes, yaw }),
         2 => (vector(), axes(), yaw())
             .prop_map(|(a_mps2, axes, yaw)| Setpoint::Acceleration { a_mps2, axes, yaw }),
+        2 => (vector(), axes(), yaw()).prop_map(|(d_m, axes, yaw)| Setpoint::Offset { d_m, axes, yaw }),
+        2 => (vector(), number())
+            .prop_map(|(omega_body_radps, thrust)| Setpoint::AttitudeRate { omega_body_radps, thrust }),
+        2 => (path(), axes(), yaw(), any::<bool>(), 0..3u32).prop_map(|(path, axes, yaw, ahead, id)| {
+            let yaw = if ahead { PathYaw::Ahead } else { PathYaw::Target(yaw) };
+            Setpoint::Trajectory(Trajectory { id, axes, path, yaw })
+        }),
     ]
+}
+
+fn path() -> impl Strategy<Value = Path> {
+    let waypoint = (vector(), number()).prop_map(|(p_m, speed_mps)| Waypoint { p_m, speed_mps });
+    let piece = (0.1..3.0f64, prop::array::uniform8(vector()))
+        .prop_map(|(seconds, coefficients)| Piece { seconds, coefficients });
+    let calm = (0.5..3.0f64, vector(), vector()).prop_map(|(seconds, p_m, v_mps)| {
+        let mut coefficients = [DVec3::ZERO; COEFFICIENTS];
+        (coefficients[0], coefficients[1]) = (p_m, v_mps);
+        Piece { seconds, coefficients }
+    });
+    prop_oneof![
+        prop::collection::vec(waypoint, 0..6)
+            .prop_map(|v| Path::Waypoints(v.into_iter().collect())),
+        prop::collection::vec(prop_oneof![piece, calm], 0..4)
+            .prop_map(|v| Path::Polynomial(v.into_iter().collect())),
+    ]
+}
+
+/// Random flights: 10^5 by `VIZFLYT_GUARD_CASES=100000`, as `tests/run` does.
+fn cases() -> u32 {
+    std::env::var("VIZFLYT_GUARD_CASES").ok().and_then(|n| n.parse().ok()).unwrap_or(5_000)
 }
 
 fn volume() -> impl Strategy<Value = Volume> {
@@ -113,7 +154,7 @@ fn volume() -> impl Strategy<Value = Volume> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 10_000, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
 
     /// Whatever a plugin asks, the vehicle stays inside, the limits hold and no NaN gets through.
     #[test]
@@ -121,10 +162,14 @@ proptest! {
         geofence in volume(),
         max_speed_mps in 0.5..8.0f64,
         max_acceleration_mps2 in 2.0..10.0f64,
+        max_tilt_deg in prop::option::of(12.0..60.0f64),
+        max_altitude_m in prop::option::of(2.4..6.0f64),
         asked in prop::collection::vec((setpoint(), 1usize..60), 1..10),
     ) {
-        let arena = arena(geofence, max_speed_mps, max_acceleration_mps2);
-        let mut vehicle = Vehicle::new(DVec3::Z * 2.0, max_acceleration_mps2);
+        let mut arena = arena(geofence, max_speed_mps, max_acceleration_mps2);
+        (arena.limits.max_tilt_deg, arena.limits.max_altitude_m) = (max_tilt_deg, max_altitude_m);
+        // It could do more than it may.
+        let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
         let mut guard = Guard::new(&arena, &vehicle.fix(time(0)), time(0));
         let mut v_before = DVec3::ZERO;
         let mut tick = 0;
@@ -153,11 +198,17 @@ proptest! {
                 // Where slew limit and fence disagree the fence wins: at flat faces by a little,
                 // at curved ones by as much as it takes.
                 let flat = matches!(geofence, Volume::Cuboid { .. });
-                prop_assert!(!flat || change_mps2 <= 1.2 * max_acceleration_mps2, "{change_mps2}");
+                let most_mps2 = FENCE_EXCESS * acceleration_within_tilt_mps2(&arena.limits);
+                prop_assert!(!flat || change_mps2 <= most_mps2 + 1e-9, "{change_mps2}");
                 v_before = v;
                 vehicle.fly(v);
                 let outside_m = geofence.signed_distance_m(vehicle.p_m) + arena.body_radius_m;
                 prop_assert!(outside_m <= 0.0, "{outside_m} m outside at {}", vehicle.p_m);
+                prop_assert!(vehicle.v_mps.length() <= max_speed_mps + 1e-9);
+                let tilts = max_tilt_deg.is_some_and(|most| vehicle.tilt_deg() > most + 1e-6);
+                prop_assert!(!flat || !tilts, "{} deg", vehicle.tilt_deg());
+                let climbs = max_altitude_m.is_some_and(|most| vehicle.p_m.z > most);
+                prop_assert!(!climbs, "at {}", vehicle.p_m);
             }
         }
         // Holding is reachable from anywhere, and it stops.
@@ -354,6 +405,98 @@ fn an_orderly_end_brakes_before_it_lands() {
 }
 
 #[test]
+fn an_offset_counts_from_where_it_was_taken() {
+    let mut guard = guard();
+    let mut vehicle = Vehicle::new(DVec3::new(1.0, -1.0, 2.0), 4.0);
+    let offset = |axes| Setpoint::Offset { d_m: DVec3::X * 0.5, axes, yaw: YawTarget::Keep };
+    guard.ask(time(0), offset(Axes::Heading)).unwrap();
+    let from_m = vehicle.p_m;
+    for tick in 1..400 {
+        guard.asked_at = time(tick);
+        vehicle.fly(passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0));
+    }
+    let ahead = DVec3::new(0.3_f64.cos(), 0.3_f64.sin(), 0.0);
+    assert!((vehicle.p_m - from_m - ahead * 0.5).length() < 0.02, "{}", vehicle.p_m);
+}
+
+/// Flies a trajectory to its end, asked for once and then kept by answers without a setpoint.
+#[test]
+fn a_trajectory_is_flown_while_the_plugin_answers() {
+    let corners = [DVec3::new(2.0, 0.0, 2.0), DVec3::new(2.0, 2.0, 2.0), DVec3::new(0.0, 0.0, 1.0)];
+    let points = corners.map(|p_m| Waypoint { p_m, speed_mps: 1.5 });
+    let path = Path::Waypoints(points.into_iter().collect());
+    let trajectory = Setpoint::Trajectory(Trajectory { path, ..Trajectory::default() });
+    let mut guard = guard();
+    let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
+    guard.ask(time(0), trajectory).unwrap();
+    let mut nearest_m = [f64::INFINITY; 3];
+    let mut tick = 0;
+    let end = loop {
+        tick += 1;
+        guard.answered(time(tick));
+        let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick)));
+        if stance != Stance::Passing {
+            break stance;
+        }
+        vehicle.fly(passed_velocity(passed));
+        for (nearest_m, corner_m) in nearest_m.iter_mut().zip(corners) {
+            *nearest_m = nearest_m.min((vehicle.p_m - corner_m).length());
+        }
+    };
+    // Over: the plugin says nothing new, and the usual deadline holds.
+    assert_eq!(end, Stance::Holding(HoldReason::NoSetpoint));
+    assert!(nearest_m.iter().all(|&m| m < 0.25), "{nearest_m:?}");
+    assert!((vehicle.p_m - corners[2]).length() < 0.15, "{}", vehicle.p_m);
+
+    // A plugin that stops answering is not followed through.
+    let mut silent = self::guard();
+    let path = Path::Waypoints(points.into_iter().collect());
+    let again = Setpoint::Trajectory(Trajectory { path, ..Trajectory::default() });
+    silent.ask(time(0), again).unwrap();
+    silent.tick(time(1), &at_rest(1));
+    assert_eq!(silent.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
+}
+
+#[test]
+fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
+    let rates = |pitch_radps, thrust| Setpoint::AttitudeRate {
+        omega_body_radps: DVec3::Y * pitch_radps,
+        thrust,
+    };
+    let mut strict = arena(room(), 3.0, 4.0);
+    strict.attitude_rate = false;
+    let mut forbidden = Guard::new(&strict, &at_rest(0), time(0));
+    assert_eq!(forbidden.ask(time(1), rates(0.0, 1.0)), Err(InvalidSetpoint::AttitudeRate));
+
+    // Nose down for 0.2 s at 1 rad/s, then level rates: it accelerates ahead by g tan(0.2).
+    let mut guard = guard();
+    let mut v = DVec3::ZERO;
+    for tick in 1..=40 {
+        let (pitch_radps, thrust) =
+            if tick <= 10 { (1.0, 1.0) } else { (0.0, 1.0 / 0.2_f64.cos()) };
+        guard.ask(time(tick), rates(pitch_radps, thrust)).unwrap();
+        let before = v;
+        v = passed_velocity(guard.tick(time(tick), &at_rest(tick)).0);
+        if tick == 40 {
+            let a = (v - before) / TICK_S;
+            let ahead = DQuat::from_rotation_z(0.3) * DVec3::X;
+            assert!((a - ahead * GRAVITY_MPS2 * 0.2_f64.tan()).length() < 1e-6, "{a}");
+        }
+    }
+}
+
+#[test]
+fn take_off_goes_back_to_the_height_of_the_beginning() {
+    let mut guard = guard();
+    let mut vehicle = Vehicle::new(DVec3::new(1.0, 1.0, 0.5), 4.0);
+    for tick in 1..600 {
+        guard.ask(time(tick), Setpoint::TakeOff).unwrap();
+        vehicle.fly(passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0));
+    }
+    assert!((vehicle.p_m - DVec3::new(1.0, 1.0, 2.0)).length() < 0.02, "{}", vehicle.p_m);
+}
+
+#[test]
 fn landing_is_final() {
     let mut guard = guard();
     guard.land();
@@ -369,6 +512,11 @@ fn arenas_the_guard_cannot_keep_are_refused() {
     assert_eq!(check_arena(&arena(room(), 3.0, 4.0)), Ok(()));
     assert!(check_arena(&arena(room(), f64::NAN, 4.0)).unwrap_err().contains("limits"));
     assert!(check_arena(&arena(room(), 3.0, 0.0)).unwrap_err().contains("limits"));
+    let mut low = arena(room(), 3.0, 4.0);
+    low.limits.max_altitude_m = Some(0.9);
+    assert!(check_arena(&low).unwrap_err().contains("max_altitude_m = 0.9"));
+    low.limits = Limits { max_tilt_deg: Some(f64::NAN), ..Limits::new(3.0, 4.0) };
+    assert!(check_arena(&low).unwrap_err().contains("max_tilt_deg"));
     let tiny = Volume::aabb(DVec3::ZERO, DVec3::splat(0.2));
     assert!(check_arena(&arena(tiny, 3.0, 4.0)).unwrap_err().contains("too small"));
     let bad = Volume::Sphere { center_m: DVec3::ZERO, radius_m: -1.0 };

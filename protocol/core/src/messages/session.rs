@@ -192,6 +192,9 @@ pub struct Limits {
 }
 
 impl Limits {
+    /// No limit at all: what [`Self::stricter`] leaves any other as it is.
+    pub const NONE: Self = Self::new(f64::INFINITY, f64::INFINITY);
+
     /// Makes limits of speed [m/s] and acceleration [m/s^2] only.
     pub const fn new(max_speed_mps: f64, max_acceleration_mps2: f64) -> Self {
         Self { max_speed_mps, max_acceleration_mps2, max_tilt_deg: None, max_altitude_m: None }
