@@ -99,6 +99,11 @@ impl<'a> Observation<'a> {
         Self { imu_after: stamp, ..self }
     }
 
+    /// Returns the memory it lies in, in the layout of [`ObservationHeader`].
+    pub fn as_bytes(&self) -> &'a [u8] {
+        self.bytes
+    }
+
     /// Returns the observation's number in this flight; numbers missing were skipped.
     pub fn seq(&self) -> u64 {
         self.header.seq

@@ -14,6 +14,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-simulator", &["vizflyt-protocol"]),
     ("vizflyt-sdk", &["vizflyt-protocol"]),
     ("vizflyt-avoid", &["vizflyt-sdk"]),
+    ("vizflyt-c", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
     (

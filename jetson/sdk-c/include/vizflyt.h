@@ -1,0 +1,185 @@
+/* VizFlyt plugins in C and C++: the layout of an observation in shared memory, and four callbacks.
+ *
+ *   #include "vizflyt.h"
+ *   static int on_image(void *user, const VizflytObservation *obs, VizflytSetpoint *answer) {
+ *       answer->kind = VIZFLYT_HOLD;
+ *       return 1;
+ *   }
+ *   int main(void) {
+ *       VizflytPlugin plugin = {0};
+ *       plugin.on_image = on_image;
+ *       return vizflyt_run(&plugin);
+ *   }
+ *
+ * Build: cargo build --release -p vizflyt-c
+ *        c++ my_plugin.cpp -I jetson/sdk-c/include target/release/libvizflyt_c.a -lpthread -ldl -lm
+ * Fly:   vizflyt demo --plugin ./a.out        (or `vizflyt fly ./a.out ...`)
+ *
+ * Frames: world is x east, y north, z up; body is x forward, y left, z up; camera is x right, y down,
+ * z forward. Rotations are unit quaternions in the order x, y, z, w. SI units; angles in radians;
+ * times in nanoseconds of CLOCK_MONOTONIC. Protocol version 4, little-endian. */
+#ifndef VIZFLYT_H
+#define VIZFLYT_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define VIZFLYT_PROTOCOL_VERSION 4
+#define VIZFLYT_MAX_CAMERAS 8
+#define VIZFLYT_MAX_IMU 64
+#define VIZFLYT_MAX_WAYPOINTS 32
+#define VIZFLYT_MAX_PIECES 8
+
+/* ---- an observation, as it lies in shared memory; valid during on_image ---- */
+
+/* One camera. Its planes lie at rgb_offset and depth_offset from the start of the observation. */
+typedef struct VizflytCamera {
+    uint64_t pose_ns;          /* when the pose that the image shows was measured */
+    uint64_t ready_ns;         /* when the runtime had the decoded image */
+    uint64_t seq;              /* tick of the server that made the image */
+    double intrinsics_px[4];   /* fx, fy, cx, cy; (0, 0) is the top-left pixel's outer corner */
+    double distortion[5];      /* in the order of OpenCV, the rest 0 */
+    double translation_m[3];   /* of the camera in the body */
+    double rotation_xyzw[4];   /* camera to body */
+    uint32_t width_px;         /* 0: this camera has no image yet */
+    uint32_t height_px;
+    uint32_t rgb_offset;
+    uint32_t depth_offset;
+    uint32_t distortion_model; /* 0 none, 1 Brown-Conrady, 2 Kannala-Brandt */
+    uint32_t reserved;
+} VizflytCamera;
+
+typedef struct VizflytImu {
+    uint64_t stamp_ns;
+    float accel_mps2[3]; /* specific force, body: at rest and level +9.8 along z */
+    float gyro_radps[3]; /* body */
+} VizflytImu;
+
+enum {
+    VIZFLYT_HAS_ATTITUDE = 1, /* rotation and angular velocity are filled in */
+    VIZFLYT_HAS_POSE = 2      /* so are position and velocity: the course gives them */
+};
+
+typedef struct VizflytObservation {
+    char magic[4]; /* "VZOB" */
+    uint16_t version;
+    uint8_t camera_count;
+    uint8_t flags;
+    uint32_t total_len; /* bytes, planes included */
+    uint32_t imu_count;
+    uint64_t seq;        /* counts observations; numbers missing were skipped */
+    uint64_t vehicle_ns; /* when the vehicle's state was true */
+    double position_m[3];    /* world; zero where the course withholds it */
+    double velocity_mps[3];  /* world; likewise */
+    double rotation_xyzw[4]; /* body to world */
+    double angular_radps[3]; /* body */
+    double battery_fraction; /* 0 to 1; negative if unknown */
+    double battery_v;        /* 0 if unknown */
+    VizflytImu imu[VIZFLYT_MAX_IMU]; /* the newest, oldest first; those had before come again */
+    VizflytCamera cameras[VIZFLYT_MAX_CAMERAS];
+} VizflytObservation;
+
+/* Returns the colour image, H x W x 3 bytes, sRGB; NULL if the camera has none yet. */
+static inline const uint8_t *vizflyt_rgb(const VizflytObservation *obs, unsigned camera) {
+    if (camera >= obs->camera_count || obs->cameras[camera].width_px == 0) return NULL;
+    return (const uint8_t *)obs + obs->cameras[camera].rgb_offset;
+}
+
+/* Returns depth along the camera's z, H x W, in millimetres; 0 is no return. NULL as above. */
+static inline const uint16_t *vizflyt_depth_mm(const VizflytObservation *obs, unsigned camera) {
+    if (camera >= obs->camera_count || obs->cameras[camera].width_px == 0) return NULL;
+    return (const uint16_t *)(const void *)((const uint8_t *)obs + obs->cameras[camera].depth_offset);
+}
+
+/* ---- what a plugin answers ---- */
+
+enum {
+    VIZFLYT_HOLD = 0,
+    VIZFLYT_LAND = 1,
+    VIZFLYT_POSITION = 2,      /* v: [m, world] */
+    VIZFLYT_VELOCITY = 3,      /* v: [m/s, axes] */
+    VIZFLYT_ACCELERATION = 4,  /* v: [m/s^2, axes], gravity compensated */
+    VIZFLYT_OFFSET = 5,        /* v: [m, axes], from where the vehicle is */
+    VIZFLYT_ATTITUDE_RATE = 6, /* v: [rad/s, body], and thrust; only where the course allows */
+    VIZFLYT_TAKE_OFF = 7,      /* to the height at which the plugin took over */
+    VIZFLYT_WAYPOINTS = 8,     /* id, axes, yaw_kind, waypoints[count] */
+    VIZFLYT_POLYNOMIAL = 9     /* id, axes, yaw_kind, pieces[count] */
+};
+enum { VIZFLYT_WORLD = 0, VIZFLYT_HEADING = 1, VIZFLYT_BODY = 2 };
+enum {
+    VIZFLYT_YAW_KEEP = 0,
+    VIZFLYT_YAW_ANGLE = 1, /* yaw: from world x, counter-clockwise [rad] */
+    VIZFLYT_YAW_RATE = 2,  /* yaw: counter-clockwise [rad/s] */
+    VIZFLYT_YAW_AHEAD = 3  /* into the direction of travel; trajectories only */
+};
+
+typedef struct VizflytWaypoint {
+    double p_m[3];
+    double speed_mps; /* greatest on the way to it */
+} VizflytWaypoint;
+
+/* Position after t seconds of the piece is the sum of coefficients[k] * t^k. */
+typedef struct VizflytPiece {
+    double seconds;
+    double coefficients[8][3];
+} VizflytPiece;
+
+typedef struct VizflytSetpoint {
+    uint32_t kind;
+    uint32_t axes;
+    uint32_t yaw_kind;
+    uint32_t count; /* of waypoints or pieces */
+    double v[3];
+    double yaw;
+    double thrust; /* over weight: 1 carries the level vehicle */
+    uint32_t id;   /* of a trajectory: the same goes on, another one starts anew */
+    uint32_t reserved;
+    const VizflytWaypoint *waypoints; /* read before on_image's caller goes on, not kept */
+    const VizflytPiece *pieces;
+} VizflytSetpoint;
+
+/* ---- the plugin ---- */
+
+typedef struct VizflytArena {
+    uint32_t camera_count;
+    uint32_t has_goal;
+    double goal_m[3]; /* world */
+    double max_speed_mps;
+    double max_acceleration_mps2;
+    uint32_t ground_truth;  /* 1: observations have VIZFLYT_HAS_POSE */
+    uint32_t attitude_rate; /* 1: VIZFLYT_ATTITUDE_RATE is allowed */
+    char name[33];
+    char cameras[VIZFLYT_MAX_CAMERAS][33]; /* their names, by index */
+} VizflytArena;
+
+/* All are called from the thread of vizflyt_run, one at a time. None may let an exception out, nor
+ * keep a pointer it was given. Any but on_image may be NULL. */
+typedef struct VizflytPlugin {
+    void *user; /* handed back to each */
+    /* Before the first image, on the ground. */
+    void (*on_start)(void *user, const VizflytArena *arena);
+    /* Returns 1 with *answer filled in (it comes zeroed: hold), 0 for no answer. */
+    int (*on_image)(void *user, const VizflytObservation *obs, VizflytSetpoint *answer);
+    /* Something happened; a sentence for a person. */
+    void (*on_event)(void *user, const char *text);
+    /* At the end of the flight. */
+    void (*on_stop)(void *user);
+} VizflytPlugin;
+
+/* Attaches to the runtime that started this program and runs to the end of the flight. Returns the
+ * exit status for main: 0 after a flight, 1 if the runtime vanished, 2 if there is none. */
+int vizflyt_run(const VizflytPlugin *plugin);
+
+#ifdef __cplusplus
+}
+static_assert(sizeof(VizflytCamera) == 176, "layout of the shared memory");
+static_assert(sizeof(VizflytImu) == 32, "layout of the shared memory");
+static_assert(sizeof(VizflytObservation) == 3608, "layout of the shared memory");
+static_assert(offsetof(VizflytObservation, cameras) == 2200, "layout of the shared memory");
+#endif
+
+#endif

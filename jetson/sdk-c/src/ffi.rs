@@ -1,0 +1,281 @@
+//! The C interface. Types mirror `include/vizflyt.h` field by field; their meaning is said there.
+
+use std::ffi::{CString, c_char, c_int, c_void};
+use std::process::ExitCode;
+
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::protocol::messages::MAX_CAMERAS;
+use vizflyt_sdk::protocol::packet::ObservationHeader;
+use vizflyt_sdk::{
+    ArenaInfo, Autonomy, Axes, Event, Observation, Path, PathYaw, Piece, Setpoint, Trajectory,
+    Waypoint, YawTarget,
+};
+
+/// A point to pass.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytWaypoint {
+    /// Where. [m, axes]
+    pub p_m: [f64; 3],
+    /// Greatest speed on the way to it. [m/s]
+    pub speed_mps: f64,
+}
+
+/// A polynomial in time.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytPiece {
+    /// How long it lasts. [s]
+    pub seconds: f64,
+    /// Of `t^k`. [m/s^k, axes]
+    pub coefficients: [[f64; 3]; 8],
+}
+
+/// What a plugin answers.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytSetpoint {
+    /// `VIZFLYT_HOLD` and so on.
+    pub kind: u32,
+    /// `VIZFLYT_WORLD` and so on.
+    pub axes: u32,
+    /// `VIZFLYT_YAW_KEEP` and so on.
+    pub yaw_kind: u32,
+    /// Of waypoints or pieces.
+    pub count: u32,
+    /// By kind.
+    pub v: [f64; 3],
+    /// By `yaw_kind`. [rad or rad/s]
+    pub yaw: f64,
+    /// Over weight.
+    pub thrust: f64,
+    /// Of a trajectory.
+    pub id: u32,
+    /// Zero.
+    pub reserved: u32,
+    /// `count` of them.
+    pub waypoints: *const VizflytWaypoint,
+    /// `count` of them.
+    pub pieces: *const VizflytPiece,
+}
+
+/// What a plugin is told at the start.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytArena {
+    /// Cameras there are.
+    pub camera_count: u32,
+    /// Whether `goal_m` is set.
+    pub has_goal: u32,
+    /// Where the flight shall end. [m, world]
+    pub goal_m: [f64; 3],
+    /// Greatest speed. [m/s]
+    pub max_speed_mps: f64,
+    /// Greatest acceleration. [m/s^2]
+    pub max_acceleration_mps2: f64,
+    /// Whether observations have the pose.
+    pub ground_truth: u32,
+    /// Whether attitude rates are allowed.
+    pub attitude_rate: u32,
+    /// The arena's name, ending in 0.
+    pub name: [u8; 33],
+    /// The cameras' names, each ending in 0.
+    pub cameras: [[u8; 33]; MAX_CAMERAS],
+}
+
+/// A plugin's callbacks.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytPlugin {
+    /// Handed back to each.
+    pub user: *mut c_void,
+    /// Before the first image.
+    pub on_start: Option<unsafe extern "C" fn(*mut c_void, *const VizflytArena)>,
+    /// At each image.
+    pub on_image: Option<
+        unsafe extern "C" fn(*mut c_void, *const ObservationHeader, *mut VizflytSetpoint) -> c_int,
+    >,
+    /// When something happened.
+    pub on_event: Option<unsafe extern "C" fn(*mut c_void, *const c_char)>,
+    /// At the end.
+    pub on_stop: Option<unsafe extern "C" fn(*mut c_void)>,
+}
+
+/// Attaches to the runtime that started this program and runs to the end of the flight; returns the
+/// exit status for `main`.
+///
+/// # Safety
+/// `plugin` points to a `VizflytPlugin` whose callbacks do what `vizflyt.h` asks of them.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
+    // SAFETY: the caller promises it, or passes null.
+    let Some(&callbacks) = (unsafe { plugin.as_ref() }) else {
+        eprintln!("vizflyt_run: the plugin is NULL");
+        return NOT_ATTACHED;
+    };
+    if callbacks.on_image.is_none() {
+        eprintln!("vizflyt_run: on_image is NULL; a plugin must answer images");
+        return NOT_ATTACHED;
+    }
+    let code = vizflyt_sdk::run(CPlugin(callbacks));
+    // `ExitCode` tells no number.
+    [0, 1, 2, 101].into_iter().find(|&n| ExitCode::from(n) == code).unwrap_or(1).into()
+}
+
+const NOT_ATTACHED: c_int = 2;
+
+struct CPlugin(VizflytPlugin);
+
+impl Autonomy for CPlugin {
+    fn on_start(&mut self, info: &ArenaInfo) {
+        let Some(on_start) = self.0.on_start else { return };
+        let mut cameras = [[0; 33]; MAX_CAMERAS];
+        for (name, camera) in cameras.iter_mut().zip(&info.cameras) {
+            *name = zero_ended(&camera.name);
+        }
+        let arena = VizflytArena {
+            camera_count: info.cameras.len() as u32,
+            has_goal: info.goal_m.is_some().into(),
+            goal_m: info.goal_m.unwrap_or_default().to_array(),
+            max_speed_mps: info.limits.max_speed_mps,
+            max_acceleration_mps2: info.limits.max_acceleration_mps2,
+            ground_truth: info.ground_truth.into(),
+            attitude_rate: info.attitude_rate.into(),
+            name: zero_ended(&info.name),
+            cameras,
+        };
+        // SAFETY: the callback keeps to `vizflyt.h`; `arena` outlives the call.
+        unsafe { on_start(self.0.user, &raw const arena) }
+    }
+
+    fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
+        let on_image = self.0.on_image?;
+        let mut answer = VizflytSetpoint {
+            kind: 0,
+            axes: 0,
+            yaw_kind: 0,
+            count: 0,
+            v: [0.0; 3],
+            yaw: 0.0,
+            thrust: 0.0,
+            id: 0,
+            reserved: 0,
+            waypoints: std::ptr::null(),
+            pieces: std::ptr::null(),
+        };
+        // The header's address is the memory's, planes behind it: validated by `Observation`.
+        let memory = obs.as_bytes().as_ptr().cast::<ObservationHeader>();
+        // SAFETY: the callback keeps to `vizflyt.h`; both pointers outlive the call.
+        let answered = unsafe { on_image(self.0.user, memory, &raw mut answer) };
+        if answered == 0 {
+            return None;
+        }
+        // SAFETY: the callback has filled in `answer` as `vizflyt.h` asks.
+        let setpoint = unsafe { setpoint(&answer) };
+        if setpoint.is_none() {
+            eprintln!("vizflyt: no such setpoint: {answer:?}");
+        }
+        setpoint
+    }
+
+    fn on_event(&mut self, event: &Event) {
+        let (Some(on_event), Ok(text)) = (self.0.on_event, CString::new(event.text.as_str()))
+        else {
+            return;
+        };
+        // SAFETY: the callback keeps to `vizflyt.h`; `text` outlives the call.
+        unsafe { on_event(self.0.user, text.as_ptr()) }
+    }
+
+    fn on_stop(&mut self) {
+        if let Some(on_stop) = self.0.on_stop {
+            // SAFETY: the callback keeps to `vizflyt.h`.
+            unsafe { on_stop(self.0.user) }
+        }
+    }
+}
+
+/// Returns `name`, which has at most 32 bytes, with a 0 behind it.
+fn zero_ended(name: &str) -> [u8; 33] {
+    let mut out = [0; 33];
+    for (to, from) in out[..32].iter_mut().zip(name.bytes()) {
+        *to = from;
+    }
+    out
+}
+
+/// Returns the setpoint; `None` if a number names none, or a list is NULL or too long.
+///
+/// # Safety
+/// `waypoints` or `pieces`, as the kind asks, is NULL or points to `count` of them.
+unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
+    let axes = match answer.axes {
+        0 => Axes::World,
+        1 => Axes::Heading,
+        2 => Axes::Body,
+        _ => return None,
+    };
+    let target = match answer.yaw_kind {
+        0 => Some(YawTarget::Keep),
+        1 => Some(YawTarget::Angle(answer.yaw)),
+        2 => Some(YawTarget::Rate(answer.yaw)),
+        _ => None,
+    };
+    let v = DVec3::from(answer.v);
+    let count = answer.count as usize;
+    let trajectory = |path| {
+        let yaw = match (answer.yaw_kind, target) {
+            (3, _) => PathYaw::Ahead,
+            (_, target) => PathYaw::Target(target?),
+        };
+        Some(Setpoint::Trajectory(Trajectory { id: answer.id, axes, path, yaw }))
+    };
+    Some(match answer.kind {
+        0 => Setpoint::Hold,
+        1 => Setpoint::Land,
+        2 => Setpoint::Position { p_world_m: v, yaw: target? },
+        3 => Setpoint::Velocity { v_mps: v, axes, yaw: target? },
+        4 => Setpoint::Acceleration { a_mps2: v, axes, yaw: target? },
+        5 => Setpoint::Offset { d_m: v, axes, yaw: target? },
+        6 => Setpoint::AttitudeRate { omega_body_radps: v, thrust: answer.thrust },
+        7 => Setpoint::TakeOff,
+        8 => {
+            if answer.waypoints.is_null() {
+                return None;
+            }
+            // SAFETY: not null, so the caller promises `count` of them.
+            let points = unsafe { std::slice::from_raw_parts(answer.waypoints, count) };
+            let point = |point: &VizflytWaypoint| Waypoint {
+                p_m: point.p_m.into(),
+                speed_mps: point.speed_mps,
+            };
+            let mut path = Path::default();
+            if let Path::Waypoints(list) = &mut path {
+                for given in points {
+                    list.push(point(given)).ok()?;
+                }
+            }
+            return trajectory(path);
+        }
+        9 => {
+            if answer.pieces.is_null() {
+                return None;
+            }
+            // SAFETY: not null, so the caller promises `count` of them.
+            let pieces = unsafe { std::slice::from_raw_parts(answer.pieces, count) };
+            let mut path = Path::Polynomial(Default::default());
+            if let Path::Polynomial(list) = &mut path {
+                for given in pieces {
+                    let coefficients = given.coefficients.map(DVec3::from);
+                    list.push(Piece { seconds: given.seconds, coefficients }).ok()?;
+                }
+            }
+            return trajectory(path);
+        }
+        _ => return None,
+    })
+}
+
+// What `vizflyt.h` asserts on its side.
+const _: () = assert!(size_of::<ObservationHeader>() == 3608);
+const _: () = assert!(std::mem::offset_of!(ObservationHeader, cameras) == 2200);

@@ -1,0 +1,152 @@
+//! The C++ example, built against the header and the static library, on real shared memory.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
+use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin, bounded};
+use vizflyt_sdk::{
+    ArenaInfo, Axes, CameraInfo, ImageStamps, Intrinsics, Limits, ObservationWriter, Setpoint,
+    Volume, YawTarget,
+};
+
+const WAIT: Duration = Duration::from_secs(20);
+
+/// Returns the newest static library beside this test.
+fn library() -> PathBuf {
+    let test = std::env::current_exe().unwrap();
+    let deps = test.parent().unwrap();
+    let is_ours = |path: &Path| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        name.starts_with("libvizflyt_c") && path.extension().is_some_and(|e| e == "a")
+    };
+    let found = deps.read_dir().unwrap().filter_map(|entry| Some(entry.ok()?.path()));
+    let newest = found
+        .filter(|path| is_ours(path))
+        .max_by_key(|path| path.metadata().and_then(|m| m.modified()).ok());
+    newest.unwrap_or_else(|| panic!("no libvizflyt_c.a in {}", deps.display()))
+}
+
+fn build(folder: &Path) -> PathBuf {
+    let crate_folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let program = folder.join("brake");
+    let built = Command::new("c++")
+        .args(["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-o"])
+        .arg(&program)
+        .arg(crate_folder.join("examples/brake.cpp"))
+        .arg("-I")
+        .arg(crate_folder.join("include"))
+        .arg(library())
+        .args(["-lpthread", "-ldl", "-lm"])
+        .output()
+        .expect("a C++ compiler: apt-get install g++");
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    program
+}
+
+fn arena() -> ArenaInfo {
+    ArenaInfo {
+        name: bounded("hall"),
+        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        limits: Limits::new(3.0, 4.0),
+        body_radius_m: 0.1,
+        takeoff_height_m: 1.0,
+        goal_m: None,
+        goal_radius_m: 1.0,
+        time_limit_s: 0.0,
+        ground_truth: false,
+        attitude_rate: false,
+        // The plugin looks for its camera by name.
+        cameras: ["rear", "front"]
+            .map(|name| CameraInfo {
+                name: bounded(name),
+                intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.5),
+                body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+            })
+            .into_iter()
+            .collect(),
+    }
+}
+
+struct Rig {
+    ipc: RuntimeEnd,
+    child: Child,
+    seq: u64,
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Rig {
+    fn start(program: &Path) -> Self {
+        let service = unique_service();
+        let ipc = RuntimeEnd::create(&service, ObservationWriter::len_for(&arena().cameras));
+        let child = Command::new(program)
+            .arg(format!("{SERVICE_OPTION}={service}"))
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut rig = Self { ipc: ipc.unwrap(), child, seq: 0 };
+        let until = Instant::now() + WAIT;
+        while !rig.ipc.plugin_attached() {
+            assert!(Instant::now() < until && rig.child.try_wait().unwrap().is_none());
+            std::thread::yield_now();
+        }
+        rig.ipc.send(&ToPlugin::Start(arena())).unwrap();
+        assert!(matches!(rig.next(), FromPlugin::Ready { .. }));
+        rig
+    }
+
+    fn next(&self) -> FromPlugin {
+        let until = Instant::now() + WAIT;
+        loop {
+            if let Some(message) = self.ipc.receive().unwrap() {
+                return message;
+            }
+            assert!(Instant::now() < until, "the plugin says nothing");
+            self.ipc.wait(Duration::from_millis(50)).unwrap();
+        }
+    }
+
+    /// Shows the front camera so much free way; returns the answer.
+    fn see(&mut self, depth_mm: u16) -> Option<Setpoint> {
+        self.seq += 1;
+        let cameras = &arena().cameras;
+        let mut loan = self.ipc.loan(ObservationWriter::len_for(cameras)).unwrap();
+        let mut writer = ObservationWriter::new(loan.memory(), self.seq, cameras).unwrap();
+        if depth_mm > 0 {
+            writer.planes(1, &cameras[1]).unwrap().depth_mm.fill(depth_mm);
+            writer.image_ready(1, &cameras[1], ImageStamps::default());
+        }
+        self.ipc.publish(loan).unwrap();
+        let FromPlugin::Answer { seq, setpoint, .. } = self.next() else { panic!("no answer") };
+        assert_eq!(seq, self.seq);
+        setpoint
+    }
+}
+
+#[test]
+fn a_cpp_plugin_attaches_sees_and_answers() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut rig = Rig::start(&build(folder.path()));
+    assert_eq!(rig.see(0), None, "no image of the front camera yet");
+    let ahead = |speed_mps: f64, yaw| {
+        let v_mps = DVec3::X * speed_mps;
+        Some(Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw })
+    };
+    assert_eq!(rig.see(9000), ahead(1.0, YawTarget::Keep));
+    assert_eq!(rig.see(2000), ahead(0.5, YawTarget::Keep));
+    assert_eq!(rig.see(900), ahead(0.0, YawTarget::Rate(0.5)));
+    rig.ipc.send(&ToPlugin::Stop).unwrap();
+    let mut said = String::new();
+    std::io::Read::read_to_string(rig.child.stdout.as_mut().unwrap(), &mut said).unwrap();
+    assert!(rig.child.wait().unwrap().success());
+    assert_eq!(said, "flying in hall\nstopped after 3 images\n");
+}
