@@ -4,7 +4,7 @@ use std::ffi::{CString, c_char, c_int, c_void};
 use std::process::ExitCode;
 
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::protocol::messages::MAX_CAMERAS;
+use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_PIECES, MAX_WAYPOINTS};
 use vizflyt_sdk::protocol::packet::ObservationHeader;
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, Axes, Event, Observation, Path, PathYaw, Piece, Setpoint, Trajectory,
@@ -91,10 +91,9 @@ pub struct VizflytPlugin {
     pub user: *mut c_void,
     /// Before the first image.
     pub on_start: Option<unsafe extern "C" fn(*mut c_void, *const VizflytArena)>,
-    /// At each image.
-    pub on_image: Option<
-        unsafe extern "C" fn(*mut c_void, *const ObservationHeader, *mut VizflytSetpoint) -> c_int,
-    >,
+    /// At each image: the observation's memory, which begins with its [`ObservationHeader`].
+    pub on_image:
+        Option<unsafe extern "C" fn(*mut c_void, *const c_void, *mut VizflytSetpoint) -> c_int>,
     /// When something happened.
     pub on_event: Option<unsafe extern "C" fn(*mut c_void, *const c_char)>,
     /// At the end.
@@ -164,7 +163,7 @@ impl Autonomy for CPlugin {
             pieces: std::ptr::null(),
         };
         // The header's address is the memory's, planes behind it: validated by `Observation`.
-        let memory = obs.as_bytes().as_ptr().cast::<ObservationHeader>();
+        let memory = obs.as_bytes().as_ptr().cast::<c_void>();
         // SAFETY: the callback keeps to `vizflyt.h`; both pointers outlive the call.
         let answered = unsafe { on_image(self.0.user, memory, &raw mut answer) };
         if answered == 0 {
@@ -240,37 +239,28 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
         6 => Setpoint::AttitudeRate { omega_body_radps: v, thrust: answer.thrust },
         7 => Setpoint::TakeOff,
         8 => {
-            if answer.waypoints.is_null() {
+            if answer.waypoints.is_null() || count > MAX_WAYPOINTS {
                 return None;
             }
             // SAFETY: not null, so the caller promises `count` of them.
-            let points = unsafe { std::slice::from_raw_parts(answer.waypoints, count) };
+            let given = unsafe { std::slice::from_raw_parts(answer.waypoints, count) };
             let point = |point: &VizflytWaypoint| Waypoint {
                 p_m: point.p_m.into(),
                 speed_mps: point.speed_mps,
             };
-            let mut path = Path::default();
-            if let Path::Waypoints(list) = &mut path {
-                for given in points {
-                    list.push(point(given)).ok()?;
-                }
-            }
-            return trajectory(path);
+            return trajectory(Path::Waypoints(given.iter().map(point).collect()));
         }
         9 => {
-            if answer.pieces.is_null() {
+            if answer.pieces.is_null() || count > MAX_PIECES {
                 return None;
             }
             // SAFETY: not null, so the caller promises `count` of them.
-            let pieces = unsafe { std::slice::from_raw_parts(answer.pieces, count) };
-            let mut path = Path::Polynomial(Default::default());
-            if let Path::Polynomial(list) = &mut path {
-                for given in pieces {
-                    let coefficients = given.coefficients.map(DVec3::from);
-                    list.push(Piece { seconds: given.seconds, coefficients }).ok()?;
-                }
-            }
-            return trajectory(path);
+            let given = unsafe { std::slice::from_raw_parts(answer.pieces, count) };
+            let piece = |piece: &VizflytPiece| Piece {
+                seconds: piece.seconds,
+                coefficients: piece.coefficients.map(DVec3::from),
+            };
+            return trajectory(Path::Polynomial(given.iter().map(piece).collect()));
         }
         _ => return None,
     })
