@@ -1,39 +1,65 @@
 //! A plugin that does what its first argument says, well or badly: for tests, and to see what the
 //! vehicle does.
 //!
-//! `vizflyt fly target/release/examples/misbehave --server ... -- forward`
+//! `vizflyt fly target/release/examples/misbehave --server ... -- late-panic`
+//!
+//! With `late-` it flies well for a moment before. Several, separated by commas, are done one after
+//! the other; what is left to do is kept in the file named by the second argument, so that a plugin
+//! that is started again goes on with the next.
 
+use std::ffi::OsString;
+use std::fs;
+use std::hint::black_box;
+use std::path::PathBuf;
 use std::process::{ExitCode, abort, exit};
 use std::thread;
 use std::time::Duration;
 
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::{ArenaInfo, Autonomy, Axes, Event, Observation, Setpoint, YawTarget};
+use vizflyt_sdk::ipc::{PluginEnd, SERVICE_OPTION};
+use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin, bounded};
+use vizflyt_sdk::{
+    ArenaInfo, Autonomy, Axes, Event, EventKind, FlightPhase, Observation, Setpoint, YawTarget,
+    host_now,
+};
 
 struct Misbehave {
-    how: String,
+    how: Vec<String>,
+    /// Where `how` is kept for the next process.
+    kept: Option<PathBuf>,
     images: u64,
     flying: bool,
+    leaked: Vec<Vec<u8>>,
 }
 
 /// Images flown well before the fault.
-const GOOD_IMAGES: u64 = 30;
+const GOOD_IMAGES: u64 = 20;
+/// Memory that is lost with each image, as with a list of all images that someone forgot. [bytes]
+const LEAK: usize = 20_000_000;
 
 impl Autonomy for Misbehave {
     fn on_start(&mut self, info: &ArenaInfo) {
-        println!("flying in {} as {}", info.name, self.how);
+        println!("flying in {} as {}", info.name, self.how.join(","));
     }
 
     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
         let forward =
             Setpoint::Velocity { v_mps: DVec3::X * 0.5, axes: Axes::Heading, yaw: YawTarget::Keep };
         // On the ground everyone behaves, unless it shall fail there.
-        let late = self.how.strip_prefix("late-");
+        let now = self.how.first().map_or("forward", String::as_str);
+        let late = now.strip_prefix("late-");
         self.images += u64::from(self.flying || late.is_none());
         if self.images <= GOOD_IMAGES && late.is_some() {
             return Some(forward);
         }
-        match late.unwrap_or(&self.how) {
+        let how = late.unwrap_or(now).to_owned();
+        if self.images == GOOD_IMAGES + 1 {
+            println!("now: {how}");
+        }
+        if self.how.len() > 1 {
+            self.next();
+        }
+        match how.as_str() {
             "hover" => Some(Setpoint::Hold),
             "land" => Some(Setpoint::Land),
             "exit" => exit(0),
@@ -43,11 +69,43 @@ impl Autonomy for Misbehave {
             }
             "panic" => panic!("index {} out of range", obs.seq()),
             "abort" => abort(),
+            "segfault" => {
+                // SAFETY: none; the fault is what is asked for.
+                unsafe { black_box(8 as *mut u64).write_volatile(1) };
+                None
+            }
             "hang" => loop {
                 thread::sleep(Duration::from_secs(1));
             },
+            "spin" => loop {
+                black_box(obs.seq());
+            },
+            "sleep" => {
+                thread::sleep(Duration::from_secs(3));
+                Some(forward)
+            }
+            "slow" => {
+                thread::sleep(Duration::from_millis(150));
+                Some(forward)
+            }
+            "leak" => {
+                self.leaked.push(vec![1; LEAK]);
+                Some(forward)
+            }
+            "fork" => loop {
+                // SAFETY: the child runs nothing but this loop.
+                let _ = unsafe { nix::unistd::fork() };
+            },
             "nan" => Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep)),
+            "infinite" => Some(Setpoint::velocity(DVec3::INFINITY, YawTarget::Keep)),
+            "outside" => {
+                let p_world_m = DVec3::new(1000.0, 1000.0, 1000.0);
+                Some(Setpoint::Position { p_world_m, yaw: YawTarget::Keep })
+            }
             "silent" => None,
+            "print" => loop {
+                println!("{}", "x".repeat(5000));
+            },
             "chatter" => {
                 for line in 0..2000 {
                     println!("{line} {}", "x".repeat(5000));
@@ -59,12 +117,7 @@ impl Autonomy for Misbehave {
     }
 
     fn on_event(&mut self, event: &Event) {
-        if let vizflyt_sdk::EventKind::Phase(phase) = &event.kind {
-            self.flying = matches!(
-                phase,
-                vizflyt_sdk::FlightPhase::Flying | vizflyt_sdk::FlightPhase::Holding
-            );
-        }
+        self.flying = flies(event).unwrap_or(self.flying);
     }
 
     fn on_stop(&mut self) {
@@ -72,7 +125,77 @@ impl Autonomy for Misbehave {
     }
 }
 
+impl Misbehave {
+    /// The next misdeed is due, after another moment of good flight.
+    fn next(&mut self) {
+        self.how.remove(0);
+        self.images = 0;
+        if let Some(kept) = &self.kept {
+            fs::write(kept, self.how.join(",")).expect("the file can be written");
+        }
+    }
+}
+
+/// Whether the vehicle is the plugin's now, if the event says so.
+fn flies(event: &Event) -> Option<bool> {
+    let EventKind::Phase(phase) = &event.kind else { return None };
+    Some(matches!(phase, FlightPhase::Flying | FlightPhase::Holding))
+}
+
+/// A plugin that goes round the SDK's loop: it floods the runtime with setpoints, or with bytes
+/// that are none.
+fn go_round(how: &str, service: &str) -> ExitCode {
+    let end = PluginEnd::open(service).expect("the runtime is there");
+    let (mut flying, mut images) = (false, 0);
+    loop {
+        let _ = end.wait(Duration::from_millis(100));
+        while let Ok(Some(message)) = end.receive() {
+            match message {
+                ToPlugin::Start(_) => {
+                    let ready = FromPlugin::Ready { name: bounded(how) };
+                    end.send(&ready).expect("the runtime reads");
+                }
+                ToPlugin::Event(event) => flying = flies(&event).unwrap_or(flying),
+                ToPlugin::Stop => return ExitCode::SUCCESS,
+            }
+        }
+        let Ok(Some(_)) = end.observation() else { continue };
+        images += u64::from(flying);
+        let (entered, returned, setpoint) = (host_now(), host_now(), Some(Setpoint::Hold));
+        let answer = FromPlugin::Answer { seq: images, entered, returned, setpoint };
+        if images <= GOOD_IMAGES {
+            end.send(&answer).expect("the runtime reads");
+            continue;
+        }
+        if images == GOOD_IMAGES + 1 {
+            println!("now: {how}");
+        }
+        if how == "late-types" {
+            let _ = end.send_bytes(b"\xff\xff\xff a list of strings, say");
+        } else {
+            // 10,000 a second, for as long as the runtime reads.
+            for _ in 0..10_000 {
+                let _ = end.send(&answer);
+                thread::sleep(Duration::from_micros(100));
+            }
+        }
+    }
+}
+
 fn main() -> ExitCode {
-    let how = std::env::args().nth(1).unwrap_or_default();
-    vizflyt_sdk::run(Misbehave { how, images: 0, flying: false })
+    let arguments: Vec<OsString> = std::env::args_os().skip(1).collect();
+    let text = |index: usize| arguments.get(index).map(|text| text.to_string_lossy().into_owned());
+    let mut how = text(0).unwrap_or_default();
+    let kept = text(1).filter(|text| !text.starts_with('-')).map(PathBuf::from);
+    let service = arguments.iter().find_map(|argument| {
+        Some(argument.to_str()?.strip_prefix(SERVICE_OPTION)?.strip_prefix('=')?.to_owned())
+    });
+    if let (Some(service), "late-flood" | "late-types") = (service, how.as_str()) {
+        return go_round(&how, &service);
+    }
+    if let Some(left) = kept.as_ref().and_then(|kept| fs::read_to_string(kept).ok()) {
+        how = left;
+    }
+    let how = how.split(',').map(str::to_owned).collect();
+    vizflyt_sdk::run(Misbehave { how, kept, images: 0, flying: false, leaked: Vec::new() })
 }

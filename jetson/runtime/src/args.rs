@@ -59,6 +59,9 @@ pub struct FlyArgs {
     /// Ends when standard input does, so that it never outlives a killed parent
     #[arg(long, hide = true)]
     pub lifeline: bool,
+    /// The settings of this computer, jetson.toml
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
 }
 
 impl FlyArgs {

@@ -13,6 +13,7 @@
 //!
 //! [plugin]
 //! path = "/home/team/first"
+//! memory_mb = 2000                    # what it may use: docs/guides/safety.md
 //! ```
 //! Text comes in through [`JetsonConfig::parse`], which refuses unknown keys (it names the nearest
 //! known one) and values that cannot work. The command line goes before the file. Nothing is
@@ -29,6 +30,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::Fingerprint;
+
+use crate::supervisor::{PluginLimits, Restart};
 
 pub use strict::{StrictError, parse_strict};
 
@@ -110,6 +113,50 @@ pub struct PluginConfig {
     /// What `vizflyt fly` flies if it is not told: a folder, a `.py`, a program, a built-in's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
+    /// Memory; without it half of this computer's. [MB]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory_mb: Option<u64>,
+    /// Processors it may keep busy, 1.5 is one and a half; without it all but one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cpus: Option<f64>,
+    /// Processes and threads; without it 128.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub processes: Option<u32>,
+    /// Time that `on_image` shall take at most, without it 100; what is beyond is shown. [ms]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub deadline_ms: Option<f64>,
+    /// When it is started again: `never`, `on_ground` (without it), `in_flight`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub restart: Option<Restart>,
+    /// How often, in one flight; without it 3.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub restarts: Option<u32>,
+    /// Whether it may use the network.
+    pub network: bool,
+    /// The user it runs as if the runtime is root; without it `vizflyt`, or else `nobody`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub user: Option<String>,
+    /// Folders it may write in, beside its own, the working folder and `/tmp`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub write: Vec<PathBuf>,
+}
+
+impl PluginConfig {
+    /// Returns what the plugin may use.
+    pub fn limits(&self) -> PluginLimits {
+        let fair = PluginLimits::default();
+        PluginLimits {
+            memory_mb: self.memory_mb.unwrap_or(fair.memory_mb),
+            cpus: self.cpus.unwrap_or(fair.cpus),
+            processes: self.processes.unwrap_or(fair.processes),
+            deadline_ms: self.deadline_ms.unwrap_or(fair.deadline_ms),
+            restart: self.restart.unwrap_or(fair.restart),
+            restarts: self.restarts.unwrap_or(fair.restarts),
+            network: self.network,
+            user: self.user.clone(),
+            write: self.write.clone(),
+        }
+    }
 }
 
 /// Why a `jetson.toml` is refused.
@@ -136,6 +183,9 @@ pub enum ConfigError {
         /// What is wrong and what to do.
         advice: String,
     },
+    /// A limit of the plugin that leaves it no room to live.
+    #[error("{0}")]
+    Plugin(String),
     /// What is wrong in which file.
     #[error("{path}: {error}", path = .path.display())]
     In {
@@ -171,6 +221,9 @@ impl JetsonConfig {
             *keys = folder.join(&*keys);
         }
         // A bare name may be a built-in: it stays as it is.
+        for folder_of_plugin in &mut config.plugin.write {
+            *folder_of_plugin = folder.join(&*folder_of_plugin);
+        }
         if let Some(plugin) = &mut config.plugin.path
             && plugin.components().count() > 1
         {
@@ -209,7 +262,8 @@ impl JetsonConfig {
         check("limits.max_speed_mps", limits.max_speed_mps, "m/s", 0.1..=30.0)?;
         check("limits.max_acceleration_mps2", limits.max_acceleration_mps2, "m/s^2", 0.1..=50.0)?;
         check("limits.max_tilt_deg", limits.max_tilt_deg, "deg", 5.0..=80.0)?;
-        check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0)
+        check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0)?;
+        self.plugin.limits().check().map_err(ConfigError::Plugin)
     }
 }
 

@@ -32,6 +32,7 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle, host_now};
 
+use crate::answers;
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
 use crate::images::{ImagePublisher, Published, SharedSenses};
@@ -42,7 +43,7 @@ use crate::report::Counters;
 use crate::stats::ImageTimes;
 use crate::steering::Steering;
 use crate::stream::{Outbox, Shared, StreamEvent};
-use crate::supervisor::{PluginEvent, Stream, Supervisor};
+use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Restart, Stream, Supervisor};
 
 /// Something another thread tells the control loop.
 #[derive(Debug)]
@@ -56,8 +57,10 @@ pub enum Happening {
     Published(Published),
     /// The plugin says something.
     FromPlugin(Box<FromPlugin>),
-    /// The plugin's process.
-    Plugin(PluginEvent),
+    /// The plugin's process; the first is 0, each one started after it one more.
+    Plugin(u32, PluginEvent),
+    /// A person wants the plugin started anew; the vehicle holds until it is back.
+    Reload,
     /// A person wants it to end.
     Interrupt,
 }
@@ -70,6 +73,10 @@ const TELEMETRY_TICKS: u64 = 5;
 const TIMING_TICKS: u64 = 50;
 /// The plugin hears of us at least this often.
 const HEARTBEAT_TICKS: u64 = 20;
+/// A plugin that says it has failed may still print why for so long, before it is started again.
+const LAST_WORDS: Duration = Duration::from_millis(300);
+/// Lines of the plugin that the page gets in a second; console and log get more.
+const PAGE_LINES_PER_SECOND: u64 = 50;
 /// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
 /// within a tick.
 pub const QUEUE: usize = 1024;
@@ -78,6 +85,8 @@ pub const QUEUE: usize = 1024;
 pub struct Control {
     /// The command that starts the plugin.
     pub plugin_command: Vec<OsString>,
+    /// What the plugin may use, and when it is started again.
+    pub plugin_limits: PluginLimits,
     /// Limits of the flight as a whole.
     pub settings: FlightSettings,
     /// The MAVLink socket.
@@ -110,9 +119,19 @@ pub struct Flown {
 /// The plugin's side, from the moment the arena is known.
 struct PluginSide {
     ipc: Arc<RuntimeEnd>,
+    command: Vec<OsString>,
+    confinement: Confinement,
     supervisor: Option<Supervisor>,
+    /// Number of the present process.
+    run: u32,
     arena: Box<ArenaInfo>,
+    /// The present process was greeted.
     started: bool,
+    /// The present process is on its way out, and another will be started; until when it may go
+    /// by itself.
+    leaving: Option<Instant>,
+    /// Another process speaks: what the former one did is forgotten.
+    anew: Arc<AtomicBool>,
     /// Ends its threads.
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -128,7 +147,14 @@ struct Loop {
     times: ImageTimes,
     published: u64,
     image_seq: u64,
+    /// The server's tick of the newest image.
+    image_tick: u64,
     image_size_px: (u32, u32),
+    /// Answers that took longer than the plugin's deadline.
+    overruns: u64,
+    restarts: u32,
+    /// Lines that went to the page in this second of ticks.
+    page_lines: u64,
     setpoints_sent: u64,
     v_setpoint_mps: DVec3,
     steering: Steering,
@@ -150,7 +176,11 @@ impl Control {
             times: ImageTimes::default(),
             published: 0,
             image_seq: 0,
+            image_tick: 0,
             image_size_px: (0, 0),
+            overruns: 0,
+            restarts: 0,
+            page_lines: 0,
             setpoints_sent: 0,
             v_setpoint_mps: DVec3::ZERO,
             steering: Steering::new(now),
@@ -228,6 +258,7 @@ impl Loop {
             self.report(now);
         }
         if self.ticks.is_multiple_of(TIMING_TICKS) {
+            self.page_lines = 0;
             self.report_timing(now);
         }
     }
@@ -263,7 +294,7 @@ impl Loop {
             Happening::Stream(event) => self.take_stream(now, event),
             Happening::Published(published) => {
                 self.published += 1;
-                self.image_seq = published.seq;
+                (self.image_seq, self.image_tick) = (published.seq, published.tick);
                 let Published { seq, pose, ready, mut images, .. } = published.clone();
                 let clock_error_ns = self.control.shared.clock.error_bound_ns(now).unwrap_or(0);
                 for image in &mut images {
@@ -275,22 +306,23 @@ impl Loop {
                     Channel::Image,
                     published.ready,
                     &json!({
-                        "seq": published.seq, "pose_ns": published.pose.as_ns(),
+                        "seq": published.seq, "tick": published.tick, "pose_ns": published.pose.as_ns(),
                         "received_ns": published.received.as_ns(),
                         "ready_ns": published.ready.as_ns()
                     }),
                 );
             }
             Happening::FromPlugin(message) => self.take_plugin(now, *message),
-            Happening::Plugin(PluginEvent::Line(stream, line)) => {
+            Happening::Plugin(_, PluginEvent::Line(stream, line)) => {
                 self.take_line(now, stream, &line);
             }
-            Happening::Plugin(PluginEvent::Exited(sentence)) => {
-                if let Some(side) = &self.plugin {
-                    side.ipc.clean_up();
-                }
-                self.flight.handle(now, Input::PluginFailed(sentence));
+            Happening::Plugin(_, PluginEvent::Note(text)) => {
+                self.tell_event(now, EventKind::Note, &format!("plugin: {text}"));
             }
+            Happening::Plugin(run, PluginEvent::Exited(sentence)) => {
+                self.plugin_exited(now, run, sentence);
+            }
+            Happening::Reload => self.replace_plugin(now, "reloading the plugin".to_owned()),
             Happening::Interrupt => self.flight.handle(now, Input::Interrupt),
         }
     }
@@ -392,13 +424,18 @@ impl Loop {
     }
 
     fn take_plugin(&mut self, now: HostTime, message: FromPlugin) {
+        // What a process said that is gone or going counts no more.
+        let counts =
+            self.plugin.as_ref().is_some_and(|side| side.started && side.leaving.is_none());
         match message {
+            FromPlugin::Ready { .. } | FromPlugin::Answer { .. } if !counts => {}
             FromPlugin::Ready { name } => {
                 tracing::info!("plugin {name} is ready");
                 self.flight.handle(now, Input::PluginReady);
             }
             FromPlugin::Answer { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
+                self.check_deadline(now, seq, returned.seconds_since(entered) * 1e3);
                 let asked = json!({"seq": seq, "setpoint": &setpoint});
                 self.control.log.write(Channel::Asked, returned, &asked);
                 if setpoint.is_some() {
@@ -415,9 +452,26 @@ impl Loop {
                 );
             }
             FromPlugin::Failed { reason } => {
-                let sentence = format!("the plugin failed: {reason}");
-                self.flight.handle(now, Input::PluginFailed(sentence));
+                self.plugin_failed(now, format!("the plugin failed: {reason}"));
             }
+        }
+    }
+
+    /// Shows by how much an answer was late: the first, then ever fewer.
+    fn check_deadline(&mut self, now: HostTime, seq: u64, took_ms: f64) {
+        let deadline_ms = self.control.plugin_limits.deadline_ms;
+        if took_ms <= deadline_ms {
+            return;
+        }
+        self.overruns += 1;
+        if self.overruns.is_power_of_two() {
+            let over_ms = took_ms - deadline_ms;
+            let count = self.overruns;
+            let text = format!(
+                "on_image took {took_ms:.0} ms for image {seq}, {over_ms:.0} ms longer than the \
+                 {deadline_ms:.0} ms of deadline_ms in [plugin] ({count} so far)"
+            );
+            self.tell_event(now, EventKind::Note, &text);
         }
     }
 
@@ -426,11 +480,27 @@ impl Loop {
             Stream::Stdout => "stdout",
             Stream::Stderr => "stderr",
         };
-        tracing::info!(target: "plugin", image = self.image_seq, "{line}");
-        let record = json!({"stream": stream, "line": line, "image_seq": self.image_seq});
+        let (tick, image_seq) = (self.image_tick, self.image_seq);
+        let record = json!({"stream": stream, "line": line, "image_seq": image_seq, "tick": tick});
         self.control.log.write(Channel::PluginOutput, now, &record);
+        if self.control.json {
+            print_line(&json!({"plugin": record}).to_string());
+        } else {
+            print_line(&format!("tick {tick} | {line}"));
+        }
+        self.page_lines += 1;
+        if self.page_lines <= PAGE_LINES_PER_SECOND {
+            let stamp = self.control.shared.clock.to_server(now);
+            let text = bounded(&format!("tick {tick} | {line}"));
+            self.control.to_server.tell(Event { stamp, kind: EventKind::PluginOutput, text });
+        }
+    }
+
+    fn tell_event(&mut self, now: HostTime, kind: EventKind, text: &str) {
         let stamp = self.control.shared.clock.to_server(now);
-        let event = Event { stamp, kind: EventKind::PluginOutput, text: bounded(line) };
+        let event = Event { stamp, kind, text: bounded(text) };
+        tracing::info!(target: "flight", "{text}");
+        self.publish_event(now, &event);
         self.control.to_server.tell(event);
     }
 
@@ -442,31 +512,103 @@ impl Loop {
         }
         let service = unique_service();
         let len = ObservationWriter::len_for(&arena.cameras);
-        let ipc = match RuntimeEnd::create(&service, len) {
+        let mut command = self.control.plugin_command.clone();
+        let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
+        let ipc = match RuntimeEnd::create_for(&service, len, confinement.user_id()) {
             Ok(ipc) => Arc::new(ipc),
             Err(error) => {
                 return self.flight.handle(now, Input::ServerRefused(error.to_string()));
             }
         };
-        let stop = Arc::new(AtomicBool::new(false));
-        let threads = self.start_threads(&ipc, &arena, &stop);
-        let mut command = self.control.plugin_command.clone();
+        let (stop, anew) = (Arc::default(), Arc::default());
+        let threads = self.start_threads(&ipc, &arena, &stop, &anew);
         command.push(format!("{SERVICE_OPTION}={service}").into());
-        let sender = self.sender.clone();
+        self.plugin = Some(PluginSide {
+            ipc,
+            command,
+            confinement,
+            supervisor: None,
+            run: 0,
+            arena,
+            started: false,
+            leaving: None,
+            anew,
+            stop,
+            threads,
+        });
+        self.start_process(now);
+    }
+
+    /// Starts the plugin's process, the first or another.
+    fn start_process(&mut self, now: HostTime) {
+        let Some(side) = &mut self.plugin else { return };
+        let (sender, run) = (self.sender.clone(), side.run);
         // Lines and the end are never dropped: the loop always reads.
         let tell = move |event| {
-            let _ = sender.send(Happening::Plugin(event));
+            let _ = sender.send(Happening::Plugin(run, event));
         };
-        let supervisor = match Supervisor::start(&command, tell) {
-            Ok(supervisor) => Some(supervisor),
+        match Supervisor::start(&side.command, &side.confinement, tell) {
+            Ok(supervisor) => side.supervisor = Some(supervisor),
             Err(error) => {
-                let program = command[0].to_string_lossy();
+                let program = side.command[0].to_string_lossy();
                 let sentence = format!("the plugin {program} cannot be started: {error}");
                 self.flight.handle(now, Input::PluginFailed(sentence));
-                None
             }
+        }
+    }
+
+    /// The plugin says that it has failed; its process ends soon after.
+    fn plugin_failed(&mut self, now: HostTime, sentence: String) {
+        if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
+            return;
+        }
+        if self.may_restart() {
+            self.restarts += 1;
+            self.replace_plugin(now, sentence);
+        } else {
+            self.flight.handle(now, Input::PluginFailed(sentence));
+        }
+    }
+
+    fn plugin_exited(&mut self, now: HostTime, run: u32, sentence: String) {
+        let Some(side) = &mut self.plugin else { return };
+        if side.run != run {
+            return;
+        }
+        side.ipc.clean_up();
+        if side.leaving.is_none() {
+            self.plugin_failed(now, sentence);
+        }
+        let Some(side) = &mut self.plugin else { return };
+        if side.leaving.take().is_some() && self.flight.can_wait_for_plugin() {
+            (side.run, side.started) = (side.run + 1, false);
+            side.anew.store(true, Ordering::Relaxed);
+            self.start_process(now);
+        }
+    }
+
+    /// Whether a plugin that failed is started again, by the policy.
+    fn may_restart(&self) -> bool {
+        let limits = &self.control.plugin_limits;
+        let is_there = match limits.restart {
+            Restart::Never => false,
+            Restart::OnGround => self.flight.is_on_ground(),
+            Restart::InFlight => true,
         };
-        self.plugin = Some(PluginSide { ipc, supervisor, arena, started: false, stop, threads });
+        is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
+    }
+
+    /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
+    fn replace_plugin(&mut self, now: HostTime, why: String) {
+        let Some(side) = &mut self.plugin else { return };
+        if side.leaving.is_some() || !self.flight.can_wait_for_plugin() {
+            return;
+        }
+        side.leaving = Some(Instant::now() + LAST_WORDS);
+        if side.ipc.plugin_attached() {
+            let _ = side.ipc.send(&ToPlugin::Stop);
+        }
+        self.flight.handle(now, Input::PluginRestarts(why));
     }
 
     fn start_threads(
@@ -474,6 +616,7 @@ impl Loop {
         ipc: &Arc<RuntimeEnd>,
         arena: &ArenaInfo,
         stop: &Arc<AtomicBool>,
+        anew: &Arc<AtomicBool>,
     ) -> Vec<JoinHandle<()>> {
         let cameras = arena.cameras.to_vec();
         let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses));
@@ -488,17 +631,12 @@ impl Loop {
                 },
             );
         });
-        let (ipc, sender, stopped) = (Arc::clone(ipc), self.sender.clone(), Arc::clone(stop));
+        let (ipc, sender) = (Arc::clone(ipc), self.sender.clone());
+        let (stopped, anew) = (Arc::clone(stop), Arc::clone(anew));
         let answers = spawn("answers", move || {
-            while !stopped.load(Ordering::Relaxed) {
-                if ipc.wait(Duration::from_millis(100)).is_err() {
-                    // No event comes any more; poll instead.
-                    thread::sleep(Duration::from_millis(1));
-                }
-                while let Ok(Some(message)) = ipc.receive() {
-                    let _ = sender.send(Happening::FromPlugin(Box::new(message)));
-                }
-            }
+            answers::read(&ipc, &stopped, &anew, |message| {
+                let _ = sender.send(Happening::FromPlugin(Box::new(message)));
+            });
         });
         images.into_iter().chain(answers).collect()
     }
@@ -506,10 +644,22 @@ impl Loop {
     /// Greets the plugin once it has attached; shows it that we live.
     fn tend_plugin(&mut self) {
         let Some(side) = &mut self.plugin else { return };
-        if !side.started && side.ipc.plugin_attached() {
+        if side.leaving.is_some_and(|until| Instant::now() > until)
+            && let Some(supervisor) = &side.supervisor
+        {
+            supervisor.kill();
+        }
+        if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
             side.started = true;
             if let Err(error) = side.ipc.send(&ToPlugin::Start((*side.arena).clone())) {
                 tracing::warn!("plugin: {error}");
+            }
+            // One that comes later learns where the flight is.
+            if side.run > 0 {
+                let stamp = self.control.shared.clock.to_server(host_now());
+                let kind = EventKind::Phase(self.flight.phase());
+                let text = bounded("the plugin was started again");
+                let _ = side.ipc.send(&ToPlugin::Event(Event { stamp, kind, text }));
             }
         } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
             side.ipc.heartbeat();
@@ -624,6 +774,8 @@ impl Loop {
             image_size_px: self.image_size_px,
             setpoints_sent: self.setpoints_sent,
             mavlink_packets: self.link.packets(),
+            plugin_overruns: self.overruns,
+            plugin_restarts: self.restarts,
             clock,
             cameras: self.times.arrivals(&arrived).to_vec(),
         };

@@ -17,6 +17,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use vizflyt_protocol::messages::{Purpose, bounded};
 
 use crate::args::FlyArgs;
+use crate::config::JetsonConfig;
 use crate::control::{Control, Happening, QUEUE, print_line};
 use crate::flight::{FlightSettings, Outcome};
 use crate::link::udp::{Partner, UdpPort};
@@ -49,6 +50,8 @@ pub fn fly_command(
     args: &FlyArgs,
     plugin_command: Vec<std::ffi::OsString>,
 ) -> anyhow::Result<Outcome> {
+    let config = args.config.as_deref().map(JetsonConfig::read).transpose()?;
+    let plugin_limits = config.unwrap_or_default().plugin.limits();
     let (fingerprint, identity) = args.server.known()?;
     let port = Arc::new(
         UdpPort::open(args.mavlink)
@@ -81,6 +84,7 @@ pub fn fly_command(
 
     let control = Control {
         plugin_command,
+        plugin_limits,
         settings: FlightSettings {
             ready_within_s: args.ready_within,
             time_limit_s: args.seconds,

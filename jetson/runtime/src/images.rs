@@ -50,6 +50,8 @@ pub type SharedSenses = Arc<Mutex<Senses>>;
 pub struct Published {
     /// Its number, from 1.
     pub seq: u64,
+    /// The server's tick of its newest image.
+    pub tick: u64,
     /// When the pose of its newest image was measured. [host]
     pub pose: HostTime,
     /// When the last byte of its newest image had been received. [host]
@@ -232,6 +234,7 @@ impl ImagePublisher {
         writer.image_ready(camera, &self.cameras[camera], stamps);
         under_way.there |= bit(camera);
         let published = &mut under_way.published;
+        published.tick = published.tick.max(tick);
         published.pose = published.pose.max(arrival.pose);
         published.received = published.received.max(whole.received);
         published.ready = ready;
@@ -350,6 +353,7 @@ impl UnderWay {
         let expected = if together as u8 & all == 0 { all } else { together as u8 & all };
         let published = Published {
             seq,
+            tick,
             pose: HostTime::ZERO,
             received: HostTime::ZERO,
             ready: HostTime::ZERO,

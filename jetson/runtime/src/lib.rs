@@ -9,12 +9,13 @@
 //!                    └─▶ log (MCAP), report, telemetry to the server
 //! ```
 //! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
-//! [`supervisor`] (the plugin's process), [`control`] (the loop that owns the rest), [`flight`]
+//! [`supervisor`] (the plugin's process, its limits), [`control`] (the loop that owns the rest), [`flight`]
 //! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
 //! pure), [`link`] (MAVLink, sans-IO),
 //! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
 //! [`report`]. [`fly()`] starts it all.
 
+mod answers;
 pub mod args;
 pub mod clock;
 pub mod config;

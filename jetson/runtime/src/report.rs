@@ -43,6 +43,10 @@ pub struct Report {
     pub clock: Option<ClockState>,
     /// What became of the images that came, by camera.
     pub cameras: Vec<Arrivals>,
+    /// Answers that took longer than the plugin's deadline.
+    pub plugin_overruns: u64,
+    /// How often the plugin was started again.
+    pub plugin_restarts: u32,
     /// Setpoints sent to the autopilot.
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
@@ -64,6 +68,10 @@ pub struct Counters {
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
     pub mavlink_packets: u64,
+    /// Answers that took longer than the plugin's deadline.
+    pub plugin_overruns: u64,
+    /// How often the plugin was started again.
+    pub plugin_restarts: u32,
     /// The server's clock.
     pub clock: Option<ClockState>,
     /// What became of the images that came, by camera.
@@ -91,6 +99,8 @@ impl Report {
             intervals,
             clock: counters.clock,
             cameras: counters.cameras.clone(),
+            plugin_overruns: counters.plugin_overruns,
+            plugin_restarts: counters.plugin_restarts,
             setpoints_sent: counters.setpoints_sent,
             mavlink_packets: counters.mavlink_packets,
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),

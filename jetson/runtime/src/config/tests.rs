@@ -56,6 +56,20 @@ fn mistakes_are_explained() {
     }
     check_refused("[limits]\nmax_speed_mps = \"2\"\n", &["line 2", "string"]);
     check_refused("[limits\n", &["line 1"]);
+    check_refused("[plugin]\nmemory_mb = 1\n", &["plugin.memory_mb = 1", "give 64"]);
+    check_refused("[plugin]\ncpus = nan\n", &["plugin.cpus = NaN"]);
+    check_refused("[plugin]\nrestart = \"always\"\n", &["line 2", "on_ground"]);
+}
+
+#[test]
+fn what_the_plugin_may_use_is_read_and_the_rest_is_fair() {
+    use crate::supervisor::{PluginLimits, Restart};
+    let text = "[plugin]\nmemory_mb = 500\nrestart = \"in_flight\"\nnetwork = true\n";
+    let found = JetsonConfig::parse(text).unwrap().plugin.limits();
+    let restart = Restart::InFlight;
+    let expected =
+        PluginLimits { memory_mb: 500, restart, network: true, ..PluginLimits::default() };
+    assert_eq!(found, expected);
 }
 
 #[test]
@@ -107,8 +121,14 @@ fn config() -> impl Strategy<Value = JetsonConfig> {
         max_tilt_deg: tilt,
         max_altitude_m: z,
     });
-    let plugin =
-        prop::option::of(text).prop_map(|path| PluginConfig { path: path.map(PathBuf::from) });
+    let plugin = (prop::option::of(text), prop::option::of(64_u64..99_999), any::<bool>());
+    let plugin = plugin.prop_map(|(path, memory_mb, network)| PluginConfig {
+        path: path.map(PathBuf::from),
+        memory_mb,
+        network,
+        write: vec!["data".into()],
+        ..PluginConfig::default()
+    });
     (prop::option::of(server), vehicle, limits, plugin).prop_map(
         |(server, vehicle, limits, plugin)| JetsonConfig { server, vehicle, limits, plugin },
     )

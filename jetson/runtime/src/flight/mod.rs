@@ -25,7 +25,8 @@ use vizflyt_protocol::messages::{
 use vizflyt_protocol::time::HostTime;
 
 use crate::guard::{
-    Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, SETPOINT_HOLD_S, Stance,
+    Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, RESTART_WITHIN_S,
+    SETPOINT_HOLD_S, Stance,
 };
 use crate::link::{Goal, LinkEvent};
 pub use outcome::{Outcome, OutcomeKind};
@@ -78,6 +79,8 @@ pub enum Input {
     ServerRefused(String),
     /// The plugin is no more; why, in a sentence.
     PluginFailed(String),
+    /// The plugin is being started again; why, in a sentence. The vehicle holds until it answers.
+    PluginRestarts(String),
     /// A person ends the flight.
     Interrupt,
 }
@@ -163,6 +166,10 @@ pub struct Flight {
     /// Why all setpoints are being refused.
     refused: Option<InvalidSetpoint>,
     landed_at: Option<HostTime>,
+    /// Why the plugin was last started again.
+    restart_reason: Option<String>,
+    /// When the fence last kept the vehicle from what the plugin asked for.
+    fence_stopped_at: Option<HostTime>,
     notices: VecDeque<Notice>,
 }
 
@@ -192,6 +199,8 @@ impl Flight {
             reminded_at: None,
             refused: None,
             landed_at: None,
+            restart_reason: None,
+            fence_stopped_at: None,
             notices: VecDeque::new(),
         }
     }
@@ -242,6 +251,7 @@ impl Flight {
             Input::PluginFailed(reason) => {
                 self.end_in_order(now, OutcomeKind::PluginFailed, reason);
             }
+            Input::PluginRestarts(why) => self.handle_restart(now, why),
             Input::Interrupt => {
                 self.interrupted_at.get_or_insert(now);
                 self.end_now(now, OutcomeKind::Landed, "stopped by a person".into());
@@ -354,6 +364,31 @@ impl Flight {
         }
     }
 
+    fn handle_restart(&mut self, now: HostTime, why: String) {
+        if !self.can_wait_for_plugin() {
+            return;
+        }
+        (self.plugin_ready, self.unanswered, self.answered_at) = (false, None, None);
+        if let Some(guard) = &mut self.guard {
+            guard.wait_for_plugin(now);
+        }
+        self.notice(EventKind::Note, format!("{why}; the plugin is started again"));
+        if self.phase == FlightPhase::Preparing {
+            self.enter(now, FlightPhase::Connecting, "waiting for the plugin");
+        }
+        self.restart_reason = Some(why);
+    }
+
+    /// Whether the vehicle stands on the ground, before take-off.
+    pub fn is_on_ground(&self) -> bool {
+        matches!(self.phase, FlightPhase::Connecting | FlightPhase::Preparing)
+    }
+
+    /// Whether the flight can go on without a plugin for a while.
+    pub fn can_wait_for_plugin(&self) -> bool {
+        self.outcome.is_none() && (self.is_on_ground() || self.is_airborne())
+    }
+
     // ---- phases ----
 
     fn connecting(&mut self, now: HostTime, link: &LinkView) {
@@ -434,7 +469,11 @@ impl Flight {
             return Orders { goal: self.goal(), setpoint: None, answers: None };
         };
         let (passed, stance) = guard.tick(now, fix);
+        let fence_stops = guard.fence_stops();
         self.take_stance(now, stance);
+        if fence_stops {
+            self.tell_of_fence(now);
+        }
         let setpoint = match passed {
             Passed::Guided(setpoint) => Some(setpoint),
             Passed::Land => None,
@@ -555,6 +594,15 @@ impl Flight {
         }
     }
 
+    /// Says that the fence stops the vehicle; once, until it has not for a while.
+    fn tell_of_fence(&mut self, now: HostTime) {
+        let former = self.fence_stopped_at.replace(now);
+        if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
+            let text = "the plugin asks to leave the geofence; the vehicle stops before it";
+            self.notice(EventKind::Note, text.to_owned());
+        }
+    }
+
     /// Someone else changed the mode: a failsafe of the autopilot, or a pilot.
     fn taken_over(&mut self, now: HostTime, mode: u32) {
         let mode = CopterMode::from_number(mode);
@@ -585,6 +633,7 @@ impl Flight {
                     let why = match reason {
                         HoldReason::Asked => "the plugin asks to hold".to_owned(),
                         HoldReason::NoSetpoint => self.why_silent(now),
+                        HoldReason::Restarting => "the plugin is being started again".to_owned(),
                         HoldReason::PoseStale => "the pose is older than 0.5 s".to_owned(),
                         HoldReason::Ending => {
                             self.outcome.as_ref().map_or(String::new(), |o| o.reason.clone())
@@ -599,6 +648,12 @@ impl Flight {
     fn verdict(&self, now: HostTime, reason: LandReason) -> (OutcomeKind, String) {
         match reason {
             LandReason::Asked => (OutcomeKind::Landed, "the plugin asked to land".into()),
+            LandReason::NoPlugin => {
+                let why = self.restart_reason.as_deref().unwrap_or("it was to be started again");
+                let within_s = RESTART_WITHIN_S;
+                let text = format!("the plugin did not come back within {within_s} s; {why}");
+                (OutcomeKind::PluginFailed, text)
+            }
             LandReason::NoSetpoint(_) if self.sees_nothing(now) => {
                 (OutcomeKind::Error, self.why_silent(now))
             }

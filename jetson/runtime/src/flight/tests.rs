@@ -401,3 +401,86 @@ fn the_stricter_limit_wins() {
     };
     assert!((v_mps.length() - 0.1).abs() < 1e-9, "{v_mps}");
 }
+
+impl Script {
+    fn restart(&mut self, why: &str) {
+        self.flight.handle(self.now, Input::PluginRestarts(why.to_owned()));
+    }
+
+    fn said(&self, text: &str) -> usize {
+        self.notices.iter().filter(|notice| notice.text.contains(text)).count()
+    }
+}
+
+#[test]
+fn a_plugin_that_is_started_again_is_waited_for_in_the_air() {
+    let mut script = Script::flying();
+    script.run(1.0);
+    let answers = script.answers.clone();
+    script.restart("the plugin ended with exit status 3");
+    script.answers = Answers::Never;
+    // Longer than a silent plugin is given.
+    script.run(6.0);
+    assert_eq!(script.flight.phase(), Holding, "{:?}", script.notices);
+    assert!(script.v_mps.length() < 1e-3, "it stands still: {}", script.v_mps);
+    assert_eq!(script.said("exit status 3; the plugin is started again"), 1);
+    script.flight.handle(script.now, Input::PluginReady);
+    script.answers = answers;
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
+    assert!(script.v_mps.x > 0.05, "{}", script.v_mps);
+    script.answers = Answers::With(Setpoint::Land);
+    script.check_end(OutcomeKind::Landed, "the plugin asked to land");
+}
+
+#[test]
+fn one_that_does_not_come_back_is_not_waited_for_longer() {
+    for answers in [Answers::Never, Answers::Without] {
+        let mut script = Script::flying();
+        script.restart("the plugin was killed by SIGSEGV");
+        script.answers = answers;
+        script.run(9.8);
+        assert_eq!(script.flight.phase(), Holding);
+        script.run(0.4);
+        assert_eq!(script.flight.phase(), Landing);
+        script
+            .check_end(OutcomeKind::PluginFailed, "within 10 s; the plugin was killed by SIGSEGV");
+    }
+}
+
+#[test]
+fn one_that_fails_on_the_ground_does_so_before_arming() {
+    let mut script = Script::new();
+    script.link.ready_to_arm = Err("the compass is confused");
+    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.flight.handle(script.now, Input::PluginReady);
+    script.run(1.0);
+    assert!(script.flight.is_on_ground() && script.flight.can_wait_for_plugin());
+    script.restart("no model file");
+    script.link.ready_to_arm = Ok(());
+    script.run(3.0);
+    assert_eq!(script.orders.goal, Goal::Prepare, "nobody is armed without a plugin");
+    script.flight.handle(script.now, Input::PluginReady);
+    script.run(4.0);
+    assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
+    // Once the flight is over, there is nothing to be started for.
+    script.flight.handle(script.now, Input::PluginFailed("it is broken".into()));
+    assert!(!script.flight.can_wait_for_plugin());
+    script.restart("no");
+    script.check_end(OutcomeKind::PluginFailed, "it is broken");
+}
+
+#[test]
+fn a_way_out_of_the_fence_is_told_once_and_not_flown() {
+    let mut script = Script::new();
+    script.flight.settings.limits = arena().limits;
+    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.flight.handle(script.now, Input::PluginReady);
+    script.run(4.0);
+    let p_world_m = DVec3::new(1000.0, 0.0, 1.0);
+    script.answers = Answers::With(Setpoint::Position { p_world_m, yaw: YawTarget::Keep });
+    script.run(12.0);
+    assert!(script.p_m.x > 3.0 && script.p_m.x < 5.0, "{}", script.p_m);
+    assert_eq!(script.said("asks to leave the geofence"), 1, "{:?}", script.notices);
+    assert_eq!(script.flight.phase(), Flying);
+}

@@ -58,6 +58,8 @@ pub enum HoldReason {
     NoSetpoint,
     /// The newest pose is older than [`POSE_HOLD_S`].
     PoseStale,
+    /// The plugin is being started again.
+    Restarting,
     /// The flight is over; it brakes before it lands.
     Ending,
 }
@@ -69,6 +71,8 @@ pub enum LandReason {
     Asked,
     /// No setpoint has come for so long. [s]
     NoSetpoint(f64),
+    /// A plugin that was to be started again has not answered within [`RESTART_WITHIN_S`].
+    NoPlugin,
     /// The newest pose is so old. [s]
     PoseLost(f64),
     /// The body is outside the fence by so much. [m]
@@ -92,6 +96,9 @@ pub enum Stance {
 pub const SETPOINT_HOLD_S: f64 = 0.5;
 /// No setpoint for this long: land. [s]
 pub const SETPOINT_LAND_S: f64 = 2.0;
+/// A plugin that is started again may take so long until its first setpoint: an interpreter that
+/// loads numpy and a small model. [s]
+pub const RESTART_WITHIN_S: f64 = 10.0;
 /// Newest pose this old: hold. At 6 m/s that is 3 m flown blind. [s]
 pub const POSE_HOLD_S: f64 = 0.5;
 /// Newest pose this old: land. ArduCopter's own estimate lasts 7 s without external navigation
@@ -122,6 +129,8 @@ const MOST_THRUST: f64 = 4.0;
 const FENCE_EXCESS: f64 = 1.2;
 /// Standard gravity, ISO 80000-3. [m/s^2]
 const GRAVITY_MPS2: f64 = 9.80665;
+/// Speed towards the fence that is taken away before it is worth a word. [m/s]
+const FENCE_STOPS_MPS: f64 = 0.1;
 /// Longest time between two ticks that counts; after a stall the slew limit must not open. [s]
 const LONGEST_TICK_S: f64 = 0.1;
 
@@ -164,6 +173,10 @@ pub struct Guard {
     ticked_at: HostTime,
     /// Set when the flight shall end in order: brake first, until then.
     ending_until: Option<HostTime>,
+    /// Set while the plugin is started again: until when it is waited for.
+    restarting_until: Option<HostTime>,
+    /// The fence kept the vehicle from what the plugin asked for, in the last tick.
+    fence_stops: bool,
     landing: Option<LandReason>,
 }
 
@@ -186,6 +199,8 @@ impl Guard {
             asked_at: now,
             ticked_at: now,
             ending_until: None,
+            restarting_until: None,
+            fence_stops: false,
             landing: None,
         }
     }
@@ -214,6 +229,7 @@ impl Guard {
         }
         self.asked = Some(setpoint);
         self.asked_at = now;
+        self.restarting_until = None;
         Ok(())
     }
 
@@ -235,9 +251,22 @@ impl Guard {
         self.landing.get_or_insert(LandReason::Ordered);
     }
 
+    /// Holds until the plugin, being started again, asks for something; lands if it does not within
+    /// [`RESTART_WITHIN_S`].
+    pub fn wait_for_plugin(&mut self, now: HostTime) {
+        (self.asked, self.asked_at) = (None, now);
+        self.resolved = Resolved::Nothing;
+        self.restarting_until = Some(now.plus_seconds(RESTART_WITHIN_S));
+    }
+
     /// Brakes, then lands. Final; [`Self::land`] still cuts the braking short.
     pub fn brake_and_land(&mut self, now: HostTime) {
         self.ending_until.get_or_insert(now.plus_seconds(BRAKE_AT_MOST_S));
+    }
+
+    /// Whether the fence keeps the vehicle from what the plugin asks for.
+    pub fn fence_stops(&self) -> bool {
+        self.fence_stops
     }
 
     /// Decides what to send at `now`, with the newest `fix`.
@@ -270,7 +299,10 @@ impl Guard {
         let age_s = now.seconds_since(fix.stamp).clamp(0.0, POSE_HOLD_S);
         let p_now = fix.p_world_m + fix.v_world_mps * age_s;
         // The fence comes last: where it and the slew limit disagree, it wins.
-        self.v_command_mps = self.fence.limit(p_now, v_slewed).clamp_length_max(self.max_speed_mps);
+        let v_inside = self.fence.limit(p_now, v_slewed);
+        self.fence_stops =
+            stance == Stance::Passing && (v_inside - v_slewed).length() > FENCE_STOPS_MPS;
+        self.v_command_mps = v_inside.clamp_length_max(self.max_speed_mps);
         let motion = GuidedMotion::Velocity(self.v_command_mps);
         (Passed::Guided(GuidedSetpoint { motion, yaw: self.yaw }), stance)
     }
@@ -292,6 +324,13 @@ impl Guard {
                 return Stance::Landing(LandReason::Ordered);
             }
             return Stance::Holding(HoldReason::Ending);
+        }
+        if let Some(until) = self.restarting_until {
+            return match pose_age_s > POSE_HOLD_S {
+                _ if now >= until => Stance::Landing(LandReason::NoPlugin),
+                true => Stance::Holding(HoldReason::PoseStale),
+                false => Stance::Holding(HoldReason::Restarting),
+            };
         }
         let silent_s = now.seconds_since(self.asked_at);
         if silent_s > SETPOINT_LAND_S {

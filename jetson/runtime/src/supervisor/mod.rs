@@ -1,11 +1,21 @@
-//! The plugin as a child process: started in its own process group, its output read line by line,
-//! its death noticed at once and told in one sentence, never outliving the runtime.
+//! The plugin as a child process: confined before its first instruction, its output read line by
+//! line, its limits watched, its death noticed at once and told in one sentence, never outliving
+//! the runtime.
+//!
+//! [`PluginLimits`] says what it may use, [`Confinement`] turns that into what this kernel offers,
+//! [`Supervisor`] is one running process. When to start the next one is for the
+//! [control loop](crate::control) to decide.
 
+mod cgroup;
+mod confine;
+mod limits;
+mod output;
 #[cfg(test)]
 mod tests;
+mod watch;
 
 use std::ffi::OsString;
-use std::io::{self, BufRead, BufReader, Read};
+use std::io;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -13,7 +23,14 @@ use std::thread;
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, killpg};
-use nix::unistd::{Pid, getppid};
+use nix::unistd::Pid;
+
+use confine::Bounds;
+use output::{Tracebacks, read_lines};
+
+pub use confine::Confinement;
+pub use limits::{LEAST_MEMORY_MB, PluginLimits, Restart};
+pub use output::LINE_BYTES;
 
 /// Which of the two outputs a line came from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +46,8 @@ pub enum Stream {
 pub enum PluginEvent {
     /// A line that the plugin printed, cut at [`LINE_BYTES`].
     Line(Stream, String),
+    /// Something about how it runs that a person should know, in a sentence.
+    Note(String),
     /// The process ended; how, in a sentence.
     Exited(String),
 }
@@ -36,20 +55,30 @@ pub enum PluginEvent {
 /// The running plugin.
 #[derive(Debug)]
 pub struct Supervisor {
-    group: Pid,
-    ended: Arc<(Mutex<Option<ExitStatus>>, Condvar)>,
+    shared: Arc<SharedState>,
 }
 
-/// Longest part of a line that is kept. [bytes]
-pub const LINE_BYTES: usize = 1024;
-/// Lines passed on per stream and second; the rest is counted. A plugin that prints per image and
-/// camera stays below.
-const LINES_PER_SECOND: u32 = 200;
+/// What the supervisor's threads share.
+struct SharedState {
+    group: Pid,
+    bounds: Bounds,
+    limits: PluginLimits,
+    ended: Mutex<Option<ExitStatus>>,
+    changed: Condvar,
+    /// The newest words on standard error.
+    last_error: Mutex<String>,
+    /// Why the supervisor itself ended it.
+    verdict: Mutex<Option<String>>,
+}
+
 /// Time a plugin has to end when asked.
 const END_WITHIN: Duration = Duration::from_millis(300);
+/// Limits are looked at this often: at 2 GB/s, 200 MB of a leak.
+const WATCH_EVERY: Duration = Duration::from_millis(100);
 
 impl Supervisor {
-    /// Starts `command` (program, then arguments). `tell` is called from the supervisor's threads.
+    /// Starts `command` (program, then arguments), confined. `tell` is called from the
+    /// supervisor's threads.
     ///
     /// The child dies with the thread that calls this (`PR_SET_PDEATHSIG`): call it from one that
     /// lives as long as the flight.
@@ -58,11 +87,13 @@ impl Supervisor {
     /// If the program cannot be started.
     pub fn start(
         command: &[OsString],
+        confinement: &Confinement,
         tell: impl Fn(PluginEvent) + Clone + Send + 'static,
     ) -> io::Result<Self> {
         let (program, arguments) = command
             .split_first()
             .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no plugin given"))?;
+        let (bounds, notes) = confinement.bounds();
         let mut process = Command::new(program);
         process
             .args(arguments)
@@ -72,120 +103,156 @@ impl Supervisor {
             // So that Ctrl-C at the terminal reaches the runtime first, and grandchildren can be
             // ended with the plugin.
             .process_group(0);
-        die_with_parent(&mut process);
+        confinement.apply(&mut process, &bounds);
         let mut child = process.spawn()?;
-        let group = Pid::from_raw(child.id() as i32);
-        let ended = Arc::new((Mutex::new(None), Condvar::new()));
-        let last_error = Arc::new(Mutex::new(String::new()));
-
-        let mut readers = Vec::new();
+        for note in notes {
+            tell(PluginEvent::Note(note));
+        }
+        let shared = Arc::new(SharedState {
+            group: Pid::from_raw(child.id() as i32),
+            bounds,
+            limits: confinement.limits.clone(),
+            ended: Mutex::new(None),
+            changed: Condvar::new(),
+            last_error: Mutex::new(String::new()),
+            verdict: Mutex::new(None),
+        });
         if let Some(stdout) = child.stdout.take() {
             let tell = tell.clone();
-            readers.push(spawn("plugin-stdout", move || {
+            spawn("plugin-stdout", move || {
                 read_lines(stdout, |line| tell(PluginEvent::Line(Stream::Stdout, line)));
-            })?);
+            })?;
         }
         if let Some(stderr) = child.stderr.take() {
-            let (tell, last) = (tell.clone(), Arc::clone(&last_error));
-            readers.push(spawn("plugin-stderr", move || {
+            let (tell, shared) = (tell.clone(), Arc::clone(&shared));
+            let mut tracebacks = Tracebacks::new(confinement.own_folders().to_vec());
+            spawn("plugin-stderr", move || {
+                let mut tell = |line| tell(PluginEvent::Line(Stream::Stderr, line));
                 read_lines(stderr, |line| {
                     if !line.trim().is_empty() {
-                        last.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&line);
+                        lock(&shared.last_error).clone_from(&line);
                     }
-                    tell(PluginEvent::Line(Stream::Stderr, line));
+                    tracebacks.take(line, &mut tell);
                 });
-            })?);
+                tracebacks.end(&mut tell);
+            })?;
         }
-        let end = Arc::clone(&ended);
-        spawn("plugin-wait", move || wait(child, group, &end, &last_error, &tell))?;
-        Ok(Self { group, ended })
+        let watched = Arc::clone(&shared);
+        spawn("plugin-watch", move || watched.watch())?;
+        let waited = Arc::clone(&shared);
+        spawn("plugin-wait", move || waited.wait(child, &tell))?;
+        Ok(Self { shared })
     }
 
     /// Returns the process id.
     pub fn id(&self) -> u32 {
-        self.group.as_raw().cast_unsigned()
+        self.shared.group.as_raw().cast_unsigned()
     }
 
     /// Whether the process still runs.
     pub fn is_running(&self) -> bool {
-        self.ended.0.lock().unwrap_or_else(PoisonError::into_inner).is_none()
+        lock(&self.shared.ended).is_none()
     }
 
     /// Ends the process and all it started: waits 0.3 s (it was asked to end by a message), then
     /// SIGTERM, 0.3 s more, then SIGKILL. Returns when it is gone.
     pub fn end(&self) {
-        if !self.wait_ended(END_WITHIN) {
+        if !self.shared.wait_ended(END_WITHIN) {
             self.signal(Signal::SIGTERM);
-            if !self.wait_ended(END_WITHIN) {
-                self.signal(Signal::SIGKILL);
+            if !self.shared.wait_ended(END_WITHIN) {
+                self.kill();
                 // A process in uninterruptible sleep may take longer; the flight does not wait.
-                self.wait_ended(Duration::from_secs(1));
+                self.shared.wait_ended(Duration::from_secs(1));
             }
+        }
+    }
+
+    /// Kills the process and all it started; does not wait for its end, which is told.
+    pub fn kill(&self) {
+        if self.is_running() {
+            self.shared.kill();
         }
     }
 
     fn signal(&self, signal: Signal) {
         if self.is_running() {
             // ESRCH: it ended meanwhile.
-            let _ = killpg(self.group, signal);
+            let _ = killpg(self.shared.group, signal);
         }
-    }
-
-    fn wait_ended(&self, timeout: Duration) -> bool {
-        let (state, changed) = &*self.ended;
-        let state = state.lock().unwrap_or_else(PoisonError::into_inner);
-        let (state, _) = changed
-            .wait_timeout_while(state, timeout, |status| status.is_none())
-            .unwrap_or_else(PoisonError::into_inner);
-        state.is_some()
     }
 }
 
 impl Drop for Supervisor {
     fn drop(&mut self) {
-        self.signal(Signal::SIGKILL);
+        self.kill();
     }
+}
+
+impl SharedState {
+    fn kill(&self) {
+        let _ = killpg(self.group, Signal::SIGKILL);
+        self.bounds.group().kill();
+    }
+
+    fn wait_ended(&self, timeout: Duration) -> bool {
+        let state = lock(&self.ended);
+        let (state, _) = self
+            .changed
+            .wait_timeout_while(state, timeout, |status| status.is_none())
+            .unwrap_or_else(PoisonError::into_inner);
+        state.is_some()
+    }
+
+    /// Looks at the limits until the process has ended; ends it if it is beyond them.
+    fn watch(&self) {
+        while !self.wait_ended(WATCH_EVERY) {
+            if let Some(sentence) = self.beyond_limits() {
+                *lock(&self.verdict) = Some(sentence);
+                self.kill();
+                return;
+            }
+        }
+    }
+
+    fn beyond_limits(&self) -> Option<String> {
+        let counted = self.bounds.counts_itself().then(|| watch::count(self.group));
+        watch::beyond_limits(&self.limits, self.bounds.group(), counted)
+    }
+
+    /// Waits for the end of the process, tells it at once, and ends what it left behind.
+    fn wait(&self, mut child: Child, tell: &impl Fn(PluginEvent)) {
+        let status = child.wait();
+        // What it left behind would keep the pipes open and the processor busy.
+        self.kill();
+        // The last words travel through a pipe that another thread reads; they are usually there.
+        // Waiting for them would delay the landing, so they are not waited for.
+        let last = lock(&self.last_error).clone();
+        let verdict = lock(&self.verdict).take();
+        let sentence = match &status {
+            // The kernel may have been faster than the watch.
+            Ok(status) => verdict
+                .or_else(|| watch::beyond_limits(&self.limits, self.bounds.group(), None))
+                .unwrap_or_else(|| describe(*status, &last)),
+            Err(error) => format!("the plugin cannot be watched: {error}"),
+        };
+        *lock(&self.ended) = Some(status.unwrap_or_default());
+        self.changed.notify_all();
+        tell(PluginEvent::Exited(sentence));
+    }
+}
+
+impl std::fmt::Debug for SharedState {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SharedState").field("group", &self.group).finish_non_exhaustive()
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> io::Result<thread::JoinHandle<()>> {
     thread::Builder::new().name(name.into()).spawn(run)
-}
-
-/// Makes the child die with the thread that starts it, even if that is killed.
-fn die_with_parent(process: &mut Command) {
-    let parent = nix::unistd::getpid();
-    // SAFETY: between fork and exec only async-signal-safe calls are allowed: prctl and getppid
-    // are, and neither allocates.
-    unsafe {
-        process.pre_exec(move || {
-            nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
-            // The parent may have died before that.
-            if getppid() == parent { Ok(()) } else { Err(io::ErrorKind::BrokenPipe.into()) }
-        });
-    }
-}
-
-/// Waits for the end of the process, tells it at once, and ends what it left behind.
-fn wait(
-    mut child: Child,
-    group: Pid,
-    ended: &(Mutex<Option<ExitStatus>>, Condvar),
-    last_error: &Mutex<String>,
-    tell: &impl Fn(PluginEvent),
-) {
-    let status = child.wait();
-    // Grandchildren would keep the pipes open and the processor busy.
-    let _ = killpg(group, Signal::SIGKILL);
-    // The last words travel through a pipe that another thread reads; they are usually there.
-    // Waiting for them would delay the landing, so they are not waited for.
-    let last = last_error.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let sentence = match &status {
-        Ok(status) => describe(*status, &last),
-        Err(error) => format!("the plugin cannot be watched: {error}"),
-    };
-    *ended.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(status.unwrap_or_default());
-    ended.1.notify_all();
-    tell(PluginEvent::Exited(sentence));
 }
 
 /// Returns how a process ended, in a sentence.
@@ -210,54 +277,19 @@ fn describe(status: ExitStatus, last_error: &str) -> String {
     if !status.success() && !last_error.is_empty() {
         text = format!("{text}; it last said: {last_error}");
     }
-    text
+    text + hint(last_error)
 }
 
-/// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`].
-fn read_lines(pipe: impl Read, mut tell: impl FnMut(String)) {
-    let mut reader = BufReader::new(pipe);
-    let (mut window, mut passed, mut dropped) = (std::time::Instant::now(), 0, 0u64);
-    while let Ok(Some(line)) = read_line(&mut reader) {
-        if window.elapsed() >= Duration::from_secs(1) {
-            if dropped > 0 {
-                tell(format!("({dropped} more lines in that second were dropped)"));
-            }
-            (window, passed, dropped) = (std::time::Instant::now(), 0, 0);
-        }
-        if passed < LINES_PER_SECOND {
-            passed += 1;
-            tell(line);
-        } else {
-            dropped += 1;
-        }
-    }
-    if dropped > 0 {
-        tell(format!("({dropped} more lines in that second were dropped)"));
-    }
-}
-
-/// Reads one line, keeps the start of it; `None` at the end. Memory stays bounded whatever comes.
-fn read_line(reader: &mut impl BufRead) -> io::Result<Option<String>> {
-    let mut line = Vec::new();
-    let mut any = false;
-    loop {
-        let available = match reader.fill_buf() {
-            Ok(available) => available,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            Err(error) => return Err(error),
-        };
-        if available.is_empty() {
-            return Ok(any.then(|| String::from_utf8_lossy(&line).into_owned()));
-        }
-        any = true;
-        let end = available.iter().position(|&byte| byte == b'\n');
-        let part = &available[..end.unwrap_or(available.len())];
-        let room = LINE_BYTES.saturating_sub(line.len());
-        line.extend_from_slice(&part[..part.len().min(room)]);
-        let used = end.map_or(available.len(), |end| end + 1);
-        reader.consume(used);
-        if end.is_some() {
-            return Ok(Some(String::from_utf8_lossy(&line).into_owned()));
-        }
+/// Returns what lies behind an error that a limit causes.
+fn hint(last_error: &str) -> &'static str {
+    let says = |marks: &[&str]| marks.iter().any(|mark| last_error.contains(mark));
+    if says(&["memory allocation of", "MemoryError", "bad_alloc"]) {
+        " (memory_mb in [plugin] allows no more)"
+    } else if says(&["Network is unreachable"]) {
+        " (a plugin has no network unless [plugin] says network = true)"
+    } else if says(&["Permission denied", "PermissionError"]) {
+        " (a plugin writes in its own folder, /tmp, and what [plugin] write lists)"
+    } else {
+        ""
     }
 }

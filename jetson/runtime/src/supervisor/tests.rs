@@ -15,28 +15,39 @@ use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 
 use super::*;
+use nix::unistd::geteuid;
 
 /// Far beyond anything a loaded machine needs; tests end when the awaited thing happens.
 const WAIT: Duration = Duration::from_mins(1);
 
 fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
+    start_with(&PluginLimits::default(), command)
+}
+
+fn start_with(limits: &PluginLimits, command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
     let (sender, receiver) = channel();
     let command: Vec<OsString> = command.iter().map(OsString::from).collect();
     let tell = move |event| {
         let _ = sender.send(event);
     };
-    (Supervisor::start(&command, tell).unwrap(), receiver)
+    let confinement = Confinement::prepare(limits, &command);
+    (Supervisor::start(&command, &confinement, tell).unwrap(), receiver)
 }
 
 /// Returns the lines and the last sentence of a child that ends by itself.
 fn to_the_end(command: &[&str]) -> (Vec<(Stream, String)>, String) {
-    let (_supervisor, receiver) = start(command);
+    to_the_end_with(&PluginLimits::default(), command)
+}
+
+fn to_the_end_with(limits: &PluginLimits, command: &[&str]) -> (Vec<(Stream, String)>, String) {
+    let (_supervisor, receiver) = start_with(limits, command);
     let (mut lines, mut sentence) = (Vec::new(), String::new());
     // Until all threads of the supervisor have dropped their sender.
     while let Ok(event) = receiver.recv_timeout(WAIT) {
         match event {
             PluginEvent::Line(stream, line) => lines.push((stream, line)),
             PluginEvent::Exited(how) => sentence = how,
+            PluginEvent::Note(_) => {}
         }
     }
     (lines, sentence)
@@ -60,9 +71,10 @@ fn each_way_to_end_has_its_sentence() {
 #[test]
 fn a_program_that_is_not_there_is_an_error() {
     let command = [OsString::from("/nonexistent/plugin")];
-    let error = Supervisor::start(&command, |_| {}).unwrap_err();
+    let confinement = Confinement::prepare(&PluginLimits::default(), &command);
+    let error = Supervisor::start(&command, &confinement, |_| {}).unwrap_err();
     assert_eq!(error.kind(), io::ErrorKind::NotFound);
-    assert!(Supervisor::start(&[], |_| {}).is_err());
+    assert!(Supervisor::start(&[], &confinement, |_| {}).is_err());
 }
 
 #[test]
@@ -115,13 +127,116 @@ fn the_child_dies_with_the_thread_that_started_it() {
             let _ = sender.send(event);
         };
         // Forgotten, as by a runtime that is killed.
-        std::mem::forget(Supervisor::start(&command, tell).unwrap());
+        let confinement = Confinement::prepare(&PluginLimits::default(), &command);
+        std::mem::forget(Supervisor::start(&command, &confinement, tell).unwrap());
     });
     starter.join().unwrap();
     let end = std::iter::from_fn(|| receiver.recv_timeout(WAIT).ok())
         .find(|event| matches!(event, PluginEvent::Exited(_)));
     let Some(PluginEvent::Exited(sentence)) = end else { panic!("it lives on") };
     assert!(sentence.contains("SIGKILL"), "{sentence}");
+}
+
+// ---- what a plugin may not ----
+
+/// Runs a Python program; returns what it printed, and how it ended. The tests need Python anyway.
+fn python(limits: &PluginLimits, program: &str) -> (String, String) {
+    let (lines, sentence) = to_the_end_with(limits, &["python3", "-c", program]);
+    let lines: Vec<_> = lines.into_iter().map(|(_, line)| line).collect();
+    (lines.join("\n"), sentence)
+}
+
+#[test]
+fn there_is_no_network_unless_allowed_and_none_of_the_systems_own_calls() {
+    let program = "
+import socket, ctypes, os
+for family in (socket.AF_INET, socket.AF_INET6):
+    try:
+        socket.socket(family, socket.SOCK_DGRAM); print('open')
+    except OSError as error:
+        print(error.strerror)
+socket.socket(socket.AF_UNIX); print('unix')
+libc = ctypes.CDLL(None, use_errno=True)
+print('unshare', libc.unshare(0x10000000), os.strerror(ctypes.get_errno()))
+print('ptrace', libc.ptrace(16, os.getppid(), 0, 0), os.strerror(ctypes.get_errno()))
+socket.create_connection(('192.0.2.1', 80), timeout=1)
+";
+    let (said, sentence) = python(&PluginLimits::default(), program);
+    let expected = "Network is unreachable\nNetwork is unreachable\nunix\n\
+                    unshare -1 Operation not permitted\nptrace -1 Operation not permitted";
+    assert!(said.starts_with(expected), "{said}");
+    assert!(sentence.contains("no network unless [plugin] says network = true"), "{sentence}");
+    let allowed = PluginLimits { network: true, ..PluginLimits::default() };
+    let (said, _) = python(&allowed, "import socket; socket.socket(); print('open')");
+    assert_eq!(said, "open");
+}
+
+#[test]
+fn it_writes_in_its_own_folders_only_and_signals_nobody() {
+    let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/var/tmp").unwrap();
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    std::fs::set_permissions(folder.path(), mode).unwrap();
+    let file = folder.path().join("x");
+    let program = format!(
+        "import os, tempfile
+tempfile.TemporaryFile().write(b'x'); print('scratch')
+try:
+    os.kill(os.getppid(), 0); print('signalled')
+except PermissionError:
+    print('no signal')
+open({file:?}, 'w').write('x'); print('written')"
+    );
+    let (said, sentence) = python(&PluginLimits::default(), &program);
+    // Where the kernel has no Landlock, a user of its own may still keep it out.
+    if !Confinement::prepare(&PluginLimits::default(), &[]).is_partial() {
+        assert!(said.contains("scratch\nno signal"), "{said}");
+        assert!(!file.exists(), "{said}");
+        assert!(sentence.contains("a plugin writes in its own folder"), "{sentence}");
+    }
+    let limits = PluginLimits { write: vec![folder.path().to_owned()], ..PluginLimits::default() };
+    let (said, _) = python(&limits, &program);
+    assert!(said.contains("written") && file.exists(), "{said}");
+}
+
+#[test]
+fn it_is_not_root_and_has_no_powers() {
+    let program = "
+import os
+status = open('/proc/self/status').read()
+print(os.geteuid() == 0, [line.split()[1] for line in status.splitlines() if 'CapEff' in line])";
+    for user in [None, Some("root".to_owned()), Some("nobody".to_owned())] {
+        let limits = PluginLimits { user: user.clone(), ..PluginLimits::default() };
+        let (said, _) = python(&limits, program);
+        assert!(said.contains("0000000000000000"), "{user:?}: {said}");
+        // By name, if asked for, or if no other user could read what it runs.
+        let command = ["python3", "-c", program].map(OsString::from);
+        let changes = Confinement::prepare(&limits, &command).user_id().is_some();
+        assert_eq!(said.starts_with("False"), changes || !geteuid().is_root(), "{user:?}: {said}");
+    }
+}
+
+#[test]
+fn memory_beyond_the_limit_ends_it_with_a_sentence() {
+    let limits = PluginLimits { memory_mb: 200, ..PluginLimits::default() };
+    let program = "
+held = []
+while True: held.append(bytearray(5_000_000))";
+    let (_, sentence) = python(&limits, program);
+    assert!(sentence.contains("more than its 200 MB of memory"), "{sentence}");
+    // Without a control group the interpreter itself is refused, and says so.
+    assert_eq!(hint("MemoryError"), " (memory_mb in [plugin] allows no more)");
+}
+
+#[test]
+fn a_fork_bomb_is_stopped_with_all_its_processes() {
+    let limits = PluginLimits { processes: 30, ..PluginLimits::default() };
+    let program = "
+import os
+while True:
+    try: os.fork()
+    except OSError: pass";
+    let (_, sentence) = python(&limits, program);
+    assert!(sentence.contains("more than its 30 processes"), "{sentence}");
 }
 
 // ---- the example plugin over real shared memory ----
@@ -166,8 +281,11 @@ struct Rig {
 impl Rig {
     fn start(how: &str) -> Self {
         let service = unique_service();
-        let ipc = RuntimeEnd::create(&service, ObservationWriter::len_for(&cameras())).unwrap();
         let program = example();
+        let command = [program.clone().into_os_string()];
+        let owner = Confinement::prepare(&PluginLimits::default(), &command).user_id();
+        let len = ObservationWriter::len_for(&cameras());
+        let ipc = RuntimeEnd::create_for(&service, len, owner).unwrap();
         let option = format!("{SERVICE_OPTION}={service}");
         let (supervisor, events) = start(&[program.to_str().unwrap(), how, &option]);
         let mut rig = Self { ipc, supervisor, events, seq: 0 };
@@ -215,7 +333,7 @@ impl Rig {
             std::iter::from_fn(|| self.events.recv_timeout(WAIT).ok()).find_map(
                 |event| match event {
                     PluginEvent::Exited(sentence) => Some(sentence),
-                    PluginEvent::Line(..) => None,
+                    PluginEvent::Line(..) | PluginEvent::Note(_) => None,
                 },
             );
         exited.expect("the plugin ends")

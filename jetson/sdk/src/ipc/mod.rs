@@ -31,6 +31,7 @@ use iceoryx2::prelude::{
     SignalHandlingMode, ipc_threadsafe, set_log_level,
 };
 use iceoryx2::service::builder::publish_subscribe::Builder as PubSubBuilder;
+use nix::unistd::Uid;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use vizflyt_protocol::packet::framing::{self, MAX_FRAMED};
@@ -93,21 +94,47 @@ const PROTOCOL_KEY: &str = "vizflyt_protocol";
 
 /// Returns the folder of this user's runtimes and plugins.
 fn user_folder() -> String {
-    format!("/tmp/vizflyt-{}/", nix::unistd::geteuid())
+    format!("/tmp/vizflyt-{}/", acting_user())
 }
 
 /// Files of iceoryx2 live under a folder and a prefix of the user's own, so that users never trip
 /// over each other's permissions. All flights of one user share them, so that the next one
-/// reclaims what a killed one left behind.
+/// reclaims what a killed one left behind. Where a plugin runs as another user than the runtime, they
+/// are that user's.
 fn config() -> Result<Config, IpcError> {
     let mut config = Config::default();
+    let user = acting_user();
     let root = user_folder();
     let root = Path::new(root.as_bytes()).map_err(IpcError::transport("naming its folder"))?;
     config.global.set_root_path(&root);
-    let prefix = format!("vizflyt{}_", nix::unistd::geteuid());
+    let prefix = format!("vizflyt{user}_");
     config.global.prefix =
         FileName::new(prefix.as_bytes()).map_err(IpcError::transport("naming its files"))?;
     Ok(config)
+}
+
+/// Returns whom this thread makes files as: the user it runs as, or the plugin's, see
+/// [`RuntimeEnd::create_for`].
+fn acting_user() -> Uid {
+    // The largest number is no user: nothing is changed, and the present one returned.
+    nix::unistd::setfsuid(Uid::from_raw(u32::MAX))
+}
+
+/// Until dropped, this thread makes and opens files as another user (setfsuid(2)).
+struct Acting {
+    former: Uid,
+}
+
+impl Acting {
+    fn as_user(user: Option<Uid>) -> Option<Self> {
+        user.map(|user| Self { former: nix::unistd::setfsuid(user) })
+    }
+}
+
+impl Drop for Acting {
+    fn drop(&mut self) {
+        nix::unistd::setfsuid(self.former);
+    }
 }
 
 /// Makes a node. Dead nodes of former flights are cleaned up on the way.
@@ -144,7 +171,14 @@ fn send<M: Serialize>(
     reader: &'static str,
 ) -> Result<(), IpcError> {
     let mut buffer = [0; MAX_FRAMED];
-    let body = framing::encode_body(message, &mut buffer);
+    send_bytes(queue, framing::encode_body(message, &mut buffer), reader)
+}
+
+fn send_bytes(
+    queue: &Publisher<Ipc, [u8], ()>,
+    body: &[u8],
+    reader: &'static str,
+) -> Result<(), IpcError> {
     let sample = queue.loan_slice_uninit(body.len()).map_err(IpcError::transport("sending"))?;
     match sample.write_from_slice(body).send() {
         Ok(_) => Ok(()),

@@ -15,9 +15,9 @@ use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
 use vizflyt_protocol::packet::PreambleError;
-use vizflyt_protocol::packet::framing::MAX_FRAMED;
+use vizflyt_protocol::packet::framing::{self, MAX_FRAMED};
 
-use super::{Ipc, IpcError, PROTOCOL_KEY, name, node, receive, send, slices, wait};
+use super::{Ipc, IpcError, PROTOCOL_KEY, name, node, receive, send_bytes, slices, wait};
 
 /// The plugin's end of the shared memory.
 #[derive(Debug)]
@@ -111,7 +111,17 @@ impl PluginEnd {
     /// # Errors
     /// [`IpcError::QueueFull`] if the runtime has not read for a second.
     pub fn send(&self, message: &FromPlugin) -> Result<(), IpcError> {
-        send(&self.from_plugin, message, "runtime")?;
+        let mut buffer = [0; MAX_FRAMED];
+        self.send_bytes(framing::encode_body(message, &mut buffer))
+    }
+
+    /// Sends bytes as they are, and wakes the runtime: for plugins in other languages that encode
+    /// messages themselves, and to test what a runtime makes of nonsense.
+    ///
+    /// # Errors
+    /// As [`Self::send`].
+    pub fn send_bytes(&self, body: &[u8]) -> Result<(), IpcError> {
+        send_bytes(&self.from_plugin, body, "runtime")?;
         self.wake_runtime.notify().map_err(IpcError::transport("waking the runtime"))?;
         Ok(())
     }

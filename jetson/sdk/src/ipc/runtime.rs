@@ -11,13 +11,14 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{AllocationStrategy, AttributeSpecifier, PortFactory as _};
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use nix::unistd::Uid;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
 use vizflyt_protocol::packet::framing::MAX_FRAMED;
 
 use super::{
-    BORROWED_OBSERVATIONS, Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive, send,
-    slices, wait,
+    Acting, BORROWED_OBSERVATIONS, Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive,
+    send, slices, wait,
 };
 
 /// The runtime's end of the shared memory. All calls return at once, but for [`Self::wait`]; a
@@ -30,6 +31,8 @@ pub struct RuntimeEnd {
     wake_plugin: Notifier<Ipc>,
     wake_runtime: Listener<Ipc>,
     to_plugin_service: PortFactory<Ipc, [u8], ()>,
+    /// Whose the files are, if not ours.
+    owner: Option<Uid>,
     // Last, so that ports go before the node they belong to.
     node: Node<Ipc>,
 }
@@ -46,6 +49,20 @@ impl RuntimeEnd {
     /// # Errors
     /// [`IpcError::Transport`], as when shared memory is full or the prefix is in use.
     pub fn create(prefix: &str, observation_len: usize) -> Result<Self, IpcError> {
+        Self::create_for(prefix, observation_len, None)
+    }
+
+    /// As [`Self::create`], for a plugin that runs as the user `owner`; only root can.
+    ///
+    /// # Errors
+    /// As [`Self::create`].
+    pub fn create_for(
+        prefix: &str,
+        observation_len: usize,
+        owner: Option<u32>,
+    ) -> Result<Self, IpcError> {
+        let owner = owner.map(Uid::from_raw);
+        let _acting = Acting::as_user(owner);
         let node = node()?;
         let creating = "creating a service";
         let port = "creating a port";
@@ -127,12 +144,14 @@ impl RuntimeEnd {
             wake_plugin,
             wake_runtime,
             to_plugin_service,
+            owner,
             node,
         })
     }
 
     /// Whether a plugin has attached: from then on messages reach it.
     pub fn plugin_attached(&self) -> bool {
+        let _acting = Acting::as_user(self.owner);
         self.to_plugin_service.dynamic_config().number_of_subscribers() > 0
     }
 
@@ -141,6 +160,7 @@ impl RuntimeEnd {
     /// # Errors
     /// [`IpcError::QueueFull`] if the plugin has left so many unread that it must be hung.
     pub fn send(&self, message: &ToPlugin) -> Result<(), IpcError> {
+        let _acting = Acting::as_user(self.owner);
         send(&self.to_plugin, message, "plugin")?;
         self.heartbeat();
         Ok(())
@@ -148,6 +168,7 @@ impl RuntimeEnd {
 
     /// Wakes the plugin. At least twice a second, so that it knows the runtime is alive.
     pub fn heartbeat(&self) {
+        let _acting = Acting::as_user(self.owner);
         // Nobody listening is no fault: the supervisor tells whether the plugin lives.
         let _ = self.wake_plugin.notify();
     }
@@ -158,12 +179,14 @@ impl RuntimeEnd {
     /// # Errors
     /// [`IpcError::Transport`] if two are lent already, or there is not so much memory.
     pub fn loan(&self, len: usize) -> Result<LoanedObservation, IpcError> {
+        let _acting = Acting::as_user(self.owner);
         let sample = self.observations.loan_slice(len);
         Ok(LoanedObservation(sample.map_err(IpcError::transport("lending memory"))?))
     }
 
     /// Publishes an observation and wakes the plugin; the one before is replaced if unread.
     pub fn publish(&self, observation: LoanedObservation) -> Result<(), IpcError> {
+        let _acting = Acting::as_user(self.owner);
         observation.0.send().map_err(IpcError::transport("publishing"))?;
         self.heartbeat();
         Ok(())
@@ -179,12 +202,14 @@ impl RuntimeEnd {
     /// # Errors
     /// [`IpcError::Message`] for one that does not decode; the next can still be read.
     pub fn receive(&self) -> Result<Option<FromPlugin>, IpcError> {
+        let _acting = Acting::as_user(self.owner);
         receive(&self.from_plugin)
     }
 
     /// Reclaims what a dead plugin held: its subscriptions and the samples it was reading. Call
     /// after each exit of a plugin.
     pub fn clean_up(&self) {
+        let _acting = Acting::as_user(self.owner);
         self.node.try_cleanup_dead_nodes();
     }
 }

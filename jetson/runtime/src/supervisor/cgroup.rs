@@ -1,0 +1,354 @@
+//! A control group of the plugin's own: memory, processors and processes of it and all it starts,
+//! and a list of them, so that none escapes its end.
+//!
+//! Version 2 where it is mounted and lends its controllers, else version 1, controller by
+//! controller. Only where this process may make a group: as root, or where systemd delegates one
+//! to the user. What a group cannot limit, [`confine`](super::confine) limits another way.
+
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use super::limits::PluginLimits;
+
+/// What a group can limit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Controller {
+    Memory,
+    Cpu,
+    Pids,
+}
+
+impl Controller {
+    const ALL: [Self; 3] = [Self::Memory, Self::Cpu, Self::Pids];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Memory => "memory",
+            Self::Cpu => "cpu",
+            Self::Pids => "pids",
+        }
+    }
+}
+
+/// The plugin's groups: one in version 2, up to three in version 1. Removed when dropped.
+#[derive(Debug, Default)]
+pub(super) struct Cgroup {
+    parts: Vec<Part>,
+}
+
+#[derive(Debug)]
+struct Part {
+    folder: PathBuf,
+    version: u8,
+    limits: Vec<Controller>,
+    /// Open for writing since before the plugin became another user.
+    procs: File,
+}
+
+/// Prefix of the groups' names; what follows is the runtime's process and a count.
+const NAME: &str = "vizflyt-plugin-";
+/// Period of the processors' quota. [us]
+const CPU_PERIOD_US: u64 = 20_000;
+
+impl Cgroup {
+    /// Makes the groups that can be made; none is no error.
+    pub(super) fn make(limits: &PluginLimits) -> Self {
+        let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
+        let own = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+        let places = places(&mounts, &own);
+        let mut group = Self::default();
+        for place in &places {
+            let missing: Vec<_> =
+                place.offers.iter().copied().filter(|&c| !group.limits(c)).collect();
+            // A group of version 2 is of use even without controllers: it knows its processes.
+            if missing.is_empty() && (place.version == 1 || group.has_version_2()) {
+                continue;
+            }
+            group.parts.extend(Part::make(place, &missing, limits));
+        }
+        group
+    }
+
+    fn has_version_2(&self) -> bool {
+        self.parts.iter().any(|part| part.version == 2)
+    }
+
+    /// Whether a group limits this.
+    pub(super) fn limits(&self, controller: Controller) -> bool {
+        self.parts.iter().any(|part| part.limits.contains(&controller))
+    }
+
+    /// Returns the files into which a process writes `0` to become a member.
+    pub(super) fn doors(&self) -> Vec<&File> {
+        self.parts.iter().map(|part| &part.procs).collect()
+    }
+
+    /// Whether the kernel ended a process of the group for its memory.
+    pub(super) fn ran_out_of_memory(&self) -> bool {
+        self.events(Controller::Memory, |part| match part.version {
+            2 => ("memory.events", "oom_kill"),
+            _ => ("memory.oom_control", "oom_kill"),
+        })
+    }
+
+    /// Whether the kernel refused the group a process.
+    pub(super) fn ran_out_of_processes(&self) -> bool {
+        self.events(Controller::Pids, |_| ("pids.events", "max"))
+    }
+
+    fn events(
+        &self,
+        controller: Controller,
+        place: impl Fn(&Part) -> (&'static str, &'static str),
+    ) -> bool {
+        let part = self.parts.iter().find(|part| part.limits.contains(&controller));
+        part.is_some_and(|part| {
+            let (file, key) = place(part);
+            let text = fs::read_to_string(part.folder.join(file)).unwrap_or_default();
+            field(&text, key).is_some_and(|count| count > 0)
+        })
+    }
+
+    /// Kills every member, and those they start meanwhile.
+    pub(super) fn kill(&self) {
+        for part in &self.parts {
+            // Version 2 since Linux 5.14; it cannot be outrun.
+            if fs::write(part.folder.join("cgroup.kill"), "1").is_ok() {
+                continue;
+            }
+            // Bounded: a member that forks faster than we read has a limit on its processes.
+            for _ in 0..64 {
+                let members = part.members();
+                if members.is_empty() {
+                    break;
+                }
+                for member in members {
+                    let _ = kill(member, Signal::SIGKILL);
+                }
+            }
+        }
+    }
+}
+
+impl Drop for Cgroup {
+    fn drop(&mut self) {
+        // A member that dies stays one until it is reaped.
+        for part in &self.parts {
+            for _ in 0..100 {
+                match fs::remove_dir(&part.folder) {
+                    Err(error) if error.kind() == io::ErrorKind::ResourceBusy => {
+                        thread::sleep(Duration::from_millis(2));
+                    }
+                    _ => break,
+                }
+            }
+        }
+    }
+}
+
+impl Part {
+    /// Makes a group at the nearest place above us where it can be made and used.
+    fn make(place: &Place, wanted: &[Controller], limits: &PluginLimits) -> Option<Self> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("{NAME}{}-{count}", std::process::id());
+        // Version 2 refuses processes in a group that lends controllers to groups below it, and
+        // ours has one: us. So the parent's is tried first, then its parents'.
+        let own = place.root.join(place.own.trim_start_matches('/'));
+        let above = own.ancestors().skip(usize::from(place.version == 2 && own != place.root));
+        let mut best: Option<Self> = None;
+        for parent in above.take_while(|parent| parent.starts_with(&place.root)) {
+            remove_left_behind(parent);
+            let folder = parent.join(&name);
+            if fs::create_dir(&folder).is_err() {
+                continue;
+            }
+            let procs = OpenOptions::new().write(true).open(folder.join("cgroup.procs"));
+            let Ok(procs) = procs else {
+                let _ = fs::remove_dir(&folder);
+                continue;
+            };
+            let mut part = Self { folder, version: place.version, limits: Vec::new(), procs };
+            part.limits = wanted.iter().copied().filter(|&c| part.limit(c, limits)).collect();
+            if best.as_ref().is_none_or(|best| best.limits.len() < part.limits.len()) {
+                part.swap_into(&mut best);
+            } else {
+                part.remove();
+            }
+            if best.as_ref().is_some_and(|best| best.limits.len() == wanted.len()) {
+                break;
+            }
+        }
+        best
+    }
+
+    fn swap_into(self, best: &mut Option<Self>) {
+        if let Some(former) = best.replace(self) {
+            former.remove();
+        }
+    }
+
+    fn remove(self) {
+        let _ = fs::remove_dir(&self.folder);
+    }
+
+    /// Sets a limit; returns whether the kernel took it.
+    fn limit(&self, controller: Controller, limits: &PluginLimits) -> bool {
+        let set = |file: &str, value: String| fs::write(self.folder.join(file), value).is_ok();
+        let memory = (limits.memory_mb * 1_000_000).to_string();
+        let quota_us = ((limits.cpus * CPU_PERIOD_US as f64) as u64).max(1000);
+        match (controller, self.version) {
+            (Controller::Memory, 2) => {
+                // Without swap accounting the file is not there, and all is memory.
+                let _ = set("memory.swap.max", "0".into());
+                let _ = set("memory.oom.group", "1".into());
+                set("memory.max", memory)
+            }
+            (Controller::Memory, _) => {
+                let done = set("memory.limit_in_bytes", memory.clone());
+                let _ = set("memory.memsw.limit_in_bytes", memory);
+                done
+            }
+            (Controller::Cpu, 2) => set("cpu.max", format!("{quota_us} {CPU_PERIOD_US}")),
+            (Controller::Cpu, _) => {
+                set("cpu.cfs_period_us", CPU_PERIOD_US.to_string())
+                    && set("cpu.cfs_quota_us", quota_us.to_string())
+            }
+            (Controller::Pids, _) => set("pids.max", limits.processes.to_string()),
+        }
+    }
+
+    fn members(&self) -> Vec<Pid> {
+        let text = fs::read_to_string(self.folder.join("cgroup.procs")).unwrap_or_default();
+        text.lines().filter_map(|line| Some(Pid::from_raw(line.parse().ok()?))).collect()
+    }
+}
+
+/// Removes groups of runtimes that were killed. One that has members refuses to go.
+fn remove_left_behind(parent: &Path) {
+    let Ok(entries) = fs::read_dir(parent) else { return };
+    for entry in entries.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let pid = name.strip_prefix(NAME).and_then(|rest| rest.split('-').next()?.parse().ok());
+        // Another runtime may have made its group and not filled it yet.
+        let runs = |pid: u32| Path::new("/proc").join(pid.to_string()).exists();
+        if pid.is_some_and(|pid| !runs(pid)) {
+            let _ = fs::remove_dir(entry.path());
+        }
+    }
+}
+
+/// A hierarchy and where we are in it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Place {
+    root: PathBuf,
+    own: String,
+    version: u8,
+    offers: Vec<Controller>,
+}
+
+/// Returns the hierarchies of `/proc/self/mountinfo` (proc_pid_mountinfo(5)) and this process's
+/// place in each by `/proc/self/cgroup` (cgroups(7)), version 2 first.
+fn places(mounts: &str, own: &str) -> Vec<Place> {
+    let mut places: Vec<Place> = mounts
+        .lines()
+        .filter_map(|line| {
+            let (mount, kind) = line.split_once(" - ")?;
+            let mut mount = mount.split(' ').skip(3);
+            let (inner, root) = (mount.next()?, mount.next()?);
+            let mut kind = kind.split(' ');
+            let version = match kind.next()? {
+                "cgroup2" => 2,
+                "cgroup" => 1,
+                _ => return None,
+            };
+            let options = kind.nth(1).unwrap_or_default();
+            let offers: Vec<Controller> = Controller::ALL
+                .into_iter()
+                .filter(|c| version == 2 || options.split(',').any(|o| o == c.name()))
+                .collect();
+            if offers.is_empty() {
+                return None;
+            }
+            let path = own.lines().find_map(|line| {
+                let mut fields = line.splitn(3, ':').skip(1);
+                let (names, path) = (fields.next()?, fields.next()?);
+                let is_it = match version {
+                    2 => names.is_empty(),
+                    _ => names.split(',').any(|name| offers.iter().any(|c| c.name() == name)),
+                };
+                is_it.then_some(path)
+            })?;
+            // Inside a container the mount shows a part of the hierarchy only.
+            let path = path.strip_prefix(inner.trim_end_matches('/')).unwrap_or(path);
+            Some(Place { root: root.into(), own: path.to_owned(), version, offers })
+        })
+        .collect();
+    places.sort_by_key(|place| std::cmp::Reverse(place.version));
+    places
+}
+
+/// Returns the number after `key` in lines of `KEY NUMBER`.
+fn field(text: &str, key: &str) -> Option<u64> {
+    text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(' ')?.trim().parse().ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MOUNTS_1: &str = "\
+35 24 0:30 / /sys/fs/cgroup rw - tmpfs tmpfs rw
+36 35 0:31 / /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory
+37 35 0:32 / /sys/fs/cgroup/cpu,cpuacct rw,relatime - cgroup cgroup rw,cpu,cpuacct
+38 35 0:33 / /sys/fs/cgroup/blkio rw,relatime - cgroup cgroup rw,blkio
+39 35 0:34 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw";
+
+    #[test]
+    fn hierarchies_of_both_versions_are_found() {
+        let own = "4:memory:/a/b\n2:cpu,cpuacct:/\n3:blkio:/\n0::/user.slice";
+        let found = places(MOUNTS_1, own);
+        let seen: Vec<_> =
+            found.iter().map(|p| (p.root.to_str().unwrap(), p.own.as_str(), p.version)).collect();
+        assert_eq!(
+            seen,
+            [
+                ("/sys/fs/cgroup/unified", "/user.slice", 2),
+                ("/sys/fs/cgroup/memory", "/a/b", 1),
+                ("/sys/fs/cgroup/cpu,cpuacct", "/", 1)
+            ]
+        );
+        assert_eq!(found[2].offers, [Controller::Cpu]);
+        let inside = "36 35 0:31 /docker/x /sys/fs/cgroup rw - cgroup2 cgroup rw";
+        assert_eq!(places(inside, "0::/docker/x/y")[0].own, "/y");
+        assert!(places("", "0::/").is_empty() && places("nonsense - cgroup", "").is_empty());
+    }
+
+    #[test]
+    fn a_group_counts_its_own_and_is_gone_afterwards() {
+        let limits = PluginLimits { processes: 9, ..PluginLimits::default() };
+        let group = Cgroup::make(&limits);
+        let folders: Vec<_> = group.parts.iter().map(|part| part.folder.clone()).collect();
+        // Where this user may make none there is nothing to see.
+        for part in &group.parts {
+            assert!(part.members().is_empty() && part.folder.exists());
+        }
+        assert!(!group.ran_out_of_memory() && !group.ran_out_of_processes());
+        drop(group);
+        assert!(folders.iter().all(|folder| !folder.exists()));
+    }
+
+    #[test]
+    fn counters_are_read() {
+        assert_eq!(field("low 0\noom_kill 3\n", "oom_kill"), Some(3));
+        assert_eq!(field("oom_kill_disable 0\noom_kill 1\n", "oom_kill"), Some(1));
+        assert_eq!(field("", "max"), None);
+    }
+}

@@ -1,0 +1,120 @@
+//! What a plugin may use, and what happens when it ends: the settings, from `[plugin]` in
+//! `jetson.toml`.
+
+use std::path::PathBuf;
+use std::thread::available_parallelism;
+
+use serde::{Deserialize, Serialize};
+
+/// When a plugin that ended is started again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Restart {
+    /// Never: on the ground the flight is off, in the air the vehicle lands.
+    Never,
+    /// As long as the vehicle stands on the ground; in the air it lands.
+    #[default]
+    OnGround,
+    /// In the air too: the vehicle holds until the plugin is back, and lands if it is not.
+    InFlight,
+}
+
+/// What a plugin may use. Memory, processors and processes count for it and all it starts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PluginLimits {
+    /// Memory. [MB]
+    pub memory_mb: u64,
+    /// Processors it may keep busy; 1.5 is one and a half.
+    pub cpus: f64,
+    /// Processes and threads.
+    pub processes: u32,
+    /// Time that `on_image` shall take at most; what is beyond is shown. [ms]
+    pub deadline_ms: f64,
+    /// When it is started again.
+    pub restart: Restart,
+    /// How often, in one flight.
+    pub restarts: u32,
+    /// Whether it may use the network.
+    pub network: bool,
+    /// The user it runs as if the runtime is root; without it `vizflyt`, or else `nobody`.
+    pub user: Option<String>,
+    /// Folders it may write in, beside its own, the working folder and `/tmp`.
+    pub write: Vec<PathBuf>,
+}
+
+impl Default for PluginLimits {
+    fn default() -> Self {
+        Self {
+            // Half of what there is: the other half is for the runtime, and on one computer for
+            // the server.
+            memory_mb: (memory_total_mb() / 2).max(LEAST_MEMORY_MB),
+            // One is left for the runtime, so that setpoints leave in time.
+            cpus: available_parallelism().map_or(1.0, |n| (n.get() as f64 - 1.0).max(1.0)),
+            // numpy, OpenCV and torch start one to two threads per processor each.
+            processes: 128,
+            // Six images at 60 Hz: the plugin flies on what was true 100 ms ago, at 2 m/s 20 cm.
+            deadline_ms: 100.0,
+            restart: Restart::default(),
+            restarts: 3,
+            network: false,
+            user: None,
+            write: Vec::new(),
+        }
+    }
+}
+
+/// Less than this, no interpreter starts. [MB]
+pub const LEAST_MEMORY_MB: u64 = 64;
+
+impl PluginLimits {
+    /// Checks that the limits leave a plugin room to live.
+    ///
+    /// # Errors
+    /// One sentence that names the setting.
+    pub fn check(&self) -> Result<(), String> {
+        if self.memory_mb < LEAST_MEMORY_MB {
+            return Err(format!(
+                "plugin.memory_mb = {}: give {LEAST_MEMORY_MB} or more",
+                self.memory_mb
+            ));
+        }
+        if !(self.cpus >= 0.1 && self.cpus <= 1024.0) {
+            return Err(format!("plugin.cpus = {}: give 0.1 or more", self.cpus));
+        }
+        if self.processes < 4 {
+            return Err(format!("plugin.processes = {}: give 4 or more", self.processes));
+        }
+        if !(self.deadline_ms > 0.0 && self.deadline_ms.is_finite()) {
+            return Err(format!("plugin.deadline_ms = {}: give more than 0", self.deadline_ms));
+        }
+        Ok(())
+    }
+}
+
+/// Returns this computer's memory; 4 GB where the system does not tell. [MB]
+fn memory_total_mb() -> u64 {
+    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let kib = text.lines().find_map(|line| line.strip_prefix("MemTotal:"));
+    let kib = kib.and_then(|kib| kib.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+    kib.map_or(4000, |kib| kib * 1024 / 1_000_000)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_leave_room_and_nonsense_is_refused() {
+        let fair = PluginLimits::default();
+        assert_eq!(fair.check(), Ok(()));
+        assert!(!fair.network && fair.cpus >= 1.0);
+        let check = |limits: PluginLimits, named: &str| {
+            let why = limits.check().unwrap_err();
+            assert!(why.contains(named), "{why}");
+        };
+        check(PluginLimits { memory_mb: 1, ..fair.clone() }, "plugin.memory_mb = 1");
+        check(PluginLimits { cpus: f64::NAN, ..fair.clone() }, "plugin.cpus = NaN");
+        check(PluginLimits { processes: 1, ..fair.clone() }, "plugin.processes = 1");
+        check(PluginLimits { deadline_ms: -1.0, ..fair }, "plugin.deadline_ms = -1");
+    }
+}

@@ -1,0 +1,277 @@
+//! What a plugin prints, line by line: bounded in length and number whatever comes, and a Python
+//! traceback turned round, so that the student's own lines come first.
+
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Longest part of a line that is kept. [bytes]
+pub const LINE_BYTES: usize = 1024;
+/// Lines passed on per stream and second; the rest is counted. A plugin that prints per image and
+/// camera stays below.
+const LINES_PER_SECOND: u32 = 200;
+/// Lines of a traceback that are held back to be turned round. Python itself shortens recursion.
+const TRACEBACK_LINES: usize = 200;
+/// Calls of other people's code that are shown.
+const FOREIGN_CALLS: usize = 6;
+
+/// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`].
+pub(super) fn read_lines(pipe: impl Read, mut tell: impl FnMut(String)) {
+    let mut reader = BufReader::new(pipe);
+    let (mut window, mut passed, mut dropped) = (Instant::now(), 0, 0u64);
+    let mut first = true;
+    let mut cut = |dropped: u64, tell: &mut dyn FnMut(String)| {
+        // The first time it says why; then it is a count.
+        let why = if first { "; printing less per image shows more" } else { "" };
+        first = false;
+        tell(format!("({dropped} more lines in that second were dropped{why})"));
+    };
+    while let Ok(Some(line)) = read_line(&mut reader) {
+        if window.elapsed() >= Duration::from_secs(1) {
+            if dropped > 0 {
+                cut(dropped, &mut tell);
+            }
+            (window, passed, dropped) = (Instant::now(), 0, 0);
+        }
+        if passed < LINES_PER_SECOND {
+            passed += 1;
+            tell(line);
+        } else {
+            dropped += 1;
+        }
+    }
+    if dropped > 0 {
+        cut(dropped, &mut tell);
+    }
+}
+
+/// Reads one line, keeps the start of it; `None` at the end. Memory stays bounded whatever comes.
+fn read_line(reader: &mut impl BufRead) -> io::Result<Option<String>> {
+    let mut line = Vec::new();
+    let mut any = false;
+    loop {
+        let available = match reader.fill_buf() {
+            Ok(available) => available,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            Err(error) => return Err(error),
+        };
+        if available.is_empty() {
+            return Ok(any.then(|| String::from_utf8_lossy(&line).into_owned()));
+        }
+        any = true;
+        let end = available.iter().position(|&byte| byte == b'\n');
+        let part = &available[..end.unwrap_or(available.len())];
+        let room = LINE_BYTES.saturating_sub(line.len());
+        line.extend_from_slice(&part[..part.len().min(room)]);
+        let used = end.map_or(available.len(), |end| end + 1);
+        reader.consume(used);
+        if end.is_some() {
+            return Ok(Some(String::from_utf8_lossy(&line).into_owned()));
+        }
+    }
+}
+
+/// Turns Python tracebacks round: what went wrong, then the student's own lines, innermost first,
+/// then how other people's code was reached. All else passes as it is.
+///
+/// ```text
+/// Traceback (most recent call last):             ValueError: cannot reshape
+///   File ".../vizflyt/_run.py", line 40, in run    first.py line 12, in on_image: x.reshape(7)
+///     answer = plugin.on_image(obs)          ->    in other people's code:
+///   File "/home/me/first/first.py", line 12, ...     vizflyt/_run.py line 40, in run: answer = ...
+///     x.reshape(7)
+/// ValueError: cannot reshape
+/// ```
+#[derive(Debug)]
+pub(super) struct Tracebacks {
+    own: Vec<PathBuf>,
+    held: Option<Vec<String>>,
+}
+
+/// The first line of a traceback.
+const FIRST: &str = "Traceback (most recent call last):";
+
+struct Call<'a> {
+    path: &'a str,
+    line: &'a str,
+    function: &'a str,
+    source: Option<&'a str>,
+}
+
+impl Tracebacks {
+    /// `own` are the folders of the student's code.
+    pub(super) fn new(own: Vec<PathBuf>) -> Self {
+        Self { own, held: None }
+    }
+
+    /// Takes a line of the error output.
+    pub(super) fn take(&mut self, line: String, tell: &mut impl FnMut(String)) {
+        let Some(held) = &mut self.held else {
+            if line == FIRST {
+                self.held = Some(vec![line]);
+            } else {
+                tell(line);
+            }
+            return;
+        };
+        let goes_on = line.starts_with("  ") && held.len() < TRACEBACK_LINES;
+        if goes_on {
+            held.push(line);
+            return;
+        }
+        let held = self.held.take().unwrap_or_default();
+        match calls(&held) {
+            // Words at the margin end it: `ValueError: ...`.
+            Some(calls) if !line.starts_with(' ') && !line.is_empty() => {
+                self.turn_round(&line, &calls, tell);
+            }
+            _ => held.into_iter().chain([line]).for_each(tell),
+        }
+    }
+
+    /// The output has ended: tells what was held back.
+    pub(super) fn end(self, tell: &mut impl FnMut(String)) {
+        self.held.into_iter().flatten().for_each(tell);
+    }
+
+    fn turn_round(&self, what: &str, calls: &[Call], tell: &mut impl FnMut(String)) {
+        tell(what.to_owned());
+        let (own, foreign): (Vec<&Call>, Vec<&Call>) =
+            calls.iter().rev().partition(|call| self.is_own(call.path));
+        for call in &own {
+            tell(format!("  {}", self.describe(call)));
+        }
+        if foreign.is_empty() {
+            return;
+        }
+        if !own.is_empty() {
+            tell("  in other people's code:".to_owned());
+        }
+        for call in foreign.iter().take(FOREIGN_CALLS) {
+            tell(format!("    {}", self.describe(call)));
+        }
+        if foreign.len() > FOREIGN_CALLS {
+            tell(format!("    and {} calls more", foreign.len() - FOREIGN_CALLS));
+        }
+    }
+
+    fn is_own(&self, path: &str) -> bool {
+        const FOREIGN: [&str; 3] = ["/site-packages/", "/dist-packages/", "/lib/python"];
+        if path.starts_with('<') || FOREIGN.iter().any(|mark| path.contains(mark)) {
+            return false;
+        }
+        let path = Path::new(path);
+        path.is_relative() || self.own.iter().any(|folder| path.starts_with(folder))
+    }
+
+    /// `first.py line 12, in on_image: x.reshape(7)`, paths as short as they are clear.
+    fn describe(&self, call: &Call) -> String {
+        let path = Path::new(call.path);
+        let short = self.own.iter().find_map(|folder| path.strip_prefix(folder).ok());
+        let library = |mark: &str| call.path.rsplit_once(mark).map(|(_, rest)| Path::new(rest));
+        let short = short
+            .filter(|_| self.is_own(call.path))
+            .or_else(|| library("-packages/"))
+            .unwrap_or(path);
+        let source = call.source.map(|source| format!(": {source}")).unwrap_or_default();
+        format!("{} line {}, in {}{source}", short.display(), call.line, call.function)
+    }
+}
+
+/// Reads the calls of a traceback (CPython's `traceback` module, `StackSummary.format`); `None` if
+/// it is none.
+fn calls(lines: &[String]) -> Option<Vec<Call<'_>>> {
+    let mut calls: Vec<Call<'_>> = Vec::new();
+    for line in &lines[1..] {
+        if let Some(place) = line.strip_prefix("  File \"") {
+            let (path, rest) = place.split_once("\", line ")?;
+            let (line, function) = rest.split_once(", in ").unwrap_or((rest, "the file"));
+            calls.push(Call { path, line, function, source: None });
+        } else if let Some(call) = calls.last_mut() {
+            // The source, then marks below it.
+            call.source = call.source.or(Some(line.trim()));
+        }
+    }
+    (!calls.is_empty()).then_some(calls)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn turned(text: &str) -> Vec<String> {
+        let mut seen = Vec::new();
+        let mut tracebacks = Tracebacks::new(vec!["/home/me/first".into()]);
+        for line in text.lines() {
+            tracebacks.take(line.to_owned(), &mut |line| seen.push(line));
+        }
+        tracebacks.end(&mut |line| seen.push(line));
+        seen
+    }
+
+    /// As Python 3.11 prints it.
+    const TRACEBACK: &str = r#"before
+Traceback (most recent call last):
+  File "/usr/lib/python3.11/runpy.py", line 196, in _run_module
+    return run()
+  File "/home/me/first/first.py", line 30, in on_image
+    steer(obs)
+    ~~~~~^^^^^
+  File "/home/me/first/steering/steer.py", line 12, in steer
+    return x.reshape(7)
+           ^^^^^^^^^^^^
+  File "/home/me/first/.venv/lib/python3.11/site-packages/numpy/core.py", line 5, in reshape
+    raise ValueError(text)
+ValueError: cannot reshape array
+after"#;
+
+    #[test]
+    fn the_students_own_lines_come_first() {
+        assert_eq!(
+            turned(TRACEBACK),
+            [
+                "before",
+                "ValueError: cannot reshape array",
+                "  steering/steer.py line 12, in steer: return x.reshape(7)",
+                "  first.py line 30, in on_image: steer(obs)",
+                "  in other people's code:",
+                "    numpy/core.py line 5, in reshape: raise ValueError(text)",
+                "    /usr/lib/python3.11/runpy.py line 196, in _run_module: return run()",
+                "after"
+            ]
+        );
+    }
+
+    #[test]
+    fn without_own_lines_or_whole_it_is_all_there() {
+        let syntax = "Traceback (most recent call last):\n  File \"<frozen x>\", line 1, in <module>\nImportError: no";
+        assert_eq!(turned(syntax), ["ImportError: no", "    <frozen x> line 1, in <module>"]);
+        let cut = "Traceback (most recent call last):\n  File \"a.py\", line 1, in f";
+        assert_eq!(turned(cut), cut.lines().collect::<Vec<_>>());
+        let odd = "Traceback (most recent call last):\nnothing";
+        assert_eq!(turned(odd), odd.lines().collect::<Vec<_>>());
+        // One that never ends is not held for ever.
+        let endless = format!("{FIRST}\n{}", "  x\n".repeat(500));
+        assert_eq!(turned(&endless).len(), 501);
+    }
+
+    #[test]
+    fn a_chain_of_two_is_turned_one_by_one() {
+        let one = "Traceback (most recent call last):\n  File \"a.py\", line 1, in f\nKeyError: 1";
+        let two = one.replace("KeyError: 1", "ValueError: 2");
+        let seen = turned(&format!("{one}\n\nDuring handling of it, another:\n\n{two}"));
+        let lines = ["  a.py line 1, in f", "", "During handling of it, another:", ""];
+        assert_eq!(seen[0], "KeyError: 1");
+        assert_eq!(seen[1..5], lines);
+        assert_eq!(seen[5], "ValueError: 2");
+    }
+
+    #[test]
+    fn a_flood_is_dropped_and_counted() {
+        let mut seen = Vec::new();
+        read_lines("x\n".repeat(100_000).as_bytes(), |line| seen.push(line));
+        // As long as the reading takes, a few seconds at most.
+        assert!(seen.len() < 20_000, "{}", seen.len());
+        assert!(seen.last().unwrap().contains("more lines in that second were dropped"));
+    }
+}

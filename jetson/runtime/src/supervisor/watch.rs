@@ -1,0 +1,101 @@
+//! Whether a plugin is beyond its limits: by its control group, else by counting its processes.
+
+use std::fs;
+
+use nix::unistd::Pid;
+
+use super::cgroup::Cgroup;
+use super::limits::PluginLimits;
+
+/// What the processes of a group hold together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Usage {
+    /// Memory of their own: shared pages count for whoever made them. [bytes]
+    pub memory: u64,
+    /// Processes and threads.
+    pub tasks: u64,
+}
+
+/// Returns why the plugin must end, in a sentence, if it must.
+pub(super) fn beyond_limits(
+    limits: &PluginLimits,
+    cgroup: &Cgroup,
+    counted: Option<Usage>,
+) -> Option<String> {
+    let usage = counted.unwrap_or_default();
+    if cgroup.ran_out_of_memory() || usage.memory > limits.memory_mb * 1_000_000 {
+        return Some(format!(
+            "the plugin used more than its {} MB of memory and was ended; look for what grows with \
+             each image, or raise memory_mb in [plugin]",
+            limits.memory_mb
+        ));
+    }
+    if cgroup.ran_out_of_processes() || usage.tasks > u64::from(limits.processes) {
+        return Some(format!(
+            "the plugin started more than its {} processes and threads and was ended; look for what \
+             starts them with each image, or raise processes in [plugin]",
+            limits.processes
+        ));
+    }
+    None
+}
+
+/// Counts the processes of a process group.
+pub(super) fn count(group: Pid) -> Usage {
+    let page = nix::unistd::sysconf(nix::unistd::SysconfVar::PAGE_SIZE).ok().flatten();
+    let page = page.map_or(4096, i64::unsigned_abs);
+    let mut usage = Usage::default();
+    for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
+        let folder = entry.path();
+        let stat = fs::read_to_string(folder.join("stat")).unwrap_or_default();
+        let Some((process_group, tasks)) = parse_stat(&stat) else { continue };
+        if process_group != group.as_raw() {
+            continue;
+        }
+        // Resident less shared (proc_pid_statm(5)): the images lie in the runtime's memory.
+        let statm = fs::read_to_string(folder.join("statm")).unwrap_or_default();
+        let mut pages = statm.split(' ').skip(1).map(|field| field.parse::<u64>().unwrap_or(0));
+        let (resident, shared) = (pages.next().unwrap_or(0), pages.next().unwrap_or(0));
+        usage.memory += resident.saturating_sub(shared) * page;
+        usage.tasks += tasks;
+    }
+    usage
+}
+
+/// Returns process group and number of threads from proc_pid_stat(5). The name in parentheses may
+/// hold anything.
+fn parse_stat(stat: &str) -> Option<(i32, u64)> {
+    let (_, fields) = stat.rsplit_once(") ")?;
+    let mut fields = fields.split(' ');
+    let group = fields.nth(2)?.parse().ok()?;
+    let threads = fields.nth(14)?.parse().ok()?;
+    Some((group, threads))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernels_line_is_read_whatever_the_name() {
+        let line = "12 (a) b (c) S 1 77 77 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 9 0 123 456 789";
+        assert_eq!(parse_stat(line), Some((77, 9)));
+        assert_eq!(parse_stat("nonsense"), None);
+        let own = fs::read_to_string("/proc/self/stat").unwrap();
+        let group = nix::unistd::getpgrp();
+        assert_eq!(parse_stat(&own).unwrap().0, group.as_raw());
+        let usage = count(group);
+        assert!(usage.tasks >= 1 && usage.memory > 100_000, "{usage:?}");
+    }
+
+    #[test]
+    fn each_limit_has_its_sentence() {
+        let limits = PluginLimits { memory_mb: 100, processes: 9, ..PluginLimits::default() };
+        let verdict = |memory, tasks| {
+            beyond_limits(&limits, &Cgroup::default(), Some(Usage { memory, tasks }))
+        };
+        assert_eq!(verdict(99_000_000, 9), None);
+        assert!(verdict(101_000_000, 1).unwrap().contains("its 100 MB of memory"));
+        assert!(verdict(0, 10).unwrap().contains("its 9 processes"));
+    }
+}
