@@ -5,6 +5,7 @@ mod bench;
 mod demo;
 mod pair;
 mod plugins;
+mod replay;
 mod scene;
 mod stats;
 
@@ -47,6 +48,8 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Where images get their age, stage by stage, and why images were skipped.
     Stats(stats::StatsArgs),
+    /// Feeds a flight's recorded images to a plugin and says where its answers differ.
+    Replay(replay::ReplayArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
@@ -57,7 +60,7 @@ fn main() -> ExitCode {
     let cli = Cli::parse();
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
         // The demo tells its own story; its children's logs would drown it.
-        Command::Demo(_) => "warn".to_owned(),
+        Command::Demo(_) | Command::Replay(_) => "warn".to_owned(),
         // What they print is the result; a load of seconds still shows its progress.
         Command::Bench(_) => "warn,vizflyt_server::scene=info".to_owned(),
         _ => "info,quinn=warn".to_owned(),
@@ -85,6 +88,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),
+        Command::Replay(args) => replay::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
     }
 }

@@ -34,17 +34,25 @@ pub(crate) fn run(args: &PluginArgs) -> ExitCode {
 
 /// Runs `vizflyt fly`; success only if the flight finished or landed as asked.
 pub(crate) fn fly(args: &FlyArgs) -> Result<ExitCode> {
-    let command = command(args)?;
+    let command = command(&args.plugin, args.plugin_command())?;
     let outcome = vizflyt_runtime::fly_command(args, command)?;
     Ok(if outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Returns the command that starts the plugin: a file, or else a built-in's name.
-fn command(args: &FlyArgs) -> Result<Vec<OsString>> {
-    let mut command = args.plugin_command();
-    let name = args.plugin.to_string_lossy().into_owned();
+/// Whether a plugin of this name is linked into this program.
+pub(crate) fn is_built_in(name: &str) -> bool {
+    !name.contains('/') && BuiltIn::from_str(name, true).is_ok()
+}
+
+/// Returns the command that starts the plugin, a file, or else a built-in's name; `command` is the
+/// plugin as typed, then its arguments.
+pub(crate) fn command(
+    plugin: &std::ffi::OsStr,
+    mut command: Vec<OsString>,
+) -> Result<Vec<OsString>> {
+    let name = plugin.to_string_lossy().into_owned();
     let is_bare_name = !name.contains('/');
-    if is_bare_name && BuiltIn::from_str(&name, true).is_ok() {
+    if is_built_in(&name) {
         let program = std::env::current_exe().context("cannot find this program's own path")?;
         command.splice(0..1, [program.into(), "plugin".into(), name.into()]);
     } else if !is_bare_name && !std::path::Path::new(&name).exists() {

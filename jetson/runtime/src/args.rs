@@ -41,6 +41,11 @@ pub struct FlyArgs {
     /// Folder for flight logs (MCAP)
     #[arg(long, value_name = "DIR", default_value = "flights")]
     pub log: PathBuf,
+    /// Shows the log's channels live to Foxglove, on this computer's port 8765 or at ADDR:PORT;
+    /// whoever reaches it sees the flight
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, require_equals = true,
+          default_missing_value = "127.0.0.1:8765")]
+    pub foxglove: Option<SocketAddr>,
     /// Writes the report (JSON) there
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,

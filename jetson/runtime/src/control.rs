@@ -376,18 +376,7 @@ impl Loop {
             };
             self.senses.lock().unwrap_or_else(PoisonError::into_inner).vehicle = Some(vehicle);
         }
-        self.control.log.write(
-            Channel::Pose,
-            stamp,
-            &json!({
-                "stamp_ns": stamp.as_ns(),
-                "p_world_m": sample.world_from_body.translation_m.to_array(),
-                "q_world_from_body_xyzw": sample.world_from_body.rotation.to_array(),
-                "v_world_mps": sample.twist.linear_mps.to_array(),
-                "omega_body_radps": sample.twist.angular_radps.to_array(),
-                "age_ms": now.seconds_since(stamp) * 1e3
-            }),
-        );
+        self.control.log.pose(now, stamp, sample);
     }
 
     /// Whether the course lets the plugin know where the vehicle is. Before it is known, nothing is
@@ -424,6 +413,7 @@ impl Loop {
     }
 
     fn take_plugin(&mut self, now: HostTime, message: FromPlugin) {
+        self.control.log.from_plugin(now, &message);
         // What a process said that is gone or going counts no more.
         let counts =
             self.plugin.as_ref().is_some_and(|side| side.started && side.leaving.is_none());
@@ -482,7 +472,7 @@ impl Loop {
         };
         let (tick, image_seq) = (self.image_tick, self.image_seq);
         let record = json!({"stream": stream, "line": line, "image_seq": image_seq, "tick": tick});
-        self.control.log.write(Channel::PluginOutput, now, &record);
+        self.control.log.line(now, stream, line, tick);
         if self.control.json {
             print_line(&json!({"plugin": record}).to_string());
         } else {
@@ -619,8 +609,9 @@ impl Loop {
         anew: &Arc<AtomicBool>,
     ) -> Vec<JoinHandle<()>> {
         let cameras = arena.cameras.to_vec();
-        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses));
         let mailbox = Arc::clone(&self.control.shared.mailbox);
+        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
+            .with_log(self.control.log.images(&mailbox));
         let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
         let images = spawn("images", move || {
             publisher.run(
@@ -651,7 +642,9 @@ impl Loop {
         }
         if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
             side.started = true;
-            if let Err(error) = side.ipc.send(&ToPlugin::Start((*side.arena).clone())) {
+            let start = ToPlugin::Start((*side.arena).clone());
+            self.control.log.to_plugin(host_now(), &start);
+            if let Err(error) = side.ipc.send(&start) {
                 tracing::warn!("plugin: {error}");
             }
             // One that comes later learns where the flight is.
@@ -659,7 +652,9 @@ impl Loop {
                 let stamp = self.control.shared.clock.to_server(host_now());
                 let kind = EventKind::Phase(self.flight.phase());
                 let text = bounded("the plugin was started again");
-                let _ = side.ipc.send(&ToPlugin::Event(Event { stamp, kind, text }));
+                let message = ToPlugin::Event(Event { stamp, kind, text });
+                self.control.log.to_plugin(host_now(), &message);
+                let _ = side.ipc.send(&message);
             }
         } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
             side.ipc.heartbeat();
@@ -681,7 +676,7 @@ impl Loop {
 
     /// Log, plugin and standard output hear of every event but the plugin's own lines.
     fn publish_event(&mut self, now: HostTime, event: &Event) {
-        self.control.log.write(Channel::Event, now, event);
+        self.control.log.event(now, event);
         if self.control.json {
             print_line(&json!({"event": event}).to_string());
         } else {
@@ -690,9 +685,12 @@ impl Loop {
         if let Some(side) = &self.plugin
             && side.started
             && side.ipc.plugin_attached()
-            && let Err(error) = side.ipc.send(&ToPlugin::Event(for_plugin(event, &side.arena)))
         {
-            tracing::debug!("plugin: {error}");
+            let message = ToPlugin::Event(for_plugin(event, &side.arena));
+            self.control.log.to_plugin(host_now(), &message);
+            if let Err(error) = side.ipc.send(&message) {
+                tracing::debug!("plugin: {error}");
+            }
         }
     }
 
@@ -711,6 +709,13 @@ impl Loop {
     }
 
     fn report_timing(&mut self, now: HostTime) {
+        if let Some(trouble) = self.control.log.poll_trouble() {
+            let text = bounded(&format!("flight log: {trouble}"));
+            let stamp = self.control.shared.clock.to_server(now);
+            let event = Event { stamp, kind: EventKind::Note, text };
+            self.publish_event(now, &event);
+            self.control.to_server.tell(event);
+        }
         let clock = self.control.shared.clock.state(now);
         let timing = self.times.timing(now, clock, &self.arrived());
         self.control.log.write(Channel::Timing, now, &timing);

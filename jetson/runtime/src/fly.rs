@@ -21,7 +21,7 @@ use crate::config::JetsonConfig;
 use crate::control::{Control, Happening, QUEUE, print_line};
 use crate::flight::{FlightSettings, Outcome};
 use crate::link::udp::{Partner, UdpPort};
-use crate::log::FlightLog;
+use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
 use crate::stream::{self, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
 
@@ -50,6 +50,7 @@ pub fn fly_command(
     args: &FlyArgs,
     plugin_command: Vec<std::ffi::OsString>,
 ) -> anyhow::Result<Outcome> {
+    keep_going_when_files_are_full();
     let config = args.config.as_deref().map(JetsonConfig::read).transpose()?;
     let plugin_limits = config.unwrap_or_default().plugin.limits();
     let (fingerprint, identity) = args.server.known()?;
@@ -57,7 +58,10 @@ pub fn fly_command(
         UdpPort::open(args.mavlink)
             .with_context(|| format!("{}: cannot open the socket", args.mavlink))?,
     );
-    let log = FlightLog::open(&args.log);
+    let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
+    let log = FlightLog::open(&args.log, live);
+    log.flight(&args.plugin, &args.plugin_arguments);
     let (sender, happenings) = sync_channel(QUEUE);
     let stop = Arc::new(AtomicBool::new(false));
     receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
@@ -65,7 +69,6 @@ pub fn fly_command(
         watch_stdin(sender.clone())?;
     }
 
-    let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let shared = Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
     let to_server = Arc::new(Outbox::default());
     watch_signals(&tokio, sender.clone())?;
@@ -114,6 +117,15 @@ pub fn fly_command(
             .with_context(|| format!("report {} cannot be written", file.display()))?;
     }
     Ok(flown.outcome)
+}
+
+/// Shows the log's channels to viewers.
+fn listen(tokio: &Runtime, address: SocketAddr) -> anyhow::Result<Live> {
+    let live = tokio.block_on(Live::start(address)).with_context(|| {
+        format!("--foxglove={address}: cannot listen there; give another address or port")
+    })?;
+    tracing::info!("foxglove: open a connection to ws://{}", live.address());
+    Ok(live)
 }
 
 fn receive_mavlink(

@@ -2,8 +2,9 @@
 //! shared memory.
 //!
 //! Budget at 640x480: 1.5 MB written once (JPEG and depth about 1.8 ms in four slices, of which the
-//! first three overlap with receiving), no copy afterwards, no allocation of ours. One thread of
-//! its own: a slow decode holds up neither poses nor events. Several cameras of one tick share one
+//! first three overlap with receiving), no copy afterwards, no allocation of ours but for the log's
+//! record: the pieces of an image go there when it is published, and their memory comes back. One
+//! thread of its own: a slow decode holds up neither poses nor events. Several cameras of one tick share one
 //! observation; it is published when all that were sent together have come, or when a later tick's
 //! image has come whole.
 //!
@@ -28,6 +29,7 @@ use vizflyt_sdk::{
     host_now,
 };
 
+use crate::log::{ImageLog, LoggedImage, observation_head};
 use crate::stream::{Arrival, Mailbox, Step, Whole};
 use crate::waterfall::Stamps;
 
@@ -73,6 +75,7 @@ pub struct ImagePublisher {
     homes: u64,
     under_way: Option<UnderWay>,
     rejected: u64,
+    log: Option<ImageLog>,
 }
 
 /// One camera's decoder and the image it is at.
@@ -101,6 +104,8 @@ struct UnderWay {
     /// Bit per camera that the server sends together with the first one.
     expected: u8,
     published: Published,
+    /// For the log; empty without one.
+    logged: Vec<LoggedImage>,
 }
 
 impl UnderWay {
@@ -123,7 +128,13 @@ impl ImagePublisher {
             homes: 0,
             under_way: None,
             rejected: 0,
+            log: None,
         }
+    }
+
+    /// Logs what it publishes.
+    pub fn with_log(self, log: Option<ImageLog>) -> Self {
+        Self { log, ..self }
     }
 
     /// Runs until `stop` says so; `tell` is called before each observation is published.
@@ -242,6 +253,16 @@ impl ImagePublisher {
         let stamps = Stamps::of(&arrival.header, &whole.trailer, arrival.pose, own);
         // One image of each camera at most, so there is room.
         let _ = published.images.push(stamps);
+        if self.log.is_some() {
+            under_way.logged.push(LoggedImage {
+                camera,
+                name: self.cameras[camera].name.as_str().to_owned(),
+                header: arrival.header,
+                pose: arrival.pose,
+                received: whole.received,
+                pieces: std::mem::take(&mut lane.pieces),
+            });
+        }
         if under_way.there & under_way.expected == under_way.expected {
             self.publish(tell)?;
         }
@@ -312,9 +333,16 @@ impl ImagePublisher {
             writer.battery(&senses.battery);
             writer.imu(&senses.imu);
         }
+        let logged =
+            self.log.as_ref().map(|log| (log, observation_head(done.memory.bytes()).to_vec()));
         // Told first: the answer must not overtake it.
         tell(done.published.clone());
-        self.ipc.publish(done.memory)
+        let published_at = host_now();
+        self.ipc.publish(done.memory)?;
+        if let Some((log, head)) = logged {
+            log.observation(published_at, done.published.seq, head, done.logged);
+        }
+        Ok(())
     }
 
     /// Gives up a camera's image, and the observation if nothing else is or will be in it.
@@ -359,7 +387,7 @@ impl UnderWay {
             ready: HostTime::ZERO,
             images: heapless::Vec::new(),
         };
-        Ok(Self { tick, home, memory, there: 0, expected, published })
+        Ok(Self { tick, home, memory, there: 0, expected, published, logged: Vec::new() })
     }
 }
 

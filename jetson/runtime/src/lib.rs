@@ -13,7 +13,7 @@
 //! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
 //! pure), [`link`] (MAVLink, sans-IO),
 //! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
-//! [`report`]. [`fly()`] starts it all.
+//! [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it all.
 
 mod answers;
 pub mod args;
@@ -26,6 +26,7 @@ pub mod guard;
 pub mod images;
 pub mod link;
 pub mod log;
+pub mod replay;
 pub mod report;
 pub mod stats;
 pub mod steering;

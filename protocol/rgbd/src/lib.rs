@@ -40,7 +40,7 @@ mod ids;
 mod image;
 mod plane;
 
-pub use color::encode_jpeg;
+pub use color::{encode_jpeg, join_jpeg, split_jpeg};
 pub use decode::{Decoder, Progress};
 pub use depth::bound::DepthBound;
 pub use encode::{EncodeOptions, Encoder};

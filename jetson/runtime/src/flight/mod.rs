@@ -14,7 +14,7 @@
 
 mod outcome;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::collections::VecDeque;
 

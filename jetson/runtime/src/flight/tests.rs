@@ -37,7 +37,7 @@ struct Script {
     notices: Vec<Notice>,
 }
 
-fn arena() -> ArenaInfo {
+pub(crate) fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0)),

@@ -226,6 +226,12 @@ impl Mailbox {
         }
     }
 
+    /// Takes a piece of memory that waits to be used again.
+    #[cfg(test)]
+    pub(crate) fn spare(&self) -> Option<Vec<u8>> {
+        self.lock().spare_pieces.pop()
+    }
+
     /// Counts what became of an image of a camera that came whole.
     pub fn note(&self, camera: usize, count: impl FnOnce(&mut Arrivals)) {
         if let Some(lane) = self.lock().lanes.get_mut(camera) {

@@ -164,18 +164,22 @@ impl JpegSliceDecoder {
 
 /// Where things are in a baseline JPEG of three components.
 #[derive(Clone, Copy, Debug)]
-struct Layout {
+pub(super) struct Layout {
     width: u16,
     /// Offset of the number of rows.
-    rows: usize,
+    pub(super) rows: usize,
+    /// Offset of the scan's header.
+    pub(super) scan_header: usize,
     /// Offset of the first byte of the scan.
-    scan: usize,
+    pub(super) scan: usize,
+    /// Width and height of what is coded together. [px]
+    pub(super) block: (u32, u32),
 }
 
 impl Layout {
     /// Reads the segments (ITU-T T.81, annex B) up to the first scan. `None` for anything that our
     /// encoders do not write.
-    fn of(jpeg: &[u8]) -> Option<Self> {
+    pub(super) fn of(jpeg: &[u8]) -> Option<Self> {
         let mut at = START_OF_IMAGE.len();
         if !jpeg.starts_with(&START_OF_IMAGE) {
             return None;
@@ -191,13 +195,20 @@ impl Layout {
                 0xe0..=0xef | 0xdb | 0xc4 | 0xfe => {}
                 // SOF0: precision, rows, columns, components.
                 0xc0 if frame.is_none() => {
-                    let &[8, _, _, high, low, 3, ..] = body else { return None };
-                    frame = Some((u16::from_be_bytes([high, low]), at + 5));
+                    let &[8, _, _, high, low, 3, ref parts @ ..] = body else { return None };
+                    let factors = || parts.chunks(3).filter_map(|part| part.get(1));
+                    let across = factors().map(|factor| u32::from(factor >> 4)).max()?;
+                    let down = factors().map(|factor| u32::from(factor & 15)).max()?;
+                    if !((1..=4).contains(&across) && (1..=4).contains(&down)) {
+                        return None;
+                    }
+                    let block = (8 * across, 8 * down);
+                    frame = Some((u16::from_be_bytes([high, low]), at + 5, block));
                 }
                 // SOS, of all components.
                 0xda => {
-                    let ((width, rows), &[3, ..]) = (frame?, body) else { return None };
-                    return Some(Self { width, rows, scan: at + 2 + len });
+                    let ((width, rows, block), &[3, ..]) = (frame?, body) else { return None };
+                    return Some(Self { width, rows, scan_header: at, scan: at + 2 + len, block });
                 }
                 _ => return None,
             }
@@ -213,4 +224,4 @@ pub(super) fn damaged(why: &str) -> DecodeError {
 /// ITU-T T.81, table B.1: SOI.
 const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
 /// ITU-T T.81, table B.1: EOI.
-const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
+pub(super) const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];

@@ -5,6 +5,7 @@
 //! slices but for the number of rows, and goes into the image's header once; the scan goes into
 //! the slice. A decoder puts them together again, so any JPEG library serves at either end.
 
+mod file;
 mod jpeg;
 mod lossless;
 #[cfg(not(feature = "turbo"))]
@@ -12,6 +13,7 @@ mod pure;
 #[cfg(feature = "turbo")]
 mod turbo;
 
+pub use file::{join_jpeg, split_jpeg};
 pub use jpeg::encode_jpeg;
 pub(crate) use jpeg::{JpegSliceDecoder, JpegSliceEncoder};
 pub(crate) use lossless::{LosslessDecoder, LosslessEncoder};

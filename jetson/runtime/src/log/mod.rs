@@ -1,0 +1,265 @@
+//! The flight log: one MCAP file with Foxglove's schemas, and the same channels live over
+//! WebSocket (`--foxglove`). `docs/guides/logs.md` is the guide.
+//!
+//! ```text
+//! control loop ── poses, setpoints, events, messages ─┐          ┌─▶ SafeFile ─▶ flights/*.mcap
+//! image thread ── pieces of each image, as received ──┴─▶ Queue ─┤     (chunk a second)
+//!                  (their memory goes back afterwards)   bounded └─▶ Live ─▶ viewers
+//! ```
+//! Nobody who flies waits for it: what finds no room is dropped, counted and said. The file is a
+//! whole one whenever the process is killed ([`file`]). Images are written as they came: the log
+//! neither decodes nor encodes them. [`read`] is the way back, and [`crate::replay`] flies it.
+
+mod channels;
+mod file;
+mod live;
+mod messages;
+mod queue;
+pub mod read;
+#[cfg(test)]
+mod tests;
+mod writer;
+
+use std::ffi::OsString;
+use std::fs::{File, create_dir_all};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde::Serialize;
+use serde_json::json;
+use vizflyt_protocol::PROTOCOL_VERSION;
+use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin};
+use vizflyt_protocol::packet::ObservationHeader;
+use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
+use vizflyt_protocol::time::HostTime;
+
+pub use self::channels::Channel;
+use self::file::RealFile;
+pub use self::file::keep_going_when_files_are_full;
+pub use self::live::Live;
+pub use self::messages::{Observation, ObservedImage, PluginMessage};
+pub use self::queue::{Dropped, LoggedImage};
+use self::queue::{ObservationRecord, Queue, Record};
+pub use self::read::read_timing;
+use self::writer::{LogWriter, Outlet};
+use crate::stream::Mailbox;
+
+/// How much a line matters, as foxglove.Log has it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Level {
+    /// What went as it should.
+    Info = 2,
+    /// Worth a look.
+    Warning = 3,
+    /// It ended the flight, or should have.
+    Error = 4,
+}
+
+/// The log of one flight. Cheap to call from the control loop; dropping it closes the file.
+#[derive(Debug)]
+pub struct FlightLog {
+    queue: Option<Arc<Queue>>,
+    writer: Option<JoinHandle<()>>,
+    path: Option<PathBuf>,
+}
+
+impl FlightLog {
+    /// Opens a log in `folder`, named by the time of day (UTC), and shows it to `live`'s viewers.
+    /// If it cannot be written, says so in a warning and writes nothing.
+    pub fn open(folder: &Path, live: Option<Live>) -> Self {
+        let path = folder.join(format!("{}.mcap", utc_name(SystemTime::now())));
+        let file = create_dir_all(folder).and_then(|()| File::create(&path));
+        let file = file.and_then(|file| Ok((file.try_clone()?, RealFile::new(file)?)));
+        let disk = file.inspect_err(|error| {
+            tracing::warn!("no flight log: {}: {error}", path.display());
+        });
+        if disk.is_err() && live.is_none() {
+            return Self { queue: None, writer: None, path: None };
+        }
+        let path = disk.is_ok().then(|| path.clone());
+        let (probe, disk) = disk.ok().unzip();
+        match Self::start(disk, probe, live) {
+            Ok((queue, writer)) => Self { queue: Some(queue), writer: Some(writer), path },
+            Err(error) => {
+                tracing::warn!("no flight log: {}: {error}", folder.display());
+                Self { queue: None, writer: None, path: None }
+            }
+        }
+    }
+
+    fn start(
+        disk: Option<RealFile>,
+        probe: Option<File>,
+        live: Option<Live>,
+    ) -> mcap::McapResult<(Arc<Queue>, JoinHandle<()>)> {
+        let outlet = Outlet::new(disk, live)?;
+        let (queue, records) = Queue::new();
+        let free_bytes = move || probe.as_ref().and_then(file::free_bytes);
+        let writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(free_bytes));
+        let handle = thread::Builder::new()
+            .name("flight-log".into())
+            .spawn(move || writer.run(&records))
+            .map_err(io::Error::from)?;
+        Ok((queue, handle))
+    }
+
+    /// Returns the file, if one is written.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// Returns what was dropped so far because the disk was too slow.
+    pub fn dropped(&self) -> Dropped {
+        self.queue.as_ref().map_or_else(Dropped::default, |queue| queue.dropped())
+    }
+
+    /// Returns a sentence about what is wrong with the log, once.
+    pub fn poll_trouble(&self) -> Option<String> {
+        self.queue.as_ref()?.poll_trouble()
+    }
+
+    /// Logs `message`, on a channel of ours, as of `at`.
+    pub fn write(&self, channel: Channel, at: HostTime, message: &impl Serialize) {
+        let Some(queue) = &self.queue else { return };
+        let Ok(json) = serde_json::to_vec(message) else { return };
+        queue.push(Record::Json { channel, at, json });
+    }
+
+    /// Logs which flight this is.
+    pub fn flight(&self, plugin: &OsString, arguments: &[OsString]) {
+        let Some(queue) = &self.queue else { return };
+        let arguments: Vec<_> = arguments.iter().map(|text| text.to_string_lossy()).collect();
+        queue.push(Record::Flight(vec![
+            ("program", concat!("vizflyt ", env!("CARGO_PKG_VERSION")).to_owned()),
+            ("protocol", PROTOCOL_VERSION.to_string()),
+            ("plugin", plugin.to_string_lossy().into_owned()),
+            ("arguments", json!(arguments).to_string()),
+        ]));
+    }
+
+    /// Logs a pose that came at `at` and was true at `stamp`.
+    pub fn pose(&self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
+        let Some(queue) = &self.queue else { return };
+        queue.push(Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs an event.
+    pub fn event(&self, at: HostTime, event: &Event) {
+        let (name, level) = match event.kind {
+            EventKind::Collision { .. } => ("collision", Level::Error),
+            EventKind::Geofence { .. } => ("geofence", Level::Error),
+            EventKind::EmergencyStop => ("stop button", Level::Error),
+            EventKind::PluginFailed => ("plugin", Level::Error),
+            EventKind::PoseLost { .. } => ("pose", Level::Warning),
+            EventKind::PoseRegained => ("pose", Level::Info),
+            EventKind::Stage { .. } | EventKind::Finished { .. } => ("course", Level::Info),
+            EventKind::TimeLimit => ("course", Level::Warning),
+            EventKind::Phase(_) => ("phase", Level::Info),
+            EventKind::PluginOutput => ("plugin", Level::Info),
+            EventKind::Note => ("note", Level::Warning),
+        };
+        self.text(Channel::Event, at, level, name, event.text.as_str());
+    }
+
+    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it had the
+    /// image of the server's `tick`.
+    pub fn line(&self, at: HostTime, stream: &str, line: &str, tick: u64) {
+        let level = if stream == "stderr" { Level::Warning } else { Level::Info };
+        self.text(Channel::PluginOutput, at, level, &format!("{stream} at tick {tick}"), line);
+    }
+
+    fn text(&self, channel: Channel, at: HostTime, level: Level, name: &str, text: &str) {
+        let Some(queue) = &self.queue else { return };
+        let (name, text) = (name.to_owned(), text.to_owned());
+        queue.push(Record::Text { channel, at, level, name, text });
+    }
+
+    /// Logs a message that was sent to the plugin at `at`; replay sends it again.
+    pub fn to_plugin(&self, at: HostTime, message: &ToPlugin) {
+        self.message(at, true, message);
+    }
+
+    /// Logs a message of the plugin; replay compares with it.
+    pub fn from_plugin(&self, at: HostTime, message: &FromPlugin) {
+        self.message(at, false, message);
+    }
+
+    fn message(&self, at: HostTime, is_to_plugin: bool, message: &impl Serialize) {
+        let Some(queue) = &self.queue else { return };
+        let mut buffer = [0; MAX_FRAMED];
+        let body = encode_body(message, &mut buffer).to_vec();
+        queue.push(Record::Plugin { at, is_to_plugin, body });
+    }
+
+    /// Returns the image thread's end of the log; the memory of images goes back to `home`.
+    pub fn images(&self, home: &Arc<Mailbox>) -> Option<ImageLog> {
+        let queue = Arc::clone(self.queue.as_ref()?);
+        Some(ImageLog { queue, home: Arc::clone(home) })
+    }
+}
+
+impl Drop for FlightLog {
+    fn drop(&mut self) {
+        let Some(queue) = self.queue.take() else { return };
+        queue.end();
+        if let Some(writer) = self.writer.take() {
+            let _ = writer.join();
+        }
+        let Dropped { images, records } = queue.dropped();
+        if images + records > 0 {
+            tracing::warn!(
+                "flight log: {images} images and {records} records are not in it; the disk is too \
+                 slow"
+            );
+        }
+    }
+}
+
+/// The image thread's end of the log: what is logged costs it a copy of the observation's head,
+/// and no wait.
+#[derive(Clone, Debug)]
+pub struct ImageLog {
+    queue: Arc<Queue>,
+    home: Arc<Mailbox>,
+}
+
+impl ImageLog {
+    /// Logs an observation: shared memory up to its first plane, and its images as received.
+    pub fn observation(&self, at: HostTime, seq: u64, head: Vec<u8>, images: Vec<LoggedImage>) {
+        let home = Arc::clone(&self.home);
+        let record = ObservationRecord { at, seq, head, images, home };
+        self.queue.push(Record::Observation(Box::new(record)));
+    }
+}
+
+/// Returns the bytes of an observation before its first plane: header and what belongs to it.
+pub fn observation_head(bytes: &[u8]) -> &[u8] {
+    let Ok(header) = ObservationHeader::parse(bytes) else { return &[] };
+    let cameras = &header.cameras[..header.camera_count.into()];
+    let first = cameras.iter().map(|camera| camera.rgb_offset as usize).min();
+    let len = first.unwrap_or(bytes.len()).max(size_of::<ObservationHeader>());
+    &bytes[..len.min(bytes.len())]
+}
+
+/// Returns `2026-11-21T04-09-21.123Z`: sorts by time, and is a file name everywhere.
+fn utc_name(time: SystemTime) -> String {
+    let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
+    let (days, second) = (since.as_secs() / 86_400, since.as_secs() % 86_400);
+    // Civil date from days since 1970, after H. Hinnant, "chrono-compatible low-level date
+    // algorithms", civil_from_days, for dates after 1970.
+    let z = days + 719_468;
+    let (era, day_of_era) = (z / 146_097, z % 146_097);
+    let year_of_era =
+        (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * shifted + 2) / 5 + 1;
+    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
+    let year = year_of_era + era * 400 + u64::from(month <= 2);
+    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    let ms = since.subsec_millis();
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}.{ms:03}Z")
+}

@@ -1,0 +1,293 @@
+//! Reads flight logs: record by record, in bounded memory, whatever the file holds.
+//!
+//! A log of a killed runtime ends early; one that is damaged is read up to there. Both are said by
+//! [`LogReader::is_cut`], not as errors.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+use std::sync::Arc;
+
+use foxglove::messages::CompressedImage;
+use mcap::records::Record;
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use prost::Message as _;
+use vizflyt_protocol::messages::Timing;
+use vizflyt_rgbd::{DecodeError, join_jpeg};
+
+use super::channels::Channel;
+use super::messages::{Observation, ObservedImage, PluginMessage};
+use super::writer::FLIGHT;
+
+/// Longest record that is read: more than an image of the largest size needs. [bytes]
+const LONGEST_RECORD: usize = 256 << 20;
+/// So much is read at once at most, whatever length a record announces. [bytes]
+const READ_AT_ONCE: usize = 1 << 20;
+
+/// Why a file is no log.
+#[derive(Debug, thiserror::Error)]
+pub enum LogError {
+    /// It cannot be opened or read.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// It does not begin as an MCAP file.
+    #[error("this is no MCAP file: {0}")]
+    Foreign(mcap::McapError),
+}
+
+/// One message of a log.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LogMessage {
+    /// Its channel's topic: `/pose`.
+    pub topic: Arc<str>,
+    /// Since 1970. [ns]
+    pub log_time_ns: u64,
+    /// As the channel's encoding has it.
+    pub data: Vec<u8>,
+}
+
+/// What a log holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Entry {
+    /// A message.
+    Message(LogMessage),
+    /// Names and values of which flight this is.
+    Flight(std::collections::BTreeMap<String, String>),
+}
+
+/// Reads a log from its start to its end.
+pub struct LogReader<R> {
+    source: R,
+    reader: LinearReader,
+    topics: HashMap<u16, Arc<str>>,
+    is_cut: bool,
+    is_over: bool,
+}
+
+impl LogReader<BufReader<File>> {
+    /// Opens a log.
+    ///
+    /// # Errors
+    /// If it cannot be opened, or is no MCAP file.
+    pub fn open(path: &Path) -> Result<Self, LogError> {
+        Self::new(BufReader::new(File::open(path)?))
+    }
+}
+
+impl<R: Read> LogReader<R> {
+    /// Reads a log from `source`.
+    ///
+    /// # Errors
+    /// If it cannot be read, or is no MCAP file.
+    pub fn new(source: R) -> Result<Self, LogError> {
+        // A killed runtime may leave a file without an end.
+        let options = LinearReaderOptions::default()
+            .with_skip_end_magic(true)
+            .with_record_length_limit(LONGEST_RECORD);
+        let reader = LinearReader::new_with_options(options);
+        let mut log =
+            Self { source, reader, topics: HashMap::new(), is_cut: false, is_over: false };
+        // The header comes first, and nothing but an MCAP file has one.
+        match log.step() {
+            Ok(_) => Ok(log),
+            Err(Stop::Io(error)) => Err(LogError::Io(error)),
+            Err(Stop::End) => Err(LogError::Foreign(mcap::McapError::UnexpectedEof)),
+            Err(Stop::Damaged(error)) => Err(LogError::Foreign(error)),
+        }
+    }
+
+    /// Whether the log ended before its end; known when [`Self::next`] has returned `None`.
+    pub fn is_cut(&self) -> bool {
+        self.is_cut
+    }
+
+    /// Returns the next message or metadata; `None` at the end, and where the log is damaged.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    #[allow(clippy::should_implement_trait)] // Why: an error ends it.
+    pub fn next(&mut self) -> Result<Option<Entry>, LogError> {
+        while !self.is_over {
+            match self.step() {
+                Ok(Some(entry)) => return Ok(Some(entry)),
+                Ok(None) => {}
+                Err(Stop::End) => self.is_over = true,
+                Err(Stop::Damaged(error)) => {
+                    tracing::debug!("log: {error}");
+                    (self.is_over, self.is_cut) = (true, true);
+                }
+                Err(Stop::Io(error)) => {
+                    self.is_over = true;
+                    return Err(error.into());
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Reads one record; `None` if it is of no interest.
+    fn step(&mut self) -> Result<Option<Entry>, Stop> {
+        loop {
+            match self.reader.next_event() {
+                None => return Err(Stop::End),
+                Some(Err(error)) => return Err(Stop::Damaged(error)),
+                Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
+                    let room = self.reader.insert(wanted.clamp(1, READ_AT_ONCE));
+                    let read = loop {
+                        match self.source.read(room) {
+                            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
+                            result => break result.map_err(Stop::Io)?,
+                        }
+                    };
+                    self.reader.notify_read(read);
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => {
+                    let record = mcap::parse_record(opcode, data).map_err(Stop::Damaged)?;
+                    return Ok(take(&mut self.topics, record));
+                }
+            }
+        }
+    }
+}
+
+/// Why there is no next record.
+enum Stop {
+    End,
+    Damaged(mcap::McapError),
+    Io(std::io::Error),
+}
+
+fn take(topics: &mut HashMap<u16, Arc<str>>, record: Record<'_>) -> Option<Entry> {
+    match record {
+        Record::Channel(channel) => {
+            topics.insert(channel.id, channel.topic.into());
+            None
+        }
+        Record::Message { header, data } => {
+            let topic = Arc::clone(topics.get(&header.channel_id)?);
+            let data = data.into_owned();
+            Some(Entry::Message(LogMessage { topic, log_time_ns: header.log_time, data }))
+        }
+        Record::Metadata(metadata) if metadata.name == FLIGHT => {
+            Some(Entry::Flight(metadata.metadata))
+        }
+        _ => None,
+    }
+}
+
+/// Reads the times of a flight from its log: of the whole flight, or, where the runtime was killed
+/// in it, of its last seconds. `None` if the log has none.
+///
+/// # Errors
+/// If the file cannot be read or is no MCAP file.
+pub fn read_timing(path: &Path) -> Result<Option<Timing>, LogError> {
+    let mut reader = LogReader::open(path)?;
+    let topic = Channel::Timing.topic("");
+    let mut found: Option<Timing> = None;
+    while let Some(entry) = reader.next()? {
+        if let Entry::Message(message) = entry
+            && *message.topic == *topic
+            && let Ok(timing) = serde_json::from_slice::<Timing>(&message.data)
+            && found.as_ref().is_none_or(|best| timing.seconds >= best.seconds)
+        {
+            found = Some(timing);
+        }
+    }
+    Ok(found)
+}
+
+/// What replay needs of a log.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Recorded {
+    /// Which flight it was.
+    Flight(std::collections::BTreeMap<String, String>),
+    /// A message to or from the plugin.
+    Plugin(PluginMessage),
+    /// What the plugin got to see, each image's bitstream whole.
+    Observation(Observation),
+    /// An observation that the log has only in part; its number.
+    Broken(u64),
+}
+
+/// Reads from a log what replay needs.
+pub struct RecordedFlight<R> {
+    reader: LogReader<R>,
+    topics: [String; 2],
+    /// The newest colour of each camera, by topic.
+    colors: HashMap<Arc<str>, (u64, Vec<u8>)>,
+    /// Whether images are wanted.
+    with_images: bool,
+}
+
+impl<R: Read> RecordedFlight<R> {
+    /// Reads from `reader`; without images, observations come with empty bitstreams.
+    pub fn new(reader: LogReader<R>, with_images: bool) -> Self {
+        let topics = [Channel::Observation, Channel::Plugin].map(|channel| channel.topic(""));
+        Self { reader, topics, colors: HashMap::new(), with_images }
+    }
+
+    /// Whether the log ended before its end.
+    pub fn is_cut(&self) -> bool {
+        self.reader.is_cut()
+    }
+
+    /// Returns the next thing; `None` at the end.
+    ///
+    /// # Errors
+    /// As [`LogReader::next`].
+    #[allow(clippy::should_implement_trait)] // Why: as `LogReader::next`.
+    pub fn next(&mut self) -> Result<Option<Recorded>, LogError> {
+        while let Some(entry) = self.reader.next()? {
+            let message = match entry {
+                Entry::Flight(values) => return Ok(Some(Recorded::Flight(values))),
+                Entry::Message(message) => message,
+            };
+            let [observation, plugin] = &self.topics;
+            if *message.topic == **observation {
+                return Ok(Some(self.observation(&message)));
+            } else if *message.topic == **plugin {
+                if let Ok(decoded) = PluginMessage::decode(&*message.data) {
+                    return Ok(Some(Recorded::Plugin(decoded)));
+                }
+            } else if self.with_images && is_color(&message.topic) {
+                self.colors.insert(message.topic, (message.log_time_ns, message.data));
+            }
+        }
+        Ok(None)
+    }
+
+    fn observation(&mut self, message: &LogMessage) -> Recorded {
+        let Ok(mut observation) = Observation::decode(&*message.data) else {
+            return Recorded::Broken(0);
+        };
+        for image in &mut observation.images {
+            if !self.with_images {
+                image.bitstream = Vec::new();
+            } else if image.is_color_apart
+                && self.join(message.log_time_ns, image).is_none_or(|joined| joined.is_err())
+            {
+                return Recorded::Broken(observation.seq);
+            }
+        }
+        Recorded::Observation(observation)
+    }
+
+    /// Puts an image's colour back into its bitstream; `None` if the log does not have it.
+    fn join(&self, at_ns: u64, image: &mut ObservedImage) -> Option<Result<(), DecodeError>> {
+        let topic = Channel::Color(0).topic(&image.name);
+        let (color_at_ns, color) = self.colors.get(&*topic)?;
+        if *color_at_ns != at_ns {
+            return None;
+        }
+        let color = CompressedImage::decode(&**color).ok()?;
+        let mut whole = Vec::with_capacity(color.data.len() + image.bitstream.len());
+        let joined = join_jpeg(&color.data, &image.bitstream, &mut whole);
+        (image.bitstream, image.is_color_apart) = (whole, false);
+        Some(joined)
+    }
+}
+
+fn is_color(topic: &str) -> bool {
+    topic.starts_with("/camera/") && topic.ends_with("/image")
+}

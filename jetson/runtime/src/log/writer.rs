@@ -1,0 +1,459 @@
+//! The log's own thread: encodes records, writes them, shows them to viewers.
+//!
+//! Budget at 640x480 and 60 Hz: 13 MB/s copied twice (into the chunk, and once more where a viewer
+//! is subscribed), one write to disk a second or every [`CHUNK_BYTES`].
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use foxglove::messages as fox;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{McapResult, WriteOptions, Writer};
+use prost::Message;
+use serde_json::json;
+use vizflyt_protocol::PROTOCOL_VERSION;
+use vizflyt_protocol::geometry::{Distortion, Pose};
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::HostTime;
+use vizflyt_rgbd::split_jpeg;
+use vizflyt_sdk::host_now;
+use zerocopy::IntoBytes;
+
+use super::channels::Channel;
+use super::file::{Disk, SafeFile};
+use super::live::Live;
+use super::messages::{Observation, ObservedImage, PluginMessage};
+use super::queue::{Dropped, LoggedImage, ObservationRecord, Queue, Record};
+
+/// A chunk is closed this often: what a killed process loses.
+const CHUNK_PERIOD: Duration = Duration::from_secs(1);
+/// Or when it is so large: what waits in memory. [bytes]
+const CHUNK_BYTES: usize = 4 << 20;
+/// Below so much room on disk images are left out, so that the flight's figures still fit, and the
+/// rest of the computer works. [bytes]
+const LEAST_FREE: u64 = 256 << 20;
+/// Above so much they come back. [bytes]
+const ENOUGH_FREE: u64 = 512 << 20;
+/// A camera's calibration is told this often, for viewers that come later.
+const CALIBRATION_PERIOD_NS: u64 = 1_000_000_000;
+
+/// Where messages go.
+pub(super) struct Outlet<D: Disk> {
+    file: Option<Writer<SafeFile<D>>>,
+    live: Option<Live>,
+    ids: BTreeMap<Channel, u16>,
+    sequence: u32,
+    /// Bytes of messages since the last chunk.
+    waiting: usize,
+    written_bytes: u64,
+}
+
+impl<D: Disk> Outlet<D> {
+    /// Begins a file, if there is one, with all fixed channels.
+    pub(super) fn new(disk: Option<D>, live: Option<Live>) -> McapResult<Self> {
+        let file = disk.map(|disk| {
+            WriteOptions::new()
+                .compression(None)
+                .profile("")
+                .library(concat!("vizflyt ", env!("CARGO_PKG_VERSION")))
+                // Closed by time or size of ours.
+                .chunk_size(None)
+                // Chunks have their own; one over all would need the file to be written in order.
+                .calculate_data_section_crc(false)
+                .create(SafeFile::new(disk))
+        });
+        let ids = BTreeMap::new();
+        let mut outlet =
+            Self { file: file.transpose()?, live, ids, sequence: 0, waiting: 0, written_bytes: 0 };
+        for channel in Channel::FIXED {
+            outlet.offer(channel, "")?;
+        }
+        outlet.flush()?;
+        Ok(outlet)
+    }
+
+    fn offer(&mut self, channel: Channel, camera: &str) -> McapResult<()> {
+        let description = channel.describe(camera);
+        if let Some(live) = &mut self.live {
+            live.offer(channel, &description);
+        }
+        let id = match &mut self.file {
+            Some(file) => {
+                let schema = &description.schema;
+                let schema = file.add_schema(&schema.name, &schema.encoding, &schema.data)?;
+                let (topic, encoding) = (&description.topic, description.encoding);
+                file.add_channel(schema, topic, encoding, &BTreeMap::new())?
+            }
+            None => 0,
+        };
+        self.ids.insert(channel, id);
+        Ok(())
+    }
+
+    fn put(
+        &mut self,
+        channel: Channel,
+        camera: &str,
+        at_ns: u64,
+        message: &[u8],
+    ) -> McapResult<()> {
+        if !self.ids.contains_key(&channel) {
+            self.offer(channel, camera)?;
+        }
+        if let Some(live) = &self.live {
+            live.send(channel, at_ns, message);
+        }
+        let Some(file) = &mut self.file else { return Ok(()) };
+        self.sequence = self.sequence.wrapping_add(1);
+        self.waiting += message.len();
+        let header = MessageHeader {
+            channel_id: self.ids[&channel],
+            sequence: self.sequence,
+            log_time: at_ns,
+            publish_time: at_ns,
+        };
+        file.write_to_known_channel(&header, message)
+    }
+
+    fn metadata(&mut self, values: BTreeMap<String, String>) -> McapResult<()> {
+        let Some(file) = &mut self.file else { return Ok(()) };
+        file.write_metadata(&Metadata { name: FLIGHT.into(), metadata: values })
+    }
+
+    /// Completes the chunk.
+    fn flush(&mut self) -> McapResult<()> {
+        self.written_bytes += std::mem::take(&mut self.waiting) as u64;
+        self.file.as_mut().map_or(Ok(()), Writer::flush)
+    }
+
+    fn finish(mut self) -> McapResult<()> {
+        if let Some(live) = self.live.take() {
+            live.stop();
+        }
+        self.file.take().map_or(Ok(()), |mut file| file.finish().map(|_| ()))
+    }
+
+    /// Gives the file up: what is on disk stays as it is.
+    fn abandon(&mut self) {
+        if let Some(file) = self.file.take() {
+            // Taken apart, as a writer that is dropped tries to finish.
+            drop(file.into_inner());
+        }
+    }
+}
+
+/// Name of the metadata record that says which flight this is.
+pub(super) const FLIGHT: &str = "vizflyt.flight";
+
+/// What the thread keeps besides the outlet.
+pub(super) struct LogWriter<D: Disk> {
+    outlet: Outlet<D>,
+    queue: Arc<Queue>,
+    /// From this computer's clock to time since 1970. [ns]
+    offset_ns: u64,
+    free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
+    images_fit: bool,
+    /// What has been said of drops.
+    told: Dropped,
+    calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
+    rest: Vec<u8>,
+}
+
+impl<D: Disk> LogWriter<D> {
+    /// `free_bytes` says how much room is on the disk, if that is known.
+    pub(super) fn new(
+        outlet: Outlet<D>,
+        queue: Arc<Queue>,
+        free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
+    ) -> Self {
+        // MCAP wants times since 1970.
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH);
+        let wall_ns = wall.map_or(0, |since| since.as_nanos() as u64);
+        Self {
+            outlet,
+            queue,
+            offset_ns: wall_ns.wrapping_sub(host_now().as_ns()),
+            free_bytes,
+            images_fit: true,
+            told: Dropped::default(),
+            calibrations: BTreeMap::new(),
+            rest: Vec::new(),
+        }
+    }
+
+    /// Writes until the flight is over. A disk that refuses ends the file, not this: viewers go on,
+    /// and the memory of images goes round.
+    pub(super) fn run(mut self, records: &Receiver<Record>) {
+        let mut flushed = Instant::now();
+        loop {
+            let result = match records.recv_timeout(CHUNK_PERIOD) {
+                Ok(Record::End) | Err(RecvTimeoutError::Disconnected) => break,
+                Ok(record) => self.take(record),
+                Err(RecvTimeoutError::Timeout) => Ok(()),
+            };
+            let is_due = flushed.elapsed() >= CHUNK_PERIOD;
+            let result = result.and_then(|()| {
+                if !is_due && self.outlet.waiting < CHUNK_BYTES {
+                    return Ok(());
+                }
+                if is_due {
+                    flushed = Instant::now();
+                    self.look_after()?;
+                }
+                self.outlet.flush()
+            });
+            if let Err(error) = result {
+                self.fail(&error);
+            }
+        }
+        let (queue, offset_ns) = (Arc::clone(&self.queue), self.offset_ns);
+        let result = self.status("the flight is over");
+        tracing::debug!("flight log: closed at {} ns", offset_ns.wrapping_add(host_now().as_ns()));
+        if let Err(error) = result.and_then(|()| self.outlet.finish()) {
+            queue.complain(format!("it could not be completed: {error}"));
+        }
+    }
+
+    fn fail(&mut self, error: &mcap::McapError) {
+        if self.outlet.file.is_none() {
+            return;
+        }
+        self.outlet.abandon();
+        let megabytes = self.outlet.written_bytes as f64 / 1e6;
+        self.queue.complain(format!(
+            "the flight is not logged any further: {error}; the first {megabytes:.1} MB are a whole \
+             file"
+        ));
+    }
+
+    /// Looks after room on the disk and what was dropped, once a second.
+    pub(super) fn look_after(&mut self) -> McapResult<()> {
+        let free = if self.outlet.file.is_some() { (self.free_bytes)() } else { None };
+        let fit = images_fit(self.images_fit, free);
+        if fit != self.images_fit {
+            self.images_fit = fit;
+            let megabytes = free.unwrap_or(0) >> 20;
+            let text = if fit {
+                format!("images are logged again: {megabytes} MB are free")
+            } else {
+                format!(
+                    "images are no longer logged: only {megabytes} MB are free on its disk; delete \
+                     old flights"
+                )
+            };
+            self.queue.complain(text);
+        }
+        let dropped = self.queue.dropped();
+        // The first, then ever fewer.
+        let is_news = |now: u64, told: u64| now > 0 && now >= 2 * told && now != told;
+        if is_news(dropped.images, self.told.images) || is_news(dropped.records, self.told.records)
+        {
+            self.told = dropped;
+            self.queue.complain(format!(
+                "{} images and {} records were dropped so far: the disk is too slow",
+                dropped.images, dropped.records
+            ));
+        }
+        self.status("")
+    }
+
+    fn status(&mut self, text: &str) -> McapResult<()> {
+        let Dropped { images, records } = self.queue.dropped();
+        let status = json!({
+            "written_bytes": self.outlet.written_bytes, "dropped_images": images,
+            "dropped_records": records, "free_bytes": (self.free_bytes)(), "text": text
+        });
+        let at_ns = self.wall_ns(host_now());
+        self.outlet.put(Channel::Log, "", at_ns, status.to_string().as_bytes())
+    }
+
+    fn wall_ns(&self, at: HostTime) -> u64 {
+        at.as_ns().wrapping_add(self.offset_ns)
+    }
+
+    fn take(&mut self, record: Record) -> McapResult<()> {
+        match record {
+            Record::Json { channel, at, json } => {
+                self.outlet.put(channel, "", self.wall_ns(at), &json)
+            }
+            Record::Pose { at, stamp, sample } => self.pose(at, stamp, &sample),
+            Record::Text { channel, at, level, name, text } => {
+                let at_ns = self.wall_ns(at);
+                let log = fox::Log {
+                    timestamp: Some(timestamp(at_ns)),
+                    level: level as i32,
+                    message: text,
+                    name,
+                    ..fox::Log::default()
+                };
+                self.outlet.put(channel, "", at_ns, &log.encode_to_vec())
+            }
+            Record::Plugin { at, is_to_plugin, body } => {
+                let protocol = PROTOCOL_VERSION.into();
+                let at_ns = at.as_ns();
+                let message = PluginMessage { is_to_plugin, protocol, body, at_ns };
+                self.outlet.put(Channel::Plugin, "", self.wall_ns(at), &message.encode_to_vec())
+            }
+            Record::Observation(record) => {
+                self.queue.taken(record.len());
+                let result = if self.images_fit { self.observation(&record) } else { Ok(()) };
+                record.recycle();
+                result
+            }
+            Record::Flight(values) => {
+                let own = |(name, value): (&str, String)| (name.to_owned(), value);
+                self.outlet.metadata(values.into_iter().map(own).collect())
+            }
+            Record::End => Ok(()),
+        }
+    }
+
+    fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) -> McapResult<()> {
+        let at_ns = self.wall_ns(stamp);
+        let (world_from_body, twist) = (&sample.world_from_body, &sample.twist);
+        let (position, orientation) = parts(world_from_body);
+        let pose = fox::PoseInFrame {
+            timestamp: Some(timestamp(at_ns)),
+            frame_id: WORLD.into(),
+            pose: Some(fox::Pose { position: Some(position), orientation: Some(orientation) }),
+        };
+        self.outlet.put(Channel::Pose, "", at_ns, &pose.encode_to_vec())?;
+        let transform = transform(at_ns, WORLD, BODY, world_from_body);
+        self.outlet.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())?;
+        let motion = json!({
+            "stamp_ns": stamp.as_ns(),
+            "v_world_mps": twist.linear_mps.to_array(),
+            "omega_body_radps": twist.angular_radps.to_array(),
+            "age_ms": at.seconds_since(stamp) * 1e3
+        });
+        self.outlet.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())
+    }
+
+    fn observation(&mut self, record: &ObservationRecord) -> McapResult<()> {
+        let at_ns = self.wall_ns(record.at);
+        let mut images = Vec::with_capacity(record.images.len());
+        for image in &record.images {
+            images.push(self.image(at_ns, image)?);
+        }
+        let observation = Observation {
+            seq: record.seq,
+            protocol: PROTOCOL_VERSION.into(),
+            published_ns: record.at.as_ns(),
+            head: record.head.clone(),
+            images,
+        };
+        self.outlet.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
+    }
+
+    /// Writes an image's colour and calibration; returns what is left of it.
+    fn image(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<ObservedImage> {
+        self.calibration(at_ns, image)?;
+        let mut jpeg = Vec::with_capacity(image.pieces.iter().map(Vec::len).sum());
+        self.rest.clear();
+        let pieces = image.pieces.iter().map(Vec::as_slice);
+        let is_color_apart = split_jpeg(pieces, &mut jpeg, &mut self.rest);
+        let bitstream = if is_color_apart {
+            let color = fox::CompressedImage {
+                timestamp: Some(timestamp(self.wall_ns(image.pose))),
+                frame_id: image.name.clone(),
+                data: jpeg.into(),
+                format: "jpeg".into(),
+            };
+            let channel = Channel::Color(image.camera as u8);
+            self.outlet.put(channel, &image.name, at_ns, &color.encode_to_vec())?;
+            self.rest.clone()
+        } else {
+            image.pieces.concat()
+        };
+        Ok(ObservedImage {
+            camera: image.camera as u32,
+            name: image.name.clone(),
+            header: image.header.as_bytes().to_vec(),
+            received_ns: image.received.as_ns(),
+            bitstream,
+            is_color_apart,
+        })
+    }
+
+    /// Tells how a camera's images are drawn, when that has changed and now and then.
+    fn calibration(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
+        let calibration = calibration(at_ns, &image.name, &image.header);
+        let body_from_cam = image.header.body_from_cam();
+        let timeless = fox::CameraCalibration { timestamp: None, ..calibration.clone() };
+        let mut key = timeless.encode_to_vec();
+        key.extend_from_slice(image.header.mount_m.as_bytes());
+        key.extend_from_slice(image.header.mount_xyzw.as_bytes());
+        let is_known = self.calibrations.get(&image.camera).is_some_and(|(known, told_ns)| {
+            *known == key && at_ns.saturating_sub(*told_ns) < CALIBRATION_PERIOD_NS
+        });
+        if is_known {
+            return Ok(());
+        }
+        self.calibrations.insert(image.camera, (key, at_ns));
+        let channel = Channel::Calibration(image.camera as u8);
+        self.outlet.put(channel, &image.name, at_ns, &calibration.encode_to_vec())?;
+        let transform = transform(at_ns, BODY, &image.name, &body_from_cam);
+        self.outlet.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())
+    }
+}
+
+const WORLD: &str = "world";
+const BODY: &str = "body";
+
+/// Whether images are to be logged with so much room on the disk.
+fn images_fit(they_did: bool, free: Option<u64>) -> bool {
+    free.is_none_or(|free| free >= if they_did { LEAST_FREE } else { ENOUGH_FREE })
+}
+
+fn timestamp(at_ns: u64) -> fox::Timestamp {
+    let (seconds, nanoseconds) = (at_ns / 1_000_000_000, at_ns % 1_000_000_000);
+    fox::Timestamp::new(u32::try_from(seconds).unwrap_or(u32::MAX), nanoseconds as u32)
+}
+
+fn parts<A, B>(pose: &Pose<A, B>) -> (fox::Vector3, fox::Quaternion) {
+    let (p, q) = (pose.translation_m, pose.rotation);
+    (fox::Vector3 { x: p.x, y: p.y, z: p.z }, fox::Quaternion { x: q.x, y: q.y, z: q.z, w: q.w })
+}
+
+fn transform<A, B>(
+    at_ns: u64,
+    parent: &str,
+    child: &str,
+    pose: &Pose<A, B>,
+) -> fox::FrameTransform {
+    let (translation, rotation) = parts(pose);
+    fox::FrameTransform {
+        timestamp: Some(timestamp(at_ns)),
+        parent_frame_id: parent.into(),
+        child_frame_id: child.into(),
+        translation: Some(translation),
+        rotation: Some(rotation),
+    }
+}
+
+fn calibration(at_ns: u64, name: &str, header: &ImageHeader) -> fox::CameraCalibration {
+    let k = header.intrinsics();
+    // OpenCV, and so Foxglove, puts the centre of the first pixel at 0; we its corner.
+    let (cx, cy) = (k.cx_px - 0.5, k.cy_px - 0.5);
+    let (model, d) = match k.distortion {
+        Distortion::None => ("", vec![]),
+        Distortion::BrownConrady { .. } => ("plumb_bob", k.distortion.to_wire().1.to_vec()),
+        Distortion::KannalaBrandt { .. } => {
+            ("kannala_brandt", k.distortion.to_wire().1[..4].to_vec())
+        }
+    };
+    fox::CameraCalibration {
+        timestamp: Some(timestamp(at_ns)),
+        frame_id: name.into(),
+        width: k.width_px,
+        height: k.height_px,
+        distortion_model: model.into(),
+        d,
+        k: vec![k.fx_px, 0.0, cx, 0.0, k.fy_px, cy, 0.0, 0.0, 1.0],
+        r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p: vec![k.fx_px, 0.0, cx, 0.0, 0.0, k.fy_px, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
+}

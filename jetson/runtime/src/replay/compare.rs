@@ -1,0 +1,116 @@
+//! How two answers differ, for people: where, and by how much.
+
+use serde::Serialize;
+use serde_json::Value;
+use vizflyt_protocol::messages::{FromPlugin, Setpoint};
+use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
+use vizflyt_protocol::time::HostTime;
+
+/// By how much two setpoints differ.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Difference {
+    /// The number that differs most: `velocity.v_mps.1`; empty if they are of other kinds.
+    pub field: String,
+    /// By how much, in the field's unit; infinite between kinds.
+    pub amount: f64,
+}
+
+/// Returns how two answers differ; `None` if they are the same, bit by bit.
+pub fn difference(recorded: Option<&Setpoint>, replayed: Option<&Setpoint>) -> Option<Difference> {
+    if bits(recorded) == bits(replayed) {
+        return None;
+    }
+    let (a, b) = (serde_json::to_value(recorded), serde_json::to_value(replayed));
+    let mut largest = Difference { field: String::new(), amount: 0.0 };
+    let is_same_kind = match (a, b) {
+        (Ok(a), Ok(b)) => walk(&a, &b, &mut String::new(), &mut largest),
+        _ => false,
+    };
+    if is_same_kind {
+        Some(largest)
+    } else {
+        Some(Difference { field: String::new(), amount: f64::INFINITY })
+    }
+}
+
+/// An answer's bytes: unlike numbers, they are equal to themselves even if they are no number.
+fn bits(setpoint: Option<&Setpoint>) -> Vec<u8> {
+    let zero = HostTime::ZERO;
+    let answer =
+        FromPlugin::Answer { seq: 0, entered: zero, returned: zero, setpoint: setpoint.cloned() };
+    encode_body(&answer, &mut [0; MAX_FRAMED]).to_vec()
+}
+
+/// Looks for the largest difference of two numbers; false if the two are built differently.
+fn walk(a: &Value, b: &Value, path: &mut String, largest: &mut Difference) -> bool {
+    let len = path.len();
+    let mut inside = |key: &str, a: &Value, b: &Value| {
+        if len > 0 {
+            path.push('.');
+        }
+        path.push_str(key);
+        let is_same = walk(a, b, path, largest);
+        path.truncate(len);
+        is_same
+    };
+    match (a, b) {
+        (Value::Object(a), Value::Object(b)) => {
+            a.len() == b.len()
+                && a.iter()
+                    .all(|(key, value)| b.get(key).is_some_and(|other| inside(key, value, other)))
+        }
+        (Value::Array(a), Value::Array(b)) => {
+            a.len() == b.len()
+                && a.iter().zip(b).enumerate().all(|(at, (a, b))| inside(&at.to_string(), a, b))
+        }
+        (Value::Number(a), Value::Number(b)) => {
+            let (a, b) = (a.as_f64().unwrap_or(0.0), b.as_f64().unwrap_or(0.0));
+            let amount = (a - b).abs();
+            // Zeros of two signs differ by nothing, and differ.
+            let is_first = largest.field.is_empty() && a.to_bits() != b.to_bits();
+            if amount > largest.amount || is_first {
+                *largest = Difference { field: path.clone(), amount };
+            }
+            true
+        }
+        (a, b) => a == b,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vizflyt_protocol::messages::YawTarget;
+    use vizflyt_sdk::glam::DVec3;
+
+    fn check(a: Option<Setpoint>, b: Option<Setpoint>, expected: Option<(&str, f64)>) {
+        let found = difference(a.as_ref(), b.as_ref());
+        let found = found.as_ref().map(|found| (&*found.field, found.amount));
+        assert_eq!(found, expected, "{a:?} {b:?}");
+    }
+
+    #[test]
+    fn the_largest_difference_is_named() {
+        let velocity = |x, y| Some(Setpoint::velocity(DVec3::new(x, y, 0.0), YawTarget::Keep));
+        check(velocity(1.0, 2.0), velocity(1.0, 2.0), None);
+        check(velocity(1.0, 2.0), velocity(1.5, 4.0), Some(("velocity.v_mps.1", 2.0)));
+        check(velocity(0.0, 2.0), velocity(-0.0, 2.0), Some(("velocity.v_mps.0", 0.0)));
+        check(velocity(1.0, 2.0), Some(Setpoint::Hold), Some(("", f64::INFINITY)));
+        check(velocity(1.0, 2.0), None, Some(("", f64::INFINITY)));
+        check(None, None, None);
+        let turned = |rad| Some(Setpoint::velocity(DVec3::ZERO, YawTarget::Angle(rad)));
+        check(turned(1.0), turned(0.75), Some(("velocity.yaw.angle", 0.25)));
+        check(turned(1.0), velocity(0.0, 0.0), Some(("", f64::INFINITY)));
+    }
+
+    #[test]
+    fn what_is_no_number_is_the_same_as_itself() {
+        let nan = || Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
+        check(nan(), nan(), None);
+        check(
+            nan(),
+            Some(Setpoint::velocity(DVec3::ZERO, YawTarget::Keep)),
+            Some(("", f64::INFINITY)),
+        );
+    }
+}

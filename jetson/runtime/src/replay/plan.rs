@@ -1,0 +1,138 @@
+//! What is to be fed when: read from the log once, before the plugin starts, without the images.
+//!
+//! In flight the plugin skips images that come while it works, and hears of events in between. A
+//! replay repeats that: it feeds the images that were answered, each after the messages that the
+//! plugin had before it entered `on_image`. After the last answer it feeds all there are: if the
+//! plugin crashed or hung, then on one of those.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::Read;
+
+use vizflyt_protocol::PROTOCOL_VERSION;
+use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
+use vizflyt_protocol::packet::framing::decode_body;
+use vizflyt_protocol::time::HostTime;
+
+use super::ReplayError;
+use crate::log::PluginMessage;
+use crate::log::read::{Recorded, RecordedFlight};
+
+/// An answer in flight.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Answer {
+    pub(super) seq: u64,
+    pub(super) entered: HostTime,
+    pub(super) setpoint: Option<Setpoint>,
+}
+
+/// The plugin that flew, as the person typed it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FlownPlugin {
+    /// The PLUGIN of `vizflyt fly`.
+    pub plugin: String,
+    /// What came after `--`.
+    pub arguments: Vec<String>,
+}
+
+/// What a log holds for a replay.
+#[derive(Debug, Default)]
+pub struct Plan {
+    /// The plugin that flew, if the log says so.
+    pub flown: Option<FlownPlugin>,
+    /// Observations in the log.
+    pub observations: u64,
+    /// Whether the log ends early.
+    pub is_cut: bool,
+    /// Messages to the plugin, and when they were sent. [host]
+    pub(super) messages: VecDeque<(HostTime, ToPlugin)>,
+    /// Answers of each image number: numbers may come again when the plugin was restarted.
+    answers: BTreeMap<u64, VecDeque<Answer>>,
+    last_entered: HostTime,
+}
+
+/// What to do with an observation.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Feed {
+    /// The plugin skipped it.
+    Skip,
+    /// Feed it after the messages sent before this time; and what the plugin answered, if it did.
+    After(HostTime, Option<Answer>),
+}
+
+impl Plan {
+    /// Reads it from a log.
+    ///
+    /// # Errors
+    /// If the log cannot be read, is of another protocol version, or holds no images.
+    pub fn read<R: Read>(mut flight: RecordedFlight<R>) -> Result<Self, ReplayError> {
+        let mut plan = Self::default();
+        while let Some(recorded) = flight.next()? {
+            match recorded {
+                Recorded::Flight(values) => plan.flown = flown(&values),
+                Recorded::Plugin(message) => plan.message(&message)?,
+                Recorded::Observation(observation) => {
+                    same_protocol(observation.protocol)?;
+                    plan.observations += 1;
+                }
+                Recorded::Broken(_) => plan.observations += 1,
+            }
+        }
+        plan.is_cut = flight.is_cut();
+        if plan.observations == 0 {
+            return Err(ReplayError::NoImages);
+        }
+        if !plan.messages.iter().any(|(_, message)| matches!(message, ToPlugin::Start(_))) {
+            return Err(ReplayError::NoStart);
+        }
+        Ok(plan)
+    }
+
+    fn message(&mut self, message: &PluginMessage) -> Result<(), ReplayError> {
+        same_protocol(message.protocol)?;
+        if message.is_to_plugin {
+            // One that does not decode is of a damaged file; the rest is still of use.
+            if let Ok(decoded) = decode_body(&message.body) {
+                self.messages.push_back((HostTime::from_ns(message.at_ns), decoded));
+            }
+        } else if let Ok(FromPlugin::Answer { seq, entered, setpoint, .. }) =
+            decode_body(&message.body)
+        {
+            self.last_entered = self.last_entered.max(entered);
+            self.answers.entry(seq).or_default().push_back(Answer { seq, entered, setpoint });
+        }
+        Ok(())
+    }
+
+    /// Returns what to do with observation `seq` that was published then; `all` feeds those too
+    /// that the plugin skipped.
+    pub(super) fn feed(&mut self, seq: u64, published: HostTime, all: bool) -> Feed {
+        let answers = self.answers.get_mut(&seq);
+        let answer = answers.and_then(|answers| {
+            // Earlier ones are another plugin process's.
+            while answers.front().is_some_and(|answer| answer.entered < published) {
+                answers.pop_front();
+            }
+            answers.pop_front()
+        });
+        match answer {
+            Some(answer) => Feed::After(answer.entered, Some(answer)),
+            None if all || published > self.last_entered => Feed::After(published, None),
+            None => Feed::Skip,
+        }
+    }
+
+    /// Returns how many answers have not been fed.
+    pub(super) fn unfed(&self) -> u64 {
+        self.answers.values().map(|answers| answers.len() as u64).sum()
+    }
+}
+
+fn same_protocol(found: u32) -> Result<(), ReplayError> {
+    if found == u32::from(PROTOCOL_VERSION) { Ok(()) } else { Err(ReplayError::Protocol(found)) }
+}
+
+fn flown(values: &BTreeMap<String, String>) -> Option<FlownPlugin> {
+    let plugin = values.get("plugin")?.clone();
+    let arguments = values.get("arguments").and_then(|json| serde_json::from_str(json).ok());
+    Some(FlownPlugin { plugin, arguments: arguments.unwrap_or_default() })
+}

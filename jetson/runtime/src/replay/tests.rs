@@ -1,0 +1,258 @@
+//! Replays of logs that these tests write, to a real plugin process: the example `misbehave`.
+
+use std::fs;
+use std::io::Cursor;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, ToPlugin, YawTarget, bounded};
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, peek, slice_len};
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::{CameraInfo, ImageStamps, ObservationBuffer};
+
+use super::*;
+use crate::log::{FlightLog, LoggedImage, observation_head};
+
+fn camera() -> CameraInfo {
+    CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    }
+}
+
+fn at(ms: u64) -> HostTime {
+    HostTime::from_ns(ms * 1_000_000)
+}
+
+/// A log being written.
+struct Flight {
+    log: FlightLog,
+    folder: tempfile::TempDir,
+}
+
+impl Flight {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        Self { log: FlightLog::open(folder.path(), None), folder }
+    }
+
+    fn start(&self, ms: u64) {
+        let mut arena = crate::flight::tests::arena();
+        arena.cameras.clear();
+        let _ = arena.cameras.push(camera());
+        self.log.to_plugin(at(ms), &ToPlugin::Start(arena));
+    }
+
+    fn event(&self, ms: u64) {
+        let text = bounded("the plugin flies");
+        let kind = EventKind::Phase(vizflyt_protocol::messages::FlightPhase::Flying);
+        let event = Event { stamp: ServerTime::ZERO, kind, text };
+        self.log.to_plugin(at(ms), &ToPlugin::Event(event));
+    }
+
+    fn image(&self, seq: u64, ms: u64) {
+        let (rgb, depth) = (vec![seq as u8; 32 * 24 * 3], vec![seq as u16; 32 * 24]);
+        let view = RgbdView { width: 32, height: 24, rgb: &rgb, depth_mm: &depth };
+        let mut all = Vec::new();
+        Encoder::new(EncodeOptions::default()).encode(&view, &mut all).unwrap();
+        let (head, mut rest) = all.split_at(peek(&all).unwrap().header_len);
+        let mut pieces = vec![head.to_vec()];
+        while !rest.is_empty() {
+            let (slice, after) = rest.split_at(slice_len(rest).unwrap() as usize);
+            pieces.push(slice.to_vec());
+            rest = after;
+        }
+        let mut buffer = ObservationBuffer::new(&[camera()]);
+        buffer.clear(seq);
+        let stamps = ImageStamps { seq, pose: at(ms), ready: at(ms) };
+        buffer.set_image(0, stamps, |_| {});
+        let k = camera().intrinsics;
+        let (mount, body) = (Pose::IDENTITY, Pose::IDENTITY);
+        let header = ImageHeader::new(seq, 0, ServerTime::ZERO, &k, &mount, &body);
+        let image = LoggedImage {
+            camera: 0,
+            name: "front".into(),
+            header,
+            pose: at(ms),
+            received: at(ms),
+            pieces,
+        };
+        let images = self.log.images(&Arc::default()).unwrap();
+        images.observation(at(ms), seq, observation_head(buffer.as_bytes()).to_vec(), vec![image]);
+    }
+
+    fn answer(&self, seq: u64, ms: u64, setpoint: Option<Setpoint>) {
+        let (entered, returned) = (at(ms), at(ms + 1));
+        let answer = FromPlugin::Answer { seq, entered, returned, setpoint };
+        self.log.from_plugin(returned, &answer);
+    }
+
+    fn close(self) -> (PathBuf, tempfile::TempDir) {
+        let path = self.log.path().unwrap().to_owned();
+        drop(self.log);
+        (path, self.folder)
+    }
+}
+
+fn plan(log: &Path) -> Result<Plan, ReplayError> {
+    Plan::read(RecordedFlight::new(LogReader::open(log)?, false))
+}
+
+fn forward(x_mps: f64) -> Setpoint {
+    let axes = vizflyt_protocol::messages::Axes::Heading;
+    Setpoint::Velocity { v_mps: DVec3::X * x_mps, axes, yaw: YawTarget::Keep }
+}
+
+#[test]
+fn images_that_were_skipped_are_skipped_and_those_after_the_last_answer_are_fed() {
+    let flight = Flight::new();
+    flight.start(5);
+    for seq in 1..=6 {
+        flight.image(seq, 10 * seq);
+    }
+    flight.answer(2, 22, Some(Setpoint::Hold));
+    flight.answer(4, 43, None);
+    let (path, _folder) = flight.close();
+    let mut plan = plan(&path).unwrap();
+    assert_eq!((plan.observations, plan.is_cut), (6, false));
+    let mut feed = |seq: u64, all| match plan.feed(seq, at(10 * seq), all) {
+        Feed::Skip => "skip".to_owned(),
+        Feed::After(time, answer) => format!(
+            "{} {}",
+            time.as_ns() / 1_000_000,
+            answer.map_or("-".into(), |answer| answer.seq.to_string())
+        ),
+    };
+    assert_eq!(feed(1, false), "skip");
+    assert_eq!(feed(2, false), "22 2");
+    assert_eq!(feed(3, false), "skip");
+    assert_eq!(feed(3, true), "30 -");
+    assert_eq!(feed(4, false), "43 4");
+    assert_eq!(feed(5, false), "50 -");
+    assert_eq!(feed(2, false), "skip", "its answer is used up");
+}
+
+#[test]
+fn a_restarted_plugins_answers_are_told_from_the_first_ones() {
+    let flight = Flight::new();
+    flight.start(5);
+    flight.image(1, 10);
+    flight.answer(1, 12, Some(Setpoint::Hold));
+    flight.start(100);
+    flight.image(1, 110);
+    flight.answer(1, 112, Some(Setpoint::Land));
+    let (path, _folder) = flight.close();
+    let mut plan = plan(&path).unwrap();
+    let mut answer = |ms| match plan.feed(1, at(ms), false) {
+        Feed::After(_, Some(answer)) => answer.setpoint,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!((answer(10), answer(110)), (Some(Setpoint::Hold), Some(Setpoint::Land)));
+}
+
+#[test]
+fn logs_that_cannot_be_replayed_say_why() {
+    let check = |flight: Flight, expected: &str| {
+        let (path, _folder) = flight.close();
+        let error = plan(&path).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    };
+    check(Flight::new(), "no images");
+    let flight = Flight::new();
+    flight.image(1, 10);
+    check(flight, "never attached");
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.mcap");
+    fs::write(&path, "no log").unwrap();
+    assert!(plan(&path).unwrap_err().to_string().contains("no MCAP file"));
+}
+
+/// Returns the command of the example plugin, which is built beside the tests.
+fn misbehave(how: &str) -> Vec<OsString> {
+    let test = std::env::current_exe().unwrap();
+    let program = test.ancestors().nth(2).unwrap().join("examples/misbehave");
+    assert!(program.exists(), "run `cargo build --release --examples` first (tests/run does)");
+    vec![program.into(), how.into()]
+}
+
+fn replay_to(log: &Path, command: Vec<OsString>, answers: &str) -> (ReplayReport, Vec<String>) {
+    let options = ReplayOptions {
+        command,
+        is_realtime: false,
+        all: false,
+        answer_within: Duration::from_secs(5),
+        answers: log.with_extension(answers),
+    };
+    let mut lines = Vec::new();
+    let line = &mut |_: Stream, text: &str| lines.push(text.to_owned());
+    let report = replay(log, plan(log).unwrap(), &options, line).unwrap();
+    (report, lines)
+}
+
+#[test]
+fn the_same_plugin_answers_the_same_and_another_one_differs() {
+    let forward_plugin = misbehave("forward");
+    let flight = Flight::new();
+    flight.start(5);
+    flight.event(6);
+    for seq in 1..=40 {
+        flight.image(seq, 10 * seq);
+        // One answer of the flight was another.
+        let x_mps = if seq == 30 { 0.25 } else { 0.5 };
+        if seq % 3 != 0 || seq == 30 {
+            flight.answer(seq, 10 * seq + 2, Some(forward(x_mps)));
+        }
+    }
+    let (path, _folder) = flight.close();
+    let (report, lines) = replay_to(&path, forward_plugin.clone(), "one");
+    assert_eq!(report.plugin_failed, None, "{lines:?}");
+    assert_eq!((report.images_logged, report.images_fed, report.compared), (40, 28, 28));
+    assert_eq!(report.differ, 1);
+    let first = report.first.unwrap();
+    assert_eq!((first.image, first.difference.amount), (30, 0.25));
+    assert_eq!(first.difference.field, "velocity.v_mps.0");
+    assert!(lines.iter().any(|line| line.contains("flying in")), "{lines:?}");
+    replay_to(&path, forward_plugin, "two");
+    let read = |name| fs::read(path.with_extension(name)).unwrap();
+    assert_eq!(read("one"), read("two"), "byte by byte");
+    assert_eq!(read("one").iter().filter(|&&byte| byte == b'\n').count(), 28);
+    let (report, _) = replay_to(&path, misbehave("hover"), "three");
+    assert_eq!((report.compared, report.differ), (28, 28));
+    assert_eq!(report.largest.unwrap().difference.amount, f64::INFINITY);
+}
+
+#[test]
+fn a_plugin_that_fails_ends_the_replay_with_the_reason() {
+    let flight = Flight::new();
+    flight.start(5);
+    flight.event(6);
+    for seq in 1..=5 {
+        flight.image(seq, 10 * seq);
+    }
+    let (path, _folder) = flight.close();
+    let (report, _) = replay_to(&path, misbehave("panic"), "answers");
+    let why = report.plugin_failed.unwrap();
+    assert!(why.contains("out of range"), "{why}");
+    assert_eq!(report.images_fed, 0);
+}
+
+#[test]
+fn a_head_that_makes_no_sense_is_not_fed() {
+    let flight = Flight::new();
+    flight.start(5);
+    flight.image(1, 10);
+    let (path, _folder) = flight.close();
+    let bytes = fs::read(&path).unwrap();
+    let mut flight = RecordedFlight::new(LogReader::new(Cursor::new(bytes)).unwrap(), true);
+    let observation = std::iter::from_fn(|| flight.next().unwrap())
+        .find_map(|recorded| match recorded {
+            Recorded::Observation(observation) => Some(observation),
+            _ => None,
+        })
+        .unwrap();
+    feeder::tests::check(&observation);
+}

@@ -1,0 +1,47 @@
+//! A log on a disk that fills up, as the kernel has it: here the process's own limit of a file's
+//! size. In a process of its own, as the limit is the process's.
+
+use nix::sys::resource::{Resource, setrlimit};
+use vizflyt_runtime::log::read::{Entry, LogReader};
+use vizflyt_runtime::log::{Channel, FlightLog, keep_going_when_files_are_full};
+use vizflyt_sdk::host_now;
+
+/// Largest file. [bytes]
+const ROOM: u64 = 3 << 20;
+
+#[test]
+fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
+    keep_going_when_files_are_full();
+    let folder = tempfile::tempdir().unwrap();
+    let log = FlightLog::open(folder.path(), None);
+    let path = log.path().unwrap().to_owned();
+    setrlimit(Resource::RLIMIT_FSIZE, ROOM, ROOM).unwrap();
+    let line = serde_json::json!({"text": "x".repeat(100_000)});
+    let mut written = 0;
+    let trouble = loop {
+        log.write(Channel::Asked, host_now(), &line);
+        written += 1;
+        // A chunk at least each second; the limit is that of a test that hangs.
+        assert!(written < 1_000_000, "the disk is never full");
+        if let Some(trouble) = log.poll_trouble()
+            && trouble.contains("not logged any further")
+        {
+            break trouble;
+        }
+    };
+    // More records stop nobody.
+    log.write(Channel::Asked, host_now(), &line);
+    drop(log);
+    let len = std::fs::metadata(&path).unwrap().len();
+    assert!(len <= ROOM, "{len} bytes");
+    let bytes = std::fs::read(&path).unwrap();
+    let strict = mcap::MessageStream::new(&bytes).unwrap();
+    assert!(strict.into_iter().all(|message| message.is_ok()), "{trouble}");
+    let mut reader = LogReader::open(&path).unwrap();
+    let mut found = 0;
+    while let Some(entry) = reader.next().unwrap() {
+        found += u64::from(matches!(entry, Entry::Message(_)));
+    }
+    assert!(!reader.is_cut(), "a whole file");
+    println!("{found} messages of {len} bytes are left: {trouble}");
+}

@@ -1,0 +1,42 @@
+//! Flight logs: any file is read as far as it goes; any recorded observation is decoded, or not.
+#![no_main]
+use std::collections::HashMap;
+use std::io::Cursor;
+
+use libfuzzer_sys::fuzz_target;
+use vizflyt_runtime::log::read::{LogReader, Recorded, RecordedFlight};
+use vizflyt_runtime::log::{Observation, ObservedImage};
+use vizflyt_runtime::replay::{Plan, decode, observation_len};
+use zerocopy::IntoBytes;
+
+/// Larger ones are for the machine that replays, not for the fuzzer.
+const LARGEST: usize = 1 << 22;
+
+fn feed(observation: &Observation) {
+    let Some(len) = observation_len(&observation.head).filter(|len| *len <= LARGEST) else {
+        return;
+    };
+    let mut blocks = vec![0u64; len.div_ceil(8)];
+    let _ = decode(observation, &mut blocks.as_mut_bytes()[..len], &mut HashMap::new());
+}
+
+fuzz_target!(|bytes: &[u8]| {
+    if bytes.starts_with(b"VZOB") {
+        // Past the container: a head, and an image's bitstream behind it.
+        for image_at in (0..bytes.len()).filter(|at| bytes[*at..].starts_with(b"VZRD")).take(4) {
+            let (head, bitstream) = bytes.split_at(image_at);
+            let image = ObservedImage { bitstream: bitstream.to_vec(), ..ObservedImage::default() };
+            feed(&Observation { head: head.to_vec(), images: vec![image], ..Default::default() });
+        }
+        return;
+    }
+    let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
+    let _ = Plan::read(RecordedFlight::new(reader, false));
+    let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
+    let mut flight = RecordedFlight::new(reader, true);
+    while let Ok(Some(recorded)) = flight.next() {
+        if let Recorded::Observation(observation) = recorded {
+            feed(&observation);
+        }
+    }
+});

@@ -1,0 +1,165 @@
+"""Flies with the given program and reads its logs with other people's packages.
+
+What is checked: the file is whole for a strict reader, also after SIGKILL; every channel has a
+schema; Foxglove's messages decode, by the schemas in the file; colour is a JPEG that Pillow opens,
+of the calibration's size; poses are unit quaternions; replaying twice gives the same bytes and the
+flight's own answers.
+"""
+
+import filecmp
+import io
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from PIL import Image
+
+FOXGLOVE = {
+    "/pose": "foxglove.PoseInFrame",
+    "/tf": "foxglove.FrameTransform",
+    "/event": "foxglove.Log",
+    "/plugin/output": "foxglove.Log",
+    "/camera/front/image": "foxglove.CompressedImage",
+    "/camera/front/calibration": "foxglove.CameraCalibration",
+}
+OURS = ["/setpoint/asked", "/setpoint/sent", "/timing", "/image/timing", "/observation",
+        "/plugin/messages", "/telemetry", "/motion", "/log"]
+checks = 0
+
+
+def check(condition, what):
+    global checks
+    checks += 1
+    if not condition:
+        sys.exit(f"failed: {what}")
+
+
+def fly(program, folder, seconds, kill):
+    """Flies a demo; kills its runtime in flight if asked. Returns the log."""
+    command = [program, "demo", "--headless", "--seed", "7", "--seconds", str(seconds), "--log",
+               str(folder)]
+    demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    said = []
+    for line in demo.stdout:
+        said.append(line)
+        if kill and "plugin flies" in line:
+            logs = list(folder.glob("*.mcap"))
+            check(len(logs) == 1, f"one log: {logs}")
+            # Some chunks, then the end without a word.
+            want = logs[0].stat().st_size + 2_000_000
+            while logs[0].stat().st_size < want and demo.poll() is None:
+                time.sleep(0.02)
+            os.kill(runtime(demo.pid), signal.SIGKILL)
+            kill = False
+    demo.wait()
+    logs = list(folder.glob("*.mcap"))
+    check(len(logs) == 1, f"one log: {logs} {said}")
+    return logs[0]
+
+
+def runtime(parent):
+    """Returns the process id of `vizflyt fly` below `parent`."""
+    for entry in pathlib.Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            command = (entry / "cmdline").read_bytes().split(b"\0")
+            status = (entry / "status").read_text()
+        except OSError:
+            continue
+        if b"fly" in command and f"PPid:\t{parent}\n" in status:
+            return int(entry.name)
+    sys.exit("failed: there is no runtime")
+
+
+def read(path, is_whole):
+    """Reads a log strictly; returns the number of messages by topic."""
+    found = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        summary = reader.get_summary()
+        check((summary is not None) == is_whole, f"a log has an index if it was closed: {path}")
+        names = [record.name for record in reader.iter_metadata()]
+        check("vizflyt.flight" in names, f"the flight is named: {names}")
+    size = None
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            topic = channel.topic
+            is_first = topic not in found
+            found[topic] = found.get(topic, 0) + 1
+            check(schema is not None, f"{topic} has a schema")
+            if topic in FOXGLOVE:
+                check(schema.name == FOXGLOVE[topic], f"{topic} is {schema.name}")
+            if channel.message_encoding == "json":
+                check(isinstance(json.loads(message.data), dict), f"{topic} is an object")
+                check(schema.encoding == "jsonschema", f"{topic} says how it is built")
+                json.loads(schema.data)
+                continue
+            check((channel.message_encoding, schema.encoding) == ("protobuf", "protobuf"), topic)
+            decoded = DecoderFactory().decoder_for("protobuf", schema)(message.data)
+            if topic == "/camera/front/calibration":
+                size = (decoded.width, decoded.height)
+                check(len(decoded.K) == 9 and decoded.K[0] > 0, "the camera matrix is there")
+            elif topic == "/camera/front/image" and found[topic] % 20 == 1:
+                image = Image.open(io.BytesIO(decoded.data))
+                image.load()
+                check(image.format == "JPEG" and image.size == size, f"{image} {size}")
+                check(image.getextrema()[1][1] > 60, "there is something in the picture")
+            elif topic == "/pose":
+                q = decoded.pose.orientation
+                norm = q.x**2 + q.y**2 + q.z**2 + q.w**2
+                check(abs(norm - 1) < 1e-6, f"unit quaternion: {norm}")
+            elif topic == "/observation":
+                check(decoded.head[:4] == b"VZOB", "the head is an observation's")
+                check(all(i.is_color_apart and i.bitstream for i in decoded.images), "images")
+            elif is_first and topic == "/event":
+                check(decoded.message != "", "an event has a sentence")
+    for topic in [*FOXGLOVE, *OURS]:
+        if topic != "/plugin/output":
+            check(found.get(topic, 0) > 0, f"{topic} is in {path}: {found}")
+    check(found["/camera/front/image"] == found["/observation"], f"an image each: {found}")
+    return found
+
+
+def replay(program, log, name):
+    answers, report = log.with_suffix(f".{name}.jsonl"), log.with_suffix(f".{name}.json")
+    done = subprocess.run([program, "replay", str(log), "--answers", str(answers), "--report",
+                           str(report)], capture_output=True, text=True)
+    check(done.returncode == 0, f"replay: {done.stdout} {done.stderr}")
+    return answers, json.loads(report.read_text())["found"]
+
+
+def main():
+    program = str(pathlib.Path(sys.argv[1]).resolve())
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = pathlib.Path(scratch)
+        whole = fly(program, folder / "whole", 8, kill=False)
+        found = read(whole, is_whole=True)
+        minute = whole.stat().st_size / found["/observation"] * 60 * 60 / 1e6
+        print(f"whole: {sum(found.values())} messages, {whole.stat().st_size / 1e6:.1f} MB; "
+              f"a minute at 60 Hz would be {minute:.0f} MB")
+        one, first = replay(program, whole, "one")
+        two, second = replay(program, whole, "two")
+        check(filecmp.cmp(one, two, shallow=False), "two replays answer the same, byte by byte")
+        check(first["compared"] > 100 and first["plugin_failed"] is None, str(first))
+        check(first["differ"] == 0 or first["images_missing"] > 0, f"as in flight: {first}")
+        print(f"replayed: {first['compared']} answers, {first['differ']} differ, "
+              f"{first['images_missing']} images missing")
+        killed = fly(program, folder / "killed", 60, kill=True)
+        found = read(killed, is_whole=False)
+        print(f"killed: {sum(found.values())} messages, {killed.stat().st_size / 1e6:.1f} MB")
+        _, report = replay(program, killed, "killed")
+        check(report["compared"] > 0, str(report))
+        print(f"{checks} checks passed")
+
+
+if __name__ == "__main__":
+    main()
