@@ -30,11 +30,15 @@
 mod autonomy;
 mod clock;
 pub mod ipc;
+#[cfg(feature = "opencv")]
+mod mat;
 mod memory;
 mod observation;
 mod run;
 
 pub use glam;
+#[cfg(feature = "opencv")]
+pub use opencv;
 pub use vizflyt_protocol as protocol;
 
 pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
