@@ -1,0 +1,298 @@
+//! A lab in which several plugins fly at once: one render server, and for each flight a simulated
+//! vehicle and a runtime, all real processes. The motion capture's packets go through this test on
+//! their way to the server, so it sees where each vehicle is, whatever the runtime says.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::net::UdpSocket;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use serde_json::Value;
+use vizflyt_e2e::vizflyt;
+use vizflyt_trust::{Client, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
+
+/// One render server for all flights of the test.
+pub(crate) struct Lab {
+    folder: tempfile::TempDir,
+    server: Process,
+    quic: String,
+    fingerprint: Fingerprint,
+    vicon: String,
+    /// Numbers the packets of all vehicles, as one motion capture does.
+    packets: Arc<AtomicU32>,
+}
+
+/// One flight, while it lasts.
+pub(crate) struct Flight {
+    /// What was asked of the plugin.
+    pub how: &'static str,
+    simulator: Process,
+    runtime: Process,
+    track: Track,
+    report: PathBuf,
+    /// What the plugin has left to do.
+    kept: PathBuf,
+}
+
+/// What was seen of a flight.
+pub(crate) struct Seen {
+    /// JSON lines of the runtime, and when each came.
+    pub lines: Vec<(Instant, Value)>,
+    /// Positions by motion capture. [m, world]
+    pub track: Vec<(Instant, DVec3)>,
+    /// The runtime's report.
+    pub report: Value,
+}
+
+type Track = Arc<Mutex<Vec<(Instant, DVec3)>>>;
+
+/// Anything here ends within this, however loaded the machine is.
+const PATIENCE: Duration = Duration::from_mins(2);
+
+/// A child that prints JSON lines; killed when dropped.
+struct Process {
+    child: Child,
+    lines: Receiver<(Instant, Value)>,
+}
+
+impl Process {
+    fn start(program: &Path, args: &[String]) -> Self {
+        let mut child = Command::new(program)
+            .args(args)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap_or_else(|error| panic!("{}: {error}", program.display()));
+        let stdout = BufReader::new(child.stdout.take().unwrap());
+        let (sender, lines) = channel();
+        thread::spawn(move || {
+            for line in stdout.lines().map_while(Result::ok) {
+                let value = serde_json::from_str(&line).unwrap_or(Value::String(line));
+                let _ = sender.send((Instant::now(), value));
+            }
+        });
+        Self { child, lines }
+    }
+
+    /// Returns the `ready` line.
+    fn ready(&self) -> Value {
+        loop {
+            let (_, line) = self.lines.recv_timeout(PATIENCE).expect("a ready line");
+            if line["ready"].is_string() {
+                return line;
+            }
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Lab {
+    /// Starts a server of a room for these vehicles.
+    pub(crate) fn open(vehicles: usize) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        // The plugins run as another user where this is root.
+        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+        fs::set_permissions(folder.path(), mode).unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let scene = at("scene").to_str().unwrap().to_owned();
+        let made =
+            Command::new(vizflyt()).args(["scene", "generate", "room", "-o", &scene]).output();
+        assert!(made.unwrap().status.success());
+        // Small images, and a fence that is soon reached: the flights are short.
+        let arena = at("scene").join("arena.toml");
+        let text = fs::read_to_string(&arena).unwrap();
+        let text = text
+            .replace("width_px = 320", "width_px = 96")
+            .replace("height_px = 240", "height_px = 72")
+            .replace("max_m = [11.0,", "max_m = [2.6,")
+            .replace("[goal]\nposition_m = [10.0,", "[goal]\nposition_m = [2.3,")
+            .replace("radius_m = 0.6", "radius_m = 0.01");
+        fs::write(&arena, text).unwrap();
+
+        let keys = KeysFolder::open(Some(&at("server"))).unwrap();
+        let fingerprint = Identity::keep(&keys, Owner::Server).unwrap().fingerprint();
+        let names: Vec<String> = (0..vehicles).map(name).collect();
+        for name in &names {
+            let own = KeysFolder::open(Some(&at(name))).unwrap();
+            let fingerprint = Identity::keep(&own, Owner::Runtime).unwrap().fingerprint();
+            let vehicles = vec![name.clone()];
+            let client = Client { name: name.clone(), fingerprint, role: Role::Team, vehicles };
+            Paired::add(&keys, client).unwrap();
+        }
+        let mut args = words("serve --json --lifeline --quic=127.0.0.1:0 --http=127.0.0.1:0");
+        args.extend(words("--vicon=127.0.0.1:0 --renderer=cpu --max-rate=20"));
+        args.push(arena.to_str().unwrap().to_owned());
+        args.push(format!("--keys={}", at("server").display()));
+        args.extend(names.iter().map(|name| format!("--vehicle={name}")));
+        let server = Process::start(&vizflyt(), &args);
+        let ready = server.ready();
+        let text = |key: &str| ready[key].as_str().unwrap().to_owned();
+        let (quic, vicon) = (text("quic"), text("vicon"));
+        Self { folder, server, quic, fingerprint, vicon, packets: Arc::default() }
+    }
+
+    /// Flies vehicle `index` with a plugin that does `how`, under the `[plugin]` settings given.
+    pub(crate) fn fly(
+        &self,
+        index: usize,
+        how: &'static str,
+        settings: &str,
+        more: &[&str],
+    ) -> Flight {
+        let name = name(index);
+        let at = |kind: &str| self.folder.path().join(format!("{name}-{kind}"));
+        let config = at("jetson.toml");
+        fs::write(&config, format!("[plugin]\n{settings}\n")).unwrap();
+        let track = Track::default();
+        let capture = self.capture(Arc::clone(&track));
+
+        let plugin = vizflyt().with_file_name("examples").join("misbehave");
+        let mut args = words("--json --lifeline --mavlink=udpin:127.0.0.1:0 --ready-within=100");
+        args.push(format!("--server={}", self.quic));
+        args.push(format!("--fingerprint={}", self.fingerprint));
+        args.push(format!("--keys={}", self.folder.path().join(&name).display()));
+        args.push(format!("--vehicle={name}"));
+        args.push(format!("--config={}", config.display()));
+        args.push(format!("--report={}", at("report").display()));
+        args.push(format!("--log={}", at("log").display()));
+        args.extend(more.iter().map(|&text| text.to_owned()));
+        args.push(plugin.to_str().unwrap().to_owned());
+        args.extend(["--".to_owned(), how.to_owned()]);
+        // Which misdeeds are left to do, for a plugin that is started again: its user writes it.
+        let kept = format!("vizflyt-misbehave-{}-{name}", std::process::id());
+        let kept = std::env::temp_dir().join(kept);
+        args.push(kept.display().to_string());
+        let runtime = Process::start(&vizflyt().with_file_name("vizflyt-jetson"), &args);
+        let mavlink = runtime.ready()["mavlink"].as_str().unwrap().to_owned();
+
+        let mut args = words("sim --json --lifeline --spawn=0.9,0,0,0");
+        args.push(format!("--mavlink=udpout:{mavlink}"));
+        args.push(format!("--vicon={capture}"));
+        args.extend([format!("--object={name}"), format!("--seed={index}")]);
+        let simulator = Process::start(&vizflyt(), &args);
+        Flight { how, simulator, runtime, track, report: at("report"), kept }
+    }
+
+    /// Returns an address whose packets are passed on to the server, and noted.
+    fn capture(&self, track: Track) -> std::net::SocketAddr {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let address = socket.local_addr().unwrap();
+        let (server, packets) = (self.vicon.clone(), Arc::clone(&self.packets));
+        thread::spawn(move || {
+            let mut packet = [0; 512];
+            // Until the process ends: packets of a vehicle that is gone do not come.
+            while let Ok(len) = socket.recv(&mut packet) {
+                let number = packets.fetch_add(1, Ordering::Relaxed);
+                packet[..4].copy_from_slice(&number.to_le_bytes());
+                let _ = socket.send_to(&packet[..len], &server);
+                // Vicon's object stream: after the name three doubles in millimetres.
+                let mm = |axis: usize| {
+                    let at = 32 + 8 * axis;
+                    f64::from_le_bytes(packet[at..at + 8].try_into().unwrap())
+                };
+                let p_m = DVec3::new(mm(0), mm(1), mm(2)) / 1000.0;
+                lock(&track).push((Instant::now(), p_m));
+            }
+        });
+        address
+    }
+
+    /// Whether the server still runs.
+    pub(crate) fn lives(&mut self) -> bool {
+        self.server.child.try_wait().unwrap().is_none()
+    }
+}
+
+impl Flight {
+    /// Waits for the end of the flight; returns what was seen of it.
+    pub(crate) fn wait(mut self) -> Seen {
+        let mut lines = Vec::new();
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.runtime.lines.recv_timeout(left) {
+                Ok(line) => lines.push(line),
+                Err(_) if Instant::now() < deadline => break,
+                Err(_) => panic!("{} flies on: {lines:#?}", self.how),
+            }
+        }
+        let _ = self.runtime.child.wait();
+        let report = fs::read_to_string(&self.report).unwrap_or_else(|_| panic!("{lines:#?}"));
+        let report = serde_json::from_str(&report).unwrap();
+        drop(self.simulator);
+        // Most leave none.
+        let _ = fs::remove_file(&self.kept);
+        let track = lock(&self.track).clone();
+        Seen { lines, track, report }
+    }
+}
+
+impl Seen {
+    /// Returns when the runtime first printed a line that contains `text`.
+    pub(crate) fn when(&self, text: &str) -> Option<Instant> {
+        let line = self.lines.iter().find(|(_, line)| line.to_string().contains(text));
+        line.map(|&(at, _)| at)
+    }
+
+    /// Returns how many events and plugin lines contain `text`.
+    pub(crate) fn count(&self, text: &str) -> usize {
+        self.lines.iter().filter(|(_, line)| line.to_string().contains(text)).count()
+    }
+
+    /// Returns the vehicle's speed around `at`, over a fifth of a second. [m/s]
+    fn speed_mps(&self, at: Instant) -> f64 {
+        let near = |at: Instant| self.track.iter().find(|&&(seen, _)| seen >= at);
+        let (Some((t0, p0)), Some((t1, p1))) = (near(at), near(at + Duration::from_millis(200)))
+        else {
+            return 0.0;
+        };
+        let seconds = t1.saturating_duration_since(*t0).as_secs_f64();
+        if seconds > 0.0 { (*p1 - *p0).length() / seconds } else { 0.0 }
+    }
+
+    /// Returns how long after `since` the vehicle first stood still or came straight down; `None`
+    /// if it never did.
+    pub(crate) fn stopped_after(&self, since: Instant) -> Option<Duration> {
+        let level = |at: Instant| {
+            let near = |at: Instant| self.track.iter().find(|&&(seen, _)| seen >= at);
+            let (Some((_, p0)), Some((_, p1))) = (near(at), near(at + Duration::from_millis(200)))
+            else {
+                return 0.0;
+            };
+            (*p1 - *p0).truncate().length() / 0.2
+        };
+        (0..200).map(|n| Duration::from_millis(50) * n).find(|&after| level(since + after) < 0.15)
+    }
+
+    /// Returns the height at the end, and the speed. [m; m/s]
+    pub(crate) fn end(&self) -> (f64, f64) {
+        let Some(&(at, p_m)) = self.track.last() else { return (f64::NAN, f64::NAN) };
+        (p_m.z, self.speed_mps(at - Duration::from_millis(400)))
+    }
+}
+
+fn name(index: usize) -> String {
+    format!("m{index}")
+}
+
+fn words(text: &str) -> Vec<String> {
+    text.split(' ').map(str::to_owned).collect()
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
