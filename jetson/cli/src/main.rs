@@ -3,11 +3,16 @@
 
 mod bench;
 mod demo;
+mod fly;
+mod lab;
+mod new;
 mod pair;
 mod plugins;
+mod project;
 mod replay;
 mod scene;
 mod stats;
+mod terminal;
 
 use std::process::ExitCode;
 
@@ -19,12 +24,14 @@ use tracing_subscriber::EnvFilter;
 #[derive(Parser, Debug)]
 #[command(version, propagate_version = true)]
 #[command(after_help = "Start here:
-  vizflyt demo        fly a simulated drone through a forest and watch it in the browser")]
+  vizflyt demo                       fly a simulated drone through a forest and watch it in the browser
+  vizflyt new first --lang python    a plugin of your own that flies
+  vizflyt fly first                  fly it in the simulated lab")]
 struct Cli {
     #[command(subcommand)]
     command: Command,
     /// What to log on standard error: error, warn, info, debug, trace; or a filter as
-    /// `vizflyt_runtime=debug`. Without it: info, and warn in `demo`.
+    /// `vizflyt_runtime=debug`. Without it: info, and warn in `demo` and `fly`.
     #[arg(long, global = true, value_name = "LEVEL")]
     log_level: Option<String>,
 }
@@ -34,10 +41,12 @@ struct Cli {
 enum Command {
     /// Everything on this machine: generated scene, simulated vehicle, example plugin, page.
     Demo(demo::DemoArgs),
+    /// Makes a folder with a plugin that flies.
+    New(new::NewArgs),
+    /// Flies a plugin: in the simulated lab, or in the real one if it is configured.
+    Fly(fly::FlyArgs),
     /// The render server: pose in, RGB-D out, page and events.
     Serve(vizflyt_server::ServeArgs),
-    /// The runtime on the Jetson: flies a plugin.
-    Fly(vizflyt_runtime::FlyArgs),
     /// Makes this computer and a render server known to each other, once, by a short code.
     Pair(pair::PairArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
@@ -59,8 +68,8 @@ fn main() -> ExitCode {
     quiet_mesa();
     let cli = Cli::parse();
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
-        // The demo tells its own story; its children's logs would drown it.
-        Command::Demo(_) | Command::Replay(_) => "warn".to_owned(),
+        // These tell their own story; logs would drown it.
+        Command::Demo(_) | Command::Fly(_) | Command::Replay(_) => "warn".to_owned(),
         // What they print is the result; a load of seconds still shows its progress.
         Command::Bench(_) => "warn,vizflyt_server::scene=info".to_owned(),
         _ => "info,quinn=warn".to_owned(),
@@ -82,7 +91,8 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
     match command {
         Command::Demo(args) => demo::run(&args, log_level),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
-        Command::Fly(args) => plugins::fly(&args),
+        Command::Fly(args) => fly::run(args, log_level),
+        Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),

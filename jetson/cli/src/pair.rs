@@ -11,7 +11,7 @@ use vizflyt_runtime::args::ServerAddress;
 use vizflyt_trust::KeysFolder;
 use vizflyt_trust::pairing::Code;
 
-use crate::demo::tell;
+use crate::terminal::tell;
 
 /// Pairs this computer with a render server, once.
 ///

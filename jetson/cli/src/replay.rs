@@ -12,8 +12,9 @@ use vizflyt_runtime::log::read::{LogReader, RecordedFlight};
 use vizflyt_runtime::replay::{Differs, FlownPlugin, Plan, ReplayOptions, ReplayReport, replay};
 use vizflyt_runtime::supervisor::Stream;
 
-use crate::demo::tell;
+use crate::fly::plugin::Plugin;
 use crate::plugins;
+use crate::terminal::tell;
 
 /// Feeds a flight's recorded images to the plugin again, or to another one, and says where the
 /// answers differ.
@@ -61,10 +62,10 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),
         None => flown(plan.flown.as_ref())?,
     };
-    let mut command = vec![plugin.clone()];
+    let mut command = Plugin::find(&plugin)?.command()?;
     command.extend(arguments);
     let options = ReplayOptions {
-        command: plugins::command(&plugin, command)?,
+        command,
         is_realtime: args.realtime,
         all: args.all,
         answer_within: Duration::try_from_secs_f64(args.within)

@@ -11,6 +11,7 @@ use clap::Args;
 use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
 
+use crate::config::{self, JetsonConfig};
 use crate::link::udp::MavlinkAddress;
 
 /// Flies a plugin: images from the render server to it, its setpoints through the guard to the
@@ -20,12 +21,12 @@ use crate::link::udp::MavlinkAddress;
     after_help = "Example:\n  vizflyt fly ./target/release/my-plugin --server 192.168.10.2:4433 \\\n    \
                         --mavlink udpin:0.0.0.0:14550 --vehicle vizflyt\n\n\
                         The vehicle lands when the plugin ends, hangs or is killed, when poses stop,\n\
-                        and on Ctrl-C."
+                        and on Ctrl-C. What the command line leaves out, jetson.toml says."
 )]
 pub struct FlyArgs {
-    /// The plugin: a program; started as a child process
+    /// The plugin; started as a child process [default: `path` of [plugin] in jetson.toml]
     #[arg(value_name = "PLUGIN")]
-    pub plugin: OsString,
+    pub plugin: Option<OsString>,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT")]
     pub plugin_arguments: Vec<OsString>,
@@ -33,11 +34,12 @@ pub struct FlyArgs {
     #[command(flatten)]
     pub server: ServerArgs,
     /// The autopilot: `udpin:ADDR:PORT` waits for it, `udpout:HOST:PORT` calls it
-    #[arg(long, value_name = "ADDRESS", default_value = "udpin:0.0.0.0:14550")]
-    pub mavlink: MavlinkAddress,
-    /// The vehicle's name in the localization system
-    #[arg(long, default_value = "vizflyt")]
-    pub vehicle: String,
+    /// [default: udpin:0.0.0.0:14550]
+    #[arg(long, value_name = "ADDRESS")]
+    pub mavlink: Option<MavlinkAddress>,
+    /// The vehicle's name in the localization system [default: vizflyt]
+    #[arg(long)]
+    pub vehicle: Option<String>,
     /// Folder for flight logs (MCAP)
     #[arg(long, value_name = "DIR", default_value = "flights")]
     pub log: PathBuf,
@@ -64,26 +66,81 @@ pub struct FlyArgs {
     /// Ends when standard input does, so that it never outlives a killed parent
     #[arg(long, hide = true)]
     pub lifeline: bool,
-    /// The settings of this computer, jetson.toml
-    #[arg(long, value_name = "FILE")]
+    /// The settings of this computer
+    /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
+    #[arg(long, value_name = "FILE", conflicts_with = "no_config")]
     pub config: Option<PathBuf>,
+    /// Reads no jetson.toml
+    #[arg(long)]
+    pub no_config: bool,
+    /// What `jetson.toml` says; [`FlyArgs::settle`] reads it.
+    #[arg(skip)]
+    pub jetson: JetsonConfig,
 }
 
 impl FlyArgs {
+    /// Reads `jetson.toml`, and takes from it what the command line leaves out. Returns which file
+    /// it was, if there is one.
+    ///
+    /// # Errors
+    /// A file that is refused, an address that has no host, no plugin at all.
+    pub fn settle(&mut self) -> anyhow::Result<Option<PathBuf>> {
+        let file = match &self.config {
+            Some(file) => Some(file.clone()),
+            None if self.no_config => None,
+            None => config::find(),
+        };
+        if let Some(file) = &file {
+            self.jetson = JetsonConfig::read(file)?;
+        }
+        let JetsonConfig { server, vehicle, plugin, .. } = &self.jetson;
+        let parse_error = |error| anyhow::anyhow!("jetson.toml: {error}");
+        // A server by the command line is another one: the file's keys are not for it.
+        if let (None, Some(server)) = (&self.server.at, server) {
+            self.server.at = Some(server.address.parse().map_err(parse_error)?);
+            self.server.fingerprint = self.server.fingerprint.or(server.fingerprint);
+            self.server.keys = self.server.keys.take().or_else(|| server.keys.clone());
+        }
+        if let (None, Some(address)) = (&self.mavlink, &vehicle.mavlink) {
+            self.mavlink = Some(address.parse().map_err(parse_error)?);
+        }
+        self.vehicle = self.vehicle.take().or_else(|| vehicle.name.clone());
+        self.limits = self.limits.stricter(&self.jetson.limits.limits());
+        let named = plugin.path.clone().map(PathBuf::into_os_string);
+        self.plugin = self.plugin.take().or(named);
+        if self.plugin.is_none() {
+            anyhow::bail!(
+                "no plugin given: `vizflyt fly PLUGIN`, or `path` of [plugin] in jetson.toml"
+            );
+        }
+        Ok(file)
+    }
+
     /// Returns the command that starts the plugin, before the runtime's own argument.
     pub fn plugin_command(&self) -> Vec<OsString> {
-        let mut command = vec![self.plugin.clone()];
-        command.extend(self.plugin_arguments.iter().cloned());
-        command
+        self.plugin.iter().chain(&self.plugin_arguments).cloned().collect()
+    }
+
+    /// Returns where the autopilot is.
+    pub fn mavlink_address(&self) -> MavlinkAddress {
+        self.mavlink.unwrap_or(MavlinkAddress::UdpIn(([0, 0, 0, 0], MAVLINK_PORT).into()))
+    }
+
+    /// Returns the vehicle's name in the localization system.
+    pub fn vehicle_name(&self) -> &str {
+        self.vehicle.as_deref().unwrap_or("vizflyt")
     }
 }
+
+/// Where ground stations and companion computers wait for an autopilot.
+const MAVLINK_PORT: u16 = 14550;
 
 /// Which server, how this computer knows it, and who this computer is.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
     /// The render server's address; `vizflyt pair HOST:PORT` makes it known once
     #[arg(long = "server", value_name = "HOST:PORT")]
-    pub at: ServerAddress,
+    pub at: Option<ServerAddress>,
     /// SHA-256 of the server's certificate [default: the one this computer is paired with]
     #[arg(long, value_name = "HEX")]
     pub fingerprint: Option<Fingerprint>,
@@ -94,23 +151,34 @@ pub struct ServerArgs {
 }
 
 impl ServerArgs {
+    /// Returns where the server is.
+    ///
+    /// # Errors
+    /// If nobody said.
+    pub fn address(&self) -> anyhow::Result<&ServerAddress> {
+        self.at.as_ref().ok_or_else(|| {
+            anyhow::anyhow!("no server is known; give --server, or [server] in jetson.toml")
+        })
+    }
+
     /// Returns who the server is and who we are.
     ///
     /// # Errors
-    /// A server that this computer is not paired with; keys that cannot be used.
+    /// No server, or one that this computer is not paired with; keys that cannot be used.
     pub fn known(&self) -> anyhow::Result<(Fingerprint, Identity)> {
+        let at = self.address()?;
         let folder = KeysFolder::open(self.keys.as_deref())?;
         let identity = Identity::keep(&folder, Owner::Runtime)?;
         if let Some(fingerprint) = self.fingerprint {
             return Ok((fingerprint, identity));
         }
-        let resolved = self.at.address.to_string();
-        let known = Servers::read(&folder)?.fingerprint(&[&self.at.typed, &resolved]);
+        let resolved = at.address.to_string();
+        let known = Servers::read(&folder)?.fingerprint(&[&at.typed, &resolved]);
         let fingerprint = known.ok_or_else(|| {
             anyhow::anyhow!(
                 "this computer is not paired with the server {0}; run `vizflyt pair {0}` and type \
                  the code from the server's page",
-                self.at
+                at
             )
         })?;
         Ok((fingerprint, identity))
@@ -162,9 +230,40 @@ mod tests {
         let args = Program::try_parse_from(line.iter().chain(&tail)).unwrap().fly;
         assert_eq!(args.plugin_command(), ["python3", "plugin.py", "--gain=2"]);
         assert_eq!(args.server.fingerprint, Some(Fingerprint::of(b"x")));
-        assert_eq!(args.server.at.address, ([127, 0, 0, 1], 4433).into());
+        assert_eq!(args.server.address().unwrap().address, ([127, 0, 0, 1], 4433).into());
         let wrong = Program::try_parse_from(line.iter().chain(&["--mavlink", "tcp:1"]));
         assert!(wrong.err().unwrap().to_string().contains("write udpin:"));
+    }
+
+    #[test]
+    fn the_command_line_goes_before_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("jetson.toml");
+        let text = "[server]\naddress = \"127.0.0.1:1\"\nkeys = \"/keys\"\n\
+                    [vehicle]\nname = \"one\"\nmavlink = \"udpin:127.0.0.1:2\"\n\
+                    [plugin]\npath = \"avoid\"\n";
+        std::fs::write(&file, text).unwrap();
+        let settle = |more: &[&str]| {
+            let line = ["fly", "--config", file.to_str().unwrap()];
+            let mut args = Program::try_parse_from(line.iter().chain(more)).unwrap().fly;
+            args.settle().map(|_| args)
+        };
+        let args = settle(&[]).unwrap();
+        assert_eq!(args.server.address().unwrap().typed, "127.0.0.1:1");
+        assert_eq!(args.server.keys, Some("/keys".into()));
+        assert_eq!(args.mavlink_address().to_string(), "udpin:127.0.0.1:2");
+        assert_eq!((args.vehicle_name(), args.plugin_command()), ("one", vec!["avoid".into()]));
+        let args =
+            settle(&["mine", "--server=127.0.0.1:3", "--vehicle=two", "--mavlink=udpin:[::1]:4"]);
+        let args = args.unwrap();
+        assert_eq!(args.server.address().unwrap().typed, "127.0.0.1:3");
+        assert_eq!(args.server.keys, None, "another server has other keys");
+        assert_eq!(args.mavlink_address().to_string(), "udpin:[::1]:4");
+        assert_eq!((args.vehicle_name(), args.plugin_command()), ("two", vec!["mine".into()]));
+        std::fs::write(&file, "").unwrap();
+        let error = settle(&[]).err().unwrap().to_string();
+        assert!(error.contains("no plugin given"), "{error}");
+        assert_eq!(settle(&["mine"]).unwrap().mavlink_address().to_string(), "udpin:0.0.0.0:14550");
     }
 
     #[test]
@@ -172,7 +271,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let keys = root.path().join("keys");
         let args = |fingerprint| ServerArgs {
-            at: "127.0.0.1:4433".parse().unwrap(),
+            at: Some("127.0.0.1:4433".parse().unwrap()),
             fingerprint,
             keys: Some(keys.clone()),
         };

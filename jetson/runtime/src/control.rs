@@ -33,6 +33,7 @@ use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle, host_now};
 
 use crate::answers;
+use crate::console::{Screen, Status};
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
 use crate::images::{ImagePublisher, Published, SharedSenses};
@@ -69,6 +70,8 @@ pub enum Happening {
 const TICK: Duration = Duration::from_millis(20);
 /// Reports to the server every so many ticks: 10 Hz.
 const TELEMETRY_TICKS: u64 = 5;
+/// The status line is renewed every so many ticks, a multiple of [`TELEMETRY_TICKS`]: 2 Hz.
+const STATUS_TICKS: u64 = 25;
 /// Where images get their age, to the server every so many ticks: 1 Hz.
 const TIMING_TICKS: u64 = 50;
 /// The plugin hears of us at least this often.
@@ -101,6 +104,8 @@ pub struct Control {
     pub log: FlightLog,
     /// Prints events as JSON.
     pub json: bool,
+    /// Where people read, if not.
+    pub screen: Screen,
 }
 
 /// What a flight leaves behind.
@@ -476,7 +481,7 @@ impl Loop {
         if self.control.json {
             print_line(&json!({"plugin": record}).to_string());
         } else {
-            print_line(&format!("tick {tick} | {line}"));
+            self.control.screen.line(&format!("tick {tick} | {line}"));
         }
         self.page_lines += 1;
         if self.page_lines <= PAGE_LINES_PER_SECOND {
@@ -680,7 +685,7 @@ impl Loop {
         if self.control.json {
             print_line(&json!({"event": event}).to_string());
         } else {
-            print_line(&event.text);
+            self.control.screen.event(&event.text);
         }
         if let Some(side) = &self.plugin
             && side.started
@@ -705,6 +710,14 @@ impl Loop {
             mavlink_packets: self.link.packets(),
         };
         self.control.log.write(Channel::Telemetry, now, &telemetry);
+        if self.ticks.is_multiple_of(STATUS_TICKS) {
+            let status = Status::of(&telemetry);
+            if self.control.json {
+                print_line(&json!({"status": status}).to_string());
+            } else {
+                self.control.screen.status(&status);
+            }
+        }
         self.control.to_server.report(telemetry);
     }
 
@@ -774,6 +787,7 @@ impl Loop {
                 }
             }
         }
+        self.control.screen.end();
         let counters = Counters {
             seconds: self.flight.seconds(now),
             image_size_px: self.image_size_px,

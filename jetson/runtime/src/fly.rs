@@ -16,8 +16,8 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{SignalKind, signal};
 use vizflyt_protocol::messages::{Purpose, bounded};
 
-use crate::args::FlyArgs;
-use crate::config::JetsonConfig;
+use crate::args::{FlyArgs, ServerAddress};
+use crate::console::Screen;
 use crate::control::{Control, Happening, QUEUE, print_line};
 use crate::flight::{FlightSettings, Outcome};
 use crate::link::udp::{Partner, UdpPort};
@@ -36,13 +36,14 @@ const CUT_SHORT: i32 = 130;
 /// # Errors
 /// If sockets or threads cannot be made, or the report cannot be written. Everything that goes
 /// wrong later is an [`Outcome`].
-#[allow(clippy::needless_pass_by_value)] // Why: an entry point; its arguments are spent.
-pub fn fly(args: FlyArgs) -> anyhow::Result<Outcome> {
+pub fn fly(mut args: FlyArgs) -> anyhow::Result<Outcome> {
+    args.settle()?;
     let command = args.plugin_command();
     fly_command(&args, command)
 }
 
-/// As [`fly`], with the plugin's command given as a list; [`FlyArgs::plugin`] only names it.
+/// As [`fly`], with `args` settled and the plugin's command given as a list; [`FlyArgs::plugin`]
+/// only names it.
 ///
 /// # Errors
 /// As [`fly`].
@@ -51,17 +52,17 @@ pub fn fly_command(
     plugin_command: Vec<std::ffi::OsString>,
 ) -> anyhow::Result<Outcome> {
     keep_going_when_files_are_full();
-    let config = args.config.as_deref().map(JetsonConfig::read).transpose()?;
-    let plugin_limits = config.unwrap_or_default().plugin.limits();
+    let plugin_limits = args.jetson.plugin.limits();
+    let server = args.server.address()?;
     let (fingerprint, identity) = args.server.known()?;
+    let mavlink = args.mavlink_address();
     let port = Arc::new(
-        UdpPort::open(args.mavlink)
-            .with_context(|| format!("{}: cannot open the socket", args.mavlink))?,
+        UdpPort::open(mavlink).with_context(|| format!("{mavlink}: cannot open the socket"))?,
     );
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
     let log = FlightLog::open(&args.log, live);
-    log.flight(&args.plugin, &args.plugin_arguments);
+    log.flight(&args.plugin.clone().unwrap_or_default(), &args.plugin_arguments);
     let (sender, happenings) = sync_channel(QUEUE);
     let stop = Arc::new(AtomicBool::new(false));
     receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
@@ -73,17 +74,17 @@ pub fn fly_command(
     let to_server = Arc::new(Outbox::default());
     watch_signals(&tokio, sender.clone())?;
     let settings = StreamSettings {
-        server: args.server.at.address,
+        server: server.address,
         fingerprint,
         identity,
-        vehicle: bounded(&args.vehicle),
+        vehicle: bounded(args.vehicle_name()),
         purpose: Purpose::Fly,
         program: bounded(concat!("vizflyt-runtime ", env!("CARGO_PKG_VERSION"))),
     };
     let outbox = Arc::clone(&to_server);
     let talk = stream::run(settings, shared.clone(), to_server, tell_stream(sender.clone()));
     let talk = tokio.spawn(talk);
-    print_ready(args, port.local_addr()?, &log);
+    print_ready(args.json, server, port.local_addr()?, &log);
 
     let control = Control {
         plugin_command,
@@ -94,11 +95,12 @@ pub fn fly_command(
             limits: args.limits,
         },
         port,
-        partner: Partner::new(args.mavlink, Instant::now()),
+        partner: Partner::new(mavlink, Instant::now()),
         shared,
         to_server: Arc::clone(&outbox),
         log,
         json: args.json,
+        screen: Screen::default(),
     };
     let flown = control.run(sender, &happenings);
     stop.store(true, Ordering::Relaxed);
@@ -200,13 +202,13 @@ fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) -> bool + 
     }
 }
 
-fn print_ready(args: &FlyArgs, mavlink: SocketAddr, log: &FlightLog) {
+fn print_ready(json: bool, server: &ServerAddress, mavlink: SocketAddr, log: &FlightLog) {
     let log = log.path().map(|path| path.display().to_string());
-    if args.json {
+    if json {
         let mavlink = mavlink.to_string();
         print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
     } else {
-        print_line(&format!("waiting for server {} and an autopilot on {mavlink}", args.server.at));
+        print_line(&format!("waiting for server {server} and an autopilot on {mavlink}"));
     }
 }
 

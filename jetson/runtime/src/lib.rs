@@ -19,6 +19,7 @@ mod answers;
 pub mod args;
 pub mod clock;
 pub mod config;
+pub mod console;
 pub mod control;
 pub mod flight;
 pub mod fly;

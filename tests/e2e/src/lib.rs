@@ -27,7 +27,7 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
 }
 
-/// A running `vizflyt demo` whose output can be waited for. Killed when dropped.
+/// A running `vizflyt` whose output can be waited for. Killed when dropped.
 pub struct Demo {
     child: Child,
     lines: Receiver<String>,
@@ -41,9 +41,15 @@ impl Demo {
     /// # Panics
     /// If the program cannot be started.
     pub fn start(args: &[&str]) -> Self {
-        let mut child = Command::new(vizflyt())
-            .args(["demo", "--headless"])
-            .args(args)
+        Self::spawn(Command::new(vizflyt()).args(["demo", "--headless"]).args(args))
+    }
+
+    /// Starts `command` in the root of the repository.
+    ///
+    /// # Panics
+    /// If the program cannot be started.
+    pub fn spawn(command: &mut Command) -> Self {
+        let mut child = command
             .current_dir(root())
             .stdin(Stdio::null())
             .stdout(Stdio::piped())

@@ -12,7 +12,7 @@ use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_scenes::SceneKind;
 
-use crate::demo::{open_browser, tell};
+use crate::terminal::{open_browser, tell};
 
 /// Makes scenes, looks at them, draws them.
 #[derive(Args, Debug)]

@@ -34,6 +34,18 @@ fn the_example_of_the_module_is_read() {
 }
 
 #[test]
+fn the_shipped_file_is_read() {
+    let config = JetsonConfig::parse(include_str!("../../../systemd/jetson.toml")).unwrap();
+    assert!(config.server.is_some() && config.plugin.path.is_some());
+    // As a person who deletes the server's section flies the simulated lab.
+    let text = include_str!("../../../systemd/jetson.toml");
+    let (before, after) = text.split_once("[server]").unwrap();
+    let (_, after) = after.split_once("[vehicle]").unwrap();
+    let config = JetsonConfig::parse(&format!("{before}[vehicle]{after}")).unwrap();
+    assert!(config.server.is_none() && config.vehicle.mavlink.is_some());
+}
+
+#[test]
 fn mistakes_are_explained() {
     check_refused("[limit]\n", &["line 1, column 2", "'limit'", "did you mean 'limits'"]);
     check_refused(

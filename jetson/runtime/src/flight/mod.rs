@@ -451,13 +451,14 @@ impl Flight {
     }
 
     fn flying(&mut self, now: HostTime, link: &LinkView) -> Orders {
-        let limit_s = self.time_limit_s();
-        if limit_s > 0.0 && self.seconds(now) > limit_s {
-            self.end_in_order(
-                now,
-                OutcomeKind::Timeout,
-                format!("time limit of {limit_s} s reached"),
-            );
+        let (asked_s, arena_s) = self.time_limits_s();
+        if self.seconds(now) > asked_s.min(arena_s) {
+            let (kind, why) = if asked_s < arena_s {
+                (OutcomeKind::Landed, format!("landing after {asked_s} s, as asked"))
+            } else {
+                (OutcomeKind::Timeout, format!("time limit of {arena_s} s reached"))
+            };
+            self.end_in_order(now, kind, why);
         }
         if link.connected && !link.armed {
             self.end_now(now, OutcomeKind::Error, "the vehicle disarmed in flight".into());
@@ -519,12 +520,11 @@ impl Flight {
         self.phase_flies() || self.phase == FlightPhase::TakingOff
     }
 
-    fn time_limit_s(&self) -> f64 {
+    /// Returns when a person wants it landed, and when the arena does; infinite without a limit. [s]
+    fn time_limits_s(&self) -> (f64, f64) {
         let arena_s = self.arena.as_ref().map_or(0.0, |arena| arena.time_limit_s);
-        match (self.settings.time_limit_s, arena_s) {
-            (ours, arena) if ours > 0.0 && arena > 0.0 => ours.min(arena),
-            (ours, arena) => ours.max(arena),
-        }
+        let limit_s = |given_s: f64| if given_s > 0.0 { given_s } else { f64::INFINITY };
+        (limit_s(self.settings.time_limit_s), limit_s(arena_s))
     }
 
     fn enter(&mut self, now: HostTime, phase: FlightPhase, why: &str) {

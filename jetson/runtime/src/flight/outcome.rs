@@ -23,7 +23,7 @@ pub enum OutcomeKind {
     Geofence,
     /// Time was up.
     Timeout,
-    /// The plugin or a person landed it.
+    /// The plugin or a person landed it, or the time that a person asked for was over.
     Landed,
     /// The plugin crashed, hung or gave up.
     PluginFailed,

@@ -366,7 +366,7 @@ fn time_limits_count_from_take_off_and_the_shorter_wins() {
     script.flight.settings.time_limit_s = 5.0;
     script.run(1.0);
     assert_eq!(script.flight.phase(), FlightPhase::Flying);
-    script.check_end(OutcomeKind::Timeout, "5 s");
+    script.check_end(OutcomeKind::Landed, "5 s");
 
     let mut script = Script::flying();
     script.flight.settings.time_limit_s = 500.0;

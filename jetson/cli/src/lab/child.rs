@@ -1,4 +1,4 @@
-//! One child process of the demo: the same binary with another subcommand, its standard output
+//! One child process of the simulated lab: the same binary with another subcommand, its standard output
 //! read as JSON lines, its life bound to ours by the pipe on its standard input.
 
 use std::ffi::OsString;
@@ -34,14 +34,14 @@ impl Role {
     }
 }
 
-/// What the demo's one loop waits for.
+/// What the one loop waits for.
 #[derive(Debug)]
 pub(crate) enum Notice {
     /// A child printed a JSON line.
     Line(Role, Value),
     /// A child closed its standard output: it has ended or is about to.
     Closed(Role),
-    /// A person asked the demo to end.
+    /// A person asked for the end.
     Interrupted,
 }
 
@@ -69,7 +69,7 @@ impl Child {
             std::thread::spawn(move || {
                 for line in BufReader::new(stdout).lines().map_while(Result::ok) {
                     if let Ok(value) = serde_json::from_str(&line) {
-                        // The demo may have ended; then nobody needs the line.
+                        // It may all have ended; then nobody needs the line.
                         drop(notices.send(Notice::Line(role, value)));
                     } else {
                         tracing::warn!("{} printed: {line}", role.name());

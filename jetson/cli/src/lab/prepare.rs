@@ -1,4 +1,4 @@
-//! Finds or makes what the demo flies in: an arena file, the spawn, and the truth if known.
+//! Finds or makes what is flown in: an arena file, the spawn, and the truth if known.
 
 use std::path::{Path, PathBuf};
 
@@ -16,8 +16,8 @@ pub(crate) struct Stage {
     pub truth: Option<PathBuf>,
     /// Where the vehicle stands: `x,y,z,yaw_deg`. [m, world; deg]
     pub spawn: String,
-    /// Holds generated files until the demo ends.
-    _folder: Option<TempDir>,
+    /// Holds generated files until the flight ends.
+    folder: Option<TempDir>,
 }
 
 impl Stage {
@@ -25,10 +25,9 @@ impl Stage {
     pub(crate) fn prepare(scene: &str, seed: u64) -> Result<Self> {
         if let Ok(kind) = scene.parse::<SceneKind>() {
             let folder = tempfile::Builder::new()
-                .prefix("vizflyt-demo-")
+                .prefix("vizflyt-lab-")
                 .tempdir()
                 .context("cannot make a folder for the generated scene")?;
-            super::tell(format!("scene       {kind}, seed {seed}"));
             let written = vizflyt_scenes::generate(kind, seed).write(folder.path())?;
             return Self::at(written.arena, Some(folder));
         }
@@ -39,7 +38,6 @@ impl Stage {
                  give one of the names, a folder with an arena.toml, or a scene file"
             );
         }
-        super::tell(format!("scene       {}", path.display()));
         if path.join("arena.toml").is_file() {
             return Self::at(path.join("arena.toml"), None);
         }
@@ -48,7 +46,12 @@ impl Stage {
         }
         // A bare scene: the server turns it upright and assumes an arena around it.
         let arena = vizflyt_server::scene::load(path, Up::default(), None)?.arena;
-        Ok(Self { arena: path.to_owned(), truth: None, spawn: spawn(&arena), _folder: None })
+        Ok(Self { arena: path.to_owned(), truth: None, spawn: spawn(&arena), folder: None })
+    }
+
+    /// Returns how the seed made it what it is, to be said behind its name.
+    pub(crate) fn seeded(&self, seed: u64) -> String {
+        self.folder.as_ref().map_or(String::new(), |_| format!(", seed {seed}"))
     }
 
     fn at(arena: PathBuf, folder: Option<TempDir>) -> Result<Self> {
@@ -57,7 +60,7 @@ impl Stage {
         let config =
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
-        Ok(Self { arena, truth, spawn: spawn(&config), _folder: folder })
+        Ok(Self { arena, truth, spawn: spawn(&config), folder })
     }
 }
 

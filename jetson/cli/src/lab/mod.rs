@@ -1,12 +1,13 @@
-//! `vizflyt demo`: everything on this machine.
+//! The simulated lab: render server, runtime and simulator as processes on this machine. `vizflyt
+//! demo` and `vizflyt fly` start it here.
 //!
 //! ```text
 //! prepare   generate (or find) the scene: scene.ply, arena.toml, truth.json
-//! keys      pair server and runtime, for this demo only
+//! keys      pair server and runtime, for this flight only
 //! serve     start the render server; it says which ports it got
 //! fly       start the runtime with the plugin; it says which port waits for MAVLink
-//! sim       start the simulated lab: vehicle, autopilot, mocap
-//! watch     print events, until the runtime ends (or a person ends the demo)
+//! sim       start the vehicle: airframe, autopilot, mocap
+//! watch     print events and status, until the runtime ends (or a person ends it all)
 //! report    join what the three measured
 //! ```
 //! The three are real processes that talk over UDP, QUIC and shared memory. This one only starts
@@ -19,14 +20,16 @@ mod prepare;
 mod report;
 
 use std::ffi::OsString;
-use std::path::PathBuf;
-use std::process::ExitCode;
+use std::path::Path;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use serde_json::Value;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use vizflyt_runtime::console::{Screen, Status};
+use vizflyt_runtime::control::print_line;
 use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
@@ -34,42 +37,94 @@ use self::keys::Keys;
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
 use self::report::Parts;
+use crate::terminal::{open_browser, tell};
 
-/// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
-#[derive(Args, Debug)]
-#[command(after_help = "Examples:
-  vizflyt demo                                  fly the forest and watch it in the browser
-  vizflyt demo --scene race --seed 3            another scene, another course
-  vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
-  vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
-pub(crate) struct DemoArgs {
-    /// forest, race, room; or the path of a scene folder, an arena.toml or a scene file.
-    #[arg(long, default_value = "forest")]
-    scene: String,
-    /// Plugin to fly: an executable, or the name of a built-in example.
-    #[arg(long, default_value = "avoid")]
-    plugin: String,
-    /// Seed of the generated scene and of the simulator's noise.
-    #[arg(long, default_value_t = 7)]
-    seed: u64,
-    /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]
+pub(crate) use self::report::Report;
+
+/// What the simulated lab looks like.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct LabArgs {
+    /// forest, race, room; or the path of a scene folder, an arena.toml or a scene file
+    /// [default: forest].
     #[arg(long)]
-    seconds: Option<f64>,
+    pub scene: Option<String>,
+    /// Seed of the generated scene and of the simulator's noise [default: 7].
+    #[arg(long)]
+    pub seed: Option<u64>,
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter.
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
-    renderer: RendererKind,
+    pub renderer: RendererKind,
     /// Opens no browser.
     #[arg(long)]
-    headless: bool,
-    /// Writes the flight's figures to this file as JSON.
-    #[arg(long, value_name = "FILE")]
-    report: Option<PathBuf>,
+    pub headless: bool,
     /// Port of the page; a free one without it.
     #[arg(long, default_value_t = 0)]
-    port: u16,
+    pub port: u16,
+}
+
+impl LabArgs {
+    /// Returns the scene's name or path.
+    pub(crate) fn scene(&self) -> &str {
+        self.scene.as_deref().unwrap_or("forest")
+    }
+
+    /// Returns the seed.
+    pub(crate) fn seed(&self) -> u64 {
+        self.seed.unwrap_or(7)
+    }
+}
+
+/// One flight in the simulated lab.
+#[derive(Debug)]
+pub(crate) struct LabFlight<'a> {
+    /// The lab.
+    pub lab: &'a LabArgs,
+    /// The plugin, and what else `vizflyt fly` is to be told.
+    pub fly: Vec<OsString>,
+    /// Arguments for the plugin.
+    pub plugin_arguments: &'a [OsString],
     /// Folder for the flight log.
-    #[arg(long, value_name = "DIR", default_value = "flights")]
-    log: PathBuf,
+    pub log: &'a Path,
+    /// Prints the runtime's JSON lines instead of lines for people.
+    pub json: bool,
+    /// What the children log.
+    pub log_level: &'a str,
+}
+
+/// Flies it to the end; `None` if a person ends it first.
+///
+/// # Errors
+/// If the lab cannot be started. What goes wrong in flight is an outcome of the report.
+pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
+    let memory = MemoryWatch::start();
+    let (notices, inbox) = mpsc::channel();
+    interrupt_notices(notices.clone())?;
+    let (scene, seed) = (flight.lab.scene(), flight.lab.seed());
+    let stage = Stage::prepare(scene, seed)?;
+    if !flight.json {
+        tell(format!("scene       {scene}{}", stage.seeded(seed)));
+    }
+    let keys = Keys::make()?;
+    let mut show = Show {
+        log_level: format!("--log-level={}", flight.log_level).into(),
+        notices,
+        inbox,
+        children: Vec::new(),
+        parts: Parts::default(),
+        json: flight.json,
+        screen: Screen::default(),
+    };
+    let result = show.fly(flight, &stage, &keys);
+    show.end();
+    match result? {
+        Flown::To { log } => Ok(Some(show.parts.join(seed, memory.peak_mb(), &log))),
+        Flown::Interrupted => {
+            if !flight.json {
+                tell("ended on request");
+            }
+            Ok(None)
+        }
+    }
 }
 
 /// How long a child may take to say it is ready: a large scene is loaded and baked.
@@ -77,39 +132,7 @@ const READY_LIMIT: Duration = Duration::from_mins(2);
 /// How long all children together may take to end.
 const END_LIMIT: Duration = Duration::from_millis(1500);
 
-/// Runs the demo; success only if the flight finished.
-pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
-    let memory = MemoryWatch::start();
-    let (notices, inbox) = mpsc::channel();
-    interrupt_notices(notices.clone())?;
-    let stage = Stage::prepare(&args.scene, args.seed)?;
-    let keys = Keys::make()?;
-    let mut show = Show {
-        log_level: format!("--log-level={log_level}").into(),
-        notices,
-        inbox,
-        children: Vec::new(),
-        parts: Parts::default(),
-    };
-    let result = show.fly(args, &stage, &keys);
-    show.end();
-    let log = match result {
-        Ok(Flown::To { log }) => log,
-        Ok(Flown::Interrupted) => {
-            tell("ended on request");
-            return Ok(ExitCode::FAILURE);
-        }
-        Err(error) => return Err(error),
-    };
-    let report = show.parts.join(args.seed, memory.peak_mb(), &log);
-    if let Some(path) = &args.report {
-        report.write(path)?;
-    }
-    tell(report.summary());
-    Ok(if report.outcome == "finished" { ExitCode::SUCCESS } else { ExitCode::FAILURE })
-}
-
-/// How the flight part of the demo ended.
+/// How the flight part ended.
 enum Flown {
     /// The runtime ended; the log is there.
     To { log: String },
@@ -125,11 +148,14 @@ struct Show {
     inbox: Receiver<Notice>,
     children: Vec<(Role, Child)>,
     parts: Parts,
+    json: bool,
+    screen: Screen,
 }
 
 impl Show {
-    fn fly(&mut self, args: &DemoArgs, stage: &Stage, keys: &Keys) -> Result<Flown> {
-        let page = format!("127.0.0.1:{}", args.port);
+    fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<Flown> {
+        let lab = flight.lab;
+        let page = format!("127.0.0.1:{}", lab.port);
         let serve: Vec<OsString> = vec![
             "serve".into(),
             stage.arena.clone().into(),
@@ -141,35 +167,43 @@ impl Show {
             // The simulator's, whoever else the arena names.
             "--vehicle=vizflyt".into(),
             format!("--http={page}").into(),
-            format!("--renderer={}", args.renderer).into(),
+            format!("--renderer={}", lab.renderer).into(),
+            self.log_level.clone(),
         ];
         let Some(server) = self.start(Role::Server, &serve)? else {
             return Ok(Flown::Interrupted);
         };
         let url = text(&server, "http")?;
-        tell(format!(
-            "renderer    {} ({})",
-            text(&server, "renderer")?,
-            text(&server, "renderer_reason")?
-        ));
-        tell(format!("page        {url}"));
-        if !args.headless {
+        if self.json {
+            print_line(&json!({"ready": "lab", "http": url}).to_string());
+        } else {
+            tell(format!(
+                "renderer    {} ({})",
+                text(&server, "renderer")?,
+                text(&server, "renderer_reason")?
+            ));
+            tell(format!("page        {url}"));
+        }
+        if !lab.headless {
             open_browser(&url);
         }
 
         keys.note_server(&text(&server, "quic")?)?;
-        let mut fly: Vec<OsString> = vec![
-            "fly".into(),
-            args.plugin.clone().into(),
+        let mut fly: Vec<OsString> = vec!["fly".into()];
+        fly.extend(flight.fly.iter().cloned());
+        fly.extend([
             "--json".into(),
             "--lifeline".into(),
             format!("--server={}", text(&server, "quic")?).into(),
             keys.option(),
             "--mavlink=udpin:127.0.0.1:0".into(),
-            format!("--log={}", args.log.display()).into(),
-        ];
-        if let Some(seconds) = args.seconds {
-            fly.push(format!("--seconds={seconds}").into());
+            "--vehicle=vizflyt".into(),
+            format!("--log={}", flight.log.display()).into(),
+            self.log_level.clone(),
+        ]);
+        if !flight.plugin_arguments.is_empty() {
+            fly.push("--".into());
+            fly.extend(flight.plugin_arguments.iter().cloned());
         }
         let Some(runtime) = self.start(Role::Runtime, &fly)? else {
             return Ok(Flown::Interrupted);
@@ -182,7 +216,8 @@ impl Show {
             format!("--mavlink=udpout:{}", text(&runtime, "mavlink")?).into(),
             format!("--vicon={}", text(&server, "vicon")?).into(),
             format!("--spawn={}", stage.spawn).into(),
-            format!("--seed={}", args.seed).into(),
+            format!("--seed={}", lab.seed()).into(),
+            self.log_level.clone(),
         ];
         if let Some(truth) = &stage.truth {
             sim.push("--truth".into());
@@ -198,10 +233,9 @@ impl Show {
         }
     }
 
-    /// Starts a child and returns its `ready` line; `None` if a person ends the demo meanwhile.
+    /// Starts a child and returns its `ready` line; `None` if a person ends it meanwhile.
     fn start(&mut self, role: Role, args: &[OsString]) -> Result<Option<Value>> {
-        let args: Vec<_> = args.iter().chain([&self.log_level]).cloned().collect();
-        let child = Child::start(role, &args, &self.notices)?;
+        let child = Child::start(role, args, &self.notices)?;
         self.children.push((role, child));
         let deadline = Instant::now() + READY_LIMIT;
         loop {
@@ -225,7 +259,7 @@ impl Show {
         }
     }
 
-    /// Prints events until the runtime ends; false if a person ends the demo first.
+    /// Prints events until the runtime ends; false if a person ends it first.
     fn watch(&mut self) -> bool {
         loop {
             match self.inbox.recv() {
@@ -233,7 +267,7 @@ impl Show {
                 Ok(Notice::Closed(Role::Runtime)) => return true,
                 // The runtime notices a dead server or vehicle by itself, and lands: let it.
                 Ok(Notice::Closed(from)) => {
-                    tell(format!("            the {} has ended", from.name()));
+                    self.screen.line(&format!("            the {} has ended", from.name()));
                 }
                 Ok(Notice::Interrupted) | Err(_) => return false,
             }
@@ -250,15 +284,28 @@ impl Show {
             } = report.clone();
         }
         // The server repeats to its page what the runtime says: take each from its source.
-        if from == Role::Runtime
-            && let Some(sentence) = line["event"]["text"].as_str()
+        if from != Role::Runtime {
+            return;
+        }
+        if self.json {
+            // The report comes later, joined.
+            if line.get("report").is_none() {
+                print_line(&line.to_string());
+            }
+        } else if let Some(sentence) = line["event"]["text"].as_str() {
+            self.screen.event(&format!("            {sentence}"));
+        } else if let (Some(tick), Some(text)) =
+            (line["plugin"]["tick"].as_u64(), line["plugin"]["line"].as_str())
         {
-            tell(format!("            {sentence}"));
+            self.screen.line(&format!("            tick {tick} | {text}"));
+        } else if let Ok(status) = Status::deserialize(&line["status"]) {
+            self.screen.status(&status);
         }
     }
 
     /// Ends every child and keeps the reports they print on the way out.
     fn end(&mut self) {
+        self.screen.end();
         let deadline = Instant::now() + END_LIMIT;
         for (_, child) in &mut self.children {
             child.ask_to_end();
@@ -313,26 +360,4 @@ fn interrupt_notices(notices: Sender<Notice>) -> Result<()> {
         });
     });
     Ok(())
-}
-
-/// Prints a line for people; unlike `println!` it does not panic when nobody reads any more.
-pub(crate) fn tell(line: impl std::fmt::Display) {
-    use std::io::Write;
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
-}
-
-/// Opens the page where there is a desktop; the address is printed in any case.
-pub(crate) fn open_browser(url: &str) {
-    let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
-    let quiet = std::process::Stdio::null;
-    let spawned = std::process::Command::new(opener)
-        .arg(url)
-        .stdin(quiet())
-        .stdout(quiet())
-        .stderr(quiet())
-        .spawn();
-    if spawned.is_err() {
-        tell("            open it in a browser");
-    }
 }

@@ -1,5 +1,5 @@
-//! Pairs the demo's server and runtime: the same files that pairing by hand writes, in a folder that
-//! ends with the demo.
+//! Pairs the simulated lab's server and runtime: the same files that pairing by hand writes, in a folder that
+//! ends with the flight.
 
 use std::ffi::OsString;
 
@@ -15,17 +15,17 @@ pub(crate) struct Keys {
 }
 
 impl Keys {
-    /// Makes both identities, and gives the runtime the demo's vehicle.
+    /// Makes both identities, and gives the runtime the vehicle.
     pub(crate) fn make() -> Result<Self> {
         let scratch = tempfile::Builder::new()
             .prefix("vizflyt-keys-")
             .tempdir()
-            .context("cannot make a folder for the demo's keys")?;
+            .context("cannot make a folder for its keys")?;
         let folder = KeysFolder::open(Some(&scratch.path().join("keys")))?;
         let server = Identity::keep(&folder, Owner::Server)?;
         let runtime = Identity::keep(&folder, Owner::Runtime)?;
         let client = Client {
-            name: "demo".to_owned(),
+            name: "simulated lab".to_owned(),
             fingerprint: runtime.fingerprint(),
             role: Role::Team,
             vehicles: vec![VEHICLE.to_owned()],

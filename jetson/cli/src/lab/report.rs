@@ -1,11 +1,11 @@
-//! The demo's report: what the runtime, the server and the simulator each measured, in one JSON
+//! The report of a flight in the simulated lab: what the runtime, the server and the simulator each measured, in one JSON
 //! object.
 
 use anyhow::{Context, Result};
 use serde::Serialize;
 use serde_json::Value;
 
-/// One flight of the demo. Written by `--report`.
+/// One flight. Written by `--report`.
 #[derive(Clone, Debug, Serialize, PartialEq)]
 pub(crate) struct Report {
     /// `finished`, `collided`, `geofence`, `timeout`, `landed`, `plugin_failed` or `error`.

@@ -1,0 +1,57 @@
+//! `vizflyt demo`: the built-in example in the simulated lab, and its page in the browser.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+
+use crate::lab::{self, LabArgs, LabFlight};
+use crate::terminal::tell;
+
+/// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt demo                                  fly the forest and watch it in the browser
+  vizflyt demo --scene race --seed 3            another scene, another course
+  vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
+  vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
+pub(crate) struct DemoArgs {
+    #[command(flatten)]
+    lab: LabArgs,
+    /// Plugin to fly: whatever `vizflyt fly` takes.
+    #[arg(long, default_value = "avoid")]
+    plugin: String,
+    /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]
+    #[arg(long)]
+    seconds: Option<f64>,
+    /// Writes the flight's figures to this file as JSON.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Folder for the flight log.
+    #[arg(long, value_name = "DIR", default_value = "flights")]
+    log: PathBuf,
+}
+
+/// Runs the demo; success only if the flight finished.
+pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
+    // The demo is the same on every computer: nobody's jetson.toml counts.
+    let mut fly = vec![args.plugin.clone().into(), "--no-config".into()];
+    if let Some(seconds) = args.seconds {
+        fly.push(format!("--seconds={seconds}").into());
+    }
+    let flight = LabFlight {
+        lab: &args.lab,
+        fly,
+        plugin_arguments: &[],
+        log: &args.log,
+        json: false,
+        log_level,
+    };
+    let Some(report) = lab::fly(&flight)? else { return Ok(ExitCode::FAILURE) };
+    if let Some(path) = &args.report {
+        report.write(path)?;
+    }
+    tell(report.summary());
+    Ok(if report.outcome == "finished" { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}

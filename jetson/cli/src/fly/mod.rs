@@ -1,0 +1,159 @@
+//! `vizflyt fly PLUGIN`: the same command in the simulated lab and in the real one. Which of the two
+//! it is, one line says before anything is armed.
+
+pub(crate) mod plugin;
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde_json::json;
+use vizflyt_runtime::control::print_line;
+
+use crate::lab::{self, LabArgs, LabFlight};
+use crate::terminal::tell;
+use plugin::Plugin;
+
+/// Flies a plugin: in the simulated lab, or in the real one if `jetson.toml` or --server names a
+/// render server.
+///
+/// PLUGIN is a folder made by `vizflyt new`, a `.py` file, a Cargo project, a program, or the name
+/// of a built-in (avoid).
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:
+  vizflyt new first --lang python && vizflyt fly first     your own plugin in the simulated lab
+  vizflyt fly avoid --scene race --seed 3                  the built-in example, another scene
+  vizflyt fly first --headless --seconds 20 --report r.json
+                                                           figures; status 0 if finished or landed
+  vizflyt fly first --server 192.168.10.2:4433 --mavlink udpin:0.0.0.0:14550
+                                                           the real lab
+
+The vehicle lands when the plugin ends, hangs or is killed, when poses stop, and on Ctrl-C.
+What the command line leaves out, jetson.toml says.")]
+pub(crate) struct FlyArgs {
+    #[command(flatten)]
+    runtime: vizflyt_runtime::FlyArgs,
+    /// Flies the simulated lab even where jetson.toml names a real one.
+    #[arg(long, conflicts_with = "at")]
+    sim: bool,
+    #[command(flatten, next_help_heading = "The simulated lab")]
+    lab: LabArgs,
+}
+
+/// Flies; success only if the flight finished or landed as asked.
+pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
+    let file = args.runtime.settle()?;
+    let name = args.runtime.plugin.clone().unwrap_or_default();
+    let plugin = Plugin::find(&name)?;
+    // Whoever started us has said which lab it is.
+    if args.runtime.server.at.is_some() && !args.sim {
+        fly_real(&args, &plugin, file.as_deref())
+    } else {
+        fly_simulated(&mut args, &plugin, file.as_deref(), log_level)
+    }
+}
+
+fn fly_real(args: &FlyArgs, plugin: &Plugin, file: Option<&Path>) -> Result<ExitCode> {
+    let runtime = &args.runtime;
+    if args.lab.scene.is_some() || args.lab.seed.is_some() {
+        bail!("--scene and --seed are for the simulated lab; add --sim to fly there");
+    }
+    let mut command = plugin.command()?;
+    command.extend(runtime.plugin_arguments.iter().cloned());
+    // A parent has said which lab it is.
+    if !runtime.lifeline {
+        let server = runtime.server.address()?;
+        let from = file.map_or("the command line".into(), |file| file.display().to_string());
+        say_lab(
+            runtime.json,
+            "real",
+            &format!(
+                "server {server}, vehicle {} on {}, by {from}; propellers will turn",
+                runtime.vehicle_name(),
+                runtime.mavlink_address(),
+            ),
+        );
+    }
+    let outcome = vizflyt_runtime::fly_command(runtime, command)?;
+    Ok(if outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn fly_simulated(
+    args: &mut FlyArgs,
+    plugin: &Plugin,
+    file: Option<&Path>,
+    log_level: &str,
+) -> Result<ExitCode> {
+    let runtime = &args.runtime;
+    // By the command line only: the file may well name the vehicle of another day.
+    for (given, option) in [
+        (runtime.server.fingerprint.is_some() && !args.sim, "--fingerprint"),
+        (runtime.server.keys.is_some() && !args.sim, "--keys"),
+        (runtime.mavlink.is_some() && runtime.jetson.vehicle.mavlink.is_none(), "--mavlink"),
+        (runtime.vehicle.is_some() && runtime.jetson.vehicle.name.is_none(), "--vehicle"),
+    ] {
+        if given {
+            bail!(
+                "{option} is for the real lab, and no server is known; give --server, or [server] \
+                 in jetson.toml"
+            );
+        }
+    }
+    // What is built here is not built again behind the server's back.
+    plugin.command()?;
+    if let Some(lab) = plugin.lab() {
+        args.lab.scene = args.lab.scene.take().or_else(|| lab.scene.clone());
+        args.lab.seed = args.lab.seed.or(lab.seed);
+    }
+    say_lab(runtime.json, "simulated", "all on this computer; nothing can break");
+    let mut fly = vec![
+        plugin.name().to_owned(),
+        format!("--seconds={}", runtime.seconds).into(),
+        format!("--ready-within={}", runtime.ready_within).into(),
+    ];
+    if let Some(address) = runtime.foxglove {
+        fly.push(format!("--foxglove={address}").into());
+    }
+    match file {
+        Some(file) => fly.extend(["--config".into(), file.into()]),
+        None => fly.push("--no-config".into()),
+    }
+    let flight = LabFlight {
+        lab: &args.lab,
+        fly,
+        plugin_arguments: &runtime.plugin_arguments,
+        log: &runtime.log,
+        json: runtime.json,
+        log_level,
+    };
+    let Some(report) = lab::fly(&flight)? else { return Ok(ExitCode::FAILURE) };
+    if let Some(path) = &runtime.report {
+        report.write(path)?;
+    }
+    if runtime.json {
+        print_line(&json!({"report": report}).to_string());
+    } else {
+        tell(report.summary());
+    }
+    let is_good = matches!(report.outcome.as_str(), "finished" | "landed");
+    Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// The one line that says which of the two labs it is.
+fn say_lab(json: bool, which: &str, what: &str) {
+    if json {
+        print_line(&json!({"lab": which, "text": what}).to_string());
+    } else {
+        tell(format!("lab         {which}: {what}"));
+    }
+}
+
+/// Returns the folder of this program's sources, if it is still there: where a plugin gets the SDK.
+pub(crate) fn sources() -> Result<std::path::PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("/"));
+    if !root.join("jetson/sdk/Cargo.toml").is_file() {
+        bail!("the sources that this program was built from are no longer at {}", root.display());
+    }
+    root.canonicalize().with_context(|| format!("cannot resolve {}", root.display()))
+}

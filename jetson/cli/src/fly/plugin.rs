@@ -1,0 +1,297 @@
+//! What PLUGIN is, and the command that starts it.
+//!
+//! ```text
+//! avoid                 a built-in: this program again, as `vizflyt plugin avoid`
+//! first/                by first/vizflyt.toml (made by `vizflyt new`); or a Cargo project; or plugin.py
+//! first/plugin.py       the python3 of its own .venv, else the one on PATH
+//! target/release/first  a program; a bare name is looked up on PATH
+//! ```
+
+use std::ffi::{OsStr, OsString};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail};
+use serde_json::Value;
+
+use super::sources;
+use crate::plugins::{BuiltIn, is_built_in};
+use crate::project::{LabConfig, Project};
+
+/// A plugin that was found.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Plugin {
+    name: OsString,
+    kind: Kind,
+    lab: Option<LabConfig>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Kind {
+    BuiltIn,
+    /// A file of Python.
+    Script(PathBuf),
+    /// The folder of a Cargo.toml.
+    Cargo(PathBuf),
+    Program,
+}
+
+impl Plugin {
+    /// Finds out what `name` is. Starts and builds nothing.
+    ///
+    /// # Errors
+    /// If it is nothing that can be flown.
+    pub(crate) fn find(name: &OsStr) -> Result<Self> {
+        let found = |kind, lab| Ok(Self { name: name.to_owned(), kind, lab });
+        let path = Path::new(name);
+        let is_bare = path.components().count() == 1 && !name.to_string_lossy().contains('/');
+        if is_bare && is_built_in(&name.to_string_lossy()) {
+            return found(Kind::BuiltIn, None);
+        }
+        if path.is_dir() {
+            if let Some(project) = Project::read(path)? {
+                return found(kind_of(&project.plugin)?, Some(project.lab));
+            }
+            for file in ["Cargo.toml", "plugin.py"] {
+                if path.join(file).is_file() {
+                    return found(kind_of(&path.join(file))?, None);
+                }
+            }
+            bail!(
+                "{} is a folder without vizflyt.toml, Cargo.toml or plugin.py; `vizflyt new NAME` \
+                 makes one that flies",
+                path.display()
+            );
+        }
+        if path.is_file() {
+            return found(kind_of(path)?, None);
+        }
+        if is_bare && on_path(name) {
+            return found(Kind::Program, None);
+        }
+        bail!(
+            "there is no plugin at {}; give a folder made by `vizflyt new`, a .py file, a program, \
+             or a built-in: {}",
+            path.display(),
+            BuiltIn::names()
+        )
+    }
+
+    /// Returns what the command line called it.
+    pub(crate) fn name(&self) -> &OsStr {
+        &self.name
+    }
+
+    /// Returns the simulated lab that its project asks for.
+    pub(crate) fn lab(&self) -> Option<&LabConfig> {
+        self.lab.as_ref()
+    }
+
+    /// Returns the command that starts it; a Cargo project is built first.
+    ///
+    /// # Errors
+    /// A build that fails, a Python without the package `vizflyt`.
+    pub(crate) fn command(&self) -> Result<Vec<OsString>> {
+        match &self.kind {
+            Kind::BuiltIn => {
+                let program = std::env::current_exe().context("cannot find this program's path")?;
+                Ok(vec![program.into(), "plugin".into(), self.name.clone()])
+            }
+            Kind::Program => Ok(vec![self.name.clone()]),
+            Kind::Cargo(folder) => Ok(vec![build(folder)?.into()]),
+            Kind::Script(script) => {
+                let python = python_of(script);
+                check_python(&python, script)?;
+                // Unbuffered: a print is seen when it is made, not when 8 kB are full.
+                Ok(vec![python.into(), "-u".into(), script.into()])
+            }
+        }
+    }
+}
+
+/// Returns what an existing file is.
+fn kind_of(path: &Path) -> Result<Kind> {
+    use std::os::unix::fs::PermissionsExt;
+    if !path.is_file() {
+        bail!("there is no file {}", path.display());
+    }
+    if path.file_name() == Some(OsStr::new("Cargo.toml")) {
+        return Ok(Kind::Cargo(path.parent().unwrap_or(Path::new(".")).to_owned()));
+    }
+    if path.extension() == Some(OsStr::new("py")) {
+        return Ok(Kind::Script(path.to_owned()));
+    }
+    let mode = path.metadata().with_context(|| format!("{}", path.display()))?.permissions().mode();
+    if mode & 0o111 == 0 {
+        bail!("{0} is neither a .py file nor a program; try `chmod +x {0}`", path.display());
+    }
+    Ok(Kind::Program)
+}
+
+fn on_path(name: &OsStr) -> bool {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
+}
+
+/// Returns the interpreter of the script's own virtual environment, else the one on PATH.
+fn python_of(script: &Path) -> PathBuf {
+    let own = script.parent().unwrap_or(Path::new("")).join(".venv/bin/python3");
+    if own.exists() { own } else { "python3".into() }
+}
+
+/// Finds out whether the plugin will find the package, before anything is started for it.
+fn check_python(python: &Path, script: &Path) -> Result<()> {
+    let folder = script.parent().unwrap_or(Path::new(""));
+    if folder.join("vizflyt.py").exists() {
+        bail!(
+            "{} hides the package vizflyt from your plugin; give the file another name",
+            folder.join("vizflyt.py").display()
+        );
+    }
+    // The script's own folder is the first that Python looks in.
+    let output = Command::new(python)
+        .args(["-c", "import sys; sys.path.insert(0, sys.argv[1]); import vizflyt; vizflyt.run"])
+        .arg(if folder == Path::new("") { Path::new(".") } else { folder })
+        .stdin(Stdio::null())
+        .output();
+    let output = match output {
+        Ok(output) => output,
+        Err(error) => bail!(
+            "{} is written in Python, and {} cannot be started: {error}; on Debian and Ubuntu: \
+             sudo apt install python3 python3-venv",
+            script.display(),
+            python.display()
+        ),
+    };
+    if output.status.success() {
+        return Ok(());
+    }
+    let words = String::from_utf8_lossy(&output.stderr);
+    let last = words.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
+    let venv = folder.join(".venv");
+    let package = match sources() {
+        Ok(root) => root.join("jetson/python").display().to_string(),
+        Err(_) => "vizflyt".to_owned(),
+    };
+    bail!(
+        "{} cannot import the package vizflyt ({last}); install it with `python3 -m venv {venv} && \
+         {venv}/bin/pip install {package}`",
+        python.display(),
+        venv = venv.display(),
+    )
+}
+
+/// Builds a Cargo project and returns its program. Cargo's own messages go to standard error.
+fn build(folder: &Path) -> Result<PathBuf> {
+    let mut cargo = Command::new("cargo")
+        .args(["build", "--release", "--message-format=json-render-diagnostics"])
+        .current_dir(folder)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .spawn()
+        .with_context(|| {
+            format!("cannot start cargo to build {}; rustup.rs installs it", folder.display())
+        })?;
+    let mut messages = String::new();
+    if let Some(mut stdout) = cargo.stdout.take() {
+        stdout.read_to_string(&mut messages).context("cannot read what cargo says")?;
+    }
+    if !cargo.wait().context("cannot wait for cargo")?.success() {
+        bail!("{} does not build; see the compiler's message above", folder.display());
+    }
+    let programs = programs(&messages);
+    match programs.as_slice() {
+        [program] => Ok(program.clone()),
+        [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
+        several => bail!(
+            "{} builds {} programs; fly one of them by its path, such as {}",
+            folder.display(),
+            several.len(),
+            several[0].display()
+        ),
+    }
+}
+
+/// Returns the programs that cargo's messages tell of.
+fn programs(messages: &str) -> Vec<PathBuf> {
+    let artifact = |line: &str| {
+        let message: Value = serde_json::from_str(line).ok()?;
+        let is_program = message["target"]["kind"].as_array()?.contains(&Value::from("bin"));
+        message["executable"].as_str().filter(|_| is_program).map(PathBuf::from)
+    };
+    messages.lines().filter_map(artifact).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    fn refused(name: &Path, parts: &[&str]) {
+        let error = format!("{:#}", Plugin::find(name.as_os_str()).unwrap_err());
+        for part in parts {
+            assert!(error.contains(part), "{} does not say {part:?}: {error}", name.display());
+        }
+    }
+
+    #[test]
+    fn plugins_are_told_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;
+        assert_eq!(kind(Path::new("avoid")), Kind::BuiltIn);
+        assert_eq!(kind(Path::new("sh")), Kind::Program, "on PATH");
+        refused(&path("none"), &["there is no plugin at", "none", "avoid"]);
+        refused(Path::new("no-such-program"), &["there is no plugin at no-such-program"]);
+        refused(folder.path(), &["folder without", "vizflyt new"]);
+
+        fs::write(path("plugin.py"), "").unwrap();
+        assert_eq!(kind(folder.path()), Kind::Script(path("plugin.py")));
+        assert_eq!(kind(&path("plugin.py")), Kind::Script(path("plugin.py")));
+        fs::write(path("Cargo.toml"), "").unwrap();
+        assert_eq!(kind(folder.path()), Kind::Cargo(folder.path().to_owned()));
+        fs::write(path("vizflyt.toml"), "plugin = \"plugin.py\"\n[lab]\nscene = \"room\"\n")
+            .unwrap();
+        let plugin = Plugin::find(folder.path().as_os_str()).unwrap();
+        assert_eq!(plugin.kind, Kind::Script(path("plugin.py")));
+        assert_eq!(plugin.lab().unwrap().scene.as_deref(), Some("room"));
+
+        fs::write(path("notes.txt"), "").unwrap();
+        refused(&path("notes.txt"), &["neither", "chmod +x"]);
+        fs::write(path("vizflyt.toml"), "plugin = \"gone.py\"\n").unwrap();
+        refused(folder.path(), &["no file", "gone.py"]);
+        fs::write(path("vizflyt.toml"), "plugins = \"gone.py\"\n").unwrap();
+        refused(folder.path(), &["vizflyt.toml", "did you mean 'plugin'"]);
+    }
+
+    #[test]
+    fn a_folder_with_its_own_python_uses_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        assert_eq!(python_of(&script), Path::new("python3"));
+        fs::create_dir_all(folder.path().join(".venv/bin")).unwrap();
+        let own = folder.path().join(".venv/bin/python3");
+        fs::write(&own, "").unwrap();
+        assert_eq!(python_of(&script), own);
+    }
+
+    #[test]
+    fn a_file_called_like_the_package_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        fs::write(folder.path().join("vizflyt.py"), "").unwrap();
+        let error = check_python(Path::new("python3"), &script).unwrap_err().to_string();
+        assert!(error.contains("vizflyt.py hides the package"), "{error}");
+    }
+
+    #[test]
+    fn programs_are_found_in_what_cargo_says() {
+        let text = "noise\n{\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"lib\"]}}\n\
+            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"custom-build\"]},\"executable\":\"/b\"}\n\
+            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"bin\"]},\"executable\":\"/t/first\"}\n\
+            {\"reason\":\"build-finished\",\"success\":true}\n";
+        assert_eq!(programs(text), [PathBuf::from("/t/first")]);
+        assert!(programs("").is_empty());
+    }
+}

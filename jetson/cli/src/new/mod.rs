@@ -1,0 +1,218 @@
+//! `vizflyt new NAME`: a folder with a plugin that flies, its test, and what an editor needs.
+//!
+//! The files are the ones under `jetson/cli/templates`, with the names filled in.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+
+use crate::fly::sources;
+use crate::plugins::BuiltIn;
+use crate::project;
+use crate::terminal::tell;
+
+/// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt new first --lang python      then: vizflyt fly first
+  vizflyt new ../second --lang rust")]
+pub(crate) struct NewArgs {
+    /// The folder to make; its last part names the plugin
+    #[arg(value_name = "NAME")]
+    path: PathBuf,
+    /// What it is written in
+    #[arg(long, value_enum)]
+    lang: Language,
+    /// The course's project that it is for: its scene, gates and rules
+    #[arg(long, value_name = "NAME")]
+    project: Option<String>,
+}
+
+/// A language of plugins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Language {
+    /// plugin.py
+    Python,
+    /// src/main.rs
+    Rust,
+}
+
+/// Makes the folder.
+pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
+    let name = name_of(&args.path)?;
+    let scene = match &args.project {
+        Some(project) => {
+            let roots: Vec<PathBuf> = sources().into_iter().collect();
+            project::course(project, &roots)?.display().to_string()
+        }
+        None => "forest".to_owned(),
+    };
+    if args.path.exists() {
+        bail!("{} is there already; give another name, or delete it", args.path.display());
+    }
+    let folder = args.path.display().to_string();
+    let files = match args.lang {
+        Language::Python => python(&name, &folder, &scene)?,
+        Language::Rust => rust(&name, &folder, &scene)?,
+    };
+    for (file, text) in files {
+        let path = args.path.join(file);
+        let write = || {
+            fs::create_dir_all(path.parent().unwrap_or(&args.path))?;
+            fs::write(&path, text)
+        };
+        write().with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    tell(format!("{folder} is made; now"));
+    if args.lang == Language::Python {
+        tell(format!(
+            "  python3 -m venv {folder}/.venv && {folder}/.venv/bin/pip install -r \
+             {folder}/requirements.txt"
+        ));
+    }
+    tell(format!("  vizflyt fly {folder}"));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// A file of the folder, and its text.
+type File = (&'static str, String);
+
+fn python(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
+    let package = sources()?.join("jetson/python").display().to_string();
+    let fill = |text: &str| {
+        let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
+        text.replace("{{class}}", &class(name)).replace("{{package}}", &package)
+    };
+    Ok(vec![
+        ("plugin.py", fill(include_str!("../../templates/python/plugin.py"))),
+        ("test_plugin.py", fill(include_str!("../../templates/python/test_plugin.py"))),
+        ("README.md", fill(include_str!("../../templates/python/README.md"))),
+        ("requirements.txt", fill(include_str!("../../templates/python/requirements.txt"))),
+        ("pyrightconfig.json", fill(include_str!("../../templates/python/pyrightconfig.json"))),
+        (".vscode/settings.json", fill(include_str!("../../templates/python/settings.json"))),
+        (".gitignore", fill(include_str!("../../templates/python/gitignore"))),
+        (project::FILE, lab("plugin.py", scene)),
+    ])
+}
+
+fn rust(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
+    // As JSON: a path in TOML is quoted alike.
+    let sdk = format!("path = {:?}", sources()?.join("jetson/sdk").display().to_string());
+    let fill = |text: &str| {
+        let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
+        text.replace("{{class}}", &class(name)).replace("{{sdk}}", &sdk)
+    };
+    Ok(vec![
+        ("Cargo.toml", fill(include_str!("../../templates/rust/Cargo.toml"))),
+        // The versions that the SDK is tested with; cargo drops what the plugin does not need.
+        ("Cargo.lock", include_str!("../../../../Cargo.lock").to_owned()),
+        ("src/main.rs", fill(include_str!("../../templates/rust/main.rs"))),
+        ("README.md", fill(include_str!("../../templates/rust/README.md"))),
+        (".vscode/settings.json", fill(include_str!("../../templates/rust/settings.json"))),
+        (".gitignore", fill(include_str!("../../templates/rust/gitignore"))),
+        (project::FILE, lab("Cargo.toml", scene)),
+    ])
+}
+
+fn lab(plugin: &str, scene: &str) -> String {
+    let text = include_str!("../../templates/vizflyt.toml");
+    text.replace("{{plugin}}", plugin).replace("{{scene}}", &format!("{scene:?}"))
+}
+
+/// Returns the plugin's name, if it can be one: of a folder, a crate and a class at once.
+fn name_of(path: &Path) -> Result<String> {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let is_good = name.starts_with(|c: char| c.is_ascii_alphabetic())
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-')
+        && name.len() <= MAX_NAME_BYTES;
+    if !is_good {
+        bail!(
+            "'{name}' is no name for a plugin: a letter, then letters, digits, - and _, at most \
+             {MAX_NAME_BYTES}"
+        );
+    }
+    if BuiltIn::from_str(&name, true).is_ok() {
+        bail!("'{name}' is a built-in plugin; give yours another name");
+    }
+    let words = [name.to_ascii_lowercase(), class(&name)];
+    if words.iter().any(|word| TAKEN.contains(&word.as_str())) {
+        bail!("'{name}' is the name of something that your plugin needs; give yours another");
+    }
+    Ok(name)
+}
+
+/// As long as an arena's names.
+const MAX_NAME_BYTES: usize = 32;
+/// Names that cargo refuses, or that would hide what the plugin imports.
+const TAKEN: [&str; 18] = [
+    "vizflyt",
+    "vizflyt-sdk",
+    "vizflyt_sdk",
+    "test",
+    "core",
+    "std",
+    "alloc",
+    "numpy",
+    "plugin",
+    "self",
+    "Autonomy",
+    "Axes",
+    "CameraImage",
+    "Event",
+    "Observation",
+    "Option",
+    "Setpoint",
+    "YawTarget",
+];
+
+/// Returns the name as a class: `my-first_plugin` is `MyFirstPlugin`.
+fn class(name: &str) -> String {
+    let word = |word: &str| {
+        let mut letters = word.chars();
+        let first = letters.next().map(|c| c.to_ascii_uppercase());
+        first.into_iter().chain(letters).collect::<String>()
+    };
+    name.split(['-', '_']).map(word).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_checked() {
+        let check = |name: &str, good: bool| {
+            assert_eq!(name_of(Path::new(name)).is_ok(), good, "{name}");
+        };
+        check("first", true);
+        check("../my-first_2", true);
+        for name in ["", "..", "/", "2nd", "-x", "a b", "ä", "avoid", "vizflyt", "Test", "event"] {
+            check(name, false);
+        }
+        check(&"a".repeat(33), false);
+    }
+
+    #[test]
+    fn classes_are_camel_case() {
+        for (name, expected) in
+            [("first", "First"), ("my-first_plugin", "MyFirstPlugin"), ("a--b", "AB"), ("aB", "AB")]
+        {
+            assert_eq!(class(name), expected);
+        }
+    }
+
+    #[test]
+    fn every_blank_is_filled_and_the_readme_has_ten_lines() {
+        let both = [python("a-b", "x/a-b", "room").unwrap(), rust("a-b", "x/a-b", "room").unwrap()];
+        for (file, text) in both.iter().flatten() {
+            assert!(!text.contains("{{"), "{file}: {text}");
+            assert!(!text.is_empty(), "{file}");
+            if *file == "README.md" {
+                assert!(text.lines().count() <= 10, "{text}");
+            }
+        }
+    }
+}

@@ -1,0 +1,276 @@
+//! What a person sees of a flight in a terminal: events as lines, and below them one line that is
+//! kept up to date. Where there is no terminal, plain lines: every event, and now and then the
+//! status.
+//!
+//! [`Console`] is pure: it returns what to write. [`Screen`] writes it.
+
+use std::io::{IsTerminal, Write};
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::{FlightPhase, Telemetry};
+
+/// What the status line tells.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Status {
+    /// Where the flight stands.
+    pub phase: FlightPhase,
+    /// Battery left, 0 to 1; `None` if unknown.
+    pub battery_fraction: Option<f32>,
+    /// Images handed to the plugin. [Hz]
+    pub image_hz: f32,
+    /// Pose stamp to plugin callback, median of the last second. [ms]
+    pub age_ms: f32,
+    /// Time inside the plugin's `on_image`, median of the last second. [ms]
+    pub plugin_ms: f32,
+}
+
+impl Status {
+    /// Returns the part of a report that people watch.
+    pub fn of(telemetry: &Telemetry) -> Self {
+        let battery = telemetry.vehicle.battery_fraction;
+        Self {
+            phase: telemetry.phase,
+            battery_fraction: (battery >= 0.0).then_some(battery),
+            image_hz: telemetry.images.rate_hz,
+            age_ms: telemetry.images.age_ms_p50,
+            plugin_ms: telemetry.images.plugin_ms_p50,
+        }
+    }
+
+    /// Returns the status as one line.
+    pub fn line(&self) -> String {
+        let battery = match self.battery_fraction {
+            Some(fraction) => format!("{:3.0} %", 100.0 * fraction),
+            None => "  ? %".to_owned(),
+        };
+        format!(
+            "{phase:<10}  battery {battery}  images {hz:5.1} Hz  age {age:5.1} ms  \
+             plugin {plugin:5.1} ms",
+            phase = phase_name(self.phase),
+            hz = self.image_hz,
+            age = self.age_ms,
+            plugin = self.plugin_ms,
+        )
+    }
+}
+
+/// Returns the phase in a word or two.
+pub fn phase_name(phase: FlightPhase) -> &'static str {
+    match phase {
+        FlightPhase::Connecting => "connecting",
+        FlightPhase::Preparing => "preparing",
+        FlightPhase::TakingOff => "taking off",
+        FlightPhase::Flying => "flying",
+        FlightPhase::Holding => "holding",
+        FlightPhase::Landing => "landing",
+        FlightPhase::Landed => "landed",
+    }
+}
+
+/// Where it is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Medium {
+    /// Understands cursor movements.
+    Terminal,
+    /// A file or a pipe.
+    Plain,
+}
+
+/// Plain lines of status come this often at most. [s]
+const PLAIN_EVERY_S: f64 = 5.0;
+/// To column 0, and clear the line.
+const CLEAR: &str = "\r\x1b[2K";
+/// Longer lines are cut, not wrapped: a wrapped line could not be cleared.
+const WRAP_OFF: &str = "\x1b[?7l";
+/// And back.
+const WRAP_ON: &str = "\x1b[?7h";
+
+/// What is on the screen.
+#[derive(Debug)]
+pub struct Console {
+    medium: Medium,
+    status: Option<Status>,
+    last_event: String,
+    told_at_s: Option<f64>,
+}
+
+impl Console {
+    /// Makes an empty console.
+    pub fn new(medium: Medium) -> Self {
+        Self { medium, status: None, last_event: String::new(), told_at_s: None }
+    }
+
+    /// Returns what to write for a line that stays, such as an event.
+    pub fn line(&mut self, text: &str) -> String {
+        let text = printable(text);
+        let status = self.status_line();
+        match self.medium {
+            Medium::Terminal if self.status.is_some() => format!("{CLEAR}{text}\n{status}"),
+            _ => text + "\n",
+        }
+    }
+
+    /// As [`Console::line`], for something that happened in the flight: the status line repeats the
+    /// last of these.
+    pub fn event(&mut self, text: &str) -> String {
+        self.last_event = printable(text.trim());
+        self.line(text)
+    }
+
+    /// Returns what to write for a new status at `now_s`.
+    pub fn status(&mut self, now_s: f64, status: &Status) -> String {
+        let former = self.status.replace(status.clone());
+        match self.medium {
+            Medium::Terminal => format!("{CLEAR}{}", self.status_line()),
+            Medium::Plain => {
+                let changed = former.is_none_or(|former| former.phase != status.phase);
+                let due = self.told_at_s.is_none_or(|at_s| now_s - at_s >= PLAIN_EVERY_S);
+                if !(changed || due) {
+                    return String::new();
+                }
+                self.told_at_s = Some(now_s);
+                format!("{}\n", status.line())
+            }
+        }
+    }
+
+    /// Returns what to write when the flight is over: the status line goes.
+    pub fn end(&mut self) -> String {
+        match (self.medium, self.status.take()) {
+            (Medium::Terminal, Some(_)) => CLEAR.to_owned(),
+            _ => String::new(),
+        }
+    }
+
+    fn status_line(&self) -> String {
+        let Some(status) = &self.status else { return String::new() };
+        // The cursor stays at the start, so that whatever else is printed begins there.
+        format!("{WRAP_OFF}{}  | {}{WRAP_ON}\r", status.line(), self.last_event)
+    }
+}
+
+/// A plugin's words must not move the cursor, or set the terminal's title.
+fn printable(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() && c != '\t' { '\u{fffd}' } else { c }).collect()
+}
+
+/// A [`Console`] on standard output.
+#[derive(Debug)]
+pub struct Screen {
+    console: Console,
+    start: Instant,
+}
+
+impl Default for Screen {
+    fn default() -> Self {
+        let is_terminal =
+            std::io::stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
+        let medium = if is_terminal { Medium::Terminal } else { Medium::Plain };
+        Self { console: Console::new(medium), start: Instant::now() }
+    }
+}
+
+impl Screen {
+    /// Prints a line that stays.
+    pub fn line(&mut self, text: &str) {
+        let text = self.console.line(text);
+        write(&text);
+    }
+
+    /// Prints something that happened in the flight.
+    pub fn event(&mut self, text: &str) {
+        let text = self.console.event(text);
+        write(&text);
+    }
+
+    /// Shows a new status.
+    pub fn status(&mut self, status: &Status) {
+        let text = self.console.status(self.start.elapsed().as_secs_f64(), status);
+        write(&text);
+    }
+
+    /// Takes the status line away.
+    pub fn end(&mut self) {
+        let text = self.console.end();
+        write(&text);
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// Unlike `print!` it does not panic when nobody reads any more.
+fn write(text: &str) {
+    if text.is_empty() {
+        return;
+    }
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn flying() -> Status {
+        Status {
+            phase: FlightPhase::Flying,
+            battery_fraction: Some(0.87),
+            image_hz: 59.9,
+            age_ms: 12.34,
+            plugin_ms: 1.04,
+        }
+    }
+
+    const LINE: &str = "flying      battery  87 %  images  59.9 Hz  age  12.3 ms  plugin   1.0 ms";
+
+    #[test]
+    fn a_terminal_keeps_one_line_below_the_events() {
+        let mut console = Console::new(Medium::Terminal);
+        assert_eq!(console.event("taking off"), "taking off\n");
+        let shown = format!("\x1b[?7l{LINE}  | taking off\x1b[?7h\r");
+        assert_eq!(console.status(0.0, &flying()), format!("\r\x1b[2K{shown}"));
+        let shown = format!("\x1b[?7l{LINE}  | the plugin flies\x1b[?7h\r");
+        let expected = format!("\r\x1b[2K  the plugin flies\n{shown}");
+        assert_eq!(console.event("  the plugin flies"), expected);
+        assert_eq!(console.end(), "\r\x1b[2K");
+        assert_eq!(console.end(), "", "once");
+    }
+
+    #[test]
+    fn without_a_terminal_there_are_only_lines() {
+        let mut console = Console::new(Medium::Plain);
+        assert_eq!(console.status(0.0, &flying()), format!("{LINE}\n"));
+        assert_eq!(console.status(0.5, &flying()), "", "nothing new");
+        let holding = Status { phase: FlightPhase::Holding, ..flying() };
+        assert!(console.status(0.6, &holding).starts_with("holding"), "at once");
+        assert_eq!(console.status(5.5, &holding), "");
+        assert!(console.status(5.6, &holding).starts_with("holding"), "every five seconds");
+        assert_eq!(console.event("held"), "held\n");
+        assert_eq!(console.end(), "");
+    }
+
+    #[test]
+    fn a_plugin_cannot_move_the_cursor() {
+        let mut console = Console::new(Medium::Plain);
+        assert_eq!(console.line("\x1b[2Jgone\r\u{7}"), "\u{fffd}[2Jgone\u{fffd}\u{fffd}\n");
+    }
+
+    #[test]
+    fn an_unknown_battery_is_not_an_empty_one() {
+        let telemetry = Telemetry {
+            vehicle: vizflyt_protocol::messages::VehicleState {
+                battery_fraction: -1.0,
+                ..Default::default()
+            },
+            ..Default::default()
+        };
+        let status = Status::of(&telemetry);
+        assert_eq!(status.battery_fraction, None);
+        assert!(status.line().contains("battery   ? %"), "{}", status.line());
+    }
+}

@@ -1,0 +1,194 @@
+//! `vizflyt new` and `vizflyt fly`, as a student uses them: the real binary, the simulated lab.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::Duration;
+
+use serde_json::Value;
+use tempfile::TempDir;
+use vizflyt_e2e::{Demo, root, vizflyt};
+
+/// Loading, baking, arming and climbing, on a loaded machine.
+const AIRBORNE: Duration = Duration::from_secs(90);
+/// A whole flight.
+const FLIGHT: Duration = Duration::from_mins(4);
+/// Building a plugin and what it needs, on a loaded machine.
+const BUILT: Duration = Duration::from_mins(9);
+
+/// A folder of a student's.
+struct Desk(TempDir);
+
+impl Desk {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+    fn write(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.path(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, text).unwrap();
+        path
+    }
+    /// `vizflyt ARGS`, with nothing of this computer's own settings.
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(vizflyt());
+        command.args(args).env("HOME", self.0.path()).env_remove("XDG_CONFIG_HOME");
+        // A student's project is built beside ours: what is the same is not built twice.
+        command.env("CARGO_TARGET_DIR", vizflyt().ancestors().nth(2).unwrap());
+        for folder in ["CARGO_HOME", "RUSTUP_HOME"] {
+            let hidden = format!(".{}", folder.split('_').next().unwrap().to_lowercase());
+            if let Some(home) = std::env::var_os("HOME")
+                && std::env::var_os(folder).is_none()
+            {
+                command.env(folder, Path::new(&home).join(hidden));
+            }
+        }
+        command
+    }
+    fn run(&self, args: &[&str]) -> Output {
+        self.command(args).current_dir(self.0.path()).output().unwrap()
+    }
+    /// Runs, expects failure, and one line of error that contains every part.
+    fn check_refused(&self, args: &[&str], parts: &[&str]) {
+        let output = self.run(args);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success(), "{args:?} succeeded");
+        let error = message.lines().find(|line| line.starts_with("error: ")).unwrap_or_else(|| {
+            panic!("{args:?} says no error: {message}");
+        });
+        for part in parts {
+            assert!(error.contains(part), "{args:?} does not say {part:?}: {message}");
+        }
+    }
+    /// Starts a flight that writes a report here.
+    fn fly(&self, plugin: &Path, args: &[&str]) -> Demo {
+        let mut command = self.command(&["fly", "--headless"]);
+        command.arg(plugin).args(args);
+        command.arg("--report").arg(self.path("report.json"));
+        command.arg("--log").arg(self.path("flights"));
+        Demo::spawn(&mut command)
+    }
+    fn report(&self) -> Value {
+        serde_json::from_str(&std::fs::read_to_string(self.path("report.json")).unwrap()).unwrap()
+    }
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn a_new_rust_plugin_is_tested_and_flies() {
+    let desk = Desk::new();
+    let folder = desk.path("my-first");
+    let made = desk.run(&["new", text(&folder), "--lang", "rust"]);
+    assert!(made.status.success(), "{made:?}");
+    let mut flight = desk.fly(&folder, &["--seconds", "12", "--seed", "4"]);
+    let lab = flight.wait_for("lab ", BUILT);
+    assert!(lab.contains("simulated"), "{lab}");
+    flight.wait_for("plugin flies", AIRBORNE);
+    let code = flight.wait(FLIGHT);
+    let report = desk.report();
+    assert_eq!(report["outcome"], "landed", "{report:#} {:#?}", flight.seen);
+    assert_eq!(code, Some(0));
+    assert!(report["mean_speed_mps"].as_f64().unwrap() > 0.1, "it moves: {report:#}");
+    // Its own test, without a vehicle.
+    let mut cargo = Command::new("cargo");
+    cargo.args(["test", "--release", "-q"]).current_dir(&folder);
+    cargo.env("CARGO_TARGET_DIR", vizflyt().ancestors().nth(2).unwrap());
+    let tested = cargo.output().unwrap();
+    assert!(tested.status.success(), "{}", String::from_utf8_lossy(&tested.stderr));
+}
+
+#[test]
+fn which_lab_it_is_stands_before_everything_else() {
+    let desk = Desk::new();
+    let fingerprint = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+    let config = desk.write(
+        "jetson.toml",
+        &format!(
+            "[server]\naddress = \"127.0.0.1:9\"\nfingerprint = \"{fingerprint}\"\n\
+             [vehicle]\nname = \"red\"\nmavlink = \"udpin:127.0.0.1:0\"\n[plugin]\npath = \"avoid\"\n"
+        ),
+    );
+    // The file in the folder where it is called, without being named.
+    let output = desk.run(&["fly", "--ready-within", "1"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    let first = said.lines().next().unwrap();
+    for part in ["lab ", "real: server 127.0.0.1:9", "vehicle red", "jetson.toml"] {
+        assert!(first.contains(part), "{said}");
+    }
+    assert!(!output.status.success());
+    assert!(said.contains("error: not in the air after 1 s"), "{said}");
+
+    // The same file, and the simulated lab all the same.
+    let mut flight = desk.fly(
+        Path::new("avoid"),
+        &["--config", text(&config), "--sim", "--scene", "room", "--seconds", "2"],
+    );
+    assert!(flight.wait_for("lab ", AIRBORNE).contains("simulated"));
+    flight.wait_for("plugin flies", AIRBORNE);
+    assert_eq!(flight.wait(FLIGHT), Some(0), "{:#?}", flight.seen);
+    assert_eq!(desk.report()["outcome"], "landed");
+}
+
+#[test]
+fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
+    let desk = Desk::new();
+    assert!(desk.run(&["new", "first", "--lang", "python"]).status.success());
+    for file in ["plugin.py", "test_plugin.py", "README.md", "vizflyt.toml", "requirements.txt"] {
+        let text = std::fs::read_to_string(desk.path("first").join(file)).unwrap();
+        assert!(!text.contains("{{"), "{file}: {text}");
+    }
+    let required = std::fs::read_to_string(desk.path("first/requirements.txt")).unwrap();
+    assert!(required.contains(text(&root().join("jetson/python").canonicalize().unwrap())));
+    // A Python without the package: what is missing, and the command that brings it.
+    let python = desk.write(
+        "first/.venv/bin/python3",
+        "#!/bin/sh\necho \"ModuleNotFoundError: No module named 'vizflyt'\" >&2\nexit 1\n",
+    );
+    std::fs::set_permissions(&python, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let parts = ["first/.venv/bin/python3 cannot import", "ModuleNotFoundError", "pip install"];
+    desk.check_refused(&["fly", "first"], &parts);
+}
+
+#[test]
+fn mistakes_are_explained() {
+    let desk = Desk::new();
+    desk.check_refused(&["fly"], &["no plugin given", "[plugin]"]);
+    desk.check_refused(&["fly", "./none"], &["no plugin at ./none", "vizflyt new", "avoid"]);
+    desk.check_refused(&["fly", "none.py"], &["no plugin at none.py"]);
+    desk.write("notes.txt", "");
+    desk.check_refused(&["fly", "notes.txt"], &["chmod +x notes.txt"]);
+    desk.check_refused(
+        &["fly", "avoid", "--mavlink", "udpin:127.0.0.1:0"],
+        &["--mavlink is for the real lab", "--server"],
+    );
+    let with_server = ["fly", "avoid", "--server", "127.0.0.1:9", "--scene", "race"];
+    desk.check_refused(&with_server, &["--scene", "simulated lab", "--sim"]);
+    desk.check_refused(&["fly", "avoid", "--scene", "forrest"], &["forrest", "forest, race"]);
+    desk.write("bad.toml", "[limits]\nmax_sped_mps = 2\n");
+    desk.check_refused(
+        &["fly", "avoid", "--config", "bad.toml"],
+        &["bad.toml: line 2", "did you mean 'max_speed_mps'"],
+    );
+    desk.check_refused(&["fly", "avoid", "--config", "gone.toml"], &["gone.toml"]);
+
+    desk.check_refused(&["new", "2nd", "--lang", "rust"], &["'2nd' is no name"]);
+    desk.check_refused(&["new", "avoid", "--lang", "rust"], &["built-in"]);
+    desk.check_refused(&["new", "x", "--lang", "cobol"], &["cobol"]);
+    desk.check_refused(&["new", "x", "--lang", "rust", "--project", "p99"], &["no project 'p99'"]);
+    assert!(!desk.path("x").exists(), "nothing is left behind");
+    desk.write("full/file", "");
+    desk.check_refused(&["new", "full", "--lang", "python"], &["there already"]);
+    desk.write("projects/p99/arena.toml", "");
+    let made = desk.run(&["new", "x", "--lang", "rust", "--project", "p99"]);
+    assert!(made.status.success(), "{made:?}");
+    let lab = std::fs::read_to_string(desk.path("x/vizflyt.toml")).unwrap();
+    assert!(lab.contains("projects/p99"), "{lab}");
+    desk.write("y/Cargo.toml", "[package]\nname = \"y\"\nversion = \"0.1.0\"\n[workspace]\n");
+    desk.write("y/src/main.rs", "fn main() { not rust }");
+    desk.check_refused(&["fly", "y"], &["y does not build"]);
+}
