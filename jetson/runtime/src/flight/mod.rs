@@ -454,7 +454,7 @@ impl Flight {
         let (asked_s, arena_s) = self.time_limits_s();
         if self.seconds(now) > asked_s.min(arena_s) {
             let (kind, why) = if asked_s < arena_s {
-                (OutcomeKind::Landed, format!("landing after {asked_s} s, as asked"))
+                (OutcomeKind::Landed, format!("the {asked_s} s asked for are over"))
             } else {
                 (OutcomeKind::Timeout, format!("time limit of {arena_s} s reached"))
             };
