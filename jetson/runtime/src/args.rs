@@ -176,9 +176,8 @@ impl ServerArgs {
         let known = Servers::read(&folder)?.fingerprint(&[&at.typed, &resolved]);
         let fingerprint = known.ok_or_else(|| {
             anyhow::anyhow!(
-                "this computer is not paired with the server {0}; run `vizflyt pair {0}` and type \
-                 the code from the server's page",
-                at
+                "this computer is not paired with the server {at}; run `vizflyt pair {at}` and type \
+                 the code from the server's page"
             )
         })?;
         Ok((fingerprint, identity))

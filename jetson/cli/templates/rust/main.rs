@@ -17,7 +17,8 @@ struct {{class}};
 
 impl Autonomy for {{class}} {
     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
-        let height_m = obs.vehicle().map(|vehicle| vehicle.world_from_body.translation_m.z);
+        let pose = obs.vehicle().and_then(|vehicle| vehicle.world_from_body);
+        let height_m = pose.map(|pose| pose.translation_m.z);
         let (v_mps, turn_radps) = steer(&obs.camera("front")?, height_m);
         Some(Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw: YawTarget::Rate(turn_radps) })
     }
