@@ -50,14 +50,15 @@ impl Desk {
     fn run(&self, args: &[&str]) -> Output {
         self.command(args).current_dir(self.0.path()).output().unwrap()
     }
-    /// Runs, expects failure, and one line of error that contains every part.
+    /// Runs, expects failure, and a last line of error that contains every part.
     fn check_refused(&self, args: &[&str], parts: &[&str]) {
         let output = self.run(args);
         let message = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(!output.status.success(), "{args:?} succeeded");
-        let error = message.lines().find(|line| line.starts_with("error: ")).unwrap_or_else(|| {
-            panic!("{args:?} says no error: {message}");
-        });
+        let error =
+            message.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_else(|| {
+                panic!("{args:?} says no error: {message}");
+            });
         for part in parts {
             assert!(error.contains(part), "{args:?} does not say {part:?}: {message}");
         }

@@ -52,7 +52,7 @@ class {{class}}(vizflyt.Plugin):
         return vizflyt.Setpoint.velocity(velocity_mps, axes="heading", yaw_rate=turn_radps)
 
     def on_event(self, event):
-        print(event)
+        print(event.text)
 
 
 if __name__ == "__main__":
