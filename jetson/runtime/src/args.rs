@@ -105,7 +105,7 @@ impl FlyArgs {
             self.mavlink = Some(address.parse().map_err(parse_error)?);
         }
         self.vehicle = self.vehicle.take().or_else(|| vehicle.name.clone());
-        self.limits = self.limits.stricter(&self.jetson.limits.limits());
+        self.limits = self.limits.stricter(&self.jetson.limits.into());
         let named = plugin.path.clone().map(PathBuf::into_os_string);
         self.plugin = self.plugin.take().or(named);
         if self.plugin.is_none() {

@@ -29,7 +29,6 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Limits;
-use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::Fingerprint;
 
 use crate::supervisor::{PluginLimits, Restart};
@@ -103,18 +102,6 @@ impl From<LimitsConfig> for Limits {
             max_acceleration_mps2: config.max_acceleration_mps2.unwrap_or(f64::INFINITY),
             max_tilt_deg: config.max_tilt_deg,
             max_altitude_m: config.max_altitude_m,
-        }
-    }
-}
-
-impl LimitsConfig {
-    /// Returns these limits; infinite where the file says nothing.
-    pub fn limits(&self) -> Limits {
-        Limits {
-            max_speed_mps: self.max_speed_mps.unwrap_or(f64::INFINITY),
-            max_acceleration_mps2: self.max_acceleration_mps2.unwrap_or(f64::INFINITY),
-            max_tilt_deg: self.max_tilt_deg,
-            max_altitude_m: self.max_altitude_m,
         }
     }
 }
