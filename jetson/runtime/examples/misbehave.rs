@@ -71,7 +71,7 @@ impl Autonomy for Misbehave {
             "abort" => abort(),
             "segfault" => {
                 // SAFETY: none; the fault is what is asked for.
-                unsafe { black_box(8 as *mut u64).write_volatile(1) };
+                unsafe { black_box(std::ptr::without_provenance_mut::<u64>(8)).write_volatile(1) };
                 None
             }
             "hang" => loop {
