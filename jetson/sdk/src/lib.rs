@@ -60,3 +60,8 @@ pub use run::{attach, run};
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]
 struct Readme;
+
+/// So does the one in the guide.
+#[cfg(doctest)]
+#[doc = include_str!("../../../docs/guides/plugin.md")]
+struct Guide;

@@ -13,24 +13,40 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::autonomy::Autonomy;
 use crate::clock::host_now;
-use crate::ipc::{IpcError, PluginEnd, SERVICE_OPTION};
+use crate::ipc::{IpcError, PluginEnd, SERVICE_OPTION, offers};
 use crate::observation::Observation;
 
 /// Runs a plugin to the end of the flight; call it from `main`.
 ///
-/// The runtime passes `--vizflyt-service PREFIX` on the command line; without it this says how to
-/// start the program, and returns 2. Other arguments are left to the plugin.
+/// The runtime passes `--vizflyt-service PREFIX` on the command line. Started by hand (`cargo run`, a
+/// debugger) it attaches to the one runtime of yours that waits for a plugin ([`ipc::Offer`](crate::ipc::Offer)).
+/// Other arguments are left to the plugin.
 ///
 /// Returns 0 after a flight, 1 if the runtime vanished, 2 if there was none to attach to, 101
 /// after a panic in the plugin (which the runtime is told).
 pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
-    if let Some(service) = service_argument(std::env::args_os()) {
-        return attach(plugin, &service);
-    }
+    let given = service_argument(std::env::args_os());
     let program = std::env::args().next().unwrap_or_default();
-    eprintln!("{program} is a VizFlyt plugin and is started by `vizflyt fly {program}`");
-    eprintln!("({SERVICE_OPTION} is missing, by which the runtime tells where its images are)");
-    ExitCode::from(NOT_ATTACHED)
+    match given.map_or_else(|| the_one_that_waits(&offers(), &program), Ok) {
+        Ok(service) => attach(plugin, &service),
+        Err(sentence) => {
+            eprintln!("plugin: {sentence}");
+            ExitCode::from(NOT_ATTACHED)
+        }
+    }
+}
+
+/// Returns the service of the only runtime that waits; else what to do, in a sentence.
+fn the_one_that_waits(waiting: &[String], program: &str) -> Result<String, String> {
+    match waiting {
+        [service] => Ok(service.clone()),
+        [] => Err(format!("no runtime waits for a plugin; fly it with `vizflyt fly {program}`")),
+        several => Err(format!(
+            "{} runtimes wait for a plugin: choose one with {SERVICE_OPTION} X, X being one of {}",
+            several.len(),
+            several.join(", ")
+        )),
+    }
 }
 
 /// As [`run`], with the service's prefix given directly.
@@ -168,6 +184,17 @@ mod tests {
         check(&["me", "--vizflyt-service"], None);
         check(&["me", "--vizflyt-services=x"], None);
         check(&["me"], None);
+    }
+
+    #[test]
+    fn started_by_hand_it_takes_the_only_runtime_that_waits() {
+        let waiting = ["a".to_owned(), "b".to_owned()];
+        assert_eq!(the_one_that_waits(&waiting[..1], "me"), Ok("a".to_owned()));
+        let none = the_one_that_waits(&[], "me").unwrap_err();
+        assert!(none.contains("`vizflyt fly me`"), "{none}");
+        let several = the_one_that_waits(&waiting, "me").unwrap_err();
+        assert!(several.contains("choose one with --vizflyt-service X"), "{several}");
+        assert!(several.ends_with("a, b"), "{several}");
     }
 
     #[test]
