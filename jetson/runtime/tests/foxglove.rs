@@ -14,7 +14,7 @@ struct Viewer(TcpStream);
 impl Viewer {
     fn connect(address: std::net::SocketAddr) -> Self {
         let mut stream = TcpStream::connect(address).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
         write!(
             stream,
             "GET / HTTP/1.1\r\nHost: {address}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
@@ -92,7 +92,7 @@ fn a_viewer_sees_the_logs_channels_and_their_messages() {
     let body = loop {
         log.write(Channel::Asked, host_now(), &json!({"seq": 12_345}));
         if viewer.0.peek(&mut first).is_ok() {
-            viewer.0.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+            viewer.0.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
             let (is_text, body) = viewer.read();
             if !is_text {
                 break body;

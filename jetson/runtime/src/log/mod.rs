@@ -22,7 +22,6 @@ mod writer;
 
 use std::ffi::OsString;
 use std::fs::{File, create_dir_all};
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -99,10 +98,8 @@ impl FlightLog {
         let (queue, records) = Queue::new();
         let free_bytes = move || probe.as_ref().and_then(file::free_bytes);
         let writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(free_bytes));
-        let handle = thread::Builder::new()
-            .name("flight-log".into())
-            .spawn(move || writer.run(&records))
-            .map_err(io::Error::from)?;
+        let handle =
+            thread::Builder::new().name("flight-log".into()).spawn(move || writer.run(&records))?;
         Ok((queue, handle))
     }
 

@@ -2,7 +2,7 @@
 //! those who fly.
 
 use std::fs;
-use std::io::{Cursor, ErrorKind};
+use std::io::{self, Cursor, ErrorKind};
 use std::time::{Duration, UNIX_EPOCH};
 
 use proptest::prelude::*;

@@ -83,6 +83,7 @@ mod tests {
     use vizflyt_protocol::messages::YawTarget;
     use vizflyt_sdk::glam::DVec3;
 
+    #[allow(clippy::needless_pass_by_value)] // Why: the cases read better.
     fn check(a: Option<Setpoint>, b: Option<Setpoint>, expected: Option<(&str, f64)>) {
         let found = difference(a.as_ref(), b.as_ref());
         let found = found.as_ref().map(|found| (&*found.field, found.amount));

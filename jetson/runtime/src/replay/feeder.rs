@@ -25,6 +25,7 @@ const LARGEST: usize = 1 << 30;
 
 /// What came of an image.
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
 pub(super) enum Answered {
     /// The plugin answered.
     With(Option<Setpoint>),
@@ -61,19 +62,19 @@ impl<'a> Feeder<'a> {
     /// Sends a message; a start begins a process, and ends the one before.
     pub(super) fn send(
         &mut self,
-        message: ToPlugin,
+        message: &ToPlugin,
         line: &mut dyn FnMut(Stream, &str),
     ) -> Result<Result<(), Failed>, ReplayError> {
         match message {
             ToPlugin::Start(_) => {
                 self.stop(line);
                 let session = self.session.insert(Session::start(self.command)?);
-                session.begin(&message, line)
+                session.begin(message, line)
             }
             // Ours comes at the end of the log.
             ToPlugin::Stop => Ok(Ok(())),
-            message => match &mut self.session {
-                Some(session) => session.send(&message, self.answer_within, line),
+            ToPlugin::Event(_) => match &mut self.session {
+                Some(session) => session.send(message, self.answer_within, line),
                 None => Ok(Ok(())),
             },
         }
@@ -162,12 +163,11 @@ impl Session {
             match self.next(line)? {
                 Some(Ok(FromPlugin::Ready { .. })) => return Ok(Ok(())),
                 Some(Ok(FromPlugin::Failed { reason })) => return Ok(Err(reason.as_str().into())),
-                Some(Ok(FromPlugin::Answer { .. })) => {}
                 Some(Err(why)) => return Ok(Err(why)),
                 None if Instant::now() > deadline => {
                     return Ok(Err("`on_start` did not return within five minutes".into()));
                 }
-                None => {}
+                Some(Ok(FromPlugin::Answer { .. })) | None => {}
             }
         }
     }
@@ -214,7 +214,6 @@ impl Session {
                 Some(Ok(FromPlugin::Failed { reason })) => {
                     return Ok(Answered::Failed(format!("the plugin failed: {reason}")));
                 }
-                Some(Ok(_)) => {}
                 Some(Err(why)) => return Ok(Answered::Failed(why)),
                 None if Instant::now() > deadline => {
                     let seconds = within.as_secs_f64();
@@ -222,7 +221,7 @@ impl Session {
                         "the plugin has not answered image {seq} for {seconds:.0} s"
                     )));
                 }
-                None => {}
+                Some(Ok(_)) | None => {}
             }
         }
     }
@@ -279,6 +278,7 @@ pub fn observation_len(head: &[u8]) -> Option<usize> {
 
 /// Writes an observation as it was: the recorded head, the images decoded anew. `None` if the log
 /// does not hold it whole, or it makes no sense.
+#[allow(clippy::implicit_hasher)] // Why: nobody brings another one.
 pub fn decode(
     observation: &Observation,
     memory: &mut [u8],

@@ -194,7 +194,7 @@ fn run(
             continue;
         };
         while let Some((_, message)) = plan.messages.pop_front_if(|(sent, _)| *sent < time) {
-            if let Err(why) = feeder.send(message, line)? {
+            if let Err(why) = feeder.send(&message, line)? {
                 return Ok(Some(why));
             }
         }

@@ -52,6 +52,7 @@ pub struct Plan {
 
 /// What to do with an observation.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
 pub(super) enum Feed {
     /// The plugin skipped it.
     Skip,

@@ -219,7 +219,7 @@ fn the_same_plugin_answers_the_same_and_another_one_differs() {
     replay_to(&path, forward_plugin, "two");
     let read = |name| fs::read(path.with_extension(name)).unwrap();
     assert_eq!(read("one"), read("two"), "byte by byte");
-    assert_eq!(read("one").iter().filter(|&&byte| byte == b'\n').count(), 28);
+    assert_eq!(String::from_utf8(read("one")).unwrap().lines().count(), 28);
     let (report, _) = replay_to(&path, misbehave("hover"), "three");
     assert_eq!((report.compared, report.differ), (28, 28));
     assert_eq!(report.largest.unwrap().difference.amount, f64::INFINITY);

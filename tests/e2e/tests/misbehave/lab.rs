@@ -8,7 +8,7 @@ use std::net::UdpSocket;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -226,8 +226,8 @@ impl Flight {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.runtime.lines.recv_timeout(left) {
                 Ok(line) => lines.push(line),
-                Err(_) if Instant::now() < deadline => break,
-                Err(_) => panic!("{} flies on: {lines:#?}", self.how),
+                Err(RecvTimeoutError::Disconnected) => break,
+                Err(RecvTimeoutError::Timeout) => panic!("{} flies on: {lines:#?}", self.how),
             }
         }
         let _ = self.runtime.child.wait();
@@ -281,7 +281,8 @@ impl Seen {
     /// Returns the height at the end, and the speed. [m; m/s]
     pub(crate) fn end(&self) -> (f64, f64) {
         let Some(&(at, p_m)) = self.track.last() else { return (f64::NAN, f64::NAN) };
-        (p_m.z, self.speed_mps(at - Duration::from_millis(400)))
+        let before = at.checked_sub(Duration::from_millis(400)).expect("the flight took longer");
+        (p_m.z, self.speed_mps(before))
     }
 }
 
