@@ -1,10 +1,10 @@
-//! A file that is a whole MCAP file at any moment, whenever its writer is killed and whenever the
-//! disk is full.
+//! A file that is a whole MCAP file between writes: when its writer is killed, and when the disk is
+//! full.
 //!
 //! What is written gathers in memory until a chunk is complete, and then goes to disk in one write
 //! with an end behind it; the next chunk overwrites that end. So the file is never half a chunk,
-//! but in the middle of that one write. A write that fails is taken back: the file is cut to the
-//! last whole chunk.
+//! but in the middle of that one write: readers that stream then get all before it. A write that
+//! fails is taken back: the file is cut to the last whole chunk.
 
 use std::fs::File;
 use std::io::{self, Error, ErrorKind, Seek, SeekFrom, Write};

@@ -7,7 +7,7 @@
 //!                  (their memory goes back afterwards)   bounded └─▶ Live ─▶ viewers
 //! ```
 //! Nobody who flies waits for it: what finds no room is dropped, counted and said. The file is a
-//! whole one whenever the process is killed ([`file`]). Images are written as they came: the log
+//! whole one whenever the process is killed, but within the one write of a chunk ([`file`]). Images are written as they came: the log
 //! neither decodes nor encodes them. [`read`] is the way back, and [`crate::replay`] flies it.
 
 mod channels;
