@@ -139,7 +139,8 @@ def read(path, is_whole):
             elif is_first and topic == "/event":
                 check(decoded.message != "", "an event has a sentence")
     for topic in [*FOXGLOVE, *OURS]:
-        if topic != "/plugin/output":
+        # A plugin may print nothing; a file that is cut may end before the first setpoint.
+        if topic != "/plugin/output" and not (is_cut and topic == "/setpoint/sent"):
             check(found.get(topic, 0) > 0, f"{topic} is in {path}: {found}")
     check(found["/camera/front/image"] == found["/observation"], f"an image each: {found}")
     return found, is_cut
