@@ -1,10 +1,15 @@
 """The example plugins fly in the simulated lab, by the real program."""
 
 import json
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
+
+from vizflyt._vizflyt import waiting_services
 
 PLUGINS = Path(__file__).parents[2] / "jetson/plugins/python"
 
@@ -70,3 +75,45 @@ def test_a_plugin_that_raises_ends_in_a_landing_with_its_own_line(fly, tmp_path)
         "raises.py:6 in on_event: ZeroDivisionError: division by zero (self.speed_mps = 1 / 0)"
         in flight.report["reason"]
     ), flight.output
+
+
+def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
+    others, report = set(waiting_services()), tmp_path / "report.json"
+    lab = subprocess.Popen(
+        [
+            program, "fly", "--attach", "--headless", "--no-config", f"--log={tmp_path}",
+            f"--report={report}",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    seen, plugin = [], None
+
+    def wait_for(text):
+        for line in lab.stdout:
+            seen.append(line)
+            if text in line:
+                return
+        pytest.fail(f"no '{text}' in {seen}")
+
+    try:
+        wait_for("waiting for a plugin: start yours")
+        (service,) = set(waiting_services()) - others
+        # By hand one names the service only if several wait.
+        choose = [f"--vizflyt-service={service}"] if others else []
+        plugin = subprocess.Popen([sys.executable, PLUGINS / "hover.py", *choose])
+        wait_for("the plugin flies")
+        assert service not in waiting_services()
+        # As a debugger does. The guard would land after 2 s.
+        plugin.send_signal(signal.SIGSTOP)
+        time.sleep(3.5)
+        plugin.kill()
+        wait_for("the plugin that had attached has ended")
+        assert not any("landing" in line for line in seen[:-1]), seen
+        lab.communicate(timeout=60)
+    finally:
+        for process in (lab, plugin):
+            if process is not None and process.poll() is None:
+                process.kill()
+                process.communicate()
+    assert json.loads(report.read_text())["outcome"] == "plugin_failed"

@@ -274,7 +274,7 @@ def test_without_a_runtime_it_says_how_to_start_one(tmp_path):
     assert err == "plugin: no runtime offers vizflyt/nobody; start the plugin with `vizflyt fly`\n"
     if not waiting_services():
         status, _, err = Process(None, tmp_path, PLAIN, arguments=[]).ended()
-        assert status == 2 and "no runtime waits for a plugin; fly it with `vizflyt fly" in err
+        assert status == 2 and "no runtime waits for a plugin; start one with `vizflyt fly --attach`" in err
 
 
 def test_a_debugger_may_stop_it_for_longer_than_a_heartbeat(stage, start):

@@ -27,6 +27,10 @@ pub struct FlyArgs {
     /// The plugin; started as a child process [default: `path` of [plugin] in jetson.toml]
     #[arg(value_name = "PLUGIN")]
     pub plugin: Option<OsString>,
+    /// Starts no plugin but waits, for ever, for one that you start: `python my_plugin.py`, a debugger,
+    /// a notebook. At a breakpoint the vehicle holds
+    #[arg(long, conflicts_with_all = ["plugin", "plugin_arguments"])]
+    pub attach: bool,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT")]
     pub plugin_arguments: Vec<OsString>,
@@ -108,7 +112,7 @@ impl FlyArgs {
         self.limits = self.limits.stricter(&self.jetson.limits.into());
         let named = plugin.path.clone().map(PathBuf::into_os_string);
         self.plugin = self.plugin.take().or(named);
-        if self.plugin.is_none() {
+        if self.plugin.is_none() && !self.attach {
             anyhow::bail!(
                 "no plugin given: `vizflyt fly PLUGIN`, or `path` of [plugin] in jetson.toml"
             );
@@ -116,8 +120,12 @@ impl FlyArgs {
         Ok(file)
     }
 
-    /// Returns the command that starts the plugin, before the runtime's own argument.
+    /// Returns the command that starts the plugin, before the runtime's own argument; empty if a
+    /// person starts it.
     pub fn plugin_command(&self) -> Vec<OsString> {
+        if self.attach {
+            return Vec::new();
+        }
         self.plugin.iter().chain(&self.plugin_arguments).cloned().collect()
     }
 

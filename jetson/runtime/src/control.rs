@@ -26,10 +26,10 @@ use serde_json::json;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
     ArenaInfo, Arrivals, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, MAX_CAMERAS,
-    PoseSample, Telemetry, ToPlugin, YawTarget, bounded,
+    PoseSample, Setpoint, Telemetry, ToPlugin, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
-use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle, host_now};
 
 use crate::answers;
@@ -80,13 +80,18 @@ const HEARTBEAT_TICKS: u64 = 20;
 const LAST_WORDS: Duration = Duration::from_millis(300);
 /// Lines of the plugin that the page gets in a second; console and log get more.
 const PAGE_LINES_PER_SECOND: u64 = 50;
+/// Whether a plugin that a person started still lives is looked up every 80 ms.
+const BY_HAND_TICKS: u64 = 4;
+/// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
+/// it would land. [s]
+const BREAKPOINT_S: f64 = 0.4;
 /// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
 /// within a tick.
 pub const QUEUE: usize = 1024;
 
 /// What the loop works with.
 pub struct Control {
-    /// The command that starts the plugin.
+    /// The command that starts the plugin; empty if a person starts it.
     pub plugin_command: Vec<OsString>,
     /// What the plugin may use, and when it is started again.
     pub plugin_limits: PluginLimits,
@@ -127,6 +132,10 @@ struct PluginSide {
     command: Vec<OsString>,
     confinement: Confinement,
     supervisor: Option<Supervisor>,
+    /// Stands until a plugin has come that a person started.
+    offer: Option<Offer>,
+    /// When a plugin that a person started last answered, or we on its behalf.
+    by_hand_answered: Option<HostTime>,
     /// Number of the present process.
     run: u32,
     arena: Box<ArenaInfo>,
@@ -258,6 +267,7 @@ impl Loop {
         self.link.handle_timeout(now);
         self.transmit();
         self.tend_plugin();
+        self.tend_by_hand(now);
         self.tell_notices(now);
         if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
             self.report(now);
@@ -430,6 +440,9 @@ impl Loop {
             }
             FromPlugin::Answer { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
+                if let Some(side) = &mut self.plugin {
+                    side.by_hand_answered = side.by_hand_answered.map(|_| now);
+                }
                 self.check_deadline(now, seq, returned.seconds_since(entered) * 1e3);
                 let asked = json!({"seq": seq, "setpoint": &setpoint});
                 self.control.log.write(Channel::Asked, returned, &asked);
@@ -509,7 +522,10 @@ impl Loop {
         let len = ObservationWriter::len_for(&arena.cameras);
         let mut command = self.control.plugin_command.clone();
         let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
-        let ipc = match RuntimeEnd::create_for(&service, len, confinement.user_id()) {
+        // Who starts a plugin by hand is its user.
+        let by_hand = command.is_empty();
+        let owner = confinement.user_id().filter(|_| !by_hand);
+        let ipc = match RuntimeEnd::create_for(&service, len, owner) {
             Ok(ipc) => Arc::new(ipc),
             Err(error) => {
                 return self.flight.handle(now, Input::ServerRefused(error.to_string()));
@@ -517,12 +533,25 @@ impl Loop {
         };
         let (stop, anew) = (Arc::default(), Arc::default());
         let threads = self.start_threads(&ipc, &arena, &stop, &anew);
-        command.push(format!("{SERVICE_OPTION}={service}").into());
+        let mut offer = None;
+        if by_hand {
+            match Offer::make(&service) {
+                Ok(made) => offer = Some(made),
+                Err(error) => {
+                    let sentence = format!("no plugin can find this runtime: {error}");
+                    self.flight.handle(now, Input::PluginFailed(sentence));
+                }
+            }
+        } else {
+            command.push(format!("{SERVICE_OPTION}={service}").into());
+        }
         self.plugin = Some(PluginSide {
             ipc,
             command,
             confinement,
             supervisor: None,
+            offer,
+            by_hand_answered: None,
             run: 0,
             arena,
             started: false,
@@ -531,7 +560,33 @@ impl Loop {
             stop,
             threads,
         });
-        self.start_process(now);
+        if by_hand {
+            let text = "waiting for a plugin: start yours, as `python my_plugin.py`";
+            self.tell_event(now, EventKind::Note, text);
+        } else {
+            self.start_process(now);
+        }
+    }
+
+    /// Watches a plugin that a person started: its end is noticed, and while it stands at a
+    /// breakpoint the vehicle holds instead of landing.
+    fn tend_by_hand(&mut self, now: HostTime) {
+        let Some(side) = &mut self.plugin else { return };
+        let Some(answered) = side.by_hand_answered else { return };
+        if self.ticks.is_multiple_of(BY_HAND_TICKS) {
+            // A killed process stays subscribed until its remains are cleared away.
+            side.ipc.clean_up();
+            if !side.ipc.plugin_attached() {
+                side.by_hand_answered = None;
+                let sentence = "the plugin that had attached has ended".to_owned();
+                return self.flight.handle(now, Input::PluginFailed(sentence));
+            }
+        }
+        if now.seconds_since(answered) > BREAKPOINT_S {
+            side.by_hand_answered = Some(now);
+            let setpoint = Some(Setpoint::Hold);
+            self.flight.handle(now, Input::Answered { seq: self.image_seq, setpoint });
+        }
     }
 
     /// Starts the plugin's process, the first or another.
@@ -590,7 +645,9 @@ impl Loop {
             Restart::OnGround => self.flight.is_on_ground(),
             Restart::InFlight => true,
         };
-        is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
+        // What a person started, a person starts again.
+        let ours = !self.control.plugin_command.is_empty();
+        ours && is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
     }
 
     /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
@@ -647,6 +704,9 @@ impl Loop {
         }
         if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
             side.started = true;
+            if side.offer.take().is_some() {
+                side.by_hand_answered = Some(host_now());
+            }
             let start = ToPlugin::Start((*side.arena).clone());
             self.control.log.to_plugin(host_now(), &start);
             if let Err(error) = side.ipc.send(&start) {

@@ -90,7 +90,7 @@ pub fn fly_command(
         plugin_command,
         plugin_limits,
         settings: FlightSettings {
-            ready_within_s: args.ready_within,
+            ready_within_s: if args.attach { 0.0 } else { args.ready_within },
             time_limit_s: args.seconds,
             limits: args.limits,
         },

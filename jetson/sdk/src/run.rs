@@ -19,7 +19,7 @@ use crate::observation::Observation;
 /// Runs a plugin to the end of the flight; call it from `main`.
 ///
 /// The runtime passes `--vizflyt-service PREFIX` on the command line. Started by hand (`cargo run`, a
-/// debugger) it attaches to the one runtime of yours that waits for a plugin ([`ipc::Offer`](crate::ipc::Offer)).
+/// debugger) it attaches to the one runtime of yours that waits for a plugin: `vizflyt fly --attach`.
 /// Other arguments are left to the plugin.
 ///
 /// Returns 0 after a flight, 1 if the runtime vanished, 2 if there was none to attach to, 101
@@ -40,7 +40,10 @@ pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
 fn the_one_that_waits(waiting: &[String], program: &str) -> Result<String, String> {
     match waiting {
         [service] => Ok(service.clone()),
-        [] => Err(format!("no runtime waits for a plugin; fly it with `vizflyt fly {program}`")),
+        [] => Err(format!(
+            "no runtime waits for a plugin; start one with `vizflyt fly --attach` in another \
+             terminal, or fly with `vizflyt fly {program}`"
+        )),
         several => Err(format!(
             "{} runtimes wait for a plugin: choose one with {SERVICE_OPTION} X, X being one of {}",
             several.len(),

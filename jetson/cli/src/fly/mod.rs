@@ -26,6 +26,7 @@ use plugin::Plugin;
   vizflyt fly avoid --scene race --seed 3                  the built-in example, another scene
   vizflyt fly first --headless --seconds 20 --report r.json
                                                            figures; status 0 if finished or landed
+  vizflyt fly --attach                                     waits for `python my_plugin.py` or a debugger
   vizflyt fly first --server 192.168.10.2:4433 --mavlink udpin:0.0.0.0:14550
                                                            the real lab
 
@@ -45,21 +46,22 @@ pub(crate) struct FlyArgs {
 pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
     let file = args.runtime.settle()?;
     let name = args.runtime.plugin.clone().unwrap_or_default();
-    let plugin = Plugin::find(&name)?;
+    let plugin = if args.runtime.attach { None } else { Some(Plugin::find(&name)?) };
+    let plugin = plugin.as_ref();
     // Whoever started us has said which lab it is.
     if args.runtime.server.at.is_some() && !args.sim {
-        fly_real(&args, &plugin, file.as_deref())
+        fly_real(&args, plugin, file.as_deref())
     } else {
-        fly_simulated(&mut args, &plugin, file.as_deref(), log_level)
+        fly_simulated(&mut args, plugin, file.as_deref(), log_level)
     }
 }
 
-fn fly_real(args: &FlyArgs, plugin: &Plugin, file: Option<&Path>) -> Result<ExitCode> {
+fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Result<ExitCode> {
     let runtime = &args.runtime;
     if args.lab.scene.is_some() || args.lab.seed.is_some() {
         bail!("--scene and --seed are for the simulated lab; add --sim to fly there");
     }
-    let mut command = plugin.command()?;
+    let mut command = plugin.map_or(Ok(Vec::new()), Plugin::command)?;
     command.extend(runtime.plugin_arguments.iter().cloned());
     // A parent has said which lab it is.
     if !runtime.lifeline {
@@ -81,7 +83,7 @@ fn fly_real(args: &FlyArgs, plugin: &Plugin, file: Option<&Path>) -> Result<Exit
 
 fn fly_simulated(
     args: &mut FlyArgs,
-    plugin: &Plugin,
+    plugin: Option<&Plugin>,
     file: Option<&Path>,
     log_level: &str,
 ) -> Result<ExitCode> {
@@ -101,14 +103,14 @@ fn fly_simulated(
         }
     }
     // What is built here is not built again behind the server's back.
-    plugin.command()?;
-    if let Some(lab) = plugin.lab() {
+    plugin.map(Plugin::command).transpose()?;
+    if let Some(lab) = plugin.and_then(Plugin::lab) {
         args.lab.scene = args.lab.scene.take().or_else(|| lab.scene.clone());
         args.lab.seed = args.lab.seed.or(lab.seed);
     }
     say_lab(runtime.json, "simulated", "all on this computer; nothing can break");
     let mut fly = vec![
-        plugin.name().to_owned(),
+        plugin.map_or("--attach".into(), |plugin| plugin.name().to_owned()),
         format!("--seconds={}", runtime.seconds).into(),
         format!("--ready-within={}", runtime.ready_within).into(),
     ];

@@ -38,7 +38,7 @@ def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
 
     ``vizflyt fly my_plugin.py`` starts the program and tells it on the command line where its images
     are. Started by hand (``python my_plugin.py``, a debugger, a notebook) it attaches to the one
-    runtime of yours that waits for a plugin, such as a :class:`Rehearsal`. Where several wait,
+    runtime of yours that waits for a plugin: ``vizflyt fly --attach``. Where several wait,
     ``service`` chooses.
 
     ``plugin`` is a class derived from :class:`Plugin`, or an instance of one.
@@ -128,8 +128,8 @@ def _attach(service: str | None) -> PluginEnd:
             if not waiting:
                 name = sys.argv[0] or "my_plugin.py"
                 raise ConnectionError(
-                    f"no runtime waits for a plugin; fly it with `vizflyt fly {name}`, or play the "
-                    "runtime's part with vizflyt.Rehearsal"
+                    "no runtime waits for a plugin; start one with `vizflyt fly --attach` in another "
+                    f"terminal, or fly with `vizflyt fly {name}`"
                 )
             service = waiting[0]
         return PluginEnd(service)
