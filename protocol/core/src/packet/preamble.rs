@@ -73,7 +73,7 @@ impl Preamble {
     /// let error = Preamble::check(&bytes, Party::Runtime).unwrap_err();
     /// # extern crate std;
     /// # use std::string::ToString;
-    /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime 3"));
+    /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime "));
     /// ```
     pub fn check(bytes: &[u8; Self::SIZE], me: Party) -> Result<Party, PreambleError> {
         let Ok(theirs) = Self::read_from_bytes(bytes) else {
