@@ -46,7 +46,12 @@ impl Default for StreamDecoder {
 
 impl StreamDecoder {
     /// Takes bytes and calls `sink` with each whole packet, in order.
-    pub fn push(&mut self, mut bytes: &[u8], mut sink: impl FnMut(Packet)) {
+    pub fn push(&mut self, bytes: &[u8], mut sink: impl FnMut(Packet)) {
+        self.push_whole(bytes, |_, packet| sink(packet));
+    }
+
+    /// As [`Self::push`]; `sink` gets the packet's bytes too, as a signature needs them.
+    pub fn push_whole(&mut self, mut bytes: &[u8], mut sink: impl FnMut(&[u8], Packet)) {
         while !bytes.is_empty() {
             let taken = bytes.len().min(self.buffer.len() - self.filled);
             self.buffer[self.filled..self.filled + taken].copy_from_slice(&bytes[..taken]);
@@ -62,7 +67,7 @@ impl StreamDecoder {
     }
 
     /// Takes every whole packet off the buffer; leaves less than one packet in it.
-    fn drain(&mut self, sink: &mut impl FnMut(Packet)) {
+    fn drain(&mut self, sink: &mut impl FnMut(&[u8], Packet)) {
         let mut start = 0;
         loop {
             let pending = &self.buffer[start..self.filled];
@@ -83,7 +88,7 @@ impl StreamDecoder {
                     match packet {
                         Some(packet) => {
                             self.stats.packets += 1;
-                            sink(packet);
+                            sink(&self.buffer[start..start + len], packet);
                         }
                         None => self.stats.unknown += 1,
                     }
@@ -97,7 +102,7 @@ impl StreamDecoder {
 }
 
 const STX_V1: u8 = 0xFE;
-const STX_V2: u8 = 0xFD;
+pub(super) const STX_V2: u8 = 0xFD;
 const SIGNED: u8 = 0x01;
 
 #[allow(clippy::large_enum_variant)] // Why: short-lived, and there is no heap to box it on.
