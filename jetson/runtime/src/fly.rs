@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -39,17 +39,19 @@ const CUT_SHORT: i32 = 130;
 pub fn fly(mut args: FlyArgs) -> anyhow::Result<Outcome> {
     args.settle()?;
     let command = args.plugin_command();
-    fly_command(&args, command)
+    fly_command(&args, command, None)
 }
 
 /// As [`fly`], with `args` settled and the plugin's command given as a list; [`FlyArgs::plugin`]
-/// only names it.
+/// only names it. For everything that comes from `reloads` the plugin is started anew, while the
+/// vehicle holds.
 ///
 /// # Errors
 /// As [`fly`].
 pub fn fly_command(
     args: &FlyArgs,
     plugin_command: Vec<std::ffi::OsString>,
+    reloads: Option<Receiver<()>>,
 ) -> anyhow::Result<Outcome> {
     keep_going_when_files_are_full();
     let plugin_limits = args.jetson.plugin.limits();
@@ -68,6 +70,9 @@ pub fn fly_command(
     receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
     if args.lifeline {
         watch_stdin(sender.clone())?;
+    }
+    if let Some(reloads) = reloads {
+        forward_reloads(reloads, sender.clone())?;
     }
 
     let shared = Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
@@ -187,6 +192,14 @@ fn watch_stdin(sender: SyncSender<Happening>) -> std::io::Result<()> {
         let _ = sender.send(Happening::Interrupt);
     };
     thread::Builder::new().name("lifeline".into()).spawn(watch)?;
+    Ok(())
+}
+
+fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<Happening>) -> std::io::Result<()> {
+    let forward = move || {
+        while reloads.recv().is_ok() && sender.send(Happening::Reload).is_ok() {}
+    };
+    thread::Builder::new().name("reloads".into()).spawn(forward)?;
     Ok(())
 }
 

@@ -136,6 +136,34 @@ fn which_lab_it_is_stands_before_everything_else() {
 }
 
 #[test]
+fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
+    let desk = Desk::new();
+    // A program that can be saved: the built-in example, under a name of its own.
+    let save = |version: &str| {
+        let text =
+            format!("#!/bin/sh\n# {version}\nexec {} plugin avoid \"$@\"\n", text(&vizflyt()));
+        let path = desk.write("mine", &text);
+        std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o755))
+            .unwrap();
+        path
+    };
+    let plugin = save("one");
+    let mut flight = desk.fly(&plugin, &["--watch", "--scene", "room", "--seconds", "20"]);
+    flight.wait_for("plugin flies", AIRBORNE);
+    let before = flight.descendants("plugin avoid");
+    save("number two");
+    flight.wait_for("reloading the plugin", AIRBORNE);
+    flight.wait_for("holding: the plugin is being started again", AIRBORNE);
+    flight.wait_for("the plugin flies again", AIRBORNE);
+    let after = flight.descendants("plugin avoid");
+    assert_eq!((before.len(), after.len()), (1, 1), "one plugin at a time");
+    assert_ne!(before, after, "another process flies");
+    assert_eq!(flight.wait(FLIGHT), Some(0), "{:#?}", flight.seen);
+    let report = desk.report();
+    assert!(report["outcome"] == "landed" || report["outcome"] == "finished", "{report:#}");
+}
+
+#[test]
 fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
     let desk = Desk::new();
     assert!(desk.run(&["new", "first", "--lang", "python"]).status.success());

@@ -2,6 +2,7 @@
 //! it is, one line says before anything is armed.
 
 pub(crate) mod plugin;
+mod watch;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -23,6 +24,7 @@ use plugin::Plugin;
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt new first --lang python && vizflyt fly first     your own plugin in the simulated lab
+  vizflyt fly first --watch                                a saved file takes over in flight
   vizflyt fly avoid --scene race --seed 3                  the built-in example, another scene
   vizflyt fly first --headless --seconds 20 --report r.json
                                                            figures; status 0 if finished or landed
@@ -35,6 +37,9 @@ What the command line leaves out, jetson.toml says.")]
 pub(crate) struct FlyArgs {
     #[command(flatten)]
     runtime: vizflyt_runtime::FlyArgs,
+    /// Starts the plugin anew whenever one of its files is saved; the vehicle holds meanwhile.
+    #[arg(long, conflicts_with = "attach")]
+    watch: bool,
     /// Flies the simulated lab even where jetson.toml names a real one.
     #[arg(long, conflicts_with = "at")]
     sim: bool,
@@ -77,7 +82,11 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
             ),
         );
     }
-    let outcome = vizflyt_runtime::fly_command(runtime, command)?;
+    let reloads = match plugin {
+        Some(plugin) if args.watch => Some(watch::watch(plugin.clone())?),
+        _ => None,
+    };
+    let outcome = vizflyt_runtime::fly_command(runtime, command, reloads)?;
     Ok(if outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -120,6 +129,9 @@ fn fly_simulated(
     match file {
         Some(file) => fly.extend(["--config".into(), file.into()]),
         None => fly.push("--no-config".into()),
+    }
+    if args.watch {
+        fly.push("--watch".into());
     }
     let flight = LabFlight {
         lab: &args.lab,

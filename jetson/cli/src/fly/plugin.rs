@@ -88,6 +88,20 @@ impl Plugin {
         self.lab.as_ref()
     }
 
+    /// Returns the file or folder whose change means another plugin.
+    pub(crate) fn watched(&self) -> PathBuf {
+        match &self.kind {
+            Kind::BuiltIn => std::env::current_exe().unwrap_or_default(),
+            Kind::Program => PathBuf::from(&self.name),
+            Kind::Cargo(folder) => folder.clone(),
+            // What it imports lies beside it.
+            Kind::Script(script) => match script.parent() {
+                Some(folder) if folder != Path::new("") => folder.to_owned(),
+                _ => PathBuf::from("."),
+            },
+        }
+    }
+
     /// Returns the command that starts it; a Cargo project is built first.
     ///
     /// # Errors

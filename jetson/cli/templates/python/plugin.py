@@ -51,9 +51,6 @@ class {{class}}(vizflyt.Plugin):
         velocity_mps, turn_radps = steer(front.depth, height_m)
         return vizflyt.Setpoint.velocity(velocity_mps, axes="heading", yaw_rate=turn_radps)
 
-    def on_event(self, event):
-        print(event.text)
-
 
 if __name__ == "__main__":
     vizflyt.run({{class}})

@@ -4,7 +4,7 @@
 //! Test it:  cargo test
 
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::{Autonomy, Axes, CameraImage, Event, Observation, Setpoint, YawTarget};
+use vizflyt_sdk::{Autonomy, Axes, CameraImage, Observation, Setpoint, YawTarget};
 
 /// Height to fly at. [m]
 const HEIGHT_M: f64 = 1.0;
@@ -21,10 +21,6 @@ impl Autonomy for {{class}} {
         let height_m = pose.map(|pose| pose.translation_m.z);
         let (v_mps, turn_radps) = steer(&obs.camera("front")?, height_m);
         Some(Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw: YawTarget::Rate(turn_radps) })
-    }
-
-    fn on_event(&mut self, event: &Event) {
-        println!("{}", event.text);
     }
 }
 
