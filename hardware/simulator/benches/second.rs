@@ -10,7 +10,7 @@ use vizflyt_simulator::simulation::{Simulation, SimulationConfig, TICK_HZ};
 
 fn send(lab: &mut Simulation, message: &MavMessage) {
     let header = MavHeader { system_id: 255, component_id: 1, sequence: 0 };
-    lab.handle_mavlink(encode(header, message, &mut [0; MAX_PACKET]));
+    lab.handle_mavlink(0, encode(header, message, &mut [0; MAX_PACKET]));
 }
 
 fn command(lab: &mut Simulation, command: MavCmd, param1: f32, param2: f32, param7: f32) {

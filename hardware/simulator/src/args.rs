@@ -11,6 +11,7 @@ use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 
 use crate::driver::Driver;
+use crate::link::serial::{DEFAULT_BAUD, baud_rate};
 use crate::link::{Endpoint, resolve};
 use crate::mocap::{MAX_NAME, MocapConfig};
 use crate::simulation::{Simulation, SimulationConfig};
@@ -19,12 +20,26 @@ use crate::stop::stop_flag;
 /// The simulated lab: vehicle, autopilot and motion capture.
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Example: vizflyt sim --mavlink udpout:127.0.0.1:14550 --vicon 127.0.0.1:51001 --spawn 1,0,0,90"
+    after_help = "Examples:\n  vizflyt sim --mavlink udpout:127.0.0.1:14550 --vicon 127.0.0.1:51001 --spawn 1,0,0,90\n  \
+                  vizflyt sim --pty /tmp/uart --baud 921600 --vicon 127.0.0.1:51001"
 )]
 pub struct SimArgs {
-    /// Where MAVLink goes: udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait.
-    #[arg(long, value_name = "ENDPOINT", default_value = "udpout:127.0.0.1:14550")]
-    pub mavlink: Endpoint,
+    /// Where MAVLink goes: udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait,
+    /// tcpout:HOST:PORT connects; serial:PATH[:BAUD] and pty:PATH[:BAUD] as below. May be given up
+    /// to four times, as telemetry ports of one autopilot [default: udpout:127.0.0.1:14550, unless
+    /// --serial or --pty is given].
+    #[arg(long, value_name = "ENDPOINT")]
+    pub mavlink: Vec<Endpoint>,
+    /// MAVLink over this serial device, or the pseudo-terminal somebody else made; waits until it
+    /// is there.
+    #[arg(long, value_name = "PATH")]
+    pub serial: Option<PathBuf>,
+    /// MAVLink over a pseudo-terminal that is made and linked to by this name.
+    #[arg(long, value_name = "PATH", conflicts_with = "serial")]
+    pub pty: Option<PathBuf>,
+    /// Baud rate of --serial and --pty; bytes leave no faster than it says.
+    #[arg(long, value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
+    pub baud: u32,
     /// Where the motion capture sends its UDP object stream; nowhere if absent.
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
     pub vicon: Option<SocketAddr>,
@@ -73,6 +88,11 @@ fn parse_address(text: &str) -> Result<SocketAddr, String> {
     resolve(text).ok_or_else(|| format!("'{text}' is not HOST:PORT"))
 }
 
+fn parse_baud(text: &str) -> Result<u32, String> {
+    let baud = text.parse().ok().filter(|&baud| baud_rate(baud).is_some());
+    baud.ok_or_else(|| format!("'{text}' is no baud rate of a telemetry port; 57600 to 3000000"))
+}
+
 fn parse_object(text: &str) -> Result<String, String> {
     if (1..=MAX_NAME).contains(&text.len()) && text.is_ascii() {
         Ok(text.to_owned())
@@ -99,6 +119,17 @@ fn parse_param(text: &str) -> Result<(String, f32), String> {
 }
 
 impl SimArgs {
+    /// Returns where MAVLink goes.
+    pub fn endpoints(&self) -> Vec<Endpoint> {
+        let mut all = self.mavlink.clone();
+        all.extend(self.serial.iter().map(|path| Endpoint::Serial(path.clone(), self.baud)));
+        all.extend(self.pty.iter().map(|path| Endpoint::Pty(path.clone(), self.baud)));
+        if all.is_empty() {
+            all.push(Endpoint::UdpOut(([127, 0, 0, 1], 14550).into()));
+        }
+        all
+    }
+
     /// Returns the lab these arguments describe; reads the file of true geometry.
     ///
     /// # Errors
@@ -163,15 +194,19 @@ impl SimArgs {
 pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let simulation = Simulation::new(args.config()?)?;
-    let driver = Driver::open(simulation, args.mavlink, args.vicon, args.realtime_factor)?;
-    let address = driver.mavlink_address()?.to_string();
+    let endpoints = args.endpoints();
+    let driver = Driver::open(simulation, &endpoints, args.vicon, args.realtime_factor)?;
+    let addresses = driver.mavlink_addresses()?;
     if args.json {
-        say(&serde_json::json!({ "ready": "simulator", "mavlink": address }));
+        let ready = serde_json::json!({
+            "ready": "simulator", "mavlink": addresses[0], "links": addresses,
+        });
+        say(&ready);
     } else {
-        say(&format!(
-            "simulator ready: MAVLink {} (our address {address}); Ctrl-C ends it",
-            args.mavlink
-        ));
+        for (endpoint, address) in endpoints.iter().zip(&addresses) {
+            say(&format!("MAVLink {endpoint} (our address {address})"));
+        }
+        say(&"simulator ready; Ctrl-C ends it");
     }
     // The loop has a thread of its own, whatever the caller's thread is busy with.
     let (simulation, lost_s) = std::thread::Builder::new()
@@ -252,6 +287,20 @@ mod tests {
     }
 
     #[test]
+    fn mavlink_goes_where_it_is_told() {
+        let check = |arguments: &[&str], expected: &[&str]| {
+            let found = parse(arguments).unwrap().endpoints();
+            assert_eq!(found.iter().map(ToString::to_string).collect::<Vec<_>>(), expected);
+        };
+        check(&[], &["udpout:127.0.0.1:14550"]);
+        check(&["--serial", "/dev/ttyS0", "--baud", "57600"], &["serial:/dev/ttyS0:57600"]);
+        check(
+            &["--mavlink", "tcpin:127.0.0.1:1", "--pty", "/tmp/u"],
+            &["tcpin:127.0.0.1:1", "pty:/tmp/u:921600"],
+        );
+    }
+
+    #[test]
     fn bad_arguments_are_named() {
         let check = |arguments: &[&str], expected: &str| {
             let error = parse(arguments)
@@ -262,7 +311,9 @@ mod tests {
         };
         check(&["--spawn", "1,2,3"], "has 3 numbers; give 4");
         check(&["--spawn", "1,2,x,4"], "give 4 numbers");
-        check(&["--mavlink", "serial:1"], "udpout:HOST:PORT");
+        check(&["--mavlink", "udp:1"], "udpout:HOST:PORT");
+        check(&["--baud", "1234"], "no baud rate");
+        check(&["--serial", "/a", "--pty", "/b"], "cannot be used with");
         check(&["--object", "a name of more than twenty-four"], "1 to 24");
         check(&["--realtime-factor", "0"], "outside 0.01 to 20");
         check(&["--param", "NO_SUCH=1"], "no parameter NO_SUCH");

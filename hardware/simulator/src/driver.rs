@@ -13,7 +13,7 @@ use anyhow::Context;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
 use crate::link::{Endpoint, Link, bind_udp};
-use crate::simulation::{Simulation, TICK_HZ};
+use crate::simulation::{MAX_LINKS, Simulation, TICK_HZ};
 
 /// Time that is caught up after a pause. More is given up: a vehicle that lives through a second
 /// in an instant would answer to setpoints of the past.
@@ -24,27 +24,37 @@ const WARN_EVERY: Duration = Duration::from_secs(5);
 /// The sockets of a running simulation.
 pub struct Driver {
     simulation: Simulation,
-    link: Link,
+    links: Vec<Link>,
     mocap: Option<(UdpSocket, SocketAddr)>,
     /// Simulated seconds per second.
     factor: f64,
 }
 
 impl Driver {
-    /// Opens the sockets: MAVLink, and where mocap datagrams go, if anywhere. `factor` is simulated
-    /// seconds per second.
+    /// Opens what MAVLink goes over, at most [`MAX_LINKS`] ways, and where mocap datagrams go, if
+    /// anywhere. `factor` is simulated seconds per second.
     ///
     /// # Errors
-    /// Fails if a socket cannot be opened.
+    /// Fails if something cannot be opened, or there are too many links.
     pub fn open(
         simulation: Simulation,
-        mavlink: Endpoint,
+        mavlink: &[Endpoint],
         vicon: Option<SocketAddr>,
         factor: f64,
     ) -> anyhow::Result<Self> {
-        let link = Link::open(mavlink).with_context(|| {
-            format!("simulator: cannot open {mavlink}; is the port in use by another simulator?")
-        })?;
+        anyhow::ensure!(
+            mavlink.len() <= MAX_LINKS,
+            "simulator: {} MAVLink endpoints; give {MAX_LINKS} at most",
+            mavlink.len()
+        );
+        let links = mavlink
+            .iter()
+            .map(|endpoint| {
+                Link::open(endpoint).with_context(|| {
+                    format!("simulator: cannot open {endpoint}; is it in use by another simulator?")
+                })
+            })
+            .collect::<anyhow::Result<_>>()?;
         let mocap = match vicon {
             Some(target) => {
                 let any = if target.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
@@ -54,15 +64,18 @@ impl Driver {
             }
             None => None,
         };
-        Ok(Self { simulation, link, mocap, factor })
+        Ok(Self { simulation, links, mocap, factor })
     }
 
-    /// Returns our address of the MAVLink link.
+    /// Returns our address or path of each MAVLink link.
     ///
     /// # Errors
     /// Fails if the operating system does not say.
-    pub fn mavlink_address(&self) -> anyhow::Result<SocketAddr> {
-        self.link.local_address().context("simulator: the link has no address")
+    pub fn mavlink_addresses(&self) -> anyhow::Result<Vec<String>> {
+        self.links
+            .iter()
+            .map(|link| link.address().context("simulator: the link has no address"))
+            .collect()
     }
 
     /// Runs until `stop` is set; returns the simulation for its report, and the time given up
@@ -71,8 +84,10 @@ impl Driver {
         let mut pacer = Pacer::new(Instant::now(), self.factor);
         let mut warned: Option<(Instant, Duration)> = None;
         while !stop.load(Ordering::Relaxed) {
-            let (simulation, link) = (&mut self.simulation, &mut self.link);
-            link.receive(|bytes| simulation.handle_mavlink(bytes));
+            let simulation = &mut self.simulation;
+            for (index, link) in self.links.iter_mut().enumerate() {
+                link.receive(|bytes| simulation.handle_mavlink(index, bytes));
+            }
             for _ in 0..pacer.due(Instant::now()) {
                 self.simulation.tick();
                 self.send_mavlink();
@@ -94,7 +109,9 @@ impl Driver {
     fn send_mavlink(&mut self) {
         let mut buffer = [0; MAX_PACKET];
         while let Some(packet) = self.simulation.poll_mavlink(&mut buffer) {
-            self.link.send(packet);
+            for link in &mut self.links {
+                link.send(packet);
+            }
         }
     }
 

@@ -11,6 +11,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::{Airframe, AirframeState};
+pub use crate::autopilot::MAX_LINKS;
 use crate::autopilot::{Autopilot, UnknownParam};
 use crate::battery::Battery;
 use crate::imu::Imu;
@@ -144,9 +145,10 @@ impl Simulation {
         self.airframe.set_wind(wind_world_mps);
     }
 
-    /// Takes bytes of the MAVLink link.
-    pub fn handle_mavlink(&mut self, bytes: &[u8]) {
-        self.autopilot.handle_input(self.now, bytes);
+    /// Takes bytes of a MAVLink link, one of [`MAX_LINKS`]. Each is a stream of its own; what is
+    /// sent goes to all.
+    pub fn handle_mavlink(&mut self, link: usize, bytes: &[u8]) {
+        self.autopilot.handle_input(self.now, link, bytes);
     }
 
     /// Returns the next MAVLink packet to send.
@@ -205,7 +207,7 @@ impl Simulation {
             armed: self.autopilot.is_armed(),
             mode: self.autopilot.mode() as u32,
             seconds: self.now.seconds_since(AutopilotTime::ZERO),
-            mavlink_packets_in: self.autopilot.link_stats().packets,
+            mavlink_packets_in: self.autopilot.packets_in(),
             mavlink_packets_out: self.packets_out,
             mavlink_packets_dropped: self.autopilot.outbox_dropped(),
             mocap_poses: self.mocap_poses,

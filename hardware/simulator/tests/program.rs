@@ -4,10 +4,11 @@
 use std::io::{BufRead, BufReader};
 use std::net::UdpSocket;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use vizflyt_protocol::mavlink::StreamDecoder;
-use vizflyt_protocol::mavlink::dialect::MavMessage;
+use vizflyt_protocol::mavlink::dialect::{MavMessage, PARAM_REQUEST_READ_DATA};
+use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
+use vizflyt_simulator::link::serial::SerialPort;
 
 /// Long enough for any machine: nothing here depends on how long it takes.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -19,10 +20,11 @@ fn listen() -> (UdpSocket, String) {
     (socket, address)
 }
 
-fn start(mavlink: &str, vicon: &str) -> Child {
+fn start(mavlink: &[&str], vicon: &str) -> Child {
     Command::new(env!("CARGO_BIN_EXE_vizflyt-simulator"))
         .args(["--json", "--lifeline", "--spawn", "1,2,0,90", "--object", "drone"])
-        .args(["--mavlink", &format!("udpout:{mavlink}"), "--vicon", vicon])
+        .args(mavlink)
+        .args(["--vicon", vicon])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
@@ -33,7 +35,8 @@ fn start(mavlink: &str, vicon: &str) -> Child {
 #[test]
 fn speaks_first_and_ends_with_its_parent() {
     let ((mavlink, mavlink_address), (vicon, vicon_address)) = (listen(), listen());
-    let mut child = start(&mavlink_address, &vicon_address);
+    let mavlink_endpoint = format!("udpout:{mavlink_address}");
+    let mut child = start(&["--mavlink", &mavlink_endpoint], &vicon_address);
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let mut line = || serde_json::from_str::<serde_json::Value>(&lines.next().unwrap().unwrap());
     assert_eq!(line().unwrap()["ready"], "simulator");
@@ -57,4 +60,52 @@ fn speaks_first_and_ends_with_its_parent() {
     let position = report["report"]["final_position_m"].as_array().unwrap();
     assert!((position[1].as_f64().unwrap() - 2.0).abs() < 0.01, "{position:?}");
     assert!(child.wait().unwrap().success());
+}
+
+/// A telemetry port on a pseudo-terminal, and UDP beside it: what comes over each is understood, what
+/// is sent goes to both.
+#[test]
+fn a_serial_line_carries_the_same() {
+    let ((mavlink, mavlink_address), (_vicon, vicon_address)) = (listen(), listen());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("uart");
+    let name = path.to_str().unwrap();
+    let endpoint = format!("udpout:{mavlink_address}");
+    let mut child = start(&["--mavlink", &endpoint, "--pty", name], &vicon_address);
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let ready: serde_json::Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
+    assert_eq!(ready["links"][1], name);
+
+    let mut uart = SerialPort::open(&path, 921_600);
+    let request = MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+        param_index: 0,
+        target_system: 1,
+        target_component: 1,
+        ..Default::default()
+    });
+    let header = MavHeader { system_id: 255, component_id: 1, sequence: 0 };
+    let mut buffer = [0; MAX_PACKET];
+    let asked = encode(header, &request, &mut buffer);
+    let is_answer = |message: &MavMessage| matches!(message, MavMessage::PARAM_VALUE(_));
+    let (mut over_uart, mut over_udp) = (0, 0);
+    let mut decoders = [StreamDecoder::default(), StreamDecoder::default()];
+    let end = Instant::now() + PATIENCE;
+    while over_uart == 0 {
+        assert!(Instant::now() < end, "no answer over the serial line");
+        uart.send(asked);
+        uart.receive(|bytes| {
+            decoders[0].push(bytes, |packet| over_uart += u32::from(is_answer(&packet.message)));
+        });
+        std::thread::yield_now();
+    }
+    let mut buffer = [0; 2048];
+    while over_udp == 0 {
+        let length = mavlink.recv(&mut buffer).unwrap();
+        decoders[1].push(&buffer[..length], |packet| {
+            over_udp += u32::from(is_answer(&packet.message));
+        });
+    }
+    drop(child.stdin.take());
+    assert!(child.wait().unwrap().success());
+    assert!(!path.is_symlink(), "the link is gone with the simulator");
 }

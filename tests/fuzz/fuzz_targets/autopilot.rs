@@ -8,7 +8,7 @@ fuzz_target!(|packets: Vec<&[u8]>| {
     let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
     let mut buffer = [0; MAX_PACKET];
     for packet in packets {
-        simulation.handle_mavlink(packet);
+        simulation.handle_mavlink(0, packet);
         for _ in 0..5 {
             simulation.tick();
         }

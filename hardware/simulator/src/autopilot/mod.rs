@@ -26,7 +26,7 @@ use std::collections::VecDeque;
 
 use glam::DVec3;
 use vizflyt_protocol::mavlink::{
-    CopterMode, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, StreamStats, dialect, encode,
+    CopterMode, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, dialect, encode,
 };
 use vizflyt_protocol::time::AutopilotTime;
 
@@ -38,6 +38,8 @@ use dialect::{MavMessage, MavSeverity};
 pub use params::{Param, ParamSpec, Params, TABLE};
 use telemetry::Streams;
 
+/// Links that are served at once, as telemetry ports: each has its own stream of bytes.
+pub const MAX_LINKS: usize = 4;
 /// Messages that wait for the link at most. A full parameter list fits; beyond it the oldest goes.
 const OUTBOX: usize = 256;
 
@@ -82,7 +84,7 @@ pub struct Autopilot {
     flight: flight::FlightState,
     failsafe: failsafe::Failsafe,
     streams: Streams,
-    decoder: StreamDecoder,
+    decoders: [StreamDecoder; MAX_LINKS],
     outbox: VecDeque<MavMessage>,
     outbox_dropped: u64,
     sequence: u8,
@@ -110,7 +112,7 @@ impl Default for Autopilot {
             flight: flight::FlightState::default(),
             failsafe: failsafe::Failsafe::default(),
             streams: Streams::default(),
-            decoder: StreamDecoder::default(),
+            decoders: Default::default(),
             outbox: VecDeque::new(),
             outbox_dropped: 0,
             sequence: 0,
@@ -133,12 +135,12 @@ impl Autopilot {
         Ok(autopilot)
     }
 
-    /// Takes bytes from the link.
-    pub fn handle_input(&mut self, now: AutopilotTime, bytes: &[u8]) {
+    /// Takes bytes from a link; there are [`MAX_LINKS`].
+    pub fn handle_input(&mut self, now: AutopilotTime, link: usize, bytes: &[u8]) {
         // Taken out while it runs, because every packet changes the rest of the autopilot.
-        let mut decoder = std::mem::take(&mut self.decoder);
+        let mut decoder = std::mem::take(&mut self.decoders[link]);
         decoder.push(bytes, |packet| self.handle_packet(now, &packet));
-        self.decoder = decoder;
+        self.decoders[link] = decoder;
     }
 
     /// Takes one sensor sample, `dt_s` after the last, and returns the motor commands: rotor
@@ -192,9 +194,9 @@ impl Autopilot {
         &self.estimator
     }
 
-    /// Returns counters of the incoming link.
-    pub fn link_stats(&self) -> StreamStats {
-        self.decoder.stats()
+    /// Returns packets received over all links.
+    pub fn packets_in(&self) -> u64 {
+        self.decoders.iter().map(|decoder| decoder.stats().packets).sum()
     }
 
     /// Returns messages dropped because the link did not take them.

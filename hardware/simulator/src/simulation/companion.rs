@@ -64,7 +64,7 @@ impl Companion {
 
     pub(crate) fn send(&mut self, message: &MavMessage) {
         let header = MavHeader { system_id: 255, component_id: 190, sequence: 0 };
-        self.lab.handle_mavlink(encode(header, message, &mut [0; MAX_PACKET]));
+        self.lab.handle_mavlink(0, encode(header, message, &mut [0; MAX_PACKET]));
     }
 
     pub(crate) fn command(&mut self, command: MavCmd, params: [f32; 7]) -> MavResult {

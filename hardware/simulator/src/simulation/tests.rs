@@ -318,9 +318,9 @@ proptest! {
                 Operation::Arm => { c.arm(); }
                 Operation::TakeOff(height) => { c.take_off(height); }
                 Operation::Garbage(bytes) => {
-                    c.lab.handle_mavlink(&bytes);
+                    c.lab.handle_mavlink(0, &bytes);
                     // Ends whatever packet the garbage pretended to begin.
-                    c.lab.handle_mavlink(&[0; 600]);
+                    c.lab.handle_mavlink(0, &[0; 600]);
                 }
                 Operation::Wait(seconds) => c.wait(seconds),
                 Operation::Wind(wind) => c.lab.set_wind(DVec3::from(wind)),
@@ -346,15 +346,15 @@ proptest! {
     fn packets_survive_garbage_around_them(garbage in prop::collection::vec(any::<u8>(), 0..600)) {
         let mut lab = Simulation::new(SimulationConfig::default()).unwrap();
         lab.tick();
-        lab.handle_mavlink(&garbage);
+        lab.handle_mavlink(0, &garbage);
         // Flushes whatever the garbage pretended to be the start of.
-        lab.handle_mavlink(&[0; 600]);
+        lab.handle_mavlink(0, &[0; 600]);
         while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {}
         let request = MavMessage::PARAM_REQUEST_LIST(
             PARAM_REQUEST_LIST_DATA { target_system: 1, target_component: 1 },
         );
         let header = MavHeader { system_id: 255, component_id: 1, sequence: 0 };
-        lab.handle_mavlink(encode(header, &request, &mut [0; MAX_PACKET]));
+        lab.handle_mavlink(0, encode(header, &request, &mut [0; MAX_PACKET]));
         let mut answers = 0;
         while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {
             answers += 1;

@@ -1,14 +1,19 @@
-//! Sockets of the simulator: where MAVLink goes and comes from. Non-blocking; a peer that is not
+//! Where MAVLink goes and comes from: UDP, TCP, or a serial line. Non-blocking; a peer that is not
 //! there loses packets and nothing else.
+
+pub mod serial;
 
 use std::fmt;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs, UdpSocket};
+use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
+use serial::{DEFAULT_BAUD, SerialPort, baud_rate};
+
 /// How MAVLink is reached.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Endpoint {
     /// Send to an address from a port of our own, as an autopilot's Wi-Fi bridge does.
     UdpOut(SocketAddr),
@@ -16,11 +21,20 @@ pub enum Endpoint {
     UdpIn(SocketAddr),
     /// Wait for one TCP client at a time.
     TcpIn(SocketAddr),
+    /// Connect to a TCP server, and again whenever it goes.
+    TcpOut(SocketAddr),
+    /// Open a serial device at a baud rate.
+    Serial(PathBuf, u32),
+    /// Make a pseudo-terminal with this name, as fast as this baud rate.
+    Pty(PathBuf, u32),
 }
 
 /// An endpoint that cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("mavlink endpoint '{0}': write udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT")]
+#[error(
+    "mavlink endpoint '{0}': write udpout:HOST:PORT, udpin:HOST:PORT, tcpin:HOST:PORT, \
+     tcpout:HOST:PORT, serial:PATH[:BAUD] or pty:PATH[:BAUD]"
+)]
 pub struct InvalidEndpoint(String);
 
 impl FromStr for Endpoint {
@@ -28,14 +42,25 @@ impl FromStr for Endpoint {
 
     fn from_str(text: &str) -> Result<Self, InvalidEndpoint> {
         let invalid = || InvalidEndpoint(text.to_owned());
-        let (kind, address) = text.split_once(':').ok_or_else(invalid)?;
-        let address = resolve(address).ok_or_else(invalid)?;
-        match kind {
-            "udpout" => Ok(Self::UdpOut(address)),
-            "udpin" => Ok(Self::UdpIn(address)),
-            "tcpin" => Ok(Self::TcpIn(address)),
-            _ => Err(invalid()),
-        }
+        let (kind, rest) = text.split_once(':').ok_or_else(invalid)?;
+        let address = || resolve(rest).ok_or_else(invalid);
+        let line = || {
+            let (path, baud) = match rest.rsplit_once(':') {
+                Some((path, baud)) => (path, baud.parse().map_err(|_| invalid())?),
+                None => (rest, DEFAULT_BAUD),
+            };
+            let known = !path.is_empty() && baud_rate(baud).is_some();
+            known.then(|| (PathBuf::from(path), baud)).ok_or_else(invalid)
+        };
+        Ok(match kind {
+            "udpout" => Self::UdpOut(address()?),
+            "udpin" => Self::UdpIn(address()?),
+            "tcpin" => Self::TcpIn(address()?),
+            "tcpout" => Self::TcpOut(address()?),
+            "serial" => line().map(|(path, baud)| Self::Serial(path, baud))?,
+            "pty" => line().map(|(path, baud)| Self::Pty(path, baud))?,
+            _ => return Err(invalid()),
+        })
     }
 }
 
@@ -45,6 +70,9 @@ impl fmt::Display for Endpoint {
             Self::UdpOut(address) => write!(f, "udpout:{address}"),
             Self::UdpIn(address) => write!(f, "udpin:{address}"),
             Self::TcpIn(address) => write!(f, "tcpin:{address}"),
+            Self::TcpOut(address) => write!(f, "tcpout:{address}"),
+            Self::Serial(path, baud) => write!(f, "serial:{}:{baud}", path.display()),
+            Self::Pty(path, baud) => write!(f, "pty:{}:{baud}", path.display()),
         }
     }
 }
@@ -61,6 +89,19 @@ const MAX_PEERS: usize = 8;
 /// Bytes a TCP client may be behind before it is let go.
 const MAX_BACKLOG: usize = 256 * 1024;
 
+/// A TCP server that is not there is tried again after this.
+const RETRY: Duration = Duration::from_millis(500);
+/// A TCP server has this long to answer; the flight waits, so it is short.
+const CONNECT_PATIENCE: Duration = Duration::from_millis(20);
+
+/// Where TCP clients come from.
+pub enum TcpSide {
+    /// They knock here.
+    Listens(TcpListener),
+    /// We knock there, next at this time.
+    Connects(SocketAddr, Instant),
+}
+
 /// An open link.
 pub enum Link {
     /// Over UDP, either way.
@@ -74,11 +115,13 @@ pub enum Link {
     },
     /// Over TCP.
     Tcp {
-        /// Where clients knock.
-        listener: TcpListener,
-        /// The client, and what it has not taken yet.
+        /// Who begins.
+        side: TcpSide,
+        /// The peer, and what it has not taken yet.
         client: Option<(TcpStream, Vec<u8>)>,
     },
+    /// Over a serial line.
+    Serial(SerialPort),
 }
 
 impl Link {
@@ -86,8 +129,8 @@ impl Link {
     ///
     /// # Errors
     /// Returns the operating system's refusal, of a port in use above all.
-    pub fn open(endpoint: Endpoint) -> io::Result<Self> {
-        Ok(match endpoint {
+    pub fn open(endpoint: &Endpoint) -> io::Result<Self> {
+        Ok(match *endpoint {
             Endpoint::UdpOut(target) => {
                 let any = if target.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
                 Self::Udp { socket: bind_udp(any)?, target: Some(target), peers: Vec::new() }
@@ -98,20 +141,29 @@ impl Link {
             Endpoint::TcpIn(address) => {
                 let listener = TcpListener::bind(address)?;
                 listener.set_nonblocking(true)?;
-                Self::Tcp { listener, client: None }
+                Self::Tcp { side: TcpSide::Listens(listener), client: None }
             }
+            Endpoint::TcpOut(address) => {
+                Self::Tcp { side: TcpSide::Connects(address, Instant::now()), client: None }
+            }
+            Endpoint::Serial(ref path, baud) => Self::Serial(SerialPort::open(path, baud)),
+            Endpoint::Pty(ref path, baud) => Self::Serial(SerialPort::make(path, baud)?),
         })
     }
 
-    /// Returns the address others reach us at, or for `udpout` the one we send from.
+    /// Returns where others reach us; for `udpout` where we send from, for `tcpout` where to.
     ///
     /// # Errors
     /// Returns the operating system's refusal.
-    pub fn local_address(&self) -> io::Result<SocketAddr> {
-        match self {
-            Self::Udp { socket, .. } => socket.local_addr(),
-            Self::Tcp { listener, .. } => listener.local_addr(),
-        }
+    pub fn address(&self) -> io::Result<String> {
+        Ok(match self {
+            Self::Udp { socket, .. } => socket.local_addr()?.to_string(),
+            Self::Tcp { side: TcpSide::Listens(listener), .. } => {
+                listener.local_addr()?.to_string()
+            }
+            Self::Tcp { side: TcpSide::Connects(address, _), .. } => address.to_string(),
+            Self::Serial(port) => port.path().display().to_string(),
+        })
     }
 
     /// Hands everything that has come to `sink`; at most 64 pieces, so that a flood cannot stop
@@ -134,8 +186,9 @@ impl Link {
                     }
                 }
             }
-            Self::Tcp { listener, client } => {
-                if let Ok((stream, _)) = listener.accept()
+            Self::Serial(port) => port.receive(sink),
+            Self::Tcp { side, client } => {
+                if let Some(stream) = side.next_peer(client.is_some())
                     && client.is_none()
                     && stream.set_nonblocking(true).is_ok()
                 {
@@ -178,6 +231,7 @@ impl Link {
                     let _ = socket.send_to(packet, address);
                 }
             }
+            Self::Serial(port) => port.send(packet),
             Self::Tcp { client, .. } => {
                 let Some((stream, backlog)) = client else { return };
                 backlog.extend_from_slice(packet);
@@ -200,6 +254,24 @@ impl Link {
                 if gone || backlog.len() > MAX_BACKLOG {
                     *client = None;
                 }
+            }
+        }
+    }
+}
+
+impl TcpSide {
+    /// Returns a new peer, if there is one; `busy` says that one is being served.
+    fn next_peer(&mut self, busy: bool) -> Option<TcpStream> {
+        match self {
+            // Also while busy: a second client is let go at once, not left to wait for ever.
+            Self::Listens(listener) => listener.accept().ok().map(|(stream, _)| stream),
+            Self::Connects(address, due) => {
+                if busy || Instant::now() < *due {
+                    return None;
+                }
+                let stream = TcpStream::connect_timeout(address, CONNECT_PATIENCE).ok();
+                *due = Instant::now() + RETRY;
+                stream
             }
         }
     }
@@ -230,12 +302,51 @@ mod tests {
 
     #[test]
     fn endpoints_read_and_print() {
-        for text in ["udpout:127.0.0.1:14550", "udpin:0.0.0.0:14550", "tcpin:127.0.0.1:5760"] {
+        for text in [
+            "udpout:127.0.0.1:14550",
+            "udpin:0.0.0.0:14550",
+            "tcpin:127.0.0.1:5760",
+            "tcpout:127.0.0.1:5760",
+            "serial:/dev/ttyUSB0:57600",
+            "pty:/tmp/uart:921600",
+        ] {
             assert_eq!(text.parse::<Endpoint>().unwrap().to_string(), text);
         }
-        for text in ["", "udp:1.2.3.4:5", "udpout", "udpout:127.0.0.1", "tcpin:127.0.0.1:99999"] {
+        assert_eq!("serial:/dev/ttyS1".parse(), Ok(Endpoint::Serial("/dev/ttyS1".into(), 921_600)));
+        for text in [
+            "",
+            "udp:1.2.3.4:5",
+            "udpout",
+            "udpout:127.0.0.1",
+            "tcpin:127.0.0.1:99999",
+            "serial:",
+            "serial:/dev/ttyS1:1234",
+            "pty::57600",
+        ] {
             let error = text.parse::<Endpoint>().unwrap_err();
-            assert!(error.to_string().contains("udpout:HOST:PORT"));
+            assert!(error.to_string().contains("udpout:HOST:PORT"), "{text}");
+        }
+    }
+
+    #[test]
+    fn tcp_is_served_both_ways_round_and_again_after_a_break() {
+        let any = SocketAddr::from(([127, 0, 0, 1], 0));
+        let mut server = Link::open(&Endpoint::TcpIn(any)).unwrap();
+        let address = server.address().unwrap().parse().unwrap();
+        let mut client = Link::open(&Endpoint::TcpOut(address)).unwrap();
+        let end = Instant::now() + Duration::from_secs(30);
+        for round in 0..2u8 {
+            let (mut there, mut back) = (Vec::new(), Vec::new());
+            while !there.contains(&round) || !back.contains(&round) {
+                assert!(Instant::now() < end, "round {round}: {there:?} {back:?}");
+                client.receive(|bytes| back.extend_from_slice(bytes));
+                server.receive(|bytes| there.extend_from_slice(bytes));
+                client.send(&[round]);
+                server.send(&[round]);
+            }
+            if let Link::Tcp { client, .. } = &mut client {
+                *client = None;
+            }
         }
     }
 }
