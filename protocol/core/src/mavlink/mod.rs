@@ -12,7 +12,7 @@ mod state;
 mod stream;
 
 pub use ::mavlink::dialects::ardupilotmega as dialect;
-pub use ::mavlink::{MavHeader, MavlinkVersion, Message};
+pub use ::mavlink::{MavHeader, MavlinkVersion, Message, MessageData};
 
 pub use command::{CopterMode, command_name, result_name};
 pub use frames::{

@@ -1,0 +1,435 @@
+//! The bridge as a MAVLink component of the vehicle: it shows itself, answers for its parameters,
+//! measures the round trip, reports the radio, and lands the vehicle when the companion is silent.
+
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::mavlink::dialect::{
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavModeFlag, MavParamType, MavResult,
+    MavSeverity, MavState, MavType, PARAM_VALUE_DATA, RADIO_STATUS_DATA, STATUSTEXT_DATA,
+    TIMESYNC_DATA,
+};
+use vizflyt_protocol::time::HostTime;
+
+use super::Chip;
+use super::clients::bit;
+use super::hub::{Hub, kind, millis};
+use super::loss::{Act, Flight};
+use crate::access::{self, Access};
+use crate::packet::Raw;
+use crate::ring::Tag;
+use crate::seal::{Own, seal, seal_message};
+use crate::settings::{NUMBERS, Settings};
+
+/// Our component: MAV_COMP_ID_UDP_BRIDGE.
+pub const COMPONENT_ID: u8 = 240;
+/// The vehicle's system number before its first heartbeat.
+const SYSTEM_ID: u8 = 1;
+
+/// What the shell is to do; only it touches flash and chip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Event {
+    /// Write [`Bridge::settings`](super::Bridge::settings) to flash.
+    Save,
+    /// Restart the chip, once what is queued has gone out.
+    Restart,
+}
+
+/// What was asked of others and awaits its answer, and who may ask us.
+#[derive(Clone, Debug)]
+pub(super) struct Asked {
+    /// TIMESYNC requests under way: their `ts1`, and when they passed.
+    syncs: heapless::Deque<(i64, HostTime), 4>,
+    /// When a client last asked: then we need not.
+    client_asked_at: Option<HostTime>,
+    /// The `ts1` of our own request.
+    ours: Option<i64>,
+    pub(super) access: Access,
+}
+
+impl Asked {
+    pub(super) fn new(chip: &Chip) -> Self {
+        Self {
+            syncs: heapless::Deque::new(),
+            client_asked_at: None,
+            ours: None,
+            access: Access::new(chip.random),
+        }
+    }
+
+    fn note_sync(&mut self, now: HostTime, ts1: i64) {
+        if self.syncs.is_full() {
+            self.syncs.pop_front();
+        }
+        // There is room now.
+        let _ = self.syncs.push_back((ts1, now));
+    }
+}
+
+/// After this silence of clients' TIMESYNC we ask ourselves. [s]
+const SYNC_S: f64 = 2.0;
+/// Heartbeats and reports. [s]
+pub(super) const SECOND_S: f64 = 1.0;
+/// No reading, in RADIO_STATUS.
+const UNKNOWN: u8 = 255;
+
+const HEARTBEAT: u32 = 0;
+const PARAM_REQUEST_READ: u32 = 20;
+const PARAM_REQUEST_LIST: u32 = 21;
+const PARAM_SET: u32 = 23;
+const COMMAND_LONG: u32 = 76;
+const COMMAND_ACK: u32 = 77;
+const TIMESYNC: u32 = 111;
+const TUNNEL: u32 = 385;
+
+impl Hub {
+    /// Returns our system and component.
+    pub(super) fn address(&self) -> (u8, u8) {
+        (self.autopilot.map_or(SYSTEM_ID, |(system, _)| system), COMPONENT_ID)
+    }
+
+    // ---- what passes by ----
+
+    /// Takes note of what the autopilot says; returns whether it is an answer to us alone.
+    pub(super) fn note_from_autopilot(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
+        let field = Fields(packet.payload());
+        match packet.id() {
+            HEARTBEAT => {
+                let autopilot = field.byte(5);
+                if autopilot == MavAutopilot::MAV_AUTOPILOT_INVALID as u8 {
+                    return false;
+                }
+                self.autopilot = Some(packet.source());
+                self.autopilot_at = now;
+                self.flight = Flight {
+                    armed: field.byte(6) & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0,
+                    mode: field.u32(0),
+                    px4: autopilot == MavAutopilot::MAV_AUTOPILOT_PX4 as u8,
+                };
+                self.heartbeat = heapless::Vec::from_slice(packet.bytes()).unwrap_or_default();
+                false
+            }
+            COMMAND_ACK => {
+                let ours = packet.target() == self.address();
+                let land = u32::from(field.u16(0)) == MavCmd::MAV_CMD_NAV_LAND as u32;
+                if ours && land && field.byte(2) == MavResult::MAV_RESULT_ACCEPTED as u8 {
+                    self.loss.note_acknowledged(now);
+                }
+                ours
+            }
+            TIMESYNC if field.i64(0) != 0 => {
+                let ts1 = field.i64(8);
+                if let Some(&(_, at)) = self.asked.syncs.iter().find(|&&(sent, _)| sent == ts1) {
+                    self.stats.round_trip_us = (now.seconds_since(at) * 1e6) as u32;
+                }
+                self.asked.ours == Some(ts1)
+            }
+            _ => false,
+        }
+    }
+
+    /// Takes note of what clients ask the autopilot.
+    pub(super) fn note_to_autopilot(&mut self, now: HostTime, packet: Raw<'_>) {
+        let field = Fields(packet.payload());
+        if packet.id() == TIMESYNC && field.i64(0) == 0 {
+            self.asked.note_sync(now, field.i64(8));
+            self.asked.client_asked_at = Some(now);
+        }
+    }
+
+    // ---- what is for us ----
+
+    /// Answers a packet for us, from the client `from` or from the autopilot.
+    pub(super) fn handle_own(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
+        let field = Fields(packet.payload());
+        match packet.id() {
+            PARAM_REQUEST_LIST => {
+                for index in 0..NUMBERS.len() {
+                    self.say_param(now, from, index);
+                }
+            }
+            PARAM_REQUEST_READ => {
+                let index = match field.u16(0).cast_signed() {
+                    -1 => find(field.text(4)),
+                    index => usize::try_from(index).ok().filter(|&index| index < NUMBERS.len()),
+                };
+                if let Some(index) = index {
+                    self.say_param(now, from, index);
+                }
+            }
+            PARAM_SET => {
+                let Some(index) = find(field.text(6)) else { return };
+                let value = field.f32(0);
+                if self.may_change(now, packet)
+                    && (0.0..=1e7).contains(&value)
+                    && value % 1.0 == 0.0
+                {
+                    // A value out of range changes nothing, as the answer shows.
+                    let _ = NUMBERS[index].set(&mut self.settings, value as u32);
+                }
+                self.say_param(now, from, index);
+            }
+            COMMAND_LONG if packet.target() == self.address() => {
+                self.handle_command(now, from, packet);
+            }
+            TUNNEL if packet.target() == self.address() => self.handle_tunnel(now, from, packet),
+            _ => {}
+        }
+    }
+
+    /// Whether a packet may change us: signed with the bridge's key, and the vehicle disarmed.
+    fn may_change(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
+        let reason = if self.flight.armed {
+            "bridge: nothing is changed while armed"
+        } else if !self.asked.access.signed_by(self.settings.key.as_ref(), packet) {
+            "bridge: changes need its key: vizflyt bridge configure"
+        } else {
+            return true;
+        };
+        self.stats.refused = self.stats.refused.wrapping_add(1);
+        self.say(now, MavSeverity::MAV_SEVERITY_WARNING, reason);
+        false
+    }
+
+    fn handle_command(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
+        let field = Fields(packet.payload());
+        let command = u32::from(field.u16(28));
+        let wish = if command == MavCmd::MAV_CMD_PREFLIGHT_STORAGE as u32 {
+            match field.f32(0) {
+                1.0 => Some(access::Wish::Save),
+                2.0 => Some(access::Wish::Reset),
+                _ => None,
+            }
+        } else if command == MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN as u32 {
+            Some(access::Wish::Restart)
+        } else {
+            None
+        };
+        let result = match wish {
+            None => MavResult::MAV_RESULT_UNSUPPORTED,
+            Some(wish) if self.may_change(now, packet) => {
+                self.grant(now, wish);
+                MavResult::MAV_RESULT_ACCEPTED
+            }
+            Some(_) => MavResult::MAV_RESULT_DENIED,
+        };
+        let [low, high] = field.u16(28).to_le_bytes();
+        let (system, component) = packet.source();
+        let ack = [low, high, result as u8, 0, 0, 0, 0, 0, system, component];
+        self.reply(now, from, COMMAND_ACK, &ack);
+    }
+
+    /// Does what was rightfully asked.
+    pub(super) fn grant(&mut self, now: HostTime, wish: access::Wish) {
+        match wish {
+            access::Wish::Save => {
+                // Twice the same wish is one; four different ones do not exist.
+                let _ = self.events.push_back(Event::Save);
+            }
+            access::Wish::Reset => {
+                // The key stays: who resets the settings does not open the bridge to others.
+                let key = self.settings.key;
+                self.settings = Settings { key, ..Settings::default() };
+                self.fix_client(now);
+            }
+            access::Wish::Restart => {
+                let _ = self.events.push_back(Event::Restart);
+            }
+        }
+    }
+
+    fn handle_tunnel(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
+        let field = Fields(packet.payload());
+        if field.u16(0) != access::TUNNEL_TYPE {
+            return;
+        }
+        let mut request = [0; access::BODY];
+        for (at, byte) in request.iter_mut().enumerate() {
+            *byte = field.byte(5 + at);
+        }
+        let len = usize::from(field.byte(4)).min(access::BODY);
+        let mut answer = [0; 5 + access::BODY];
+        let used = self.handle_request(now, &request[..len], &mut answer[5..]);
+        let [low, high] = access::TUNNEL_TYPE.to_le_bytes();
+        let (system, component) = packet.source();
+        answer[..5].copy_from_slice(&[low, high, system, component, used as u8]);
+        self.reply(now, from, TUNNEL, &answer[..5 + used]);
+    }
+
+    // ---- what we say ----
+
+    /// Once a second, and when the companion is silent.
+    pub(super) fn poll_component(&mut self, now: HostTime) {
+        if let Some(act) = self.loss.poll(now, self.flight, self.settings.loss_ms) {
+            self.act(now, act);
+        }
+        if now < self.second_at {
+            return;
+        }
+        self.second_at = now.plus_seconds(SECOND_S);
+        self.beacon_due = self.settings.beacon && self.autopilot.is_some();
+        self.tell_clients(
+            now,
+            &Own::HEARTBEAT(HEARTBEAT_DATA {
+                mavtype: MavType::MAV_TYPE_GENERIC,
+                autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+                system_status: MavState::MAV_STATE_ACTIVE,
+                mavlink_version: 3,
+                ..HEARTBEAT_DATA::default()
+            }),
+        );
+        if self.autopilot.is_none() {
+            return;
+        }
+        if self.settings.radio_status {
+            let status = Own::RADIO_STATUS(self.radio_status());
+            self.tell_clients(now, &status);
+            self.tell_autopilot(now, &status);
+        }
+        let asked_s = self.asked.client_asked_at.map(|at| now.seconds_since(at));
+        if !asked_s.is_some_and(|asked_s| asked_s < SYNC_S) {
+            let ts1 = now.as_ns().cast_signed().max(1);
+            self.asked.note_sync(now, ts1);
+            self.asked.ours = Some(ts1);
+            self.tell_autopilot(now, &Own::TIMESYNC(TIMESYNC_DATA { ts1, ..Default::default() }));
+        }
+    }
+
+    fn act(&mut self, now: HostTime, Act::Land { confirmation }: Act) {
+        let Some(target) = self.autopilot else { return };
+        if confirmation == 0 {
+            self.stats.landings = self.stats.landings.wrapping_add(1);
+            let text = "bridge: the companion is silent: landing";
+            self.say(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
+        }
+        self.tell_autopilot(
+            now,
+            &Own::COMMAND_LONG(COMMAND_LONG_DATA {
+                command: MavCmd::MAV_CMD_NAV_LAND,
+                target_system: target.0,
+                target_component: target.1,
+                confirmation,
+                ..Default::default()
+            }),
+        );
+    }
+
+    pub(super) fn note_saved(&mut self, now: HostTime, saved: bool) {
+        if !saved {
+            let text = "bridge: its flash did not take the settings";
+            self.say(now, MavSeverity::MAV_SEVERITY_ERROR, text);
+        }
+    }
+
+    fn radio_status(&self) -> RADIO_STATUS_DATA {
+        let most = self.clients.iter().flatten().map(|client| client.pending).max().unwrap_or(0);
+        // As SiK radios count: 1.9 steps per decibel above -127 dBm.
+        let rssi = self
+            .signal_dbm
+            .map_or(UNKNOWN, |dbm| ((f32::from(dbm) + 127.0) * 1.9).clamp(0.0, 254.0) as u8);
+        RADIO_STATUS_DATA {
+            rxerrors: self.stats.uart.cut.bad_checksum as u16,
+            fixed: 0,
+            rssi,
+            remrssi: UNKNOWN,
+            // What the autopilot slows its streams by: the slowest client's room.
+            txbuf: 100 - (most * 100 / super::hub::DOWN as u32).min(100) as u8,
+            noise: UNKNOWN,
+            remnoise: UNKNOWN,
+        }
+    }
+
+    /// Says a sentence of at most 50 characters to everybody.
+    fn say(&mut self, now: HostTime, severity: MavSeverity, text: &str) {
+        let message =
+            Own::STATUSTEXT(STATUSTEXT_DATA { severity, text: text.into(), ..Default::default() });
+        self.tell_clients(now, &message);
+        self.tell_autopilot(now, &message);
+    }
+
+    fn say_param(&mut self, now: HostTime, to: Option<usize>, index: usize) {
+        let number = &NUMBERS[index];
+        let message = Own::PARAM_VALUE(PARAM_VALUE_DATA {
+            param_value: number.value(&self.settings) as f32,
+            param_count: NUMBERS.len() as u16,
+            param_index: index as u16,
+            param_id: number.name.into(),
+            param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
+        });
+        let mut packet = [0; MAX_PACKET];
+        let len = seal_message(&mut packet, self.address(), 0, &message);
+        self.deliver(now, to, message.id(), &packet[..len]);
+    }
+
+    /// Sends a message to whoever asked.
+    fn reply(&mut self, now: HostTime, to: Option<usize>, id: u32, payload: &[u8]) {
+        let mut packet = [0; MAX_PACKET];
+        let len = seal(&mut packet, self.address(), 0, id, payload);
+        self.deliver(now, to, id, &packet[..len]);
+    }
+
+    fn tell_clients(&mut self, now: HostTime, message: &Own) {
+        let mut packet = [0; MAX_PACKET];
+        let len = seal_message(&mut packet, self.address(), 0, message);
+        let everybody = self.listeners((0, 0), None);
+        self.push_down(now, self.address(), kind(message.id()), everybody, true, &packet[..len]);
+    }
+
+    fn tell_autopilot(&mut self, now: HostTime, message: &Own) {
+        let mut packet = [0; MAX_PACKET];
+        let len = seal_message(&mut packet, self.address(), 0, message);
+        self.deliver(now, None, message.id(), &packet[..len]);
+    }
+
+    /// Puts a packet of ours into the queue of a client or of the autopilot; its number follows
+    /// when it goes out.
+    fn deliver(&mut self, now: HostTime, to: Option<usize>, id: u32, packet: &[u8]) {
+        let source = self.address();
+        if let Some(index) = to {
+            self.push_down(now, source, kind(id), bit(index), true, packet);
+        } else {
+            let tag = Tag { kind: kind(id), source, to: 0, ours: true, stamp_ms: millis(now) };
+            self.push_up(tag, packet);
+        }
+    }
+}
+
+/// Returns the place of a parameter by its name.
+fn find(name: &str) -> Option<usize> {
+    NUMBERS.iter().position(|number| number.name == name)
+}
+
+/// Reads a payload's fields; what MAVLink 2 left out is zero.
+struct Fields<'a>(&'a [u8]);
+
+impl<'a> Fields<'a> {
+    fn bytes<const N: usize>(&self, at: usize) -> [u8; N] {
+        core::array::from_fn(|i| self.byte(at + i))
+    }
+
+    fn byte(&self, at: usize) -> u8 {
+        self.0.get(at).copied().unwrap_or(0)
+    }
+
+    fn u16(&self, at: usize) -> u16 {
+        u16::from_le_bytes(self.bytes(at))
+    }
+
+    fn u32(&self, at: usize) -> u32 {
+        u32::from_le_bytes(self.bytes(at))
+    }
+
+    fn i64(&self, at: usize) -> i64 {
+        i64::from_le_bytes(self.bytes(at))
+    }
+
+    fn f32(&self, at: usize) -> f32 {
+        f32::from_le_bytes(self.bytes(at))
+    }
+
+    /// A name of at most 16 characters; empty if it is no text.
+    fn text(&self, at: usize) -> &'a str {
+        let field = self.0.get(at..).unwrap_or_default();
+        let field = &field[..field.len().min(16)];
+        let end = field.iter().position(|&byte| byte == 0).unwrap_or(field.len());
+        core::str::from_utf8(&field[..end]).unwrap_or_default()
+    }
+}

@@ -1,0 +1,506 @@
+//! Where packets go: the state behind [`Bridge`](super::Bridge).
+
+use core::net::SocketAddrV4;
+
+use heapless::Deque;
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::time::HostTime;
+
+use super::clients::{CLIENTS, Client, Peer, bit};
+use super::component::{Event, SECOND_S};
+use super::loss::{Flight, LinkLoss};
+use super::{Chip, IDLE_NS};
+use crate::packet::{CutStats, Raw};
+use crate::ring::{Ring, Tag};
+use crate::seal::renumber;
+use crate::settings::Settings;
+use crate::stats::{Reason, Sequences, Stats};
+
+/// Bytes from the autopilot that clients have not taken yet: 89 ms at 921600 baud.
+pub(super) const DOWN: usize = 8192;
+/// Bytes of setpoints, poses and commands that wait for the autopilot's port.
+const URGENT: usize = 2048;
+/// Bytes of everything else that do.
+const NORMAL: usize = 4096;
+/// A setpoint or pose this old is not worth sending when a newer one waits behind it: a period at
+/// 50 Hz. [ms]
+const STALE_MS: u16 = 20;
+/// An autopilot silent for this long is gone: three heartbeats. [s]
+const LOST_AFTER_S: f64 = 3.5;
+/// A client silent for this long gives its place to a new one if there is no other. [s]
+const REPLACEABLE_S: f64 = 2.0;
+
+#[derive(Clone, Debug)]
+pub(super) struct Hub {
+    pub(super) settings: Settings,
+    pub(super) chip: Chip,
+    pub(super) stats: Stats,
+    pub(super) down: Ring<DOWN>,
+    pub(super) urgent: Ring<URGENT>,
+    pub(super) normal: Ring<NORMAL>,
+    pub(super) clients: [Option<Client>; CLIENTS],
+    /// Where the next look for a due client begins, so that all get their turn.
+    turn: usize,
+    uart_sequences: Sequences<4>,
+    /// When the autopilot's port last spoke.
+    pub(super) uart_at: HostTime,
+    /// It is in the middle of a packet.
+    uart_busy: bool,
+    /// The autopilot, while its heartbeats come.
+    pub(super) autopilot: Option<(u8, u8)>,
+    pub(super) autopilot_at: HostTime,
+    pub(super) flight: Flight,
+    /// Its newest heartbeat, as it came: what the beacon says.
+    pub(super) heartbeat: heapless::Vec<u8, 48>,
+    pub(super) loss: LinkLoss,
+    pub(super) events: Deque<Event, 4>,
+    pub(super) started_at: HostTime,
+    pub(super) second_at: HostTime,
+    pub(super) beacon_due: bool,
+    pub(super) broadcast: Option<SocketAddrV4>,
+    pub(super) signal_dbm: Option<i8>,
+    /// Counter of our own packets to the autopilot.
+    pub(super) uart_sequence: u8,
+    pub(super) asked: super::component::Asked,
+}
+
+impl Hub {
+    pub(super) fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
+        let mut hub = Self {
+            chip,
+            stats: Stats::default(),
+            down: Ring::new(),
+            urgent: Ring::new(),
+            normal: Ring::new(),
+            clients: [const { None }; CLIENTS],
+            turn: 0,
+            uart_sequences: Sequences::new(),
+            uart_at: now,
+            uart_busy: false,
+            autopilot: None,
+            autopilot_at: now,
+            flight: Flight::default(),
+            heartbeat: heapless::Vec::new(),
+            loss: LinkLoss::default(),
+            events: Deque::new(),
+            started_at: now,
+            second_at: now.plus_seconds(SECOND_S),
+            beacon_due: false,
+            broadcast: None,
+            signal_dbm: None,
+            uart_sequence: 0,
+            asked: super::component::Asked::new(&chip),
+            settings,
+        };
+        hub.fix_client(now);
+        hub
+    }
+
+    /// Gives the client of the settings its place.
+    pub(super) fn fix_client(&mut self, now: HostTime) {
+        for place in &mut self.clients {
+            if place.as_ref().is_some_and(|client| client.fixed) {
+                *place = None;
+            }
+        }
+        if let Some(address) = self.settings.client {
+            let index = self.open(now, Peer::Udp(address));
+            if let Some(client) = index.and_then(|index| self.clients[index].as_mut()) {
+                client.fixed = true;
+            }
+        }
+    }
+
+    // ---- from the autopilot ----
+
+    pub(super) fn note_uart_bytes(&mut self, now: HostTime, len: usize) {
+        if len > 0 {
+            self.uart_at = now;
+            self.stats.uart.bytes_in = self.stats.uart.bytes_in.wrapping_add(len as u32);
+        }
+    }
+
+    pub(super) fn note_uart_cut(&mut self, cut: CutStats, busy: bool) {
+        self.stats.uart.cut = cut;
+        self.uart_busy = busy;
+    }
+
+    pub(super) fn note_stream_cut(&mut self, before: CutStats, after: CutStats) {
+        let net = &mut self.stats.net.cut;
+        let add = |to: &mut u32, before: u32, after: u32| {
+            *to = to.wrapping_add(after.wrapping_sub(before));
+        };
+        add(&mut net.packets, before.packets, after.packets);
+        add(&mut net.unknown, before.unknown, after.unknown);
+        add(&mut net.bad_checksum, before.bad_checksum, after.bad_checksum);
+        add(&mut net.dropped_bytes, before.dropped_bytes, after.dropped_bytes);
+    }
+
+    pub(super) fn take_uart(&mut self, now: HostTime, packet: Raw<'_>) {
+        let lost = self.uart_sequences.note(packet.source(), packet.sequence());
+        self.stats.uart.lost = self.stats.uart.lost.wrapping_add(lost);
+        if self.note_from_autopilot(now, packet) {
+            return;
+        }
+        let target = packet.target();
+        if target == self.address() {
+            self.handle_own(now, None, packet);
+            return;
+        }
+        let to = self.listeners(target, None);
+        self.push_down(now, packet.source(), kind(packet.id()), to, false, packet.bytes());
+    }
+
+    /// Puts a packet into the clients' ring.
+    pub(super) fn push_down(
+        &mut self,
+        now: HostTime,
+        source: (u8, u8),
+        kind: u16,
+        to: u8,
+        ours: bool,
+        bytes: &[u8],
+    ) {
+        if to == 0 {
+            if !ours {
+                self.stats.drop(Reason::NoClient, 1);
+            }
+            return;
+        }
+        while !self.down.fits(bytes.len()) {
+            self.evict();
+        }
+        self.down.push(Tag { kind, source, to, ours, stamp_ms: millis(now) }, bytes);
+        for (index, client) in self.clients.iter_mut().enumerate() {
+            let Some(client) = client.as_mut().filter(|_| to & bit(index) != 0) else { continue };
+            if client.pending == 0 {
+                client.since = now;
+            }
+            client.pending += bytes.len() as u32;
+            client.hurry |= hurries_down(kind);
+        }
+    }
+
+    /// Lets the oldest packet of the clients' ring go; who has not read it loses it.
+    fn evict(&mut self) {
+        let tail = self.down.tail();
+        let Some((tag, len, next)) = self.down.peek(tail) else { return };
+        for (index, client) in self.clients.iter_mut().enumerate() {
+            let Some(client) = client.as_mut().filter(|client| client.cursor == tail) else {
+                continue;
+            };
+            client.cursor = next;
+            if tag.to & bit(index) != 0 {
+                client.pending -= len as u32;
+                client.slow = client.slow.wrapping_add(1);
+                self.stats.drop(Reason::ClientSlow, 1);
+            }
+        }
+        self.down.pop();
+    }
+
+    /// Returns the clients that a packet for `target` is for: those behind which the target
+    /// lives, or all if nobody knows it.
+    pub(super) fn listeners(&self, target: (u8, u8), except: Option<usize>) -> u8 {
+        let mut all = 0;
+        let mut holders = 0;
+        for (index, client) in self.clients.iter().enumerate() {
+            if let Some(client) = client.as_ref().filter(|_| Some(index) != except) {
+                all |= bit(index);
+                if target.0 != 0 && client.holds(target) {
+                    holders |= bit(index);
+                }
+            }
+        }
+        if holders == 0 { all } else { holders }
+    }
+
+    // ---- from the network ----
+
+    pub(super) fn take_client(&mut self, now: HostTime, peer: Peer, packet: Raw<'_>) {
+        let Some(index) = self.open(now, peer) else {
+            self.stats.drop(Reason::TooManyClients, 1);
+            return;
+        };
+        if let Some(client) = &mut self.clients[index] {
+            let lost = client.note(now, packet);
+            self.stats.net.lost = self.stats.net.lost.wrapping_add(lost);
+        }
+        let target = packet.target();
+        let own = self.address();
+        if target == own {
+            self.handle_own(now, Some(index), packet);
+            return;
+        }
+        if target.0 == 0 || (target.0 == own.0 && target.1 == 0) {
+            // For everybody, us among them.
+            self.handle_own(now, Some(index), packet);
+        }
+        let holders = self.holders(target, index);
+        if holders != 0 {
+            self.push_down(now, packet.source(), kind(packet.id()), holders, false, packet.bytes());
+            return;
+        }
+        self.loss.note_packet(now, packet.source(), streams(kind(packet.id())));
+        self.note_to_autopilot(now, packet);
+        let tag = Tag {
+            kind: kind(packet.id()),
+            source: packet.source(),
+            to: 0,
+            ours: false,
+            stamp_ms: millis(now),
+        };
+        self.push_up(tag, packet.bytes());
+    }
+
+    /// Returns the other clients that hold `target`, if it is not the vehicle itself.
+    fn holders(&self, target: (u8, u8), except: usize) -> u8 {
+        let vehicle = self.autopilot.is_some_and(|(system, _)| system == target.0);
+        if target.0 == 0 || vehicle {
+            return 0;
+        }
+        let mut holders = 0;
+        for (index, client) in self.clients.iter().enumerate() {
+            if index != except && client.as_ref().is_some_and(|client| client.holds(target)) {
+                holders |= bit(index);
+            }
+        }
+        holders
+    }
+
+    /// Puts a packet into one of the queues for the autopilot's port.
+    pub(super) fn push_up(&mut self, tag: Tag, bytes: &[u8]) {
+        if overtakes(tag.kind) {
+            while !self.urgent.fits(bytes.len()) {
+                self.urgent.pop();
+                self.stats.drop(Reason::UartFull, 1);
+            }
+            self.urgent.push(tag, bytes);
+        } else if self.normal.fits(bytes.len()) {
+            self.normal.push(tag, bytes);
+        } else {
+            self.stats.drop(Reason::UartFull, 1);
+        }
+    }
+
+    /// Returns the place of a client, a new one if it is new and there is room.
+    pub(super) fn open(&mut self, now: HostTime, peer: Peer) -> Option<usize> {
+        let known = |client: &Option<Client>| client.as_ref().is_some_and(|c| c.peer == peer);
+        if let Some(index) = self.clients.iter().position(known) {
+            return Some(index);
+        }
+        let free = self.clients.iter().position(Option::is_none);
+        let index = free.or_else(|| self.replaceable(now))?;
+        self.clients[index] = Some(Client::new(peer, false, now, self.down.head()));
+        Some(index)
+    }
+
+    /// Returns the place of the UDP client that is silent for longest, if that is long.
+    fn replaceable(&self, now: HostTime) -> Option<usize> {
+        self.clients
+            .iter()
+            .enumerate()
+            .filter_map(|(index, client)| Some((index, client.as_ref()?)))
+            .filter(|(_, client)| matches!(client.peer, Peer::Udp(_)) && !client.fixed)
+            .map(|(index, client)| (index, now.seconds_since(client.heard_at)))
+            .filter(|&(_, silent_s)| silent_s > REPLACEABLE_S)
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(index, _)| index)
+    }
+
+    pub(super) fn close(&mut self, peer: Peer) {
+        for place in &mut self.clients {
+            if place.as_ref().is_some_and(|client| client.peer == peer) {
+                *place = None;
+            }
+        }
+    }
+
+    // ---- time ----
+
+    /// Does what is due: silence of clients and autopilot, the seconds' messages, link loss.
+    pub(super) fn poll(&mut self, now: HostTime) {
+        for place in &mut self.clients {
+            if place.as_ref().is_some_and(|client| client.is_gone(now, &self.settings)) {
+                *place = None;
+            }
+        }
+        if self.autopilot.is_some() && now.seconds_since(self.autopilot_at) > LOST_AFTER_S {
+            self.autopilot = None;
+            self.flight = Flight::default();
+        }
+        self.poll_component(now);
+    }
+
+    /// Returns when something other than sending is due next.
+    pub(super) fn due(&self) -> HostTime {
+        let mut due = self.second_at;
+        if let Some(at) = self.loss.due(self.flight, self.settings.loss_ms) {
+            due = due.min(at);
+        }
+        due
+    }
+
+    /// Returns when a datagram is due to the first client that `of` names; `None` while none waits.
+    pub(super) fn batches_due(&self, of: impl Fn(Peer) -> bool) -> Option<HostTime> {
+        self.clients
+            .iter()
+            .flatten()
+            .filter(|client| client.pending > 0 && of(client.peer))
+            .map(|client| self.batch_due(client))
+            .min()
+    }
+
+    /// Returns when what is pending for a client goes out.
+    fn batch_due(&self, client: &Client) -> HostTime {
+        if client.hurry || client.pending >= u32::from(self.settings.batch_bytes) {
+            return client.since;
+        }
+        let full = client.since.plus_ns(i64::from(self.settings.batch_us) * 1000);
+        if self.uart_busy { full } else { full.min(self.uart_at.plus_ns(IDLE_NS)) }
+    }
+
+    // ---- what comes out ----
+
+    pub(super) fn poll_uart(&mut self, now: HostTime, out: &mut [u8; MAX_PACKET]) -> usize {
+        self.drop_stale(now);
+        let len = take(&mut self.urgent, out).or_else(|| take(&mut self.normal, out));
+        let Some((tag, len)) = len else { return 0 };
+        if tag.ours {
+            self.uart_sequence = self.uart_sequence.wrapping_add(1);
+            renumber(&mut out[..len], self.uart_sequence);
+        }
+        self.stats.uart.bytes_out = self.stats.uart.bytes_out.wrapping_add(len as u32);
+        self.stats.uart.packets_out = self.stats.uart.packets_out.wrapping_add(1);
+        len
+    }
+
+    /// Leaves out setpoints and poses that are late while a newer one of the same sender waits.
+    fn drop_stale(&mut self, now: HostTime) {
+        while let Some((tag, _, mut next)) = self.urgent.peek(self.urgent.tail()) {
+            let age_ms = millis(now).wrapping_sub(tag.stamp_ms);
+            if !streams(tag.kind) || age_ms <= STALE_MS {
+                return;
+            }
+            let mut newer = false;
+            while let Some((other, _, behind)) = self.urgent.peek(next) {
+                newer |= (other.kind, other.source) == (tag.kind, tag.source);
+                next = behind;
+            }
+            if !newer {
+                return;
+            }
+            self.urgent.pop();
+            self.stats.drop(Reason::Superseded, 1);
+        }
+    }
+
+    pub(super) fn poll_udp(
+        &mut self,
+        now: HostTime,
+        out: &mut [u8],
+    ) -> Option<(SocketAddrV4, usize)> {
+        for step in 0..CLIENTS {
+            let index = (self.turn + step) % CLIENTS;
+            let Some(Client { peer: Peer::Udp(address), .. }) = self.clients[index] else {
+                continue;
+            };
+            let len = self.fill(now, index, out);
+            if len > 0 {
+                self.turn = index + 1;
+                return Some((address, len));
+            }
+        }
+        self.beacon(out)
+    }
+
+    /// Writes the autopilot's newest heartbeat for everybody on the network, once a second, while
+    /// nobody listens.
+    fn beacon(&mut self, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
+        let due = core::mem::take(&mut self.beacon_due);
+        let to = self.broadcast.filter(|_| due && self.clients.iter().all(Option::is_none))?;
+        let len = self.heartbeat.len();
+        out.get_mut(..len).filter(|out| !out.is_empty())?.copy_from_slice(&self.heartbeat);
+        Some((to, len))
+    }
+
+    pub(super) fn poll_tcp(&mut self, now: HostTime, slot: u8, out: &mut [u8]) -> usize {
+        let here = |client: &Option<Client>| {
+            client.as_ref().is_some_and(|client| client.peer == Peer::Tcp(slot))
+        };
+        self.clients.iter().position(here).map_or(0, |index| self.fill(now, index, out))
+    }
+
+    /// Writes what is due to a client into `out`, whole packets only; returns its length.
+    fn fill(&mut self, now: HostTime, index: usize, out: &mut [u8]) -> usize {
+        let most = out.len().min(usize::from(self.settings.batch_bytes));
+        let due = self.clients[index]
+            .as_ref()
+            .is_some_and(|client| client.pending > 0 && self.batch_due(client) <= now);
+        let Some(client) = self.clients[index].as_mut().filter(|_| due) else { return 0 };
+        let mut used = 0;
+        while let Some((tag, len, next)) = self.down.peek(client.cursor) {
+            if tag.to & bit(index) != 0 {
+                if used + len > most {
+                    break;
+                }
+                self.down.copy(client.cursor, &mut out[used..used + len]);
+                if tag.ours {
+                    client.sequence = client.sequence.wrapping_add(1);
+                    renumber(&mut out[used..used + len], client.sequence);
+                }
+                used += len;
+                client.pending -= len as u32;
+                client.sent = client.sent.wrapping_add(1);
+                self.stats.net.packets_out = self.stats.net.packets_out.wrapping_add(1);
+            }
+            client.cursor = next;
+        }
+        if client.pending == 0 {
+            client.hurry = false;
+        }
+        self.stats.net.bytes_out = self.stats.net.bytes_out.wrapping_add(used as u32);
+        used
+    }
+}
+
+/// Takes the oldest packet off a queue.
+fn take<const N: usize>(ring: &mut Ring<N>, out: &mut [u8; MAX_PACKET]) -> Option<(Tag, usize)> {
+    let (tag, len, _) = ring.peek(ring.tail())?;
+    ring.copy(ring.tail(), &mut out[..len]);
+    ring.pop();
+    Some((tag, len))
+}
+
+/// Returns a message's number as the ring keeps it.
+pub(super) fn kind(id: u32) -> u16 {
+    u16::try_from(id).unwrap_or(u16::MAX)
+}
+
+/// Returns milliseconds of a clock that wraps after 65.5 s.
+pub(super) fn millis(now: HostTime) -> u16 {
+    (now.as_ns() / 1_000_000) as u16
+}
+
+/// Whether a message is one of a stream by which a vehicle flies: setpoints and external
+/// navigation. Of these the newest counts.
+pub(super) fn streams(kind: u16) -> bool {
+    // SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT,
+    // MANUAL_CONTROL, RC_CHANNELS_OVERRIDE; GLOBAL_VISION_POSITION_ESTIMATE,
+    // VISION_POSITION_ESTIMATE, VISION_SPEED_ESTIMATE, VICON_POSITION_ESTIMATE, ATT_POS_MOCAP,
+    // GPS_INPUT, ODOMETRY.
+    matches!(kind, 82 | 84 | 86 | 69 | 70 | 101..=104 | 138 | 232 | 331)
+}
+
+/// Whether a message overtakes others on the way to the autopilot: streams, commands and what
+/// measures time.
+fn overtakes(kind: u16) -> bool {
+    // HEARTBEAT, SET_MODE, COMMAND_INT, COMMAND_LONG, COMMAND_CANCEL, TIMESYNC.
+    streams(kind) || matches!(kind, 0 | 11 | 75 | 76 | 80 | 111)
+}
+
+/// Whether a message from the autopilot does not wait for a batch to fill.
+fn hurries_down(kind: u16) -> bool {
+    // COMMAND_ACK, TIMESYNC.
+    matches!(kind, 77 | 111)
+}

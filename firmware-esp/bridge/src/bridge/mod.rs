@@ -1,0 +1,217 @@
+//! The bridge, sans-IO: bytes of both sides and `now` in, whole packets out.
+//!
+//! ```text
+//! UART ── handle_uart() ──▶ cut ──▶ ring ── poll_udp(), poll_tcp() ──▶ each client, batched
+//! network ── handle_datagram(), handle_stream() ──▶ cut ──▶ urgent │ normal ── poll_uart() ──▶ UART
+//! ```
+//! Packets go on byte for byte as they came, signature included, never split over datagrams. What
+//! the autopilot sends lies in one ring that every client reads at its own pace; who is too slow
+//! loses its oldest, counted. Towards the autopilot setpoints, poses and commands overtake the rest.
+//! Every packet that does not go on is counted with its reason ([`Stats`]).
+
+mod clients;
+mod component;
+mod hub;
+mod loss;
+mod requests;
+#[cfg(test)]
+mod tests;
+
+use core::net::SocketAddrV4;
+
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::time::HostTime;
+
+pub use clients::{CLIENTS, Peer, TCP_SLOTS};
+pub use component::{COMPONENT_ID, Event};
+use hub::Hub;
+pub use requests::REPORT;
+
+use crate::packet::{Cutter, each_in_datagram};
+use crate::settings::Settings;
+use crate::stats::Stats;
+
+/// What a bridge knows of the chip it runs on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Chip {
+    /// The radio's address.
+    pub address: [u8; 6],
+    /// Random bytes of this start: nobody guesses the next.
+    pub random: [u8; 16],
+}
+
+/// Silence on the autopilot's port after which a batch goes out and an unfinished packet is given
+/// up waiting for. Autopilots write packets whole; a byte at 57600 baud takes 0.17 ms. [ns]
+const IDLE_NS: i64 = 1_000_000;
+/// Silence after which a candidate's missing rest is not coming. [ns]
+const STALL_NS: i64 = 50_000_000;
+
+/// The bridge. See the module.
+#[derive(Clone, Debug)]
+pub struct Bridge {
+    uart: Cutter,
+    tcp: [Cutter; TCP_SLOTS],
+    hub: Hub,
+}
+
+impl Bridge {
+    /// Makes a bridge at `now`.
+    pub fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
+        Self {
+            uart: Cutter::default(),
+            tcp: core::array::from_fn(|_| Cutter::default()),
+            hub: Hub::new(now, settings, chip),
+        }
+    }
+
+    // ---- what goes in ----
+
+    /// Takes bytes from the autopilot's port, in any portions.
+    pub fn handle_uart(&mut self, now: HostTime, bytes: &[u8]) {
+        let Self { uart, hub, .. } = self;
+        hub.note_uart_bytes(now, bytes.len());
+        uart.push(bytes, |packet| hub.take_uart(now, packet));
+        hub.note_uart_cut(uart.stats(), uart.is_waiting());
+        hub.poll(now);
+    }
+
+    /// Takes a datagram. Its sender becomes a client if it holds a packet.
+    pub fn handle_datagram(&mut self, now: HostTime, from: SocketAddrV4, bytes: &[u8]) {
+        let hub = &mut self.hub;
+        let mut cut = hub.stats.net.cut;
+        hub.stats.net.bytes_in = hub.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        each_in_datagram(bytes, &mut cut, |packet| hub.take_client(now, Peer::Udp(from), packet));
+        hub.stats.net.cut = cut;
+        hub.poll(now);
+    }
+
+    /// Somebody has connected by TCP to this slot.
+    pub fn open_stream(&mut self, now: HostTime, slot: u8) {
+        if let Some(cutter) = self.tcp.get_mut(usize::from(slot)) {
+            cutter.restart();
+            self.hub.open(now, Peer::Tcp(slot));
+        }
+    }
+
+    /// Takes bytes from a TCP connection.
+    pub fn handle_stream(&mut self, now: HostTime, slot: u8, bytes: &[u8]) {
+        let Self { tcp, hub, .. } = self;
+        let Some(cutter) = tcp.get_mut(usize::from(slot)) else { return };
+        hub.stats.net.bytes_in = hub.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        let before = cutter.stats();
+        cutter.push(bytes, |packet| hub.take_client(now, Peer::Tcp(slot), packet));
+        hub.note_stream_cut(before, cutter.stats());
+        hub.poll(now);
+    }
+
+    /// The TCP connection of this slot has ended.
+    pub fn close_stream(&mut self, slot: u8) {
+        self.hub.close(Peer::Tcp(slot));
+    }
+
+    /// Tells how well the radio hears its partner; `None` where it does not know. [dBm]
+    pub fn set_signal(&mut self, dbm: Option<i8>) {
+        self.hub.signal_dbm = dbm;
+    }
+
+    /// Tells whether the network is up, and the address to which heartbeats are broadcast until
+    /// somebody answers.
+    pub fn set_network(&mut self, broadcast: Option<SocketAddrV4>) {
+        self.hub.broadcast = broadcast;
+    }
+
+    /// The network refused a datagram that was taken from [`Self::poll_udp`].
+    pub fn note_not_sent(&mut self) {
+        self.hub.stats.drop(crate::stats::Reason::NotSent, 1);
+    }
+
+    /// Tells how [`Event::Save`] went; a bridge that could not save says so.
+    pub fn note_saved(&mut self, now: HostTime, saved: bool) {
+        self.hub.note_saved(now, saved);
+    }
+
+    /// Does what is due at `now`.
+    pub fn handle_timeout(&mut self, now: HostTime) {
+        let Self { uart, hub, .. } = self;
+        if uart.is_waiting() && now >= hub.uart_at.plus_ns(STALL_NS) {
+            uart.flush(|packet| hub.take_uart(now, packet));
+            hub.note_uart_cut(uart.stats(), false);
+        }
+        hub.poll(now);
+    }
+
+    // ---- what comes out ----
+
+    /// Writes the next packet for the autopilot into `out`; returns its length, 0 if there is none.
+    pub fn poll_uart(&mut self, now: HostTime, out: &mut [u8; MAX_PACKET]) -> usize {
+        self.hub.poll_uart(now, out)
+    }
+
+    /// Writes the next datagram into `out` (300 bytes at least); returns whom it is for and its
+    /// length.
+    pub fn poll_udp(&mut self, now: HostTime, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
+        self.hub.poll_udp(now, out)
+    }
+
+    /// Writes what is due to a TCP client into `out` (300 bytes at least); returns its length, 0
+    /// if nothing is.
+    pub fn poll_tcp(&mut self, now: HostTime, slot: u8, out: &mut [u8]) -> usize {
+        self.hub.poll_tcp(now, slot, out)
+    }
+
+    /// Returns what the shell is to do: save, restart.
+    pub fn poll_event(&mut self) -> Option<Event> {
+        self.hub.events.pop_front()
+    }
+
+    /// Returns when the next datagram is due; `None` while none waits.
+    pub fn udp_due(&self) -> Option<HostTime> {
+        self.hub.batches_due(|peer| matches!(peer, Peer::Udp(_)))
+    }
+
+    /// Returns when something is due to a TCP client; `None` while nothing waits.
+    pub fn tcp_due(&self, slot: u8) -> Option<HostTime> {
+        self.hub.batches_due(|peer| peer == Peer::Tcp(slot))
+    }
+
+    /// Returns when [`Self::handle_timeout`] is due.
+    pub fn poll_timeout(&self) -> HostTime {
+        let due = self.hub.due();
+        if self.uart.is_waiting() { due.min(self.hub.uart_at.plus_ns(STALL_NS)) } else { due }
+    }
+
+    /// Returns the counters.
+    pub fn stats(&self) -> &Stats {
+        &self.hub.stats
+    }
+
+    /// Returns the settings as they are now; the shell writes them to flash when told.
+    pub fn settings(&self) -> &Settings {
+        &self.hub.settings
+    }
+
+    /// Returns what it knows of its chip.
+    pub fn chip(&self) -> &Chip {
+        &self.hub.chip
+    }
+
+    /// Returns the system and component of the autopilot, while its heartbeats come.
+    pub fn autopilot(&self) -> Option<(u8, u8)> {
+        self.hub.autopilot
+    }
+
+    /// Whether the vehicle is armed: then nothing about the bridge is changed.
+    pub fn is_armed(&self) -> bool {
+        self.hub.flight.armed
+    }
+
+    /// Whether it is landing the vehicle because the companion is silent.
+    pub fn is_landing(&self) -> bool {
+        self.hub.loss.is_landing()
+    }
+
+    /// Returns each client: where, packets sent to it, packets it was too slow for.
+    pub fn clients(&self) -> impl Iterator<Item = (Peer, u32, u32)> {
+        self.hub.clients.iter().flatten().map(|client| (client.peer, client.sent, client.slow))
+    }
+}

@@ -1,0 +1,184 @@
+//! Answers the requests of `access`.
+
+use vizflyt_protocol::time::HostTime;
+
+use super::hub::Hub;
+use crate::access::{HEAD, Op, PROOF, Verdict, Wish};
+use crate::settings::Refused;
+
+/// The counters of STATS, in their order on the wire, four bytes each.
+pub const REPORT: [&str; 22] = [
+    "uptime_s",
+    "uart_bytes_in",
+    "uart_bytes_out",
+    "uart_packets_in",
+    "uart_packets_out",
+    "uart_lost",
+    "uart_bad_checksum",
+    "uart_dropped_bytes",
+    "net_bytes_in",
+    "net_bytes_out",
+    "net_packets_in",
+    "net_packets_out",
+    "net_lost",
+    "net_dropped_bytes",
+    "drop_uart_full",
+    "drop_superseded",
+    "drop_client_slow",
+    "drop_no_client",
+    "drop_too_many_clients",
+    "drop_not_sent",
+    "round_trip_us",
+    "landings",
+];
+
+impl Hub {
+    /// Answers a request; returns the answer's length.
+    pub(super) fn handle_request(
+        &mut self,
+        now: HostTime,
+        request: &[u8],
+        answer: &mut [u8],
+    ) -> usize {
+        let number = request.first().copied().unwrap_or(0);
+        let mut body = 2;
+        let verdict = match (Op::from_number(number), request.get(HEAD..)) {
+            (Some(op), Some(rest)) => {
+                let (verdict, len) = self.answer(now, op, request, rest, &mut answer[2..]);
+                body += len;
+                verdict
+            }
+            _ => Verdict::Unknown,
+        };
+        answer[0] = number | 0x80;
+        answer[1] = verdict as u8;
+        body
+    }
+
+    fn answer(
+        &mut self,
+        now: HostTime,
+        op: Op,
+        request: &[u8],
+        rest: &[u8],
+        out: &mut [u8],
+    ) -> (Verdict, usize) {
+        let mut rest = rest;
+        if op.changes() || op == Op::Claim {
+            if let Some(verdict) = self.refusal(op, request) {
+                self.stats.refused = self.stats.refused.wrapping_add(1);
+                return (verdict, 0);
+            }
+            if op.changes() {
+                rest = &rest[..rest.len() - PROOF];
+            }
+        }
+        let text = core::str::from_utf8(rest).unwrap_or_default();
+        match op {
+            Op::Hello => (Verdict::Done, self.hello(out)),
+            Op::Stats => (Verdict::Done, self.report(now, out)),
+            Op::Read => match self.settings.read(text) {
+                Some(value) => {
+                    out[..value.len()].copy_from_slice(value.as_bytes());
+                    (Verdict::Done, value.len())
+                }
+                None => (Verdict::Unknown, 0),
+            },
+            Op::Set => {
+                let verdict = match text.split_once('=') {
+                    Some((name, value)) => verdict_of(self.settings.set(name, value)),
+                    None => Verdict::Malformed,
+                };
+                self.fix_client(now);
+                (verdict, 0)
+            }
+            Op::Save => {
+                self.grant(now, Wish::Save);
+                (Verdict::Done, 0)
+            }
+            Op::Reset => {
+                self.grant(now, Wish::Reset);
+                (Verdict::Done, 0)
+            }
+            Op::Restart => {
+                self.grant(now, Wish::Restart);
+                (Verdict::Done, 0)
+            }
+            Op::Claim => match rest.try_into() {
+                Ok(key) => {
+                    self.settings.key = Some(key);
+                    self.grant(now, Wish::Save);
+                    (Verdict::Done, 0)
+                }
+                Err(_) => (Verdict::Malformed, 0),
+            },
+        }
+    }
+
+    /// Returns why a change is refused, if it is.
+    fn refusal(&mut self, op: Op, request: &[u8]) -> Option<Verdict> {
+        if self.flight.armed {
+            return Some(Verdict::Armed);
+        }
+        match (self.settings.key, op) {
+            (None, Op::Claim) => None,
+            (None, _) => Some(Verdict::Unclaimed),
+            (Some(_), Op::Claim) => Some(Verdict::Claimed),
+            (Some(key), _) => {
+                (!self.asked.access.proves(&key, request)).then_some(Verdict::WrongKey)
+            }
+        }
+    }
+
+    fn hello(&self, out: &mut [u8]) -> usize {
+        let access = &self.asked.access;
+        out[..16].copy_from_slice(&access.random);
+        out[16..20].copy_from_slice(&access.counter.to_le_bytes());
+        out[20] = u8::from(self.settings.key.is_some()) | u8::from(self.flight.armed) << 1;
+        let version = env!("CARGO_PKG_VERSION").as_bytes();
+        out[21..21 + version.len()].copy_from_slice(version);
+        21 + version.len()
+    }
+
+    fn report(&self, now: HostTime, out: &mut [u8]) -> usize {
+        let s = &self.stats;
+        let [full, superseded, slow, nobody, many, not_sent] = s.drops;
+        let counters: [u32; REPORT.len()] = [
+            now.seconds_since(self.started_at) as u32,
+            s.uart.bytes_in,
+            s.uart.bytes_out,
+            s.uart.cut.packets,
+            s.uart.packets_out,
+            s.uart.lost,
+            s.uart.cut.bad_checksum,
+            s.uart.cut.dropped_bytes,
+            s.net.bytes_in,
+            s.net.bytes_out,
+            s.net.cut.packets,
+            s.net.packets_out,
+            s.net.lost,
+            s.net.cut.dropped_bytes,
+            full,
+            superseded,
+            slow,
+            nobody,
+            many,
+            not_sent,
+            s.round_trip_us,
+            s.landings,
+        ];
+        for (bytes, counter) in out.chunks_exact_mut(4).zip(counters) {
+            bytes.copy_from_slice(&counter.to_le_bytes());
+        }
+        4 * counters.len()
+    }
+}
+
+fn verdict_of(result: Result<(), Refused>) -> Verdict {
+    match result {
+        Ok(()) => Verdict::Done,
+        Err(Refused::Unknown) => Verdict::Unknown,
+        Err(Refused::Malformed) => Verdict::Malformed,
+        Err(Refused::OutOfRange) => Verdict::OutOfRange,
+    }
+}

@@ -1,0 +1,28 @@
+//! Carries MAVLink between an autopilot's serial port and a network: the firmware of the Wi-Fi
+//! bridge on a vehicle, without what differs between chips.
+//!
+//! ```text
+//! autopilot ══ UART ══▶ shell ─ bytes ─▶ Bridge ─ datagrams ─▶ shell ══ Wi-Fi ══▶ companion
+//!           ◀══════════        ◀────────        ◀────────────        ◀═════════
+//! ```
+//! [`Bridge`] is sans-IO: bytes and `now` in, packets out, no allocation; tests, fuzzers, the host's
+//! `vizflyt bridge emulate` and every chip run this one. [`shell`] (feature `net`) drives it over
+//! embassy-net and embedded-io-async. A chip's own part is its pins, its radio and its flash.
+
+#![no_std]
+
+pub mod access;
+pub mod bridge;
+pub mod packet;
+mod ring;
+pub mod seal;
+pub mod settings;
+#[cfg(feature = "net")]
+pub mod shell;
+pub mod stats;
+pub mod storage;
+mod targets;
+
+pub use bridge::{Bridge, Chip, Event, Peer};
+pub use settings::Settings;
+pub use stats::Stats;

@@ -1,0 +1,118 @@
+//! Makes packets of our own: MAVLink 2, zeros at the end left out.
+
+use vizflyt_protocol::mavlink::dialect::MavMessage;
+use vizflyt_protocol::mavlink::{MAX_PACKET, MavlinkVersion, Message};
+
+use crate::packet::x25;
+
+/// Writes a packet of message `id` into `out`; returns its length. The dialect knows the message.
+pub fn seal(
+    out: &mut [u8; MAX_PACKET],
+    source: (u8, u8),
+    sequence: u8,
+    id: u32,
+    payload: &[u8],
+) -> usize {
+    // One byte stays, even if it is zero (MAVLink guide, "Empty-byte payload truncation").
+    let trailing = payload.iter().rev().take_while(|&&byte| byte == 0).count();
+    let len = (payload.len() - trailing).max(1);
+    let [id0, id1, id2, _] = id.to_le_bytes();
+    out[..10]
+        .copy_from_slice(&[0xFD, len as u8, 0, 0, sequence, source.0, source.1, id0, id1, id2]);
+    out[10..10 + len].fill(0);
+    let given = payload.len().min(len);
+    out[10..10 + given].copy_from_slice(&payload[..given]);
+    write_crc(&mut out[..12 + len], id);
+    12 + len
+}
+
+/// Writes a message of the dialect into `out`; returns its length.
+pub(crate) fn seal_message(
+    out: &mut [u8; MAX_PACKET],
+    source: (u8, u8),
+    sequence: u8,
+    message: &Own,
+) -> usize {
+    let mut payload = [0; 255];
+    let len = message.payload(&mut payload);
+    seal(out, source, sequence, message.id(), &payload[..len])
+}
+
+/// Gives an unsigned packet of ours another sequence number.
+pub(crate) fn renumber(packet: &mut [u8], sequence: u8) {
+    packet[4] = sequence;
+    let id = u32::from_le_bytes([packet[7], packet[8], packet[9], 0]);
+    write_crc(packet, id);
+}
+
+fn write_crc(packet: &mut [u8], id: u32) {
+    let at = packet.len() - 2;
+    let extra = MavMessage::extra_crc(id);
+    let crc = packet[1..at].iter().chain([&extra]).fold(0xFFFF, |crc, &byte| x25(crc, byte));
+    packet[at..].copy_from_slice(&crc.to_le_bytes());
+}
+
+macro_rules! own {
+    ($($name:ident($data:ident)),* $(,)?) => {
+        /// The messages we send. Not the dialect's own enum: that would bring all 300 of them
+        /// into a chip's flash.
+        #[allow(non_camel_case_types, clippy::upper_case_acronyms)] // Why: named as MAVLink names them.
+        #[derive(Clone, Debug)]
+        pub(crate) enum Own {
+            $($name(vizflyt_protocol::mavlink::dialect::$data)),*
+        }
+
+        impl Own {
+            pub(crate) fn id(&self) -> u32 {
+                use vizflyt_protocol::mavlink::MessageData;
+                match self {
+                    $(Self::$name(_) => vizflyt_protocol::mavlink::dialect::$data::ID),*
+                }
+            }
+
+            fn payload(&self, out: &mut [u8]) -> usize {
+                use vizflyt_protocol::mavlink::MessageData;
+                match self {
+                    $(Self::$name(data) => data.ser(MavlinkVersion::V2, out)),*
+                }
+            }
+        }
+    };
+}
+
+own!(
+    HEARTBEAT(HEARTBEAT_DATA),
+    PARAM_VALUE(PARAM_VALUE_DATA),
+    RADIO_STATUS(RADIO_STATUS_DATA),
+    STATUSTEXT(STATUSTEXT_DATA),
+    COMMAND_LONG(COMMAND_LONG_DATA),
+    TIMESYNC(TIMESYNC_DATA),
+);
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, TIMESYNC_DATA};
+    use vizflyt_protocol::mavlink::{MavHeader, encode};
+
+    use super::*;
+
+    #[test]
+    fn ours_are_the_dialects_own_bytes() {
+        let heartbeat = HEARTBEAT_DATA { custom_mode: 7, ..Default::default() };
+        let timesync = TIMESYNC_DATA { ts1: 5, ..Default::default() };
+        let empty = TIMESYNC_DATA::default();
+        for (own, message) in [
+            (Own::HEARTBEAT(heartbeat.clone()), MavMessage::HEARTBEAT(heartbeat)),
+            (Own::TIMESYNC(timesync.clone()), MavMessage::TIMESYNC(timesync)),
+            (Own::TIMESYNC(empty.clone()), MavMessage::TIMESYNC(empty)),
+        ] {
+            let (mut ours, mut theirs) = ([0; MAX_PACKET], [0; MAX_PACKET]);
+            let header = MavHeader { system_id: 1, component_id: 240, sequence: 9 };
+            let len = seal_message(&mut ours, (1, 240), 3, &own);
+            renumber(&mut ours[..len], 9);
+            assert_eq!(&ours[..len], encode(header, &message, &mut theirs));
+        }
+    }
+}

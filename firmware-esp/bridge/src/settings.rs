@@ -1,0 +1,446 @@
+//! What a bridge can be told, and the names it is told by. Numbers are MAVLink parameters of our
+//! component as well; texts (networks, passwords, addresses) go through `vizflyt bridge configure`
+//! alone. Passwords and the key are written, never read back.
+
+use core::fmt::Write as _;
+use core::net::{Ipv4Addr, SocketAddrV4};
+use core::str::FromStr;
+
+use heapless::String;
+
+/// Which network a bridge is part of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WifiRole {
+    /// Makes a network of its own.
+    AccessPoint,
+    /// Joins one; makes its own if it cannot for [`Settings::fallback_s`].
+    Station,
+}
+
+/// The key that opens the configuration.
+pub type Key = [u8; 32];
+
+/// Everything a bridge can be told. Lives in flash; see `storage`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// Speed of the autopilot's port, 57600 to 3000000. [baud]
+    pub baud: u32,
+    /// Whether RTS and CTS are wired.
+    pub flow_control: bool,
+    /// Packets for one client wait this long for each other at most, 0 to 20000. [us]
+    pub batch_us: u32,
+    /// Bytes of a datagram at most, 300 to 1400. [bytes]
+    pub batch_bytes: u16,
+    /// A client that spoke first is forgotten after this silence, 2 to 600. [s]
+    pub client_timeout_s: u16,
+    /// UDP port that clients send to, and that their packets come from.
+    pub udp_port: u16,
+    /// TCP port; 0 closes it.
+    pub tcp_port: u16,
+    /// Port of the status page; 0 closes it.
+    pub page_port: u16,
+    /// LAND after a companion was silent for this long while the vehicle follows it, 200 to 10000;
+    /// 0 turns it off. [ms]
+    pub loss_ms: u16,
+    /// RADIO_STATUS each second.
+    pub radio_status: bool,
+    /// Until somebody answers, heartbeats are broadcast to port 14550 each second.
+    pub beacon: bool,
+    /// Which network.
+    pub wifi_role: WifiRole,
+    /// Channel of the network we make, 1 to 13.
+    pub wifi_channel: u8,
+    /// A station that cannot join for this long makes its own network, 5 to 600. [s]
+    pub fallback_s: u16,
+    /// Network to join.
+    pub ssid: String<32>,
+    /// Its password.
+    pub password: String<64>,
+    /// Name of the network we make; empty: `vizflyt-` and three bytes of the chip's address.
+    pub ap_ssid: String<32>,
+    /// Its password, 8 characters at least; empty leaves it open, which a bridge says aloud.
+    pub ap_password: String<64>,
+    /// Name that `NAME.local` finds us by.
+    pub hostname: String<32>,
+    /// Our address and its prefix length as a station; `None` asks by DHCP.
+    pub address: Option<(Ipv4Addr, u8)>,
+    /// Where the way out is, with a fixed address.
+    pub gateway: Option<Ipv4Addr>,
+    /// A client that is always sent to, whether it spoke or not.
+    pub client: Option<SocketAddrV4>,
+    /// The key; `None` until a bridge is claimed.
+    pub key: Option<Key>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            baud: 921_600,
+            flow_control: false,
+            batch_us: 5000,
+            batch_bytes: 1400,
+            client_timeout_s: 10,
+            udp_port: 14550,
+            tcp_port: 5760,
+            page_port: 80,
+            loss_ms: 1000,
+            radio_status: true,
+            beacon: true,
+            wifi_role: WifiRole::AccessPoint,
+            wifi_channel: 6,
+            fallback_s: 30,
+            ssid: String::new(),
+            password: String::new(),
+            ap_ssid: String::new(),
+            ap_password: String::new(),
+            hostname: text("vizflyt"),
+            address: None,
+            gateway: None,
+            client: None,
+            key: None,
+        }
+    }
+}
+
+/// A value that was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refused {
+    /// There is no setting of this name.
+    Unknown,
+    /// The value is no number, address or text of the right length.
+    Malformed,
+    /// The number is outside its range.
+    OutOfRange,
+}
+
+/// A number that is a MAVLink parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Number {
+    /// Name, at most 16 characters.
+    pub name: &'static str,
+    /// Least value.
+    pub least: u32,
+    /// Greatest value.
+    pub most: u32,
+    /// Whether 0 is allowed besides: it turns the thing off.
+    pub zero: bool,
+    /// It counts only after a restart of the bridge.
+    pub at_restart: bool,
+    read: fn(&Settings) -> u32,
+    write: fn(&mut Settings, u32),
+}
+
+/// All numbers, in the order of their parameter index.
+pub const NUMBERS: &[Number] = &[
+    number("UART_BAUD", 57_600, 3_000_000, true, |s| s.baud, |s, v| s.baud = v),
+    number("UART_FLOW", 0, 1, true, |s| s.flow_control.into(), |s, v| s.flow_control = v != 0),
+    number("BATCH_US", 0, 20_000, false, |s| s.batch_us, |s, v| s.batch_us = v),
+    number(
+        "BATCH_BYTES",
+        300,
+        1400,
+        false,
+        |s| s.batch_bytes.into(),
+        |s, v| {
+            s.batch_bytes = v as u16;
+        },
+    ),
+    number(
+        "CLIENT_TIMEOUT_S",
+        2,
+        600,
+        false,
+        |s| s.client_timeout_s.into(),
+        |s, v| {
+            s.client_timeout_s = v as u16;
+        },
+    ),
+    number("UDP_PORT", 1, 65_535, true, |s| s.udp_port.into(), |s, v| s.udp_port = v as u16),
+    number("TCP_PORT", 0, 65_535, true, |s| s.tcp_port.into(), |s, v| s.tcp_port = v as u16),
+    number("PAGE_PORT", 0, 65_535, true, |s| s.page_port.into(), |s, v| s.page_port = v as u16),
+    Number {
+        zero: true,
+        ..number("LOSS_MS", 200, 10_000, false, |s| s.loss_ms.into(), |s, v| s.loss_ms = v as u16)
+    },
+    number("RADIO_STATUS", 0, 1, false, |s| s.radio_status.into(), |s, v| s.radio_status = v != 0),
+    number("BEACON", 0, 1, false, |s| s.beacon.into(), |s, v| s.beacon = v != 0),
+    number(
+        "WIFI_STATION",
+        0,
+        1,
+        true,
+        |s| u32::from(s.wifi_role == WifiRole::Station),
+        |s, v| {
+            s.wifi_role = if v == 0 { WifiRole::AccessPoint } else { WifiRole::Station };
+        },
+    ),
+    number("WIFI_CHANNEL", 1, 13, true, |s| s.wifi_channel.into(), |s, v| s.wifi_channel = v as u8),
+    number(
+        "WIFI_FALLBACK_S",
+        5,
+        600,
+        true,
+        |s| s.fallback_s.into(),
+        |s, v| {
+            s.fallback_s = v as u16;
+        },
+    ),
+];
+
+/// The texts' names, and whether they may be read back.
+pub const TEXTS: &[(&str, bool)] = &[
+    ("wifi.ssid", true),
+    ("wifi.password", false),
+    ("wifi.ap_ssid", true),
+    ("wifi.ap_password", false),
+    ("hostname", true),
+    ("address", true),
+    ("gateway", true),
+    ("client", true),
+    ("key", false),
+];
+
+const fn number(
+    name: &'static str,
+    least: u32,
+    most: u32,
+    at_restart: bool,
+    read: fn(&Settings) -> u32,
+    write: fn(&mut Settings, u32),
+) -> Number {
+    Number { name, least, most, zero: false, at_restart, read, write }
+}
+
+impl Number {
+    /// Returns its value.
+    pub fn value(&self, settings: &Settings) -> u32 {
+        (self.read)(settings)
+    }
+
+    /// Sets it.
+    ///
+    /// # Errors
+    /// [`Refused::OutOfRange`].
+    pub fn set(&self, settings: &mut Settings, value: u32) -> Result<(), Refused> {
+        if (self.least..=self.most).contains(&value) || (self.zero && value == 0) {
+            (self.write)(settings, value);
+            Ok(())
+        } else {
+            Err(Refused::OutOfRange)
+        }
+    }
+}
+
+impl Settings {
+    /// Sets a number or text by its name; an empty text takes an address away.
+    ///
+    /// # Errors
+    /// See [`Refused`].
+    pub fn set(&mut self, name: &str, value: &str) -> Result<(), Refused> {
+        if let Some(number) = NUMBERS.iter().find(|number| number.name == name) {
+            let value = value.parse().map_err(|_| Refused::Malformed)?;
+            return number.set(self, value);
+        }
+        match name {
+            "wifi.ssid" => put(&mut self.ssid, value),
+            "wifi.password" => put_password(&mut self.password, value),
+            "wifi.ap_ssid" => put(&mut self.ap_ssid, value),
+            "wifi.ap_password" => put_password(&mut self.ap_password, value),
+            "hostname" => {
+                let letter = |c: char| c.is_ascii_alphanumeric() || c == '-';
+                if value.is_empty() || !value.chars().all(letter) {
+                    return Err(Refused::Malformed);
+                }
+                put(&mut self.hostname, value)
+            }
+            "address" => {
+                self.address = maybe(value, |value| {
+                    let (address, prefix) = value.split_once('/').ok_or(Refused::Malformed)?;
+                    let prefix = parsed(prefix)?;
+                    if prefix > 30 {
+                        return Err(Refused::OutOfRange);
+                    }
+                    Ok((parsed(address)?, prefix))
+                })?;
+                Ok(())
+            }
+            "gateway" => {
+                self.gateway = maybe(value, parsed)?;
+                Ok(())
+            }
+            "client" => {
+                self.client = maybe(value, parsed)?;
+                Ok(())
+            }
+            "key" => {
+                self.key = maybe(value, key_from_hex)?;
+                Ok(())
+            }
+            _ => Err(Refused::Unknown),
+        }
+    }
+
+    /// Calls `sink` with every setting's name and value, secrets too: for flash.
+    pub(crate) fn each(&self, mut sink: impl FnMut(&str, &str)) {
+        let open: [(&str, &str); 2] =
+            [("wifi.password", &self.password), ("wifi.ap_password", &self.ap_password)];
+        for (name, value) in open {
+            sink(name, value);
+        }
+        if let Some(key) = self.key {
+            let mut hex = String::<64>::new();
+            for byte in key {
+                // 32 bytes are 64 digits: it fits.
+                let _ = write!(hex, "{byte:02x}");
+            }
+            sink("key", &hex);
+        }
+        let readable = TEXTS.iter().filter(|(_, readable)| *readable).map(|(name, _)| *name);
+        for name in readable.chain(NUMBERS.iter().map(|number| number.name)) {
+            sink(name, &self.read(name).unwrap_or_default());
+        }
+    }
+
+    /// Returns a setting's value in words; `***` for what is never read back.
+    pub fn read(&self, name: &str) -> Option<String<64>> {
+        let mut out = String::new();
+        let shown = |out: &mut String<64>, value: &dyn core::fmt::Display| {
+            // The longest value is a name of 32 characters: it fits.
+            let _ = write!(out, "{value}");
+        };
+        if let Some(number) = NUMBERS.iter().find(|number| number.name == name) {
+            shown(&mut out, &number.value(self));
+            return Some(out);
+        }
+        let secret = |out: &mut String<64>, set: bool| {
+            let _ = out.push_str(if set { "***" } else { "" });
+        };
+        match name {
+            "wifi.ssid" => shown(&mut out, &self.ssid),
+            "wifi.password" => secret(&mut out, !self.password.is_empty()),
+            "wifi.ap_ssid" => shown(&mut out, &self.ap_ssid),
+            "wifi.ap_password" => secret(&mut out, !self.ap_password.is_empty()),
+            "hostname" => shown(&mut out, &self.hostname),
+            "address" => {
+                if let Some((address, prefix)) = self.address {
+                    shown(&mut out, &format_args!("{address}/{prefix}"));
+                }
+            }
+            "gateway" => {
+                if let Some(gateway) = self.gateway {
+                    shown(&mut out, &gateway);
+                }
+            }
+            "client" => {
+                if let Some(client) = self.client {
+                    shown(&mut out, &client);
+                }
+            }
+            "key" => secret(&mut out, self.key.is_some()),
+            _ => return None,
+        }
+        Some(out)
+    }
+}
+
+/// Reads a key of 64 hexadecimal digits.
+///
+/// # Errors
+/// [`Refused::Malformed`].
+pub fn key_from_hex(text: &str) -> Result<Key, Refused> {
+    let digits = text.as_bytes();
+    if digits.len() != 64 {
+        return Err(Refused::Malformed);
+    }
+    let mut key = [0; 32];
+    for (byte, pair) in key.iter_mut().zip(digits.chunks_exact(2)) {
+        let digit = |d: u8| (d as char).to_digit(16).ok_or(Refused::Malformed);
+        *byte = (digit(pair[0])? * 16 + digit(pair[1])?) as u8;
+    }
+    Ok(key)
+}
+
+/// Returns a short text.
+pub(crate) fn text<const N: usize>(value: &str) -> String<N> {
+    let mut out = String::new();
+    // Why: callers give constants that fit.
+    let _ = out.push_str(value);
+    out
+}
+
+fn put<const N: usize>(to: &mut String<N>, value: &str) -> Result<(), Refused> {
+    *to = String::try_from(value).map_err(|_| Refused::Malformed)?;
+    Ok(())
+}
+
+/// WPA2 wants 8 to 63 characters.
+fn put_password(to: &mut String<64>, value: &str) -> Result<(), Refused> {
+    if value.is_empty() || (8..=63).contains(&value.len()) {
+        put(to, value)
+    } else {
+        Err(Refused::Malformed)
+    }
+}
+
+fn maybe<T>(
+    value: &str,
+    read: impl FnOnce(&str) -> Result<T, Refused>,
+) -> Result<Option<T>, Refused> {
+    if value.is_empty() { Ok(None) } else { read(value).map(Some) }
+}
+
+fn parsed<T: FromStr>(value: &str) -> Result<T, Refused> {
+    value.parse().map_err(|_| Refused::Malformed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_number_is_named_in_range_and_kept() {
+        for (index, number) in NUMBERS.iter().enumerate() {
+            assert!(number.name.len() <= 16, "{}", number.name);
+            assert!(NUMBERS[..index].iter().all(|other| other.name != number.name));
+            let mut settings = Settings::default();
+            let default = number.value(&settings);
+            assert!((number.least..=number.most).contains(&default), "{}", number.name);
+            for value in [number.least, number.most] {
+                number.set(&mut settings, value).unwrap();
+                assert_eq!(number.value(&settings), value, "{}", number.name);
+            }
+            assert_eq!(number.set(&mut settings, number.most + 1), Err(Refused::OutOfRange));
+            assert_eq!(number.set(&mut settings, 0).is_ok(), number.least == 0 || number.zero);
+        }
+    }
+
+    #[test]
+    fn texts_are_checked_and_secrets_stay() {
+        let check = |name: &str, value: &str, expected: Result<&str, Refused>| {
+            let mut settings = Settings::default();
+            let result = settings.set(name, value);
+            let read = settings.read(name).unwrap_or_default();
+            assert_eq!(result.map(|()| read.as_str()), expected, "{name}={value}");
+        };
+        check("wifi.ssid", "lab net", Ok("lab net"));
+        check("wifi.ssid", "a name of more than thirty-two bytes", Err(Refused::Malformed));
+        check("wifi.password", "12345678", Ok("***"));
+        check("wifi.ap_password", "short", Err(Refused::Malformed));
+        check("wifi.ap_password", "", Ok(""));
+        check("hostname", "drone-3", Ok("drone-3"));
+        check("hostname", "drone 3", Err(Refused::Malformed));
+        check("address", "192.168.10.7/24", Ok("192.168.10.7/24"));
+        check("address", "192.168.10.7", Err(Refused::Malformed));
+        check("address", "192.168.10.7/31", Err(Refused::OutOfRange));
+        check("address", "", Ok(""));
+        check("gateway", "192.168.10.1", Ok("192.168.10.1"));
+        check("client", "192.168.10.2:14550", Ok("192.168.10.2:14550"));
+        check("client", "somewhere", Err(Refused::Malformed));
+        check("key", "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff", Ok("***"));
+        check("key", "0011", Err(Refused::Malformed));
+        check("UART_BAUD", "57600", Ok("57600"));
+        check("UART_BAUD", "9600", Err(Refused::OutOfRange));
+        check("LOSS_MS", "0", Ok("0"));
+        check("NO_SUCH", "1", Err(Refused::Unknown));
+    }
+}

@@ -1,0 +1,378 @@
+//! Drives a [`Bridge`] over embassy-net and any asynchronous serial port: the loop that every chip
+//! runs. A chip's own crate makes the network stack, the port, the flash and the random numbers, and
+//! then awaits [`run`] for ever.
+//!
+//! Everything runs in one task: futures side by side on one [`Shared`], no lock, no allocation.
+
+use core::cell::RefCell;
+use core::net::SocketAddrV4;
+
+use embassy_futures::join::{join, join3, join4};
+use embassy_futures::select::select;
+use embassy_net::tcp::TcpSocket;
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::{IpAddress, IpEndpoint, Stack};
+use embassy_sync::blocking_mutex::raw::NoopRawMutex;
+use embassy_sync::signal::Signal;
+use embassy_time::{Duration, Instant, Timer};
+use embedded_io_async::{Read, Write};
+use embedded_storage::nor_flash::NorFlash;
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::time::HostTime;
+
+use crate::bridge::{Bridge, Event, TCP_SLOTS};
+use crate::storage::Store;
+
+/// What only the chip can do.
+pub trait Platform {
+    /// Restarts the chip.
+    fn restart(&mut self);
+
+    /// Shows how things are, by a light.
+    fn show(&mut self, light: Light);
+
+    /// Returns how well the radio hears its partner; `None` where it does not know. [dBm]
+    fn signal_dbm(&mut self) -> Option<i8>;
+}
+
+/// What the light says; the number is how often it blinks in a period of two seconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Light {
+    /// On: autopilot and a client are there.
+    Forwarding = 0,
+    /// One blink: no network.
+    NoNetwork = 1,
+    /// Two blinks: no heartbeat from an autopilot.
+    NoAutopilot = 2,
+    /// Three blinks: nobody listens.
+    NoClient = 3,
+    /// Four blinks: no key yet; `vizflyt bridge configure` claims it.
+    Unclaimed = 4,
+    /// Fast: the companion is silent and the bridge lands the vehicle.
+    Landing = 10,
+}
+
+/// The bridge and what wakes its tasks.
+#[allow(missing_debug_implementations)] // Why: embassy's signals have none.
+pub struct Shared {
+    bridge: RefCell<Bridge>,
+    uart: Wake,
+    udp: Wake,
+    tcp: [Wake; TCP_SLOTS],
+    timer: Wake,
+}
+
+type Wake = Signal<NoopRawMutex, ()>;
+
+impl Shared {
+    /// Takes a bridge.
+    pub fn new(bridge: Bridge) -> Self {
+        Self {
+            bridge: RefCell::new(bridge),
+            uart: Wake::new(),
+            udp: Wake::new(),
+            tcp: [const { Wake::new() }; TCP_SLOTS],
+            timer: Wake::new(),
+        }
+    }
+
+    /// Gives the bridge something; wakes whoever may have something to do now.
+    pub fn with<T>(&self, f: impl FnOnce(&mut Bridge, HostTime) -> T) -> T {
+        let result = f(&mut self.bridge.borrow_mut(), now());
+        for wake in [&self.uart, &self.udp, &self.timer].into_iter().chain(&self.tcp) {
+            wake.signal(());
+        }
+        result
+    }
+
+    /// Takes something from the bridge; wakes nobody.
+    fn take<T>(&self, f: impl FnOnce(&mut Bridge, HostTime) -> T) -> T {
+        f(&mut self.bridge.borrow_mut(), now())
+    }
+}
+
+/// Memory of the sockets and of what goes through them.
+#[derive(Debug)]
+pub struct Buffers {
+    udp_in_meta: [PacketMetadata; 16],
+    udp_in: [u8; 2048],
+    udp_out_meta: [PacketMetadata; 4],
+    udp_out: [u8; 2800],
+    datagram_in: [u8; 1472],
+    datagram_out: [u8; 1400],
+    tcp: [TcpBuffers; TCP_SLOTS],
+}
+
+#[derive(Debug)]
+struct TcpBuffers {
+    receive: [u8; 536],
+    transmit: [u8; 1072],
+    batch: [u8; 536],
+}
+
+impl Default for Buffers {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Buffers {
+    /// Empty buffers; `const`, for a chip's static memory.
+    pub const fn new() -> Self {
+        Self {
+            udp_in_meta: [PacketMetadata::EMPTY; 16],
+            udp_in: [0; 2048],
+            udp_out_meta: [PacketMetadata::EMPTY; 4],
+            udp_out: [0; 2800],
+            datagram_in: [0; 1472],
+            datagram_out: [0; 1400],
+            tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
+                TCP_SLOTS],
+        }
+    }
+}
+
+/// Sockets of a bridge, for a stack's `StackResources`: UDP, TCP, and what the stack needs itself
+/// (DHCP).
+pub const SOCKETS: usize = 2 + TCP_SLOTS;
+
+/// What a bridge of ours may take of a chip's RAM: state and buffers. [bytes]
+pub const RAM_BUDGET: usize = 30 * 1024;
+const _: () = assert!(
+    core::mem::size_of::<Shared>() + core::mem::size_of::<Buffers>() <= RAM_BUDGET,
+    "the bridge outgrows the ESP8266: shrink a ring or a buffer"
+);
+
+/// Runs the bridge for ever: serial port, network, flash and light.
+pub async fn run<R: Read, W: Write, F: NorFlash, P: Platform>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    (uart_in, uart_out): (R, W),
+    store: &mut Store<F>,
+    platform: &mut P,
+    buffers: &mut Buffers,
+) -> ! {
+    join3(
+        serial(shared, uart_in, uart_out),
+        serve(shared, stack, buffers),
+        mind(shared, stack, store, platform),
+    )
+    .await;
+    // Each of the three is endless.
+    core::future::pending().await
+}
+
+/// Carries bytes between the bridge and the autopilot's port.
+async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out: W) {
+    let receive = async {
+        let mut bytes = [0; 128];
+        loop {
+            match uart_in.read(&mut bytes).await {
+                Ok(len) if len > 0 => {
+                    shared.with(|bridge, now| bridge.handle_uart(now, &bytes[..len]));
+                }
+                // An overrun, or a line that is not there: the checksum finds what is missing.
+                // A pause, so that a port that fails at once does not starve the rest.
+                _ => Timer::after(Duration::from_millis(1)).await,
+            }
+        }
+    };
+    let send = async {
+        let mut packet = [0; MAX_PACKET];
+        loop {
+            match shared.take(|bridge, now| bridge.poll_uart(now, &mut packet)) {
+                0 => shared.uart.wait().await,
+                len => {
+                    if uart_out.write_all(&packet[..len]).await.is_err() {
+                        Timer::after(Duration::from_millis(1)).await;
+                    }
+                }
+            }
+        }
+    };
+    join(receive, send).await;
+}
+
+/// Serves the network on one stack.
+async fn serve(shared: &Shared, stack: Stack<'_>, buffers: &mut Buffers) {
+    let (udp_port, tcp_port) =
+        shared.take(|bridge, _| (bridge.settings().udp_port, bridge.settings().tcp_port));
+    let Buffers { udp_in_meta, udp_in, udp_out_meta, udp_out, datagram_in, datagram_out, tcp } =
+        buffers;
+    let mut socket = UdpSocket::new(stack, udp_in_meta, udp_in, udp_out_meta, udp_out);
+    // The port is not 0 and the socket is new: nothing else is refused.
+    let _ = socket.bind(udp_port);
+    let receive = async {
+        loop {
+            let Ok((len, meta)) = socket.recv_from(datagram_in).await else { continue };
+            let IpAddress::Ipv4(address) = meta.endpoint.addr;
+            let from = SocketAddrV4::new(address, meta.endpoint.port);
+            shared.with(|bridge, now| bridge.handle_datagram(now, from, &datagram_in[..len]));
+        }
+    };
+    let send = async {
+        loop {
+            let next = shared.take(|bridge, now| bridge.poll_udp(now, datagram_out));
+            let Some((to, len)) = next else {
+                wait(&shared.udp, shared.take(|bridge, _| bridge.udp_due())).await;
+                continue;
+            };
+            let to = IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port());
+            if socket.send_to(&datagram_out[..len], to).await.is_err() {
+                shared.take(|bridge, _| bridge.note_not_sent());
+            }
+        }
+    };
+    let [first, second] = tcp;
+    join4(
+        receive,
+        send,
+        connection(shared, stack, tcp_port, 0, first),
+        connection(shared, stack, tcp_port, 1, second),
+    )
+    .await;
+}
+
+/// Serves one TCP client after another.
+async fn connection(
+    shared: &Shared,
+    stack: Stack<'_>,
+    port: u16,
+    slot: u8,
+    buffers: &mut TcpBuffers,
+) {
+    if port == 0 {
+        return;
+    }
+    let TcpBuffers { receive, transmit, batch } = buffers;
+    let wake = &shared.tcp[usize::from(slot)];
+    loop {
+        let mut socket = TcpSocket::new(stack, receive, transmit);
+        if socket.accept(port).await.is_err() {
+            Timer::after(Duration::from_millis(100)).await;
+            continue;
+        }
+        // Packets must not wait for each other, and a client that is gone must make room.
+        socket.set_nagle_enabled(false);
+        socket.set_timeout(Some(Duration::from_secs(10)));
+        socket.set_keep_alive(Some(Duration::from_secs(3)));
+        shared.with(|bridge, now| bridge.open_stream(now, slot));
+        {
+            let (mut reader, mut writer) = socket.split();
+            let read = async {
+                let mut bytes = [0; 128];
+                while let Ok(len @ 1..) = reader.read(&mut bytes).await {
+                    shared.with(|bridge, now| bridge.handle_stream(now, slot, &bytes[..len]));
+                }
+            };
+            let write = async {
+                loop {
+                    match shared.take(|bridge, now| bridge.poll_tcp(now, slot, batch)) {
+                        0 => wait(wake, shared.take(|bridge, _| bridge.tcp_due(slot))).await,
+                        len => {
+                            if writer.write_all(&batch[..len]).await.is_err() {
+                                return;
+                            }
+                        }
+                    }
+                }
+            };
+            select(read, write).await;
+        }
+        shared.with(|bridge, _| bridge.close_stream(slot));
+        socket.abort();
+        // A connection that is reset already has nothing to flush.
+        let _ = socket.flush().await;
+    }
+}
+
+/// Keeps the bridge's time, its settings and its light.
+async fn mind<F: NorFlash, P: Platform>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    store: &mut Store<F>,
+    platform: &mut P,
+) {
+    let mut shown = None;
+    let mut signal = platform.signal_dbm();
+    let mut asked_at = Instant::now();
+    loop {
+        // Asking the radio is slow on some chips; this loop turns with every packet.
+        if asked_at.elapsed() > Duration::from_secs(1) {
+            signal = platform.signal_dbm();
+            asked_at = Instant::now();
+        }
+        let broadcast = stack.config_v4().map(|config| {
+            let address = config.address.broadcast().unwrap_or(core::net::Ipv4Addr::BROADCAST);
+            SocketAddrV4::new(address, BEACON_PORT)
+        });
+        let (event, light, due) = shared.take(|bridge, now| {
+            bridge.set_network(broadcast);
+            bridge.set_signal(signal);
+            bridge.handle_timeout(now);
+            (bridge.poll_event(), light(bridge, broadcast.is_some()), bridge.poll_timeout())
+        });
+        shared.uart.signal(());
+        shared.udp.signal(());
+        if shown != Some(light) {
+            platform.show(light);
+            shown = Some(light);
+        }
+        match event {
+            Some(Event::Save) => {
+                let settings = shared.take(|bridge, _| bridge.settings().clone());
+                let saved = store.save(&settings).is_ok();
+                shared.with(|bridge, now| bridge.note_saved(now, saved));
+            }
+            Some(Event::Restart) => {
+                // The answer goes out first.
+                Timer::after(Duration::from_millis(300)).await;
+                platform.restart();
+            }
+            None => {
+                wait(&shared.timer, Some(due)).await;
+            }
+        }
+    }
+}
+
+/// Ground stations and companions listen here.
+const BEACON_PORT: u16 = 14550;
+
+/// Returns what the light shows.
+pub fn light(bridge: &Bridge, network: bool) -> Light {
+    if bridge.is_landing() {
+        Light::Landing
+    } else if !network {
+        Light::NoNetwork
+    } else if bridge.autopilot().is_none() {
+        Light::NoAutopilot
+    } else if bridge.clients().next().is_none() {
+        Light::NoClient
+    } else if bridge.settings().key.is_none() {
+        Light::Unclaimed
+    } else {
+        Light::Forwarding
+    }
+}
+
+/// Waits until woken, or until `due`.
+async fn wait(wake: &Wake, due: Option<HostTime>) {
+    match due {
+        Some(due) => {
+            select(wake.wait(), Timer::at(instant(due))).await;
+        }
+        None => wake.wait().await,
+    }
+}
+
+fn now() -> HostTime {
+    HostTime::from_ns(Instant::now().as_micros() * 1000)
+}
+
+/// Returns the moment on embassy's clock, a tick later rather than earlier: nothing is due yet
+/// just before it.
+fn instant(at: HostTime) -> Instant {
+    Instant::from_micros(at.as_ns().div_ceil(1000))
+}

@@ -1,0 +1,168 @@
+//! What a bridge counts. Counters wrap; readers take differences.
+
+use crate::packet::CutStats;
+
+/// Why a packet did not go on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Reason {
+    /// The autopilot's port was behind: more came than its baud rate carries.
+    UartFull,
+    /// A setpoint or pose waited for more than a period and a newer one of the same sender came.
+    Superseded,
+    /// A client took its packets too slowly, or its Wi-Fi did.
+    ClientSlow,
+    /// Nobody listens on the network.
+    NoClient,
+    /// All places for clients are taken.
+    TooManyClients,
+    /// The network refused a datagram: no route, no link.
+    NotSent,
+}
+
+/// Every reason with its name, as `vizflyt bridge stats` and the page show it.
+pub const REASONS: [(Reason, &str); 6] = [
+    (Reason::UartFull, "uart_full"),
+    (Reason::Superseded, "superseded"),
+    (Reason::ClientSlow, "client_slow"),
+    (Reason::NoClient, "no_client"),
+    (Reason::TooManyClients, "too_many_clients"),
+    (Reason::NotSent, "not_sent"),
+];
+
+/// What went through one side.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Side {
+    /// Bytes that came in.
+    pub bytes_in: u32,
+    /// Bytes that went out.
+    pub bytes_out: u32,
+    /// Packets that went out.
+    pub packets_out: u32,
+    /// Packets missing in the senders' sequence numbers: lost before they reached us.
+    pub lost: u32,
+    /// What came in, and what of it was no packet.
+    pub cut: CutStats,
+}
+
+/// All counters.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stats {
+    /// The autopilot's port.
+    pub uart: Side,
+    /// All clients.
+    pub net: Side,
+    /// Packets dropped, by [`Reason`].
+    pub drops: [u32; REASONS.len()],
+    /// Round trip to the autopilot by TIMESYNC, newest; 0 before the first. [us]
+    pub round_trip_us: u32,
+    /// Times the link-loss action was taken.
+    pub landings: u32,
+    /// Configuration attempts refused: wrong key, no key, vehicle armed.
+    pub refused: u32,
+}
+
+impl Stats {
+    /// Counts packets dropped for `reason`.
+    pub(crate) fn drop(&mut self, reason: Reason, packets: u32) {
+        let counter = &mut self.drops[reason as usize];
+        *counter = counter.wrapping_add(packets);
+    }
+
+    /// Returns how many packets were dropped for `reason`.
+    pub fn dropped(&self, reason: Reason) -> u32 {
+        self.drops[reason as usize]
+    }
+}
+
+/// Counts what is missing in the sequence numbers of a few senders.
+#[derive(Clone, Debug)]
+pub(crate) struct Sequences<const N: usize> {
+    senders: [Option<Sender>; N],
+    oldest: usize,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Sender {
+    source: (u8, u8),
+    last: u8,
+}
+
+/// A jump this far or further is taken for a restart or an overtaken packet: a loss of half the
+/// counter's range at once is told from neither.
+const MOST_LOST: u8 = 128;
+
+impl<const N: usize> Sequences<N> {
+    pub(crate) const fn new() -> Self {
+        Self { senders: [None; N], oldest: 0 }
+    }
+
+    /// Takes note of a packet; returns how many were lost before it.
+    pub(crate) fn note(&mut self, source: (u8, u8), sequence: u8) -> u32 {
+        let known = self.senders.iter_mut().flatten().find(|sender| sender.source == source);
+        if let Some(sender) = known {
+            let missing = sequence.wrapping_sub(sender.last).wrapping_sub(1);
+            if missing < MOST_LOST {
+                sender.last = sequence;
+                return missing.into();
+            }
+            // Overtaken: 255 is the same number again, 254 the one before. A restart is far off.
+            if missing < 240 {
+                sender.last = sequence;
+            }
+            return 0;
+        }
+        let sender = Some(Sender { source, last: sequence });
+        if let Some(place) = self.senders.iter_mut().find(|place| place.is_none()) {
+            *place = sender;
+        } else {
+            self.senders[self.oldest] = sender;
+            self.oldest = (self.oldest + 1) % N;
+        }
+        0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(numbers: &[u8], expected: u32) {
+        let mut sequences = Sequences::<2>::new();
+        let lost: u32 = numbers.iter().map(|&number| sequences.note((1, 1), number)).sum();
+        assert_eq!(lost, expected, "{numbers:?}");
+    }
+
+    #[test]
+    fn gaps_are_counted_also_across_the_wrap() {
+        check(&[0, 1, 2, 3], 0);
+        check(&[7], 0);
+        check(&[0, 2], 1);
+        check(&[254, 255, 0, 1], 0);
+        check(&[254, 1], 2);
+        check(&[255, 0], 0);
+        // Twice the same, and overtaken by one: nothing is lost that way.
+        check(&[5, 5, 6], 0);
+        check(&[5, 7, 6, 8], 1);
+        // Restarted.
+        check(&[100, 0, 1, 2], 0);
+    }
+
+    #[test]
+    fn senders_are_told_apart_and_a_third_takes_a_place() {
+        let mut sequences = Sequences::<2>::new();
+        assert_eq!(sequences.note((1, 1), 0), 0);
+        assert_eq!(sequences.note((255, 191), 9), 0);
+        assert_eq!(sequences.note((1, 1), 2), 1);
+        assert_eq!(sequences.note((3, 3), 0), 0);
+        assert_eq!(sequences.note((255, 191), 11), 1);
+        assert_eq!(sequences.note((3, 3), 1), 0);
+    }
+
+    #[test]
+    fn each_reason_has_its_own_counter() {
+        for (place, (reason, _)) in REASONS.iter().enumerate() {
+            assert_eq!(*reason as usize, place);
+        }
+    }
+}

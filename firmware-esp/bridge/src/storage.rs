@@ -1,0 +1,159 @@
+//! Settings in flash: two sectors that take turns, so that a power cut while writing leaves the
+//! settings before. Names and values as text: a newer firmware's unknown names are skipped, an
+//! older one's missing names keep their defaults.
+
+use embedded_storage::nor_flash::NorFlash;
+use sha2::{Digest, Sha256};
+
+use crate::settings::Settings;
+
+/// Bytes of a record at most; all settings at their longest take three quarters of it.
+const RECORD: usize = 1024;
+/// Magic (4), sequence (4), length (2), zero (2), hash (8).
+const HEAD: usize = 20;
+const MAGIC: [u8; 4] = *b"VZB1";
+
+/// A flash that did not take the settings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StoreError {
+    /// It refused to read, erase or write.
+    Flash,
+    /// What was read back differs.
+    Verify,
+}
+
+/// Two sectors of a flash.
+#[derive(Debug)]
+pub struct Store<F> {
+    flash: F,
+    base: u32,
+}
+
+impl<F: NorFlash> Store<F> {
+    /// Bytes it uses from `base` on.
+    pub const SIZE: u32 = 2 * F::ERASE_SIZE as u32;
+
+    /// Uses [`Self::SIZE`] bytes from `base` on, which is the start of a sector.
+    pub fn new(flash: F, base: u32) -> Self {
+        const { assert!(F::ERASE_SIZE >= RECORD && RECORD.is_multiple_of(F::WRITE_SIZE)) };
+        Self { flash, base }
+    }
+
+    /// Returns the newest settings; `None` if none were ever saved.
+    pub fn load(&mut self) -> Option<Settings> {
+        let mut record = [0; RECORD];
+        let (slot, _) = self.newest(&mut record)?;
+        self.read(slot, &mut record)?;
+        let (_, body) = valid(&record)?;
+        let mut settings = Settings::default();
+        for line in body.lines() {
+            if let Some((name, value)) = line.split_once('=') {
+                // A name of another firmware, or a value outside today's range.
+                let _ = settings.set(name, value);
+            }
+        }
+        Some(settings)
+    }
+
+    /// Writes settings over the older record.
+    ///
+    /// # Errors
+    /// See [`StoreError`]; the settings before are still there.
+    pub fn save(&mut self, settings: &Settings) -> Result<(), StoreError> {
+        let mut record = [0; RECORD];
+        let (slot, sequence) = match self.newest(&mut record) {
+            Some((slot, sequence)) => (1 - slot, sequence.wrapping_add(1)),
+            None => (0, 0),
+        };
+        let len = encode(settings, sequence, &mut record);
+        let used = len.next_multiple_of(F::WRITE_SIZE.max(4));
+        let at = self.at(slot);
+        let flash = &mut self.flash;
+        flash.erase(at, at + F::ERASE_SIZE as u32).map_err(|_| StoreError::Flash)?;
+        flash.write(at, &record[..used]).map_err(|_| StoreError::Flash)?;
+        let hash: [u8; 8] = core::array::from_fn(|i| record[12 + i]);
+        self.read(slot, &mut record).ok_or(StoreError::Flash)?;
+        match valid(&record) {
+            Some((found, _)) if found == sequence && record[12..20] == hash => Ok(()),
+            _ => Err(StoreError::Verify),
+        }
+    }
+
+    /// Forgets everything, the key too: for the button, which takes a hand on the vehicle.
+    ///
+    /// # Errors
+    /// [`StoreError::Flash`].
+    pub fn clear(&mut self) -> Result<(), StoreError> {
+        self.flash.erase(self.base, self.base + Self::SIZE).map_err(|_| StoreError::Flash)
+    }
+
+    /// Returns the flash.
+    pub fn into_flash(self) -> F {
+        self.flash
+    }
+
+    fn at(&self, slot: u32) -> u32 {
+        self.base + slot * F::ERASE_SIZE as u32
+    }
+
+    fn read(&mut self, slot: u32, record: &mut [u8; RECORD]) -> Option<()> {
+        let at = self.at(slot);
+        self.flash.read(at, record).ok()
+    }
+
+    /// Returns slot and sequence of the newest valid record.
+    fn newest(&mut self, record: &mut [u8; RECORD]) -> Option<(u32, u32)> {
+        let mut newest: Option<(u32, u32)> = None;
+        for slot in 0..2 {
+            if self.read(slot, record).is_none() {
+                continue;
+            }
+            let Some((sequence, _)) = valid(record) else { continue };
+            let newer = newest.is_none_or(|(_, known)| sequence.wrapping_sub(known) < u32::MAX / 2);
+            if newer {
+                newest = Some((slot, sequence));
+            }
+        }
+        newest
+    }
+}
+
+fn encode(settings: &Settings, sequence: u32, record: &mut [u8; RECORD]) -> usize {
+    record.fill(0);
+    let mut len = HEAD;
+    settings.each(|name, value| {
+        for part in [name, "=", value, "\n"] {
+            // All settings at their longest fit: see the test.
+            if let Some(place) = record.get_mut(len..len + part.len()) {
+                place.copy_from_slice(part.as_bytes());
+                len += part.len();
+            }
+        }
+    });
+    record[..4].copy_from_slice(&MAGIC);
+    record[4..8].copy_from_slice(&sequence.to_le_bytes());
+    record[8..10].copy_from_slice(&((len - HEAD) as u16).to_le_bytes());
+    let hash = hash(record, len);
+    record[12..20].copy_from_slice(&hash);
+    len
+}
+
+/// Returns a record's sequence and body if it is whole.
+fn valid(record: &[u8; RECORD]) -> Option<(u32, &str)> {
+    let len = HEAD + usize::from(u16::from_le_bytes([record[8], record[9]]));
+    if record[..4] != MAGIC || len > RECORD || record[12..20] != hash(record, len) {
+        return None;
+    }
+    let sequence = u32::from_le_bytes([record[4], record[5], record[6], record[7]]);
+    Some((sequence, core::str::from_utf8(&record[HEAD..len]).ok()?))
+}
+
+/// Returns what a record's bytes but the hash itself add up to.
+fn hash(record: &[u8; RECORD], len: usize) -> [u8; 8] {
+    let whole =
+        Sha256::new().chain_update(&record[..12]).chain_update(&record[HEAD..len]).finalize();
+    core::array::from_fn(|at| whole[at])
+}
+
+#[cfg(test)]
+mod tests;
