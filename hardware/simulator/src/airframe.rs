@@ -93,6 +93,8 @@ pub struct Airframe {
     state: AirframeState,
     floor_z_m: f64,
     wind_world_mps: DVec3,
+    /// What each rotor gives of what a sound one would.
+    soundness: [f64; 4],
     specific_force_body: DVec3,
 }
 
@@ -109,6 +111,7 @@ impl Airframe {
             },
             floor_z_m: p_world_m.z,
             wind_world_mps: DVec3::ZERO,
+            soundness: [1.0; 4],
             specific_force_body: DVec3::Z * GRAVITY_MPS2,
         }
     }
@@ -126,6 +129,11 @@ impl Airframe {
     /// Sets the wind. [m/s, world]
     pub fn set_wind(&mut self, wind_world_mps: DVec3) {
         self.wind_world_mps = wind_world_mps;
+    }
+
+    /// Breaks a motor, by ArduCopter's order from 0: from now on it gives this share of its thrust.
+    pub fn break_motor(&mut self, motor: usize, share: f64) {
+        self.soundness[motor] = share.clamp(0.0, 1.0);
     }
 
     /// Returns what an ideal accelerometer felt on average over the last tick. [m/s^2, body]
@@ -177,7 +185,8 @@ impl Airframe {
     }
 
     fn derivative(&self, s: &AirframeState, commands: [f64; 4]) -> Derivative {
-        let thrusts = s.rotor_speed.map(thrust_n);
+        let thrusts: [f64; 4] =
+            std::array::from_fn(|i| thrust_n(s.rotor_speed[i]) * self.soundness[i]);
         let mut torque = DVec3::ZERO;
         let mut rotor_momentum = 0.0;
         for ((mount, thrust), speed) in MOUNTS.iter().zip(thrusts).zip(s.rotor_speed) {

@@ -14,8 +14,10 @@ use crate::driver::Driver;
 use crate::link::serial::{DEFAULT_BAUD, baud_rate};
 use crate::link::{Endpoint, resolve};
 use crate::mocap::{MAX_NAME, MocapConfig};
+use crate::simulation::faults::{Faults, MotorFault};
 use crate::simulation::{Simulation, SimulationConfig};
 use crate::stop::stop_flag;
+use crate::wifi::WifiConfig;
 
 /// The simulated lab: vehicle, autopilot and motion capture.
 #[derive(Args, Clone, Debug)]
@@ -64,6 +66,45 @@ pub struct SimArgs {
     /// Steady wind in metres per second, world axes.
     #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = parse_numbers::<3>, allow_hyphen_values = true)]
     pub wind: [f64; 3],
+    /// Standard deviation of gusts along each horizontal axis, in metres per second.
+    #[arg(long, value_name = "M/S", default_value_t = 0.0)]
+    pub gusts: f64,
+    /// How much each unbalanced rotor shakes the sensors at full throttle, in m/s^2; with 200 a hovering
+    /// vehicle reports about the 30 that ArduPilot warns of.
+    #[arg(long, value_name = "M/S^2", default_value_t = 0.0)]
+    pub vibration: f64,
+    /// Charge of the battery at the start, in percent.
+    #[arg(long, value_name = "PERCENT", default_value_t = 100.0)]
+    pub battery: f64,
+    /// A radio control is there: its receiver is connected and its transmitter is on.
+    #[arg(long)]
+    pub radio: bool,
+    /// The transmitter falls silent this many seconds after leaving the floor.
+    #[arg(long, value_name = "SECONDS", requires = "radio")]
+    pub radio_lost_after: Option<f64>,
+    /// A motor (1 to 4, ArduCopter's order) fails so many seconds after leaving the floor; it gives
+    /// PERCENT of its thrust from then on, nothing if absent.
+    #[arg(long, value_name = "MOTOR@SECONDS[,PERCENT]", value_parser = parse_motor_fault)]
+    pub motor_failure: Option<MotorFault>,
+    /// The autopilot reboots this many seconds after leaving the floor: motors stop at once.
+    #[arg(long, value_name = "SECONDS")]
+    pub reboot_after: Option<f64>,
+    /// MAVLink goes through a model of an ESP8266's Wi-Fi: batches of 2 to 5 ms, latency, bursts of
+    /// loss.
+    #[arg(long)]
+    pub wifi: bool,
+    /// Latency of --wifi, in milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 2.0, requires = "wifi")]
+    pub wifi_latency_ms: f64,
+    /// Mean latency that contention adds to it, in milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 1.0, requires = "wifi")]
+    pub wifi_jitter_ms: f64,
+    /// Share of --wifi's batches that are lost, in percent.
+    #[arg(long, value_name = "PERCENT", default_value_t = 1.0, requires = "wifi")]
+    pub wifi_loss_percent: f64,
+    /// Batches lost in a row, on average.
+    #[arg(long, value_name = "BATCHES", default_value_t = 3.0, requires = "wifi")]
+    pub wifi_burst: f64,
     /// Simulated seconds per second.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     pub realtime_factor: f64,
@@ -111,6 +152,18 @@ fn parse_numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     numbers.try_into().map_err(|_| format!("'{text}' has {count} numbers; give {N}"))
 }
 
+fn parse_motor_fault(text: &str) -> Result<MotorFault, String> {
+    let read = || {
+        let (motor, rest) = text.split_once('@')?;
+        let (after_s, percent) = rest.split_once(',').unwrap_or((rest, "0"));
+        let motor = motor.parse::<usize>().ok().filter(|motor| (1..=4).contains(motor))? - 1;
+        let after_s = after_s.parse::<f64>().ok().filter(|s| (0.0..=1e6).contains(s))?;
+        let percent = percent.parse::<f64>().ok().filter(|p| (0.0..=100.0).contains(p))?;
+        Some(MotorFault { motor, share: percent / 100.0, after_s })
+    };
+    read().ok_or_else(|| format!("'{text}': write MOTOR@SECONDS or MOTOR@SECONDS,PERCENT, as 2@5"))
+}
+
 fn parse_param(text: &str) -> Result<(String, f32), String> {
     text.split_once('=')
         .and_then(|(name, value)| Some((name.to_owned(), value.parse::<f32>().ok()?)))
@@ -148,6 +201,15 @@ impl SimArgs {
         in_range("mocap-delay-ms", self.mocap_delay_ms, 0.0..=10_000.0)?;
         in_range("mocap-drop-percent", self.mocap_drop_percent, 0.0..=100.0)?;
         in_range("mocap-stop-after", self.mocap_stop_after.unwrap_or(0.0), 0.0..=1e9)?;
+        in_range("gusts", self.gusts, 0.0..=20.0)?;
+        in_range("vibration", self.vibration, 0.0..=2000.0)?;
+        in_range("battery", self.battery, 0.0..=100.0)?;
+        in_range("radio-lost-after", self.radio_lost_after.unwrap_or(0.0), 0.0..=1e9)?;
+        in_range("reboot-after", self.reboot_after.unwrap_or(0.0), 0.0..=1e9)?;
+        in_range("wifi-latency-ms", self.wifi_latency_ms, 0.0..=10_000.0)?;
+        in_range("wifi-jitter-ms", self.wifi_jitter_ms, 0.0..=10_000.0)?;
+        in_range("wifi-loss-percent", self.wifi_loss_percent, 0.0..=100.0)?;
+        in_range("wifi-burst", self.wifi_burst, 1.0..=10_000.0)?;
         let [x, y, z, yaw_deg] = self.spawn;
         Ok(SimulationConfig {
             spawn_m: DVec3::new(x, y, z),
@@ -164,6 +226,23 @@ impl SimArgs {
             },
             params: self.params.clone(),
             wind_world_mps: DVec3::from(self.wind),
+            gust_mps: self.gusts,
+            vibration_mps2: self.vibration,
+            battery_share: self.battery / 100.0,
+            radio: self.radio,
+            faults: Faults {
+                motor: self.motor_failure,
+                radio_lost_after_s: self.radio_lost_after,
+                reboot_after_s: self.reboot_after,
+            },
+            wifi: self.wifi.then_some(WifiConfig {
+                seed: self.seed,
+                latency_s: self.wifi_latency_ms / 1000.0,
+                jitter_s: self.wifi_jitter_ms / 1000.0,
+                loss: self.wifi_loss_percent / 100.0,
+                burst: self.wifi_burst,
+                ..WifiConfig::default()
+            }),
         })
     }
 
@@ -301,6 +380,17 @@ mod tests {
     }
 
     #[test]
+    fn what_breaks_is_understood() {
+        let args =
+            parse(&["--motor-failure", "2@5.5,30", "--reboot-after", "3", "--wifi"]).unwrap();
+        let config = args.config().unwrap();
+        let motor = MotorFault { motor: 1, share: 0.3, after_s: 5.5 };
+        assert_eq!((config.faults.motor, config.faults.reboot_after_s), (Some(motor), Some(3.0)));
+        assert_eq!(config.wifi, Some(WifiConfig::default()));
+        assert_eq!(parse(&[]).unwrap().config().unwrap().wifi, None);
+    }
+
+    #[test]
     fn bad_arguments_are_named() {
         let check = |arguments: &[&str], expected: &str| {
             let error = parse(arguments)
@@ -312,6 +402,10 @@ mod tests {
         check(&["--spawn", "1,2,3"], "has 3 numbers; give 4");
         check(&["--spawn", "1,2,x,4"], "give 4 numbers");
         check(&["--mavlink", "udp:1"], "udpout:HOST:PORT");
+        check(&["--motor-failure", "5@1"], "MOTOR@SECONDS");
+        check(&["--wifi-latency-ms", "5"], "--wifi");
+        check(&["--radio-lost-after", "5"], "--radio");
+        check(&["--battery", "130"], "outside 0 to 100");
         check(&["--baud", "1234"], "no baud rate");
         check(&["--serial", "/a", "--pty", "/b"], "cannot be used with");
         check(&["--object", "a name of more than twenty-four"], "1 to 24");

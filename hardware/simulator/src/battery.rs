@@ -28,6 +28,11 @@ impl Default for Battery {
 }
 
 impl Battery {
+    /// Makes a battery charged to a share, 0 to 1.
+    pub fn charged(share: f64) -> Self {
+        Self { left_ah: CAPACITY_AH * share.clamp(0.0, 1.0), current_a: 0.0 }
+    }
+
     /// Drains the battery for `dt_s` with rotors at fractions of full speed.
     pub fn tick(&mut self, rotor_speed: [f64; 4], dt_s: f64) {
         let lift_w: f64 =
@@ -52,7 +57,7 @@ impl Battery {
     }
 }
 
-/// Returns the charge left as the autopilot guesses it from the voltage, 0 to 1.
+/// Returns the charge left as one may guess it from a resting voltage, 0 to 1.
 pub fn fraction_of(voltage_v: f64) -> f64 {
     ((voltage_v / CELLS - 3.3) / 0.9).clamp(0.0, 1.0)
 }

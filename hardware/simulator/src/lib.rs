@@ -17,6 +17,7 @@ pub mod battery;
 pub mod imu;
 pub mod motor;
 mod noise;
+pub mod wind;
 
 pub mod autopilot;
 pub mod control;
@@ -25,6 +26,7 @@ pub mod estimator;
 pub mod mocap;
 pub mod simulation;
 pub mod truth;
+pub mod wifi;
 
 mod args;
 pub mod driver;

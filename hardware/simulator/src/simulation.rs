@@ -2,7 +2,9 @@
 //! caller turns the crank with [`Simulation::tick`] and carries bytes.
 //!
 //! One tick is 2.5 ms: two physics steps, one sensor sample, one turn of the autopilot, and every
-//! second time a mocap pose.
+//! second time a mocap pose. What breaks, and when, is in [`faults`].
+
+pub mod faults;
 
 use glam::DVec3;
 use serde::Serialize;
@@ -12,11 +14,14 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::{Airframe, AirframeState};
 pub use crate::autopilot::MAX_LINKS;
-use crate::autopilot::{Autopilot, UnknownParam};
+use crate::autopilot::{Autopilot, Radio, UnknownParam};
 use crate::battery::Battery;
 use crate::imu::Imu;
 use crate::mocap::{DATAGRAM, Mocap, MocapConfig};
 use crate::truth::{Truth, TruthReport};
+use crate::wifi::{Wifi, WifiConfig};
+use crate::wind::Wind;
+use faults::{Due, Faults};
 
 /// Ticks a second: the rate of ArduCopter's main loop. [Hz]
 pub const TICK_HZ: u64 = 400;
@@ -24,6 +29,9 @@ const TICK_NS: i64 = 1_000_000_000 / TICK_HZ.cast_signed();
 const TICK_S: f64 = 1.0 / TICK_HZ as f64;
 /// Physics steps a tick: 800 Hz.
 const STEPS: u32 = 2;
+
+/// An autopilot that reboots says nothing for this long. [s]
+const BOOT_S: f64 = 1.5;
 
 /// The lab as it stands at the start.
 #[derive(Clone, Debug)]
@@ -42,8 +50,20 @@ pub struct SimulationConfig {
     pub mocap: MocapConfig,
     /// Autopilot parameters that differ from the defaults.
     pub params: Vec<(String, f32)>,
-    /// Wind. [m/s, world]
+    /// Steady wind. [m/s, world]
     pub wind_world_mps: DVec3,
+    /// Standard deviation of gusts along each horizontal axis. [m/s]
+    pub gust_mps: f64,
+    /// Amplitude with which the rotors shake the sensors at full throttle. [m/s^2]
+    pub vibration_mps2: f64,
+    /// Charge of the battery at the start, 0 to 1.
+    pub battery_share: f64,
+    /// A receiver is connected and a transmitter is on.
+    pub radio: bool,
+    /// What breaks, and when.
+    pub faults: Faults,
+    /// MAVLink goes over this Wi-Fi; over a cable if absent.
+    pub wifi: Option<WifiConfig>,
 }
 
 impl Default for SimulationConfig {
@@ -57,6 +77,12 @@ impl Default for SimulationConfig {
             mocap: MocapConfig::default(),
             params: Vec::new(),
             wind_world_mps: DVec3::ZERO,
+            gust_mps: 0.0,
+            vibration_mps2: 0.0,
+            battery_share: 1.0,
+            radio: false,
+            faults: Faults::default(),
+            wifi: None,
         }
     }
 }
@@ -83,12 +109,23 @@ pub struct SimulationReport {
     pub mavlink_packets_dropped: u64,
     /// Mocap poses sent.
     pub mocap_poses: u64,
+    /// MAVLink packets that the simulated Wi-Fi lost, both ways.
+    pub wifi_packets_lost: u64,
+    /// Times the autopilot has rebooted.
+    pub reboots: u32,
 }
 
 /// The lab.
 pub struct Simulation {
     now: AutopilotTime,
+    /// When the autopilot began to run; its clock counts from here.
+    booted_at: AutopilotTime,
+    reboots: u32,
+    /// To the autopilot, and from it.
+    wifi: Option<[Wifi; 2]>,
     airframe: Airframe,
+    wind: Wind,
+    faults: Faults,
     imu: Imu,
     battery: Battery,
     autopilot: Autopilot,
@@ -107,14 +144,21 @@ impl Simulation {
     /// # Errors
     /// Returns the first parameter name that the autopilot does not have.
     pub fn new(config: SimulationConfig) -> Result<Self, UnknownParam> {
-        let mut airframe = Airframe::standing(config.spawn_m, config.spawn_yaw_rad);
-        airframe.set_wind(config.wind_world_mps);
+        let mut imu = Imu::new(config.seed);
+        imu.set_vibration(config.vibration_mps2);
+        let mut autopilot = Autopilot::with_params(&config.params)?;
+        autopilot.set_radio(if config.radio { Radio::Heard } else { Radio::Absent });
         Ok(Self {
             now: AutopilotTime::ZERO,
-            airframe,
-            imu: Imu::new(config.seed),
-            battery: Battery::default(),
-            autopilot: Autopilot::with_params(&config.params)?,
+            booted_at: AutopilotTime::ZERO,
+            reboots: 0,
+            airframe: Airframe::standing(config.spawn_m, config.spawn_yaw_rad),
+            wind: Wind::new(config.seed, config.wind_world_mps, config.gust_mps),
+            faults: config.faults,
+            wifi: config.wifi.map(|wifi| [Wifi::new(wifi, 0), Wifi::new(wifi, 1)]),
+            imu,
+            battery: Battery::charged(config.battery_share),
+            autopilot,
             mocap: Mocap::new(MocapConfig { seed: config.seed, ..config.mocap }),
             truth: Truth::new(&config.obstacles, config.body_radius_m, config.spawn_m.z),
             motors: [0.0; 4],
@@ -125,7 +169,7 @@ impl Simulation {
         })
     }
 
-    /// Returns the time since boot.
+    /// Returns the time since the start.
     pub fn now(&self) -> AutopilotTime {
         self.now
     }
@@ -140,22 +184,70 @@ impl Simulation {
         &self.autopilot
     }
 
-    /// Sets the wind. [m/s, world]
+    /// Returns the time on the autopilot's own clock, which starts anew when it reboots.
+    pub fn autopilot_now(&self) -> AutopilotTime {
+        AutopilotTime::from_ns(self.now.as_ns().saturating_sub(self.booted_at.as_ns()))
+    }
+
+    /// Sets the steady wind. [m/s, world]
     pub fn set_wind(&mut self, wind_world_mps: DVec3) {
-        self.airframe.set_wind(wind_world_mps);
+        self.wind.set_steady(wind_world_mps);
+    }
+
+    /// Breaks a motor, from 0 in ArduCopter's order: it gives this share of its thrust.
+    pub fn break_motor(&mut self, motor: usize, share: f64) {
+        self.airframe.break_motor(motor, share);
+    }
+
+    /// Says what the receiver of the radio control hears.
+    pub fn set_radio(&mut self, radio: Radio) {
+        self.autopilot.set_radio(radio);
+    }
+
+    /// The autopilot loses power for a moment: motors stop, it forgets all but its parameters, and
+    /// is silent for [`BOOT_S`].
+    pub fn reboot(&mut self) {
+        tracing::info!(target: "autopilot", "reboots");
+        self.autopilot = self.autopilot.rebooted();
+        self.motors = [0.0; 4];
+        self.booted_at = self.now.plus_seconds(BOOT_S);
+        self.reboots += 1;
+    }
+
+    fn is_booting(&self) -> bool {
+        self.now < self.booted_at
     }
 
     /// Takes bytes of a MAVLink link, one of [`MAX_LINKS`]. Each is a stream of its own; what is
     /// sent goes to all.
     pub fn handle_mavlink(&mut self, link: usize, bytes: &[u8]) {
-        self.autopilot.handle_input(self.now, link, bytes);
+        match &mut self.wifi {
+            Some([up, _]) => up.send(self.now, link, bytes),
+            None => self.deliver(link, bytes),
+        }
+    }
+
+    fn deliver(&mut self, link: usize, bytes: &[u8]) {
+        if !self.is_booting() {
+            self.autopilot.handle_input(self.autopilot_now(), link, bytes);
+        }
     }
 
     /// Returns the next MAVLink packet to send.
     pub fn poll_mavlink<'a>(&mut self, buffer: &'a mut [u8; MAX_PACKET]) -> Option<&'a [u8]> {
-        let packet = self.autopilot.poll_transmit(buffer)?;
-        self.packets_out += 1;
-        Some(packet)
+        let Some([_, down]) = &mut self.wifi else {
+            let packet = self.autopilot.poll_transmit(buffer)?;
+            self.packets_out += 1;
+            return Some(packet);
+        };
+        while let Some(packet) = self.autopilot.poll_transmit(buffer) {
+            down.send(self.now, 0, packet);
+            self.packets_out += 1;
+        }
+        let (_, packet) = down.poll(self.now)?;
+        let whole = buffer.get_mut(..packet.len())?;
+        whole.copy_from_slice(&packet);
+        Some(whole)
     }
 
     /// Returns the next mocap datagram to send.
@@ -170,6 +262,7 @@ impl Simulation {
         let dt_s = TICK_S / f64::from(STEPS);
         let mut felt_body = DVec3::ZERO;
         let mut omega_body = DVec3::ZERO;
+        self.airframe.set_wind(self.wind.tick(TICK_S));
         for _ in 0..STEPS {
             omega_body += self.airframe.state().omega_body_radps / 2.0;
             self.airframe.tick(self.motors, dt_s);
@@ -183,12 +276,33 @@ impl Simulation {
         self.battery.tick(state.rotor_speed, TICK_S);
 
         let steps = f64::from(STEPS);
-        let mut sample =
-            self.imu.sample(felt_body / steps, omega_body / steps, state.p_world_m.z, TICK_S);
+        let mut sample = self.imu.sample(
+            felt_body / steps,
+            omega_body / steps,
+            state.p_world_m.z,
+            state.rotor_speed,
+            TICK_S,
+        );
         sample.battery_v = self.battery.voltage_v();
         sample.battery_a = self.battery.current_a();
-        self.motors = self.autopilot.handle_sensors(self.now, &sample, TICK_S);
-        self.autopilot.handle_timeout(self.now);
+        if !self.is_booting() {
+            let now = self.autopilot_now();
+            self.motors = self.autopilot.handle_sensors(now, &sample, TICK_S);
+            self.autopilot.handle_timeout(now);
+            if self.autopilot.wants_reboot() {
+                self.reboot();
+            }
+        }
+        while let Some((link, packet)) = self.wifi.as_mut().and_then(|[up, _]| up.poll(self.now)) {
+            self.deliver(link, &packet);
+        }
+        while let Some(due) = self.faults.due(self.truth.since_take_off_s()) {
+            match due {
+                Due::Motor { motor, share } => self.break_motor(motor, share),
+                Due::Radio => self.set_radio(Radio::Lost),
+                Due::Reboot => self.reboot(),
+            }
+        }
         self.mocap.handle_truth(self.now, &state.pose());
 
         if self.autopilot.is_armed() && !self.autopilot.is_landed() {
@@ -211,6 +325,8 @@ impl Simulation {
             mavlink_packets_out: self.packets_out,
             mavlink_packets_dropped: self.autopilot.outbox_dropped(),
             mocap_poses: self.mocap_poses,
+            wifi_packets_lost: self.wifi.iter().flatten().map(Wifi::lost).sum(),
+            reboots: self.reboots,
         }
     }
 }

@@ -60,6 +60,7 @@ pub struct Truth {
     travelled_m: f64,
     nearest: Option<(f64, DVec3)>,
     airborne_s: f64,
+    since_take_off_s: f64,
     path_m: f64,
     max_speed_mps: f64,
     course: Mean,
@@ -105,6 +106,7 @@ impl Truth {
             travelled_m: 0.0,
             nearest: None,
             airborne_s: 0.0,
+            since_take_off_s: 0.0,
             path_m: 0.0,
             max_speed_mps: 0.0,
             course: Mean::default(),
@@ -122,6 +124,9 @@ impl Truth {
         self.travelled_m += step_m;
         let airborne = p.z > self.floor_z_m + AIRBORNE_M;
         self.landed = self.airborne_s > 0.0 && !airborne && !armed;
+        if airborne || self.since_take_off_s > 0.0 {
+            self.since_take_off_s += dt_s;
+        }
         if !airborne {
             return;
         }
@@ -139,6 +144,11 @@ impl Truth {
             }
         }
         self.measure(p);
+    }
+
+    /// Returns the time since the vehicle first left the floor; 0 before. [s]
+    pub fn since_take_off_s(&self) -> f64 {
+        self.since_take_off_s
     }
 
     fn measure(&mut self, p: DVec3) {

@@ -1,16 +1,14 @@
 //! Messages of the link: commands with their acknowledgements, setpoints, vision, parameters.
 
 use vizflyt_protocol::mavlink::{
-    CopterMode, GuidedMotion, Packet, dialect, guided_from_mavlink, vision_from_mavlink,
-    world_from_ned, world_rotation_from_ned,
+    CopterMode, Packet, dialect, vision_from_mavlink, world_from_ned, world_rotation_from_ned,
 };
 use vizflyt_protocol::time::AutopilotTime;
 
 use super::dialect::{MavCmd, MavMessage, MavResult, MavSeverity};
 use super::failsafe::needs_position;
-use super::flight::FlightState;
 use super::telemetry::autopilot_version;
-use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE};
+use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE, name_of};
 use crate::estimator::VisionMeasurement;
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -19,6 +17,11 @@ use vizflyt_protocol::messages::YawTarget;
 /// Passed as param2 to arm or disarm against all checks (ArduPilot's magic numbers).
 const FORCE_ARM: f32 = 2989.0;
 const FORCE_DISARM: f32 = 21196.0;
+/// Passed as param6 to reboot while armed.
+const FORCE_REBOOT: f32 = 20_190_226.0;
+
+/// EK3_SRC1_POSXY.
+const EXTERNAL_NAVIGATION: f64 = 6.0;
 
 /// One command, whichever message carried it.
 struct Command {
@@ -127,13 +130,14 @@ impl Autopilot {
             MavCmd::MAV_CMD_DO_SET_MODE => self.change_mode(now, p2 as u32),
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 1.0 => self.arm(now, p2 == FORCE_ARM),
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM if p1 == 0.0 => {
-                if self.armed && !self.landed && p2 != FORCE_DISARM {
-                    self.say(MavSeverity::MAV_SEVERITY_CRITICAL, "Disarm: not landed");
-                    MavResult::MAV_RESULT_FAILED
-                } else {
-                    self.disarm();
-                    MavResult::MAV_RESULT_ACCEPTED
-                }
+                self.disarm_on_command(p2 == FORCE_DISARM)
+            }
+            MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN => {
+                self.reboot_on_command(p1, c.params[5] == FORCE_REBOOT)
+            }
+            MavCmd::MAV_CMD_DO_FENCE_ENABLE if p1 == 0.0 || p1 == 1.0 => {
+                self.params.set(Param::FenceEnable as usize, p1);
+                MavResult::MAV_RESULT_ACCEPTED
             }
             MavCmd::MAV_CMD_NAV_TAKEOFF => self.take_off(now, f64::from(c.params[6])),
             MavCmd::MAV_CMD_NAV_LAND => self.change_mode(now, CopterMode::Land as u32),
@@ -204,97 +208,6 @@ impl Autopilot {
         }
     }
 
-    /// Why the vehicle may not be armed; `None` if it may.
-    pub(super) fn arming_refusal(&self, now: AutopilotTime) -> Option<&'static str> {
-        let health = self.estimator.health(now);
-        if !health.attitude {
-            Some("PreArm: AHRS: not healthy")
-        } else if self.params.value(Param::FsThrEnable) != 0.0 {
-            Some("PreArm: RC not found")
-        } else if self.params.value(Param::VisoType) != 0.0 && !health.vision {
-            Some("PreArm: VisOdom: not healthy")
-        } else if needs_position(self.mode) && health.origin && !health.position {
-            // Without an origin a real ArduCopter arms all the same and refuses the take-off.
-            Some("PreArm: Need Position Estimate")
-        } else {
-            None
-        }
-    }
-
-    fn arm(&mut self, now: AutopilotTime, force: bool) -> MavResult {
-        if self.armed {
-            return MavResult::MAV_RESULT_ACCEPTED;
-        }
-        if matches!(self.mode, CopterMode::Land | CopterMode::Rtl | CopterMode::Brake) {
-            let text = format!("Arm: {} mode not armable", name_of(self.mode));
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
-            return MavResult::MAV_RESULT_FAILED;
-        }
-        if let Some(reason) = self.arming_refusal(now)
-            && !(force && self.estimator.health(now).attitude)
-        {
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, reason);
-            return MavResult::MAV_RESULT_FAILED;
-        }
-        self.armed = true;
-        self.landed = true;
-        self.home = Some(self.estimator.estimate().p_world_m);
-        self.flight = FlightState::default();
-        self.say(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
-        self.streams.heartbeat_now();
-        MavResult::MAV_RESULT_ACCEPTED
-    }
-
-    fn take_off(&mut self, now: AutopilotTime, height_m: f64) -> MavResult {
-        let health = self.estimator.health(now);
-        let refusal = if self.mode != CopterMode::Guided {
-            Some("Takeoff refused: not in GUIDED")
-        } else if !self.armed {
-            Some("Takeoff refused: not armed")
-        } else if !self.landed {
-            Some("Takeoff refused: already flying")
-        } else if !health.origin || !health.position {
-            Some("Takeoff refused: no EKF origin")
-        } else if !(height_m > 0.0 && height_m < 1000.0) {
-            Some("Takeoff refused: height out of range")
-        } else {
-            None
-        };
-        if let Some(text) = refusal {
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, text);
-            return MavResult::MAV_RESULT_FAILED;
-        }
-        let ground_m = self.home.map_or(0.0, |home| home.z);
-        self.guided = Guided::TakeOff { z_m: ground_m + height_m };
-        self.landed = false;
-        MavResult::MAV_RESULT_ACCEPTED
-    }
-
-    fn handle_setpoint(
-        &mut self,
-        now: AutopilotTime,
-        m: &dialect::SET_POSITION_TARGET_LOCAL_NED_DATA,
-    ) {
-        // Outside GUIDED, and on the ground, ArduCopter drops setpoints without a word.
-        if self.mode != CopterMode::Guided || !self.armed || self.landed {
-            return;
-        }
-        // A mask that GUIDED knows no motion for means: stop.
-        let Ok(setpoint) = guided_from_mavlink(m) else {
-            let finite = [m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate];
-            if finite.iter().all(|value| value.is_finite()) {
-                self.guided = Guided::Hold;
-            }
-            return;
-        };
-        let p_world_m = match setpoint.motion {
-            GuidedMotion::Position(p) | GuidedMotion::PositionVelocity(p, _) => p,
-            GuidedMotion::Velocity(_) | GuidedMotion::Acceleration(_) => DVec3::ZERO,
-        };
-        self.flight.yaw = setpoint.yaw;
-        self.guided = Guided::Setpoint { setpoint, since: now, p_world_m };
-    }
-
     fn handle_vision(
         &mut self,
         now: AutopilotTime,
@@ -304,6 +217,11 @@ impl Autopilot {
         variance_m2: f32,
     ) {
         if self.params.value(Param::VisoType) == 0.0 {
+            return;
+        }
+        // Heard, and not flown by, unless the sources say external navigation.
+        if self.params.value(Param::Ek3PosXy) != EXTERNAL_NAVIGATION {
+            self.estimator.hear_vision(now);
             return;
         }
         let least_m = self.params.value(Param::VisoPosNoise);
@@ -344,18 +262,5 @@ impl Autopilot {
                 param_type: spec.kind,
             }));
         }
-    }
-}
-
-/// ArduCopter's name of a mode.
-fn name_of(mode: CopterMode) -> &'static str {
-    match mode {
-        CopterMode::Stabilize => "STABILIZE",
-        CopterMode::AltHold => "ALT_HOLD",
-        CopterMode::Guided => "GUIDED",
-        CopterMode::Loiter => "LOITER",
-        CopterMode::Rtl => "RTL",
-        CopterMode::Land => "LAND",
-        CopterMode::Brake => "BRAKE",
     }
 }

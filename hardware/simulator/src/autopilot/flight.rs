@@ -6,7 +6,6 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion};
 use vizflyt_protocol::messages::YawTarget;
 use vizflyt_protocol::time::AutopilotTime;
 
-use super::dialect::MavSeverity;
 use super::{Autopilot, Guided, Param, Return};
 use crate::airframe::{GRAVITY_MPS2, MASS_KG};
 use crate::control::Limits;
@@ -220,7 +219,8 @@ impl Autopilot {
             return Demand::Motion(Horizontal::Level, self.descent());
         };
         let p = self.estimator.estimate().p_world_m;
-        let cruise_z = p.z.max(home.z + self.params.value(Param::RtlAlt));
+        let climb_m = self.params.value(Param::RtlAlt).min(self.fence_ceiling_m());
+        let cruise_z = p.z.max(home.z + climb_m);
         let away_m = (p - home).truncate().length();
         match self.returning {
             Return::Climb if cruise_z - p.z < 0.2 => self.returning = Return::Travel,
@@ -307,16 +307,5 @@ impl Autopilot {
     /// Returns the throttle of the moment. [%]
     pub(super) fn throttle_percent(&self) -> u16 {
         (self.flight.lift / THRUST_TO_WEIGHT * 100.0).clamp(0.0, 100.0) as u16
-    }
-
-    /// Stops the motors.
-    pub(super) fn disarm(&mut self) {
-        if self.armed {
-            self.armed = false;
-            self.landed = true;
-            self.guided = Guided::Hold;
-            self.flight = FlightState::default();
-            self.say(MavSeverity::MAV_SEVERITY_INFO, "Disarming motors");
-        }
     }
 }

@@ -110,18 +110,61 @@ params! {
     FsGcsEnable = "FS_GCS_ENABLE", 5.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
     /// Silence that counts as lost. [s]
     FsGcsTimeout = "FS_GCS_TIMEOUT", 5.0, 2.0..120.0, MAV_PARAM_TYPE_REAL32;
-    /// Lost radio control: 0 lets the vehicle arm without a receiver (lab).
+    /// Lost radio control: 0 lets the vehicle arm without a receiver (lab), 1 RTL, 3 LAND.
     FsThrEnable = "FS_THR_ENABLE", 0.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
-    /// Lost estimate: 1 lands.
+    /// Lost estimate: 1 lands, 2 holds the height.
     FsEkfAction = "FS_EKF_ACTION", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
+    /// Exceptions: 4 goes on in GUIDED without radio control, 8 goes on landing whatever is lost,
+    /// 16 (ArduCopter's default) concerns pilots.
+    FsOptions = "FS_OPTIONS", 16.0, 0.0..63.0, MAV_PARAM_TYPE_INT32;
+    /// Silence of the radio control that counts as lost. [s]
+    RcFsTimeout = "RC_FS_TIMEOUT", 1.0, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
     /// Crash detection disarms.
     FsCrashCheck = "FS_CRASH_CHECK", 1.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
-    /// The autopilot's own fence; reported, not flown.
+    /// Skips arming checks; any bit skips all of them here.
+    ArmingSkipChecks = "ARMING_SKIPCHK", 0.0, -1.0..1048575.0, MAV_PARAM_TYPE_INT32;
+    /// Bits of the attitude reference: 16 takes the recorded origin below at boot.
+    AhrsOptions = "AHRS_OPTIONS", 0.0, 0.0..65535.0, MAV_PARAM_TYPE_INT16;
+    /// Recorded origin. [deg]
+    AhrsOriginLat = "AHRS_ORIGIN_LAT", 0.0, -90.0..90.0, MAV_PARAM_TYPE_REAL32;
+    /// Recorded origin. [deg]
+    AhrsOriginLon = "AHRS_ORIGIN_LON", 0.0, -180.0..180.0, MAV_PARAM_TYPE_REAL32;
+    /// Recorded origin. [m]
+    AhrsOriginAlt = "AHRS_ORIGIN_ALT", 0.0, -1000.0..10000.0, MAV_PARAM_TYPE_REAL32;
+    /// The autopilot's own fence, around home.
     FenceEnable = "FENCE_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
+    /// Sides: 1 ceiling, 2 circle, 4 polygons (not simulated), 8 floor.
+    FenceType = "FENCE_TYPE", 7.0, 0.0..15.0, MAV_PARAM_TYPE_INT8;
+    /// A breach: 0 is only reported, 1 RTL, 2 LAND, 4 BRAKE.
+    FenceAction = "FENCE_ACTION", 1.0, 0.0..5.0, MAV_PARAM_TYPE_INT8;
+    /// Ceiling over home. [m]
+    FenceAltMax = "FENCE_ALT_MAX", 100.0, 0.5..1000.0, MAV_PARAM_TYPE_REAL32;
+    /// Floor over home. [m]
+    FenceAltMin = "FENCE_ALT_MIN", -10.0, -100.0..100.0, MAV_PARAM_TYPE_REAL32;
+    /// Radius around home. [m]
+    FenceRadius = "FENCE_RADIUS", 300.0, 0.5..10000.0, MAV_PARAM_TYPE_REAL32;
+    /// RTL stays this far under the ceiling. [m]
+    FenceMargin = "FENCE_MARGIN", 2.0, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
     /// Battery monitor: 4 measures voltage and current (lab).
     BattMonitor = "BATT_MONITOR", 4.0, 0.0..30.0, MAV_PARAM_TYPE_INT8;
     /// Battery capacity. [mAh]
     BattCapacity = "BATT_CAPACITY", 850.0, 0.0..100000.0, MAV_PARAM_TYPE_INT32;
+    /// Low voltage; 0 is off. Four cells of 3.5 V (lab). [V]
+    BattLowVolt = "BATT_LOW_VOLT", 14.0, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
+    /// Critical voltage; 0 is off. Four cells of 3.3 V (lab). [V]
+    BattCrtVolt = "BATT_CRT_VOLT", 13.2, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
+    /// Low charge left; 0 is off. [mAh]
+    BattLowMah = "BATT_LOW_MAH", 0.0, 0.0..100000.0, MAV_PARAM_TYPE_REAL32;
+    /// Critical charge left; 0 is off. [mAh]
+    BattCrtMah = "BATT_CRT_MAH", 0.0, 0.0..100000.0, MAV_PARAM_TYPE_REAL32;
+    /// A voltage must be low for this long. [s]
+    BattLowTimer = "BATT_LOW_TIMER", 10.0, 0.0..120.0, MAV_PARAM_TYPE_INT16;
+    /// Low: 0 is only said, 1 LAND (lab), 2 RTL, 5 motors off, 7 BRAKE.
+    BattFsLowAct = "BATT_FS_LOW_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
+    /// Critical: likewise (lab).
+    BattFsCrtAct = "BATT_FS_CRT_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
+    /// No arming below this; 0 is off. [V]
+    BattArmVolt = "BATT_ARM_VOLT", 0.0, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
     /// Throttle at hover; reported from the airframe's thrust-to-weight.
     MotHover = "MOT_THST_HOVER", 0.16, 0.05..0.8, MAV_PARAM_TYPE_REAL32;
 }

@@ -14,7 +14,6 @@ use super::dialect::{
 };
 use super::{Autopilot, Guided};
 use crate::airframe::GRAVITY_MPS2;
-use crate::battery::fraction_of;
 
 const HEARTBEAT: u32 = 0;
 const SYS_STATUS: u32 = 1;
@@ -25,6 +24,9 @@ const ATTITUDE: u32 = 30;
 const ATTITUDE_QUATERNION: u32 = 31;
 const LOCAL_POSITION_NED: u32 = 32;
 pub(super) const GPS_GLOBAL_ORIGIN: u32 = 49;
+const GLOBAL_POSITION_INT: u32 = 33;
+const FENCE_STATUS: u32 = 162;
+const VIBRATION: u32 = 241;
 const VFR_HUD: u32 = 74;
 const BATTERY_STATUS: u32 = 147;
 const AUTOPILOT_VERSION: u32 = 148;
@@ -33,7 +35,7 @@ const HOME_POSITION: u32 = 242;
 const EXTENDED_SYS_STATE: u32 = 245;
 
 /// Everything that can be streamed, with its interval at boot; 0 is off. [us]
-const DEFAULTS: [(u32, i32); 14] = [
+const DEFAULTS: [(u32, i32); 17] = [
     (HEARTBEAT, 1_000_000),
     (SYS_STATUS, 250_000),
     (SYSTEM_TIME, 1_000_000),
@@ -42,6 +44,9 @@ const DEFAULTS: [(u32, i32); 14] = [
     (ATTITUDE, 250_000),
     (ATTITUDE_QUATERNION, 0),
     (LOCAL_POSITION_NED, 250_000),
+    (GLOBAL_POSITION_INT, 250_000),
+    (FENCE_STATUS, 1_000_000),
+    (VIBRATION, 500_000),
     (GPS_GLOBAL_ORIGIN, 0),
     (VFR_HUD, 250_000),
     (BATTERY_STATUS, 1_000_000),
@@ -110,18 +115,21 @@ impl Streams {
                 RAW_IMU,
                 ATTITUDE,
                 LOCAL_POSITION_NED,
+                GLOBAL_POSITION_INT,
+                FENCE_STATUS,
+                VIBRATION,
                 VFR_HUD,
                 BATTERY_STATUS,
                 EKF_STATUS_REPORT,
                 EXTENDED_SYS_STATE,
             ],
             MavDataStream::MAV_DATA_STREAM_RAW_SENSORS => &[RAW_IMU],
-            MavDataStream::MAV_DATA_STREAM_EXTENDED_STATUS => &[SYS_STATUS],
-            MavDataStream::MAV_DATA_STREAM_POSITION => &[LOCAL_POSITION_NED],
+            MavDataStream::MAV_DATA_STREAM_EXTENDED_STATUS => &[SYS_STATUS, FENCE_STATUS],
+            MavDataStream::MAV_DATA_STREAM_POSITION => &[LOCAL_POSITION_NED, GLOBAL_POSITION_INT],
             MavDataStream::MAV_DATA_STREAM_EXTRA1 => &[ATTITUDE],
             MavDataStream::MAV_DATA_STREAM_EXTRA2 => &[VFR_HUD],
             MavDataStream::MAV_DATA_STREAM_EXTRA3 => {
-                &[SYSTEM_TIME, BATTERY_STATUS, EKF_STATUS_REPORT]
+                &[SYSTEM_TIME, BATTERY_STATUS, EKF_STATUS_REPORT, VIBRATION]
             }
             _ => &[],
         };
@@ -244,7 +252,10 @@ impl Autopilot {
                     .rem_euclid(360.0) as i16,
                 throttle: self.throttle_percent(),
             }),
-            BATTERY_STATUS => self.battery_status(),
+            GLOBAL_POSITION_INT => self.global_position(now, boot_ms)?,
+            FENCE_STATUS => self.fence_status(),
+            VIBRATION => self.vibration.message(now),
+            BATTERY_STATUS => self.battery_status()?,
             AUTOPILOT_VERSION => autopilot_version(),
             EKF_STATUS_REPORT => self.ekf_status(now),
             HOME_POSITION => self.home_position(now)?,
@@ -272,7 +283,8 @@ impl Autopilot {
         if self.armed {
             base_mode |= MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED;
         }
-        let system_status = if self.failsafe.ekf || self.failsafe.gcs && self.armed {
+        let acted = self.failsafe.gcs || self.failsafe.radio || self.failsafe.battery.is_some();
+        let system_status = if self.failsafe.ekf || acted && self.armed {
             MavState::MAV_STATE_CRITICAL
         } else if self.armed && !self.landed {
             MavState::MAV_STATE_ACTIVE
@@ -309,30 +321,64 @@ impl Autopilot {
             onboard_control_sensors_enabled: present,
             onboard_control_sensors_health: health,
             load: 100,
-            voltage_battery: (self.sample.battery_v * 1000.0) as u16,
-            current_battery: (self.sample.battery_a * 100.0) as i16,
+            voltage_battery: if self.has_gauge() {
+                (self.sample.battery_v * 1000.0) as u16
+            } else {
+                0
+            },
+            current_battery: if self.has_gauge() {
+                (self.sample.battery_a * 100.0) as i16
+            } else {
+                -1
+            },
             battery_remaining: self.battery_percent(),
             ..Default::default()
         })
     }
 
-    fn battery_percent(&self) -> i8 {
-        (fraction_of(self.sample.battery_v) * 100.0) as i8
-    }
-
-    fn battery_status(&self) -> MavMessage {
+    fn battery_status(&self) -> Option<MavMessage> {
+        if !self.has_gauge() {
+            return None;
+        }
         // Cells that are not there read 65535.
         let mut voltages = [u16::MAX; 10];
         voltages[0] = (self.sample.battery_v * 1000.0) as u16;
-        MavMessage::BATTERY_STATUS(dialect::BATTERY_STATUS_DATA {
-            current_consumed: -1,
+        Some(MavMessage::BATTERY_STATUS(dialect::BATTERY_STATUS_DATA {
+            current_consumed: self.gauge.used_mah as i32,
             energy_consumed: -1,
             temperature: i16::MAX,
             voltages,
             current_battery: (self.sample.battery_a * 100.0) as i16,
             battery_remaining: self.battery_percent(),
             ..Default::default()
-        })
+        }))
+    }
+
+    /// GLOBAL_POSITION_INT on a sphere around the origin, good for a room.
+    fn global_position(&self, now: AutopilotTime, boot_ms: u32) -> Option<MavMessage> {
+        const EARTH_RADIUS_M: f64 = 6_378_137.0;
+        let (latitude, longitude, altitude_mm) = self.origin?;
+        if !self.estimator.health(now).position {
+            return None;
+        }
+        let estimate = self.estimator.estimate();
+        let (p, v) = (ned_from_world(estimate.p_world_m), ned_from_world(estimate.v_world_mps));
+        let home_z = self.home.map_or(0.0, |home| home.z);
+        let shrink = (f64::from(latitude) * 1e-7).to_radians().cos().max(1e-3);
+        let e7 = |m: f64| ((m / EARTH_RADIUS_M).to_degrees() * 1e7) as i32;
+        let cm = |mps: f64| (mps * 100.0) as i16;
+        let yaw = yaw_ned_from_world(yaw_of(estimate.world_from_body));
+        Some(MavMessage::GLOBAL_POSITION_INT(dialect::GLOBAL_POSITION_INT_DATA {
+            time_boot_ms: boot_ms,
+            lat: latitude.saturating_add(e7(p.x)),
+            lon: longitude.saturating_add(e7(p.y / shrink)),
+            alt: altitude_mm.saturating_add((-p.z * 1000.0) as i32),
+            relative_alt: ((estimate.p_world_m.z - home_z) * 1000.0) as i32,
+            vx: cm(v.x),
+            vy: cm(v.y),
+            vz: cm(v.z),
+            hdg: (yaw.to_degrees().rem_euclid(360.0) * 100.0) as u16,
+        }))
     }
 
     fn ekf_status(&self, now: AutopilotTime) -> MavMessage {

@@ -277,6 +277,11 @@ impl Estimator {
         self.hold_still(now, still);
     }
 
+    /// Takes note that external navigation speaks, without flying by it.
+    pub fn hear_vision(&mut self, now: AutopilotTime) {
+        self.last_vision = Some(now);
+    }
+
     /// Takes one pose from external navigation.
     pub fn handle_vision(&mut self, now: AutopilotTime, m: &VisionMeasurement) {
         let pose = &m.world_from_body;

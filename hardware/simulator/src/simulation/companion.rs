@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use glam::{DQuat, DVec3, EulerRot};
-use vizflyt_protocol::geometry::Pose;
+use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, MavCmd, MavMessage, MavResult, SET_GPS_GLOBAL_ORIGIN_DATA,
 };
@@ -36,6 +36,10 @@ pub(crate) struct Companion {
     /// Setpoint resent at 20 Hz.
     pub(crate) setpoint: Option<GuidedSetpoint>,
     setpoint_due_ns: u64,
+    /// Added to the vision's positions, with its counter of jumps. [m, world]
+    pub(crate) vision_shift: (DVec3, u8),
+    /// System id that all is sent from.
+    pub(crate) system_id: u8,
     /// Vision poses come this much later than they were valid. [s]
     pub(crate) vision_latency_s: f64,
     late: std::collections::VecDeque<(u64, MavMessage)>,
@@ -57,17 +61,20 @@ impl Companion {
             heartbeat_due_ns: 0,
             setpoint: None,
             setpoint_due_ns: 0,
+            vision_shift: (DVec3::ZERO, 0),
+            system_id: 255,
             vision_latency_s: 0.0,
             late: std::collections::VecDeque::new(),
         }
     }
 
     pub(crate) fn send(&mut self, message: &MavMessage) {
-        let header = MavHeader { system_id: 255, component_id: 190, sequence: 0 };
+        let header = MavHeader { system_id: self.system_id.into(), component_id: 190, sequence: 0 };
         self.lab.handle_mavlink(0, encode(header, message, &mut [0; MAX_PACKET]));
     }
 
-    pub(crate) fn command(&mut self, command: MavCmd, params: [f32; 7]) -> MavResult {
+    /// Sends a command without waiting for its acknowledgement.
+    pub(crate) fn ask(&mut self, command: MavCmd, params: [f32; 7]) {
         let [param1, param2, param3, param4, param5, param6, param7] = params;
         self.send(&MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
             param1,
@@ -82,6 +89,10 @@ impl Companion {
             target_component: 1,
             confirmation: 0,
         }));
+    }
+
+    pub(crate) fn command(&mut self, command: MavCmd, params: [f32; 7]) -> MavResult {
+        self.ask(command, params);
         self.tick();
         let (acknowledged, result) = *self.acks.last().expect("every command is acknowledged");
         assert_eq!(acknowledged, command);
@@ -91,7 +102,7 @@ impl Companion {
     pub(crate) fn tick(&mut self) {
         self.lab.tick();
         let now_ns = self.lab.now().as_ns();
-        let mut pose = None;
+        let mut pose: Option<Pose<World, Body>> = None;
         while let Some(datagram) = self.lab.poll_mocap() {
             let value =
                 |i: usize| f64::from_le_bytes(datagram[32 + 8 * i..40 + 8 * i].try_into().unwrap());
@@ -105,7 +116,9 @@ impl Companion {
         {
             self.vision_due_ns = now_ns + 20_000_000;
             let usec = now_ns / 1000 + self.clock_offset_us;
-            let message = vision_to_mavlink(&pose, usec, 0, 0.01);
+            let (shift, resets) = self.vision_shift;
+            let pose = Pose::new(pose.translation_m + shift, pose.rotation);
+            let message = vision_to_mavlink(&pose, usec, resets, 0.01);
             let due_ns = now_ns + (self.vision_latency_s * 1e9) as u64;
             self.late.push_back((due_ns, MavMessage::VISION_POSITION_ESTIMATE(message)));
         }

@@ -1,3 +1,6 @@
+mod failsafes;
+mod pitfalls;
+
 use glam::DVec3;
 use vizflyt_protocol::mavlink::dialect::{
     EkfStatusFlags, MavCmd, MavMessage, MavModeFlag, MavResult, MavSysStatusSensor,
