@@ -19,6 +19,9 @@ from pymavlink import mavutil  # noqa: E402  (reads MAVLINK20 when it is importe
 
 mavlink = mavutil.mavlink
 
+# An EKF origin: latitude, longitude [1e-7 deg], altitude [mm]. Any place on Earth will do.
+ORIGIN = (423000000, -718000000, 100000)
+
 # u32 frame, u8 items; per item u8 id, u16 size, char[24] name, f64 x y z [mm], f64 rx ry rz [rad].
 VICON_HEAD = struct.Struct("<IB")
 VICON_ITEM = struct.Struct("<BH24s6d")
@@ -45,9 +48,10 @@ def ned_euler(r):
 class Vicon:
     """Listens to the UDP object stream."""
 
-    def __init__(self):
+    def __init__(self, port=0):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
+        # A given port is a motion capture's in the lab, which sends from elsewhere.
+        self.socket.bind(("0.0.0.0" if port else "127.0.0.1", port))
         self.socket.setblocking(False)
         self.address = "127.0.0.1:%d" % self.socket.getsockname()[1]
         self.frames = []

@@ -10,13 +10,12 @@ import statistics
 import sys
 import time
 
-from lab import Lab, mavlink
+from lab import ORIGIN, Lab, mavlink
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 FAILED = mavlink.MAV_RESULT_FAILED
 SPAWN = (0.5, -0.3)
 SPAWN_YAW_DEG = 30.0
-ORIGIN = (423000000, -718000000, 100000)
 HEIGHT = 1.2
 
 passed = failed = 0

@@ -1,0 +1,113 @@
+"""Runs every client against a simulator of its own, all at once; prints what they print, and how
+many checks passed.
+
+Usage: all.py COMMAND...   (what starts the simulator)
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+# Nothing here takes half as long, however loaded the machine is. [s]
+LIMIT = 400
+# A client, and how it writes the address of a TCP server.
+SQUARES = [
+    ("square_pymavlink.py", "tcp:%s"),
+    ("square_mavproxy.py", "tcp:%s"),
+    ("square_mavsdk.py", "tcpout://%s"),
+]
+
+
+def python(script, *args, **options):
+    return subprocess.Popen(
+        [sys.executable, os.path.join(HERE, script), *args],
+        text=True,
+        stdout=subprocess.PIPE,
+        **options,
+    )
+
+
+def square(command, script, address, seed, results):
+    """Flies one client on a simulator with two links: one for what a net gives, one for it."""
+    feed = python("feed.py", "0", "-", stdin=subprocess.PIPE)
+    vicon = feed.stdout.readline().strip()
+    endpoints = ["--mavlink", "udpin:127.0.0.1:0", "--mavlink", "tcpin:127.0.0.1:0"]
+    simulator = subprocess.Popen(
+        [*command, "--json", "--lifeline", *endpoints, "--vicon", vicon, "--seed", str(seed)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    client = None
+    try:
+        net, port = json.loads(simulator.stdout.readline())["links"]
+        feed.stdin.write("udpout:%s\n" % net)
+        feed.stdin.flush()
+        client = python(script, address % port)
+        watchdog = threading.Timer(LIMIT, client.kill)
+        watchdog.start()
+        lines = []
+        for line in client.stdout:
+            print(line, end="", flush=True)
+            lines.append(line)
+        status = client.wait()
+        watchdog.cancel()
+        # What the referee saw: it flew a square of four metres, and landed.
+        simulator.stdin.close()
+        report = [json.loads(line) for line in simulator.stdout][-1]["report"]
+        good = report["landed"] and report["path_m"] > 5.0
+        print("%s  %s: the referee agrees" % ("ok  " if good else "FAIL", script), flush=True)
+        results.append((script, status == 0 and good, counted(lines) + good, not good))
+    finally:
+        for process in (client, simulator, feed):
+            if process:
+                process.kill()
+                process.wait()
+
+
+def counted(lines):
+    """Returns how many checks a client says have passed."""
+    found = re.search(r"(\d+) passed", lines[-1]) if lines else None
+    return int(found.group(1)) if found else 0
+
+
+def behaviour(command, results):
+    """The long one, of what an autopilot does and refuses."""
+    client = python("behaviour.py", *command)
+    lines = []
+    for line in client.stdout:
+        print(line, end="", flush=True)
+        lines.append(line)
+    results.append(("behaviour.py", client.wait() == 0, counted(lines), False))
+
+
+def main():
+    command = sys.argv[1:]
+    if not command:
+        sys.exit(__doc__)
+    # What the simulators say beside, the clients hear anyway.
+    os.environ.setdefault("RUST_LOG", "warn")
+    results = []
+    threads = [threading.Thread(target=behaviour, args=(command, results))]
+    for seed, (script, address) in enumerate(SQUARES, 11):
+        threads.append(
+            threading.Thread(target=square, args=(command, script, address, seed, results))
+        )
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    failed = [script for script, good, _, _ in results if not good]
+    # A thread that ended by an exception has left no result.
+    missing = len(threads) - len(results)
+    passed = sum(count for _, _, count, _ in results)
+    print("%d checks passed; failed: %s" % (passed, ", ".join(failed) or "none"))
+    return bool(failed or missing)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

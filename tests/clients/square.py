@@ -1,0 +1,55 @@
+"""What the three clients have in common: the flight, and how it is judged.
+
+A client connects, waits until the vehicle may fly, arms, takes off, flies a square and lands. It is
+judged by what the vehicle itself reports, so that the same script runs against the simulator, ArduPilot's
+own simulation, and a vehicle in a net (with its propellers off until you trust it).
+"""
+
+import math
+import sys
+import time
+
+# Height above the ground, and side of the square. [m]
+HEIGHT, SIDE = 1.2, 1.0
+# A corner counts as reached this near, and this slow. [m], [m/s]
+NEAR, SLOW = 0.2, 0.25
+# Corners from the start: north and east. [m]
+CORNERS = [(SIDE, 0), (SIDE, SIDE), (0, SIDE), (0, 0)]
+# Any step may take this long; ArduCopter without GPS is ready after some 15 s, with it after 45. [s]
+PATIENCE = 120.0
+
+
+class Checks:
+    """Counts and prints checks."""
+
+    def __init__(self, client):
+        self.client = client
+        self.passed = self.failed = 0
+
+    def __call__(self, name, good, detail=""):
+        self.passed += bool(good)
+        self.failed += not good
+        more = "" if good or detail == "" else "  (%s)" % (detail,)
+        print("%s  %s: %s%s" % ("ok  " if good else "FAIL", self.client, name, more), flush=True)
+        if not good:
+            # What comes next would only fail for the same reason.
+            self.end()
+
+    def end(self):
+        print("%s: %d passed, %d failed" % (self.client, self.passed, self.failed), flush=True)
+        sys.exit(self.failed != 0)
+
+
+def until(done, seconds=PATIENCE, work=lambda: time.sleep(0.02)):
+    """Works until `done()`; returns whether it came to that within `seconds`."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if done():
+            return True
+        work()
+    return bool(done())
+
+
+def reached(position, speed, target):
+    """Whether the vehicle stands at a target (north, east, height)."""
+    return math.dist(position, target) < NEAR and speed < SLOW

@@ -1,0 +1,133 @@
+"""Flies a square with MAVProxy: its own prompt is typed at, as a person would, and the vehicle is
+watched over an output that MAVProxy forwards to.
+
+Usage: square_mavproxy.py CONNECTION      for example tcp:127.0.0.1:5760, udp:127.0.0.1:14550
+"""
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+from square import CORNERS, HEIGHT, Checks, reached, until
+
+from pymavlink import mavutil
+
+
+class Proxy:
+    """A running MAVProxy."""
+
+    def __init__(self, connection, folder):
+        self.watch = mavutil.mavlink_connection("udpin:127.0.0.1:0", source_system=254)
+        port = self.watch.port.getsockname()[1]
+        program = os.path.join(os.path.dirname(sys.executable), "mavproxy.py")
+        self.process = subprocess.Popen(
+            [sys.executable, "-u", program, "--master", connection]
+            + ["--out", "udpout:127.0.0.1:%d" % port, "--state-basedir", folder]
+            + ["--default-modules", "cmdlong,arm,mode,param,misc"],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.newest = {}
+        self.said = []
+        threading.Thread(target=self.listen, daemon=True).start()
+
+    def listen(self):
+        for line in self.process.stdout:
+            self.said.append(line.rstrip())
+
+    def type(self, line):
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def work(self):
+        message = self.watch.recv_match(blocking=True, timeout=0.05)
+        while message:
+            if message.get_srcComponent() == 1:
+                self.newest[message.get_type()] = message
+            message = self.watch.recv_match(blocking=False)
+
+    def until(self, done, line=None, seconds=120.0, every=3.0):
+        """Works until `done()`, typing `line` every few seconds until then."""
+        typed = [0.0]
+
+        def work():
+            if line and time.monotonic() - typed[0] > every:
+                typed[0] = time.monotonic()
+                self.type(line)
+            self.work()
+
+        return until(done, seconds, work)
+
+    def ready(self):
+        if not all(kind in self.newest for kind in ("EKF_STATUS_REPORT", "LOCAL_POSITION_NED")):
+            return False
+        flags = self.newest["EKF_STATUS_REPORT"].flags
+        return flags & 0x18 == 0x18 and not flags & 0x80
+
+    def mode(self):
+        return self.newest["HEARTBEAT"].custom_mode
+
+    def armed(self):
+        return bool(self.newest["HEARTBEAT"].base_mode & 128)
+
+    def position(self):
+        m = self.newest["LOCAL_POSITION_NED"]
+        return m.x, m.y, -m.z
+
+    def speed(self):
+        m = self.newest["LOCAL_POSITION_NED"]
+        return math.hypot(m.vx, m.vy, m.vz)
+
+    def yaw(self):
+        return self.newest["ATTITUDE"].yaw
+
+
+def fly(check, proxy):
+    check("connects", proxy.until(lambda: "HEARTBEAT" in proxy.newest), proxy.said[-5:])
+    got_all = lambda: any("Received" in line and "parameters" in line for line in proxy.said)
+    check("reads the parameters", proxy.until(got_all), proxy.said[-5:])
+    check("becomes ready", proxy.until(proxy.ready), proxy.said[-5:])
+    # Its `position` ignores yaw: the nose must not turn into travel (pitfall 4).
+    proxy.type("param set WP_YAW_BEHAVIOR 0")
+    check("GUIDED", proxy.until(lambda: proxy.mode() == 4, "mode GUIDED"), proxy.said[-5:])
+    check("arms", proxy.until(proxy.armed, "arm throttle"), proxy.said[-5:])
+    north, east, ground = proxy.position()
+    proxy.type("takeoff %g" % HEIGHT)
+    up = lambda: abs(proxy.position()[2] - ground - HEIGHT) < 0.2
+    check("takes off", proxy.until(up), proxy.said[-5:])
+    sin, cos = math.sin(proxy.yaw()), math.cos(proxy.yaw())
+    for number, (dx, dy) in enumerate(CORNERS, 1):
+        target = (north + dx, east + dy, ground + HEIGHT)
+        # `position` takes metres ahead, right and down from where the vehicle is.
+        x, y, z = (a - b for a, b in zip(target, proxy.position()))
+        proxy.type("position %.3f %.3f %.3f" % (x * cos + y * sin, y * cos - x * sin, -z))
+        there = lambda: reached(proxy.position(), proxy.speed(), target)
+        check("corner %d" % number, proxy.until(there), (proxy.position(), target))
+    check("LAND", proxy.until(lambda: proxy.mode() == 9, "mode LAND"), proxy.said[-5:])
+    check("lands and disarms", proxy.until(lambda: not proxy.armed()), proxy.said[-5:])
+    check("stands on the ground", abs(proxy.position()[2] - ground) < 0.3, proxy.position())
+
+
+def main():
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    check = Checks("MAVProxy")
+    with tempfile.TemporaryDirectory() as folder:
+        proxy = Proxy(sys.argv[1], folder)
+        try:
+            fly(check, proxy)
+        finally:
+            proxy.process.kill()
+            proxy.process.wait()
+    check.end()
+
+
+if __name__ == "__main__":
+    main()
