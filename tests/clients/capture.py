@@ -12,6 +12,8 @@ from pymavlink.dialects.v10 import ardupilotmega as v1
 from pymavlink.dialects.v20 import ardupilotmega as v2
 
 FOLDER = Path(__file__).parents[2] / "firmware-esp/bridge/tests/data"
+# MANUAL_CONTROL calls its target system otherwise.
+SYSTEM = {69: "target"}
 
 
 def value(index, kind, length):
@@ -26,7 +28,7 @@ def message(dialect, cls, index):
     fields = []
     for place, (name, kind) in enumerate(zip(cls.fieldnames, cls.fieldtypes)):
         length = cls.array_lengths[cls.ordered_fieldnames.index(name)]
-        if name == "target_system":
+        if name == SYSTEM.get(cls.id, "target_system"):
             fields.append(7)
         elif name == "target_component":
             fields.append(9)
@@ -49,7 +51,7 @@ def main():
             link.signing.sign_outgoing = True
         made = message(dialect, dialect.mavlink_map[id_] if old else cls, number)
         packed = made.pack(link, force_mavlink1=old)
-        target = [getattr(made, name, 0) for name in ("target_system", "target_component")]
+        target = [getattr(made, name, 0) for name in (SYSTEM.get(id_, "target_system"), "target_component")]
         signed = int(bool(packed[0] == 0xFD and packed[2] & 1))
         packets.append(packed)
         lines.append(

@@ -161,7 +161,7 @@ const COUNT: u32 = 1000;
 
 #[test]
 fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
-    let lights = with_bridge(|stack, mut uart_in, mut uart_out| async move {
+    let lights = with_bridge(|stack, uart_in, mut uart_out| async move {
         let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 16]);
         let (mut rx, mut tx) = ([0; 8192], [0; 8192]);
         let mut socket = UdpSocket::new(stack, &mut rx_meta, &mut rx, &mut tx_meta, &mut tx);
@@ -212,7 +212,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
 
 #[test]
 fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
-    with_bridge(|stack, mut uart_in, mut uart_out| async move {
+    with_bridge(|stack, uart_in, mut uart_out| async move {
         for _ in 0..3 {
             let (mut rx, mut tx) = ([0; 4096], [0; 4096]);
             let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
