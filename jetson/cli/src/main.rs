@@ -2,8 +2,8 @@
 //! reads the command line and starts one.
 
 mod bench;
-mod bridge;
 mod demo;
+mod doctor;
 mod fly;
 mod lab;
 mod new;
@@ -14,6 +14,7 @@ mod replay;
 mod scene;
 mod stats;
 mod terminal;
+mod vehicle;
 
 use std::process::ExitCode;
 
@@ -50,10 +51,12 @@ enum Command {
     Serve(vizflyt_server::ServeArgs),
     /// Makes this computer and a render server known to each other, once, by a short code.
     Pair(pair::PairArgs),
+    /// Finds what is wrong before it flies: the autopilot's parameters.
+    Doctor(doctor::DoctorArgs),
+    /// What is set up on the vehicle once: the key for MAVLink signing.
+    Vehicle(vehicle::VehicleArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
-    /// The Wi-Fi bridge of a vehicle: emulated here, or asked over the network.
-    Bridge(bridge::BridgeArgs),
     /// Makes scenes, looks at them, draws them.
     Scene(scene::SceneArgs),
     /// Measures how fast this machine draws.
@@ -97,8 +100,9 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Fly(args) => fly::run(args, log_level),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
+        Command::Vehicle(args) => vehicle::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
-        Command::Bridge(args) => bridge::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),

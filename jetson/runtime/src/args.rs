@@ -11,8 +11,9 @@ use clap::Args;
 use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
 
-use crate::config::{self, JetsonConfig};
-use crate::link::udp::MavlinkAddress;
+use crate::config::{self, JetsonConfig, VehicleConfig};
+use crate::link::port::MavlinkAddress;
+use crate::link::{LinkSettings, SigningFile, VISION_HZ};
 
 /// Flies a plugin: images from the render server to it, its setpoints through the guard to the
 /// autopilot.
@@ -37,7 +38,8 @@ pub struct FlyArgs {
     /// The render server, and how it is known
     #[command(flatten)]
     pub server: ServerArgs,
-    /// The autopilot: `udpin:ADDR:PORT` waits for it, `udpout:HOST:PORT` calls it
+    /// The autopilot: `udpin:ADDR:PORT` waits for it, `udpout:HOST:PORT` calls it; also `tcpin:`, `tcpout:`
+    /// and `serial:/dev/ttyTHS1:921600`, with `:rtscts` after it for flow control
     /// [default: udpin:0.0.0.0:14550]
     #[arg(long, value_name = "ADDRESS")]
     pub mavlink: Option<MavlinkAddress>,
@@ -131,7 +133,15 @@ impl FlyArgs {
 
     /// Returns where the autopilot is.
     pub fn mavlink_address(&self) -> MavlinkAddress {
-        self.mavlink.unwrap_or(MavlinkAddress::UdpIn(([0, 0, 0, 0], MAVLINK_PORT).into()))
+        self.mavlink.clone().unwrap_or_else(MavlinkAddress::usual)
+    }
+
+    /// Returns what `jetson.toml` sets of the link.
+    ///
+    /// # Errors
+    /// As [`link_settings`].
+    pub fn link_settings(&self) -> anyhow::Result<LinkSettings> {
+        link_settings(&self.jetson.vehicle, self.vehicle_name())
     }
 
     /// Returns the vehicle's name in the localization system.
@@ -140,8 +150,21 @@ impl FlyArgs {
     }
 }
 
-/// Where ground stations and companion computers wait for an autopilot.
-const MAVLINK_PORT: u16 = 14550;
+/// Returns what a `[vehicle]` sets of the link to the autopilot of the vehicle with this name.
+///
+/// # Errors
+/// If the key for signing cannot be used.
+pub fn link_settings(vehicle: &VehicleConfig, name: &str) -> anyhow::Result<LinkSettings> {
+    // No name of the computer: the vehicle's own says enough.
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let key = vehicle.signing_key.as_deref();
+    Ok(LinkSettings {
+        name: format!("{name} on {}", host.trim()),
+        system: vehicle.system,
+        vision_hz: vehicle.vision_hz.unwrap_or(*VISION_HZ.end()),
+        signing: key.map(|path| SigningFile::new(path).open()).transpose()?,
+    })
+}
 
 /// Which server, how this computer knows it, and who this computer is.
 #[derive(Args, Clone, Debug)]

@@ -6,7 +6,7 @@
 //!
 //! [vehicle]
 //! name = "vizflyt"
-//! mavlink = "udpin:0.0.0.0:14550"
+//! mavlink = "udpin:0.0.0.0:14550"     # or serial:/dev/ttyTHS1:921600
 //!
 //! [limits]                            # of these and the arena's, the stricter wins
 //! max_speed_mps = 2.0
@@ -31,6 +31,8 @@ use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::Fingerprint;
 
+use crate::link::VISION_HZ;
+use crate::link::port::{self, Shape};
 use crate::supervisor::{PluginLimits, Restart};
 
 pub use strict::{StrictError, parse_strict};
@@ -71,9 +73,20 @@ pub struct VehicleConfig {
     /// Its name in the localization system.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Its autopilot: `udpin:ADDR:PORT` or `udpout:HOST:PORT`.
+    /// Its autopilot: `udpin:ADDR:PORT`, `udpout:HOST:PORT`, `tcpin:`, `tcpout:` or
+    /// `serial:PATH:BAUD`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mavlink: Option<String>,
+    /// Its autopilot's MAVLink system id, where several share a link; without it the only one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub system: Option<u8>,
+    /// Poses sent to the autopilot, 30 to 50; without it 50. [Hz]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vision_hz: Option<f64>,
+    /// File with the key for MAVLink 2 signing, made by `vizflyt vehicle sign`; with it, packets
+    /// that are not signed are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub signing_key: Option<PathBuf>,
 }
 
 /// `[limits]`: what the guard keeps to beyond the arena's own limits.
@@ -220,6 +233,9 @@ impl JetsonConfig {
         if let Some(keys) = config.server.as_mut().and_then(|server| server.keys.as_mut()) {
             *keys = folder.join(&*keys);
         }
+        if let Some(key) = &mut config.vehicle.signing_key {
+            *key = folder.join(&*key);
+        }
         // A bare name may be a built-in: it stays as it is.
         for folder_of_plugin in &mut config.plugin.write {
             *folder_of_plugin = folder.join(&*folder_of_plugin);
@@ -250,14 +266,13 @@ impl JetsonConfig {
             return Err(invalid("vehicle.name", quoted(name), "give 1 to 32 bytes"));
         }
         if let Some(address) = &self.vehicle.mavlink {
-            let host_port =
-                address.strip_prefix("udpin:").or_else(|| address.strip_prefix("udpout:"));
-            let host_port = host_port.ok_or_else(|| {
-                let advice = "write \"udpin:0.0.0.0:14550\" or \"udpout:HOST:PORT\"";
-                invalid("vehicle.mavlink", quoted(address), advice)
-            })?;
-            check_host_port("vehicle.mavlink", address, host_port)?;
+            match port::shape(address) {
+                None => return Err(invalid("vehicle.mavlink", quoted(address), port::SHAPES)),
+                Some(Shape::Net(_, at)) => check_host_port("vehicle.mavlink", address, at)?,
+                Some(Shape::Serial(..)) => {}
+            }
         }
+        check("vehicle.vision_hz", self.vehicle.vision_hz, "Hz", VISION_HZ)?;
         let limits = &self.limits;
         check("limits.max_speed_mps", limits.max_speed_mps, "m/s", 0.1..=30.0)?;
         check("limits.max_acceleration_mps2", limits.max_acceleration_mps2, "m/s^2", 0.1..=50.0)?;

@@ -14,7 +14,6 @@
 
 use std::ffi::OsString;
 use std::io::Write;
-use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::sync::{Arc, PoisonError};
@@ -37,8 +36,8 @@ use crate::console::{Screen, Status};
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
 use crate::images::{ImagePublisher, Published, SharedSenses};
-use crate::link::udp::{Partner, UdpPort};
-use crate::link::{Link, LinkEvent};
+use crate::link::port::Port;
+use crate::link::{Link, LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
 use crate::report::Counters;
 use crate::stats::ImageTimes;
@@ -50,8 +49,8 @@ use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Restart, Stream,
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant)] // Why: the queue of 0.7 MB is there anyway; a box is one per image.
 pub enum Happening {
-    /// Bytes from the MAVLink socket.
-    Mavlink(Vec<u8>, SocketAddr),
+    /// Bytes from the autopilot.
+    Mavlink(Vec<u8>),
     /// The server's side.
     Stream(StreamEvent),
     /// An observation is about to reach the plugin.
@@ -97,10 +96,10 @@ pub struct Control {
     pub plugin_limits: PluginLimits,
     /// Limits of the flight as a whole.
     pub settings: FlightSettings,
-    /// The MAVLink socket.
-    pub port: Arc<UdpPort>,
-    /// Whom to answer on it.
-    pub partner: Partner,
+    /// The way to the autopilot.
+    pub port: Arc<Port>,
+    /// What a person has set of the link.
+    pub link: LinkSettings,
     /// Clock and mailbox of the stream.
     pub shared: Shared,
     /// To the server.
@@ -180,10 +179,11 @@ impl Control {
     pub fn run(self, sender: SyncSender<Happening>, happenings: &Receiver<Happening>) -> Flown {
         let now = host_now();
         let settings = self.settings;
+        let link = Link::with(now, self.link.clone());
         let mut state = Loop {
             control: self,
             sender,
-            link: Link::new(now),
+            link,
             flight: Flight::new(settings, now),
             plugin: None,
             senses: SharedSenses::default(),
@@ -245,7 +245,7 @@ impl Loop {
             armed: state.armed,
             mode: state.mode,
             took_off: self.link.took_off(),
-            ready_to_arm: self.link.ready_to_arm(),
+            ready_to_arm: self.link.ready_to_arm(now),
         };
         let orders = self.flight.tick(now, &view);
         self.steering.done(now);
@@ -279,11 +279,8 @@ impl Loop {
     }
 
     fn transmit(&mut self) {
-        let to = self.control.partner.address();
         while let Some(datagram) = self.link.poll_transmit() {
-            if let Some(to) = to {
-                self.control.port.send(&datagram, to);
-            }
+            self.control.port.send(&datagram);
         }
         let now = host_now();
         while let Some(event) = self.link.poll_event() {
@@ -300,11 +297,9 @@ impl Loop {
     fn take(&mut self, happening: Happening) {
         let now = host_now();
         match happening {
-            Happening::Mavlink(bytes, from) => {
-                if self.control.partner.heard(from, Instant::now()) {
-                    self.link.handle_input(now, &bytes);
-                    self.sense();
-                }
+            Happening::Mavlink(bytes) => {
+                self.link.handle_input(now, &bytes);
+                self.sense();
             }
             Happening::Stream(event) => self.take_stream(now, event),
             Happening::Published(published) => {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::Context;
 use serde_json::json;
@@ -20,7 +20,7 @@ use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
 use crate::control::{Control, Happening, QUEUE, print_line};
 use crate::flight::{FlightSettings, Outcome};
-use crate::link::udp::{Partner, UdpPort};
+use crate::link::port::Port;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
 use crate::stream::{self, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
@@ -59,7 +59,8 @@ pub fn fly_command(
     let (fingerprint, identity) = args.server.known()?;
     let mavlink = args.mavlink_address();
     let port = Arc::new(
-        UdpPort::open(mavlink).with_context(|| format!("{mavlink}: cannot open the socket"))?,
+        Port::open(&mavlink)
+            .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?,
     );
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
@@ -89,7 +90,7 @@ pub fn fly_command(
     let outbox = Arc::clone(&to_server);
     let talk = stream::run(settings, shared.clone(), to_server, tell_stream(sender.clone()));
     let talk = tokio.spawn(talk);
-    print_ready(args.json, server, port.local_addr()?, &log);
+    print_ready(args.json, server, &port.local()?, &log);
 
     let control = Control {
         plugin_command,
@@ -100,7 +101,7 @@ pub fn fly_command(
             limits: args.limits,
         },
         port,
-        partner: Partner::new(mavlink, Instant::now()),
+        link: args.link_settings()?,
         shared,
         to_server: Arc::clone(&outbox),
         log,
@@ -136,7 +137,7 @@ fn listen(tokio: &Runtime, address: SocketAddr) -> anyhow::Result<Live> {
 }
 
 fn receive_mavlink(
-    port: Arc<UdpPort>,
+    port: Arc<Port>,
     sender: SyncSender<Happening>,
     stop: Arc<AtomicBool>,
 ) -> std::io::Result<()> {
@@ -145,9 +146,9 @@ fn receive_mavlink(
         let mut buffer = [0; 2048];
         while !stop.load(Ordering::Relaxed) {
             match port.receive(&mut buffer) {
-                Ok(Some((len, from))) => {
+                Ok(Some(len)) => {
                     // A full queue drops telemetry, as the network might.
-                    let _ = sender.try_send(Happening::Mavlink(buffer[..len].to_vec(), from));
+                    let _ = sender.try_send(Happening::Mavlink(buffer[..len].to_vec()));
                 }
                 Ok(None) => {}
                 Err(error) => {
@@ -215,10 +216,9 @@ fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) -> bool + 
     }
 }
 
-fn print_ready(json: bool, server: &ServerAddress, mavlink: SocketAddr, log: &FlightLog) {
+fn print_ready(json: bool, server: &ServerAddress, mavlink: &str, log: &FlightLog) {
     let log = log.path().map(|path| path.display().to_string());
     if json {
-        let mavlink = mavlink.to_string();
         print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
     } else {
         print_line(&format!("waiting for server {server} and an autopilot on {mavlink}"));

@@ -13,8 +13,10 @@
 //! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
 //! pure), [`link`] (MAVLink, sans-IO),
 //! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
-//! [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it all.
+//! [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it all. [`airframe`] stands beside: the
+//! autopilot's parameters, read, judged and written before a flight.
 
+pub mod airframe;
 mod answers;
 pub mod args;
 pub mod clock;

@@ -21,7 +21,9 @@ fn check_refused(args: &[&str], texts: &[&str]) {
 
 #[test]
 fn every_command_has_help() {
-    for command in ["demo", "new", "serve", "fly", "pair", "sim", "scene", "bench"] {
+    for command in
+        ["demo", "new", "serve", "fly", "pair", "doctor", "vehicle", "sim", "scene", "bench"]
+    {
         let output = run(&[command, "--help"]);
         assert!(output.status.success(), "{command}");
         assert!(output.stdout.len() > 200, "{command} --help is a stub");

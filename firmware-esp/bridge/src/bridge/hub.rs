@@ -143,7 +143,7 @@ impl Hub {
             return;
         }
         let target = packet.target();
-        if self.is_ours(target) {
+        if target == self.address() {
             self.handle_own(now, None, packet);
             return;
         }
@@ -228,7 +228,7 @@ impl Hub {
         }
         let target = packet.target();
         let own = self.address();
-        if self.is_ours(target) {
+        if target == own {
             self.handle_own(now, Some(index), packet);
             return;
         }

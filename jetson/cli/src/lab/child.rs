@@ -21,8 +21,6 @@ pub(crate) enum Role {
     Runtime,
     /// `vizflyt sim`.
     Simulator,
-    /// `vizflyt bridge emulate`.
-    Bridge,
 }
 
 impl Role {
@@ -32,7 +30,6 @@ impl Role {
             Self::Server => "render server",
             Self::Runtime => "runtime",
             Self::Simulator => "simulator",
-            Self::Bridge => "bridge",
         }
     }
 }

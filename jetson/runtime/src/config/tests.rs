@@ -61,6 +61,8 @@ fn mistakes_are_explained() {
     check_refused("[server]\naddress = \"lab\"\n", &["server.address = \"lab\"", "a port"]);
     check_refused("[vehicle]\nmavlink = \"tcp:1\"\n", &["vehicle.mavlink", "udpin:"]);
     check_refused("[vehicle]\nmavlink = \"udpin:x\"\n", &["vehicle.mavlink", "a port"]);
+    check_refused("[vehicle]\nmavlink = \"serial:/dev/x:1\"\n", &["vehicle.mavlink", "serial:"]);
+    check_refused("[vehicle]\nvision_hz = 100.0\n", &["vehicle.vision_hz", "from 30 to 50"]);
     check_refused("[vehicle]\nname = \"\"\n", &["vehicle.name", "1 to 32 bytes"]);
     for value in ["0", "-1", "nan", "inf", "1e9"] {
         let text = format!("[limits]\nmax_speed_mps = {value}\n");
@@ -125,7 +127,7 @@ fn config() -> impl Strategy<Value = JetsonConfig> {
     let mavlink = ("udp(in|out)", any::<u16>());
     let mavlink = mavlink.prop_map(|(kind, port)| format!("{kind}:127.0.0.1:{port}"));
     let vehicle = (prop::option::of(text), prop::option::of(mavlink))
-        .prop_map(|(name, mavlink)| VehicleConfig { name, mavlink });
+        .prop_map(|(name, mavlink)| VehicleConfig { name, mavlink, ..VehicleConfig::default() });
     let limit = || prop::option::of(5.0..30.0);
     let limits = (limit(), limit(), limit(), limit()).prop_map(|(v, a, tilt, z)| LimitsConfig {
         max_speed_mps: v,

@@ -16,6 +16,7 @@ mod outcome;
 #[cfg(test)]
 pub(crate) mod tests;
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
@@ -86,7 +87,7 @@ pub enum Input {
 }
 
 /// What the link knows at a tick.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct LinkView {
     /// Heartbeats come.
     pub connected: bool,
@@ -97,7 +98,7 @@ pub struct LinkView {
     /// The take-off was accepted.
     pub took_off: bool,
     /// What arming still waits for.
-    pub ready_to_arm: Result<(), &'static str>,
+    pub ready_to_arm: Result<(), Cow<'static, str>>,
 }
 
 /// What is to be done now.
@@ -339,7 +340,11 @@ impl Flight {
             LinkEvent::Text { severity, text } if severity <= SEVERITY_WARNING => {
                 self.notice(EventKind::Note, format!("autopilot: {text}"));
             }
-            _ => {}
+            event => {
+                if let Some(warning) = event.warning() {
+                    self.notice(EventKind::Note, warning);
+                }
+            }
         }
     }
 
@@ -391,7 +396,23 @@ impl Flight {
 
     // ---- phases ----
 
+    /// Lands a vehicle that a former runtime has left in the air: our heartbeats would keep the
+    /// autopilot's own failsafe from doing so.
+    fn is_left_over(&mut self, now: HostTime, link: &LinkView) -> bool {
+        let left = link.connected && link.armed && link.mode == CopterMode::Guided as u32;
+        if left {
+            let why = "the vehicle is armed and in GUIDED with nobody to guide it, as a former runtime \
+                       left it; landing";
+            let reason = self.decide(OutcomeKind::Error, why.into());
+            self.enter(now, FlightPhase::Landing, &reason);
+        }
+        left
+    }
+
     fn connecting(&mut self, now: HostTime, link: &LinkView) {
+        if self.is_left_over(now, link) {
+            return;
+        }
         let missing = if self.arena.is_none() {
             Some("no answer from the server; check --server")
         } else if !self.plugin_ready {
@@ -408,6 +429,9 @@ impl Flight {
     }
 
     fn preparing(&mut self, now: HostTime, link: &LinkView) {
+        if self.is_left_over(now, link) {
+            return;
+        }
         let pose_age_s = self.fix.map(|fix| now.seconds_since(fix.stamp));
         let missing = if link.armed {
             Some("the vehicle is armed already; disarm it first")
@@ -416,7 +440,7 @@ impl Flight {
         } else if self.answered_at.is_none() {
             Some("the plugin has not answered an image yet")
         } else {
-            link.ready_to_arm.err()
+            link.ready_to_arm.as_ref().err().map(AsRef::as_ref)
         };
         match (missing, self.fix) {
             (None, Some(fix)) => {

@@ -192,7 +192,7 @@ fn nothing_is_armed_before_all_are_ready() {
     type Spoil = fn(&mut Script);
     let checks: [(Spoil, &str); 6] = [
         (|script| script.link.connected = false, "no heartbeat"),
-        (|script| script.link.ready_to_arm = Err("the compass is confused"), "compass"),
+        (|script| script.link.ready_to_arm = Err("the compass is confused".into()), "compass"),
         (|script| script.poses = false, "no pose"),
         (|script| script.images = false, "not answered an image"),
         (|script| script.answers = Answers::Never, "not answered an image"),
@@ -449,9 +449,19 @@ fn one_that_does_not_come_back_is_not_waited_for_longer() {
 }
 
 #[test]
+fn what_a_former_runtime_left_in_the_air_is_landed() {
+    let mut script = Script::new();
+    (script.link.armed, script.link.mode) = (true, 4);
+    script.run(0.1);
+    assert_eq!((script.orders.goal, script.flight.phase()), (Goal::Land, Landing));
+    assert!(script.flight.outcome().is_none(), "not before it is on the ground");
+    script.check_end(OutcomeKind::Error, "nobody to guide it");
+}
+
+#[test]
 fn one_that_fails_on_the_ground_does_so_before_arming() {
     let mut script = Script::new();
-    script.link.ready_to_arm = Err("the compass is confused");
+    script.link.ready_to_arm = Err("the compass is confused".into());
     script.flight.handle(script.now, Input::Arena(Box::new(arena())));
     script.flight.handle(script.now, Input::PluginReady);
     script.run(1.0);

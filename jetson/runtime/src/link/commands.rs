@@ -5,6 +5,8 @@ use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
 use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
 use vizflyt_protocol::time::HostTime;
 
+use super::words::is_final;
+
 /// A command to the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Command {
@@ -15,11 +17,29 @@ pub(super) enum Command {
     Land,
     /// Message id and its period. [us]
     Interval(u32, f32),
+    /// A message once, by its id.
+    Message(u32),
 }
 
 impl Command {
     pub(super) fn name(self) -> &'static str {
         command_name(self.mavlink())
+    }
+
+    /// Whether the flight goes on without it.
+    pub(super) fn is_chore(self) -> bool {
+        matches!(self, Self::Interval(..) | Self::Message(_))
+    }
+
+    pub(super) fn mavlink(self) -> MavCmd {
+        match self {
+            Self::Mode(_) => MavCmd::MAV_CMD_DO_SET_MODE,
+            Self::Arm => MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            Self::TakeOff(_) => MavCmd::MAV_CMD_NAV_TAKEOFF,
+            Self::Land => MavCmd::MAV_CMD_NAV_LAND,
+            Self::Interval(..) => MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+            Self::Message(_) => MavCmd::MAV_CMD_REQUEST_MESSAGE,
+        }
     }
 }
 
@@ -146,8 +166,8 @@ impl Commands {
                 pending.refusals = pending.refusals.saturating_add(1);
                 pending.waits = false;
                 pending.due_at = now.plus_seconds(RETRY_S);
-                let final_word = matches!(refusal, MavResult::MAV_RESULT_UNSUPPORTED)
-                    || pending.refusals >= REFUSALS;
+                let final_word =
+                    is_final(refusal) || pending.command.is_chore() || pending.refusals >= REFUSALS;
                 if pending.patience == Patience::Bounded && final_word {
                     return self.give_up();
                 }
@@ -170,10 +190,10 @@ impl Commands {
         pending.dead = true;
         let command = pending.command;
         let why = match pending.last_result {
-            Some(result) => result_name(result).to_owned(),
+            Some(result) => format!("refused ({})", result_name(result)),
             None => format!("not answered ({REPEATS} times)"),
         };
-        if let Command::Interval(..) = command {
+        if command.is_chore() {
             // Of no weight: the next one may go out at once.
             self.pending = None;
         }

@@ -1,0 +1,180 @@
+//! What an autopilot has, against what it should have.
+
+use std::collections::BTreeMap;
+
+use super::names::{Known, Version, known};
+use super::rules::RULES;
+use crate::link::same;
+
+/// A parameter that is not as it should be.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Difference {
+    /// Its name in the autopilot's version.
+    pub name: String,
+    /// What the autopilot has, in its own unit; `None` if it does not have the parameter.
+    pub has: Option<f64>,
+    /// What it should have, in its own unit.
+    pub right: f64,
+    /// What is dangerous about what it has.
+    pub danger: Option<String>,
+}
+
+/// The room, where it differs from the one that the files were written for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Room {
+    /// Height at which the fence ends. [m]
+    pub ceiling_m: Option<f64>,
+    /// Distance from the take-off point at which it ends. [m]
+    pub radius_m: Option<f64>,
+}
+
+impl Room {
+    /// Puts the room's measures in the place of the file's.
+    fn fit(self, version: Version, name: &str, right: f64) -> f64 {
+        let measure = match name {
+            "FENCE_ALT_MAX" => self.ceiling_m,
+            "FENCE_RADIUS" => self.radius_m,
+            _ => None,
+        };
+        let fitted = measure.zip(known(version, name));
+        fitted.map_or(right, |(newest, known)| known.value_in(version, newest))
+    }
+}
+
+/// Returns the differences of what an autopilot `has` from what is `wanted`, the dangerous ones first.
+pub fn compare(
+    version: Version,
+    wanted: &BTreeMap<String, f64>,
+    room: Room,
+    has: impl Fn(&str) -> Option<f64>,
+) -> Vec<Difference> {
+    let mut found: Vec<(usize, Difference)> = Vec::new();
+    for (name, &right) in wanted {
+        let right = room.fit(version, name, right);
+        let value = has(name);
+        if value.is_some_and(|value| same(value, right)) {
+            continue;
+        }
+        let known = known(version, name);
+        let (rank, danger) = match (known, value) {
+            (Some(known), Some(value)) => danger(version, known, value, right),
+            _ => (usize::MAX, None),
+        };
+        let name = name.clone();
+        found.push((rank, Difference { name, has: value, right, danger }));
+    }
+    found.sort_by_key(|(rank, _)| *rank);
+    found.into_iter().map(|(_, difference)| difference).collect()
+}
+
+/// Returns how bad a value is (less is worse), and why.
+fn danger(version: Version, known: &Known, value: f64, right: f64) -> (usize, Option<String>) {
+    let Some(rank) = RULES.iter().position(|rule| rule.name == known.name) else {
+        return (usize::MAX, None);
+    };
+    let newest = known.newest(version, value);
+    let beyond = matches!(known.name, "FENCE_ALT_MAX" | "FENCE_RADIUS") && value > right;
+    match (RULES[rank].danger)(newest) {
+        Some(why) => (rank, Some(why.to_owned())),
+        None if beyond => (rank, Some("the fence ends outside the room".to_owned())),
+        None => (usize::MAX - 1, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{contradictions, parse_params, shipped};
+    use super::*;
+
+    fn wanted(version: Version) -> BTreeMap<String, f64> {
+        parse_params(shipped(version)).unwrap()
+    }
+
+    /// The files: no unknown name, no value out of range, nothing that contradicts itself or that our
+    /// own rules call dangerous, and the same airframe in every version.
+    #[test]
+    fn the_shipped_files_hold_water() {
+        let mut newest: Vec<BTreeMap<&'static str, f64>> = Vec::new();
+        for version in Version::ALL {
+            let mut values = BTreeMap::new();
+            for (name, value) in wanted(version) {
+                let known = known(version, &name)
+                    .unwrap_or_else(|| panic!("{name} is no parameter of {version:?}"));
+                let value = known.newest(version, value);
+                let in_range = (known.least..=known.most).contains(&value);
+                assert!(in_range, "{name} = {value} is not from {} to {}", known.least, known.most);
+                assert!(
+                    !known.whole || value.fract() == 0.0,
+                    "{name} = {value} is no whole number"
+                );
+                values.insert(known.name, value);
+            }
+            assert_eq!(contradictions(&values), Vec::<String>::new(), "{version:?}");
+            for rule in RULES {
+                let value =
+                    values.get(rule.name).unwrap_or_else(|| panic!("{} is not set", rule.name));
+                assert_eq!((rule.danger)(*value), None, "{} in {version:?}", rule.name);
+            }
+            newest.push(values);
+        }
+        for values in &newest[1..] {
+            assert_eq!(values.keys().collect::<Vec<_>>(), newest[0].keys().collect::<Vec<_>>());
+            for (name, value) in values {
+                assert!(same(*value, newest[0][name]), "{name}: {value} and {}", newest[0][name]);
+            }
+        }
+    }
+
+    #[test]
+    fn contradictions_are_found() {
+        let check = |pairs: &[(&'static str, f64)], expected: &str| {
+            let found = contradictions(&pairs.iter().copied().collect());
+            assert!(found.len() == 1 && found[0].contains(expected), "{found:?}");
+        };
+        check(&[("EK3_SRC1_YAW", 6.0), ("VISO_TYPE", 0.0)], "VISO_TYPE = 0");
+        check(&[("BATT_LOW_VOLT", 13.0), ("BATT_CRT_VOLT", 13.2)], "above BATT_CRT_VOLT");
+        check(&[("RTL_ALT_M", 15.0), ("FENCE_ALT_MAX", 3.0)], "below FENCE_ALT_MAX");
+        check(&[("EK3_SRC1_POSXY", 3.0), ("GPS1_TYPE", 0.0)], "needs a GPS");
+        check(&[("FENCE_ENABLE", 1.0), ("FENCE_TYPE", 2.0)], "no ceiling");
+    }
+
+    /// The published lab's parameters, which would climb into the net.
+    #[test]
+    fn the_published_labs_dangers_are_named() {
+        for version in Version::ALL {
+            let mut has = wanted(version);
+            let mut set = |name: &str, newest: f64| {
+                let known = super::super::names::known(Version::V48, name).unwrap();
+                has.insert(known.name_in(version).to_owned(), known.value_in(version, newest));
+            };
+            set("GPS1_TYPE", 14.0);
+            set("EK3_SRC1_POSXY", 3.0);
+            set("VISO_TYPE", 0.0);
+            set("FENCE_ENABLE", 0.0);
+            set("BATT_MONITOR", 0.0);
+            set("FS_GCS_ENABLE", 1.0);
+            set("RTL_ALT_M", 15.0);
+            let found =
+                compare(version, &wanted(version), Room::default(), |name| has.get(name).copied());
+            assert_eq!(found.len(), 7, "{found:?}");
+            let dangers = found.iter().filter(|difference| difference.danger.is_some()).count();
+            assert_eq!(dangers, 6, "{found:?}");
+            assert_eq!(found[0].name, "FS_GCS_ENABLE");
+            assert!(found[0].danger.as_ref().unwrap().contains("into the ceiling"));
+            assert_eq!(found[6].danger, None, "a GPS alone is no danger: {found:?}");
+        }
+    }
+
+    #[test]
+    fn the_room_goes_before_the_file() {
+        let version = Version::V48;
+        let room = Room { ceiling_m: Some(2.5), radius_m: Some(3.0) };
+        let has = wanted(version);
+        let found = compare(version, &wanted(version), room, |name| has.get(name).copied());
+        let fence: Vec<_> = found.iter().map(|f| (f.name.as_str(), f.right)).collect();
+        assert_eq!(fence, [("FENCE_ALT_MAX", 2.5), ("FENCE_RADIUS", 3.0)]);
+        assert!(found[0].danger.as_ref().unwrap().contains("outside the room"), "{found:?}");
+        let nothing = compare(version, &wanted(version), Room::default(), |_| None);
+        assert!(nothing.iter().all(|f| f.has.is_none() && f.danger.is_none()));
+    }
+}

@@ -1,0 +1,28 @@
+//! The autopilot's parameters as this airframe needs them: the files in `hardware/airframe`, what the
+//! names of three ArduCopter versions mean, and which values are dangerous in a room.
+//!
+//! ```text
+//! hardware/airframe/*.param ── file ──▶ wanted ─┐
+//! autopilot ── visit ──▶ firmware, values ──────┴─ compare ──▶ differences ──▶ a person; --apply
+//! ```
+
+mod compare;
+mod file;
+mod names;
+mod rules;
+mod visit;
+
+pub use compare::{Difference, Room, compare};
+pub use file::{ParamFileError, parse_params};
+pub use names::{Known, Version, known};
+pub use rules::{RULES, Rule, contradictions};
+pub use visit::{Visit, VisitError};
+
+/// Returns this airframe's file for a version.
+pub fn shipped(version: Version) -> &'static str {
+    match version {
+        Version::V45 => include_str!("../../../../hardware/airframe/whippet-copter-4.5.param"),
+        Version::V46 => include_str!("../../../../hardware/airframe/whippet-copter-4.6.param"),
+        Version::V48 => include_str!("../../../../hardware/airframe/whippet-copter-4.8.param"),
+    }
+}

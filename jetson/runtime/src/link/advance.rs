@@ -1,0 +1,294 @@
+//! What to send next: the command that the goal needs, and what is due every second.
+
+// Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
+#![allow(deprecated)]
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::yaw_of;
+use vizflyt_protocol::mavlink::dialect::{
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
+    MavState, MavType, PARAM_REQUEST_LIST_DATA, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
+    SET_GPS_GLOBAL_ORIGIN_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
+};
+use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, GuidedSetpoint, guided_to_mavlink};
+use vizflyt_protocol::messages::YawTarget;
+use vizflyt_protocol::time::HostTime;
+
+use super::commands::{Answer, Command, Patience};
+use super::companions::ANNOUNCES;
+use super::dialect::Rise;
+use super::params::Request;
+use super::rates::Verdict;
+use super::{Goal, Link, LinkEvent, Rising, Target};
+
+/// Any place will do indoors: it only ties the local frame to the globe. ArduCopter's own
+/// test field. [1e-7 degrees, 1e-7 degrees, mm]
+const ORIGIN: (i32, i32, i32) = (-353_632_621, 1_491_652_374, 584_000);
+/// PX4 enters OFFBOARD only if setpoints have come at more than 2 Hz for a second: sent at 20. [s]
+const RISE_PERIOD_S: f64 = 0.05;
+/// Streamed for this long before the mode is asked for. [s]
+const RISE_LEAD_S: f64 = 1.2;
+/// Our name is told again this often while somebody else commands the vehicle. [s]
+const ANNOUNCE_S: f64 = 5.0;
+/// Pre-arm checks are asked for in words this often while they fail; ArduCopter tells by itself
+/// every 30 s. [s]
+const PREARM_S: f64 = 5.0;
+
+impl Link {
+    /// Sends the command that the goal needs next, or repeats the one under way.
+    pub(super) fn advance(&mut self, now: HostTime) {
+        let Some(target) = self.autopilot else { return };
+        if let Answer::GivenUp { command, why } = self.commands.handle_timeout(now) {
+            self.given_up(now, command, &why);
+        }
+        self.advance_params(now, target);
+        let Some(command) = self.wanted(now, target) else { return };
+        let endless = self.goal == Goal::Land && !command.is_chore();
+        let patience = if endless { Patience::Endless } else { Patience::Bounded };
+        if let Some(confirmation) = self.commands.start(now, command, patience) {
+            let mut message = self.message(command);
+            message.confirmation = confirmation;
+            self.send_command(now, target, message);
+        }
+    }
+
+    fn wanted(&mut self, now: HostTime, target: Target) -> Option<Command> {
+        let guided = self.state.mode == CopterMode::Guided as u32;
+        let landing = self.state.mode == CopterMode::Land as u32;
+        let chore = self.chores.front().copied();
+        if self.goal_is_stale {
+            return chore;
+        }
+        match self.goal {
+            Goal::TakeOff(height_m) if self.dialect.rise() == Rise::BySetpoint => {
+                self.rise(now, target, height_m)
+            }
+            Goal::TakeOff(_) if !guided => Some(Command::Mode(CopterMode::Guided)),
+            Goal::TakeOff(_) if !self.state.armed => Some(Command::Arm),
+            Goal::TakeOff(height_m) if !self.took_off => Some(Command::TakeOff(height_m)),
+            // By command first, by mode next, in turn until one of them works.
+            Goal::Land if self.state.armed && !landing => Some(if self.commands.is_odd_try() {
+                Command::Mode(CopterMode::Land)
+            } else {
+                Command::Land
+            }),
+            _ => chore,
+        }
+    }
+
+    /// Streams the point to rise to; returns the command that is needed besides.
+    fn rise(&mut self, now: HostTime, target: Target, height_m: f32) -> Option<Command> {
+        if !self.position_known {
+            return self.chores.front().copied();
+        }
+        let rising = *self.rising.get_or_insert_with(|| {
+            let p_world_m = self.state.p_world_m + DVec3::Z * f64::from(height_m);
+            let setpoint = GuidedSetpoint {
+                motion: GuidedMotion::Position(p_world_m),
+                yaw: YawTarget::Angle(yaw_of(self.state.world_from_body)),
+            };
+            Rising { setpoint, since: now, due_at: now }
+        });
+        if now >= rising.due_at {
+            let boot_ms = (now.as_ns() / 1_000_000) as u32;
+            let to = (target.system, target.component);
+            let message = guided_to_mavlink(&rising.setpoint, to, boot_ms);
+            self.send(now, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(message));
+            self.rising = Some(Rising { due_at: now.plus_seconds(RISE_PERIOD_S), ..rising });
+        }
+        if now.seconds_since(rising.since) < RISE_LEAD_S {
+            return None;
+        }
+        if self.state.mode != CopterMode::Guided as u32 {
+            Some(Command::Mode(CopterMode::Guided))
+        } else if !self.state.armed {
+            Some(Command::Arm)
+        } else {
+            if !self.took_off {
+                self.rose();
+            }
+            None
+        }
+    }
+
+    fn advance_params(&mut self, now: HostTime, target: Target) {
+        let mut requests = Vec::new();
+        if let Some(event) = self.params.poll(now, |request| requests.push(request)) {
+            self.param_event(event);
+        }
+        let (target_system, target_component) = (target.system, target.component);
+        for request in requests {
+            let message = match request {
+                Request::List => MavMessage::PARAM_REQUEST_LIST(PARAM_REQUEST_LIST_DATA {
+                    target_system,
+                    target_component,
+                }),
+                Request::ByIndex(index) => {
+                    MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+                        param_index: index as i16,
+                        target_system,
+                        target_component,
+                        ..Default::default()
+                    })
+                }
+                Request::ByName(name) => MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+                    param_index: -1,
+                    param_id: name.as_str().into(),
+                    target_system,
+                    target_component,
+                }),
+                Request::Set { name, value, kind } => MavMessage::PARAM_SET(PARAM_SET_DATA {
+                    param_value: self.dialect.value_to_wire(value, kind),
+                    param_id: name.as_str().into(),
+                    param_type: kind,
+                    target_system,
+                    target_component,
+                }),
+            };
+            self.send(now, &message);
+        }
+    }
+
+    pub(super) fn every_second(&mut self, now: HostTime) {
+        // Heartbeats also tell a bridge or an autopilot that waits where we are.
+        self.send_heartbeat(now);
+        if let Some(fault) = self.signatures.as_mut().and_then(super::Signatures::take_news) {
+            self.events.push_back(LinkEvent::NotSigned(fault));
+        }
+        let Some(target) = self.autopilot else { return };
+        let request = TIMESYNC_DATA {
+            tc1: 0,
+            ts1: now.as_ns() as i64,
+            target_system: target.system,
+            target_component: target.component,
+        };
+        self.note_clock_request(request.ts1);
+        self.send(now, &MavMessage::TIMESYNC(request));
+        if self.dialect.needs_origin() && !self.origin_set {
+            self.send(
+                now,
+                &MavMessage::SET_GPS_GLOBAL_ORIGIN(SET_GPS_GLOBAL_ORIGIN_DATA {
+                    latitude: ORIGIN.0,
+                    longitude: ORIGIN.1,
+                    altitude: ORIGIN.2,
+                    target_system: target.system,
+                    time_usec: now.as_ns() / 1000,
+                }),
+            );
+        }
+        self.check_rates(now);
+        self.tell_delay(now);
+        self.announce(now);
+        self.ask_why(now, target);
+    }
+
+    fn check_rates(&mut self, now: HostTime) {
+        let (chores, events) = (&mut self.chores, &mut self.events);
+        // A queue of chores is asked for already.
+        let may_ask = chores.is_empty();
+        self.rates.check(now, |verdict| match verdict {
+            Verdict::Ask((id, period_us)) if may_ask => {
+                chores.push_back(Command::Interval(id, period_us));
+            }
+            Verdict::Ask(_) => {}
+            Verdict::Slow(rate) => events.push_back(LinkEvent::Slow(rate)),
+        });
+    }
+
+    /// Compares external navigation's latency with the autopilot's setting, once, on the ground.
+    fn tell_delay(&mut self, now: HostTime) {
+        if self.delay_told || self.state.armed || self.params.is_busy() {
+            return;
+        }
+        if let Some(delay) = self.delay(now) {
+            self.delay_told = true;
+            if !delay.is_close() {
+                self.events.push_back(LinkEvent::Delay(delay));
+            }
+        }
+    }
+
+    /// Tells our name to others on the vehicle: once, and again while there are some.
+    fn announce(&mut self, now: HostTime) {
+        let due = match self.announced_at {
+            None => true,
+            Some(at) => now.seconds_since(at) >= ANNOUNCE_S && self.companions.other(now).is_some(),
+        };
+        if due && !self.settings.name.is_empty() {
+            self.announced_at = Some(now);
+            let text = self.own_name();
+            self.send(
+                now,
+                &MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+                    severity: MavSeverity::MAV_SEVERITY_INFO,
+                    text: text.as_str().into(),
+                    ..Default::default()
+                }),
+            );
+        }
+    }
+
+    fn own_name(&self) -> String {
+        let mut text = format!("{ANNOUNCES}{}", self.settings.name);
+        while text.len() > 50 {
+            text.pop();
+        }
+        text
+    }
+
+    /// Whether a text is an echo of our own announcement.
+    pub(super) fn is_own_name(&self, text: &str) -> bool {
+        !self.settings.name.is_empty() && text == self.own_name()
+    }
+
+    /// Has failing pre-arm checks said in words.
+    fn ask_why(&mut self, now: HostTime, target: Target) {
+        let due = self.prearm.asked_at.is_none_or(|at| now.seconds_since(at) >= PREARM_S);
+        let wanted = self.prearm.ok == Some(false) && self.goal == Goal::Prepare;
+        if wanted && due && !self.prearm.mute && !self.state.armed {
+            self.prearm.asked_at = Some(now);
+            let command = MavCmd::MAV_CMD_RUN_PREARM_CHECKS;
+            self.send_command(now, target, COMMAND_LONG_DATA { command, ..Default::default() });
+        }
+    }
+
+    fn send_command(&mut self, now: HostTime, target: Target, mut message: COMMAND_LONG_DATA) {
+        (message.target_system, message.target_component) = (target.system, target.component);
+        self.commanded.retain(|(command, _)| *command != message.command);
+        self.commanded.push((message.command, now));
+        self.send(now, &MavMessage::COMMAND_LONG(message));
+    }
+
+    fn send_heartbeat(&mut self, now: HostTime) {
+        let heartbeat = HEARTBEAT_DATA {
+            // Ours to use, as we are no autopilot: tells two runtimes apart.
+            custom_mode: self.companions.own(),
+            mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+            base_mode: MavModeFlag::empty(),
+            system_status: MavState::MAV_STATE_ACTIVE,
+            mavlink_version: 3,
+        };
+        self.send(now, &MavMessage::HEARTBEAT(heartbeat));
+    }
+
+    /// Returns the message without target and confirmation.
+    fn message(&self, command: Command) -> COMMAND_LONG_DATA {
+        let mut message = COMMAND_LONG_DATA { command: command.mavlink(), ..Default::default() };
+        match command {
+            Command::Mode(mode) => {
+                message.param1 = f32::from(MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED.bits());
+                (message.param2, message.param3) = self.dialect.mode_parameters(mode);
+            }
+            Command::Arm => message.param1 = 1.0,
+            Command::TakeOff(height_m) => message.param7 = height_m,
+            Command::Land => {}
+            Command::Interval(id, period_us) => {
+                message.param1 = id as f32;
+                message.param2 = period_us;
+            }
+            Command::Message(id) => message.param1 = id as f32,
+        }
+        message
+    }
+}

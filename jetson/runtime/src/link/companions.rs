@@ -1,0 +1,150 @@
+//! Whether somebody else commands this vehicle. Two companions that steer one vehicle fight: the
+//! second is refused, by its name where it has told one.
+//!
+//! Told apart by: heartbeats of a companion computer that are not an echo of ours (a number in their
+//! unused `custom_mode` says so), and answers of the autopilot to questions that we did not ask.
+
+use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavType};
+use vizflyt_protocol::time::HostTime;
+
+use super::{COMPONENT_ID, SYSTEM_ID};
+
+/// What a companion announces itself with, before its name.
+pub(super) const ANNOUNCES: &str = "companion ";
+/// Silent for this long: gone. [s]
+const GONE_AFTER_S: f64 = 5.0;
+/// Signs needed: one may be an answer to a former run of ours.
+const SIGNS: u32 = 3;
+/// Others remembered.
+const MOST: usize = 8;
+/// MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4.
+const COMPANIONS: std::ops::RangeInclusive<u8> = 191..=194;
+
+#[derive(Clone, Debug)]
+struct Other {
+    id: (u8, u8),
+    name: Option<String>,
+    signs: u32,
+    heard_at: HostTime,
+}
+
+/// Who else speaks to the vehicle.
+#[derive(Clone, Debug)]
+pub(super) struct Companions {
+    /// Tells our heartbeats from those of another that has our ids.
+    own: u32,
+    others: Vec<Other>,
+}
+
+impl Companions {
+    /// Makes one; `own` differs from runtime to runtime.
+    pub(super) fn new(own: u32) -> Self {
+        Self { own, others: Vec::new() }
+    }
+
+    /// Returns what goes into our heartbeats' `custom_mode`.
+    pub(super) fn own(&self) -> u32 {
+        self.own
+    }
+
+    /// Takes a heartbeat that is not of the autopilot.
+    pub(super) fn heartbeat(&mut self, now: HostTime, from: (u8, u8), heartbeat: &HEARTBEAT_DATA) {
+        let echo = from == (SYSTEM_ID, COMPONENT_ID) && heartbeat.custom_mode == self.own;
+        let companion = heartbeat.mavtype == MavType::MAV_TYPE_ONBOARD_CONTROLLER
+            && COMPANIONS.contains(&from.1);
+        if companion && !echo {
+            self.sign(now, from);
+        }
+    }
+
+    /// Takes an answer of the autopilot that names `to` and that we did not ask for.
+    pub(super) fn answer(&mut self, now: HostTime, to: (u8, u8)) {
+        if COMPANIONS.contains(&to.1) {
+            self.sign(now, to);
+        }
+    }
+
+    /// Takes a text of somebody who is neither the autopilot nor we.
+    pub(super) fn text(&mut self, now: HostTime, from: (u8, u8), text: &str) {
+        if let Some(name) = text.strip_prefix(ANNOUNCES)
+            && COMPANIONS.contains(&from.1)
+        {
+            self.sign(now, from);
+            if let Some(other) = self.others.iter_mut().find(|other| other.id == from) {
+                other.name = Some(name.trim().to_owned());
+            }
+        }
+    }
+
+    fn sign(&mut self, now: HostTime, id: (u8, u8)) {
+        self.others.retain(|other| now.seconds_since(other.heard_at) < GONE_AFTER_S);
+        if let Some(other) = self.others.iter_mut().find(|other| other.id == id) {
+            other.signs = other.signs.saturating_add(1);
+            other.heard_at = now;
+        } else if self.others.len() < MOST {
+            self.others.push(Other { id, name: None, signs: 1, heard_at: now });
+        }
+    }
+
+    /// Returns who else commands the vehicle, in words.
+    pub(super) fn other(&self, now: HostTime) -> Option<String> {
+        let here = |other: &&Other| {
+            other.signs >= SIGNS && now.seconds_since(other.heard_at) < GONE_AFTER_S
+        };
+        self.others.iter().find(here).map(|other| {
+            let (system, component) = other.id;
+            let ids = format!("system {system}, component {component}");
+            match &other.name {
+                Some(name) => format!("\"{name}\" ({ids})"),
+                None => format!("another companion ({ids})"),
+            }
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn beat(own: u32, mavtype: MavType) -> HEARTBEAT_DATA {
+        HEARTBEAT_DATA { custom_mode: own, mavtype, ..Default::default() }
+    }
+
+    #[test]
+    fn another_is_named_an_echo_and_a_ground_station_are_not() {
+        let computer = MavType::MAV_TYPE_ONBOARD_CONTROLLER;
+        let check = |from: (u8, u8), heartbeat: HEARTBEAT_DATA, expected: Option<&str>| {
+            let mut companions = Companions::new(77);
+            let mut now = HostTime::from_ns(1_000_000_000);
+            for _ in 0..SIGNS {
+                assert_eq!(companions.other(now), None);
+                now = now.plus_seconds(1.0);
+                companions.heartbeat(now, from, &heartbeat);
+            }
+            assert_eq!(companions.other(now).as_deref(), expected);
+            assert_eq!(companions.other(now.plus_seconds(GONE_AFTER_S)), None, "it is gone");
+        };
+        check((255, 191), beat(77, computer), None);
+        check((255, 190), beat(0, MavType::MAV_TYPE_GCS), None);
+        check((1, 240), beat(0, computer), None);
+        check(
+            (255, 191),
+            beat(78, computer),
+            Some("another companion (system 255, component 191)"),
+        );
+        check((1, 192), beat(0, computer), Some("another companion (system 1, component 192)"));
+    }
+
+    #[test]
+    fn its_name_is_told_where_it_told_it() {
+        let mut companions = Companions::new(1);
+        let now = HostTime::from_ns(1);
+        for _ in 0..SIGNS {
+            companions.text(now, (255, 191), "companion wasp-jetson");
+        }
+        let expected = "\"wasp-jetson\" (system 255, component 191)";
+        assert_eq!(companions.other(now).as_deref(), Some(expected));
+        companions.text(now, (1, 1), "companion of nobody");
+        assert_eq!(companions.other(now).as_deref(), Some(expected));
+    }
+}

@@ -1,0 +1,135 @@
+//! The external navigation feed: which poses go to the autopilot, and how old they are when they
+//! get there. ArduCopter relates the stamps' clock to its own by the quickest packet, so the least
+//! latency is what it cannot see and has to be told: VISO_DELAY_MS.
+
+use vizflyt_protocol::time::HostTime;
+
+/// Rates that ArduCopter flew with; its filter takes at most 50 a second. [Hz]
+pub const VISION_HZ: std::ops::RangeInclusive<f64> = 30.0..=50.0;
+
+/// Poses older than this say nothing of now. [s]
+const STALE_S: f64 = 0.5;
+/// Poses over which the latency is measured: 5 s.
+const WINDOW: usize = 250;
+/// A pose is due when this much of the period is over: they come on a grid of their own.
+const SLACK: f64 = 0.1;
+/// A setting this close to the measurement will do. [ms]
+const CLOSE_MS: f64 = 10.0;
+
+/// The feed.
+#[derive(Clone, Debug)]
+pub(super) struct Feed {
+    period_s: f64,
+    due_at: Option<HostTime>,
+    /// Ages of the newest poses when they were sent. [s]
+    ages_s: Vec<f64>,
+    next: usize,
+    stale: u64,
+}
+
+/// What external navigation's latency is, and what the autopilot takes it to be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Delay {
+    /// The autopilot's parameter for it.
+    pub parameter: &'static str,
+    /// Least time from the measurement to the autopilot. [ms]
+    pub measured_ms: f64,
+    /// What the autopilot is set to; `None` if it is not known. [ms]
+    pub set_ms: Option<f64>,
+}
+
+impl Delay {
+    /// Whether the setting is good enough.
+    pub fn is_close(&self) -> bool {
+        self.set_ms.is_none_or(|set_ms| (set_ms - self.measured_ms).abs() <= CLOSE_MS)
+    }
+}
+
+impl Feed {
+    /// Makes a feed of `hz` poses a second; held within [`VISION_HZ`].
+    pub(super) fn new(hz: f64) -> Self {
+        let hz = hz.max(*VISION_HZ.start()).min(*VISION_HZ.end());
+        Self { period_s: 1.0 / hz, due_at: None, ages_s: Vec::new(), next: 0, stale: 0 }
+    }
+
+    /// Whether a pose that was true at `stamp` is to be sent now.
+    pub(super) fn take(&mut self, now: HostTime, stamp: HostTime) -> bool {
+        let age_s = now.seconds_since(stamp);
+        if !(age_s < STALE_S) {
+            self.stale += 1;
+            return false;
+        }
+        let early_s = SLACK * self.period_s;
+        let due_at = self.due_at.unwrap_or(now);
+        if now.plus_seconds(early_s) < due_at {
+            return false;
+        }
+        // On the grid, unless it has fallen behind.
+        let next = due_at.plus_seconds(self.period_s);
+        let behind = next.seconds_since(now) < early_s;
+        self.due_at = Some(if behind { now.plus_seconds(self.period_s) } else { next });
+        if self.ages_s.len() < WINDOW {
+            self.ages_s.push(age_s);
+        } else {
+            self.ages_s[self.next] = age_s;
+            self.next = (self.next + 1) % WINDOW;
+        }
+        true
+    }
+
+    /// Returns poses that came too late to be sent.
+    pub(super) fn stale(&self) -> u64 {
+        self.stale
+    }
+
+    /// Returns the least latency from measurement to autopilot, `link_s` of it on the link, once a
+    /// window is full. [ms]
+    pub(super) fn delay_ms(&self, link_s: f64) -> Option<f64> {
+        if self.ages_s.len() < WINDOW {
+            return None;
+        }
+        let least_s = self.ages_s.iter().copied().fold(f64::INFINITY, f64::min);
+        Some((least_s.max(0.0) + link_s.max(0.0)) * 1e3)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sent(hz_in: f64, hz_out: f64) -> usize {
+        let mut feed = Feed::new(hz_out);
+        let start = HostTime::from_ns(1_000_000_000);
+        let at = |i: usize| start.plus_seconds(i as f64 / hz_in);
+        (0..(10.0 * hz_in) as usize).filter(|&i| feed.take(at(i), at(i))).count()
+    }
+
+    #[test]
+    fn whatever_comes_in_the_rate_out_is_kept() {
+        for hz_in in [100.0, 120.0, 200.0, 240.0] {
+            for hz_out in [30.0, 40.0, 50.0] {
+                let n = sent(hz_in, hz_out) as f64 / 10.0;
+                assert!(n <= hz_out + 0.2 && n > 0.85 * hz_out, "{hz_in} to {hz_out}: {n}");
+            }
+        }
+        assert_eq!(sent(25.0, 50.0), 250, "what comes slower all goes out");
+        assert_eq!(sent(100.0, 50.0), 500);
+    }
+
+    #[test]
+    fn the_least_latency_is_measured_and_compared() {
+        let mut feed = Feed::new(50.0);
+        let mut now = HostTime::from_ns(1_000_000_000);
+        for i in 0..400 {
+            let age_s = 0.034 + f64::from(i % 7) * 0.003;
+            assert!(feed.take(now, now.plus_seconds(-age_s)));
+            now = now.plus_seconds(0.02);
+        }
+        let measured_ms = feed.delay_ms(0.002).unwrap();
+        assert!((measured_ms - 36.0).abs() < 0.1, "{measured_ms}");
+        let delay = |set_ms| Delay { parameter: "VISO_DELAY_MS", measured_ms, set_ms };
+        assert!(delay(None).is_close() && delay(Some(40.0)).is_close());
+        assert!(!delay(Some(10.0)).is_close());
+        assert!(!feed.take(now, now.plus_seconds(-0.6)) && feed.stale() == 1, "too old");
+    }
+}

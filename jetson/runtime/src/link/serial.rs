@@ -1,0 +1,136 @@
+//! MAVLink over a serial line: raw bytes, 8N1. A device that goes away is opened again when it is
+//! back. What the line cannot take at once waits; when too much waits, whole packets are dropped, as
+//! a datagram would be.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, ErrorKind, Read, Write};
+use std::os::fd::AsFd;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use nix::libc::{O_NOCTTY, O_NONBLOCK};
+use nix::poll::{PollFd, PollFlags, poll};
+use nix::sys::termios::{
+    BaudRate, ControlFlags, FlushArg, SetArg, cfmakeraw, cfsetspeed, tcflush, tcgetattr, tcsetattr,
+};
+
+/// Longest wait for bytes. [ms]
+const WAIT_MS: u8 = 100;
+/// Bytes that may wait for the line: 20 ms at 921600 baud. Older setpoints are worth nothing.
+const BACKLOG: usize = 2048;
+
+/// The line.
+#[derive(Debug)]
+pub(super) struct SerialPort {
+    path: PathBuf,
+    baud: BaudRate,
+    flow: bool,
+    file: Mutex<Option<Arc<File>>>,
+    backlog: Mutex<Vec<u8>>,
+}
+
+/// Returns the system's name of a speed; `None` if it has none.
+pub(super) fn speed(baud: u32) -> Option<BaudRate> {
+    const SPEEDS: [(u32, BaudRate); 14] = [
+        (9_600, BaudRate::B9600),
+        (19_200, BaudRate::B19200),
+        (38_400, BaudRate::B38400),
+        (57_600, BaudRate::B57600),
+        (115_200, BaudRate::B115200),
+        (230_400, BaudRate::B230400),
+        (460_800, BaudRate::B460800),
+        (500_000, BaudRate::B500000),
+        (921_600, BaudRate::B921600),
+        (1_000_000, BaudRate::B1000000),
+        (1_500_000, BaudRate::B1500000),
+        (2_000_000, BaudRate::B2000000),
+        (3_000_000, BaudRate::B3000000),
+        (4_000_000, BaudRate::B4000000),
+    ];
+    SPEEDS.iter().find(|(known, _)| *known == baud).map(|&(_, speed)| speed)
+}
+
+impl SerialPort {
+    pub(super) fn open(path: &Path, baud: u32, flow: bool) -> io::Result<Self> {
+        let baud = speed(baud).ok_or(ErrorKind::InvalidInput)?;
+        let file = open(path, baud, flow)?;
+        Ok(Self {
+            path: path.to_owned(),
+            baud,
+            flow,
+            file: Mutex::new(Some(Arc::new(file))),
+            backlog: Mutex::default(),
+        })
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn current(&self) -> Option<Arc<File>> {
+        self.file.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn set(&self, file: Option<Arc<File>>) {
+        *self.file.lock().unwrap_or_else(PoisonError::into_inner) = file;
+    }
+
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> Option<usize> {
+        let Some(file) = self.current() else {
+            match open(&self.path, self.baud, self.flow) {
+                Ok(file) => {
+                    self.backlog.lock().unwrap_or_else(PoisonError::into_inner).clear();
+                    self.set(Some(Arc::new(file)));
+                }
+                Err(_) => thread::sleep(Duration::from_millis(u64::from(WAIT_MS))),
+            }
+            return None;
+        };
+        let mut fds = [PollFd::new(file.as_fd(), PollFlags::POLLIN)];
+        // Interrupted or timed out: the caller comes again.
+        if !matches!(poll(&mut fds, WAIT_MS), Ok(ready) if ready > 0) {
+            return None;
+        }
+        match (&*file).read(buffer) {
+            Ok(len) if len > 0 => return Some(len),
+            Err(error)
+                if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
+            // Unplugged.
+            Ok(_) | Err(_) => self.set(None),
+        }
+        None
+    }
+
+    pub(super) fn send(&self, bytes: &[u8]) {
+        let Some(file) = self.current() else { return };
+        let mut backlog = self.backlog.lock().unwrap_or_else(PoisonError::into_inner);
+        if backlog.len() + bytes.len() <= BACKLOG {
+            backlog.extend_from_slice(bytes);
+        }
+        while !backlog.is_empty() {
+            match (&*file).write(&backlog) {
+                Ok(len) if len > 0 => {
+                    backlog.drain(..len);
+                }
+                // No room now, or gone: the receiving thread notices the latter.
+                _ => break,
+            }
+        }
+    }
+}
+
+fn open(path: &Path, baud: BaudRate, flow: bool) -> io::Result<File> {
+    let file =
+        OpenOptions::new().read(true).write(true).custom_flags(O_NOCTTY | O_NONBLOCK).open(path)?;
+    let mut settings = tcgetattr(&file)?;
+    cfmakeraw(&mut settings);
+    settings.control_flags |= ControlFlags::CLOCAL | ControlFlags::CREAD;
+    settings.control_flags.set(ControlFlags::CRTSCTS, flow);
+    cfsetspeed(&mut settings, baud)?;
+    tcsetattr(&file, SetArg::TCSANOW, &settings)?;
+    tcflush(&file, FlushArg::TCIOFLUSH)?;
+    Ok(file)
+}

@@ -1,0 +1,228 @@
+//! Signing on this link: the key and its file, and what is refused.
+//!
+//! The key is 64 hexadecimal digits in a file that only its owner reads; beside it stands the stamp
+//! that the next run starts from, so that a computer whose clock was reset does not sign with stamps
+//! that the autopilot has seen.
+
+use std::fs::{self, OpenOptions};
+use std::io::Write;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use vizflyt_protocol::mavlink::dialect::MavMessage;
+use vizflyt_protocol::mavlink::{
+    MAX_PACKET, Signer, SigningFault, SigningKey, SigningTime, Verifier,
+};
+use vizflyt_protocol::time::HostTime;
+
+/// Signing for one run of the link.
+#[derive(Clone, Debug)]
+pub struct LinkSigning {
+    /// The secret.
+    pub key: SigningKey,
+    /// The stamp of the moment at which the link is made.
+    pub start: SigningTime,
+}
+
+/// Signs and judges.
+#[derive(Clone, Debug)]
+pub(super) struct Signatures {
+    signer: Signer,
+    verifier: Verifier,
+    made_at: HostTime,
+    start: SigningTime,
+    refused: u64,
+    /// Not told yet.
+    news: Option<SigningFault>,
+}
+
+impl Signatures {
+    pub(super) fn new(now: HostTime, signing: LinkSigning) -> Self {
+        Self {
+            signer: Signer::new(signing.key.clone(), 0),
+            verifier: Verifier::new(signing.key),
+            made_at: now,
+            start: signing.start,
+            refused: 0,
+            news: None,
+        }
+    }
+
+    fn time(&self, now: HostTime) -> SigningTime {
+        self.start.plus_us((now.seconds_since(self.made_at).max(0.0) * 1e6) as u64)
+    }
+
+    pub(super) fn sign(
+        &mut self,
+        now: HostTime,
+        buffer: &mut [u8; MAX_PACKET],
+        len: usize,
+    ) -> usize {
+        let time = self.time(now);
+        self.signer.sign(time, buffer, len)
+    }
+
+    /// Whether a packet may be believed. RADIO_STATUS is, unsigned: a bridge has no key (MAVLink
+    /// guide, "Accepting Unsigned Packets").
+    pub(super) fn accepts(&mut self, now: HostTime, bytes: &[u8], message: &MavMessage) -> bool {
+        if matches!(message, MavMessage::RADIO_STATUS(_)) {
+            return true;
+        }
+        let time = self.time(now);
+        match self.verifier.check(time, bytes) {
+            Ok(()) => true,
+            Err(fault) => {
+                self.refused += 1;
+                self.news = Some(fault);
+                false
+            }
+        }
+    }
+
+    pub(super) fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Returns why a packet was refused since the last call.
+    pub(super) fn take_news(&mut self) -> Option<SigningFault> {
+        self.news.take()
+    }
+}
+
+/// The key's file.
+#[derive(Clone, Debug)]
+pub struct SigningFile {
+    path: PathBuf,
+}
+
+/// Why the key's file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SigningFileError {
+    /// Not read or written.
+    #[error("{path}: {why}", path = .path.display())]
+    Unusable {
+        /// Which.
+        path: PathBuf,
+        /// The system's reason.
+        why: std::io::Error,
+    },
+    /// It holds something else.
+    #[error(
+        "{path} holds no key of 64 hexadecimal digits; make one with `vizflyt vehicle sign`",
+        path = .path.display()
+    )]
+    NoKey {
+        /// Which.
+        path: PathBuf,
+    },
+    /// Others can read it.
+    #[error("{path} can be read by others; `chmod 600` it, and make a new key", path = .path.display())]
+    Open {
+        /// Which.
+        path: PathBuf,
+    },
+}
+
+/// Put between the stamps of two runs where the clock fell back: longer than a flight. [us]
+const RESERVE_US: u64 = 3_600_000_000;
+
+impl SigningFile {
+    /// Names a file; nothing is read yet.
+    pub fn new(path: &Path) -> Self {
+        Self { path: path.to_owned() }
+    }
+
+    /// Writes a new key.
+    ///
+    /// # Errors
+    /// If the file is there already, or cannot be written.
+    pub fn create(&self, key: &SigningKey) -> Result<(), SigningFileError> {
+        let hex: String = key.bytes().iter().map(|byte| format!("{byte:02x}")).collect();
+        let written = OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .mode(0o600)
+            .open(&self.path)
+            .and_then(|mut file| file.write_all((hex + "\n").as_bytes()));
+        written.map_err(|why| self.unusable(why))
+    }
+
+    /// Reads the key, and takes the stamp that this run starts from.
+    ///
+    /// # Errors
+    /// If there is no key, others can read it, or the stamp cannot be kept.
+    pub fn open(&self) -> Result<LinkSigning, SigningFileError> {
+        let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        self.open_at(SigningTime::from_unix_us(since_1970.as_micros() as u64))
+    }
+
+    fn open_at(&self, wall: SigningTime) -> Result<LinkSigning, SigningFileError> {
+        let meta = fs::metadata(&self.path).map_err(|why| self.unusable(why))?;
+        if meta.permissions().mode() & 0o077 != 0 {
+            return Err(SigningFileError::Open { path: self.path.clone() });
+        }
+        let text = fs::read_to_string(&self.path).map_err(|why| self.unusable(why))?;
+        let key = key_from_hex(text.trim())
+            .ok_or_else(|| SigningFileError::NoKey { path: self.path.clone() })?;
+        let stamp_path = self.path.with_extension("stamp");
+        let last = fs::read_to_string(&stamp_path).ok().and_then(|text| text.trim().parse().ok());
+        let last = SigningTime::from_units(last.unwrap_or(0));
+        let start = if wall > last { wall } else { last.plus_us(RESERVE_US) };
+        fs::write(&stamp_path, start.units().to_string())
+            .map_err(|why| SigningFileError::Unusable { path: stamp_path, why })?;
+        Ok(LinkSigning { key, start })
+    }
+
+    fn unusable(&self, why: std::io::Error) -> SigningFileError {
+        SigningFileError::Unusable { path: self.path.clone(), why }
+    }
+}
+
+fn key_from_hex(text: &str) -> Option<SigningKey> {
+    if text.len() != 64 || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        return None;
+    }
+    let mut bytes = [0; 32];
+    for (i, byte) in bytes.iter_mut().enumerate() {
+        *byte = u8::from_str_radix(text.get(2 * i..2 * i + 2)?, 16).ok()?;
+    }
+    Some(SigningKey::new(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_is_kept_for_its_owner_and_stamps_never_fall_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = SigningFile::new(&folder.path().join("mavlink.key"));
+        let key = SigningKey::new(core::array::from_fn(|i| 200 + i as u8));
+        file.create(&key).unwrap();
+        assert!(file.create(&key).is_err(), "a key is not overwritten");
+        let at = SigningTime::from_units;
+        let first = file.open_at(at(5_000)).unwrap();
+        assert_eq!((first.key, first.start), (key, at(5_000)));
+        assert_eq!(file.open_at(at(9_000)).unwrap().start, at(9_000));
+        let fallen_back = file.open_at(at(10)).unwrap().start;
+        assert_eq!(fallen_back, at(9_000).plus_us(RESERVE_US));
+        assert!(file.open_at(at(11)).unwrap().start > fallen_back);
+    }
+
+    #[test]
+    fn what_is_no_key_or_no_secret_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("key");
+        let check = |text: &str, mode, expected: &str| {
+            fs::write(&path, text).unwrap();
+            fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
+            let error = SigningFile::new(&path).open().unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        };
+        check("secret", 0o600, "no key of 64");
+        check(&"+f".repeat(32), 0o644, "read by others");
+        fs::remove_file(&path).unwrap();
+        assert!(SigningFile::new(&path).open().unwrap_err().to_string().contains("key:"));
+    }
+}

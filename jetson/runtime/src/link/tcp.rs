@@ -1,0 +1,96 @@
+//! MAVLink over TCP, as a simulated ArduCopter (port 5760) and some bridges offer it. A broken
+//! connection is made again; bytes that cannot go out at once break it, as half a packet is none.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+/// Longest wait for bytes, so that the receiving thread sees the end of the flight.
+const WAIT: Duration = Duration::from_millis(100);
+/// Longest wait of the control loop for room in the socket's buffer.
+const SEND_WAIT: Duration = Duration::from_millis(20);
+/// A server that is not there answers at once on this host, and within this elsewhere.
+const CONNECT_WAIT: Duration = Duration::from_millis(500);
+
+/// One connection at a time.
+#[derive(Debug)]
+pub(super) struct TcpPort {
+    peer: Peer,
+    stream: Mutex<Option<Arc<TcpStream>>>,
+}
+
+#[derive(Debug)]
+enum Peer {
+    Waits(TcpListener),
+    Calls(SocketAddr),
+}
+
+impl TcpPort {
+    pub(super) fn listen(local: SocketAddr) -> io::Result<Self> {
+        let listener = TcpListener::bind(local)?;
+        listener.set_nonblocking(true)?;
+        Ok(Self { peer: Peer::Waits(listener), stream: Mutex::default() })
+    }
+
+    pub(super) fn connect(to: SocketAddr) -> Self {
+        Self { peer: Peer::Calls(to), stream: Mutex::default() }
+    }
+
+    pub(super) fn local(&self) -> io::Result<String> {
+        match &self.peer {
+            Peer::Waits(listener) => Ok(listener.local_addr()?.to_string()),
+            Peer::Calls(to) => Ok(to.to_string()),
+        }
+    }
+
+    fn current(&self) -> Option<Arc<TcpStream>> {
+        self.stream.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn set(&self, stream: Option<Arc<TcpStream>>) {
+        *self.stream.lock().unwrap_or_else(PoisonError::into_inner) = stream;
+    }
+
+    /// Makes the connection, if it can be made within [`CONNECT_WAIT`].
+    fn open(&self) -> io::Result<Arc<TcpStream>> {
+        let stream = match &self.peer {
+            Peer::Waits(listener) => listener.accept()?.0,
+            Peer::Calls(to) => TcpStream::connect_timeout(to, CONNECT_WAIT)?,
+        };
+        stream.set_nonblocking(false)?;
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(WAIT))?;
+        stream.set_write_timeout(Some(SEND_WAIT))?;
+        Ok(Arc::new(stream))
+    }
+
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> Option<usize> {
+        let Some(stream) = self.current() else {
+            match self.open() {
+                Ok(stream) => self.set(Some(stream)),
+                Err(_) => thread::sleep(WAIT / 5),
+            }
+            return None;
+        };
+        match (&*stream).read(buffer) {
+            Ok(len) if len > 0 => return Some(len),
+            Err(error) if is_pause(&error) => {}
+            Ok(_) | Err(_) => self.set(None),
+        }
+        None
+    }
+
+    pub(super) fn send(&self, bytes: &[u8]) {
+        if let Some(stream) = self.current()
+            && (&*stream).write_all(bytes).is_err()
+        {
+            self.set(None);
+        }
+    }
+}
+
+fn is_pause(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}

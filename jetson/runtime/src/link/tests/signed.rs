@@ -1,0 +1,89 @@
+//! A link that signs: what is unsigned, forged or said before is refused.
+
+use vizflyt_protocol::mavlink::{Signer, SigningKey, SigningTime, Verifier};
+
+use super::*;
+
+const START: SigningTime = SigningTime::from_units(3_700_000_000_000);
+
+fn key() -> SigningKey {
+    SigningKey::new([42; 32])
+}
+
+fn link(now: HostTime) -> Link {
+    let signing = Some(LinkSigning { key: key(), start: START });
+    Link::with(now, LinkSettings { signing, ..LinkSettings::default() })
+}
+
+/// A heartbeat of the autopilot, signed if there is a signer.
+fn beat(signer: Option<&mut Signer>, at: SigningTime) -> Vec<u8> {
+    let header = MavHeader { system_id: 1, component_id: 1, sequence: 0 };
+    let heartbeat = HEARTBEAT_DATA {
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+        ..Default::default()
+    };
+    let mut bytes = [0; MAX_PACKET];
+    let mut len = encode(header, &MavMessage::HEARTBEAT(heartbeat), &mut bytes).len();
+    if let Some(signer) = signer {
+        len = signer.sign(at, &mut bytes, len);
+    }
+    bytes[..len].to_vec()
+}
+
+#[test]
+fn only_what_is_signed_anew_is_believed() {
+    let now = HostTime::from_ns(5_000_000_000);
+    let mut link = link(now);
+    link.handle_input(now, &beat(None, START));
+    assert!(!link.is_connected());
+    link.handle_timeout(now);
+    assert!(link.ready_to_arm(now).unwrap_err().contains("not signed with our key"));
+    let mut other = Signer::new(SigningKey::new([1; 32]), 0);
+    link.handle_input(now, &beat(Some(&mut other), START));
+    assert!(!link.is_connected());
+    let mut signer = Signer::new(key(), 0);
+    let good = beat(Some(&mut signer), START);
+    link.handle_input(now, &good);
+    assert!(link.is_connected() && link.state().armed);
+    assert_eq!(link.refused().0, 2);
+    // The same again keeps nothing alive.
+    let later = now.plus_seconds(4.0);
+    link.handle_input(later, &good);
+    link.handle_timeout(later);
+    assert!(!link.is_connected());
+    let faults: Vec<_> =
+        std::iter::from_fn(|| link.poll_event()).filter_map(|event| event.warning()).collect();
+    assert!(faults.iter().any(|text| text.contains("heard before")), "{faults:?}");
+}
+
+#[test]
+fn all_that_is_sent_is_signed() {
+    let now = HostTime::from_ns(5_000_000_000);
+    let mut link = link(now);
+    let mut signer = Signer::new(key(), 0);
+    link.handle_input(now, &beat(Some(&mut signer), START));
+    link.handle_timeout(now);
+    let mut verifier = Verifier::new(key());
+    let mut packets = 0;
+    while let Some(datagram) = link.poll_transmit() {
+        assert_eq!(verifier.check(START, &datagram), Ok(()));
+        packets += 1;
+    }
+    assert!(packets > 3, "{packets}");
+}
+
+#[test]
+fn a_key_is_handed_over() {
+    let mut script = Script::new();
+    let signing = LinkSigning { key: key(), start: START };
+    assert!(!script.link.setup_signing(script.now, Some(&signing)), "to nobody");
+    script.heartbeat();
+    assert!(script.link.setup_signing(script.now, Some(&signing)));
+    script.drain();
+    let set = |m: &MavMessage| {
+        matches!(m, MavMessage::SETUP_SIGNING(m)
+            if m.secret_key == [42; 32] && m.initial_timestamp == START.units() && m.target_system == 1)
+    };
+    assert_eq!(script.count(set), 2);
+}

@@ -1,0 +1,162 @@
+//! What the link tells people: what arming waits for, and why a command was refused.
+
+use std::borrow::Cow;
+
+use vizflyt_protocol::mavlink::CopterMode;
+use vizflyt_protocol::mavlink::dialect::{EkfStatusFlags, MavResult, MavSysStatusSensor};
+use vizflyt_protocol::time::HostTime;
+
+use super::commands::Command;
+use super::dialect::Rise;
+use super::{LOST_AFTER_S, Link, events};
+
+/// Texts of the autopilot this young belong to a refusal. [s]
+const TEXT_BELONGS_S: f64 = 3.0;
+/// A pre-arm text this old has been taken back: ArduCopter repeats them every 30 s. [s]
+const PREARM_KEPT_S: f64 = 35.0;
+
+/// Whether asking again is of no use.
+pub(super) fn is_final(result: MavResult) -> bool {
+    matches!(result, MavResult::MAV_RESULT_UNSUPPORTED)
+}
+
+impl Link {
+    /// Returns what arming waits for.
+    pub(super) fn missing(&self, now: HostTime) -> Option<Cow<'static, str>> {
+        if self.autopilot.is_none() {
+            let refused = self.signatures.as_ref().map_or(0, super::Signatures::refused);
+            return Some(if refused > 0 {
+                "packets come, but not signed with our key; run `vizflyt vehicle sign`".into()
+            } else {
+                "no heartbeat from an autopilot; check power, link and --mavlink".into()
+            });
+        }
+        if let Some((rival, at)) = self.rival
+            && now.seconds_since(at) < LOST_AFTER_S
+        {
+            let ours = self.system().unwrap_or(0);
+            let text = format!(
+                "two autopilots are on this link, systems {ours} and {rival}; say which one is to fly \
+                 with `system` of [vehicle] in jetson.toml"
+            );
+            return Some(text.into());
+        }
+        if let Some(other) = self.companions.other(now) {
+            let text = format!("{other} commands this vehicle too; stop one of the two");
+            return Some(text.into());
+        }
+        if let Some(missing) = self.navigation_missing() {
+            return Some(missing);
+        }
+        match self.prearm.ok {
+            Some(true) => None,
+            Some(false) => Some(self.prearm_words(now).into()),
+            None => Some("the autopilot has not reported its pre-arm checks yet".into()),
+        }
+    }
+
+    /// Returns why the autopilot does not know where it is.
+    fn navigation_missing(&self) -> Option<Cow<'static, str>> {
+        if self.dialect.needs_origin() && !self.origin_set {
+            return Some("the autopilot has not confirmed its origin yet".into());
+        }
+        // PX4 calls a position that external navigation gives relative.
+        let position = if self.dialect.rise() == Rise::BySetpoint {
+            EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_POS_HORIZ_REL
+        } else {
+            EkfStatusFlags::EKF_POS_HORIZ_ABS
+        };
+        let has_position =
+            self.ekf.intersects(position) && !self.ekf.contains(EkfStatusFlags::EKF_CONST_POS_MODE);
+        if has_position {
+            return None;
+        }
+        let mut text = "the autopilot's estimator has no position yet; ".to_owned();
+        // Say what is wrong rather than what might be.
+        let off = |name: &str, right: f64| {
+            let value = self.params().get(name)?.value;
+            (value != right).then(|| format!("{name} is {value}, it must be {right}"))
+        };
+        let wrong = off("VISO_TYPE", 1.0).or_else(|| off("EK3_SRC1_POSXY", 6.0));
+        text += &wrong.unwrap_or_else(|| self.dialect.navigation_advice().to_owned());
+        Some(text.into())
+    }
+
+    fn prearm_words(&self, now: HostTime) -> String {
+        let mut text = "the autopilot's pre-arm checks fail".to_owned();
+        let fresh = |(at, _): &&(HostTime, String)| now.seconds_since(*at) < PREARM_KEPT_S;
+        let said: Vec<&str> =
+            self.prearm.texts.iter().filter(fresh).map(|(_, text)| text.as_str()).collect();
+        for (i, why) in said.iter().enumerate() {
+            text += if i == 0 { ": " } else { "; " };
+            text += &format!("\"{why}\"");
+            if let Some(advice) = events::advice(why) {
+                text += &format!(" ({advice})");
+            }
+        }
+        let unhealthy: Vec<&str> = SENSORS
+            .iter()
+            .filter(|(sensor, _)| self.prearm.unhealthy.contains(*sensor))
+            .map(|&(_, name)| name)
+            .collect();
+        if !unhealthy.is_empty() {
+            text += &format!("; not healthy: {}", unhealthy.join(", "));
+        }
+        text
+    }
+
+    /// Returns the sentence for a command that was given up.
+    pub(super) fn refusal(&self, now: HostTime, command: Command, why: &str) -> String {
+        let said: Vec<&str> = self
+            .texts
+            .iter()
+            .filter(|(at, _)| now.seconds_since(*at) <= TEXT_BELONGS_S)
+            .map(|(_, text)| text.as_str())
+            .collect();
+        let guess = if said.is_empty() { self.cause(command) } else { None };
+        events::refusal(command.name(), why, &said, guess)
+    }
+
+    /// Returns why the autopilot refuses, as far as its state tells: ArduCopter refuses some commands
+    /// without a word.
+    fn cause(&self, command: Command) -> Option<Cow<'static, str>> {
+        let guided = self.state.mode == CopterMode::Guided as u32;
+        match command {
+            Command::TakeOff(height_m) if !(height_m > 0.0) => {
+                Some(format!("{height_m} m is no height; set takeoff_height_m of the arena").into())
+            }
+            Command::TakeOff(_) if self.dialect.needs_origin() && !self.origin_set => Some(
+                "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the way to the \
+                 autopilot, or set AHRS_OPTIONS=16 and AHRS_ORIGIN_*"
+                    .into(),
+            ),
+            Command::TakeOff(_) if !guided => {
+                let follow = self.dialect.follow();
+                Some(
+                    format!("it is not in {follow}; a pilot or a failsafe changed the mode").into(),
+                )
+            }
+            Command::TakeOff(_) if !self.state.armed => {
+                Some("it is disarmed; DISARM_DELAY passed, or a pilot did it".into())
+            }
+            Command::Mode(_) | Command::Arm | Command::TakeOff(_) => self.navigation_missing(),
+            Command::Land | Command::Interval(..) | Command::Message(_) => None,
+        }
+    }
+}
+
+const SENSORS: [(MavSysStatusSensor, &str); 13] = [
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_GYRO, "gyroscope"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_ACCEL, "accelerometer"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_MAG, "compass"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE, "barometer"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_GPS, "GPS"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_VISION_POSITION, "external navigation"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS, "motor outputs or safety switch"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_RC_RECEIVER, "RC receiver"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_GEOFENCE, "fence"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_AHRS, "attitude"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_LOGGING, "logging"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_BATTERY, "battery"),
+    (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_PROPULSION, "motors"),
+];

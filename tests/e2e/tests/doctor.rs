@@ -1,0 +1,89 @@
+//! `vizflyt doctor vehicle` against the simulated autopilot: it names what is dangerous, and mends it.
+
+use std::process::{Command, Output};
+use std::time::Duration;
+
+use vizflyt_e2e::{Demo, vizflyt};
+
+/// A simulated autopilot with these parameters; returns the address to reach it.
+fn simulator(params: &[&str]) -> (Demo, String) {
+    let mut command = Command::new(vizflyt());
+    command.args(["sim", "--json", "--mavlink", "tcpin:127.0.0.1:0"]);
+    for param in params {
+        command.args(["--param", param]);
+    }
+    let mut simulator = Demo::spawn(&mut command);
+    let ready = simulator.wait_for("\"ready\"", Duration::from_secs(30));
+    let ready: serde_json::Value = serde_json::from_str(&ready).unwrap();
+    let address = format!("tcpout:{}", ready["mavlink"].as_str().unwrap());
+    (simulator, address)
+}
+
+fn doctor(address: &str, more: &[&str]) -> (Output, String) {
+    let output = Command::new(vizflyt())
+        .args(["doctor", "vehicle", "--mavlink", address])
+        .args(more)
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned()
+        + &String::from_utf8_lossy(&output.stderr);
+    (output, text)
+}
+
+#[test]
+fn dangers_are_named_and_mended() {
+    let (_simulator, address) = simulator(&["FS_GCS_ENABLE=1", "RTL_ALT_M=15", "BATT_MONITOR=0"]);
+    let (output, text) = doctor(&address, &[]);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    for expected in [
+        "DANGER   FS_GCS_ENABLE is 1, right is 5",
+        "into the ceiling",
+        "DANGER   RTL_ALT_M is 15, right is 1",
+        "DANGER   BATT_MONITOR is 0, right is 4: the battery is not watched",
+        "`--apply` writes the right values",
+    ] {
+        assert!(text.contains(expected), "no '{expected}' in:\n{text}");
+    }
+    // Nothing was written.
+    let (_, again) = doctor(&address, &[]);
+    assert_eq!(again, text);
+
+    let (output, text) = doctor(&address, &["--apply"]);
+    assert!(output.status.success(), "{text}");
+    let shown = text.find("DANGER   FS_GCS_ENABLE").unwrap();
+    let written = text.find("written  FS_GCS_ENABLE = 5").unwrap();
+    assert!(shown < written, "shown before it is written:\n{text}");
+
+    let (output, text) = doctor(&address, &[]);
+    assert!(output.status.success() && text.contains("0 dangerous, 0 other differences"), "{text}");
+}
+
+#[test]
+fn nobody_there_is_said_in_words() {
+    let (output, text) = doctor("udpin:127.0.0.1:0", &[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text.contains("no heartbeat from an autopilot"), "{text}");
+    let (output, text) = doctor("serial:/dev/no-such-line:57600", &[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(text.contains("serial:/dev/no-such-line:57600"), "{text}");
+}
+
+#[test]
+fn a_key_is_made_once_and_given() {
+    let folder = tempfile::tempdir().unwrap();
+    let key = folder.path().join("mavlink.key");
+    let (_simulator, address) = simulator(&[]);
+    let sign = || {
+        let key = key.to_str().unwrap();
+        let args = ["vehicle", "sign", "--mavlink", &address, "--key", key];
+        Command::new(vizflyt()).args(args).output().unwrap()
+    };
+    let output = sign();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success() && text.contains("(new; only you can read it)"), "{output:?}");
+    assert!(text.contains("given    to system 1"), "{text}");
+    let made = std::fs::read_to_string(&key).unwrap();
+    let output = sign();
+    assert!(output.status.success() && !String::from_utf8_lossy(&output.stdout).contains("new;"));
+    assert_eq!(std::fs::read_to_string(&key).unwrap(), made);
+}
