@@ -288,12 +288,7 @@ impl Settings {
             sink(name, value);
         }
         if let Some(key) = self.key {
-            let mut hex = String::<64>::new();
-            for byte in key {
-                // 32 bytes are 64 digits: it fits.
-                let _ = write!(hex, "{byte:02x}");
-            }
-            sink("key", &hex);
+            sink("key", &key_to_hex(&key));
         }
         let readable = TEXTS.iter().filter(|(_, readable)| *readable).map(|(name, _)| *name);
         for name in readable.chain(NUMBERS.iter().map(|number| number.name)) {
@@ -358,6 +353,16 @@ pub fn key_from_hex(text: &str) -> Result<Key, Refused> {
         *byte = (digit(pair[0])? * 16 + digit(pair[1])?) as u8;
     }
     Ok(key)
+}
+
+/// Returns a key's 64 hexadecimal digits.
+pub fn key_to_hex(key: &Key) -> String<64> {
+    let mut hex = String::new();
+    for byte in key {
+        // 32 bytes are 64 digits: it fits.
+        let _ = write!(hex, "{byte:02x}");
+    }
+    hex
 }
 
 /// Returns a short text.

@@ -69,11 +69,67 @@ impl Stats {
         *counter = counter.wrapping_add(packets);
     }
 
+    /// Returns every counter, in the order of [`REPORT`].
+    pub fn report(&self, uptime_s: u32) -> [u32; REPORT.len()] {
+        let (uart, net) = (&self.uart, &self.net);
+        let [full, superseded, slow, nobody, many, not_sent] = self.drops;
+        [
+            uptime_s,
+            uart.bytes_in,
+            uart.bytes_out,
+            uart.cut.packets,
+            uart.packets_out,
+            uart.lost,
+            uart.cut.bad_checksum,
+            uart.cut.dropped_bytes,
+            net.bytes_in,
+            net.bytes_out,
+            net.cut.packets,
+            net.packets_out,
+            net.lost,
+            net.cut.dropped_bytes,
+            full,
+            superseded,
+            slow,
+            nobody,
+            many,
+            not_sent,
+            self.round_trip_us,
+            self.landings,
+        ]
+    }
+
     /// Returns how many packets were dropped for `reason`.
     pub fn dropped(&self, reason: Reason) -> u32 {
         self.drops[reason as usize]
     }
 }
+
+/// Names of the counters, as `vizflyt bridge stats`, the page and the wire have them.
+pub const REPORT: [&str; 22] = [
+    "uptime_s",
+    "uart_bytes_in",
+    "uart_bytes_out",
+    "uart_packets_in",
+    "uart_packets_out",
+    "uart_lost",
+    "uart_bad_checksum",
+    "uart_dropped_bytes",
+    "net_bytes_in",
+    "net_bytes_out",
+    "net_packets_in",
+    "net_packets_out",
+    "net_lost",
+    "net_dropped_bytes",
+    "drop_uart_full",
+    "drop_superseded",
+    "drop_client_slow",
+    "drop_no_client",
+    "drop_too_many_clients",
+    "drop_not_sent",
+    "round_trip_us",
+    "landings",
+];
 
 /// Counts what is missing in the sequence numbers of a few senders.
 #[derive(Clone, Debug)]
@@ -161,6 +217,13 @@ mod tests {
 
     #[test]
     fn each_reason_has_its_own_counter() {
+        let mut stats = Stats::default();
+        for (reason, name) in REASONS {
+            stats.drop(reason, 1 + reason as u32);
+            let place =
+                REPORT.iter().position(|counter| counter.strip_prefix("drop_") == Some(name));
+            assert_eq!(stats.report(0)[place.unwrap()], 1 + reason as u32, "{name}");
+        }
         for (place, (reason, _)) in REASONS.iter().enumerate() {
             assert_eq!(*reason as usize, place);
         }

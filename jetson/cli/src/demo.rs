@@ -15,6 +15,7 @@ use crate::terminal::tell;
   vizflyt demo                                  fly the forest and watch it in the browser
   vizflyt demo --scene race --seed 3            another scene, another course
   vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
+  vizflyt demo --through-bridge                 MAVLink goes through the vehicle's Wi-Fi bridge, emulated
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
     #[command(flatten)]

@@ -2,6 +2,7 @@
 //! reads the command line and starts one.
 
 mod bench;
+mod bridge;
 mod demo;
 mod doctor;
 mod fly;
@@ -57,6 +58,8 @@ enum Command {
     Vehicle(vehicle::VehicleArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
+    /// The Wi-Fi bridge of a vehicle: emulated here, or asked over the network.
+    Bridge(bridge::BridgeArgs),
     /// Makes scenes, looks at them, draws them.
     Scene(scene::SceneArgs),
     /// Measures how fast this machine draws.
@@ -103,6 +106,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Doctor(args) => doctor::run(&args),
         Command::Vehicle(args) => vehicle::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
+        Command::Bridge(args) => bridge::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),

@@ -1,10 +1,40 @@
 //! What people see outside a flight: lines on standard output, and the page in a browser.
 
+use anyhow::{Context, Result};
+
 /// Prints a line for people; unlike `println!` it does not panic when nobody reads any more.
 pub(crate) fn tell(line: impl std::fmt::Display) {
     use std::io::Write;
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}
+
+/// Calls `notice` on SIGINT and SIGTERM, until it returns false.
+pub(crate) fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot watch for signals")?;
+    // Installed before this returns, so that no signal falls between.
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt()).context("cannot watch for SIGINT")?;
+    let mut terminate = signal(SignalKind::terminate()).context("cannot watch for SIGTERM")?;
+    drop(guard);
+    std::thread::spawn(move || {
+        runtime.block_on(async {
+            loop {
+                tokio::select! {
+                    _ = interrupt.recv() => {}
+                    _ = terminate.recv() => {}
+                }
+                if !notice() {
+                    return;
+                }
+            }
+        });
+    });
+    Ok(())
 }
 
 /// Opens the page where there is a desktop; the address is printed in any case.

@@ -86,6 +86,12 @@ impl Hub {
         (self.autopilot.map_or(SYSTEM_ID, |(system, _)| system), COMPONENT_ID)
     }
 
+    /// Whether a packet for `target` is for us alone; who does not know the vehicle's number yet
+    /// may leave it out.
+    pub(super) fn is_ours(&self, target: (u8, u8)) -> bool {
+        target == self.address() || target == (0, COMPONENT_ID)
+    }
+
     // ---- what passes by ----
 
     /// Takes note of what the autopilot says; returns whether it is an answer to us alone.
@@ -167,10 +173,10 @@ impl Hub {
                 }
                 self.say_param(now, from, index);
             }
-            COMMAND_LONG if packet.target() == self.address() => {
+            COMMAND_LONG if self.is_ours(packet.target()) => {
                 self.handle_command(now, from, packet);
             }
-            TUNNEL if packet.target() == self.address() => self.handle_tunnel(now, from, packet),
+            TUNNEL if self.is_ours(packet.target()) => self.handle_tunnel(now, from, packet),
             _ => {}
         }
     }

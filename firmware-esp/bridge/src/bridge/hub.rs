@@ -143,7 +143,7 @@ impl Hub {
             return;
         }
         let target = packet.target();
-        if target == self.address() {
+        if self.is_ours(target) {
             self.handle_own(now, None, packet);
             return;
         }
@@ -228,7 +228,7 @@ impl Hub {
         }
         let target = packet.target();
         let own = self.address();
-        if target == own {
+        if self.is_ours(target) {
             self.handle_own(now, Some(index), packet);
             return;
         }

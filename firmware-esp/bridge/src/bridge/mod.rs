@@ -25,7 +25,6 @@ use vizflyt_protocol::time::HostTime;
 pub use clients::{CLIENTS, Peer, TCP_SLOTS};
 pub use component::{COMPONENT_ID, Event};
 use hub::Hub;
-pub use requests::REPORT;
 
 use crate::packet::{Cutter, each_in_datagram};
 use crate::settings::Settings;

@@ -6,32 +6,6 @@ use super::hub::Hub;
 use crate::access::{HEAD, Op, PROOF, Verdict, Wish};
 use crate::settings::Refused;
 
-/// The counters of STATS, in their order on the wire, four bytes each.
-pub const REPORT: [&str; 22] = [
-    "uptime_s",
-    "uart_bytes_in",
-    "uart_bytes_out",
-    "uart_packets_in",
-    "uart_packets_out",
-    "uart_lost",
-    "uart_bad_checksum",
-    "uart_dropped_bytes",
-    "net_bytes_in",
-    "net_bytes_out",
-    "net_packets_in",
-    "net_packets_out",
-    "net_lost",
-    "net_dropped_bytes",
-    "drop_uart_full",
-    "drop_superseded",
-    "drop_client_slow",
-    "drop_no_client",
-    "drop_too_many_clients",
-    "drop_not_sent",
-    "round_trip_us",
-    "landings",
-];
-
 impl Hub {
     /// Answers a request; returns the answer's length.
     pub(super) fn handle_request(
@@ -141,32 +115,7 @@ impl Hub {
     }
 
     fn report(&self, now: HostTime, out: &mut [u8]) -> usize {
-        let s = &self.stats;
-        let [full, superseded, slow, nobody, many, not_sent] = s.drops;
-        let counters: [u32; REPORT.len()] = [
-            now.seconds_since(self.started_at) as u32,
-            s.uart.bytes_in,
-            s.uart.bytes_out,
-            s.uart.cut.packets,
-            s.uart.packets_out,
-            s.uart.lost,
-            s.uart.cut.bad_checksum,
-            s.uart.cut.dropped_bytes,
-            s.net.bytes_in,
-            s.net.bytes_out,
-            s.net.cut.packets,
-            s.net.packets_out,
-            s.net.lost,
-            s.net.cut.dropped_bytes,
-            full,
-            superseded,
-            slow,
-            nobody,
-            many,
-            not_sent,
-            s.round_trip_us,
-            s.landings,
-        ];
+        let counters = self.stats.report(now.seconds_since(self.started_at) as u32);
         for (bytes, counter) in out.chunks_exact_mut(4).zip(counters) {
             bytes.copy_from_slice(&counter.to_le_bytes());
         }

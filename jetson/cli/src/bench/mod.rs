@@ -1,6 +1,8 @@
-//! `vizflyt bench`: how fast this machine draws and streams, and what its images need.
+//! `vizflyt bench`: how fast this machine draws and streams, and what its images need; what the
+//! bridge adds to a packet's way.
 
 mod bandwidth;
+mod bridge;
 mod render;
 mod stream;
 
@@ -19,6 +21,7 @@ pub(crate) struct BenchArgs {
 #[derive(Subcommand, Debug)]
 enum BenchCommand {
     Bandwidth(bandwidth::BandwidthArgs),
+    Bridge(bridge::BridgeBenchArgs),
     Render(render::RenderArgs),
     Stream(stream::StreamArgs),
 }
@@ -27,6 +30,7 @@ enum BenchCommand {
 pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
     match args.command {
         BenchCommand::Bandwidth(args) => bandwidth::run(&args)?,
+        BenchCommand::Bridge(args) => bridge::run(&args)?,
         BenchCommand::Render(args) => render::run(&args)?,
         BenchCommand::Stream(args) => stream::run(&args)?,
     }

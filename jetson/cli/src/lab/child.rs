@@ -21,6 +21,8 @@ pub(crate) enum Role {
     Runtime,
     /// `vizflyt sim`.
     Simulator,
+    /// `vizflyt bridge emulate`.
+    Bridge,
 }
 
 impl Role {
@@ -30,6 +32,7 @@ impl Role {
             Self::Server => "render server",
             Self::Runtime => "runtime",
             Self::Simulator => "simulator",
+            Self::Bridge => "bridge",
         }
     }
 }

@@ -6,6 +6,7 @@
 //! keys      pair server and runtime, for this flight only
 //! serve     start the render server; it says which ports it got
 //! fly       start the runtime with the plugin; it says which port waits for MAVLink
+//! bridge    start the Wi-Fi bridge, if it is wanted; it says where its serial port is
 //! sim       start the vehicle: airframe, autopilot, mocap
 //! watch     print events and status, until the runtime ends (or a person ends it all)
 //! report    join what the three measured
@@ -37,7 +38,7 @@ use self::keys::Keys;
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
 use self::report::Parts;
-use crate::terminal::{open_browser, tell};
+use crate::terminal::{on_interrupt, open_browser, tell};
 
 pub(crate) use self::report::Report;
 
@@ -57,6 +58,9 @@ pub(crate) struct LabArgs {
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
+    /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
+    #[arg(long)]
+    pub through_bridge: bool,
     /// Port of the page; a free one without it.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
@@ -98,7 +102,8 @@ pub(crate) struct LabFlight<'a> {
 pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let memory = MemoryWatch::start();
     let (notices, inbox) = mpsc::channel();
-    interrupt_notices(notices.clone())?;
+    let interrupted = notices.clone();
+    on_interrupt(move || interrupted.send(Notice::Interrupted).is_ok())?;
     let (scene, seed) = (flight.lab.scene(), flight.lab.seed());
     let stage = Stage::prepare(scene, seed)?;
     if !flight.json {
@@ -209,11 +214,29 @@ impl Show {
             return Ok(Flown::Interrupted);
         };
 
+        let mavlink = text(&runtime, "mavlink")?;
+        let vehicle = if lab.through_bridge {
+            let bridge: Vec<OsString> = vec![
+                "bridge".into(),
+                "emulate".into(),
+                "--json".into(),
+                "--lifeline".into(),
+                "--listen=127.0.0.1:0".into(),
+                format!("--client={mavlink}").into(),
+                self.log_level.clone(),
+            ];
+            let Some(bridge) = self.start(Role::Bridge, &bridge)? else {
+                return Ok(Flown::Interrupted);
+            };
+            format!("--serial={}", text(&bridge, "uart")?)
+        } else {
+            format!("--mavlink=udpout:{mavlink}")
+        };
         let mut sim: Vec<OsString> = vec![
             "sim".into(),
             "--json".into(),
             "--lifeline".into(),
-            format!("--mavlink=udpout:{}", text(&runtime, "mavlink")?).into(),
+            vehicle.into(),
             format!("--vicon={}", text(&server, "vicon")?).into(),
             format!("--spawn={}", stage.spawn).into(),
             format!("--seed={}", lab.seed()).into(),
@@ -281,6 +304,7 @@ impl Show {
                 Role::Server => &mut self.parts.server,
                 Role::Runtime => &mut self.parts.runtime,
                 Role::Simulator => &mut self.parts.simulator,
+                Role::Bridge => &mut self.parts.bridge,
             } = report.clone();
         }
         // The server repeats to its page what the runtime says: take each from its source.
@@ -332,32 +356,4 @@ fn text(ready: &Value, key: &str) -> Result<String> {
         .as_str()
         .map(str::to_owned)
         .with_context(|| format!("the ready line {ready} has no '{key}'"))
-}
-
-/// Sends [`Notice::Interrupted`] on SIGINT and SIGTERM.
-fn interrupt_notices(notices: Sender<Notice>) -> Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .context("cannot watch for signals")?;
-    std::thread::spawn(move || {
-        runtime.block_on(async {
-            use tokio::signal::unix::{SignalKind, signal};
-            let (Ok(mut interrupt), Ok(mut terminate)) =
-                (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
-            else {
-                return;
-            };
-            loop {
-                tokio::select! {
-                    _ = interrupt.recv() => {}
-                    _ = terminate.recv() => {}
-                }
-                if notices.send(Notice::Interrupted).is_err() {
-                    return;
-                }
-            }
-        });
-    });
-    Ok(())
 }

@@ -52,6 +52,8 @@ pub(crate) struct Report {
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received by the runtime.
     pub mavlink_packets: u64,
+    /// The bridge's counters, where MAVLink passed through one.
+    pub bridge: Value,
     /// Peak of the summed resident memory of all processes. [MB]
     pub peak_rss_mb: f64,
     /// The renderer that drew, such as `cpu avx2`.
@@ -71,6 +73,8 @@ pub(crate) struct Parts {
     pub server: Value,
     /// The simulator's report: the truth.
     pub simulator: Value,
+    /// The bridge's report, if there was one.
+    pub bridge: Value,
 }
 
 impl Parts {
@@ -121,6 +125,7 @@ impl Parts {
             min_clearance_m: self.simulator["min_clearance_m"].as_f64(),
             setpoints_sent: count(&self.runtime, "setpoints_sent"),
             mavlink_packets: count(&self.runtime, "mavlink_packets"),
+            bridge: self.bridge.clone(),
             peak_rss_mb,
             renderer: text(&self.server, "renderer").unwrap_or_default(),
             renderer_reason: text(&self.server, "renderer_reason").unwrap_or_default(),
@@ -184,6 +189,7 @@ mod tests {
             runtime: json!({"outcome": "finished", "reason": "", "image_hz": 50.5}),
             server: json!({"renderer": "cpu"}),
             simulator: json!({"collided": false, "min_clearance_m": 0.4}),
+            bridge: Value::Null,
         }
     }
 

@@ -22,11 +22,14 @@ const STOPPING_SHARE: f64 = 0.5;
 /// From a command to the vehicle's answer: link 20 ms, tick 20 ms, attitude and velocity loops
 /// about 0.2 s. The vehicle flies on at its speed for that long. [s]
 const REACTION_S: f64 = 0.3;
-/// Kept free beyond the stopping distance, for localization and tracking errors. [m]
-const MARGIN_M: f64 = 0.1;
+/// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
+/// an autopilot's integrators carry the vehicle a decimetre too far. [m]
+const MARGIN_M: f64 = 0.2;
 /// Along a curved face, the part of the distance left that one stopping path may not use up.
 const KEPT_SHARE: f64 = 0.9;
-/// Fastest way back from beyond the margin. [m/s]
+/// Way back from beyond the margin, by how far beyond it is. [1/s]
+const BACK_PER_S: f64 = 2.0;
+/// Fastest way back. [m/s]
 const BACK_MPS: f64 = 0.5;
 
 impl Fence {
@@ -86,7 +89,7 @@ impl Fence {
     /// stops before it: v t + v^2 / 2a = d. Negative (back) if the distance is. [m/s]
     fn approach_mps(&self, free_m: f64) -> f64 {
         if !(free_m > 0.0) {
-            return free_m.max(-BACK_MPS);
+            return (BACK_PER_S * free_m).max(-BACK_MPS);
         }
         let a = self.stopping_mps2;
         let lag_mps = a * REACTION_S;

@@ -5,6 +5,7 @@ use sha2::{Digest, Sha256};
 use super::*;
 use crate::access::{self, Op, PROOF, TUNNEL_TYPE, Verdict};
 use crate::settings::Key;
+use crate::stats::REPORT;
 
 const KEY: Key = [0x42; 32];
 

@@ -1,0 +1,148 @@
+//! Asks a bridge over the network: requests in MAVLink's TUNNEL, answers by it (`vizflyt_bridge::access`).
+
+use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use vizflyt_bridge::access::{BODY, HEAD, Op, TUNNEL_TYPE, Verdict, proof};
+use vizflyt_bridge::bridge::COMPONENT_ID;
+use vizflyt_bridge::packet::{CutStats, each_in_datagram};
+use vizflyt_bridge::seal::seal;
+use vizflyt_bridge::settings::Key;
+use vizflyt_protocol::mavlink::MAX_PACKET;
+
+/// TUNNEL's number.
+const TUNNEL: u32 = 385;
+/// We speak as a ground station's component of our own: MAV_COMP_ID_ONBOARD_COMPUTER4.
+const SOURCE: (u8, u8) = (255, 194);
+/// An answer takes this long at most; then the request is repeated.
+const PATIENCE: Duration = Duration::from_millis(400);
+/// Repetitions.
+const ATTEMPTS: u8 = 6;
+
+/// A bridge on the network.
+pub(crate) struct Asked {
+    socket: UdpSocket,
+    address: SocketAddr,
+    sequence: u8,
+    random: [u8; 16],
+    counter: u32,
+    /// Whether it has a key.
+    pub(crate) claimed: bool,
+    /// Its firmware's version.
+    pub(crate) version: String,
+}
+
+impl Asked {
+    /// Finds the bridge at `address`.
+    pub(crate) fn open(address: &str) -> Result<Self> {
+        let with_port =
+            if address.contains(':') { address.to_owned() } else { format!("{address}:14550") };
+        let resolved = with_port
+            .to_socket_addrs()
+            .with_context(|| format!("bridge: {address} has no address"))?
+            .find(SocketAddr::is_ipv4)
+            .with_context(|| format!("bridge: {address} has no IPv4 address"))?;
+        let socket = UdpSocket::bind("0.0.0.0:0").context("bridge: cannot open a socket")?;
+        socket.set_read_timeout(Some(Duration::from_millis(50)))?;
+        let mut asked = Self {
+            socket,
+            address: resolved,
+            sequence: 0,
+            random: [0; 16],
+            counter: 0,
+            claimed: false,
+            version: String::new(),
+        };
+        let (_, hello) = asked.ask(Op::Hello, b"", None)?;
+        let (Some(random), Some(counter), Some(&flags)) = (
+            hello.first_chunk(),
+            hello.get(16..20).and_then(|bytes| bytes.try_into().ok()),
+            hello.get(20),
+        ) else {
+            bail!("bridge: {address} answers as no bridge of ours does");
+        };
+        asked.random = *random;
+        asked.counter = u32::from_le_bytes(counter);
+        asked.claimed = flags & 1 != 0;
+        asked.version = String::from_utf8_lossy(&hello[21..]).into_owned();
+        Ok(asked)
+    }
+
+    /// Asks, and returns verdict and body of the answer; `key` proves a change.
+    pub(crate) fn ask(
+        &mut self,
+        op: Op,
+        body: &[u8],
+        key: Option<&Key>,
+    ) -> Result<(Verdict, Vec<u8>)> {
+        let proof_len = if key.is_some() { vizflyt_bridge::access::PROOF } else { 0 };
+        if HEAD + body.len() + proof_len > BODY {
+            bail!("bridge: a request of {} bytes is too long", body.len());
+        }
+        for _ in 0..ATTEMPTS {
+            // A repetition needs a counter of its own: the answer may have been lost, not the request.
+            self.counter += 1;
+            let mut request = vec![op as u8];
+            request.extend_from_slice(&self.counter.to_le_bytes());
+            request.extend_from_slice(body);
+            if let Some(key) = key {
+                let proof = proof(key, &self.random, &request);
+                request.extend_from_slice(&proof);
+            }
+            self.send(&request)?;
+            let until = Instant::now() + PATIENCE;
+            while Instant::now() < until {
+                if let Some(answer) = self.receive(op) {
+                    return Ok(answer);
+                }
+            }
+        }
+        bail!(
+            "bridge: {} does not answer; is it on, and is this computer in its network?",
+            self.address
+        )
+    }
+
+    fn send(&mut self, request: &[u8]) -> Result<()> {
+        let [low, high] = TUNNEL_TYPE.to_le_bytes();
+        // The vehicle's number need not be known: zero is any.
+        let mut payload = vec![low, high, 0, COMPONENT_ID, request.len() as u8];
+        payload.extend_from_slice(request);
+        let mut packet = [0; MAX_PACKET];
+        let len = seal(&mut packet, SOURCE, self.sequence, TUNNEL, &payload);
+        self.sequence = self.sequence.wrapping_add(1);
+        self.socket
+            .send_to(&packet[..len], self.address)
+            .with_context(|| format!("bridge: cannot send to {}", self.address))?;
+        Ok(())
+    }
+
+    /// Waits a moment for the answer; telemetry that comes too is left aside.
+    fn receive(&self, op: Op) -> Option<(Verdict, Vec<u8>)> {
+        let mut bytes = [0; 2048];
+        // Nothing yet, or refused: asked again.
+        let (len, from) = self.socket.recv_from(&mut bytes).ok()?;
+        if from != self.address {
+            return None;
+        }
+        let mut answer = None;
+        each_in_datagram(&bytes[..len], &mut CutStats::default(), |packet| {
+            if packet.id() != TUNNEL || packet.source().1 != COMPONENT_ID {
+                return;
+            }
+            let mut payload = packet.payload().to_vec();
+            payload.resize(5 + BODY, 0);
+            let len = usize::from(payload[4]).min(BODY);
+            let body = &payload[5..5 + len];
+            if payload[..2] == TUNNEL_TYPE.to_le_bytes()
+                && let [number, verdict, rest @ ..] = body
+                && *number == op as u8 | 0x80
+                && let Some(verdict) = Verdict::from_number(*verdict)
+            {
+                answer = Some((verdict, rest.to_vec()));
+            }
+        });
+        answer
+    }
+}

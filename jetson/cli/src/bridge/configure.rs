@@ -1,0 +1,185 @@
+//! `vizflyt bridge configure`: claims a bridge, shows its settings, changes them. And `stats`.
+
+use std::io::Read;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde_json::{Map, Value};
+use vizflyt_bridge::access::{Op, Verdict};
+use vizflyt_bridge::settings::{Key, NUMBERS, TEXTS, key_from_hex, key_to_hex};
+use vizflyt_bridge::stats::REPORT;
+use vizflyt_trust::KeysFolder;
+
+use super::ask::Asked;
+use crate::terminal::tell;
+
+/// Shows and changes a bridge's settings.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:
+  vizflyt bridge configure --claim                                  once, with a new bridge
+  vizflyt bridge configure                                          shows every setting
+  vizflyt bridge configure WIFI_STATION=1 wifi.ssid=lab wifi.password=... --restart
+  vizflyt bridge configure --bridge vizflyt.local LOSS_MS=800
+
+A change is kept at once. Nothing changes while the vehicle is armed.")]
+pub(crate) struct ConfigureArgs {
+    /// Settings to change; none shows them all.
+    #[arg(value_name = "NAME=VALUE")]
+    changes: Vec<String>,
+    /// Where the bridge is: ADDRESS or ADDRESS:PORT.
+    #[arg(long, value_name = "ADDRESS", default_value_t = super::emulate::DEFAULT_BRIDGE.to_string())]
+    bridge: String,
+    /// Gives a new bridge its key: makes one if there is none yet. Do it where nobody else is in
+    /// the bridge's network.
+    #[arg(long)]
+    claim: bool,
+    /// Puts every setting but the key back to what it was on the first day, before the changes.
+    #[arg(long)]
+    reset: bool,
+    /// Restarts the bridge afterwards: speed, ports and Wi-Fi count only then.
+    #[arg(long)]
+    restart: bool,
+    /// Folder of keys; the bridge's is `bridge.key` in it.
+    #[arg(long, value_name = "DIR")]
+    keys: Option<PathBuf>,
+}
+
+/// Counters of a bridge: what passed, what was lost, and why.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct StatsArgs {
+    /// Where the bridge is: ADDRESS or ADDRESS:PORT.
+    #[arg(value_name = "ADDRESS", default_value_t = super::emulate::DEFAULT_BRIDGE.to_string())]
+    bridge: String,
+    /// Prints them as JSON.
+    #[arg(long)]
+    json: bool,
+    /// Prints what has changed, every second.
+    #[arg(long, conflicts_with = "json")]
+    watch: bool,
+}
+
+/// The key's file.
+const KEY_FILE: &str = "bridge.key";
+
+/// Runs `configure`.
+pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
+    let mut asked = Asked::open(&args.bridge)?;
+    if args.claim {
+        claim(&mut asked, args)?;
+    }
+    let changes = !args.changes.is_empty() || args.reset || args.restart;
+    if changes {
+        let key = read_key(args)?.with_context(
+            || "bridge: no key in the folder of keys; `vizflyt bridge configure --claim` makes one",
+        )?;
+        let mut tell_it = |op: Op, body: &str| change(&mut asked, op, body, &key);
+        if args.reset {
+            tell_it(Op::Reset, "")?;
+        }
+        for setting in &args.changes {
+            tell_it(Op::Set, setting)?;
+        }
+        tell_it(Op::Save, "")?;
+        if args.restart {
+            tell_it(Op::Restart, "")?;
+            tell("saved; the bridge restarts");
+            return Ok(());
+        }
+        tell("saved");
+    }
+    if !args.claim {
+        show(&mut asked)?;
+    }
+    Ok(())
+}
+
+fn claim(asked: &mut Asked, args: &ConfigureArgs) -> Result<()> {
+    let key = if let Some(key) = read_key(args)? {
+        key
+    } else {
+        let mut key: Key = [0; 32];
+        std::fs::File::open("/dev/urandom")
+            .and_then(|mut file| file.read_exact(&mut key))
+            .context("bridge: no random numbers from /dev/urandom")?;
+        let folder = KeysFolder::open(args.keys.as_deref())?;
+        folder.write(KEY_FILE, &format!("{}\n", key_to_hex(&key)))?;
+        key
+    };
+    let (verdict, _) = asked.ask(Op::Claim, &key, None)?;
+    if verdict != Verdict::Done {
+        bail!("bridge: not claimed: {}", verdict.words());
+    }
+    let path = KeysFolder::open(args.keys.as_deref())?.file(KEY_FILE);
+    tell(format!("claimed; its key is in {}", path.display()));
+    Ok(())
+}
+
+fn read_key(args: &ConfigureArgs) -> Result<Option<Key>> {
+    let folder = KeysFolder::open(args.keys.as_deref())?;
+    let Some(text) = folder.read_secret(KEY_FILE)? else { return Ok(None) };
+    let key = key_from_hex(text.trim()).map_err(|_| {
+        anyhow::anyhow!("{}: not 64 hexadecimal digits", folder.file(KEY_FILE).display())
+    })?;
+    Ok(Some(key))
+}
+
+fn change(asked: &mut Asked, op: Op, body: &str, key: &Key) -> Result<()> {
+    match asked.ask(op, body.as_bytes(), Some(key))? {
+        (Verdict::Done, _) => Ok(()),
+        (verdict, _) => {
+            // A password must not end up in somebody's terminal log.
+            let name = body.split('=').next().unwrap_or_default();
+            bail!("bridge: {op:?} {name} is refused: {}", verdict.words())
+        }
+    }
+}
+
+fn show(asked: &mut Asked) -> Result<()> {
+    let claimed = if asked.claimed { "" } else { "; it has no key yet: --claim" };
+    tell(format!("bridge {}{claimed}", asked.version));
+    let names = NUMBERS.iter().map(|number| number.name);
+    for name in names.chain(TEXTS.iter().map(|&(name, _)| name)) {
+        // An older firmware may not know a name of ours.
+        if let (Verdict::Done, value) = asked.ask(Op::Read, name.as_bytes(), None)? {
+            tell(format!("{name:18} {}", String::from_utf8_lossy(&value)));
+        }
+    }
+    Ok(())
+}
+
+/// Runs `stats`.
+pub(crate) fn stats(args: &StatsArgs) -> Result<()> {
+    let mut asked = Asked::open(&args.bridge)?;
+    let mut before: Option<Vec<u32>> = None;
+    loop {
+        let (_, body) = asked.ask(Op::Stats, b"", None)?;
+        let values: Vec<u32> = body
+            .chunks_exact(4)
+            .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
+            .collect();
+        let named = || REPORT.iter().copied().zip(&values);
+        if args.json {
+            let map: Map<String, Value> =
+                named().map(|(name, &value)| (name.to_owned(), value.into())).collect();
+            tell(Value::Object(map));
+        } else if let Some(before) = &before {
+            let changed: Vec<String> = named()
+                .zip(before)
+                .filter(|((_, value), before)| value != before)
+                .map(|((name, value), before)| format!("{name} +{}", value.wrapping_sub(*before)))
+                .collect();
+            tell(changed.join("  "));
+        } else {
+            for (name, value) in named() {
+                tell(format!("{name:24} {value}"));
+            }
+        }
+        if !args.watch {
+            return Ok(());
+        }
+        before = Some(values);
+        std::thread::sleep(Duration::from_secs(1));
+    }
+}

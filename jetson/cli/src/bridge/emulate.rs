@@ -1,0 +1,398 @@
+//! `vizflyt bridge emulate`: the bridge of the vehicle on this computer. The same core that chips
+//! run, here between a pseudo-terminal (or a real serial port) and this computer's sockets; only the
+//! shell around it is another: one thread that waits on file descriptors.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream, UdpSocket};
+use std::os::fd::AsFd;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::time::TimeSpec;
+use serde_json::json;
+use vizflyt_bridge::bridge::TCP_SLOTS;
+use vizflyt_bridge::stats::REPORT;
+use vizflyt_bridge::storage::Store;
+use vizflyt_bridge::{Bridge, Chip, Event, Settings};
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::time::HostTime;
+
+use super::flash::FileFlash;
+use super::port::{Port, Uart};
+use crate::terminal::tell;
+
+/// Runs the bridge's firmware on this computer.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:
+  vizflyt bridge emulate --uart pty:/tmp/uart           then: vizflyt sim --serial /tmp/uart
+  vizflyt bridge emulate --uart /dev/ttyUSB0            this computer carries a real autopilot's port
+  vizflyt bridge emulate --client 127.0.0.1:14550       speaks first, to a runtime that waits there")]
+pub(crate) struct EmulateArgs {
+    /// The autopilot's port: `pty` makes a pseudo-terminal, `pty:PATH` links to it by a name, PATH
+    /// is a serial device.
+    #[arg(long, value_name = "UART", default_value = "pty")]
+    uart: Uart,
+    /// UDP address that clients send to.
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:14555")]
+    listen: SocketAddrV4,
+    /// TCP address that clients connect to; none without it.
+    #[arg(long, value_name = "ADDR:PORT")]
+    tcp: Option<SocketAddrV4>,
+    /// A client that is sent to before it speaks.
+    #[arg(long, value_name = "ADDR:PORT")]
+    client: Option<SocketAddrV4>,
+    /// Speed of the port; a pseudo-terminal takes as long as a line of this speed would.
+    #[arg(long, value_name = "BAUD")]
+    baud: Option<u32>,
+    /// Any other setting, as in `vizflyt bridge configure`; may be given several times.
+    #[arg(long = "set", value_name = "NAME=VALUE")]
+    settings: Vec<String>,
+    /// Keeps the bridge's flash in this file, so that saved settings outlive it.
+    #[arg(long, value_name = "FILE")]
+    flash: Option<PathBuf>,
+    /// Prints JSON lines on stdout: one when ready, one report at the end.
+    #[arg(long)]
+    json: bool,
+    /// Ends when stdin ends.
+    #[arg(long, hide = true)]
+    lifeline: bool,
+}
+
+impl EmulateArgs {
+    /// A bridge between a new pseudo-terminal and a free port of loopback.
+    pub(crate) fn loopback(baud: u32) -> Self {
+        Self {
+            uart: Uart::Pty(None),
+            listen: SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0),
+            tcp: None,
+            client: None,
+            baud: Some(baud),
+            settings: Vec::new(),
+            flash: None,
+            json: false,
+            lifeline: false,
+        }
+    }
+}
+
+/// The loop wakes at least this often, to see that it shall end.
+const WAKE: Duration = Duration::from_millis(50);
+
+/// Runs it until told to end.
+pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
+    let stop = stop_flag(args.lifeline)?;
+    let mut emulation = Emulation::open(args)?;
+    let uart = emulation.port.path().display().to_string();
+    let udp = emulation.udp.local_addr()?.to_string();
+    let tcp = match &emulation.listener {
+        Some(listener) => Some(listener.local_addr()?.to_string()),
+        None => None,
+    };
+    if args.json {
+        tell(json!({"ready": "bridge", "uart": uart, "udp": udp, "tcp": tcp}));
+    } else {
+        tell(format!("bridge ready: autopilot at {uart}, clients at udp {udp}; Ctrl-C ends it"));
+        if let Some(tcp) = tcp {
+            tell(format!("              and tcp {tcp}"));
+        }
+    }
+    while !stop.load(Ordering::Relaxed) {
+        emulation.turn()?;
+        emulation.wait()?;
+    }
+    let report = emulation.report();
+    if args.json {
+        tell(json!({ "report": report }));
+    } else {
+        for (name, value) in report.as_object().into_iter().flatten() {
+            tell(format!("{name:24} {value}"));
+        }
+    }
+    Ok(())
+}
+
+/// A bridge with its sockets and its port.
+pub(crate) struct Emulation {
+    bridge: Bridge,
+    overrides: Vec<(String, String)>,
+    store: Store<FileFlash>,
+    pub(crate) port: Port,
+    pub(crate) udp: UdpSocket,
+    listener: Option<TcpListener>,
+    streams: [Option<Connection>; TCP_SLOTS],
+    start: Instant,
+    booted: Instant,
+}
+
+/// A TCP client and what it has not taken yet.
+struct Connection {
+    stream: TcpStream,
+    pending: Vec<u8>,
+}
+
+impl Emulation {
+    /// Opens port and sockets.
+    pub(crate) fn open(args: &EmulateArgs) -> Result<Self> {
+        let mut overrides = vec![("UDP_PORT".to_owned(), args.listen.port().max(1).to_string())];
+        overrides.extend(args.client.map(|client| ("client".to_owned(), client.to_string())));
+        overrides.extend(args.baud.map(|baud| ("UART_BAUD".to_owned(), baud.to_string())));
+        for setting in &args.settings {
+            let (name, value) = setting
+                .split_once('=')
+                .with_context(|| format!("--set {setting}: write NAME=VALUE"))?;
+            overrides.push((name.to_owned(), value.to_owned()));
+        }
+        let flash = FileFlash::open(args.flash.clone()).with_context(|| {
+            let path = args.flash.clone().unwrap_or_default();
+            format!("bridge: cannot read the flash in {}", path.display())
+        })?;
+        let mut store = Store::new(flash, 0);
+        let settings = boot_settings(&mut store, &overrides)?;
+        let port = Port::open(&args.uart, settings.baud)?;
+        let udp = UdpSocket::bind(args.listen)
+            .with_context(|| format!("bridge: cannot listen on {}; is it in use?", args.listen))?;
+        udp.set_nonblocking(true)?;
+        let listener = match args.tcp {
+            Some(address) => {
+                let listener = TcpListener::bind(address).with_context(|| {
+                    format!("bridge: cannot listen on {address}; is it in use?")
+                })?;
+                listener.set_nonblocking(true)?;
+                Some(listener)
+            }
+            None => None,
+        };
+        let start = Instant::now();
+        let bridge = Bridge::new(HostTime::ZERO, settings, chip()?);
+        Ok(Self {
+            bridge,
+            overrides,
+            store,
+            port,
+            udp,
+            listener,
+            streams: [const { None }; TCP_SLOTS],
+            start,
+            booted: start,
+        })
+    }
+
+    /// Carries what there is to carry now.
+    pub(crate) fn turn(&mut self) -> Result<()> {
+        let now = Instant::now();
+        let at = self.host(now);
+        let bridge = &mut self.bridge;
+        self.port.receive(now, |bytes| bridge.handle_uart(at, bytes))?;
+        self.hear_udp(at);
+        self.hear_tcp(at);
+        if self.bridge.poll_timeout() <= at {
+            self.bridge.handle_timeout(at);
+        }
+        let mut packet = [0; MAX_PACKET];
+        while self.port.is_free(now)? {
+            match self.bridge.poll_uart(at, &mut packet) {
+                0 => break,
+                len => self.port.send(now, &packet[..len]),
+            }
+        }
+        let mut datagram = [0; 1472];
+        while let Some((to, len)) = self.bridge.poll_udp(at, &mut datagram) {
+            if self.udp.send_to(&datagram[..len], to).is_err() {
+                self.bridge.note_not_sent();
+            }
+        }
+        self.say_tcp(at);
+        while let Some(event) = self.bridge.poll_event() {
+            match event {
+                Event::Save => {
+                    let saved = self.store.save(self.bridge.settings()).is_ok();
+                    self.bridge.note_saved(at, saved);
+                }
+                Event::Restart => self.restart(at)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// What a chip does when it restarts: everything but the flash is forgotten.
+    fn restart(&mut self, at: HostTime) -> Result<()> {
+        tracing::info!("bridge: restarts");
+        let settings = boot_settings(&mut self.store, &self.overrides)?;
+        self.bridge = Bridge::new(at, settings, chip()?);
+        self.streams = [const { None }; TCP_SLOTS];
+        self.booted = Instant::now();
+        Ok(())
+    }
+
+    fn hear_udp(&mut self, at: HostTime) {
+        let mut bytes = [0; 2048];
+        // A flood must not stop the autopilot's side.
+        for _ in 0..64 {
+            match self.udp.recv_from(&mut bytes) {
+                Ok((len, SocketAddr::V4(from))) => {
+                    self.bridge.handle_datagram(at, from, &bytes[..len]);
+                }
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return,
+                // A client that is not there yet reports itself as refused: go on.
+                _ => {}
+            }
+        }
+    }
+
+    fn hear_tcp(&mut self, at: HostTime) {
+        if let Some((stream, _)) =
+            self.listener.as_ref().and_then(|listener| listener.accept().ok())
+            && let Some(slot) = self.streams.iter().position(Option::is_none)
+            && stream.set_nonblocking(true).is_ok()
+        {
+            // Small packets must not wait for each other; failing that they merely do.
+            let _ = stream.set_nodelay(true);
+            self.streams[slot] = Some(Connection { stream, pending: Vec::new() });
+            self.bridge.open_stream(at, slot as u8);
+        }
+        let mut bytes = [0; 2048];
+        for (slot, place) in self.streams.iter_mut().enumerate() {
+            let Some(connection) = place else { continue };
+            let gone = loop {
+                match connection.stream.read(&mut bytes) {
+                    Ok(0) => break true,
+                    Ok(len) => self.bridge.handle_stream(at, slot as u8, &bytes[..len]),
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => break false,
+                    Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                    Err(_) => break true,
+                }
+            };
+            if gone {
+                *place = None;
+                self.bridge.close_stream(slot as u8);
+            }
+        }
+    }
+
+    fn say_tcp(&mut self, at: HostTime) {
+        for (slot, place) in self.streams.iter_mut().enumerate() {
+            let Some(connection) = place else { continue };
+            let gone = loop {
+                if connection.pending.is_empty() {
+                    let mut batch = [0; 1472];
+                    match self.bridge.poll_tcp(at, slot as u8, &mut batch) {
+                        0 => break false,
+                        len => connection.pending.extend_from_slice(&batch[..len]),
+                    }
+                }
+                match connection.stream.write(&connection.pending) {
+                    Ok(0) => break true,
+                    Ok(len) => drop(connection.pending.drain(..len)),
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => break false,
+                    Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                    Err(_) => break true,
+                }
+            };
+            if gone {
+                *place = None;
+                self.bridge.close_stream(slot as u8);
+            }
+        }
+    }
+
+    /// Waits until something comes in or falls due.
+    pub(crate) fn wait(&self) -> Result<()> {
+        let now = Instant::now();
+        let mut due = now + WAKE;
+        if let Some(at) = self.port.due() {
+            due = due.min(at);
+        }
+        let mut timeouts = vec![Some(self.bridge.poll_timeout()), self.bridge.udp_due()];
+        let mut fds = Vec::new();
+        if self.port.wants_input() {
+            fds.push(PollFd::new(self.port.as_fd(), PollFlags::POLLIN));
+        }
+        fds.push(PollFd::new(self.udp.as_fd(), PollFlags::POLLIN));
+        if let Some(listener) = &self.listener {
+            fds.push(PollFd::new(listener.as_fd(), PollFlags::POLLIN));
+        }
+        for (slot, connection) in self.streams.iter().enumerate() {
+            let Some(connection) = connection else { continue };
+            let mut flags = PollFlags::POLLIN;
+            if connection.pending.is_empty() {
+                timeouts.push(self.bridge.tcp_due(slot as u8));
+            } else {
+                flags |= PollFlags::POLLOUT;
+            }
+            fds.push(PollFd::new(connection.stream.as_fd(), flags));
+        }
+        for at in timeouts.into_iter().flatten() {
+            due = due.min(self.start + Duration::from_nanos(at.as_ns()));
+        }
+        let left = TimeSpec::from_duration(due.saturating_duration_since(now));
+        match ppoll(&mut fds, Some(left), None) {
+            Ok(_) | Err(nix::errno::Errno::EINTR) => Ok(()),
+            Err(error) => Err(error).context("bridge: cannot wait for its sockets"),
+        }
+    }
+
+    /// Returns every counter by its name.
+    pub(crate) fn report(&self) -> serde_json::Value {
+        let counters = self.bridge.stats().report(self.booted.elapsed().as_secs() as u32);
+        REPORT
+            .iter()
+            .zip(counters)
+            .map(|(name, value)| ((*name).to_owned(), value.into()))
+            .collect::<serde_json::Map<_, _>>()
+            .into()
+    }
+
+    fn host(&self, now: Instant) -> HostTime {
+        HostTime::from_ns(now.duration_since(self.start).as_nanos() as u64)
+    }
+}
+
+/// Returns the settings of a start: what flash holds, then what the command line says.
+fn boot_settings(store: &mut Store<FileFlash>, overrides: &[(String, String)]) -> Result<Settings> {
+    let mut settings = store.load().unwrap_or_default();
+    for (name, value) in overrides {
+        if let Err(refused) = settings.set(name, value) {
+            bail!(
+                "bridge: {name}={value} is refused: {refused:?}; see `vizflyt bridge configure --list`"
+            );
+        }
+    }
+    Ok(settings)
+}
+
+fn chip() -> Result<Chip> {
+    let mut random = [0; 16];
+    std::fs::File::open("/dev/urandom")
+        .and_then(|mut file| file.read_exact(&mut random))
+        .context("bridge: no random numbers from /dev/urandom")?;
+    Ok(Chip { address: [2, 0, 0, random[0], random[1], random[2]], random })
+}
+
+/// Returns a flag that is set on SIGINT or SIGTERM, and with `lifeline` when stdin ends.
+fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    crate::terminal::on_interrupt(move || {
+        set.store(true, Ordering::Relaxed);
+        false
+    })?;
+    if lifeline {
+        let set = Arc::clone(&flag);
+        std::thread::spawn(move || {
+            let mut buffer = [0; 256];
+            // Bytes mean nothing; the end, or an error, means that the parent has gone.
+            while matches!(std::io::stdin().read(&mut buffer), Ok(len) if len > 0) {}
+            set.store(true, Ordering::Relaxed);
+        });
+    }
+    Ok(flag)
+}
+
+/// Where a bridge in AP mode is, and the port it listens on.
+pub(crate) const DEFAULT_BRIDGE: SocketAddrV4 =
+    SocketAddrV4::new(Ipv4Addr::new(192, 168, 4, 1), 14550);

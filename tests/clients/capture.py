@@ -1,0 +1,68 @@
+"""Writes the packets that the bridge is tested with, as pymavlink makes them:
+firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt.
+
+    target/clients/bin/python tests/clients/capture.py
+
+Every message of the dialect once, small fields set and floats not, some as MAVLink 1, some signed.
+"""
+
+from pathlib import Path
+
+from pymavlink.dialects.v10 import ardupilotmega as v1
+from pymavlink.dialects.v20 import ardupilotmega as v2
+
+FOLDER = Path(__file__).parents[2] / "firmware-esp/bridge/tests/data"
+# MANUAL_CONTROL calls its target system otherwise.
+SYSTEM = {69: "target"}
+
+
+def value(index, kind, length):
+    """Returns a value that shows where it went: the target fields are told apart from the rest."""
+    if kind == "char":
+        return ("text%d" % index).encode()[:length] if length else b"x"
+    number = 1.5 if kind in ("float", "double") else 3 + index % 100
+    return [number] * length if length else number
+
+
+def message(dialect, cls, index):
+    fields = []
+    for place, (name, kind) in enumerate(zip(cls.fieldnames, cls.fieldtypes)):
+        length = cls.array_lengths[cls.ordered_fieldnames.index(name)]
+        if name == SYSTEM.get(cls.id, "target_system"):
+            fields.append(7)
+        elif name == "target_component":
+            fields.append(9)
+        else:
+            fields.append(value(index + place, kind, length))
+    return cls(*fields)
+
+
+def main():
+    packets, lines = [], []
+    for number, (id_, cls) in enumerate(sorted(v2.mavlink_map.items())):
+        old = number % 5 == 4 and id_ in v1.mavlink_map
+        dialect = v1 if old else v2
+        link = dialect.MAVLink(None, srcSystem=1 + number % 3, srcComponent=1 + number % 2)
+        link.seq = number % 256
+        if not old and number % 3 == 0:
+            link.signing.secret_key = bytes(range(32))
+            link.signing.link_id = 5
+            link.signing.timestamp = 10_000 + number
+            link.signing.sign_outgoing = True
+        made = message(dialect, dialect.mavlink_map[id_] if old else cls, number)
+        packed = made.pack(link, force_mavlink1=old)
+        target = [getattr(made, name, 0) for name in (SYSTEM.get(id_, "target_system"), "target_component")]
+        signed = int(bool(packed[0] == 0xFD and packed[2] & 1))
+        packets.append(packed)
+        lines.append(
+            " ".join(map(str, [len(packed), id_, link.srcSystem, link.srcComponent, link.seq, signed, *target]))
+        )
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    (FOLDER / "pymavlink.bin").write_bytes(b"".join(packets))
+    head = "# length message system component sequence signed target_system target_component\n"
+    (FOLDER / "pymavlink.txt").write_text(head + "\n".join(lines) + "\n")
+    print(len(packets), "packets,", sum(map(len, packets)), "bytes")
+
+
+if __name__ == "__main__":
+    main()
