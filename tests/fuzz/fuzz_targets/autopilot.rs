@@ -1,14 +1,31 @@
-//! The simulated autopilot's MAVLink side: any bytes, in order, with time going on.
+//! The simulated autopilot's MAVLink side: any bytes on any of its links, in order, over a cable or
+//! Wi-Fi, with time going on and things breaking.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::mavlink::MAX_PACKET;
-use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
+use vizflyt_simulator::autopilot::Radio;
+use vizflyt_simulator::simulation::{MAX_LINKS, Simulation, SimulationConfig};
+use vizflyt_simulator::wifi::WifiConfig;
 
-fuzz_target!(|packets: Vec<&[u8]>| {
-    let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
+fuzz_target!(|input: (bool, bool, Vec<(u8, &[u8])>)| {
+    let (over_wifi, radio, steps) = input;
+    let config = SimulationConfig {
+        wifi: over_wifi.then(WifiConfig::default),
+        radio,
+        vibration_mps2: 100.0,
+        gust_mps: 1.0,
+        ..SimulationConfig::default()
+    };
+    let mut simulation = Simulation::new(config).unwrap();
     let mut buffer = [0; MAX_PACKET];
-    for packet in packets {
-        simulation.handle_mavlink(0, packet);
+    for (what, packet) in steps {
+        match what {
+            250 => simulation.reboot(),
+            251 => simulation.set_radio(Radio::Lost),
+            252 => simulation.set_radio(Radio::Heard),
+            253 => simulation.break_motor(packet.len() % 4, 0.5),
+            link => simulation.handle_mavlink(usize::from(link) % MAX_LINKS, packet),
+        }
         for _ in 0..5 {
             simulation.tick();
         }

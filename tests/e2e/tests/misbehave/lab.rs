@@ -1,13 +1,18 @@
 //! A lab in which several plugins fly at once: one render server, and for each flight a simulated
-//! vehicle and a runtime, all real processes. The motion capture's packets go through this test on
-//! their way to the server, so it sees where each vehicle is, whatever the runtime says.
+//! vehicle and a runtime, all real processes. The motion capture's packets and the vehicle's MAVLink go
+//! through this test on their way, so it sees where each vehicle is, whatever the runtime says, and
+//! can cut either.
+//!
+//! `linkloss` shares this file: what one of the two tests does not use, the other does.
+
+#![allow(dead_code)]
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::net::UdpSocket;
+use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -16,6 +21,8 @@ use std::time::{Duration, Instant};
 use glam::DVec3;
 use serde_json::Value;
 use vizflyt_e2e::vizflyt;
+use vizflyt_protocol::mavlink::StreamDecoder;
+use vizflyt_protocol::mavlink::dialect::MavMessage;
 use vizflyt_trust::{Client, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
 
 /// One render server for all flights of the test.
@@ -29,6 +36,15 @@ pub(crate) struct Lab {
     packets: Arc<AtomicU32>,
 }
 
+/// What can be cut between the vehicle and the rest; set to cut.
+#[derive(Default)]
+pub(crate) struct Cuts {
+    /// Poses from the motion capture to the server.
+    pub poses: AtomicBool,
+    /// MAVLink, both ways.
+    pub mavlink: AtomicBool,
+}
+
 /// One flight, while it lasts.
 pub(crate) struct Flight {
     /// What was asked of the plugin.
@@ -36,6 +52,11 @@ pub(crate) struct Flight {
     simulator: Process,
     runtime: Process,
     track: Track,
+    /// Modes that the vehicle's own heartbeats told of.
+    modes: Modes,
+    cuts: Arc<Cuts>,
+    /// Sends to the vehicle what goes round the runtime.
+    aside: Aside,
     report: PathBuf,
     /// What the plugin has left to do.
     kept: PathBuf,
@@ -45,13 +66,33 @@ pub(crate) struct Flight {
 pub(crate) struct Seen {
     /// JSON lines of the runtime, and when each came.
     pub lines: Vec<(Instant, Value)>,
-    /// Positions by motion capture. [m, world]
-    pub track: Vec<(Instant, DVec3)>,
+    /// Positions by motion capture, also while its poses are cut. [m, world]
+    pub track: Vec<Sight>,
+    /// Modes of the vehicle, and when each began.
+    pub modes: Vec<(Instant, u32)>,
     /// The runtime's report.
     pub report: Value,
 }
 
-type Track = Arc<Mutex<Vec<(Instant, DVec3)>>>;
+/// One pose of the motion capture.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sight {
+    /// When it came.
+    pub at: Instant,
+    /// When it was true, on the simulator's clock. [s]
+    pub stamp_s: f64,
+    /// Where the vehicle was. [m, world]
+    pub p_m: DVec3,
+}
+
+type Track = Arc<Mutex<Vec<Sight>>>;
+type Modes = Arc<Mutex<Vec<(Instant, u32)>>>;
+
+/// A way to the vehicle beside the runtime's.
+struct Aside {
+    socket: UdpSocket,
+    vehicle: Arc<Mutex<Option<SocketAddr>>>,
+}
 
 /// Anything here ends within this, however loaded the machine is.
 const PATIENCE: Duration = Duration::from_mins(2);
@@ -152,13 +193,15 @@ impl Lab {
         how: &'static str,
         settings: &str,
         more: &[&str],
+        vehicle: &[&str],
     ) -> Flight {
         let name = name(index);
         let at = |kind: &str| self.folder.path().join(format!("{name}-{kind}"));
         let config = at("jetson.toml");
         fs::write(&config, format!("[plugin]\n{settings}\n")).unwrap();
         let track = Track::default();
-        let capture = self.capture(Arc::clone(&track));
+        let cuts = Arc::new(Cuts::default());
+        let capture = self.capture(Arc::clone(&track), Arc::clone(&cuts));
 
         let plugin = vizflyt().with_file_name("examples").join("misbehave");
         let mut args = words("--json --lifeline --mavlink=udpin:127.0.0.1:0 --ready-within=100");
@@ -179,16 +222,19 @@ impl Lab {
         let runtime = Process::start(&vizflyt().with_file_name("vizflyt-jetson"), &args);
         let mavlink = runtime.ready()["mavlink"].as_str().unwrap().to_owned();
 
+        let modes = Modes::default();
+        let (air, aside) = carry(mavlink, Arc::clone(&modes), Arc::clone(&cuts));
         let mut args = words("sim --json --lifeline --spawn=0.9,0,0,0");
-        args.push(format!("--mavlink=udpout:{mavlink}"));
+        args.push(format!("--mavlink=udpout:{air}"));
+        args.extend(vehicle.iter().map(|&text| text.to_owned()));
         args.push(format!("--vicon={capture}"));
         args.extend([format!("--object={name}"), format!("--seed={index}")]);
         let simulator = Process::start(&vizflyt(), &args);
-        Flight { how, simulator, runtime, track, report: at("report"), kept }
+        Flight { how, simulator, runtime, track, modes, cuts, aside, report: at("report"), kept }
     }
 
     /// Returns an address whose packets are passed on to the server, and noted.
-    fn capture(&self, track: Track) -> std::net::SocketAddr {
+    fn capture(&self, track: Track, cuts: Arc<Cuts>) -> SocketAddr {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         let address = socket.local_addr().unwrap();
         let (server, packets) = (self.vicon.clone(), Arc::clone(&self.packets));
@@ -196,19 +242,29 @@ impl Lab {
             let mut packet = [0; 512];
             // Until the process ends: packets of a vehicle that is gone do not come.
             while let Ok(len) = socket.recv(&mut packet) {
+                let frame = u32::from_le_bytes(packet[..4].try_into().unwrap());
                 let number = packets.fetch_add(1, Ordering::Relaxed);
                 packet[..4].copy_from_slice(&number.to_le_bytes());
-                let _ = socket.send_to(&packet[..len], &server);
+                if !cuts.poses.load(Ordering::Relaxed) {
+                    let _ = socket.send_to(&packet[..len], &server);
+                }
                 // Vicon's object stream: after the name three doubles in millimetres.
                 let mm = |axis: usize| {
                     let at = 32 + 8 * axis;
                     f64::from_le_bytes(packet[at..at + 8].try_into().unwrap())
                 };
                 let p_m = DVec3::new(mm(0), mm(1), mm(2)) / 1000.0;
-                lock(&track).push((Instant::now(), p_m));
+                let stamp_s = f64::from(frame) / CAPTURE_HZ;
+                lock(&track).push(Sight { at: Instant::now(), stamp_s, p_m });
             }
         });
         address
+    }
+
+    /// Kills the server.
+    pub(crate) fn kill_server(&mut self) {
+        let _ = self.server.child.kill();
+        let _ = self.server.child.wait();
     }
 
     /// Whether the server still runs.
@@ -218,6 +274,49 @@ impl Lab {
 }
 
 impl Flight {
+    /// Waits until the runtime prints a line that contains `text`; returns what it printed.
+    pub(crate) fn until(&mut self, text: &str) -> Vec<(Instant, Value)> {
+        let mut lines = Vec::new();
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let Ok(line) = self.runtime.lines.recv_timeout(left) else {
+                panic!("{}: no line with {text}: {lines:#?}", self.how)
+            };
+            let is_it = line.1.to_string().contains(text);
+            lines.push(line);
+            if is_it {
+                return lines;
+            }
+        }
+    }
+
+    /// What can be cut.
+    pub(crate) fn cuts(&self) -> &Cuts {
+        &self.cuts
+    }
+
+    /// Kills the runtime; its plugin goes with it.
+    pub(crate) fn kill_runtime(&mut self) {
+        let _ = self.runtime.child.kill();
+    }
+
+    /// Sends a packet to the vehicle that the runtime knows nothing of.
+    pub(crate) fn tell_vehicle(&self, packet: &[u8]) {
+        let vehicle = lock(&self.aside.vehicle).expect("the vehicle has been heard");
+        self.aside.socket.send_to(packet, vehicle).unwrap();
+    }
+
+    /// Returns the newest pose.
+    pub(crate) fn now(&self) -> Sight {
+        *lock(&self.track).last().expect("the motion capture runs")
+    }
+
+    /// Returns what has been seen so far, without waiting for the runtime.
+    pub(crate) fn so_far(&self) -> (Vec<Sight>, Vec<(Instant, u32)>) {
+        (lock(&self.track).clone(), lock(&self.modes).clone())
+    }
+
     /// Waits for the end of the flight; returns what was seen of it.
     pub(crate) fn wait(mut self) -> Seen {
         let mut lines = Vec::new();
@@ -233,11 +332,11 @@ impl Flight {
         let _ = self.runtime.child.wait();
         let report = fs::read_to_string(&self.report).unwrap_or_else(|_| panic!("{lines:#?}"));
         let report = serde_json::from_str(&report).unwrap();
-        drop(self.simulator);
         // Most leave none.
         let _ = fs::remove_file(&self.kept);
-        let track = lock(&self.track).clone();
-        Seen { lines, track, report }
+        let (track, modes) = self.so_far();
+        drop(self.simulator);
+        Seen { lines, track, modes, report }
     }
 }
 
@@ -255,36 +354,82 @@ impl Seen {
 
     /// Returns the vehicle's speed around `at`, over a fifth of a second. [m/s]
     fn speed_mps(&self, at: Instant) -> f64 {
-        let near = |at: Instant| self.track.iter().find(|&&(seen, _)| seen >= at);
-        let (Some((t0, p0)), Some((t1, p1))) = (near(at), near(at + Duration::from_millis(200)))
-        else {
+        let near = |at: Instant| self.track.iter().find(|sight| sight.at >= at);
+        let (Some(a), Some(b)) = (near(at), near(at + Duration::from_millis(200))) else {
             return 0.0;
         };
-        let seconds = t1.saturating_duration_since(*t0).as_secs_f64();
-        if seconds > 0.0 { (*p1 - *p0).length() / seconds } else { 0.0 }
+        let seconds = b.at.saturating_duration_since(a.at).as_secs_f64();
+        if seconds > 0.0 { (b.p_m - a.p_m).length() / seconds } else { 0.0 }
     }
 
     /// Returns how long after `since` the vehicle first stood still or came straight down; `None`
     /// if it never did.
     pub(crate) fn stopped_after(&self, since: Instant) -> Option<Duration> {
         let level = |at: Instant| {
-            let near = |at: Instant| self.track.iter().find(|&&(seen, _)| seen >= at);
-            let (Some((_, p0)), Some((_, p1))) = (near(at), near(at + Duration::from_millis(200)))
-            else {
+            let near = |at: Instant| self.track.iter().find(|sight| sight.at >= at);
+            let (Some(a), Some(b)) = (near(at), near(at + Duration::from_millis(200))) else {
                 return 0.0;
             };
-            (*p1 - *p0).truncate().length() / 0.2
+            (b.p_m - a.p_m).truncate().length() / 0.2
         };
         (0..200).map(|n| Duration::from_millis(50) * n).find(|&after| level(since + after) < 0.15)
     }
 
     /// Returns the height at the end, and the speed. [m; m/s]
     pub(crate) fn end(&self) -> (f64, f64) {
-        let Some(&(at, p_m)) = self.track.last() else { return (f64::NAN, f64::NAN) };
+        let Some(&Sight { at, p_m, .. }) = self.track.last() else {
+            return (f64::NAN, f64::NAN);
+        };
         let before = at.checked_sub(Duration::from_millis(400)).expect("the flight took longer");
         (p_m.z, self.speed_mps(before))
     }
 }
+
+/// Carries MAVLink between a vehicle, which sends to the address returned, and the runtime at
+/// `runtime`.
+fn carry(runtime: String, modes: Modes, cuts: Arc<Cuts>) -> (SocketAddr, Aside) {
+    let to_vehicle = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let to_runtime = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let address = to_vehicle.local_addr().unwrap();
+    let vehicle = Arc::new(Mutex::new(None));
+    let aside = Aside { socket: to_vehicle.try_clone().unwrap(), vehicle: Arc::clone(&vehicle) };
+    let is_open = move |cuts: &Cuts| !cuts.mavlink.load(Ordering::Relaxed);
+    let (from_runtime, up) = (to_runtime.try_clone().unwrap(), to_vehicle.try_clone().unwrap());
+    let (known, open) = (Arc::clone(&vehicle), Arc::clone(&cuts));
+    // Both until the process ends: a packet of a vehicle or runtime that is gone does not come.
+    thread::spawn(move || {
+        let mut packet = [0; 2048];
+        loop {
+            // A runtime that is gone reports itself as refused: go on.
+            let Ok(len) = from_runtime.recv(&mut packet) else { continue };
+            if let (true, Some(vehicle)) = (is_open(&open), *lock(&known)) {
+                let _ = up.send_to(&packet[..len], vehicle);
+            }
+        }
+    });
+    thread::spawn(move || {
+        let mut packet = [0; 2048];
+        let mut decoder = StreamDecoder::default();
+        loop {
+            let Ok((len, from)) = to_vehicle.recv_from(&mut packet) else { continue };
+            *lock(&vehicle) = Some(from);
+            decoder.push(&packet[..len], |packet| {
+                let MavMessage::HEARTBEAT(heartbeat) = packet.message else { return };
+                let mut modes = lock(&modes);
+                if modes.last().is_none_or(|&(_, mode)| mode != heartbeat.custom_mode) {
+                    modes.push((Instant::now(), heartbeat.custom_mode));
+                }
+            });
+            if is_open(&cuts) {
+                let _ = to_runtime.send_to(&packet[..len], &runtime);
+            }
+        }
+    });
+    (address, aside)
+}
+
+/// The simulated motion capture's rate. [Hz]
+const CAPTURE_HZ: f64 = 200.0;
 
 fn name(index: usize) -> String {
     format!("m{index}")

@@ -82,7 +82,7 @@ fn whatever_a_plugin_does_the_vehicle_holds_or_lands() {
     for batch in CASES.chunks(TOGETHER) {
         let start = |(index, case): (usize, &Case)| {
             let more: &[&str] = if case.flies_on() { &["--seconds=7"] } else { &[] };
-            lab.fly(index, case.how, case.settings, more)
+            lab.fly(index, case.how, case.settings, more, &[])
         };
         let flights: Vec<_> = batch.iter().enumerate().map(start).collect();
         for (case, flight) in batch.iter().zip(flights) {
@@ -147,7 +147,7 @@ impl Case {
         if self.settings.contains("restart") && restarts != Some(2) {
             return Some(format!("it was started again {restarts:?} times"));
         }
-        let furthest = seen.track.iter().map(|(_, p_m)| p_m.x).fold(0.0, f64::max);
+        let furthest = seen.track.iter().map(|sight| sight.p_m.x).fold(0.0, f64::max);
         if !(furthest < 2.6) {
             return Some(format!("it was at x = {furthest} m, outside the fence"));
         }

@@ -1,0 +1,308 @@
+//! The chain of links between a pose and a motor, broken at each of its joints in flight. The vehicle
+//! is watched from outside, by the motion capture's own packets: whatever is lost, it is down inside
+//! the fence within 6 s of the last good pose, and has drifted by 1 m at most; what comes back in time
+//! costs a pause and no landing.
+//!
+//! Prints the table of `docs/guides/failsafe.md`; with `VIZFLYT_LINKLOSS=write` writes it there.
+//! Durations are the simulator's, so that a busy machine does not make the vehicle look slow.
+
+#[path = "../misbehave/lab.rs"]
+mod lab;
+mod table;
+
+use std::sync::Mutex;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use lab::{Flight, Lab, Sight};
+use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
+use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
+
+/// What is lost.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Loss {
+    /// The runtime is killed.
+    Runtime,
+    /// MAVLink stops both ways: Wi-Fi, or a bridge without power. [s]
+    Mavlink(f64),
+    /// The motion capture sees nothing. [s]
+    Poses(f64),
+    /// The server is killed.
+    Server,
+    /// The autopilot reboots.
+    Autopilot,
+}
+
+/// For ever, as far as a flight goes. [s]
+const FOR_EVER: f64 = 1e6;
+
+/// A row of the table.
+struct Case {
+    loss: Loss,
+    /// How the row reads.
+    name: &'static str,
+    /// Who notices, and what it does.
+    does: &'static str,
+    /// Whether the vehicle comes down; else it flies on.
+    lands: bool,
+}
+
+const CASES: [Case; 9] = [
+    Case {
+        loss: Loss::Runtime,
+        name: "the runtime is killed",
+        does: "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT",
+        lands: true,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies",
+        does: "autopilot: as above; runtime: LAND, unheard",
+        lands: true,
+    },
+    Case {
+        loss: Loss::Mavlink(1.0),
+        name: "Wi-Fi is away for 1 s, or the bridge reboots in that time",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        lands: false,
+    },
+    Case {
+        loss: Loss::Poses(0.2),
+        name: "the pose stalls for 200 ms",
+        does: "nobody: the autopilot's estimate bridges it",
+        lands: false,
+    },
+    Case {
+        loss: Loss::Poses(1.0),
+        name: "the pose stalls for 1 s",
+        does: "runtime: holds after 0.5 s, flies on",
+        lands: false,
+    },
+    Case {
+        loss: Loss::Poses(5.0),
+        name: "the pose stalls for 5 s",
+        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        lands: true,
+    },
+    Case {
+        loss: Loss::Poses(FOR_EVER),
+        name: "the pose is gone",
+        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        lands: true,
+    },
+    Case {
+        loss: Loss::Autopilot,
+        name: "the autopilot reboots in flight",
+        does: "nobody can: motors stop, it falls",
+        lands: true,
+    },
+    Case {
+        loss: Loss::Server,
+        name: "the server is killed",
+        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        lands: true,
+    },
+];
+
+/// Vehicles that fly at a time; the server is the last row's, alone.
+const TOGETHER: usize = 4;
+/// The vehicle's own failsafes (`hardware/airframe`): the runtime cannot act for it when it is gone.
+const VEHICLE: [&str; 5] = [
+    "--param=FS_GCS_ENABLE=5",
+    "--param=FS_GCS_TIMEOUT=3",
+    "--param=GUID_TIMEOUT=0.5",
+    "--param=FS_OPTIONS=8",
+    "--param=WP_YAW_BEHAVIOR=0",
+];
+/// Down means this near the floor. [m]
+const DOWN_M: f64 = 0.05;
+/// The promise. [s], [m]
+const DOWN_WITHIN_S: f64 = 6.0;
+const DRIFT_AT_MOST_M: f64 = 1.0;
+/// How long a vehicle that shall fly on is watched after the loss is over. [s]
+const WATCH_S: f64 = 3.0;
+/// The room's fence, which the lab draws in. [m, world]
+const FENCE_X_M: (f64, f64) = (0.0, 2.6);
+/// A limit on waiting; nothing takes half as long.
+const PATIENCE: Duration = Duration::from_mins(2);
+
+/// A row as measured.
+struct Row {
+    case: &'static Case,
+    /// From the loss until it stood, or came straight down. [s]
+    stands_s: Option<f64>,
+    /// From the loss until LAND was entered. [s]
+    lands_s: Option<f64>,
+    /// From the last good pose until it was down. [s]
+    down_s: Option<f64>,
+    /// Greatest horizontal distance from where it was at the last good pose, until it was down or
+    /// the loss was over. [m]
+    drift_m: f64,
+}
+
+#[test]
+fn whatever_is_lost_the_vehicle_is_down_in_time_or_flies_on() {
+    let mut rows = Vec::new();
+    let (last, others) = CASES.split_last().expect("there are rows");
+    for batch in others.chunks(TOGETHER) {
+        let mut lab = Lab::open(TOGETHER);
+        rows.extend(fly(&mut lab, batch));
+    }
+    let mut lab = Lab::open(1);
+    rows.extend(fly(&mut lab, std::slice::from_ref(last)));
+    let found = table::write(&rows);
+    println!("{found}");
+    let complaints: Vec<_> = rows.iter().filter_map(Row::complaint).collect();
+    assert!(complaints.is_empty(), "{complaints:#?}");
+    if std::env::var("VIZFLYT_LINKLOSS").is_ok_and(|what| what == "write") {
+        table::replace(&found);
+    }
+    table::compare(&rows);
+}
+
+/// Flies some cases at once, each with a thread that strikes it.
+fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
+    let start = |(index, _): (usize, &Case)| lab.fly(index, "forward", "", &[], &VEHICLE);
+    let flights: Vec<_> = cases.iter().enumerate().map(start).collect();
+    let lab = Mutex::new(lab);
+    std::thread::scope(|scope| {
+        let lab = &lab;
+        let flights: Vec<_> = cases
+            .iter()
+            .zip(flights)
+            .map(|(case, flight)| scope.spawn(move || fly_one(lab, case, flight)))
+            .collect();
+        flights.into_iter().map(|flight| flight.join().expect("a flight's thread")).collect()
+    })
+}
+
+/// Strikes a vehicle half a metre into its flight, at 0.5 m/s.
+fn fly_one(lab: &Mutex<&mut Lab>, case: &'static Case, mut flight: Flight) -> Row {
+    flight.until("\"phase\":\"flying\"");
+    let start = flight.now().p_m;
+    wait(case.name, || (flight.now().p_m - start).truncate().length() > 0.4);
+    let last_good = flight.now();
+    strike(lab, &mut flight, case.loss);
+    judge(case, flight, last_good)
+}
+
+fn wait(what: &str, done: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !done() {
+        assert!(Instant::now() < deadline, "{what}: waited in vain");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Lets the loss happen, and end if it does, on the simulator's clock.
+fn strike(lab: &Mutex<&mut Lab>, flight: &mut Flight, loss: Loss) {
+    let since_s = flight.now().stamp_s;
+    match loss {
+        Loss::Runtime => flight.kill_runtime(),
+        Loss::Server => lab.lock().expect("nobody panics with it").kill_server(),
+        Loss::Mavlink(seconds) => {
+            flight.cuts().mavlink.store(true, Ordering::Relaxed);
+            wait("the cut", || seconds == FOR_EVER || flight.now().stamp_s - since_s >= seconds);
+            flight.cuts().mavlink.store(seconds == FOR_EVER, Ordering::Relaxed);
+        }
+        Loss::Poses(seconds) => {
+            flight.cuts().poses.store(true, Ordering::Relaxed);
+            wait("the stall", || seconds == FOR_EVER || flight.now().stamp_s - since_s >= seconds);
+            flight.cuts().poses.store(seconds == FOR_EVER, Ordering::Relaxed);
+        }
+        Loss::Autopilot => {
+            let reboot = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+                command: MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
+                param1: 1.0,
+                // While armed it must be forced, as a fault would.
+                param6: 20_190_226.0,
+                target_system: 1,
+                target_component: 1,
+                ..Default::default()
+            });
+            let header = MavHeader { system_id: 254, component_id: 1, sequence: 0 };
+            flight.tell_vehicle(encode(header, &reboot, &mut [0; MAX_PACKET]));
+        }
+    }
+}
+
+/// Watches the rest of a flight.
+fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
+    let over_s = match case.loss {
+        Loss::Mavlink(seconds) | Loss::Poses(seconds) if seconds < FOR_EVER => seconds,
+        _ => 0.0,
+    };
+    let since_s = |sight: &Sight| sight.stamp_s - last_good.stamp_s;
+    let is_down = |sight: &Sight| sight.p_m.z < DOWN_M;
+    // One that lands is watched until it is down, or ought to be; one that flies on for a while.
+    wait(case.name, || {
+        let now = flight.now();
+        if case.lands {
+            is_down(&now) || since_s(&now) > 3.0 * DOWN_WITHIN_S
+        } else {
+            since_s(&now) > over_s + WATCH_S
+        }
+    });
+    let (track, modes) = flight.so_far();
+    let lost: Vec<_> = track.iter().filter(|sight| sight.stamp_s >= last_good.stamp_s).collect();
+    let down = lost.iter().find(|sight| is_down(sight));
+    let until_s = match (case.lands, down) {
+        (true, Some(down)) => since_s(down),
+        (true, None) => f64::INFINITY,
+        (false, _) => over_s,
+    };
+    let drift_m = lost
+        .iter()
+        .filter(|sight| since_s(sight) <= until_s)
+        .map(|sight| (sight.p_m - last_good.p_m).truncate().length())
+        .fold(0.0, f64::max);
+    let at_s = |at: Instant| {
+        lost.iter().find(|sight| sight.at >= at).map_or(f64::NAN, |sight| since_s(sight))
+    };
+    let land = CopterMode::Land as u32;
+    let landed = modes.iter().find(|&&(at, mode)| mode == land && at >= last_good.at);
+    let row = Row {
+        case,
+        // One that flies on stands later too, at the end of its way.
+        stands_s: stands_s(&lost, &last_good).filter(|&s| case.lands || s <= over_s),
+        lands_s: landed.map(|&(at, _)| at_s(at)),
+        down_s: down.map(|sight| since_s(sight)),
+        drift_m,
+    };
+    // The runtime's own end is its own test's matter; a killed one has none.
+    drop(flight);
+    let outside = track.iter().find(|sight| !(FENCE_X_M.0..FENCE_X_M.1).contains(&sight.p_m.x));
+    assert!(outside.is_none(), "{}: left the fence: {outside:?}", case.name);
+    row
+}
+
+/// When the vehicle first moved along the ground by less than 3 cm in a fifth of a second.
+fn stands_s(lost: &[&Sight], last_good: &Sight) -> Option<f64> {
+    let mut later = 0;
+    lost.iter().find_map(|sight| {
+        while lost.get(later)?.stamp_s < sight.stamp_s + 0.2 {
+            later += 1;
+        }
+        let moved_m = (lost[later].p_m - sight.p_m).truncate().length();
+        (moved_m < 0.03).then_some(sight.stamp_s - last_good.stamp_s)
+    })
+}
+
+impl Row {
+    /// Returns what breaks the promise.
+    fn complaint(&self) -> Option<String> {
+        let name = self.case.name;
+        if !(self.drift_m <= DRIFT_AT_MOST_M) {
+            return Some(format!("{name}: drifted by {:.2} m", self.drift_m));
+        }
+        match (self.case.lands, self.down_s) {
+            (true, None) => Some(format!("{name}: it did not come down")),
+            (true, Some(down_s)) if !(down_s <= DOWN_WITHIN_S) => {
+                Some(format!("{name}: down after {down_s:.2} s"))
+            }
+            (false, Some(_)) => Some(format!("{name}: it landed")),
+            (false, None) if self.lands_s.is_some() => Some(format!("{name}: it began to land")),
+            _ => None,
+        }
+    }
+}
