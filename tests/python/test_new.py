@@ -75,6 +75,11 @@ def test_a_file_saved_in_flight_flies_and_one_that_breaks_lands(program, first):
         change(first, "HEIGHT_M = 1.0", "HEIGHT_M = 1.3")
         flight.wait_for("holding: the plugin is being started again")
         flight.wait_for("the plugin flies again")
+        # What is not Python changes nothing: the old one flies on.
+        change(first, "def on_image", "deff on_image")
+        flight.wait_for("not reloaded: first/plugin.py is not Python")
+        change(first, "deff on_image", "def on_image")
+        flight.wait_for("the plugin flies again")
         change(first, "front.depth, height_m", "front.deepth, height_m")
         flight.wait_for("the plugin flies again")
         report = flight.report()

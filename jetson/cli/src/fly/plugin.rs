@@ -154,7 +154,21 @@ fn python_of(script: &Path) -> PathBuf {
     if own.exists() { own } else { "python3".into() }
 }
 
-/// Finds out whether the plugin will find the package, before anything is started for it.
+/// Compiles the script, then finds the package as the script will: its own folder is the first that
+/// Python looks in.
+const CHECK: &str = "
+import sys
+try:
+    compile(open(sys.argv[1], 'rb').read(), sys.argv[1], 'exec')
+except (SyntaxError, ValueError) as error:
+    import traceback
+    sys.exit('cannot be compiled\\n' + ''.join(traceback.format_exception_only(error)))
+sys.path.insert(0, sys.argv[2])
+import vizflyt
+vizflyt.run
+";
+
+/// Finds out whether the plugin is Python and will find the package, before anything is started for it.
 fn check_python(python: &Path, script: &Path) -> Result<()> {
     let folder = script.parent().unwrap_or(Path::new(""));
     if folder.join("vizflyt.py").exists() {
@@ -163,9 +177,9 @@ fn check_python(python: &Path, script: &Path) -> Result<()> {
             folder.join("vizflyt.py").display()
         );
     }
-    // The script's own folder is the first that Python looks in.
     let output = Command::new(python)
-        .args(["-c", "import sys; sys.path.insert(0, sys.argv[1]); import vizflyt; vizflyt.run"])
+        .args(["-c", CHECK])
+        .arg(script)
         .arg(if folder == Path::new("") { Path::new(".") } else { folder })
         .stdin(Stdio::null())
         .output();
@@ -182,6 +196,9 @@ fn check_python(python: &Path, script: &Path) -> Result<()> {
         return Ok(());
     }
     let words = String::from_utf8_lossy(&output.stderr);
+    if let Some(mistake) = words.strip_prefix("cannot be compiled\n") {
+        bail!("{} is not Python:\n{}", script.display(), mistake.trim_end());
+    }
     let last = words.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
     let venv = folder.join(".venv");
     let package = match sources() {
@@ -297,6 +314,17 @@ mod tests {
         fs::write(folder.path().join("vizflyt.py"), "").unwrap();
         let error = check_python(Path::new("python3"), &script).unwrap_err().to_string();
         assert!(error.contains("vizflyt.py hides the package"), "{error}");
+    }
+
+    #[test]
+    fn a_script_that_is_not_python_is_shown_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        fs::write(&script, "import vizflyt\nclass First(vizflyt.Plugin:\n").unwrap();
+        let error = check_python(Path::new("python3"), &script).unwrap_err().to_string();
+        for part in ["plugin.py is not Python", "line 2", "class First", "SyntaxError"] {
+            assert!(error.contains(part), "no {part:?} in {error}");
+        }
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! `--watch`: looks at a plugin's files and has it started anew when one is saved. A Cargo project is
-//! built first, while the old plugin flies on; what does not build changes nothing.
+//! built first, and a script compiled, while the old plugin flies on; what fails there changes nothing.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
