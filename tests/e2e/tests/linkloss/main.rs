@@ -106,13 +106,31 @@ const CASES: [Case; 9] = [
 
 /// Vehicles that fly at a time; the server is the last row's, alone.
 const TOGETHER: usize = 4;
-/// The vehicle's own failsafes (`hardware/airframe`): the runtime cannot act for it when it is gone.
-const VEHICLE: [&str; 5] = [
-    "--param=FS_GCS_ENABLE=5",
-    "--param=FS_GCS_TIMEOUT=3",
-    "--param=GUID_TIMEOUT=0.5",
-    "--param=FS_OPTIONS=8",
-    "--param=WP_YAW_BEHAVIOR=0",
+/// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
+/// for an autopilot that does not hear it.
+const PARAMETERS: [&str; 22] = [
+    "FS_GCS_ENABLE",
+    "FS_GCS_TIMEOUT",
+    "FS_THR_ENABLE",
+    "FS_EKF_ACTION",
+    "FS_CRASH_CHECK",
+    "FS_OPTIONS",
+    "GUID_TIMEOUT",
+    "FENCE_ENABLE",
+    "FENCE_TYPE",
+    "FENCE_ACTION",
+    "FENCE_ALT_MAX",
+    "FENCE_RADIUS",
+    "BATT_MONITOR",
+    "BATT_LOW_VOLT",
+    "BATT_FS_LOW_ACT",
+    "WP_SPD",
+    "WP_SPD_UP",
+    "WP_SPD_DN",
+    "WP_YAW_BEHAVIOR",
+    "LAND_SPD_MS",
+    "LAND_SPD_HIGH_MS",
+    "LAND_ALT_LOW_M",
 ];
 /// Down means this near the floor. [m]
 const DOWN_M: f64 = 0.05;
@@ -162,7 +180,9 @@ fn whatever_is_lost_the_vehicle_is_down_in_time_or_flies_on() {
 
 /// Flies some cases at once, each with a thread that strikes it.
 fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
-    let start = |(index, _): (usize, &Case)| lab.fly(index, "forward", "", &[], &VEHICLE);
+    let vehicle = vehicle();
+    let vehicle: Vec<&str> = vehicle.iter().map(String::as_str).collect();
+    let start = |(index, _): (usize, &Case)| lab.fly(index, "forward", "", &[], &vehicle);
     let flights: Vec<_> = cases.iter().enumerate().map(start).collect();
     let lab = Mutex::new(lab);
     std::thread::scope(|scope| {
@@ -174,6 +194,20 @@ fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
             .collect();
         flights.into_iter().map(|flight| flight.join().expect("a flight's thread")).collect()
     })
+}
+
+/// Returns the simulator's arguments for a vehicle set up as `hardware/airframe` says, with a pilot.
+fn vehicle() -> Vec<String> {
+    let path = vizflyt_e2e::root().join("hardware/airframe/whippet-copter-4.8.param");
+    let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
+    let values: Vec<_> = text
+        .lines()
+        .filter_map(|line| line.split_once(','))
+        .filter(|(name, _)| PARAMETERS.contains(name))
+        .map(|(name, value)| format!("--param={name}={value}"))
+        .collect();
+    assert_eq!(values.len(), PARAMETERS.len(), "hardware/airframe lacks one of {PARAMETERS:?}");
+    values.into_iter().chain(["--radio".to_owned()]).collect()
 }
 
 /// Strikes a vehicle half a metre into its flight, at 0.5 m/s.
