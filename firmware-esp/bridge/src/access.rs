@@ -133,7 +133,7 @@ pub(crate) struct Access {
 }
 
 impl Access {
-    pub(crate) fn new(random: [u8; 16]) -> Self {
+    pub(crate) const fn new(random: [u8; 16]) -> Self {
         Self { random, counter: 0, signed_at: 0 }
     }
 

@@ -12,7 +12,11 @@
 #![no_std]
 
 pub mod access;
+#[cfg(feature = "net")]
+pub mod blink;
 pub mod bridge;
+pub mod dhcp;
+pub mod mdns;
 pub mod packet;
 mod ring;
 pub mod seal;
@@ -22,6 +26,8 @@ pub mod shell;
 pub mod stats;
 pub mod storage;
 mod targets;
+#[cfg(feature = "net")]
+pub mod wifi;
 
 pub use bridge::{Bridge, Chip, Event, Peer};
 pub use settings::Settings;

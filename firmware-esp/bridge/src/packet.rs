@@ -77,6 +77,12 @@ pub struct CutStats {
     pub dropped_bytes: u32,
 }
 
+impl CutStats {
+    /// Nothing yet; as the default, but `const`.
+    pub(crate) const NONE: Self =
+        Self { packets: 0, unknown: 0, bad_checksum: 0, dropped_bytes: 0 };
+}
+
 /// Bytes of a stream in, whole packets out.
 #[derive(Clone, Debug)]
 pub struct Cutter {
@@ -90,11 +96,16 @@ const BUFFER: usize = MAX_PACKET + 128;
 
 impl Default for Cutter {
     fn default() -> Self {
-        Self { buffer: [0; BUFFER], filled: 0, stats: CutStats::default() }
+        Self::new()
     }
 }
 
 impl Cutter {
+    /// An empty one.
+    pub const fn new() -> Self {
+        Self { buffer: [0; BUFFER], filled: 0, stats: CutStats::NONE }
+    }
+
     /// Takes bytes and calls `sink` with each whole packet, in order.
     pub fn push(&mut self, mut bytes: &[u8], mut sink: impl FnMut(Raw<'_>)) {
         while !bytes.is_empty() {

@@ -74,6 +74,13 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
+        Self { hostname: text("vizflyt"), ..Self::unnamed() }
+    }
+}
+
+impl Settings {
+    /// The defaults without a name; `const`, for a chip's static memory.
+    pub(crate) const fn unnamed() -> Self {
         Self {
             baud: 921_600,
             flow_control: false,
@@ -93,7 +100,7 @@ impl Default for Settings {
             password: String::new(),
             ap_ssid: String::new(),
             ap_password: String::new(),
-            hostname: text("vizflyt"),
+            hostname: String::new(),
             address: None,
             gateway: None,
             client: None,

@@ -67,7 +67,7 @@ type Wake = Signal<NoopRawMutex, ()>;
 
 impl Shared {
     /// Takes a bridge.
-    pub fn new(bridge: Bridge) -> Self {
+    pub const fn new(bridge: Bridge) -> Self {
         Self {
             bridge: RefCell::new(bridge),
             uart: Wake::new(),

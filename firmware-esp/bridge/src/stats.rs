@@ -62,7 +62,22 @@ pub struct Stats {
     pub refused: u32,
 }
 
+impl Side {
+    const NONE: Self =
+        Self { bytes_in: 0, bytes_out: 0, packets_out: 0, lost: 0, cut: CutStats::NONE };
+}
+
 impl Stats {
+    /// Nothing yet; as the default, but `const`.
+    pub(crate) const NONE: Self = Self {
+        uart: Side::NONE,
+        net: Side::NONE,
+        drops: [0; REASONS.len()],
+        round_trip_us: 0,
+        landings: 0,
+        refused: 0,
+    };
+
     /// Counts packets dropped for `reason`.
     pub(crate) fn drop(&mut self, reason: Reason, packets: u32) {
         let counter = &mut self.drops[reason as usize];

@@ -9,7 +9,6 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::time::HostTime;
 
-use super::Chip;
 use super::clients::bit;
 use super::hub::{Hub, kind, millis};
 use super::loss::{Act, Flight};
@@ -46,12 +45,12 @@ pub(super) struct Asked {
 }
 
 impl Asked {
-    pub(super) fn new(chip: &Chip) -> Self {
+    pub(super) const fn new(random: [u8; 16]) -> Self {
         Self {
             syncs: heapless::Deque::new(),
             client_asked_at: None,
             ours: None,
-            access: Access::new(chip.random),
+            access: Access::new(random),
         }
     }
 

@@ -65,35 +65,47 @@ pub(super) struct Hub {
 }
 
 impl Hub {
-    pub(super) fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
-        let mut hub = Self {
-            chip,
-            stats: Stats::default(),
+    /// One that has not begun; `const`, so that it lies in a chip's static memory from the start
+    /// and never on its stack.
+    pub(super) const fn empty() -> Self {
+        Self {
+            chip: Chip { address: [0; 6], random: [0; 16] },
+            stats: Stats::NONE,
             down: Ring::new(),
             urgent: Ring::new(),
             normal: Ring::new(),
             clients: [const { None }; CLIENTS],
             turn: 0,
             uart_sequences: Sequences::new(),
-            uart_at: now,
+            uart_at: HostTime::ZERO,
             uart_busy: false,
             autopilot: None,
-            autopilot_at: now,
-            flight: Flight::default(),
+            autopilot_at: HostTime::ZERO,
+            flight: Flight::UNKNOWN,
             heartbeat: heapless::Vec::new(),
-            loss: LinkLoss::default(),
+            loss: LinkLoss::NONE,
             events: Deque::new(),
-            started_at: now,
-            second_at: now.plus_seconds(SECOND_S),
+            started_at: HostTime::ZERO,
+            second_at: HostTime::ZERO,
             beacon_due: false,
             broadcast: None,
             signal_dbm: None,
             uart_sequence: 0,
-            asked: super::component::Asked::new(&chip),
-            settings,
-        };
-        hub.fix_client(now);
-        hub
+            asked: super::component::Asked::new([0; 16]),
+            settings: Settings::unnamed(),
+        }
+    }
+
+    /// Begins at `now`.
+    pub(super) fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
+        self.asked = super::component::Asked::new(chip.random);
+        self.chip = chip;
+        self.settings = settings;
+        self.uart_at = now;
+        self.autopilot_at = now;
+        self.started_at = now;
+        self.second_at = now.plus_seconds(SECOND_S);
+        self.fix_client(now);
     }
 
     /// Gives the client of the settings its place.

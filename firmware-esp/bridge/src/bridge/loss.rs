@@ -19,6 +19,9 @@ pub(crate) struct Flight {
 }
 
 impl Flight {
+    /// Before the first heartbeat; as the default, but `const`.
+    pub(crate) const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
+
     /// Whether the vehicle does what a companion says.
     pub(crate) fn follows(self) -> bool {
         let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
@@ -69,6 +72,9 @@ pub(crate) enum Act {
 }
 
 impl LinkLoss {
+    /// No companion yet; as the default, but `const`.
+    pub(crate) const NONE: Self = Self { streamer: None, landing: None };
+
     /// Takes note of a packet from the network; `streams`: it is a setpoint or a pose.
     pub(crate) fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
         match &mut self.streamer {

@@ -56,11 +56,20 @@ pub struct Bridge {
 impl Bridge {
     /// Makes a bridge at `now`.
     pub fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
-        Self {
-            uart: Cutter::default(),
-            tcp: core::array::from_fn(|_| Cutter::default()),
-            hub: Hub::new(now, settings, chip),
-        }
+        let mut bridge = Self::empty();
+        bridge.begin(now, settings, chip);
+        bridge
+    }
+
+    /// A bridge that has not begun: `const`, for a chip's static memory, whose stack has no room
+    /// for one.
+    pub const fn empty() -> Self {
+        Self { uart: Cutter::new(), tcp: [const { Cutter::new() }; TCP_SLOTS], hub: Hub::empty() }
+    }
+
+    /// Begins at `now`; once, before anything else.
+    pub fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
+        self.hub.begin(now, settings, chip);
     }
 
     // ---- what goes in ----

@@ -1,0 +1,246 @@
+//! Which network a bridge is part of: joins the one of the settings, falls back to its own, and
+//! comes back. Addresses, and the name to be found by, go with it.
+//!
+//! ```text
+//! station: join ─ joined ─▶ address (DHCP or fixed) ─ lost ─▶ join ...
+//!            └─ not for `fallback_s` ─▶ own network ─ nobody there for a minute ─▶ join ...
+//! access point: own network, 192.168.4.1, which gives addresses to whoever joins
+//! ```
+
+use core::fmt::Write as _;
+use core::future::pending;
+use core::net::{Ipv4Addr, SocketAddrV4};
+
+use embassy_futures::join::join;
+use embassy_futures::select::select;
+use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::{ConfigV4, DhcpConfig, IpAddress, Ipv4Cidr, Stack, StaticConfigV4};
+use embassy_time::{Duration, Instant, Timer, with_timeout};
+use heapless::String;
+
+use crate::settings::{Settings, WifiRole};
+use crate::shell::Shared;
+use crate::{dhcp, mdns};
+
+/// The radio of a chip. It is one interface of the network stack, in whichever role.
+#[allow(async_fn_in_trait)] // Why: a bridge is one task; nothing needs to be `Send`.
+pub trait Radio {
+    /// Tries once to join a network, for ten seconds or so; returns whether it did. An empty
+    /// password: an open network.
+    async fn join(&mut self, ssid: &str, password: &str) -> bool;
+
+    /// Returns when the network that was joined is lost.
+    async fn lost(&mut self);
+
+    /// Makes a network of its own; returns whether it could. An empty password leaves it open.
+    async fn open(&mut self, ssid: &str, password: &str, channel: u8) -> bool;
+}
+
+/// Address of a bridge in its own network.
+pub const OWN_ADDRESS: Ipv4Addr = Ipv4Addr::new(192, 168, 4, 1);
+/// Sockets that this module opens.
+pub const SOCKETS: usize = 2;
+
+/// Memory of its sockets.
+#[derive(Debug)]
+pub struct Buffers {
+    leases: dhcp::Leases,
+    dhcp: Socket<DHCP_REQUEST, { dhcp::ANSWER }>,
+    mdns: Socket<MDNS_QUERY, { mdns::ANSWER }>,
+}
+
+#[derive(Debug)]
+struct Socket<const IN: usize, const OUT: usize> {
+    meta_in: [PacketMetadata; 1],
+    bytes_in: [u8; IN],
+    meta_out: [PacketMetadata; 1],
+    bytes_out: [u8; OUT],
+}
+
+/// The longest request that a station may send before it knows us (RFC 2131, section 2). [bytes]
+const DHCP_REQUEST: usize = 548;
+/// A query for one name; those that ask for dozens of services are not for us. [bytes]
+const MDNS_QUERY: usize = 256;
+
+impl<const IN: usize, const OUT: usize> Socket<IN, OUT> {
+    const fn new() -> Self {
+        Self {
+            meta_in: [PacketMetadata::EMPTY],
+            bytes_in: [0; IN],
+            meta_out: [PacketMetadata::EMPTY],
+            bytes_out: [0; OUT],
+        }
+    }
+
+    fn open<'a>(&'a mut self, stack: Stack<'a>, port: u16) -> UdpSocket<'a> {
+        let Self { meta_in, bytes_in, meta_out, bytes_out } = self;
+        let mut socket = UdpSocket::new(stack, meta_in, bytes_in, meta_out, bytes_out);
+        // The port is not 0 and the socket is new: nothing else is refused.
+        let _ = socket.bind(port);
+        socket
+    }
+}
+
+impl Default for Buffers {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Buffers {
+    /// Empty buffers; `const`, for a chip's static memory.
+    pub const fn new() -> Self {
+        Self { leases: dhcp::Leases::new(), dhcp: Socket::new(), mdns: Socket::new() }
+    }
+}
+
+/// Keeps the bridge on a network, for ever.
+pub async fn run<R: Radio>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    radio: &mut R,
+    buffers: &mut Buffers,
+) -> ! {
+    let Buffers { leases, dhcp, mdns } = buffers;
+    // A group of its own for queries; where the stack has no place for it the name is not found.
+    let _ = stack.join_multicast_group(IpAddress::Ipv4(mdns::GROUP.0));
+    join(
+        keep(shared, stack, radio),
+        join(
+            give_addresses(stack, leases, dhcp.open(stack, 67)),
+            answer_to_name(shared, stack, mdns.open(stack, mdns::GROUP.1)),
+        ),
+    )
+    .await;
+    // Each of the three is endless.
+    pending().await
+}
+
+/// Joins, falls back, comes back.
+async fn keep<R: Radio>(shared: &Shared, stack: Stack<'_>, radio: &mut R) {
+    loop {
+        let settings = shared.with(|bridge, _| bridge.settings().clone());
+        let joins = settings.wifi_role == WifiRole::Station && !settings.ssid.is_empty();
+        if joins {
+            be_station(stack, radio, &settings).await;
+        }
+        let name = own_name(shared, &settings);
+        stack.set_config_v4(ConfigV4::None);
+        if !radio.open(&name, &settings.ap_password, settings.wifi_channel).await {
+            Timer::after(Duration::from_secs(1)).await;
+            continue;
+        }
+        stack.set_config_v4(ConfigV4::Static(fixed(OWN_ADDRESS, 24, None)));
+        if !joins {
+            pending::<()>().await;
+        }
+        // Whoever flies by the fallback keeps it: back only when nobody is there.
+        let mut lonely_since = Instant::now();
+        while lonely_since.elapsed() < LONELY {
+            Timer::after(Duration::from_secs(1)).await;
+            if shared.with(|bridge, _| bridge.is_armed() || bridge.clients().next().is_some()) {
+                lonely_since = Instant::now();
+            }
+        }
+    }
+}
+
+/// How long nobody is there before the settings' network is tried again.
+const LONELY: Duration = Duration::from_secs(60);
+
+/// Returns when the network could not be had for the set time.
+async fn be_station<R: Radio>(stack: Stack<'_>, radio: &mut R, settings: &Settings) {
+    let patience = Duration::from_secs(settings.fallback_s.into());
+    let mut without_since = Instant::now();
+    while without_since.elapsed() < patience {
+        if !radio.join(&settings.ssid, &settings.password).await {
+            Timer::after(Duration::from_millis(500)).await;
+            continue;
+        }
+        stack.set_config_v4(match settings.address {
+            Some((address, prefix)) => ConfigV4::Static(fixed(address, prefix, settings.gateway)),
+            None => ConfigV4::Dhcp(asks(settings)),
+        });
+        let mut has_address = false;
+        let address = async {
+            has_address = with_timeout(patience, stack.wait_config_up()).await.is_ok();
+            if has_address {
+                pending::<()>().await;
+            }
+            // A network that gives no address is none.
+        };
+        select(radio.lost(), address).await;
+        stack.set_config_v4(ConfigV4::None);
+        if has_address {
+            without_since = Instant::now();
+        }
+    }
+}
+
+fn fixed(address: Ipv4Addr, prefix: u8, gateway: Option<Ipv4Addr>) -> StaticConfigV4 {
+    StaticConfigV4 {
+        address: Ipv4Cidr::new(address, prefix),
+        gateway,
+        dns_servers: heapless::Vec::new(),
+    }
+}
+
+fn asks(settings: &Settings) -> DhcpConfig {
+    let mut config = DhcpConfig::default();
+    config.hostname = settings.hostname.as_str().try_into().ok();
+    config
+}
+
+/// Returns the name of the network we make.
+fn own_name(shared: &Shared, settings: &Settings) -> String<32> {
+    if !settings.ap_ssid.is_empty() {
+        return settings.ap_ssid.clone();
+    }
+    let [.., a, b, c] = shared.with(|bridge, _| bridge.chip().address);
+    let mut name = String::new();
+    // 14 characters fit.
+    let _ = write!(name, "vizflyt-{a:02x}{b:02x}{c:02x}");
+    name
+}
+
+/// Gives addresses to those in our own network.
+async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket: UdpSocket<'_>) {
+    let everybody = SocketAddrV4::new(Ipv4Addr::BROADCAST, 68);
+    let mut answer = [0; dhcp::ANSWER];
+    loop {
+        let len = socket
+            .recv_from_with(|request, _| {
+                own_address(stack)
+                    .filter(|&address| address == OWN_ADDRESS)
+                    .and_then(|address| leases.answer(address, request, &mut answer))
+            })
+            .await;
+        if let Some(len) = len {
+            // A lost answer is asked for again.
+            let _ = socket.send_to(&answer[..len], everybody).await;
+        }
+    }
+}
+
+/// Lets the bridge be found by its name.
+async fn answer_to_name(shared: &Shared, stack: Stack<'_>, mut socket: UdpSocket<'_>) {
+    let group = SocketAddrV4::new(mdns::GROUP.0, mdns::GROUP.1);
+    let mut answer = [0; mdns::ANSWER];
+    loop {
+        let len = socket
+            .recv_from_with(|query, _| {
+                let address = own_address(stack)?;
+                shared.with(|bridge, _| {
+                    mdns::answer(query, &bridge.settings().hostname, address, &mut answer)
+                })
+            })
+            .await;
+        if let Some(len) = len {
+            let _ = socket.send_to(&answer[..len], group).await;
+        }
+    }
+}
+
+fn own_address(stack: Stack<'_>) -> Option<Ipv4Addr> {
+    stack.config_v4().map(|config| config.address.address())
+}

@@ -1,0 +1,64 @@
+//! What a person sees and presses, and what the bridge asks of the chip besides bytes.
+
+use core::sync::atomic::{AtomicU8, Ordering};
+
+use embassy_time::{Duration, Instant, Timer};
+use embedded_storage::nor_flash::NorFlash;
+use esp_hal::gpio::Input;
+use esp_println::println;
+use vizflyt_bridge::shell::{Light, Platform};
+
+use crate::flash::{self, Flash};
+use crate::{radio, serial};
+
+/// How long the button is held to forget the settings, the key among them.
+const HELD: Duration = Duration::from_secs(5);
+
+static LIGHT: AtomicU8 = AtomicU8::new(Light::NoNetwork as u8);
+
+/// Returns what the light says now.
+pub(crate) fn light() -> Light {
+    let code = LIGHT.load(Ordering::Relaxed);
+    [Light::Forwarding, Light::NoAutopilot, Light::NoClient, Light::Unclaimed, Light::Landing]
+        .into_iter()
+        .find(|&light| light as u8 == code)
+        .unwrap_or(Light::NoNetwork)
+}
+
+/// The chip, for the bridge.
+pub(crate) struct Front;
+
+impl Platform for Front {
+    fn restart(&mut self) {
+        esp_hal::system::software_reset();
+    }
+
+    fn show(&mut self, light: Light) {
+        println!("{light:?}; serial overruns {}", serial::overruns());
+        LIGHT.store(light as u8, Ordering::Relaxed);
+    }
+
+    fn signal_dbm(&mut self) -> Option<i8> {
+        radio::signal_dbm()
+    }
+}
+
+/// Watches the button, for ever: held, it forgets the settings and restarts.
+pub(crate) async fn watch(button: Input<'static>, flash: &'static Flash) -> ! {
+    let mut released_at = Instant::now();
+    loop {
+        Timer::after(Duration::from_millis(100)).await;
+        if button.is_high() {
+            released_at = Instant::now();
+        }
+        if released_at.elapsed() >= HELD {
+            let mut settings = flash::settings(flash);
+            let len = settings.len;
+            match settings.erase(0, len) {
+                Ok(()) => println!("the settings are forgotten"),
+                Err(error) => println!("the settings stay: {error:?}"),
+            }
+            esp_hal::system::software_reset();
+        }
+    }
+}

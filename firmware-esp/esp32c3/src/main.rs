@@ -1,0 +1,152 @@
+//! The bridge on an ESP32-C3: pins, radio, flash and executor; what it does is the shared core.
+//!
+//! ```text
+//! GPIO4 ──▶ autopilot RX      GPIO5 ◀── autopilot TX       UART1, 921600 baud
+//! GPIO6 RTS ──▶ CTS           GPIO7 CTS ◀── RTS            only with UART_FLOW
+//! GPIO10 LED to ground, GPIO8 LED to 3.3 V (on most boards)
+//! GPIO9 the BOOT button: held for five seconds it forgets the settings
+//! USB: log, and flashing
+//! ```
+//! The autopilot's bytes are taken in an interrupt, the radio has the scheduler's threads, and the
+//! bridge is the tasks of the main thread.
+
+#![no_std]
+#![no_main]
+
+extern crate alloc;
+
+mod flash;
+mod front;
+mod radio;
+mod serial;
+mod update;
+
+use core::cell::RefCell;
+
+use embassy_executor::Spawner;
+use embassy_net::{Runner, Stack, StackResources};
+use esp_backtrace as _;
+use esp_hal::clock::CpuClock;
+use esp_hal::gpio::{Input, InputConfig, Level, Output, OutputConfig, Pull};
+use esp_hal::interrupt::Priority;
+use esp_hal::ram;
+use esp_hal::rng::Rng;
+use esp_hal::timer::timg::TimerGroup;
+use esp_hal::uart::{Uart, UartTx};
+use esp_hal::{Blocking, efuse};
+use esp_println::println;
+use esp_radio::wifi::{ControllerConfig, WifiController};
+use esp_rtos::embassy::InterruptExecutor;
+use esp_storage::FlashStorage;
+use static_cell::{ConstStaticCell, StaticCell};
+use vizflyt_bridge::shell::{self, Buffers, Shared};
+use vizflyt_bridge::storage::Store;
+use vizflyt_bridge::{Bridge, Chip, blink, wifi};
+
+esp_bootloader_esp_idf::esp_app_desc!();
+
+/// Memory of the radio's driver, its queues and the threads it runs in. The first part is what the
+/// chip's own loader used. [bytes]
+const RECLAIMED_BYTES: usize = 64 * 1024;
+const HEAP_BYTES: usize = 48 * 1024;
+
+#[esp_rtos::main]
+async fn main(spawner: Spawner) -> ! {
+    static FLASH: StaticCell<flash::Flash> = StaticCell::new();
+    static URGENT: StaticCell<InterruptExecutor<1>> = StaticCell::new();
+    static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
+        StaticCell::new();
+    static SHARED: ConstStaticCell<Shared> = ConstStaticCell::new(Shared::new(Bridge::empty()));
+    static BUFFERS: ConstStaticCell<Buffers> = ConstStaticCell::new(Buffers::new());
+    static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
+
+    let chip = esp_hal::init(esp_hal::Config::default().with_cpu_clock(CpuClock::max()));
+    esp_alloc::heap_allocator!(#[ram(reclaimed)] size: RECLAIMED_BYTES);
+    esp_alloc::heap_allocator!(size: HEAP_BYTES);
+    // The radio's driver needs the scheduler before anything else.
+    esp_rtos::start(TimerGroup::new(chip.TIMG0).timer0, chip.FROM_CPU_INTR0);
+
+    let flash: &'static flash::Flash =
+        FLASH.init_with(|| RefCell::new(FlashStorage::new(chip.FLASH)));
+    let mut store = Store::new(flash::settings(flash), 0);
+    let settings = store.load().unwrap_or_default();
+    update::came_up(flash);
+
+    let port = Uart::new(chip.UART1, serial::config(settings.baud, settings.flow_control))
+        // The settings keep within what the port can do.
+        .unwrap_or_else(|error| panic!("the serial port refuses {} baud: {error}", settings.baud))
+        .with_tx(chip.GPIO4)
+        .with_rx(chip.GPIO5);
+    let port =
+        if settings.flow_control { port.with_rts(chip.GPIO6).with_cts(chip.GPIO7) } else { port };
+    let (receiver, sender) = port.split();
+    let urgent = URGENT.init(InterruptExecutor::new(chip.FROM_CPU_INTR1));
+    // Each task is spawned once: its one place is free.
+    urgent.start(Priority::Priority3).spawn(serial::receive(receiver).unwrap());
+
+    let rng = Rng::new();
+    let mut random = [0; 16];
+    let mut seed = [0; 8];
+    let controller = WifiController::new(chip.WIFI, ControllerConfig::default())
+        .unwrap_or_else(|error| panic!("the radio does not start: {error:?}"));
+    // Random indeed only with the radio on.
+    rng.read(&mut random);
+    rng.read(&mut seed);
+    let (stack, runner) = embassy_net::new(
+        radio::Radio::new(),
+        embassy_net::Config::default(),
+        RESOURCES.init_with(StackResources::new),
+        u64::from_le_bytes(seed),
+    );
+
+    let shared: &'static Shared = SHARED.take();
+    let mut address = [0; 6];
+    address.copy_from_slice(efuse::base_mac_address().as_bytes());
+    println!("vizflyt bridge {}, {} baud", env!("CARGO_PKG_VERSION"), settings.baud);
+    shared.with(|bridge, now| bridge.begin(now, settings, Chip { address, random }));
+
+    spawner.spawn(network(runner).unwrap());
+    spawner.spawn(join_networks(shared, stack, controller, WIFI.take()).unwrap());
+    spawner.spawn(forward(shared, stack, sender, store, BUFFERS.take()).unwrap());
+    let led = Output::new(chip.GPIO10, Level::Low, OutputConfig::default());
+    let board_led = Output::new(chip.GPIO8, Level::High, OutputConfig::default());
+    let button = Input::new(chip.GPIO9, InputConfig::default().with_pull(Pull::Up));
+    spawner.spawn(light(led, board_led).unwrap());
+    front::watch(button, flash).await
+}
+
+#[embassy_executor::task]
+async fn network(mut runner: Runner<'static, radio::Radio>) {
+    runner.run().await;
+}
+
+#[embassy_executor::task]
+async fn join_networks(
+    shared: &'static Shared,
+    stack: Stack<'static>,
+    controller: WifiController<'static>,
+    buffers: &'static mut wifi::Buffers,
+) {
+    wifi::run(shared, stack, &mut radio::Control::new(controller), buffers).await;
+}
+
+#[embassy_executor::task]
+async fn forward(
+    shared: &'static Shared,
+    stack: Stack<'static>,
+    sender: UartTx<'static, Blocking>,
+    mut store: Store<flash::Region>,
+    buffers: &'static mut Buffers,
+) {
+    let port = (&serial::RECEIVED, sender.into_async());
+    shell::run(shared, stack, port, &mut store, &mut front::Front, buffers).await;
+}
+
+#[embassy_executor::task]
+async fn light(mut led: Output<'static>, mut board_led: Output<'static>) {
+    blink::run(front::light, |on| {
+        led.set_level(on.into());
+        board_led.set_level((!on).into());
+    })
+    .await;
+}

@@ -1,0 +1,197 @@
+//! The radio as one Ethernet interface, whichever network it is part of.
+//!
+//! The chip has an interface of its own for each role, with an address of its own. The network
+//! stack sees one that changes its address: a bridge that falls back to its own network goes on
+//! with the same sockets.
+
+use core::cell::Cell;
+use core::sync::atomic::{AtomicI8, Ordering};
+use core::task::Context;
+
+use critical_section::Mutex;
+use embassy_futures::select::select;
+use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState};
+use embassy_sync::waitqueue::AtomicWaker;
+use embassy_time::{Duration, Timer, with_timeout};
+use esp_println::println;
+use esp_radio::wifi::ap::AccessPointConfig;
+use esp_radio::wifi::sta::StationConfig;
+use esp_radio::wifi::{
+    AuthenticationMethodConfig, Config, Interface, PowerSaveMode, WifiController,
+};
+use vizflyt_bridge::wifi;
+
+/// Which network the radio is part of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// None: it is being changed.
+    Off,
+    /// Somebody else's.
+    Station,
+    /// Its own.
+    AccessPoint,
+}
+
+static ROLE: Mutex<Cell<Role>> = Mutex::new(Cell::new(Role::Off));
+static CHANGED: AtomicWaker = AtomicWaker::new();
+
+/// Tells the network stack which interface counts from now on.
+pub(crate) fn set_role(role: Role) {
+    critical_section::with(|section| ROLE.borrow(section).set(role));
+    CHANGED.wake();
+}
+
+/// Returns the role.
+pub(crate) fn role() -> Role {
+    critical_section::with(|section| ROLE.borrow(section).get())
+}
+
+/// What the network stack drives.
+pub(crate) struct Radio {
+    station: Interface,
+    access_point: Interface,
+}
+
+impl Radio {
+    /// Takes both interfaces of the chip. Once.
+    pub(crate) fn new() -> Self {
+        Self { station: Interface::station(), access_point: Interface::access_point() }
+    }
+
+    fn current(&mut self) -> &mut Interface {
+        if role() == Role::AccessPoint { &mut self.access_point } else { &mut self.station }
+    }
+}
+
+impl Driver for Radio {
+    type RxToken<'a> = <Interface as Driver>::RxToken<'a>;
+    type TxToken<'a> = <Interface as Driver>::TxToken<'a>;
+
+    fn receive(&mut self, cx: &mut Context<'_>) -> Option<(Self::RxToken<'_>, Self::TxToken<'_>)> {
+        CHANGED.register(cx.waker());
+        Driver::receive(self.current(), cx)
+    }
+
+    fn transmit(&mut self, cx: &mut Context<'_>) -> Option<Self::TxToken<'_>> {
+        CHANGED.register(cx.waker());
+        Driver::transmit(self.current(), cx)
+    }
+
+    fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
+        CHANGED.register(cx.waker());
+        match role() {
+            Role::Off => LinkState::Down,
+            Role::Station | Role::AccessPoint => self.current().link_state(cx),
+        }
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        self.station.capabilities()
+    }
+
+    fn hardware_address(&self) -> HardwareAddress {
+        let interface =
+            if role() == Role::AccessPoint { &self.access_point } else { &self.station };
+        interface.hardware_address()
+    }
+}
+
+/// The radio, for the bridge.
+pub(crate) struct Control {
+    controller: WifiController<'static>,
+}
+
+/// Longer than any network takes that will let us in.
+const JOIN: Duration = Duration::from_secs(10);
+
+static SIGNAL_DBM: AtomicI8 = AtomicI8::new(0);
+
+/// Returns how well the network is heard that we are in. [dBm]
+pub(crate) fn signal_dbm() -> Option<i8> {
+    match SIGNAL_DBM.load(Ordering::Relaxed) {
+        0 => None,
+        dbm => Some(dbm),
+    }
+}
+
+impl Control {
+    /// Takes the chip's radio.
+    pub(crate) fn new(controller: WifiController<'static>) -> Self {
+        Self { controller }
+    }
+
+    fn configure(&mut self, config: &Config) -> bool {
+        let done = self.controller.set_config(config);
+        // Sleeping between beacons costs 100 ms of latency and more.
+        let awake = self.controller.set_power_saving(PowerSaveMode::None);
+        match done.and(awake) {
+            Ok(()) => true,
+            Err(error) => {
+                println!("the radio refuses: {error:?}");
+                false
+            }
+        }
+    }
+}
+
+/// An open network where there is no password.
+fn authentication(password: &str) -> Option<AuthenticationMethodConfig> {
+    if password.is_empty() {
+        return Some(AuthenticationMethodConfig::Open);
+    }
+    password.try_into().ok().map(AuthenticationMethodConfig::Wpa2Personal)
+}
+
+impl wifi::Radio for Control {
+    async fn join(&mut self, ssid: &str, password: &str) -> bool {
+        set_role(Role::Off);
+        let (Ok(ssid), Some(authentication)) = (ssid.try_into(), authentication(password)) else {
+            return false;
+        };
+        let config = StationConfig::default().with_ssid(ssid).with_authentication(authentication);
+        if !self.configure(&Config::Station(config)) {
+            return false;
+        }
+        match with_timeout(JOIN, self.controller.connect_async()).await {
+            Ok(Ok(_)) => {
+                set_role(Role::Station);
+                true
+            }
+            Ok(Err(error)) => {
+                println!("not joined: {error:?}");
+                false
+            }
+            Err(_) => false,
+        }
+    }
+
+    async fn lost(&mut self) {
+        let listen = async {
+            loop {
+                let dbm = self.controller.rssi().ok().and_then(|dbm| i8::try_from(dbm).ok());
+                SIGNAL_DBM.store(dbm.unwrap_or(0), Ordering::Relaxed);
+                Timer::after(Duration::from_secs(1)).await;
+            }
+        };
+        select(self.controller.wait_for_disconnect_async(), listen).await;
+        SIGNAL_DBM.store(0, Ordering::Relaxed);
+        set_role(Role::Off);
+    }
+
+    async fn open(&mut self, ssid: &str, password: &str, channel: u8) -> bool {
+        set_role(Role::Off);
+        let (Ok(ssid), Some(authentication)) = (ssid.try_into(), authentication(password)) else {
+            return false;
+        };
+        let config = AccessPointConfig::default()
+            .with_ssid(ssid)
+            .with_authentication(authentication)
+            .with_channel(channel);
+        let open = self.configure(&Config::AccessPoint(config));
+        if open {
+            println!("own network {ssid:?}, channel {channel}");
+            set_role(Role::AccessPoint);
+        }
+        open
+    }
+}

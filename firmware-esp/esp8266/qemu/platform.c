@@ -1,0 +1,258 @@
+/* The bridge's platform in QEMU: frames, serial line and flash are file descriptors of the
+ * emulator's process, which whoever starts it has opened. Reads return at once (the descriptors
+ * are non-blocking); the loop waits where nothing is due. */
+
+#include "../include/vizflyt_platform.h"
+
+int simcall(int number, int a, int b, int c);
+uint32_t cycles(void);
+int simcall_error;
+
+enum { SYS_EXIT = 1, SYS_READ = 3, SYS_WRITE = 4, SYS_LSEEK = 19, SYS_SELECT_ONE = 29 };
+enum { SELECT_READ = 1 };
+enum { EAGAIN = 11 };
+
+/* The descriptors: an AF_UNIX socket of one Ethernet frame a packet, a raw pty, a file. */
+enum { CONSOLE = 2, FRAMES = 100, SERIAL = 101, FLASH = 102 };
+
+/* QEMU does its I/O page by page, and a packet must be one read: a page of its own. */
+static uint8_t page[4096] __attribute__((aligned(4096)));
+
+/* ccount runs at this rate in QEMU's lx106 (its overlay's core frequency). [Hz] */
+#define CYCLES_PER_US 40u
+
+static volatile int woken;
+
+static void copy(uint8_t *to, const uint8_t *from, uint32_t len)
+{
+    while (len--)
+        *to++ = *from++;
+}
+
+static void stop(int status)
+{
+    for (;;)
+        simcall(SYS_EXIT, status, 0, 0);
+}
+
+uint32_t platform_time_us(void)
+{
+    static uint32_t last, rest, now_us;
+    uint32_t at = cycles();
+    uint32_t passed = at - last + rest;
+    last = at;
+    now_us += passed / CYCLES_PER_US;
+    rest = passed % CYCLES_PER_US;
+    return now_us;
+}
+
+uint32_t platform_random(void)
+{
+    /* Xorshift over the clock: only port numbers and identifiers depend on it here. */
+    static uint32_t state = 0x9E3779B9;
+    state ^= cycles();
+    state ^= state << 13;
+    state ^= state >> 17;
+    state ^= state << 5;
+    return state;
+}
+
+void platform_wake(void)
+{
+    woken = 1;
+}
+
+static void say(const char *line, uint32_t len)
+{
+    if (len > sizeof page - 1)
+        len = sizeof page - 1;
+    copy(page, (const uint8_t *)line, len);
+    page[len] = '\n';
+    simcall(SYS_WRITE, CONSOLE, (int)page, len + 1);
+}
+
+/* The core has given up. */
+void abort(void)
+{
+    say("abort", 5);
+    stop(1);
+    __builtin_unreachable();
+}
+
+void platform_restart(void)
+{
+    /* Whoever started the emulator starts it again. */
+    stop(2);
+    __builtin_unreachable();
+}
+
+uint32_t platform_uart_read(uint8_t *into, uint32_t len)
+{
+    if (len > sizeof page)
+        len = sizeof page;
+    int done = simcall(SYS_READ, SERIAL, (int)page, len);
+    if (done <= 0)
+        return 0;
+    copy(into, page, done);
+    return done;
+}
+
+uint32_t platform_uart_write(const uint8_t *bytes, uint32_t len)
+{
+    if (len > sizeof page)
+        len = sizeof page;
+    copy(page, bytes, len);
+    int done = simcall(SYS_WRITE, SERIAL, (int)page, len);
+    return done < 0 ? 0 : done;
+}
+
+uint32_t platform_uart_is_idle(void)
+{
+    return 1;
+}
+
+void platform_uart_configure(uint32_t baud, uint32_t flow_control)
+{
+    /* A pty has neither. */
+    (void)baud;
+    (void)flow_control;
+}
+
+void platform_mac(uint8_t into[6])
+{
+    static const uint8_t mac[6] = {0x02, 0x56, 0x46, 0x82, 0x66, 0x01}; /* locally administered */
+    copy(into, mac, 6);
+}
+
+uint32_t platform_frame_ready(void)
+{
+    return 1;
+}
+
+void platform_frame_out(const uint8_t *frame, uint32_t len)
+{
+    copy(page, frame, len);
+    /* A full socket: wait, as the radio's own queue would. */
+    while (simcall(SYS_WRITE, FRAMES, (int)page, len) < 0)
+        if (simcall_error != EAGAIN)
+            stop(0);
+}
+
+int32_t platform_wifi_station(const char *ssid, const char *password)
+{
+    (void)ssid;
+    (void)password;
+    return 0;
+}
+
+int32_t platform_wifi_access_point(const char *ssid, const char *password, uint32_t channel)
+{
+    (void)ssid;
+    (void)password;
+    (void)channel;
+    return 0;
+}
+
+uint32_t platform_link_up(void)
+{
+    return 1;
+}
+
+int32_t platform_rssi_dbm(void)
+{
+    return -50;
+}
+
+void platform_led(uint32_t on)
+{
+    (void)on;
+}
+
+/* The flash is a file as long as the chip's; the same rules: written bits only go from 1 to 0. */
+
+int32_t platform_flash_read(uint32_t address, uint8_t *into, uint32_t len)
+{
+    while (len) {
+        uint32_t part = len < sizeof page ? len : sizeof page;
+        if (simcall(SYS_LSEEK, FLASH, address, 0) != (int)address ||
+            simcall(SYS_READ, FLASH, (int)page, part) != (int)part)
+            return -1;
+        copy(into, page, part);
+        address += part;
+        into += part;
+        len -= part;
+    }
+    return 0;
+}
+
+int32_t platform_flash_write(uint32_t address, const uint8_t *bytes, uint32_t len)
+{
+    while (len) {
+        uint32_t part = len < sizeof page ? len : sizeof page;
+        if (simcall(SYS_LSEEK, FLASH, address, 0) != (int)address ||
+            simcall(SYS_READ, FLASH, (int)page, part) != (int)part)
+            return -1;
+        for (uint32_t i = 0; i < part; i++)
+            page[i] &= bytes[i];
+        if (simcall(SYS_LSEEK, FLASH, address, 0) != (int)address ||
+            simcall(SYS_WRITE, FLASH, (int)page, part) != (int)part)
+            return -1;
+        address += part;
+        bytes += part;
+        len -= part;
+    }
+    return 0;
+}
+
+int32_t platform_flash_erase(uint32_t sector)
+{
+    uint32_t address = sector * sizeof page;
+    for (uint32_t i = 0; i < sizeof page; i++)
+        page[i] = 0xFF;
+    if (simcall(SYS_LSEEK, FLASH, address, 0) != (int)address ||
+        simcall(SYS_WRITE, FLASH, (int)page, sizeof page) != (int)sizeof page)
+        return -1;
+    return 0;
+}
+
+extern uint32_t _stack_bottom[], _stack_top[];
+
+static void report_stack(void)
+{
+    uint32_t *deepest = _stack_bottom;
+    while (deepest < _stack_top && *deepest == 0xA5A5A5A5)
+        deepest++;
+    uint32_t used = (uint32_t)_stack_top - (uint32_t)deepest;
+    char line[32] = "stack used: ";
+    uint32_t at = 12;
+    for (uint32_t scale = 10000; scale; scale /= 10)
+        line[at++] = '0' + used / scale % 10;
+    say(line, at);
+}
+
+int main(void)
+{
+    vizflyt_start();
+    for (;;) {
+        int frames = 0, len = -1;
+        uint32_t zero[2] = {0, 0};
+        while (vizflyt_frame_room() && (len = simcall(SYS_READ, FRAMES, (int)page, 1600)) > 0) {
+            vizflyt_frame_in(page, len);
+            frames++;
+        }
+        if (len == 0) {
+            report_stack();
+            stop(0);
+        }
+        uint32_t events = VIZFLYT_UART_WRITABLE | VIZFLYT_FRAMES_SENT;
+        if (simcall(SYS_SELECT_ONE, SERIAL, SELECT_READ, (int)zero) > 0)
+            events |= VIZFLYT_UART_READABLE;
+        woken = 0;
+        uint32_t due_us = vizflyt_poll(events);
+        if (!woken && !frames && !(events & VIZFLYT_UART_READABLE)) {
+            /* The serial line cannot be waited for at the same time: look at it every 0.2 ms. */
+            uint32_t wait[2] = {0, due_us < 200 ? due_us : 200};
+            simcall(SYS_SELECT_ONE, FRAMES, SELECT_READ, (int)wait);
+        }
+    }
+}

@@ -1,0 +1,76 @@
+/* Where QEMU's lx106 begins and where its exceptions go. The chip itself starts in its ROM and in
+ * the vendor's SDK; this file is for the emulator only. */
+
+    .section .reset, "ax"
+    .global _start
+_start:
+    j       begin
+    .align  4
+    .literal_position
+begin:
+    movi    a0, 0
+    wsr     a0, ps          /* not in an exception, interrupts at level 0 */
+    isync
+    movi    a1, _stack_top
+    movi    a2, _stack_bottom
+    movi    a3, 0xA5A5A5A5  /* painted: how deep the stack went is read at the end */
+1:  s32i    a3, a2, 0
+    addi    a2, a2, 4
+    bltu    a2, a1, 1b
+    movi    a2, _bss_start
+    movi    a4, _bss_end
+    movi    a3, 0
+2:  bgeu    a2, a4, 3f
+    s32i    a3, a2, 0
+    addi    a2, a2, 4
+    j       2b
+3:  movi    a0, main
+    callx0  a0
+4:  j       4b
+
+/* Exceptions end the emulator with a status of their own: 0x60 + the vector's number. Offsets are
+ * the lx106's: debug 0x10, NMI 0x20, kernel 0x30, user 0x50, double 0x70. */
+    .macro  vector offset, status
+    .org    \offset
+    movi    a2, 1
+    movi    a3, \status
+    simcall
+    .endm
+
+    .section .vectors, "ax"
+    vector  0x10, 0x61
+    vector  0x20, 0x62
+    vector  0x30, 0x63
+    vector  0x50, 0x65
+    vector  0x70, 0x67
+
+    .section .text.simcall, "ax"
+    /* int simcall(int number, int a, int b, int c): the error number goes to simcall_error. */
+    .literal_position
+    .global simcall
+    .align  4
+simcall:
+    simcall
+    movi    a4, simcall_error
+    s32i    a3, a4, 0
+    ret
+
+    .section .text.cycles, "ax"
+    .global cycles
+    .align  4
+cycles:
+    rsr     a2, ccount
+    ret
+
+    .section .text.platform_interrupts, "ax"
+    .global platform_interrupts_off
+    .align  4
+platform_interrupts_off:
+    rsil    a2, 15
+    ret
+    .global platform_interrupts_restore
+    .align  4
+platform_interrupts_restore:
+    wsr     a2, ps
+    rsync
+    ret

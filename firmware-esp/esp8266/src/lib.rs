@@ -1,0 +1,170 @@
+//! The bridge on an ESP8266: the shared core behind a small C interface.
+//!
+//! ```text
+//! C (QEMU's semihosting, or the vendor's SDK)        Rust, one object for both
+//! main loop ── vizflyt_poll ──────────────────────▶ executor: network, bridge, light
+//! radio ────── vizflyt_frame_in ──────────────────▶ radio ring ─▶ embassy-net ─▶ sockets
+//! ◀─────────── platform_frame_out ─────────────────           ◀─
+//! UART ◀────── platform_uart_read, _write ──────────▶ bridge
+//! ```
+//! The loop calls [`vizflyt_poll`] after every event and when a timer is due; nothing here blocks,
+//! allocates, or runs in an interrupt.
+
+#![no_std]
+
+mod clock;
+mod flash;
+mod front;
+mod platform;
+mod radio;
+mod uart;
+
+use core::cell::Cell;
+use core::panic::PanicInfo;
+
+use critical_section::Mutex;
+use embassy_executor::raw::Executor;
+use embassy_net::{Config, Runner, Stack, StackResources};
+use static_cell::{ConstStaticCell, StaticCell};
+use vizflyt_bridge::shell::{self, Buffers, Shared};
+use vizflyt_bridge::storage::Store;
+use vizflyt_bridge::{Bridge, Chip, blink, wifi};
+
+/// Where the settings lie in the flash; see the SDK's map in `sdk/platform.c`.
+const SETTINGS: flash::Region = flash::Region { start: 0x3F_0000, len: 2 * flash::SECTOR };
+
+/// The executor, which belongs to the loop that calls [`vizflyt_poll`].
+#[derive(Clone, Copy)]
+struct Loop(&'static Executor);
+
+#[expect(unsafe_code, reason = "one core and one thread of control")]
+// SAFETY: the chip has one core, and interrupts never touch the executor but through `pender`.
+unsafe impl Send for Loop {}
+
+static RUNNING: Mutex<Cell<Option<Loop>>> = Mutex::new(Cell::new(None));
+
+#[expect(unsafe_code, reason = "what the executor calls to be polled again")]
+#[unsafe(export_name = "__pender")]
+fn pender(_context: *mut ()) {
+    platform::wake();
+}
+
+/// Builds the network, the bridge and their tasks. See `include/vizflyt_platform.h`.
+#[expect(unsafe_code, reason = "called from C")]
+#[unsafe(no_mangle)]
+pub extern "C" fn vizflyt_start() {
+    static EXECUTOR: StaticCell<Executor> = StaticCell::new();
+    static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
+        StaticCell::new();
+    static RADIO: StaticCell<radio::Radio> = StaticCell::new();
+    static SHARED: ConstStaticCell<Shared> = ConstStaticCell::new(Shared::new(Bridge::empty()));
+    static BUFFERS: ConstStaticCell<Buffers> = ConstStaticCell::new(Buffers::new());
+    static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
+
+    let mut store = Store::new(SETTINGS, 0);
+    let settings = store.load().unwrap_or_default();
+    platform::uart_configure(settings.baud, settings.flow_control);
+
+    let address = platform::mac();
+    let mut random = [0; 16];
+    for word in random.chunks_exact_mut(4) {
+        word.copy_from_slice(&platform::random().to_le_bytes());
+    }
+    let seed = u64::from(platform::random()) << 32 | u64::from(platform::random());
+    let radio = RADIO.init(radio::Radio::new(address));
+    let (stack, runner) =
+        embassy_net::new(radio, Config::default(), RESOURCES.init_with(StackResources::new), seed);
+    let chip = Chip { address, random };
+    let shared = SHARED.take();
+    shared.with(|bridge, now| bridge.begin(now, settings, chip));
+
+    let executor: &'static Executor = EXECUTOR.init(Executor::new(core::ptr::null_mut()));
+    critical_section::with(|section| RUNNING.borrow(section).set(Some(Loop(executor))));
+    let spawner = executor.spawner();
+    // Each is spawned once: the one place of its task is free.
+    spawner.spawn(network(runner).unwrap());
+    spawner.spawn(join_networks(shared, stack, WIFI.take()).unwrap());
+    spawner.spawn(forward(shared, stack, store, BUFFERS.take()).unwrap());
+    spawner.spawn(light().unwrap());
+}
+
+/// Runs every task that can make progress; returns when the next one is due. [us]
+#[expect(unsafe_code, reason = "called from C")]
+#[unsafe(no_mangle)]
+pub extern "C" fn vizflyt_poll(events: u32) -> u32 {
+    if events & UART_READABLE != 0 {
+        uart::readable();
+    }
+    if events & UART_WRITABLE != 0 {
+        uart::writable();
+    }
+    if events & (FRAMES_SENT | LINK) != 0 {
+        radio::changed();
+    }
+    clock::wake_due();
+    if let Some(Loop(executor)) = critical_section::with(|section| RUNNING.borrow(section).get()) {
+        // SAFETY: one thread of control, and no platform function calls back into this one.
+        unsafe { executor.poll() };
+    }
+    clock::wake_due()
+}
+
+const UART_READABLE: u32 = 1;
+const UART_WRITABLE: u32 = 2;
+const FRAMES_SENT: u32 = 4;
+const LINK: u32 = 8;
+
+/// Takes a received frame; 0, or -1 if it was dropped.
+///
+/// # Safety
+/// `frame` points to `len` readable bytes.
+#[expect(unsafe_code, reason = "called from C")]
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn vizflyt_frame_in(frame: *const u8, len: u32) -> i32 {
+    // SAFETY: the caller's promise.
+    let frame = unsafe { core::slice::from_raw_parts(frame, len as usize) };
+    if radio::receive(frame) { 0 } else { -1 }
+}
+
+/// Returns for how many frames there is room.
+#[expect(unsafe_code, reason = "called from C")]
+#[unsafe(no_mangle)]
+pub extern "C" fn vizflyt_frame_room() -> u32 {
+    radio::room() as u32
+}
+
+#[embassy_executor::task]
+async fn network(mut runner: Runner<'static, &'static mut radio::Radio>) {
+    runner.run().await;
+}
+
+#[embassy_executor::task]
+async fn forward(
+    shared: &'static Shared,
+    stack: Stack<'static>,
+    mut store: Store<flash::Region>,
+    buffers: &'static mut Buffers,
+) {
+    let uart = (uart::Receiver, uart::Sender);
+    shell::run(shared, stack, uart, &mut store, &mut front::Front, buffers).await;
+}
+
+#[embassy_executor::task]
+async fn join_networks(
+    shared: &'static Shared,
+    stack: Stack<'static>,
+    buffers: &'static mut wifi::Buffers,
+) {
+    wifi::run(shared, stack, &mut radio::Control, buffers).await;
+}
+
+#[embassy_executor::task]
+async fn light() {
+    blink::run(front::light, platform::led).await;
+}
+
+/// Never linked: panics abort where they are (see `build`); the compiler asks for it all the same.
+#[panic_handler]
+fn panic(_: &PanicInfo<'_>) -> ! {
+    platform::abort()
+}

@@ -1,0 +1,170 @@
+//! What the C side offers, safely wrapped. `include/vizflyt_platform.h` tells what each one does.
+
+#![expect(unsafe_code, reason = "the seam to C")]
+
+use core::ffi::CStr;
+
+mod c {
+    unsafe extern "C" {
+        pub(super) safe fn platform_time_us() -> u32;
+        pub(super) safe fn platform_interrupts_off() -> u32;
+        pub(super) safe fn platform_interrupts_restore(state: u32);
+        pub(super) safe fn platform_random() -> u32;
+        pub(super) safe fn platform_wake();
+        pub(super) safe fn abort() -> !;
+        pub(super) safe fn platform_restart() -> !;
+        pub(super) fn platform_uart_read(into: *mut u8, len: u32) -> u32;
+        pub(super) fn platform_uart_write(bytes: *const u8, len: u32) -> u32;
+        pub(super) safe fn platform_uart_is_idle() -> u32;
+        pub(super) safe fn platform_uart_configure(baud: u32, flow_control: u32);
+        pub(super) fn platform_mac(into: *mut u8);
+        pub(super) safe fn platform_frame_ready() -> u32;
+        pub(super) fn platform_frame_out(frame: *const u8, len: u32);
+        pub(super) fn platform_wifi_station(ssid: *const u8, password: *const u8) -> i32;
+        pub(super) fn platform_wifi_access_point(
+            ssid: *const u8,
+            password: *const u8,
+            channel: u32,
+        ) -> i32;
+        pub(super) safe fn platform_link_up() -> u32;
+        pub(super) safe fn platform_rssi_dbm() -> i32;
+        pub(super) safe fn platform_led(on: u32);
+        pub(super) fn platform_flash_read(address: u32, into: *mut u8, len: u32) -> i32;
+        pub(super) fn platform_flash_write(address: u32, bytes: *const u8, len: u32) -> i32;
+        pub(super) safe fn platform_flash_erase(sector: u32) -> i32;
+    }
+}
+
+/// Returns microseconds since an arbitrary start; wraps after 71 minutes. [us]
+pub(crate) fn time_us() -> u32 {
+    c::platform_time_us()
+}
+
+/// Returns random bits.
+pub(crate) fn random() -> u32 {
+    c::platform_random()
+}
+
+/// Asks for another poll.
+pub(crate) fn wake() {
+    c::platform_wake();
+}
+
+/// Gives up: restarts the chip, or stops the emulator.
+pub(crate) fn abort() -> ! {
+    c::abort()
+}
+
+/// Restarts the chip.
+pub(crate) fn restart() -> ! {
+    c::platform_restart()
+}
+
+/// Copies received bytes; returns how many.
+pub(crate) fn uart_read(into: &mut [u8]) -> usize {
+    // SAFETY: the C side writes at most `len` bytes into the slice.
+    unsafe { c::platform_uart_read(into.as_mut_ptr(), into.len() as u32) as usize }
+}
+
+/// Hands bytes over to be sent; returns how many were taken.
+pub(crate) fn uart_write(bytes: &[u8]) -> usize {
+    // SAFETY: the C side reads at most `len` bytes of the slice.
+    unsafe { c::platform_uart_write(bytes.as_ptr(), bytes.len() as u32) as usize }
+}
+
+/// Whether all bytes handed over have left.
+pub(crate) fn uart_is_idle() -> bool {
+    c::platform_uart_is_idle() != 0
+}
+
+/// Sets rate and flow control.
+pub(crate) fn uart_configure(baud: u32, flow_control: bool) {
+    c::platform_uart_configure(baud, u32::from(flow_control));
+}
+
+/// Returns the interface's address.
+pub(crate) fn mac() -> [u8; 6] {
+    let mut mac = [0; 6];
+    // SAFETY: the C side writes six bytes.
+    unsafe { c::platform_mac(mac.as_mut_ptr()) };
+    mac
+}
+
+/// Whether a frame can be sent.
+pub(crate) fn is_frame_ready() -> bool {
+    c::platform_frame_ready() != 0
+}
+
+/// Sends a frame.
+pub(crate) fn frame_out(frame: &[u8]) {
+    // SAFETY: the C side copies the slice before it returns.
+    unsafe { c::platform_frame_out(frame.as_ptr(), frame.len() as u32) }
+}
+
+/// Joins a network.
+pub(crate) fn wifi_station(ssid: &CStr, password: &CStr) -> bool {
+    // SAFETY: both end in a zero and are only read.
+    unsafe { c::platform_wifi_station(ssid.as_ptr().cast(), password.as_ptr().cast()) == 0 }
+}
+
+/// Opens a network.
+pub(crate) fn wifi_access_point(ssid: &CStr, password: &CStr, channel: u8) -> bool {
+    // SAFETY: as above.
+    unsafe {
+        c::platform_wifi_access_point(
+            ssid.as_ptr().cast(),
+            password.as_ptr().cast(),
+            u32::from(channel),
+        ) == 0
+    }
+}
+
+/// Whether the radio is joined or open.
+pub(crate) fn is_link_up() -> bool {
+    c::platform_link_up() != 0
+}
+
+/// Returns the signal strength. [dBm]
+pub(crate) fn rssi_dbm() -> Option<i8> {
+    match c::platform_rssi_dbm() {
+        0 => None,
+        dbm => Some(dbm.clamp(-128, -1) as i8),
+    }
+}
+
+/// Switches the LED.
+pub(crate) fn led(on: bool) {
+    c::platform_led(u32::from(on));
+}
+
+/// Reads flash; returns whether it could.
+pub(crate) fn flash_read(address: u32, into: &mut [u8]) -> bool {
+    // SAFETY: the C side writes at most `len` bytes into the slice.
+    unsafe { c::platform_flash_read(address, into.as_mut_ptr(), into.len() as u32) == 0 }
+}
+
+/// Writes erased flash; returns whether it could.
+pub(crate) fn flash_write(address: u32, bytes: &[u8]) -> bool {
+    // SAFETY: the C side only reads the slice.
+    unsafe { c::platform_flash_write(address, bytes.as_ptr(), bytes.len() as u32) == 0 }
+}
+
+/// Erases a sector of 4096 bytes; returns whether it could.
+pub(crate) fn flash_erase(sector: u32) -> bool {
+    c::platform_flash_erase(sector) == 0
+}
+
+struct InterruptsOff;
+critical_section::set_impl!(InterruptsOff);
+
+// SAFETY: with interrupts off nothing else runs on the chip's one core; the state is restored in
+// reverse order.
+unsafe impl critical_section::Impl for InterruptsOff {
+    unsafe fn acquire() -> u32 {
+        c::platform_interrupts_off()
+    }
+
+    unsafe fn release(state: u32) {
+        c::platform_interrupts_restore(state);
+    }
+}
