@@ -4,6 +4,8 @@ The emulator's radio is a socket of Ethernet frames, with the small network belo
 ARP, IPv4 and UDP of its own, so that nothing of the bridge's stack tests itself. Its serial line is
 a pty. Packets are pymavlink's: every message of the dialect in turn, random fields, MAVLink 1 and 2,
 some signed. What comes out must be, byte by byte, what went in: nothing lost, altered, or twice.
+Before that the network's other end does what a computer does that joins: asks for an address, and for
+the bridge by its name.
 
     qemu.py [--packets N] [--seed N] IMAGE
 """
@@ -52,22 +54,25 @@ class Network:
     def __init__(self, wire, address, bridge):
         self.wire = wire
         self.address = socket.inet_aton(address)
+        self.listens = {self.address}
         self.bridge = socket.inet_aton(bridge)
         self.identification = 0
 
     def _frame(self, kind, payload):
         self.wire.send(BRIDGE_MAC + OUR_MAC + struct.pack("!H", kind) + payload)
 
-    def send(self, port, payload):
-        """Sends a datagram from our `port` to the bridge."""
+    def send(self, port, payload, source=None, to=None, to_port=BRIDGE_PORT):
+        """Sends a datagram from our `port`; to the bridge if nothing else is said."""
+        source = source or self.address
+        to = socket.inet_aton(to) if to else self.bridge
         length = 8 + len(payload)
-        pseudo = self.address + self.bridge + struct.pack("!BBH", 0, 17, length)
-        header = struct.pack("!HHHH", port, BRIDGE_PORT, length, 0)
+        pseudo = source + to + struct.pack("!BBH", 0, 17, length)
+        header = struct.pack("!HHHH", port, to_port, length, 0)
         total = checksum(pseudo + header + payload) or 0xFFFF
         udp = header[:6] + struct.pack("!H", total) + payload
         self.identification = (self.identification + 1) & 0xFFFF
         ip = struct.pack("!BBHHHBBH", 0x45, 0, 20 + length, self.identification, 0x4000, 64, 17, 0)
-        ip += self.address + self.bridge
+        ip += source + to
         ip = ip[:10] + struct.pack("!H", checksum(ip)) + ip[12:]
         self._frame(0x0800, ip + udp)
 
@@ -87,13 +92,46 @@ class Network:
             return None
         header, length = (packet[0] & 15) * 4, struct.unpack("!H", packet[2:4])[0]
         assert checksum(packet[:header]) == 0, "the bridge sent a wrong IPv4 checksum"
-        if packet[16:20] != self.address:
-            return None  # multicast, as mDNS
+        if packet[16:20] not in self.listens:
+            return None
         assert packet[12:16] == self.bridge, "the bridge sent from a wrong address"
         udp = packet[header:length]
         pseudo = packet[12:20] + struct.pack("!BBH", 0, 17, len(udp))
         assert checksum(pseudo + udp) == 0, "the bridge sent a wrong UDP checksum"
         return struct.unpack("!H", udp[2:4])[0], udp[8:]
+
+
+    def expect(self, port, what):
+        """Waits for a datagram to our `port`."""
+        ends = time.monotonic() + PATIENCE_S
+        while time.monotonic() < ends:
+            if select.select([self.wire], [], [], 0.2)[0]:
+                datagram = self.receive()
+                if datagram and datagram[0] == port:
+                    return datagram[1]
+        raise SystemExit(f"no {what} within {PATIENCE_S} s")
+
+
+def join(network):
+    """Does what a computer does that joins: asks for an address (RFC 2131), and for a name (RFC 6762)."""
+    everybody = "255.255.255.255"
+    network.listens |= {socket.inet_aton(everybody), socket.inet_aton("224.0.0.251")}
+
+    def ask(kind, options=b""):
+        head = struct.pack("!BBBBIHH", 1, 1, 6, 0, 0x56495A46, 0, 0x8000) + bytes(16) + OUR_MAC
+        request = head.ljust(236, b"\0") + b"\x63\x82\x53\x63" + bytes([53, 1, kind]) + options + b"\xff"
+        network.send(68, request, source=bytes(4), to=everybody, to_port=67)
+        answer = network.expect(68, "answer of the bridge's DHCP")
+        assert answer[4:8] == b"VIZF" and answer[28:34] == OUR_MAC and answer[240:242] == b"\x35\x01"
+        return answer[242], answer[16:20]
+
+    assert ask(1) == (2, network.address), "the offer"
+    assert ask(3, b"\x32\x04" + network.address + b"\x36\x04" + network.bridge) == (5, network.address)
+    name = b"\x07vizflyt\x05local\0"
+    query = struct.pack("!6H", 0, 0, 1, 0, 0, 0) + name + b"\0\x01\0\x01"
+    network.send(5353, query, to="224.0.0.251", to_port=5353)
+    answer = network.expect(5353, "answer to the bridge's name")
+    assert answer[12:12 + len(name)] == name and answer[-4:] == network.bridge
 
 
 class Sender:
@@ -193,7 +231,9 @@ def main():
         stdin=subprocess.DEVNULL, pass_fds=(100, 101, 102))
     radio.close()
     try:
-        rate = exercise(options, Network(ours, "192.168.4.2", "192.168.4.1"), line, emulator)
+        network = Network(ours, "192.168.4.2", "192.168.4.1")
+        join(network)
+        rate = exercise(options, network, line, emulator)
     except BaseException:
         emulator.kill()
         raise

@@ -208,11 +208,12 @@ async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket:
     let everybody = SocketAddrV4::new(Ipv4Addr::BROADCAST, 68);
     let mut answer = [0; dhcp::ANSWER];
     loop {
+        // Asked first: the stack cannot be asked while it lends out a datagram.
+        socket.wait_recv_ready().await;
+        let own = own_address(stack) == Some(OWN_ADDRESS);
         let len = socket
             .recv_from_with(|request, _| {
-                own_address(stack)
-                    .filter(|&address| address == OWN_ADDRESS)
-                    .and_then(|address| leases.answer(address, request, &mut answer))
+                own.then(|| leases.answer(OWN_ADDRESS, request, &mut answer)).flatten()
             })
             .await;
         if let Some(len) = len {
@@ -227,13 +228,11 @@ async fn answer_to_name(shared: &Shared, stack: Stack<'_>, mut socket: UdpSocket
     let group = SocketAddrV4::new(mdns::GROUP.0, mdns::GROUP.1);
     let mut answer = [0; mdns::ANSWER];
     loop {
+        socket.wait_recv_ready().await;
+        let address = own_address(stack);
+        let name = shared.with(|bridge, _| bridge.settings().hostname.clone());
         let len = socket
-            .recv_from_with(|query, _| {
-                let address = own_address(stack)?;
-                shared.with(|bridge, _| {
-                    mdns::answer(query, &bridge.settings().hostname, address, &mut answer)
-                })
-            })
+            .recv_from_with(|query, _| mdns::answer(query, &name, address?, &mut answer))
             .await;
         if let Some(len) = len {
             let _ = socket.send_to(&answer[..len], group).await;

@@ -19,7 +19,6 @@ mod flash;
 mod front;
 mod radio;
 mod serial;
-mod update;
 
 use core::cell::RefCell;
 
@@ -70,7 +69,6 @@ async fn main(spawner: Spawner) -> ! {
         FLASH.init_with(|| RefCell::new(FlashStorage::new(chip.FLASH)));
     let mut store = Store::new(flash::settings(flash), 0);
     let settings = store.load().unwrap_or_default();
-    update::came_up(flash);
 
     let port = Uart::new(chip.UART1, serial::config(settings.baud, settings.flow_control))
         // The settings keep within what the port can do.

@@ -1,0 +1,1 @@
+#include "ets_sys.h"
