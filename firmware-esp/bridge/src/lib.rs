@@ -18,6 +18,7 @@ pub mod bridge;
 pub mod dhcp;
 pub mod mdns;
 pub mod packet;
+pub mod page;
 mod ring;
 pub mod seal;
 pub mod settings;
@@ -26,6 +27,8 @@ pub mod shell;
 pub mod stats;
 pub mod storage;
 mod targets;
+#[cfg(feature = "update")]
+pub mod update;
 #[cfg(feature = "net")]
 pub mod wifi;
 

@@ -84,7 +84,7 @@ impl Settings {
         Self {
             baud: 921_600,
             flow_control: false,
-            batch_us: 5000,
+            batch_us: 2500,
             batch_bytes: 1400,
             client_timeout_s: 10,
             udp_port: 14550,

@@ -7,7 +7,7 @@
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
 
-use embassy_futures::join::{join, join3, join4};
+use embassy_futures::join::{join, join3, join5};
 use embassy_futures::select::select;
 use embassy_net::tcp::TcpSocket;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
@@ -21,6 +21,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 use crate::bridge::{Bridge, Event, TCP_SLOTS};
+use crate::page;
 use crate::storage::Store;
 
 /// What only the chip can do.
@@ -98,10 +99,18 @@ pub struct Buffers {
     udp_in_meta: [PacketMetadata; 16],
     udp_in: [u8; 2048],
     udp_out_meta: [PacketMetadata; 4],
-    udp_out: [u8; 2800],
+    udp_out: [u8; 1472],
     datagram_in: [u8; 1472],
     datagram_out: [u8; 1400],
     tcp: [TcpBuffers; TCP_SLOTS],
+    page: PageBuffers,
+}
+
+#[derive(Debug)]
+struct PageBuffers {
+    receive: [u8; 128],
+    transmit: [u8; 536],
+    request: [u8; 256],
 }
 
 #[derive(Debug)]
@@ -124,18 +133,19 @@ impl Buffers {
             udp_in_meta: [PacketMetadata::EMPTY; 16],
             udp_in: [0; 2048],
             udp_out_meta: [PacketMetadata::EMPTY; 4],
-            udp_out: [0; 2800],
+            udp_out: [0; 1472],
             datagram_in: [0; 1472],
             datagram_out: [0; 1400],
             tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
                 TCP_SLOTS],
+            page: PageBuffers { receive: [0; 128], transmit: [0; 536], request: [0; 256] },
         }
     }
 }
 
-/// Sockets of a bridge, for a stack's `StackResources`: UDP, TCP, and what the stack needs itself
-/// (DHCP).
-pub const SOCKETS: usize = 2 + TCP_SLOTS;
+/// Sockets of a bridge, for a stack's `StackResources`: UDP, TCP, the page, and what the stack needs
+/// itself (DHCP).
+pub const SOCKETS: usize = 3 + TCP_SLOTS;
 
 /// What a bridge of ours may take of a chip's RAM: state and buffers. [bytes]
 pub const RAM_BUDGET: usize = 30 * 1024;
@@ -198,8 +208,16 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
 async fn serve(shared: &Shared, stack: Stack<'_>, buffers: &mut Buffers) {
     let (udp_port, tcp_port) =
         shared.take(|bridge, _| (bridge.settings().udp_port, bridge.settings().tcp_port));
-    let Buffers { udp_in_meta, udp_in, udp_out_meta, udp_out, datagram_in, datagram_out, tcp } =
-        buffers;
+    let Buffers {
+        udp_in_meta,
+        udp_in,
+        udp_out_meta,
+        udp_out,
+        datagram_in,
+        datagram_out,
+        tcp,
+        page,
+    } = buffers;
     let mut socket = UdpSocket::new(stack, udp_in_meta, udp_in, udp_out_meta, udp_out);
     // The port is not 0 and the socket is new: nothing else is refused.
     let _ = socket.bind(udp_port);
@@ -225,11 +243,12 @@ async fn serve(shared: &Shared, stack: Stack<'_>, buffers: &mut Buffers) {
         }
     };
     let [first, second] = tcp;
-    join4(
+    join5(
         receive,
         send,
         connection(shared, stack, tcp_port, 0, first),
         connection(shared, stack, tcp_port, 1, second),
+        show_page(shared, stack, page),
     )
     .await;
 }
@@ -283,6 +302,40 @@ async fn connection(
         shared.with(|bridge, _| bridge.close_stream(slot));
         socket.abort();
         // A connection that is reset already has nothing to flush.
+        let _ = socket.flush().await;
+    }
+}
+
+/// Serves the status page, to one browser after another.
+async fn show_page(shared: &Shared, stack: Stack<'_>, buffers: &mut PageBuffers) {
+    let port = shared.take(|bridge, _| bridge.settings().page_port);
+    if port == 0 {
+        return;
+    }
+    let PageBuffers { receive, transmit, request } = buffers;
+    loop {
+        let mut socket = TcpSocket::new(stack, receive, transmit);
+        // A browser that opens a connection for later must not keep others out.
+        socket.set_timeout(Some(Duration::from_secs(5)));
+        if socket.accept(port).await.is_err() {
+            Timer::after(Duration::from_millis(100)).await;
+            continue;
+        }
+        let mut len = 0;
+        while len < request.len() && !page::is_whole(&request[..len]) {
+            match socket.read(&mut request[len..]).await {
+                Ok(more @ 1..) => len += more,
+                _ => break,
+            }
+        }
+        if len > 0 {
+            let response = shared.take(|bridge, now| page::respond(bridge, now, &request[..len]));
+            // A browser that has gone wants no answer.
+            let _ = socket.write_all(response.as_bytes()).await;
+        }
+        socket.close();
+        let _ = socket.flush().await;
+        socket.abort();
         let _ = socket.flush().await;
     }
 }

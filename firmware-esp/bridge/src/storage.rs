@@ -156,4 +156,4 @@ fn hash(record: &[u8; RECORD], len: usize) -> [u8; 8] {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

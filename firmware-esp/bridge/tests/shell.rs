@@ -211,6 +211,27 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
 }
 
 #[test]
+fn a_browser_sees_the_page() {
+    with_bridge(|stack, _uart_in, _uart_out| async move {
+        for _ in 0..2 {
+            let (mut rx, mut tx) = ([0; 4096], [0; 1024]);
+            let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
+            // Refused while the page still serves the one before, as a browser would try again.
+            while socket.connect((BRIDGE, 80)).await.is_err() {
+                embassy_time::Timer::after(Duration::from_millis(1)).await;
+            }
+            socket.write_all(b"GET /stats.json HTTP/1.1\r\nHost: bridge\r\n\r\n").await.unwrap();
+            let (mut answer, mut bytes) = (Vec::new(), [0; 512]);
+            while let Ok(len @ 1..) = socket.read(&mut bytes).await {
+                answer.extend_from_slice(&bytes[..len]);
+            }
+            let answer = String::from_utf8(answer).unwrap();
+            assert!(answer.starts_with("HTTP/1.0 200 OK") && answer.ends_with("}\n"), "{answer}");
+        }
+    });
+}
+
+#[test]
 fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
     with_bridge(|stack, uart_in, mut uart_out| async move {
         for _ in 0..3 {

@@ -128,6 +128,7 @@ fn until(what: &str, mut step: impl FnMut() -> bool) {
 fn thousands_of_packets_pass_both_ways_and_none_is_lost_or_changed() {
     let mut rig = Rig::start(&[]);
     let (mut up, mut down) = (Vec::new(), Vec::new());
+    // Not setpoints: of those the bridge leaves out late ones, and this machine may be late.
     let (mut decoder, count) = (StreamDecoder::default(), 2000u32);
     let mut sent = 0;
     rig.companion.send(&packet(0, (255, 191), &heartbeat(false))).unwrap();
@@ -140,17 +141,17 @@ fn thousands_of_packets_pass_both_ways_and_none_is_lost_or_changed() {
         // No more at once than the line and its queues hold: the counters must stay at zero.
         let through = up.len().min(down.len()) as u32;
         while sent < count && sent < through + 15 {
-            rig.companion.send(&packet(sent as u8, (255, 191), &vision(sent.into()))).unwrap();
+            rig.companion.send(&packet(sent as u8, (255, 191), &param(sent as u16))).unwrap();
             rig.uart.write_all(&packet(sent as u8, (1, 1), &attitude(sent))).unwrap();
             sent += 1;
         }
         read(&mut rig.uart, &mut decoder, &mut up);
         receive(&rig.companion, &mut down);
-        up.retain(|message| matches!(message, MavMessage::VISION_POSITION_ESTIMATE(_)));
+        up.retain(|message| matches!(message, MavMessage::PARAM_VALUE(_)));
         down.retain(|message| matches!(message, MavMessage::ATTITUDE(_)));
         up.len() == count as usize && down.len() == count as usize
     });
-    assert_eq!(up, (0..count).map(|i| vision(i.into())).collect::<Vec<_>>());
+    assert_eq!(up, (0..count).map(|i| param(i as u16)).collect::<Vec<_>>());
     assert_eq!(down, (0..count).map(attitude).collect::<Vec<_>>());
     let report = stats(&rig);
     for (name, value) in report.as_object().unwrap() {

@@ -283,15 +283,31 @@ impl Hub {
     /// Puts a packet into one of the queues for the autopilot's port.
     pub(super) fn push_up(&mut self, tag: Tag, bytes: &[u8]) {
         if overtakes(tag.kind) {
-            while !self.urgent.fits(bytes.len()) {
-                self.urgent.pop();
-                self.stats.drop(Reason::UartFull, 1);
-            }
+            self.make_way(bytes.len());
             self.urgent.push(tag, bytes);
         } else if self.normal.fits(bytes.len()) {
             self.normal.push(tag, bytes);
         } else {
             self.stats.drop(Reason::UartFull, 1);
+        }
+    }
+
+    /// Makes room among the urgent packets: the oldest setpoints and poses give way, for their
+    /// newer ones are there; commands stay as long as any of those is left.
+    fn make_way(&mut self, len: usize) {
+        let mut commands = 0;
+        while !self.urgent.fits(len) {
+            let mut packet = [0; MAX_PACKET];
+            let Some((tag, len)) = take(&mut self.urgent, &mut packet) else { return };
+            if streams(tag.kind) {
+                self.stats.drop(Reason::Superseded, 1);
+            } else if commands < URGENT / len {
+                // Behind the others: once round, and every stream packet has been met.
+                commands += 1;
+                self.urgent.push(tag, &packet[..len]);
+            } else {
+                self.stats.drop(Reason::UartFull, 1);
+            }
         }
     }
 

@@ -41,7 +41,7 @@ pub struct Chip {
 
 /// Silence on the autopilot's port after which a batch goes out and an unfinished packet is given
 /// up waiting for. Autopilots write packets whole; a byte at 57600 baud takes 0.17 ms. [ns]
-const IDLE_NS: i64 = 1_000_000;
+const IDLE_NS: i64 = 500_000;
 /// Silence after which a candidate's missing rest is not coming. [ns]
 const STALL_NS: i64 = 50_000_000;
 
@@ -191,6 +191,11 @@ impl Bridge {
     /// Returns the counters.
     pub fn stats(&self) -> &Stats {
         &self.hub.stats
+    }
+
+    /// Returns how long it has run. [s]
+    pub fn uptime_s(&self, now: HostTime) -> u32 {
+        now.seconds_since(self.hub.started_at) as u32
     }
 
     /// Returns the settings as they are now; the shell writes them to flash when told.

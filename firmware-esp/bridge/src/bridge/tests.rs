@@ -118,17 +118,17 @@ fn packets_pass_both_ways_byte_for_byte() {
     let telemetry =
         [bytes(0, AUTOPILOT, &heartbeat(false, 0)), bytes(1, AUTOPILOT, &attitude(0.5))];
     bridge.handle_uart(at(5), &telemetry.concat());
-    // Nothing leaves before the line is silent for a millisecond.
+    // Nothing leaves before the line is silent for half a millisecond.
     assert_eq!(datagrams(&mut bridge, at(5)), []);
-    assert_eq!(bridge.udp_due(), Some(at(6)));
+    assert_eq!(bridge.udp_due(), Some(at(5).plus_ns(500_000)));
     let sent = datagrams(&mut bridge, at(6));
     assert_eq!(sent, [(address(2), telemetry.concat())]);
     assert_eq!(bridge.stats().drops, [0; 6]);
 }
 
 #[test]
-fn a_busy_line_is_batched_for_five_milliseconds_or_a_datagram() {
-    let mut bridge = bridge(quiet());
+fn a_busy_line_is_batched_for_the_set_time_or_a_datagram() {
+    let mut bridge = bridge(Settings { batch_us: 5000, ..quiet() });
     bridge.handle_datagram(at(0), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
     let packet = bytes(0, AUTOPILOT, &attitude(0.25));
     // A packet each half millisecond: the line is never silent.
@@ -197,20 +197,34 @@ fn a_late_setpoint_gives_way_to_a_newer_one_and_is_counted() {
 }
 
 #[test]
-fn a_full_port_drops_the_oldest_setpoints_and_the_newest_rest_and_counts_them() {
+fn a_full_port_keeps_the_newest_setpoints_every_command_and_the_oldest_rest() {
     let mut bridge = bridge(quiet());
     for round in 0..200u8 {
         bridge.handle_datagram(at(1), address(2), &bytes(round, RUNTIME, &param(round.into())));
         bridge.handle_datagram(at(1), address(3), &bytes(round, (200, 1), &setpoint(round.into())));
+        if round % 20 == 0 {
+            let beat = heartbeat(false, 0);
+            bridge.handle_datagram(at(1), address(4), &bytes(round, (201, 1), &beat));
+        }
     }
     let left = foreign(uart(&mut bridge, at(1)));
-    let setpoints: Vec<u8> =
-        left.iter().filter(|packet| packet[5] == 200).map(|packet| packet[4]).collect();
-    let params: Vec<u8> =
-        left.iter().filter(|packet| packet[5] == 255).map(|packet| packet[4]).collect();
-    assert_eq!(setpoints.last(), Some(&199));
-    assert_eq!(params.first(), Some(&0));
-    assert_eq!(bridge.stats().dropped(Reason::UartFull) as usize, 400 - left.len());
+    let from = |system: u8| -> Vec<u8> {
+        left.iter().filter(|packet| packet[5] == system).map(|packet| packet[4]).collect()
+    };
+    assert_eq!(from(200).last(), Some(&199));
+    assert!(from(200).is_sorted());
+    assert_eq!(from(255).first(), Some(&0));
+    assert_eq!(from(201).len(), 10, "every command");
+    let stats = bridge.stats();
+    assert_eq!(stats.dropped(Reason::Superseded) as usize, 200 - from(200).len());
+    assert_eq!(stats.dropped(Reason::UartFull) as usize, 200 - from(255).len());
+    // A flood of nothing but commands still ends, and is counted.
+    for round in 0..200u8 {
+        bridge.handle_datagram(at(2), address(4), &bytes(round, (201, 1), &heartbeat(false, 0)));
+    }
+    let kept = foreign(uart(&mut bridge, at(2))).len();
+    let full = bridge.stats().dropped(Reason::UartFull) as usize;
+    assert_eq!(full + kept + from(255).len(), 400);
 }
 
 #[test]

@@ -11,13 +11,13 @@ use super::*;
 
 /// A flash in memory that, like flash, only clears bits; its power fails after so many bytes.
 #[derive(Clone, Debug)]
-struct Memory {
-    bytes: Vec<u8>,
-    power: usize,
+pub(crate) struct Memory {
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) power: usize,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct PowerCut;
+pub(crate) struct PowerCut;
 
 impl NorFlashError for PowerCut {
     fn kind(&self) -> NorFlashErrorKind {
@@ -43,6 +43,11 @@ impl ReadNorFlash for Memory {
 }
 
 impl Memory {
+    /// Erased, with power enough.
+    pub(crate) fn of(len: usize) -> Self {
+        Self { bytes: vec![0xFF; len], power: usize::MAX }
+    }
+
     fn spend(&mut self) -> Result<(), PowerCut> {
         self.power = self.power.checked_sub(1).ok_or(PowerCut)?;
         Ok(())
@@ -73,7 +78,7 @@ impl NorFlash for Memory {
 }
 
 fn store() -> Store<Memory> {
-    Store::new(Memory { bytes: vec![0xFF; 3 * 4096], power: usize::MAX }, 4096)
+    Store::new(Memory::of(3 * 4096), 4096)
 }
 
 fn with_loss(loss_ms: u16) -> Settings {

@@ -239,9 +239,9 @@ fn talk(
     let mut bytes = [0; 4096];
     // A quarter of a second more, for what is under way.
     let until = start + Duration::from_secs(seconds.into()) + Duration::from_millis(250);
+    let due = |tick: u32| start + Duration::from_micros(u64::from(tick) * u64::from(TICK_US));
     while Instant::now() < until {
-        let due = start + Duration::from_micros(u64::from(tick) * u64::from(TICK_US));
-        if tick < ticks && Instant::now() >= due {
+        while tick < ticks && Instant::now() >= due(tick) {
             for (place, message) in say(tick, 0).into_iter().enumerate() {
                 let stamp = (start.elapsed().as_micros() / 10) as u32 + place as u32;
                 let message = say(tick, stamp).swap_remove(place);

@@ -1,0 +1,340 @@
+//! Signed firmware, and the way back from one that does not work.
+//!
+//! ```text
+//! header: signature right? for this chip? not older? ─▶ spare half: erase, write ─▶ read back, hash
+//!        ─▶ boot it on trial ─▶ healthy? keep it : after three starts, the half before
+//! ```
+//! Nothing is erased before the signature has been verified, and the running half is never
+//! touched: power may fail at any moment. A chip without two halves has no [`Slots`] and no updates.
+
+use ed25519_dalek::{Signature, VerifyingKey};
+use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
+use sha2::{Digest, Sha256};
+
+/// Bytes before a firmware.
+pub const HEADER: usize = 112;
+const MAGIC: [u8; 4] = *b"VZU1";
+/// What is signed: everything before the signature, and what it is for.
+const SIGNED: usize = 48;
+const CONTEXT: &[u8] = b"vizflyt bridge firmware 1";
+
+/// Which chip a firmware is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Target {
+    /// `vizflyt bridge emulate`, and tests.
+    Host = 0,
+    /// ESP32-C3.
+    Esp32C3 = 1,
+    /// ESP8266.
+    Esp8266 = 2,
+}
+
+/// What a header says of the firmware behind it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// Its chip, by number.
+    pub target: u8,
+    /// Counts up; a bridge takes no older one than it runs.
+    pub build: u32,
+    /// Bytes behind the header.
+    pub len: u32,
+    /// SHA-256 of them.
+    pub hash: [u8; 32],
+}
+
+impl Header {
+    /// Returns what is to be signed: the header's bytes behind [`CONTEXT`].
+    fn message(&self) -> [u8; CONTEXT.len() + SIGNED] {
+        let mut message = [0; CONTEXT.len() + SIGNED];
+        message[..CONTEXT.len()].copy_from_slice(CONTEXT);
+        let head = &mut message[CONTEXT.len()..];
+        head[..4].copy_from_slice(&MAGIC);
+        head[4] = self.target;
+        head[8..12].copy_from_slice(&self.build.to_le_bytes());
+        head[12..16].copy_from_slice(&self.len.to_le_bytes());
+        head[16..48].copy_from_slice(&self.hash);
+        message
+    }
+
+    /// Returns the header's bytes; `sign` signs what it is given by Ed25519.
+    pub fn seal(&self, sign: impl FnOnce(&[u8]) -> [u8; 64]) -> [u8; HEADER] {
+        let message = self.message();
+        let mut bytes = [0; HEADER];
+        bytes[..SIGNED].copy_from_slice(&message[CONTEXT.len()..]);
+        bytes[SIGNED..].copy_from_slice(&sign(&message));
+        bytes
+    }
+
+    /// Reads a header and verifies its signature.
+    ///
+    /// # Errors
+    /// [`Fault::NoFirmware`] and [`Fault::Signature`].
+    pub fn open(bytes: &[u8; HEADER], key: &[u8; 32]) -> Result<Self, Fault> {
+        let word = |at: usize| {
+            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+        };
+        let header = Self {
+            target: bytes[4],
+            build: word(8),
+            len: word(12),
+            hash: core::array::from_fn(|at| bytes[16 + at]),
+        };
+        let message = header.message();
+        if bytes[..SIGNED] != message[CONTEXT.len()..] {
+            return Err(Fault::NoFirmware);
+        }
+        let signature = Signature::from_bytes(&core::array::from_fn(|at| bytes[SIGNED + at]));
+        VerifyingKey::from_bytes(key)
+            .and_then(|key| key.verify_strict(&message, &signature))
+            .map_err(|_| Fault::Signature)?;
+        Ok(header)
+    }
+}
+
+/// Why a firmware is not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// The bytes are no firmware of ours.
+    NoFirmware,
+    /// It is not signed by the key.
+    Signature,
+    /// It is for another chip.
+    OtherChip,
+    /// It is older than the one that runs.
+    Older,
+    /// It does not fit the spare half.
+    TooLong,
+    /// The flash refused, or what was read back differs.
+    Flash,
+    /// What came is not what was signed.
+    Damaged,
+}
+
+impl Fault {
+    /// Returns it in words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::NoFirmware => "these bytes are no firmware for a bridge",
+            Self::Signature => "the signature is not of this bridge's firmware key",
+            Self::OtherChip => "the firmware is for another chip",
+            Self::Older => "the firmware is older than the one that runs",
+            Self::TooLong => "the firmware does not fit the chip",
+            Self::Flash => "the flash did not take it",
+            Self::Damaged => "what came is not what was signed",
+        }
+    }
+}
+
+/// A chip's two halves.
+pub trait Slots {
+    /// The half that does not run, from address 0 on.
+    type Spare: NorFlash;
+
+    /// Returns the half that does not run.
+    fn spare(&mut self) -> &mut Self::Spare;
+
+    /// Makes the chip start the spare half from now on, on trial; returns whether it could.
+    fn start_spare(&mut self) -> bool;
+}
+
+/// What this bridge takes.
+#[derive(Clone, Copy, Debug)]
+pub struct Wanted {
+    /// Its chip.
+    pub target: Target,
+    /// The build that runs.
+    pub build: u32,
+    /// The public half of the key that signs its firmware.
+    pub key: [u8; 32],
+}
+
+/// Bytes written to flash at once: a page of every NOR flash.
+const PAGE: usize = 256;
+
+/// Takes a firmware in any portions.
+#[derive(Debug)]
+pub struct Updater {
+    wanted: Wanted,
+    header: [u8; HEADER],
+    head_len: usize,
+    open: Option<Header>,
+    page: [u8; PAGE],
+    page_len: usize,
+    written: u32,
+}
+
+impl Updater {
+    /// Waits for a firmware's first byte.
+    pub fn new(wanted: Wanted) -> Self {
+        Self {
+            wanted,
+            header: [0; HEADER],
+            head_len: 0,
+            open: None,
+            page: [0; PAGE],
+            page_len: 0,
+            written: 0,
+        }
+    }
+
+    /// Takes bytes; returns true with the last: it is whole, verified, and starts next.
+    ///
+    /// # Errors
+    /// See [`Fault`]. The running firmware stays.
+    pub fn feed<S: Slots>(&mut self, slots: &mut S, mut bytes: &[u8]) -> Result<bool, Fault> {
+        let header = if let Some(header) = self.open {
+            header
+        } else {
+            let taken = bytes.len().min(HEADER - self.head_len);
+            self.header[self.head_len..self.head_len + taken].copy_from_slice(&bytes[..taken]);
+            self.head_len += taken;
+            bytes = &bytes[taken..];
+            if self.head_len < HEADER {
+                return Ok(false);
+            }
+            let header = Header::open(&self.header, &self.wanted.key)?;
+            self.judge(&header, slots.spare().capacity())?;
+            self.open = Some(header);
+            header
+        };
+        while !bytes.is_empty() {
+            let left = header.len - self.written - self.page_len as u32;
+            let taken = bytes.len().min(PAGE - self.page_len).min(left as usize);
+            if taken == 0 {
+                return Err(Fault::Damaged);
+            }
+            self.page[self.page_len..self.page_len + taken].copy_from_slice(&bytes[..taken]);
+            self.page_len += taken;
+            bytes = &bytes[taken..];
+            if self.page_len == PAGE || self.written + self.page_len as u32 == header.len {
+                self.write_page(slots.spare())?;
+            }
+        }
+        if self.written < header.len {
+            return Ok(false);
+        }
+        verify(slots.spare(), &header)?;
+        if slots.start_spare() { Ok(true) } else { Err(Fault::Flash) }
+    }
+
+    fn judge(&self, header: &Header, capacity: usize) -> Result<(), Fault> {
+        if header.target != self.wanted.target as u8 {
+            Err(Fault::OtherChip)
+        } else if header.build < self.wanted.build {
+            Err(Fault::Older)
+        } else if header.len == 0 || header.len as usize > capacity {
+            Err(Fault::TooLong)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn write_page<F: NorFlash>(&mut self, flash: &mut F) -> Result<(), Fault> {
+        const { assert!(PAGE.is_multiple_of(F::WRITE_SIZE) && F::ERASE_SIZE.is_multiple_of(PAGE)) };
+        let sector = F::ERASE_SIZE as u32;
+        let at = self.written;
+        if at.is_multiple_of(sector) {
+            flash.erase(at, at + sector).map_err(|_| Fault::Flash)?;
+        }
+        self.page[self.page_len..].fill(0xFF);
+        let len = self.page_len.next_multiple_of(F::WRITE_SIZE);
+        flash.write(at, &self.page[..len]).map_err(|_| Fault::Flash)?;
+        self.written += self.page_len as u32;
+        self.page_len = 0;
+        Ok(())
+    }
+}
+
+/// Reads the spare half back.
+fn verify<F: NorFlash>(flash: &mut F, header: &Header) -> Result<(), Fault> {
+    let (mut hash, mut at, mut page) = (Sha256::new(), 0, [0; PAGE]);
+    while at < header.len {
+        let len = (header.len - at).min(PAGE as u32) as usize;
+        let read = len.next_multiple_of(F::READ_SIZE.max(1));
+        flash.read(at, &mut page[..read]).map_err(|_| Fault::Flash)?;
+        hash.update(&page[..len]);
+        at += len as u32;
+    }
+    if hash.finalize()[..] == header.hash { Ok(()) } else { Err(Fault::Damaged) }
+}
+
+/// Starts that a new firmware has to become healthy.
+pub const STARTS: u32 = 3;
+const ON_TRIAL: u32 = 0x7A17_5A17;
+
+/// The record of a trial: one sector of flash, whose bits only ever fall between two updates, so
+/// that a start is counted without erasing. For chips whose loader does not count by itself.
+#[derive(Debug)]
+pub struct Trial<F> {
+    flash: F,
+    base: u32,
+}
+
+/// What a start shall do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Run; nothing is on trial.
+    Settled,
+    /// Run, and call [`Trial::keep`] once healthy.
+    OnTrial,
+    /// Start the half before: this one had its starts.
+    GoBack,
+}
+
+impl<F: NorFlash> Trial<F> {
+    /// Uses the sector that starts at `base`.
+    pub fn new(flash: F, base: u32) -> Self {
+        const { assert!(F::WRITE_SIZE <= 4 && F::READ_SIZE <= 4) };
+        Self { flash, base }
+    }
+
+    /// Begins a trial; call it before [`Slots::start_spare`] switches.
+    ///
+    /// # Errors
+    /// [`Fault::Flash`].
+    pub fn begin(&mut self) -> Result<(), Fault> {
+        let end = self.base + F::ERASE_SIZE as u32;
+        self.flash.erase(self.base, end).map_err(|_| Fault::Flash)?;
+        self.write(0, ON_TRIAL)
+    }
+
+    /// Counts a start and says what it shall do.
+    ///
+    /// # Errors
+    /// [`Fault::Flash`]; then run: a flash that cannot count cannot switch either.
+    pub fn start(&mut self) -> Result<Verdict, Fault> {
+        if self.read(0)? != ON_TRIAL || self.read(4)? == 0 {
+            return Ok(Verdict::Settled);
+        }
+        let left = self.read(8)?;
+        let starts = left.count_zeros();
+        if starts >= STARTS {
+            self.write(4, 0)?;
+            return Ok(Verdict::GoBack);
+        }
+        self.write(8, left << 1)?;
+        Ok(Verdict::OnTrial)
+    }
+
+    /// Ends the trial: the firmware works.
+    ///
+    /// # Errors
+    /// [`Fault::Flash`].
+    pub fn keep(&mut self) -> Result<(), Fault> {
+        if self.read(0)? == ON_TRIAL { self.write(4, 0) } else { Ok(()) }
+    }
+
+    fn read(&mut self, at: u32) -> Result<u32, Fault> {
+        let mut word = [0; 4];
+        self.flash.read(self.base + at, &mut word).map_err(|_| Fault::Flash)?;
+        Ok(u32::from_le_bytes(word))
+    }
+
+    fn write(&mut self, at: u32, word: u32) -> Result<(), Fault> {
+        self.flash.write(self.base + at, &word.to_le_bytes()).map_err(|_| Fault::Flash)
+    }
+}
+
+#[cfg(test)]
+mod tests;
