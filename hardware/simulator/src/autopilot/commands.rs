@@ -247,7 +247,7 @@ impl Autopilot {
             self.say(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
         }
         // Answered even if it was set before: the first answer may have been lost.
-        if let Some(message) = self.message(now, super::telemetry::GPS_GLOBAL_ORIGIN) {
+        if let Some(message) = self.message(now, super::streams::GPS_GLOBAL_ORIGIN) {
             self.send(message);
         }
     }

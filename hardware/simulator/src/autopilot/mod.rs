@@ -21,6 +21,7 @@ mod failsafe;
 mod flight;
 mod params;
 mod setpoints;
+mod streams;
 mod telemetry;
 #[cfg(test)]
 mod tests;
@@ -40,7 +41,7 @@ use crate::estimator::Estimator;
 use crate::imu::SensorSample;
 use dialect::{MavMessage, MavSeverity};
 pub use params::{Param, ParamSpec, Params, TABLE};
-use telemetry::Streams;
+use streams::Streams;
 
 /// Links that are served at once, as telemetry ports: each has its own stream of bytes.
 pub const MAX_LINKS: usize = 4;
