@@ -11,8 +11,8 @@ use vizflyt_protocol::mavlink::SigningKey;
 use vizflyt_runtime::airframe::Visit;
 use vizflyt_runtime::args::link_settings;
 use vizflyt_runtime::config::{self, JetsonConfig};
-use vizflyt_runtime::link::SigningFile;
 use vizflyt_runtime::link::port::MavlinkAddress;
+use vizflyt_runtime::link::{LinkSettings, SigningFile};
 
 use crate::terminal::tell;
 
@@ -32,6 +32,19 @@ pub(crate) struct AutopilotArgs {
 impl AutopilotArgs {
     /// Finds the autopilot, and greets it.
     pub(crate) fn visit(&self) -> Result<Visit> {
+        self.visit_with(|_| {})
+    }
+
+    /// As [`Self::visit`], over a wire that nobody else has.
+    fn visit_by_wire(&self) -> Result<Visit> {
+        self.visit_with(|settings| {
+            if let Some(signing) = &mut settings.signing {
+                signing.trusts_wire = true;
+            }
+        })
+    }
+
+    fn visit_with(&self, change: impl Fn(&mut LinkSettings)) -> Result<Visit> {
         let file = self.config.clone().or_else(config::find);
         let vehicle = match file {
             Some(file) => JetsonConfig::read(&file)?.vehicle,
@@ -43,7 +56,9 @@ impl AutopilotArgs {
             (None, None) => MavlinkAddress::usual(),
         };
         let name = vehicle.name.as_deref().unwrap_or("vizflyt");
-        Ok(Visit::open(&address, link_settings(&vehicle, name)?)?)
+        let mut settings = link_settings(&vehicle, name)?;
+        change(&mut settings);
+        Ok(Visit::open(&address, settings)?)
     }
 }
 
@@ -86,7 +101,7 @@ struct SignArgs {
 pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
     let What::Sign(args) = &args.what;
     let Some(path) = &args.key else {
-        args.autopilot.visit()?.sign(None)?;
+        args.autopilot.visit_by_wire()?.sign(None)?;
         tell("signing is off; take `signing_key` out of jetson.toml");
         return Ok(ExitCode::SUCCESS);
     };
@@ -100,7 +115,7 @@ pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
         tell(format!("key      {} (new; only you can read it)", path.display()));
     }
     let signing = file.open()?;
-    let mut visit = args.autopilot.visit()?;
+    let mut visit = args.autopilot.visit_by_wire()?;
     visit.sign(Some(&signing))?;
     tell(format!("given    to system {}", visit.link().system().unwrap_or(0)));
     tell(format!("now set signing_key = \"{}\" under [vehicle] in jetson.toml", path.display()));

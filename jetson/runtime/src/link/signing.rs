@@ -23,6 +23,8 @@ pub struct LinkSigning {
     pub key: SigningKey,
     /// The stamp of the moment at which the link is made.
     pub start: SigningTime,
+    /// Believes what is not signed too: only where a key is handed over, as USB is not signed.
+    pub trusts_wire: bool,
 }
 
 /// Signs and judges.
@@ -32,6 +34,7 @@ pub(super) struct Signatures {
     verifier: Verifier,
     made_at: HostTime,
     start: SigningTime,
+    trusts_wire: bool,
     refused: u64,
     /// Not told yet.
     news: Option<SigningFault>,
@@ -44,6 +47,7 @@ impl Signatures {
             verifier: Verifier::new(signing.key),
             made_at: now,
             start: signing.start,
+            trusts_wire: signing.trusts_wire,
             refused: 0,
             news: None,
         }
@@ -66,7 +70,7 @@ impl Signatures {
     /// Whether a packet may be believed. RADIO_STATUS is, unsigned: a bridge has no key (MAVLink
     /// guide, "Accepting Unsigned Packets").
     pub(super) fn accepts(&mut self, now: HostTime, bytes: &[u8], message: &MavMessage) -> bool {
-        if matches!(message, MavMessage::RADIO_STATUS(_)) {
+        if self.trusts_wire || matches!(message, MavMessage::RADIO_STATUS(_)) {
             return true;
         }
         let time = self.time(now);
@@ -138,7 +142,7 @@ impl SigningFile {
     /// # Errors
     /// If the file is there already, or cannot be written.
     pub fn create(&self, key: &SigningKey) -> Result<(), SigningFileError> {
-        let hex: String = key.bytes().iter().map(|byte| format!("{byte:02x}")).collect();
+        let hex = key.bytes().iter().fold(String::new(), |hex, byte| hex + &format!("{byte:02x}"));
         let written = OpenOptions::new()
             .write(true)
             .create_new(true)
@@ -171,7 +175,7 @@ impl SigningFile {
         let start = if wall > last { wall } else { last.plus_us(RESERVE_US) };
         fs::write(&stamp_path, start.units().to_string())
             .map_err(|why| SigningFileError::Unusable { path: stamp_path, why })?;
-        Ok(LinkSigning { key, start })
+        Ok(LinkSigning { key, start, trusts_wire: false })
     }
 
     fn unusable(&self, why: std::io::Error) -> SigningFileError {

@@ -83,26 +83,24 @@ impl Link {
     }
 
     fn prearm_words(&self, now: HostTime) -> String {
-        let mut text = "the autopilot's pre-arm checks fail".to_owned();
         let fresh = |(at, _): &&(HostTime, String)| now.seconds_since(*at) < PREARM_KEPT_S;
-        let said: Vec<&str> =
-            self.prearm.texts.iter().filter(fresh).map(|(_, text)| text.as_str()).collect();
-        for (i, why) in said.iter().enumerate() {
-            text += if i == 0 { ": " } else { "; " };
-            text += &format!("\"{why}\"");
-            if let Some(advice) = events::advice(why) {
-                text += &format!(" ({advice})");
-            }
-        }
+        let reason = |(_, why): &(HostTime, String)| match events::advice(why) {
+            Some(advice) => format!("\"{why}\" ({advice})"),
+            None => format!("\"{why}\""),
+        };
+        let reasons: Vec<String> = self.prearm.texts.iter().filter(fresh).map(reason).collect();
         let unhealthy: Vec<&str> = SENSORS
             .iter()
             .filter(|(sensor, _)| self.prearm.unhealthy.contains(*sensor))
             .map(|&(_, name)| name)
             .collect();
-        if !unhealthy.is_empty() {
-            text += &format!("; not healthy: {}", unhealthy.join(", "));
-        }
-        text
+        let colon = if reasons.is_empty() { "" } else { ": " };
+        let also = if unhealthy.is_empty() { "" } else { "; not healthy: " };
+        format!(
+            "the autopilot's pre-arm checks fail{colon}{}{also}{}",
+            reasons.join("; "),
+            unhealthy.join(", ")
+        )
     }
 
     /// Returns the sentence for a command that was given up.

@@ -11,7 +11,7 @@ fn key() -> SigningKey {
 }
 
 fn link(now: HostTime) -> Link {
-    let signing = Some(LinkSigning { key: key(), start: START });
+    let signing = Some(LinkSigning { key: key(), start: START, trusts_wire: false });
     Link::with(now, LinkSettings { signing, ..LinkSettings::default() })
 }
 
@@ -74,9 +74,18 @@ fn all_that_is_sent_is_signed() {
 }
 
 #[test]
+fn a_trusted_wire_need_not_sign() {
+    let now = HostTime::from_ns(5_000_000_000);
+    let signing = Some(LinkSigning { key: key(), start: START, trusts_wire: true });
+    let mut link = Link::with(now, LinkSettings { signing, ..LinkSettings::default() });
+    link.handle_input(now, &beat(None, START));
+    assert!(link.is_connected());
+}
+
+#[test]
 fn a_key_is_handed_over() {
     let mut script = Script::new();
-    let signing = LinkSigning { key: key(), start: START };
+    let signing = LinkSigning { key: key(), start: START, trusts_wire: false };
     assert!(!script.link.setup_signing(script.now, Some(&signing)), "to nobody");
     script.heartbeat();
     assert!(script.link.setup_signing(script.now, Some(&signing)));
