@@ -242,7 +242,7 @@ fn talk(
     let due = |tick: u32| start + Duration::from_micros(u64::from(tick) * u64::from(TICK_US));
     while Instant::now() < until {
         while tick < ticks && Instant::now() >= due(tick) {
-            for (place, message) in say(tick, 0).into_iter().enumerate() {
+            for place in 0..say(tick, 0).len() {
                 let stamp = (start.elapsed().as_micros() / 10) as u32 + place as u32;
                 let message = say(tick, stamp).swap_remove(place);
                 let header = MavHeader { system_id: from.0.into(), component_id: from.1, sequence };
