@@ -17,7 +17,7 @@ use vizflyt_protocol::mavlink::dialect::{
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
 /// Anything that takes longer is broken, on any machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 /// O_NONBLOCK | O_NOCTTY on Linux.
 const FLAGS: i32 = 0o4000 | 0o400;
 

@@ -34,6 +34,9 @@ const PX4_OFFBOARD: u32 = 6 << 16;
 /// Packets that make a stream, within [`STREAM_S`].
 const STREAM: u8 = 10;
 const STREAM_S: f64 = 2.0;
+/// A companion silent for this long has ended, if nothing follows it. Longer than the time from the
+/// last pose before arming to the heartbeat that tells of it. [s]
+const ENDED_S: f64 = 5.0;
 /// LAND is repeated this often until it is acknowledged. [s]
 const REPEAT_S: f64 = 0.3;
 /// And this often from then on, until the mode has changed: heartbeats come once a second. [s]
@@ -130,6 +133,12 @@ impl LinkLoss {
             // Its stream is to be seen anew before it is followed again.
             self.streamer = None;
         }
+        // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
+        // later without one is not landed for its silence.
+        let ended = |streamer: &Streamer| now.seconds_since(streamer.heard_at) > ENDED_S;
+        if !flight.follows() && self.streamer.as_ref().is_some_and(ended) {
+            self.streamer = None;
+        }
         if self.due(flight, loss_ms)? > now {
             return None;
         }
@@ -195,6 +204,16 @@ mod tests {
         assert_eq!(landings(|_| px4, 1000, 20, 2200), [(2000, 0)]);
         // ArduCopter's number means nothing to PX4.
         assert_eq!(landings(|_| Flight { mode: 4, ..px4 }, 1000, 20, 5000), []);
+    }
+
+    #[test]
+    fn a_companion_that_ended_on_the_ground_lands_nobody_later() {
+        let pilot = |ms| Flight { mode: 5, armed: ms < 3000, ..GUIDED };
+        let later = |ms| if ms < 7000 { pilot(ms) } else { GUIDED };
+        assert_eq!(landings(later, 1000, 20, 12_000), []);
+        // One that falls silent while the vehicle is being armed does.
+        let soon = |ms| if ms < 4000 { pilot(ms) } else { GUIDED };
+        assert_eq!(landings(soon, 1000, 20, 4200), [(4000, 0)]);
     }
 
     #[test]
