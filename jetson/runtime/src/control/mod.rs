@@ -12,30 +12,28 @@
 //!
 //! Why longer than most: it is where everything meets, and holds no logic of its own.
 
+mod plugin;
+mod telling;
+
 use std::ffi::OsString;
-use std::io::Write;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::sync::{Arc, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use serde_json::json;
-use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Arrivals, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, MAX_CAMERAS,
-    PoseSample, Setpoint, Telemetry, ToPlugin, YawTarget, bounded,
+    CameraInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, ToPlugin, bounded,
 };
 use vizflyt_protocol::time::HostTime;
-use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
-use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle, host_now};
+use vizflyt_sdk::{Battery, ImuSample, Vehicle, host_now};
 
-use crate::answers;
-use crate::console::{Screen, Status};
+use crate::console::Screen;
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
-use crate::images::{ImagePublisher, Published, SharedSenses};
+use crate::images::{Published, SharedSenses};
 use crate::link::port::Port;
 use crate::link::{Link, LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
@@ -43,7 +41,10 @@ use crate::report::Counters;
 use crate::stats::ImageTimes;
 use crate::steering::Steering;
 use crate::stream::{Outbox, Shared, StreamEvent};
-use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Restart, Stream, Supervisor};
+use crate::supervisor::{PluginEvent, PluginLimits, Stream};
+
+use plugin::PluginSide;
+pub use telling::print_line;
 
 /// Something another thread tells the control loop.
 #[derive(Debug)]
@@ -69,21 +70,10 @@ pub enum Happening {
 const TICK: Duration = Duration::from_millis(20);
 /// Reports to the server every so many ticks: 10 Hz.
 const TELEMETRY_TICKS: u64 = 5;
-/// The status line is renewed every so many ticks, a multiple of [`TELEMETRY_TICKS`]: 2 Hz.
-const STATUS_TICKS: u64 = 25;
 /// Where images get their age, to the server every so many ticks: 1 Hz.
 const TIMING_TICKS: u64 = 50;
-/// The plugin hears of us at least this often.
-const HEARTBEAT_TICKS: u64 = 20;
-/// A plugin that says it has failed may still print why for so long, before it is started again.
-const LAST_WORDS: Duration = Duration::from_millis(300);
 /// Lines of the plugin that the page gets in a second; console and log get more.
 const PAGE_LINES_PER_SECOND: u64 = 50;
-/// Whether a plugin that a person started still lives is looked up every 80 ms.
-const BY_HAND_TICKS: u64 = 4;
-/// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
-/// it would land. [s]
-const BREAKPOINT_S: f64 = 0.4;
 /// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
 /// within a tick.
 pub const QUEUE: usize = 1024;
@@ -123,31 +113,6 @@ pub struct Flown {
     pub counters: Counters,
     /// The log, still open.
     pub log: FlightLog,
-}
-
-/// The plugin's side, from the moment the arena is known.
-struct PluginSide {
-    ipc: Arc<RuntimeEnd>,
-    command: Vec<OsString>,
-    confinement: Confinement,
-    supervisor: Option<Supervisor>,
-    /// Stands until a plugin has come that a person started.
-    offer: Option<Offer>,
-    /// When a plugin that a person started last answered, or we on its behalf.
-    by_hand_answered: Option<HostTime>,
-    /// Number of the present process.
-    run: u32,
-    arena: Box<ArenaInfo>,
-    /// The present process was greeted.
-    started: bool,
-    /// The present process is on its way out, and another will be started; until when it may go
-    /// by itself.
-    leaving: Option<Instant>,
-    /// Another process speaks: what the former one did is forgotten.
-    anew: Arc<AtomicBool>,
-    /// Ends its threads.
-    stop: Arc<AtomicBool>,
-    threads: Vec<JoinHandle<()>>,
 }
 
 struct Loop {
@@ -507,313 +472,6 @@ impl Loop {
         self.control.to_server.tell(event);
     }
 
-    // ---- the plugin ----
-
-    fn start_plugin(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
-        if let Some(camera) = arena.cameras.first() {
-            self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
-        }
-        let service = unique_service();
-        let len = ObservationWriter::len_for(&arena.cameras);
-        let mut command = self.control.plugin_command.clone();
-        let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
-        // Who starts a plugin by hand is its user.
-        let by_hand = command.is_empty();
-        let owner = confinement.user_id().filter(|_| !by_hand);
-        let ipc = match RuntimeEnd::create_for(&service, len, owner) {
-            Ok(ipc) => Arc::new(ipc),
-            Err(error) => {
-                return self.flight.handle(now, Input::ServerRefused(error.to_string()));
-            }
-        };
-        let (stop, anew) = (Arc::default(), Arc::default());
-        let threads = self.start_threads(&ipc, &arena, &stop, &anew);
-        let mut offer = None;
-        if by_hand {
-            match Offer::make(&service) {
-                Ok(made) => offer = Some(made),
-                Err(error) => {
-                    let sentence = format!("no plugin can find this runtime: {error}");
-                    self.flight.handle(now, Input::PluginFailed(sentence));
-                }
-            }
-        } else {
-            command.push(format!("{SERVICE_OPTION}={service}").into());
-        }
-        self.plugin = Some(PluginSide {
-            ipc,
-            command,
-            confinement,
-            supervisor: None,
-            offer,
-            by_hand_answered: None,
-            run: 0,
-            arena,
-            started: false,
-            leaving: None,
-            anew,
-            stop,
-            threads,
-        });
-        if by_hand {
-            let text = "waiting for a plugin: start yours, as `python my_plugin.py`";
-            self.tell_event(now, EventKind::Note, text);
-        } else {
-            self.start_process(now);
-        }
-    }
-
-    /// Watches a plugin that a person started: its end is noticed, and while it stands at a
-    /// breakpoint the vehicle holds instead of landing.
-    fn tend_by_hand(&mut self, now: HostTime) {
-        let Some(side) = &mut self.plugin else { return };
-        let Some(answered) = side.by_hand_answered else { return };
-        if self.ticks.is_multiple_of(BY_HAND_TICKS) {
-            // A killed process stays subscribed until its remains are cleared away.
-            side.ipc.clean_up();
-            if !side.ipc.plugin_attached() {
-                side.by_hand_answered = None;
-                let sentence = "the plugin that had attached has ended".to_owned();
-                return self.flight.handle(now, Input::PluginFailed(sentence));
-            }
-        }
-        if now.seconds_since(answered) > BREAKPOINT_S {
-            side.by_hand_answered = Some(now);
-            let setpoint = Some(Setpoint::Hold);
-            self.flight.handle(now, Input::Answered { seq: self.image_seq, setpoint });
-        }
-    }
-
-    /// Starts the plugin's process, the first or another.
-    fn start_process(&mut self, now: HostTime) {
-        let Some(side) = &mut self.plugin else { return };
-        let (sender, run) = (self.sender.clone(), side.run);
-        // Lines and the end are never dropped: the loop always reads.
-        let tell = move |event| {
-            let _ = sender.send(Happening::Plugin(run, event));
-        };
-        match Supervisor::start(&side.command, &side.confinement, tell) {
-            Ok(supervisor) => side.supervisor = Some(supervisor),
-            Err(error) => {
-                let program = side.command[0].to_string_lossy();
-                let sentence = format!("the plugin {program} cannot be started: {error}");
-                self.flight.handle(now, Input::PluginFailed(sentence));
-            }
-        }
-    }
-
-    /// The plugin says that it has failed; its process ends soon after.
-    fn plugin_failed(&mut self, now: HostTime, sentence: String) {
-        if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
-            return;
-        }
-        if self.may_restart() {
-            self.restarts += 1;
-            self.replace_plugin(now, sentence);
-        } else {
-            self.flight.handle(now, Input::PluginFailed(sentence));
-        }
-    }
-
-    fn plugin_exited(&mut self, now: HostTime, run: u32, sentence: String) {
-        let Some(side) = &mut self.plugin else { return };
-        if side.run != run {
-            return;
-        }
-        side.ipc.clean_up();
-        if side.leaving.is_none() {
-            self.plugin_failed(now, sentence);
-        }
-        let Some(side) = &mut self.plugin else { return };
-        if side.leaving.take().is_some() && self.flight.can_wait_for_plugin() {
-            (side.run, side.started) = (side.run + 1, false);
-            side.anew.store(true, Ordering::Relaxed);
-            self.start_process(now);
-        }
-    }
-
-    /// Whether a plugin that failed is started again, by the policy.
-    fn may_restart(&self) -> bool {
-        let limits = &self.control.plugin_limits;
-        let is_there = match limits.restart {
-            Restart::Never => false,
-            Restart::OnGround => self.flight.is_on_ground(),
-            Restart::InFlight => true,
-        };
-        // What a person started, a person starts again.
-        let ours = !self.control.plugin_command.is_empty();
-        ours && is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
-    }
-
-    /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
-    fn replace_plugin(&mut self, now: HostTime, why: String) {
-        let Some(side) = &mut self.plugin else { return };
-        if side.leaving.is_some() || !self.flight.can_wait_for_plugin() {
-            return;
-        }
-        side.leaving = Some(Instant::now() + LAST_WORDS);
-        if side.ipc.plugin_attached() {
-            let _ = side.ipc.send(&ToPlugin::Stop);
-        }
-        self.flight.handle(now, Input::PluginRestarts(why));
-    }
-
-    fn start_threads(
-        &self,
-        ipc: &Arc<RuntimeEnd>,
-        arena: &ArenaInfo,
-        stop: &Arc<AtomicBool>,
-        anew: &Arc<AtomicBool>,
-    ) -> Vec<JoinHandle<()>> {
-        let cameras = arena.cameras.to_vec();
-        let mailbox = Arc::clone(&self.control.shared.mailbox);
-        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
-            .with_log(self.control.log.images(&mailbox));
-        let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
-        let images = spawn("images", move || {
-            publisher.run(
-                &mailbox,
-                || stopped.load(Ordering::Relaxed),
-                |published| {
-                    let _ = sender.send(Happening::Published(published));
-                },
-            );
-        });
-        let (ipc, sender) = (Arc::clone(ipc), self.sender.clone());
-        let (stopped, anew) = (Arc::clone(stop), Arc::clone(anew));
-        let answers = spawn("answers", move || {
-            answers::read(&ipc, &stopped, &anew, |message| {
-                let _ = sender.send(Happening::FromPlugin(Box::new(message)));
-            });
-        });
-        images.into_iter().chain(answers).collect()
-    }
-
-    /// Greets the plugin once it has attached; shows it that we live.
-    fn tend_plugin(&mut self) {
-        let Some(side) = &mut self.plugin else { return };
-        if side.leaving.is_some_and(|until| Instant::now() > until)
-            && let Some(supervisor) = &side.supervisor
-        {
-            supervisor.kill();
-        }
-        if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
-            side.started = true;
-            if side.offer.take().is_some() {
-                side.by_hand_answered = Some(host_now());
-            }
-            let start = ToPlugin::Start((*side.arena).clone());
-            self.control.log.to_plugin(host_now(), &start);
-            if let Err(error) = side.ipc.send(&start) {
-                tracing::warn!("plugin: {error}");
-            }
-            // One that comes later learns where the flight is.
-            if side.run > 0 {
-                let stamp = self.control.shared.clock.to_server(host_now());
-                let kind = EventKind::Phase(self.flight.phase());
-                let text = bounded("the plugin was started again");
-                let message = ToPlugin::Event(Event { stamp, kind, text });
-                self.control.log.to_plugin(host_now(), &message);
-                let _ = side.ipc.send(&message);
-            }
-        } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
-            side.ipc.heartbeat();
-        }
-    }
-
-    // ---- telling others ----
-
-    fn tell_notices(&mut self, now: HostTime) {
-        while let Some(notice) = self.flight.poll_notice() {
-            let stamp = self.control.shared.clock.to_server(now);
-            let text = bounded(&notice.text);
-            let event = Event { stamp, kind: notice.kind, text };
-            tracing::info!(target: "flight", "{}", notice.text);
-            self.publish_event(now, &event);
-            self.control.to_server.tell(event);
-        }
-    }
-
-    /// Log, plugin and standard output hear of every event but the plugin's own lines.
-    fn publish_event(&mut self, now: HostTime, event: &Event) {
-        self.control.log.event(now, event);
-        if self.control.json {
-            print_line(&json!({"event": event}).to_string());
-        } else {
-            self.control.screen.event(&event.text);
-        }
-        if let Some(side) = &self.plugin
-            && side.started
-            && side.ipc.plugin_attached()
-        {
-            let message = ToPlugin::Event(for_plugin(event, &side.arena));
-            self.control.log.to_plugin(host_now(), &message);
-            if let Err(error) = side.ipc.send(&message) {
-                tracing::debug!("plugin: {error}");
-            }
-        }
-    }
-
-    fn report(&mut self, now: HostTime) {
-        let replaced = self.control.shared.mailbox.replaced();
-        let telemetry = Telemetry {
-            phase: self.flight.phase(),
-            vehicle: *self.link.state(),
-            images: self.times.last_second(now, self.published, replaced),
-            v_setpoint_mps: self.v_setpoint_mps,
-            setpoints_sent: self.setpoints_sent,
-            mavlink_packets: self.link.packets(),
-        };
-        self.control.log.write(Channel::Telemetry, now, &telemetry);
-        if self.ticks.is_multiple_of(STATUS_TICKS) {
-            let status = Status::of(&telemetry);
-            if self.control.json {
-                print_line(&json!({"status": status}).to_string());
-            } else {
-                self.control.screen.status(&status);
-            }
-        }
-        self.control.to_server.report(telemetry);
-    }
-
-    fn report_timing(&mut self, now: HostTime) {
-        if let Some(trouble) = self.control.log.poll_trouble() {
-            let text = bounded(&format!("flight log: {trouble}"));
-            let stamp = self.control.shared.clock.to_server(now);
-            let event = Event { stamp, kind: EventKind::Note, text };
-            self.publish_event(now, &event);
-            self.control.to_server.tell(event);
-        }
-        let clock = self.control.shared.clock.state(now);
-        let timing = self.times.timing(now, clock, &self.arrived());
-        self.control.log.write(Channel::Timing, now, &timing);
-        self.control.to_server.report_timing(timing);
-    }
-
-    /// Returns what became of images before they reached shared memory, by camera.
-    fn arrived(&self) -> Vec<Arrivals> {
-        let cameras = self.plugin.as_ref().map_or(0, |side| side.arena.cameras.len());
-        self.control.shared.mailbox.arrivals()[..cameras.min(MAX_CAMERAS)].to_vec()
-    }
-
-    fn log_sent(&mut self, now: HostTime, setpoint: &GuidedSetpoint) {
-        let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return };
-        self.v_setpoint_mps = v_mps;
-        let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
-            YawTarget::Angle(yaw_rad) => (Some(yaw_rad), None),
-            YawTarget::Rate(rate_radps) => (None, Some(rate_radps)),
-            YawTarget::Keep => (None, None),
-        };
-        self.control.log.write(
-            Channel::Sent,
-            now,
-            &json!({
-                "v_world_mps": v_mps.to_array(), "yaw_rad": yaw_rad,
-                "yaw_rate_radps": yaw_rate_radps
-            }),
-        );
-    }
-
     // ---- the end ----
 
     fn finish(mut self, outcome: Outcome, happenings: &Receiver<Happening>) -> Flown {
@@ -855,27 +513,4 @@ impl Loop {
         };
         Flown { outcome, times: self.times, counters, log: self.control.log }
     }
-}
-
-/// Returns the event as the plugin may know it: without the place where the course withholds it.
-fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
-    let mut event = event.clone();
-    if !arena.ground_truth
-        && let EventKind::Collision { p_world_m, .. } | EventKind::Geofence { p_world_m, .. } =
-            &mut event.kind
-    {
-        *p_world_m = DVec3::ZERO;
-    }
-    event
-}
-
-fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Option<JoinHandle<()>> {
-    let thread = thread::Builder::new().name(name.into()).spawn(run);
-    thread.inspect_err(|error| tracing::error!("thread {name}: {error}")).ok()
-}
-
-/// Prints a line for a program that may have stopped listening.
-pub fn print_line(line: &str) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }

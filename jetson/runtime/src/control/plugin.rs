@@ -1,0 +1,273 @@
+//! The plugin in the control loop: its process and shared memory, when it is started, replaced, tended and
+//! given up.
+
+use std::ffi::OsString;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, Setpoint, ToPlugin, bounded};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::{ObservationWriter, host_now};
+
+use super::{Happening, Loop};
+use crate::answers;
+use crate::flight::Input;
+use crate::images::ImagePublisher;
+use crate::supervisor::{Confinement, Restart, Supervisor};
+
+/// The plugin hears of us at least this often.
+const HEARTBEAT_TICKS: u64 = 20;
+/// A plugin that says it has failed may still print why for so long, before it is started again.
+const LAST_WORDS: Duration = Duration::from_millis(300);
+/// Whether a plugin that a person started still lives is looked up every 80 ms.
+const BY_HAND_TICKS: u64 = 4;
+/// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
+/// it would land. [s]
+const BREAKPOINT_S: f64 = 0.4;
+
+/// The plugin's side, from the moment the arena is known.
+pub(super) struct PluginSide {
+    pub(super) ipc: Arc<RuntimeEnd>,
+    pub(super) command: Vec<OsString>,
+    pub(super) confinement: Confinement,
+    pub(super) supervisor: Option<Supervisor>,
+    /// Stands until a plugin has come that a person started.
+    pub(super) offer: Option<Offer>,
+    /// When a plugin that a person started last answered, or we on its behalf.
+    pub(super) by_hand_answered: Option<HostTime>,
+    /// Number of the present process.
+    pub(super) run: u32,
+    pub(super) arena: Box<ArenaInfo>,
+    /// The present process was greeted.
+    pub(super) started: bool,
+    /// The present process is on its way out, and another will be started; until when it may go
+    /// by itself.
+    pub(super) leaving: Option<Instant>,
+    /// Another process speaks: what the former one did is forgotten.
+    pub(super) anew: Arc<AtomicBool>,
+    /// Ends its threads.
+    pub(super) stop: Arc<AtomicBool>,
+    pub(super) threads: Vec<JoinHandle<()>>,
+}
+
+impl Loop {
+    pub(super) fn start_plugin(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
+        if let Some(camera) = arena.cameras.first() {
+            self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+        }
+        let service = unique_service();
+        let len = ObservationWriter::len_for(&arena.cameras);
+        let mut command = self.control.plugin_command.clone();
+        let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
+        // Who starts a plugin by hand is its user.
+        let by_hand = command.is_empty();
+        let owner = confinement.user_id().filter(|_| !by_hand);
+        let ipc = match RuntimeEnd::create_for(&service, len, owner) {
+            Ok(ipc) => Arc::new(ipc),
+            Err(error) => {
+                return self.flight.handle(now, Input::ServerRefused(error.to_string()));
+            }
+        };
+        let (stop, anew) = (Arc::default(), Arc::default());
+        let threads = self.start_threads(&ipc, &arena, &stop, &anew);
+        let mut offer = None;
+        if by_hand {
+            match Offer::make(&service) {
+                Ok(made) => offer = Some(made),
+                Err(error) => {
+                    let sentence = format!("no plugin can find this runtime: {error}");
+                    self.flight.handle(now, Input::PluginFailed(sentence));
+                }
+            }
+        } else {
+            command.push(format!("{SERVICE_OPTION}={service}").into());
+        }
+        self.plugin = Some(PluginSide {
+            ipc,
+            command,
+            confinement,
+            supervisor: None,
+            offer,
+            by_hand_answered: None,
+            run: 0,
+            arena,
+            started: false,
+            leaving: None,
+            anew,
+            stop,
+            threads,
+        });
+        if by_hand {
+            let text = "waiting for a plugin: start yours, as `python my_plugin.py`";
+            self.tell_event(now, EventKind::Note, text);
+        } else {
+            self.start_process(now);
+        }
+    }
+
+    /// Watches a plugin that a person started: its end is noticed, and while it stands at a
+    /// breakpoint the vehicle holds instead of landing.
+    pub(super) fn tend_by_hand(&mut self, now: HostTime) {
+        let Some(side) = &mut self.plugin else { return };
+        let Some(answered) = side.by_hand_answered else { return };
+        if self.ticks.is_multiple_of(BY_HAND_TICKS) {
+            // A killed process stays subscribed until its remains are cleared away.
+            side.ipc.clean_up();
+            if !side.ipc.plugin_attached() {
+                side.by_hand_answered = None;
+                let sentence = "the plugin that had attached has ended".to_owned();
+                return self.flight.handle(now, Input::PluginFailed(sentence));
+            }
+        }
+        if now.seconds_since(answered) > BREAKPOINT_S {
+            side.by_hand_answered = Some(now);
+            let setpoint = Some(Setpoint::Hold);
+            self.flight.handle(now, Input::Answered { seq: self.image_seq, setpoint });
+        }
+    }
+
+    /// Starts the plugin's process, the first or another.
+    pub(super) fn start_process(&mut self, now: HostTime) {
+        let Some(side) = &mut self.plugin else { return };
+        let (sender, run) = (self.sender.clone(), side.run);
+        // Lines and the end are never dropped: the loop always reads.
+        let tell = move |event| {
+            let _ = sender.send(Happening::Plugin(run, event));
+        };
+        match Supervisor::start(&side.command, &side.confinement, tell) {
+            Ok(supervisor) => side.supervisor = Some(supervisor),
+            Err(error) => {
+                let program = side.command[0].to_string_lossy();
+                let sentence = format!("the plugin {program} cannot be started: {error}");
+                self.flight.handle(now, Input::PluginFailed(sentence));
+            }
+        }
+    }
+
+    /// The plugin says that it has failed; its process ends soon after.
+    pub(super) fn plugin_failed(&mut self, now: HostTime, sentence: String) {
+        if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
+            return;
+        }
+        if self.may_restart() {
+            self.restarts += 1;
+            self.replace_plugin(now, sentence);
+        } else {
+            self.flight.handle(now, Input::PluginFailed(sentence));
+        }
+    }
+
+    pub(super) fn plugin_exited(&mut self, now: HostTime, run: u32, sentence: String) {
+        let Some(side) = &mut self.plugin else { return };
+        if side.run != run {
+            return;
+        }
+        side.ipc.clean_up();
+        if side.leaving.is_none() {
+            self.plugin_failed(now, sentence);
+        }
+        let Some(side) = &mut self.plugin else { return };
+        if side.leaving.take().is_some() && self.flight.can_wait_for_plugin() {
+            (side.run, side.started) = (side.run + 1, false);
+            side.anew.store(true, Ordering::Relaxed);
+            self.start_process(now);
+        }
+    }
+
+    /// Whether a plugin that failed is started again, by the policy.
+    pub(super) fn may_restart(&self) -> bool {
+        let limits = &self.control.plugin_limits;
+        let is_there = match limits.restart {
+            Restart::Never => false,
+            Restart::OnGround => self.flight.is_on_ground(),
+            Restart::InFlight => true,
+        };
+        // What a person started, a person starts again.
+        let ours = !self.control.plugin_command.is_empty();
+        ours && is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
+    }
+
+    /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
+    pub(super) fn replace_plugin(&mut self, now: HostTime, why: String) {
+        let Some(side) = &mut self.plugin else { return };
+        if side.leaving.is_some() || !self.flight.can_wait_for_plugin() {
+            return;
+        }
+        side.leaving = Some(Instant::now() + LAST_WORDS);
+        if side.ipc.plugin_attached() {
+            let _ = side.ipc.send(&ToPlugin::Stop);
+        }
+        self.flight.handle(now, Input::PluginRestarts(why));
+    }
+
+    pub(super) fn start_threads(
+        &self,
+        ipc: &Arc<RuntimeEnd>,
+        arena: &ArenaInfo,
+        stop: &Arc<AtomicBool>,
+        anew: &Arc<AtomicBool>,
+    ) -> Vec<JoinHandle<()>> {
+        let cameras = arena.cameras.to_vec();
+        let mailbox = Arc::clone(&self.control.shared.mailbox);
+        let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
+            .with_log(self.control.log.images(&mailbox));
+        let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
+        let images = spawn("images", move || {
+            publisher.run(
+                &mailbox,
+                || stopped.load(Ordering::Relaxed),
+                |published| {
+                    let _ = sender.send(Happening::Published(published));
+                },
+            );
+        });
+        let (ipc, sender) = (Arc::clone(ipc), self.sender.clone());
+        let (stopped, anew) = (Arc::clone(stop), Arc::clone(anew));
+        let answers = spawn("answers", move || {
+            answers::read(&ipc, &stopped, &anew, |message| {
+                let _ = sender.send(Happening::FromPlugin(Box::new(message)));
+            });
+        });
+        images.into_iter().chain(answers).collect()
+    }
+
+    /// Greets the plugin once it has attached; shows it that we live.
+    pub(super) fn tend_plugin(&mut self) {
+        let Some(side) = &mut self.plugin else { return };
+        if side.leaving.is_some_and(|until| Instant::now() > until)
+            && let Some(supervisor) = &side.supervisor
+        {
+            supervisor.kill();
+        }
+        if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
+            side.started = true;
+            if side.offer.take().is_some() {
+                side.by_hand_answered = Some(host_now());
+            }
+            let start = ToPlugin::Start((*side.arena).clone());
+            self.control.log.to_plugin(host_now(), &start);
+            if let Err(error) = side.ipc.send(&start) {
+                tracing::warn!("plugin: {error}");
+            }
+            // One that comes later learns where the flight is.
+            if side.run > 0 {
+                let stamp = self.control.shared.clock.to_server(host_now());
+                let kind = EventKind::Phase(self.flight.phase());
+                let text = bounded("the plugin was started again");
+                let message = ToPlugin::Event(Event { stamp, kind, text });
+                self.control.log.to_plugin(host_now(), &message);
+                let _ = side.ipc.send(&message);
+            }
+        } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
+            side.ipc.heartbeat();
+        }
+    }
+}
+
+fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Option<JoinHandle<()>> {
+    let thread = thread::Builder::new().name(name.into()).spawn(run);
+    thread.inspect_err(|error| tracing::error!("thread {name}: {error}")).ok()
+}
