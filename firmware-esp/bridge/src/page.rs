@@ -1,5 +1,6 @@
 //! The status page: what a browser shows of a bridge, and the same as JSON. Reading only: settings
-//! change by `vizflyt bridge configure`, with the key.
+//! change by `vizflyt bridge configure`, with the key; a firmware comes here too, and its signature
+//! speaks for it.
 
 use core::fmt::{self, Write as _};
 
@@ -33,7 +34,32 @@ pub fn respond(bridge: &Bridge, now: HostTime, request: &[u8]) -> String<RESPONS
 
 /// Whether the end of the request's head has come.
 pub fn is_whole(request: &[u8]) -> bool {
-    request.windows(4).any(|end| end == b"\r\n\r\n")
+    body(request).is_some()
+}
+
+/// Returns where a new firmware begins in a request that brings one: `POST /update`, the signed file
+/// as it is.
+pub fn firmware(request: &[u8]) -> Option<usize> {
+    body(request).filter(|_| request.starts_with(b"POST /update "))
+}
+
+/// Answers a request that brought a firmware.
+pub fn respond_firmware(taken: Result<(), &str>) -> String<RESPONSE> {
+    let mut out = String::new();
+    // Fits: the longest reason is a sentence.
+    let _ = match taken {
+        Ok(()) => out.write_str(
+            "HTTP/1.0 200 OK\r\nConnection: close\r\n\r\nverified; it starts now, on trial\n",
+        ),
+        Err(why) => {
+            write!(out, "HTTP/1.0 409 Conflict\r\nConnection: close\r\n\r\n{why}\n")
+        }
+    };
+    out
+}
+
+fn body(request: &[u8]) -> Option<usize> {
+    request.windows(4).position(|end| end == b"\r\n\r\n").map(|at| at + 4)
 }
 
 fn counters(bridge: &Bridge, now: HostTime) -> impl Iterator<Item = (&'static str, u32)> {

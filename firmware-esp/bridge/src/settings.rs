@@ -349,15 +349,23 @@ impl Settings {
 ///
 /// # Errors
 /// [`Refused::Malformed`].
-pub fn key_from_hex(text: &str) -> Result<Key, Refused> {
+pub const fn key_from_hex(text: &str) -> Result<Key, Refused> {
     let digits = text.as_bytes();
     if digits.len() != 64 {
         return Err(Refused::Malformed);
     }
     let mut key = [0; 32];
-    for (byte, pair) in key.iter_mut().zip(digits.chunks_exact(2)) {
-        let digit = |d: u8| (d as char).to_digit(16).ok_or(Refused::Malformed);
-        *byte = (digit(pair[0])? * 16 + digit(pair[1])?) as u8;
+    let mut at = 0;
+    // No iterators in a constant, where chips have their key.
+    while at < 64 {
+        let digit = match digits[at] {
+            digit @ b'0'..=b'9' => digit - b'0',
+            digit @ b'a'..=b'f' => digit - b'a' + 10,
+            digit @ b'A'..=b'F' => digit - b'A' + 10,
+            _ => return Err(Refused::Malformed),
+        };
+        key[at / 2] = (key[at / 2] << 4) | digit;
+        at += 1;
     }
     Ok(key)
 }

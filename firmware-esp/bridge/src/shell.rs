@@ -34,6 +34,16 @@ pub trait Platform {
 
     /// Returns how well the radio hears its partner; `None` where it does not know. [dBm]
     fn signal_dbm(&mut self) -> Option<i8>;
+
+    /// Takes the next bytes of a new firmware, of which `first` are the beginning; returns true with
+    /// the last: it is verified, and the next start is its own; `update` does both.
+    ///
+    /// # Errors
+    /// Why it is not taken, in words; the firmware that runs stays.
+    fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
+        let _ = (first, bytes);
+        Err("this bridge takes no firmware over the network; flash it by wire")
+    }
 }
 
 /// What the light says; the number is how often it blinks in a period of two seconds.
@@ -108,7 +118,7 @@ pub struct Buffers {
 
 #[derive(Debug)]
 struct PageBuffers {
-    receive: [u8; 128],
+    receive: [u8; 536],
     transmit: [u8; 536],
     request: [u8; 256],
 }
@@ -138,7 +148,7 @@ impl Buffers {
             datagram_out: [0; 1400],
             tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
                 TCP_SLOTS],
-            page: PageBuffers { receive: [0; 128], transmit: [0; 536], request: [0; 256] },
+            page: PageBuffers { receive: [0; 536], transmit: [0; 536], request: [0; 256] },
         }
     }
 }
@@ -163,10 +173,12 @@ pub async fn run<R: Read, W: Write, F: NorFlash, P: Platform>(
     platform: &mut P,
     buffers: &mut Buffers,
 ) -> ! {
+    // Borrowed for a call at a time, never while waiting.
+    let platform = RefCell::new(platform);
     join3(
         serial(shared, uart_in, uart_out),
-        serve(shared, stack, buffers),
-        mind(shared, stack, store, platform),
+        serve(shared, stack, &platform, buffers),
+        mind(shared, stack, store, &platform),
     )
     .await;
     // Each of the three is endless.
@@ -205,7 +217,12 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
 }
 
 /// Serves the network on one stack.
-async fn serve(shared: &Shared, stack: Stack<'_>, buffers: &mut Buffers) {
+async fn serve<P: Platform>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    platform: &RefCell<&mut P>,
+    buffers: &mut Buffers,
+) {
     let (udp_port, tcp_port) =
         shared.take(|bridge, _| (bridge.settings().udp_port, bridge.settings().tcp_port));
     let Buffers {
@@ -248,7 +265,7 @@ async fn serve(shared: &Shared, stack: Stack<'_>, buffers: &mut Buffers) {
         send,
         connection(shared, stack, tcp_port, 0, first),
         connection(shared, stack, tcp_port, 1, second),
-        show_page(shared, stack, page),
+        show_page(shared, stack, platform, page),
     )
     .await;
 }
@@ -306,8 +323,13 @@ async fn connection(
     }
 }
 
-/// Serves the status page, to one browser after another.
-async fn show_page(shared: &Shared, stack: Stack<'_>, buffers: &mut PageBuffers) {
+/// Serves the status page, to one browser after another, and takes firmware.
+async fn show_page<P: Platform>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    platform: &RefCell<&mut P>,
+    buffers: &mut PageBuffers,
+) {
     let port = shared.take(|bridge, _| bridge.settings().page_port);
     if port == 0 {
         return;
@@ -328,7 +350,15 @@ async fn show_page(shared: &Shared, stack: Stack<'_>, buffers: &mut PageBuffers)
                 _ => break,
             }
         }
-        if len > 0 {
+        let mut restart = false;
+        if let Some(from) = page::firmware(&request[..len]) {
+            let taken = take_firmware(shared, platform, &mut socket, request, from, len).await;
+            restart = taken.is_ok();
+            let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
+            socket.close();
+            // Whoever still sends reads the answer only after that.
+            while let Ok(1..) = socket.read(request).await {}
+        } else if len > 0 {
             let response = shared.take(|bridge, now| page::respond(bridge, now, &request[..len]));
             // A browser that has gone wants no answer.
             let _ = socket.write_all(response.as_bytes()).await;
@@ -337,6 +367,36 @@ async fn show_page(shared: &Shared, stack: Stack<'_>, buffers: &mut PageBuffers)
         let _ = socket.flush().await;
         socket.abort();
         let _ = socket.flush().await;
+        if restart {
+            platform.borrow_mut().restart();
+        }
+    }
+}
+
+/// Takes a firmware whose first bytes are `request[from..to]`, the rest from the connection.
+async fn take_firmware<P: Platform>(
+    shared: &Shared,
+    platform: &RefCell<&mut P>,
+    socket: &mut TcpSocket<'_>,
+    request: &mut [u8],
+    mut from: usize,
+    mut to: usize,
+) -> Result<(), &'static str> {
+    let mut first = true;
+    loop {
+        // Asked again and again: it takes seconds, and flash stops everything else while it erases.
+        if shared.take(|bridge, _| bridge.is_armed()) {
+            return Err("the vehicle is armed; land and disarm it first");
+        }
+        if platform.borrow_mut().update(first, &request[from..to])? {
+            return Ok(());
+        }
+        first = false;
+        from = 0;
+        to = match socket.read(request).await {
+            Ok(len @ 1..) => len,
+            _ => return Err("the connection ended before the firmware did"),
+        };
     }
 }
 
@@ -345,15 +405,15 @@ async fn mind<F: NorFlash, P: Platform>(
     shared: &Shared,
     stack: Stack<'_>,
     store: &mut Store<F>,
-    platform: &mut P,
+    platform: &RefCell<&mut P>,
 ) {
     let mut shown = None;
-    let mut signal = platform.signal_dbm();
+    let mut signal = platform.borrow_mut().signal_dbm();
     let mut asked_at = Instant::now();
     loop {
         // Asking the radio is slow on some chips; this loop turns with every packet.
         if asked_at.elapsed() > Duration::from_secs(1) {
-            signal = platform.signal_dbm();
+            signal = platform.borrow_mut().signal_dbm();
             asked_at = Instant::now();
         }
         let broadcast = stack.config_v4().map(|config| {
@@ -369,7 +429,7 @@ async fn mind<F: NorFlash, P: Platform>(
         shared.uart.signal(());
         shared.udp.signal(());
         if shown != Some(light) {
-            platform.show(light);
+            platform.borrow_mut().show(light);
             shown = Some(light);
         }
         match event {
@@ -381,7 +441,7 @@ async fn mind<F: NorFlash, P: Platform>(
             Some(Event::Restart) => {
                 // The answer goes out first.
                 Timer::after(Duration::from_millis(300)).await;
-                platform.restart();
+                platform.borrow_mut().restart();
             }
             None => {
                 wait(&shared.timer, Some(due)).await;

@@ -13,7 +13,8 @@ use sha2::{Digest, Sha256};
 
 /// Bytes before a firmware.
 pub const HEADER: usize = 112;
-const MAGIC: [u8; 4] = *b"VZU1";
+/// The header begins with it.
+pub const MAGIC: [u8; 4] = *b"VZU1";
 /// What is signed: everything before the signature, and what it is for.
 const SIGNED: usize = 48;
 const CONTEXT: &[u8] = b"vizflyt bridge firmware 1";

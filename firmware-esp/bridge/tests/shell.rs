@@ -4,6 +4,7 @@
 use core::future::Future;
 use core::net::Ipv4Addr;
 
+use ed25519_dalek::{Signer, SigningKey};
 use embassy_futures::join::{join, join3};
 use embassy_futures::select::{Either, select};
 use embassy_net::tcp::TcpSocket;
@@ -15,10 +16,12 @@ use embassy_sync::pipe::{Pipe, Reader, Writer};
 use embassy_time::{Duration, with_timeout};
 use embedded_io_async::Write;
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashErrorKind, ReadNorFlash};
+use sha2::{Digest, Sha256};
 use vizflyt_bridge::packet::{CutStats, Cutter, each_in_datagram};
 use vizflyt_bridge::seal::seal;
 use vizflyt_bridge::shell::{Buffers, Light, Platform, SOCKETS, Shared, run};
 use vizflyt_bridge::storage::Store;
+use vizflyt_bridge::update::{Fault, Header, Slots, Target, Updater, Wanted};
 use vizflyt_bridge::{Bridge, Chip, Settings};
 use vizflyt_protocol::time::HostTime;
 
@@ -28,14 +31,18 @@ const COMPANION: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 2);
 /// Longer than this only a hang takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A chip without anything.
-#[derive(Default)]
+/// A chip whose flash is memory.
 struct Bare {
     lights: Vec<Light>,
+    halves: Halves,
+    updater: Option<Updater>,
+    restarts: u32,
 }
 
 impl Platform for Bare {
-    fn restart(&mut self) {}
+    fn restart(&mut self) {
+        self.restarts += 1;
+    }
 
     fn show(&mut self, light: Light) {
         self.lights.push(light);
@@ -44,36 +51,81 @@ impl Platform for Bare {
     fn signal_dbm(&mut self) -> Option<i8> {
         Some(-50)
     }
+
+    fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
+        if first {
+            self.updater = None;
+        }
+        let updater = self.updater.get_or_insert_with(|| Updater::new(wanted()));
+        updater.feed(&mut self.halves, bytes).map_err(Fault::words)
+    }
 }
 
-struct NoFlash;
+struct Halves {
+    spare: Ram,
+    starts_spare: bool,
+}
 
-impl ErrorType for NoFlash {
+impl Slots for Halves {
+    type Spare = Ram;
+
+    fn spare(&mut self) -> &mut Ram {
+        &mut self.spare
+    }
+
+    fn start_spare(&mut self) -> bool {
+        self.starts_spare = true;
+        true
+    }
+}
+
+const FIRMWARE_SECRET: [u8; 32] = [9; 32];
+
+fn wanted() -> Wanted {
+    let key = SigningKey::from_bytes(&FIRMWARE_SECRET).verifying_key().to_bytes();
+    Wanted { target: Target::Host, build: 3, key }
+}
+
+/// Flash in memory: erased bytes are ones, writing clears bits.
+struct Ram(Vec<u8>);
+
+impl ErrorType for Ram {
     type Error = NorFlashErrorKind;
 }
 
-impl ReadNorFlash for NoFlash {
+impl Ram {
+    fn place(&mut self, from: u32, len: usize) -> Result<&mut [u8], NorFlashErrorKind> {
+        let from = from as usize;
+        self.0.get_mut(from..from + len).ok_or(NorFlashErrorKind::OutOfBounds)
+    }
+}
+
+impl ReadNorFlash for Ram {
     const READ_SIZE: usize = 4;
 
-    fn read(&mut self, _: u32, bytes: &mut [u8]) -> Result<(), NorFlashErrorKind> {
-        bytes.fill(0xFF);
+    fn read(&mut self, from: u32, bytes: &mut [u8]) -> Result<(), NorFlashErrorKind> {
+        bytes.copy_from_slice(self.place(from, bytes.len())?);
         Ok(())
     }
 
     fn capacity(&self) -> usize {
-        8192
+        self.0.len()
     }
 }
 
-impl NorFlash for NoFlash {
+impl NorFlash for Ram {
     const WRITE_SIZE: usize = 4;
     const ERASE_SIZE: usize = 4096;
 
-    fn erase(&mut self, _: u32, _: u32) -> Result<(), NorFlashErrorKind> {
+    fn erase(&mut self, from: u32, to: u32) -> Result<(), NorFlashErrorKind> {
+        self.place(from, (to - from) as usize)?.fill(0xFF);
         Ok(())
     }
 
-    fn write(&mut self, _: u32, _: &[u8]) -> Result<(), NorFlashErrorKind> {
+    fn write(&mut self, from: u32, bytes: &[u8]) -> Result<(), NorFlashErrorKind> {
+        for (cell, byte) in self.place(from, bytes.len())?.iter_mut().zip(bytes) {
+            *cell &= byte;
+        }
         Ok(())
     }
 }
@@ -102,10 +154,8 @@ fn fixed(address: Ipv4Addr) -> Config {
     })
 }
 
-/// Runs `test` with a bridge's companion and autopilot; returns what the light showed.
-fn with_bridge<F>(
-    test: impl FnOnce(Stack<'static>, LineIn<'static>, LineOut<'static>) -> F,
-) -> Vec<Light>
+/// Runs `test` with a bridge's companion and autopilot; returns the chip as it was left.
+fn with_bridge<F>(test: impl FnOnce(Stack<'static>, LineIn<'static>, LineOut<'static>) -> F) -> Bare
 where
     F: Future<Output = ()>,
 {
@@ -131,7 +181,9 @@ where
     let settings = Settings { radio_status: false, ..Settings::default() };
     let shared = Shared::new(Bridge::new(HostTime::ZERO, settings, Chip::default()));
     let mut buffers = Box::new(Buffers::new());
-    let (mut store, mut bare) = (Store::new(NoFlash, 0), Bare::default());
+    let mut store = Store::new(Ram(vec![0xFF; 8192]), 0);
+    let halves = Halves { spare: Ram(vec![0; 5 * 4096]), starts_spare: false };
+    let mut bare = Bare { lights: Vec::new(), halves, updater: None, restarts: 0 };
     {
         let bridge =
             run(&shared, stack_a, (bridge_in, bridge_out), &mut store, &mut bare, &mut buffers);
@@ -143,7 +195,7 @@ where
             Either::Second(done) => done.expect("everything comes in time"),
         }
     }
-    bare.lights
+    bare
 }
 
 /// A whole packet of message `id`, told apart by `number`.
@@ -161,7 +213,7 @@ const COUNT: u32 = 1000;
 
 #[test]
 fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
-    let lights = with_bridge(|stack, uart_in, mut uart_out| async move {
+    let chip = with_bridge(|stack, uart_in, mut uart_out| async move {
         let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 16]);
         let (mut rx, mut tx) = ([0; 8192], [0; 8192]);
         let mut socket = UdpSocket::new(stack, &mut rx_meta, &mut rx, &mut tx_meta, &mut tx);
@@ -207,7 +259,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
         };
         join(say, hear).await;
     });
-    assert!(lights.contains(&Light::NoAutopilot), "{lights:?}");
+    assert!(chip.lights.contains(&Light::NoAutopilot), "{:?}", chip.lights);
 }
 
 #[test]
@@ -266,4 +318,85 @@ fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
             let _ = socket.flush().await;
         }
     });
+}
+
+/// Signs a firmware as `vizflyt bridge firmware sign` does.
+fn signed(body: &[u8]) -> Vec<u8> {
+    let header = Header {
+        target: Target::Host as u8,
+        build: 3,
+        len: body.len() as u32,
+        hash: Sha256::digest(body).into(),
+    };
+    let key = SigningKey::from_bytes(&FIRMWARE_SECRET);
+    [&header.seal(|message| key.sign(message).to_bytes())[..], body].concat()
+}
+
+/// Brings a firmware and returns the answer.
+async fn bring(stack: Stack<'static>, firmware: &[u8]) -> String {
+    let (mut rx, mut tx) = ([0; 1024], [0; 1024]);
+    let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
+    while socket.connect((BRIDGE, 80)).await.is_err() {
+        embassy_time::Timer::after(Duration::from_millis(1)).await;
+    }
+    let mut request = b"POST /update HTTP/1.0\r\n\r\n".to_vec();
+    request.extend_from_slice(firmware);
+    // A refusal may come before the last byte has gone.
+    let _ = socket.write_all(&request).await;
+    socket.close();
+    let (mut answer, mut bytes) = (Vec::new(), [0; 512]);
+    while let Ok(len @ 1..) = socket.read(&mut bytes).await {
+        answer.extend_from_slice(&bytes[..len]);
+    }
+    String::from_utf8(answer).unwrap()
+}
+
+fn firmware() -> Vec<u8> {
+    (0..9000_u32).map(|at| (at * 31 % 251) as u8).collect()
+}
+
+#[test]
+fn a_signed_firmware_is_taken_over_the_network_and_started() {
+    let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
+        let answer = bring(stack, &signed(&firmware())).await;
+        assert!(answer.starts_with("HTTP/1.0 200 OK"), "{answer}");
+        // Served after the former is done with; a chip would be starting now.
+        bring(stack, b"").await;
+    });
+    assert!(chip.halves.starts_spare && chip.restarts > 0);
+    assert_eq!(&chip.halves.spare.0[..9000], &firmware()[..]);
+}
+
+#[test]
+fn any_other_is_refused_in_words_and_nothing_is_written() {
+    let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
+        let mut forged = signed(&firmware());
+        forged[60] ^= 1;
+        let answer = bring(stack, &forged).await;
+        assert!(answer.starts_with("HTTP/1.0 409") && answer.contains("signature"), "{answer}");
+        let answer = bring(stack, b"nothing").await;
+        assert!(answer.contains("the connection ended before the firmware did"), "{answer}");
+    });
+    assert!(!chip.halves.starts_spare && chip.restarts == 0);
+    assert!(chip.halves.spare.0.iter().all(|&byte| byte == 0), "erased");
+}
+
+#[test]
+fn an_armed_vehicle_keeps_its_firmware() {
+    let chip = with_bridge(|stack, _uart_in, mut uart_out| async move {
+        // Custom mode GUIDED, a quadrotor of ArduPilot's, armed, active, MAVLink 2.
+        let payload = [4, 0, 0, 0, 2, 3, 0x80 | 0x09, 4, 3];
+        let mut heartbeat = [0; 280];
+        let len = seal(&mut heartbeat, (1, 1), 0, 0, &payload);
+        uart_out.write_all(&heartbeat[..len]).await.unwrap();
+        // Taken when the page says so.
+        loop {
+            let answer = bring(stack, &signed(&firmware())[..50]).await;
+            if answer.contains("the vehicle is armed") {
+                break;
+            }
+            embassy_time::Timer::after(Duration::from_millis(5)).await;
+        }
+    });
+    assert!(!chip.halves.starts_spare);
 }

@@ -9,6 +9,7 @@ use esp_println::println;
 use vizflyt_bridge::shell::{Light, Platform};
 
 use crate::flash::{self, Flash};
+use crate::update::Updates;
 use crate::{radio, serial};
 
 /// How long the button is held to forget the settings, the key among them.
@@ -26,7 +27,10 @@ pub(crate) fn light() -> Light {
 }
 
 /// The chip, for the bridge.
-pub(crate) struct Front;
+pub(crate) struct Front {
+    /// `None` if it takes no firmware over the network.
+    pub(crate) updates: Option<Updates>,
+}
 
 impl Platform for Front {
     fn restart(&mut self) {
@@ -40,6 +44,13 @@ impl Platform for Front {
 
     fn signal_dbm(&mut self) -> Option<i8> {
         radio::signal_dbm()
+    }
+
+    fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
+        match &mut self.updates {
+            Some(updates) => updates.take(first, bytes),
+            None => Err("this bridge was built without a firmware key; flash it by wire"),
+        }
     }
 }
 

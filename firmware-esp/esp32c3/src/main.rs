@@ -19,11 +19,13 @@ mod flash;
 mod front;
 mod radio;
 mod serial;
+mod update;
 
 use core::cell::RefCell;
 
 use embassy_executor::Spawner;
 use embassy_net::{Runner, Stack, StackResources};
+use embassy_time::{Duration, Timer};
 use esp_backtrace as _;
 use esp_hal::clock::CpuClock;
 use esp_hal::gpio::{Input, InputConfig, Level, Output, OutputConfig, Pull};
@@ -48,6 +50,8 @@ esp_bootloader_esp_idf::esp_app_desc!();
 /// chip's own loader used. [bytes]
 const RECLAIMED_BYTES: usize = 64 * 1024;
 const HEAP_BYTES: usize = 48 * 1024;
+/// Time on the network after which a new firmware stays.
+const TRIAL: Duration = Duration::from_secs(30);
 
 #[esp_rtos::main]
 async fn main(spawner: Spawner) -> ! {
@@ -60,13 +64,14 @@ async fn main(spawner: Spawner) -> ! {
     static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
 
     let chip = esp_hal::init(esp_hal::Config::default().with_cpu_clock(CpuClock::max()));
+    let flash: &'static flash::Flash =
+        FLASH.init_with(|| RefCell::new(FlashStorage::new(chip.FLASH)));
+    let on_trial = update::start(flash);
     esp_alloc::heap_allocator!(#[ram(reclaimed)] size: RECLAIMED_BYTES);
     esp_alloc::heap_allocator!(size: HEAP_BYTES);
     // The radio's driver needs the scheduler before anything else.
     esp_rtos::start(TimerGroup::new(chip.TIMG0).timer0, chip.FROM_CPU_INTR0);
 
-    let flash: &'static flash::Flash =
-        FLASH.init_with(|| RefCell::new(FlashStorage::new(chip.FLASH)));
     let mut store = Store::new(flash::settings(flash), 0);
     let settings = store.load().unwrap_or_default();
 
@@ -105,7 +110,11 @@ async fn main(spawner: Spawner) -> ! {
 
     spawner.spawn(network(runner).unwrap());
     spawner.spawn(join_networks(shared, stack, controller, WIFI.take()).unwrap());
-    spawner.spawn(forward(shared, stack, sender, store, BUFFERS.take()).unwrap());
+    let front = front::Front { updates: update::Updates::new(flash) };
+    spawner.spawn(forward(shared, stack, sender, store, front, BUFFERS.take()).unwrap());
+    if on_trial {
+        spawner.spawn(settle(stack, flash).unwrap());
+    }
     let led = Output::new(chip.GPIO10, Level::Low, OutputConfig::default());
     let board_led = Output::new(chip.GPIO8, Level::High, OutputConfig::default());
     let button = Input::new(chip.GPIO9, InputConfig::default().with_pull(Pull::Up));
@@ -134,10 +143,20 @@ async fn forward(
     stack: Stack<'static>,
     sender: UartTx<'static, Blocking>,
     mut store: Store<flash::Region>,
+    mut front: front::Front,
     buffers: &'static mut Buffers,
 ) {
     let port = (&serial::RECEIVED, sender.into_async());
-    shell::run(shared, stack, port, &mut store, &mut front::Front, buffers).await;
+    shell::run(shared, stack, port, &mut store, &mut front, buffers).await;
+}
+
+/// A new firmware that has been on the network for a while works: whoever does not like it can bring
+/// another.
+#[embassy_executor::task]
+async fn settle(stack: Stack<'static>, flash: &'static flash::Flash) {
+    stack.wait_config_up().await;
+    Timer::after(TRIAL).await;
+    update::keep(flash);
 }
 
 #[embassy_executor::task]

@@ -3,6 +3,7 @@
 mod ask;
 mod configure;
 mod emulate;
+mod firmware;
 mod flash;
 mod port;
 
@@ -27,6 +28,8 @@ enum BridgeCommand {
     Stats(configure::StatsArgs),
     /// Shows and changes a bridge's settings.
     Configure(configure::ConfigureArgs),
+    /// Signs a bridge's firmware, and brings it over the network.
+    Firmware(firmware::FirmwareArgs),
 }
 
 /// Runs what was asked for.
@@ -35,5 +38,6 @@ pub(crate) fn run(args: BridgeArgs) -> Result<()> {
         BridgeCommand::Emulate(args) => emulate::run(&args),
         BridgeCommand::Stats(args) => configure::stats(&args),
         BridgeCommand::Configure(args) => configure::configure(&args),
+        BridgeCommand::Firmware(args) => firmware::run(&args),
     }
 }
