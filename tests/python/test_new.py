@@ -81,7 +81,7 @@ def test_a_file_saved_in_flight_flies_and_one_that_breaks_lands(program, first):
         change(first, "deff on_image", "def on_image")
         flight.wait_for("the plugin flies again")
         change(first, "front.depth, height_m", "front.deepth, height_m")
-        flight.wait_for("the plugin flies again")
+        flight.wait_for("the plugin failed")
         report = flight.report()
     assert report["outcome"] == "plugin_failed", flight.seen
     assert "plugin.py:" in report["reason"] and "deepth" in report["reason"], report
