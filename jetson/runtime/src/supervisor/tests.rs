@@ -141,7 +141,9 @@ fn the_child_dies_with_the_thread_that_started_it() {
 
 /// Runs a Python program; returns what it printed, and how it ended. The tests need Python anyway.
 fn python(limits: &PluginLimits, program: &str) -> (String, String) {
-    let (lines, sentence) = to_the_end_with(limits, &["python3", "-c", program]);
+    let (mut lines, sentence) = to_the_end_with(limits, &["python3", "-c", program]);
+    // Two pipes: which is read first is chance.
+    lines.sort_by_key(|(stream, _)| *stream != Stream::Stdout);
     let lines: Vec<_> = lines.into_iter().map(|(_, line)| line).collect();
     (lines.join("\n"), sentence)
 }
