@@ -6,7 +6,7 @@
 //! Prints the table of `docs/guides/failsafe.md`; with `VIZFLYT_LINKLOSS=write` writes it there.
 //! Durations are the simulator's, so that a busy machine does not make the vehicle look slow.
 
-#[path = "../misbehave/lab.rs"]
+#[path = "../lab/mod.rs"]
 mod lab;
 mod table;
 

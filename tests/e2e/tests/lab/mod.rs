@@ -3,7 +3,7 @@
 //! through this test on their way, so it sees where each vehicle is, whatever the runtime says, and
 //! can cut either.
 //!
-//! `linkloss` shares this file: what one of the two tests does not use, the other does.
+//! Of `misbehave` and `linkloss`: what one of the two does not use, the other does.
 
 #![allow(dead_code)]
 
