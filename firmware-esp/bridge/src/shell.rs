@@ -207,6 +207,7 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
                 0 => shared.uart.wait().await,
                 len => {
                     if uart_out.write_all(&packet[..len]).await.is_err() {
+                        shared.take(|bridge, _| bridge.note_not_sent());
                         Timer::after(Duration::from_millis(1)).await;
                     }
                 }

@@ -16,7 +16,7 @@ pub enum Reason {
     NoClient,
     /// All places for clients are taken.
     TooManyClients,
-    /// The network refused a datagram: no route, no link.
+    /// Network or port refused it: no route, no link, a fault of the line.
     NotSent,
 }
 

@@ -1,5 +1,5 @@
 //! Makes what is flashed of the ESP32-C3's bridge: one file with bootloader, partition table and
-//! program for the first time, over USB, and the program alone for updates over the air.
+//! program for the first time, over USB, and the program alone for updates over the network.
 //!
 //! `vizflyt-bridge-image ELF PARTITIONS.csv FOLDER`
 

@@ -128,7 +128,7 @@ impl Bridge {
         self.hub.broadcast = broadcast;
     }
 
-    /// The network refused a datagram that was taken from [`Self::poll_udp`].
+    /// Network or port refused what was taken from [`Self::poll_udp`] or [`Self::poll_uart`].
     pub fn note_not_sent(&mut self) {
         self.hub.stats.drop(crate::stats::Reason::NotSent, 1);
     }

@@ -391,25 +391,20 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
     uart(&mut bridge, at(108));
     // Once clients have stopped asking, the bridge asks; the answer stays here.
     bridge.handle_timeout(at(5000));
-    let asked: Vec<i64> = uart(&mut bridge, at(5000))
-        .iter()
-        .flat_map(|packet| decode(packet))
-        .filter_map(|packet| match packet.message {
-            MavMessage::TIMESYNC(sync) => Some(sync.ts1),
-            _ => None,
-        })
-        .collect();
-    assert_eq!(asked, [], "the autopilot is silent, nobody is there to ask");
+    let asked = |bridge: &mut Bridge, now| -> Vec<i64> {
+        uart(bridge, now)
+            .iter()
+            .flat_map(|packet| decode(packet))
+            .filter_map(|packet| match packet.message {
+                MavMessage::TIMESYNC(sync) => Some(sync.ts1),
+                _ => None,
+            })
+            .collect()
+    };
+    assert_eq!(asked(&mut bridge, at(5000)), [], "the autopilot is silent, nobody is there to ask");
     bridge.handle_uart(at(5500), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_timeout(at(6001));
-    let asked: Vec<i64> = uart(&mut bridge, at(6001))
-        .iter()
-        .flat_map(|packet| decode(packet))
-        .filter_map(|packet| match packet.message {
-            MavMessage::TIMESYNC(sync) => Some(sync.ts1),
-            _ => None,
-        })
-        .collect();
+    let asked = asked(&mut bridge, at(6001));
     assert_eq!(asked.len(), 1);
     datagrams(&mut bridge, at(6010));
     bridge.handle_uart(at(6004), &bytes(0, AUTOPILOT, &sync(9, asked[0])));
