@@ -219,6 +219,11 @@ impl Updater {
         if slots.start_spare() { Ok(true) } else { Err(Fault::Flash) }
     }
 
+    /// Returns the build number of the firmware that comes, once its header is verified.
+    pub fn build(&self) -> Option<u32> {
+        self.open.map(|header| header.build)
+    }
+
     fn judge(&self, header: &Header, capacity: usize) -> Result<(), Fault> {
         if header.target != self.wanted.target as u8 {
             Err(Fault::OtherChip)

@@ -33,7 +33,7 @@ fn second(lab: &mut Simulation) {
             let state = lab.state();
             let pose = Pose::new(state.p_world_m, state.world_from_body);
             let usec = lab.now().as_ns() / 1000;
-            let message = vision_to_mavlink(&pose, usec, 0, 0.01);
+            let message = vision_to_mavlink(&pose, usec, 0, DVec3::splat(0.01), DVec3::splat(0.01));
             send(lab, &MavMessage::VISION_POSITION_ESTIMATE(message));
         }
         while lab.poll_mocap().is_some() {}

@@ -13,10 +13,12 @@ use vizflyt_protocol::geometry::Volume;
 use crate::driver::Driver;
 use crate::link::serial::{DEFAULT_BAUD, baud_rate};
 use crate::link::{Endpoint, resolve};
+use crate::mocap::feed::{FeedTarget, Format};
 use crate::mocap::{MAX_NAME, MocapConfig};
 use crate::simulation::faults::{Faults, MotorFault};
 use crate::simulation::{Simulation, SimulationConfig};
 use crate::stop::stop_flag;
+use crate::truth_feed::TruthFeed;
 use crate::wifi::WifiConfig;
 
 /// The simulated lab: vehicle, autopilot and motion capture.
@@ -42,9 +44,17 @@ pub struct SimArgs {
     /// Baud rate of --serial and --pty; bytes leave no faster than it says.
     #[arg(long, value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
     pub baud: u32,
-    /// Where the motion capture sends its UDP object stream; nowhere if absent.
+    /// Where the motion capture sends Vicon's UDP object stream; nowhere if absent.
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
     pub vicon: Option<SocketAddr>,
+    /// Where another system streams to: vicon, json or mavlink; natnet, where Motive waits for listeners,
+    /// or a multicast group. May be given several times.
+    #[arg(long, value_name = "FORMAT:HOST:PORT")]
+    pub mocap: Vec<FeedTarget>,
+    /// Where the true pose is sent at every tick, with its instant on CLOCK_MONOTONIC, as the JSON that
+    /// `vizflyt serve` reads poses from: what `vizflyt tags locate` draws its simulated cameras' images by.
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
+    pub truth_to: Option<SocketAddr>,
     /// Name of the vehicle in the motion capture.
     #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
     pub object: String,
@@ -117,6 +127,10 @@ pub struct SimArgs {
     /// Share of the motion capture's datagrams that are lost, in percent.
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0)]
     pub mocap_drop_percent: f64,
+    /// Instead of flying, somebody lifts the vehicle, pushes it forward, turns it left and raises its nose,
+    /// over and over: what `vizflyt doctor localization` asks for.
+    #[arg(long)]
+    pub hand: bool,
     /// Prints JSON lines on stdout: one when ready, one report at the end.
     #[arg(long)]
     pub json: bool,
@@ -224,6 +238,7 @@ impl SimArgs {
                 latency_s: self.mocap_delay_ms / 1000.0,
                 loss: self.mocap_drop_percent / 100.0,
             },
+            hand: self.hand,
             params: self.params.clone(),
             wind_world_mps: DVec3::from(self.wind),
             gust_mps: self.gusts,
@@ -274,11 +289,16 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let simulation = Simulation::new(args.config()?)?;
     let endpoints = args.endpoints();
-    let driver = Driver::open(simulation, &endpoints, args.vicon, args.realtime_factor)?;
+    let truth = args.truth_to.map(|target| TruthFeed::open(target, &args.object)).transpose();
+    let vicon = args.vicon.map(|address| FeedTarget { format: Format::Vicon, address });
+    let mocap: Vec<_> = vicon.into_iter().chain(args.mocap.iter().copied()).collect();
+    let driver = Driver::open(simulation, &endpoints, &mocap, args.realtime_factor)?
+        .telling_truth(truth.context("simulator: cannot open a socket for the true pose")?);
     let addresses = driver.mavlink_addresses()?;
     if args.json {
         let ready = serde_json::json!({
             "ready": "simulator", "mavlink": addresses[0], "links": addresses,
+            "mocap": driver.mocap_addresses()?,
         });
         say(&ready);
     } else {

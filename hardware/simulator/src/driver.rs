@@ -4,7 +4,7 @@
 //! millisecond late). A machine too slow for real time loses simulated time instead of falling
 //! ever further behind: see [`MAX_BEHIND`].
 
-use std::net::{SocketAddr, UdpSocket};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -12,8 +12,10 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
-use crate::link::{Endpoint, Link, bind_udp};
+use crate::link::{Endpoint, Link};
+use crate::mocap::feed::{Feed, FeedTarget};
 use crate::simulation::{MAX_LINKS, Simulation, TICK_HZ};
+use crate::truth_feed::TruthFeed;
 
 /// Time that is caught up after a pause. More is given up: a vehicle that lives through a second
 /// in an instant would answer to setpoints of the past.
@@ -25,13 +27,14 @@ const WARN_EVERY: Duration = Duration::from_secs(5);
 pub struct Driver {
     simulation: Simulation,
     links: Vec<Link>,
-    mocap: Option<(UdpSocket, SocketAddr)>,
+    mocap: Vec<Feed>,
+    truth: Option<TruthFeed>,
     /// Simulated seconds per second.
     factor: f64,
 }
 
 impl Driver {
-    /// Opens what MAVLink goes over, at most [`MAX_LINKS`] ways, and where mocap datagrams go, if
+    /// Opens what MAVLink goes over, at most [`MAX_LINKS`] ways, and where mocap poses go, if
     /// anywhere. `factor` is simulated seconds per second.
     ///
     /// # Errors
@@ -39,7 +42,7 @@ impl Driver {
     pub fn open(
         simulation: Simulation,
         mavlink: &[Endpoint],
-        vicon: Option<SocketAddr>,
+        mocap: &[FeedTarget],
         factor: f64,
     ) -> anyhow::Result<Self> {
         anyhow::ensure!(
@@ -55,16 +58,30 @@ impl Driver {
                 })
             })
             .collect::<anyhow::Result<_>>()?;
-        let mocap = match vicon {
-            Some(target) => {
-                let any = if target.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
-                let socket =
-                    bind_udp(any).context("simulator: cannot open a socket for the mocap")?;
-                Some((socket, target))
-            }
-            None => None,
-        };
-        Ok(Self { simulation, links, mocap, factor })
+        let mocap = mocap
+            .iter()
+            .map(|target| Feed::open(*target))
+            .collect::<std::io::Result<_>>()
+            .context("simulator: cannot open a socket for the mocap")?;
+        Ok(Self { simulation, links, mocap, truth: None, factor })
+    }
+
+    /// Also sends the true pose at every tick, for cameras that are simulated elsewhere.
+    #[must_use]
+    pub fn telling_truth(mut self, feed: Option<TruthFeed>) -> Self {
+        self.truth = feed;
+        self
+    }
+
+    /// Returns our address of each mocap feed.
+    ///
+    /// # Errors
+    /// If the operating system does not say.
+    pub fn mocap_addresses(&self) -> anyhow::Result<Vec<SocketAddr>> {
+        self.mocap
+            .iter()
+            .map(|feed| feed.address().context("simulator: a feed has no address"))
+            .collect()
     }
 
     /// Returns our address or path of each MAVLink link.
@@ -88,9 +105,13 @@ impl Driver {
             for (index, link) in self.links.iter_mut().enumerate() {
                 link.receive(|bytes| simulation.handle_mavlink(index, bytes));
             }
-            for _ in 0..pacer.due(Instant::now()) {
+            let ticks = pacer.due(Instant::now());
+            for left in (0..ticks).rev() {
                 self.simulation.tick();
                 self.send_mavlink();
+                if let Some(truth) = &mut self.truth {
+                    truth.send(pacer.at(left), &self.simulation.true_pose());
+                }
             }
             self.send_mocap();
             let before = warned.map_or(Duration::ZERO, |(_, lost)| lost);
@@ -119,12 +140,12 @@ impl Driver {
     /// from the present.
     fn send_mocap(&mut self) {
         let mut newest = None;
-        while let Some(datagram) = self.simulation.poll_mocap() {
-            newest = Some(datagram);
+        while let Some(sight) = self.simulation.poll_mocap() {
+            newest = Some(sight);
         }
-        if let (Some(datagram), Some((socket, target))) = (newest, &self.mocap) {
-            // Lost like any datagram if nobody listens.
-            let _ = socket.send_to(&datagram, target);
+        let Some(sight) = newest else { return };
+        for feed in &mut self.mocap {
+            feed.send(self.simulation.object(), &sight, self.simulation.now());
         }
     }
 }
@@ -144,6 +165,12 @@ impl Pacer {
     fn new(start: Instant, factor: f64) -> Self {
         let tick = Duration::from_secs_f64(1.0 / (TICK_HZ as f64 * factor));
         Self { tick, most_behind: MAX_BEHIND.max(tick * 2), next: start, lost: Duration::ZERO }
+    }
+
+    /// Returns for when the tick was due that `left` of those due are left behind.
+    fn at(&self, left: u32) -> Instant {
+        let back = self.tick * (left + 1);
+        self.next.checked_sub(back).unwrap_or(self.next)
     }
 
     /// Returns the ticks due at `now` and counts them as done.

@@ -5,10 +5,10 @@
 //! motors -> airframe (RK4, 800 Hz) -> imu (400 Hz) -> autopilot: estimator -> control -> motors
 //!                 |                                       ^  |
 //!                 +-> mocap (200 Hz) -> UDP               MAVLink
-//!                 +-> truth: clearance, speed, path
+//!                 +-> truth: clearance, speed, path; truth_feed (400 Hz) -> UDP, for simulated cameras
 //! ```
 //!
-//! Everything but [`driver`], `link` and `stop` is sans-IO: bytes, samples and `dt` in, bytes and
+//! Everything but [`driver`], `link`, [`truth_feed`] and `stop` is sans-IO: bytes, samples and `dt` in, bytes and
 //! commands out, so that a test flies minutes in milliseconds and the same seed gives the same
 //! flight. [`simulation`] holds the parts together on one virtual clock.
 
@@ -32,5 +32,6 @@ mod args;
 pub mod driver;
 pub mod link;
 mod stop;
+pub mod truth_feed;
 
 pub use args::{SimArgs, run};

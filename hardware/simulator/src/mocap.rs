@@ -1,21 +1,18 @@
-//! Motion capture: the true pose in, Vicon Tracker's UDP object stream out. 200 Hz.
+//! Motion capture: the true pose in, what a system of cameras makes of it out. 200 Hz.
 //!
-//! Layout, little-endian, packed: `u32 frame, u8 items`, then per item `u8 id = 0, u16 size = 72,
-//! char[24] name, f64 x, y, z [mm], f64 rx, ry, rz [rad]`.
-//!
-//! Rotation: turns about the fixed x, then the fixed y, then the fixed z axis,
-//! `R = Rz(rz) * Ry(ry) * Rx(rx)`.
+//! How that is written on the wire, by which vendor: [`formats`]; who sends it: [`feed`].
+
+pub mod feed;
+pub mod formats;
 
 use std::collections::VecDeque;
 
-use glam::{DQuat, EulerRot};
+use glam::DQuat;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::AutopilotTime;
 
 use crate::noise::Noise;
 
-/// Bytes of a datagram with one object.
-pub const DATAGRAM: usize = 5 + 3 + 72;
 /// Longest object name. [bytes]
 pub const MAX_NAME: usize = 24;
 /// Time between two poses. [s]
@@ -46,6 +43,17 @@ impl Default for MocapConfig {
     }
 }
 
+/// What the cameras saw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sight {
+    /// Counts their images, from 1.
+    pub frame: u32,
+    /// When they were exposed.
+    pub at: AutopilotTime,
+    /// Where the vehicle seemed to be.
+    pub world_from_body: Pose<World, Body>,
+}
+
 /// The motion capture system.
 #[derive(Clone, Debug)]
 pub struct Mocap {
@@ -53,7 +61,7 @@ pub struct Mocap {
     noise: Noise,
     frame: u32,
     due: AutopilotTime,
-    waiting: VecDeque<(AutopilotTime, [u8; DATAGRAM])>,
+    waiting: VecDeque<(AutopilotTime, Sight)>,
 }
 
 impl Mocap {
@@ -80,82 +88,32 @@ impl Mocap {
             pose.rotation * turned,
         );
         if !stopped && !lost {
-            let datagram = encode_object(self.frame, &self.config.object, &measured);
-            self.waiting.push_back((now.plus_seconds(self.config.latency_s), datagram));
+            let sight = Sight { frame: self.frame, at: now, world_from_body: measured };
+            self.waiting.push_back((now.plus_seconds(self.config.latency_s), sight));
         }
     }
 
-    /// Returns the next datagram whose time to be sent has come.
-    pub fn poll_transmit(&mut self, now: AutopilotTime) -> Option<[u8; DATAGRAM]> {
+    /// Returns the next sight whose time to be sent has come.
+    pub fn poll_transmit(&mut self, now: AutopilotTime) -> Option<Sight> {
         match self.waiting.front() {
-            Some(&(at, datagram)) if at <= now => {
+            Some(&(at, sight)) if at <= now => {
                 self.waiting.pop_front();
-                Some(datagram)
+                Some(sight)
             }
             _ => None,
         }
     }
-}
 
-/// Returns a datagram with one object; a longer name is cut.
-pub fn encode_object(frame: u32, name: &str, pose: &Pose<World, Body>) -> [u8; DATAGRAM] {
-    let mut datagram = [0; DATAGRAM];
-    datagram[..4].copy_from_slice(&frame.to_le_bytes());
-    datagram[4] = 1;
-    datagram[6..8].copy_from_slice(&72u16.to_le_bytes());
-    let length = name.len().min(MAX_NAME);
-    datagram[8..8 + length].copy_from_slice(&name.as_bytes()[..length]);
-    let p_mm = pose.translation_m * 1000.0;
-    // Intrinsic z-y-x is fixed x-y-z.
-    let (rz, ry, rx) = pose.rotation.to_euler(EulerRot::ZYX);
-    for (i, value) in [p_mm.x, p_mm.y, p_mm.z, rx, ry, rz].into_iter().enumerate() {
-        let at = 8 + MAX_NAME + 8 * i;
-        datagram[at..at + 8].copy_from_slice(&value.to_le_bytes());
+    /// Returns the vehicle's name in the motion capture.
+    pub fn object(&self) -> &str {
+        &self.config.object
     }
-    datagram
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::DVec3;
-    use proptest::prelude::*;
-
-    fn read(datagram: &[u8; DATAGRAM]) -> (u32, String, [f64; 6]) {
-        let frame = u32::from_le_bytes(datagram[..4].try_into().unwrap());
-        let name = String::from_utf8_lossy(&datagram[8..32]).trim_end_matches('\0').to_owned();
-        let value =
-            |i: usize| f64::from_le_bytes(datagram[32 + 8 * i..40 + 8 * i].try_into().unwrap());
-        (frame, name, std::array::from_fn(value))
-    }
-
-    #[test]
-    fn the_layout_is_tracker_s() {
-        let rotation = DQuat::from_rotation_z(0.3);
-        let pose = Pose::new(DVec3::new(1.0, -2.0, 0.5), rotation);
-        let datagram = encode_object(7, "vizflyt", &pose);
-        assert_eq!(datagram.len(), 80);
-        assert_eq!(&datagram[..8], &[7, 0, 0, 0, 1, 0, 72, 0]);
-        let (_, name, values) = read(&datagram);
-        assert_eq!(name, "vizflyt");
-        assert_eq!(&values[..3], &[1000.0, -2000.0, 500.0]);
-        assert!(values[3].abs() < 1e-12 && values[4].abs() < 1e-12);
-        assert!((values[5] - 0.3).abs() < 1e-12);
-    }
-
-    proptest! {
-        /// R = Rz(rz) * Ry(ry) * Rx(rx).
-        #[test]
-        fn angles_are_about_fixed_x_then_y_then_z(
-            rx in -3.0..3.0f64, ry in -1.5..1.5f64, rz in -3.0..3.0f64,
-        ) {
-            let rotation = DQuat::from_rotation_z(rz) * DQuat::from_rotation_y(ry) * DQuat::from_rotation_x(rx);
-            let (_, _, values) = read(&encode_object(0, "x", &Pose::new(DVec3::ZERO, rotation)));
-            prop_assert!((values[3] - rx).abs() < 1e-6);
-            prop_assert!((values[4] - ry).abs() < 1e-6);
-            prop_assert!((values[5] - rz).abs() < 1e-6);
-        }
-    }
 
     /// Runs for `seconds` and returns (time sent [ms], frame, position [m]).
     fn run(config: MocapConfig, seconds: f64) -> Vec<(u64, u32, DVec3)> {
@@ -165,10 +123,9 @@ mod tests {
         for i in 0..(seconds * 400.0) as u64 {
             let now = AutopilotTime::from_ns(i * 2_500_000);
             mocap.handle_truth(now, &pose);
-            while let Some(datagram) = mocap.poll_transmit(now) {
-                let (frame, _, v) = read(&datagram);
-                let p_m = DVec3::new(v[0], v[1], v[2]) / 1000.0;
-                sent.push((now.as_ns() / 1_000_000, frame, p_m));
+            while let Some(sight) = mocap.poll_transmit(now) {
+                let p_m = sight.world_from_body.translation_m;
+                sent.push((now.as_ns() / 1_000_000, sight.frame, p_m));
             }
         }
         sent

@@ -5,10 +5,11 @@
 //! second time a mocap pose. What breaks, and when, is in [`faults`].
 
 pub mod faults;
+mod hand;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde::Serialize;
-use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::AutopilotTime;
 
@@ -17,7 +18,7 @@ pub use crate::autopilot::MAX_LINKS;
 use crate::autopilot::{Autopilot, Radio, UnknownParam};
 use crate::battery::Battery;
 use crate::imu::Imu;
-use crate::mocap::{DATAGRAM, Mocap, MocapConfig};
+use crate::mocap::{Mocap, MocapConfig, Sight};
 use crate::truth::{Truth, TruthReport};
 use crate::wifi::{Wifi, WifiConfig};
 use crate::wind::Wind;
@@ -48,6 +49,8 @@ pub struct SimulationConfig {
     pub body_radius_m: f64,
     /// The motion capture; its seed is replaced by `seed`.
     pub mocap: MocapConfig,
+    /// The motion capture sees somebody carry the vehicle about instead.
+    pub hand: bool,
     /// Autopilot parameters that differ from the defaults.
     pub params: Vec<(String, f32)>,
     /// Steady wind. [m/s, world]
@@ -75,6 +78,7 @@ impl Default for SimulationConfig {
             obstacles: Vec::new(),
             body_radius_m: 0.12,
             mocap: MocapConfig::default(),
+            hand: false,
             params: Vec::new(),
             wind_world_mps: DVec3::ZERO,
             gust_mps: 0.0,
@@ -107,6 +111,8 @@ pub struct SimulationReport {
     pub mavlink_packets_out: u64,
     /// MAVLink packets dropped unsent because nobody took them in time.
     pub mavlink_packets_dropped: u64,
+    /// Packets ignored because they were not signed with the autopilot's key.
+    pub mavlink_packets_refused: u64,
     /// Mocap poses sent.
     pub mocap_poses: u64,
     /// MAVLink packets that the simulated Wi-Fi lost, both ways.
@@ -130,6 +136,8 @@ pub struct Simulation {
     battery: Battery,
     autopilot: Autopilot,
     mocap: Mocap,
+    /// Where it is carried from.
+    hand: Option<Pose<World, Body>>,
     truth: Truth,
     motors: [f64; 4],
     packets_out: u64,
@@ -159,6 +167,9 @@ impl Simulation {
             imu,
             battery: Battery::charged(config.battery_share),
             autopilot,
+            hand: config
+                .hand
+                .then(|| Pose::new(config.spawn_m, DQuat::from_rotation_z(config.spawn_yaw_rad))),
             mocap: Mocap::new(MocapConfig { seed: config.seed, ..config.mocap }),
             truth: Truth::new(&config.obstacles, config.body_radius_m, config.spawn_m.z),
             motors: [0.0; 4],
@@ -250,11 +261,21 @@ impl Simulation {
         Some(whole)
     }
 
-    /// Returns the next mocap datagram to send.
-    pub fn poll_mocap(&mut self) -> Option<[u8; DATAGRAM]> {
-        let datagram = self.mocap.poll_transmit(self.now)?;
+    /// Returns what the motion capture is to send next.
+    pub fn poll_mocap(&mut self) -> Option<Sight> {
+        let sight = self.mocap.poll_transmit(self.now)?;
         self.mocap_poses += 1;
-        Some(datagram)
+        Some(sight)
+    }
+
+    /// Returns the vehicle's name in the motion capture.
+    pub fn object(&self) -> &str {
+        self.mocap.object()
+    }
+
+    /// Returns where the vehicle truly is.
+    pub fn true_pose(&self) -> Pose<World, Body> {
+        self.airframe.state().pose()
     }
 
     /// Goes on by one tick of 2.5 ms.
@@ -303,7 +324,13 @@ impl Simulation {
                 Due::Reboot => self.reboot(),
             }
         }
-        self.mocap.handle_truth(self.now, &state.pose());
+        let seen = match self.hand {
+            Some(world_from_start) => {
+                hand::carried(&world_from_start, self.now.seconds_since(AutopilotTime::ZERO))
+            }
+            None => state.pose(),
+        };
+        self.mocap.handle_truth(self.now, &seen);
 
         if self.autopilot.is_armed() && !self.autopilot.is_landed() {
             let error = self.autopilot.estimator().estimate().p_world_m - state.p_world_m;
@@ -324,6 +351,7 @@ impl Simulation {
             mavlink_packets_in: self.autopilot.packets_in(),
             mavlink_packets_out: self.packets_out,
             mavlink_packets_dropped: self.autopilot.outbox_dropped(),
+            mavlink_packets_refused: self.autopilot.packets_refused(),
             mocap_poses: self.mocap_poses,
             wifi_packets_lost: self.wifi.iter().flatten().map(Wifi::lost).sum(),
             reboots: self.reboots,

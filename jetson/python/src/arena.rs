@@ -5,7 +5,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, bounded};
+use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, PoseAges, bounded};
 use vizflyt_sdk::{ArenaInfo as SdkArenaInfo, CameraInfo as SdkCameraInfo, Limits as SdkLimits};
 use vizflyt_sdk::{Body, Cam};
 
@@ -145,6 +145,8 @@ impl ArenaInfo {
         Ok(Self(SdkArenaInfo {
             name: bounded(name),
             geofence: geofence.map_or(everywhere, |volume| volume.0),
+            no_fly: [].into_iter().collect(),
+            floor_z_m: 0.0,
             limits: limits.map_or(usual, |limits| limits.0),
             body_radius_m,
             takeoff_height_m,
@@ -152,6 +154,7 @@ impl ArenaInfo {
             goal_radius_m,
             time_limit_s,
             ground_truth,
+            pose_ages: PoseAges::default(),
             attitude_rate,
             cameras: cameras.into_iter().map(|camera| camera.0).collect(),
         }))

@@ -95,6 +95,7 @@ impl ObservationBuffer {
             seq,
             pose: HostTime::from_ns(stamp_ns),
             ready: HostTime::from_ns(ready_ns.unwrap_or(stamp_ns)),
+            ahead_ns: 0,
         };
         let mut buffer = self.buffer.lock().unwrap_or_else(PoisonError::into_inner);
         buffer.set_image(index, stamps, |planes| {

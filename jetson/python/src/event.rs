@@ -68,7 +68,7 @@ impl Event {
     }
 
     /// What happened: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
-    /// 'emergency_stop', 'phase', 'plugin_failed' or 'note'.
+    /// 'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
     #[getter]
     fn kind(&self) -> &str {
         &self.kind

@@ -51,9 +51,13 @@ pub(crate) struct CameraImage {
     /// Tick of the server that made the image; equal for all cameras of a tick.
     #[pyo3(get)]
     seq: u64,
-    /// When the pose that the image shows was measured. [ns, `time.monotonic_ns()`]
+    /// When the newest pose behind the image was measured. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     stamp_ns: u64,
+    /// The instant that the image shows, about now: where depth is to meet the vehicle's pose, take
+    /// the pose of this instant. [ns, `time.monotonic_ns()`]
+    #[pyo3(get)]
+    shown_ns: u64,
     /// When the runtime had the decoded image. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     ready_ns: u64,
@@ -170,6 +174,7 @@ impl CameraImage {
             name: image.name.to_owned(),
             seq: image.seq,
             stamp_ns: image.stamp.as_ns(),
+            shown_ns: image.shown.as_ns(),
             ready_ns: image.ready.as_ns(),
             intrinsics: image.intrinsics,
             body_from_cam: image.body_from_cam,

@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define VIZFLYT_PROTOCOL_VERSION 4
+#define VIZFLYT_PROTOCOL_VERSION 5
 #define VIZFLYT_MAX_CAMERAS 8
 #define VIZFLYT_MAX_IMU 64
 #define VIZFLYT_MAX_WAYPOINTS 32
@@ -38,7 +38,7 @@ extern "C" {
 
 /* One camera. Its planes lie at rgb_offset and depth_offset from the start of the observation. */
 typedef struct VizflytCamera {
-    uint64_t pose_ns;          /* when the pose that the image shows was measured */
+    uint64_t pose_ns;          /* when the newest pose behind the image was measured */
     uint64_t ready_ns;         /* when the runtime had the decoded image */
     uint64_t seq;              /* tick of the server that made the image */
     double intrinsics_px[4];   /* fx, fy, cx, cy; (0, 0) is the top-left pixel's outer corner */
@@ -50,7 +50,7 @@ typedef struct VizflytCamera {
     uint32_t rgb_offset;
     uint32_t depth_offset;
     uint32_t distortion_model; /* 0 none, 1 Brown-Conrady, 2 Kannala-Brandt */
-    uint32_t reserved;
+    int32_t ahead_ns;          /* by how much later than pose_ns the instant is that the image shows */
 } VizflytCamera;
 
 typedef struct VizflytImu {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin, bounded};
+use vizflyt_sdk::protocol::messages::{FromPlugin, PoseAges, ToPlugin, bounded};
 use vizflyt_sdk::{
     ArenaInfo, Axes, CameraInfo, ImageStamps, Intrinsics, Limits, ObservationWriter, Setpoint,
     Volume, YawTarget,
@@ -51,6 +51,8 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("hall"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -58,6 +60,7 @@ fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: false,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         // The plugin looks for its camera by name.
         cameras: ["rear", "front"]

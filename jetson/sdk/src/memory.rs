@@ -13,8 +13,10 @@ use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 pub struct ImageStamps {
     /// Tick of the server.
     pub seq: u64,
-    /// When the pose that the image shows was measured. [host]
+    /// When the newest pose behind the image was measured. [host]
     pub pose: HostTime,
+    /// By how much later the instant is that the image shows. [ns]
+    pub ahead_ns: i32,
     /// When the image was decoded. [host]
     pub ready: HostTime,
 }
@@ -192,6 +194,7 @@ impl<'m> ObservationWriter<'m> {
         head.rotation_xyzw = camera.body_from_cam.rotation.to_array();
         head.seq = stamps.seq;
         head.pose_ns = stamps.pose.as_ns();
+        head.ahead_ns = stamps.ahead_ns;
         head.ready_ns = stamps.ready.as_ns();
     }
 }
@@ -347,8 +350,12 @@ mod tests {
             gyro_radps: DVec3::X,
         };
         buffer.set_imu(&[imu(10), imu(20), imu(30)]);
-        let stamps =
-            ImageStamps { seq: 3, pose: HostTime::from_ns(7), ready: HostTime::from_ns(9) };
+        let stamps = ImageStamps {
+            seq: 3,
+            pose: HostTime::from_ns(7),
+            ready: HostTime::from_ns(9),
+            ahead_ns: 4,
+        };
         buffer.set_image(1, stamps, |planes| {
             for (index, depth_mm) in planes.depth_mm.iter_mut().enumerate() {
                 *depth_mm = index as u16;

@@ -64,8 +64,12 @@ pub struct CameraImage<'a> {
     pub name: &'a str,
     /// Tick of the server that made the image; equal for all cameras of a tick.
     pub seq: u64,
-    /// When the pose that the image shows was measured. [host]
+    /// When the newest pose behind the image was measured: its age counts from here. [host]
     pub stamp: HostTime,
+    /// The instant that the image shows: the server moves the pose on to when the image is seen, so
+    /// this is about now. Where depth is to meet the vehicle's pose, take the pose of this instant.
+    /// [host]
+    pub shown: HostTime,
     /// When the runtime had the decoded image. [host]
     pub ready: HostTime,
     /// Width. [px]
@@ -190,6 +194,7 @@ fn image<'a>(
         name: name.map_or("", |name| name.as_str()),
         seq: camera.seq,
         stamp: HostTime::from_ns(camera.pose_ns),
+        shown: HostTime::from_ns(camera.pose_ns).plus_ns(camera.ahead_ns.into()),
         ready: HostTime::from_ns(camera.ready_ns),
         width_px: camera.width_px,
         height_px: camera.height_px,

@@ -7,6 +7,7 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use super::dialect::{MavCmd, MavMessage, MavResult, MavSeverity};
 use super::failsafe::needs_position;
+use super::signing::Signing;
 use super::telemetry::autopilot_version;
 use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE, name_of};
 use crate::estimator::VisionMeasurement;
@@ -46,6 +47,9 @@ impl Autopilot {
             MavMessage::COMMAND_INT(m) if self.is_for_us(m.target_system, m.target_component) => {
                 let params = [m.param1, m.param2, m.param3, m.param4, m.x as f32, m.y as f32, m.z];
                 self.handle_command(now, &Command { kind: m.command, params, sender });
+            }
+            MavMessage::SETUP_SIGNING(m) if self.is_for_us(m.target_system, m.target_component) => {
+                self.signing = Signing::set_up(now, m);
             }
             MavMessage::SET_MODE(m) if m.target_system == self.system_id() => {
                 self.change_mode(now, m.custom_mode);

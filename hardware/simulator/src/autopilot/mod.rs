@@ -3,7 +3,8 @@
 //! no socket, no clock.
 //!
 //! - [`Autopilot::handle_sensors`], 400 Hz: estimate -> mode -> control -> motors ([`flight`]).
-//! - [`Autopilot::handle_input`]: bytes of the link -> messages -> commands ([`commands`]).
+//! - [`Autopilot::handle_input`]: bytes of the link -> signed by the key, if one was given
+//!   ([`signing`]) -> messages -> commands ([`commands`]).
 //! - [`Autopilot::handle_timeout`]: heartbeats, streams, failsafes ([`telemetry`], [`failsafe`]).
 //! - [`Autopilot::poll_transmit`]: bytes for the link.
 //!
@@ -21,6 +22,7 @@ mod failsafe;
 mod flight;
 mod params;
 mod setpoints;
+mod signing;
 mod streams;
 mod telemetry;
 #[cfg(test)]
@@ -104,6 +106,10 @@ pub struct Autopilot {
     decoders: [StreamDecoder; MAX_LINKS],
     outbox: VecDeque<MavMessage>,
     outbox_dropped: u64,
+    /// Since a key was given.
+    signing: Option<signing::Signing>,
+    /// Of the last [`Self::handle_timeout`].
+    now: AutopilotTime,
     sequence: u8,
     last_ground_station: Option<AutopilotTime>,
     radio: Radio,
@@ -136,6 +142,8 @@ impl Default for Autopilot {
             decoders: Default::default(),
             outbox: VecDeque::new(),
             outbox_dropped: 0,
+            signing: None,
+            now: AutopilotTime::ZERO,
             sequence: 0,
             last_ground_station: None,
             radio: Radio::Absent,
@@ -160,9 +168,10 @@ impl Autopilot {
         Ok(autopilot)
     }
 
-    /// Makes an autopilot that boots with the parameters this one has stored.
+    /// Makes an autopilot that boots with the parameters and the key this one has stored.
     pub fn rebooted(&self) -> Self {
-        Self { params: self.params.clone(), radio: self.radio, ..Self::default() }
+        let signing = self.signing.as_ref().map(|signing| signing.rebooted(self.now));
+        Self { params: self.params.clone(), radio: self.radio, signing, ..Self::default() }
     }
 
     /// Whether somebody has asked for a reboot.
@@ -179,7 +188,12 @@ impl Autopilot {
     pub fn handle_input(&mut self, now: AutopilotTime, link: usize, bytes: &[u8]) {
         // Taken out while it runs, because every packet changes the rest of the autopilot.
         let mut decoder = std::mem::take(&mut self.decoders[link]);
-        decoder.push(bytes, |packet| self.handle_packet(now, &packet));
+        decoder.push_whole(bytes, |bytes, packet| {
+            let mut signing = self.signing.as_mut();
+            if signing.as_mut().is_none_or(|s| s.accepts(now, link, bytes, &packet.message)) {
+                self.handle_packet(now, &packet);
+            }
+        });
         self.decoders[link] = decoder;
     }
 
@@ -200,6 +214,7 @@ impl Autopilot {
 
     /// Does what is due: heartbeat, streams, failsafes. Call at least 100 times a second.
     pub fn handle_timeout(&mut self, now: AutopilotTime) {
+        self.now = now;
         self.check_failsafes(now);
         self.stream(now);
     }
@@ -213,7 +228,11 @@ impl Autopilot {
             sequence: self.sequence,
         };
         self.sequence = self.sequence.wrapping_add(1);
-        Some(encode(header, &message, buffer))
+        let mut len = encode(header, &message, buffer).len();
+        if let Some(signing) = &mut self.signing {
+            len = signing.sign(self.now, buffer, len);
+        }
+        Some(&buffer[..len])
     }
 
     /// Whether the motors may turn.
@@ -239,6 +258,11 @@ impl Autopilot {
     /// Returns packets received over all links.
     pub fn packets_in(&self) -> u64 {
         self.decoders.iter().map(|decoder| decoder.stats().packets).sum()
+    }
+
+    /// Returns packets refused because they were not signed with the key; each is one of those received.
+    pub fn packets_refused(&self) -> u64 {
+        self.signing.as_ref().map_or(0, signing::Signing::refused)
     }
 
     /// Returns messages dropped because the link did not take them.

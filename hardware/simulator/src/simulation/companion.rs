@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DQuat, DVec3, EulerRot};
+use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, MavCmd, MavMessage, MavResult, SET_GPS_GLOBAL_ORIGIN_DATA,
@@ -103,12 +103,8 @@ impl Companion {
         self.lab.tick();
         let now_ns = self.lab.now().as_ns();
         let mut pose: Option<Pose<World, Body>> = None;
-        while let Some(datagram) = self.lab.poll_mocap() {
-            let value =
-                |i: usize| f64::from_le_bytes(datagram[32 + 8 * i..40 + 8 * i].try_into().unwrap());
-            let rotation = DQuat::from_euler(EulerRot::ZYX, value(5), value(4), value(3));
-            let p = DVec3::new(value(0), value(1), value(2)) / 1000.0;
-            pose = Some(Pose::new(p, rotation));
+        while let Some(sight) = self.lab.poll_mocap() {
+            pose = Some(sight.world_from_body);
         }
         if let Some(pose) = pose
             && self.vision
@@ -118,7 +114,8 @@ impl Companion {
             let usec = now_ns / 1000 + self.clock_offset_us;
             let (shift, resets) = self.vision_shift;
             let pose = Pose::new(pose.translation_m + shift, pose.rotation);
-            let message = vision_to_mavlink(&pose, usec, resets, 0.01);
+            let sigma = DVec3::splat(0.01);
+            let message = vision_to_mavlink(&pose, usec, resets, sigma, sigma);
             let due_ns = now_ns + (self.vision_latency_s * 1e9) as u64;
             self.late.push_back((due_ns, MavMessage::VISION_POSITION_ESTIMATE(message)));
         }

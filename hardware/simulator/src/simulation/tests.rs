@@ -1,5 +1,6 @@
 use super::companion::Companion;
 use super::*;
+use crate::mocap::formats::encode_object;
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
 use vizflyt_protocol::mavlink::dialect::{
@@ -213,8 +214,8 @@ fn the_same_seed_sends_the_same_bytes() {
             while let Some(packet) = lab.poll_mavlink(&mut [0; MAX_PACKET]) {
                 sent.extend_from_slice(packet);
             }
-            while let Some(datagram) = lab.poll_mocap() {
-                sent.extend_from_slice(&datagram);
+            while let Some(sight) = lab.poll_mocap() {
+                sent.extend(encode_object(sight.frame, "vizflyt", &sight.world_from_body));
             }
         }
         sent

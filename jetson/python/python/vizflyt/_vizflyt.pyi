@@ -182,7 +182,12 @@ class CameraImage:
 
     @property
     def stamp_ns(self) -> int:
-        """When the pose that the image shows was measured. [ns, `time.monotonic_ns()`]"""
+        """When the newest pose behind the image was measured. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def shown_ns(self) -> int:
+        """The instant that the image shows, about now: where depth is to meet the vehicle's pose, take
+        the pose of this instant. [ns, `time.monotonic_ns()`]"""
 
     @property
     def ready_ns(self) -> int:
@@ -421,7 +426,7 @@ class Event:
     @property
     def kind(self) -> str:
         """What happened: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
-        'emergency_stop', 'phase', 'plugin_failed' or 'note'.
+        'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
         """
 
     @property

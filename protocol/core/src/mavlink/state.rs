@@ -24,15 +24,20 @@ fn attitude_of_euler(roll: f32, pitch: f32, yaw: f32) -> DQuat {
     world_rotation_from_ned(DQuat::from_euler(EulerRot::ZYX, yaw.into(), pitch.into(), roll.into()))
 }
 
-/// Makes the external navigation message from a localized pose.
+/// Makes the external navigation message from a localized pose that may be off by one standard
+/// deviation in position [m, world] and attitude [rad, body].
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::geometry::Pose;
 /// use vizflyt_protocol::mavlink::{vision_from_mavlink, vision_to_mavlink};
 /// // At (1, 2, 3), level, nose east: NED (2, 1, -3), yaw 90 degrees.
-/// let message = vision_to_mavlink(&Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::IDENTITY), 55, 0, 0.01);
+/// let sigma_m = DVec3::new(0.1, 0.2, 0.3);
+/// let pose = Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::IDENTITY);
+/// let message = vision_to_mavlink(&pose, 55, 0, sigma_m, DVec3::splat(0.01));
 /// assert_eq!((message.x, message.y, message.z), (2.0, 1.0, -3.0));
+/// // The variances of x (north) and y (east).
+/// assert!((message.covariance[0] - 0.04).abs() < 1e-6 && (message.covariance[6] - 0.01).abs() < 1e-6);
 /// assert!((message.yaw - 90f32.to_radians()).abs() < 1e-6);
 /// let back = vision_from_mavlink(&message);
 /// assert!((back.translation_m - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-6);
@@ -41,14 +46,18 @@ pub fn vision_to_mavlink(
     world_from_body: &Pose<World, Body>,
     usec: u64,
     reset_counter: u8,
-    sigma_m: f32,
+    position_sigma_m: DVec3,
+    rotation_sigma_rad: DVec3,
 ) -> VISION_POSITION_ESTIMATE_DATA {
     let p = ned_from_world(world_from_body.translation_m);
     let (roll, pitch, yaw) = euler_ned(world_from_body.rotation);
     let mut covariance = [0.0; 21];
     // Upper triangle, row by row: the diagonal of (x, y, z, roll, pitch, yaw).
-    for diagonal in [0, 6, 11, 15, 18, 20] {
-        covariance[diagonal] = sigma_m * sigma_m;
+    // Of a vehicle that is about level, errors of roll, pitch and yaw are those about body axes.
+    let (p_sigma, r_sigma) = (ned_from_world(position_sigma_m), rotation_sigma_rad);
+    let sigmas = [p_sigma.x, p_sigma.y, p_sigma.z, r_sigma.x, r_sigma.y, r_sigma.z];
+    for (diagonal, sigma) in [0, 6, 11, 15, 18, 20].into_iter().zip(sigmas) {
+        covariance[diagonal] = (sigma * sigma) as f32;
     }
     VISION_POSITION_ESTIMATE_DATA {
         usec,
@@ -186,7 +195,7 @@ mod tests {
         ) {
             let rotation = DQuat::from_euler(EulerRot::ZYX, yaw, pitch, roll);
             let pose = Pose::new(DVec3::from(p), rotation);
-            let back = vision_from_mavlink(&vision_to_mavlink(&pose, 1, 0, 0.1));
+            let back = vision_from_mavlink(&vision_to_mavlink(&pose, 1, 0, DVec3::ONE, DVec3::ONE));
             prop_assert!((back.translation_m - pose.translation_m).length() < 1e-4);
             prop_assert!(back.rotation.dot(rotation).abs() > 1.0 - 1e-6);
             let (attitude, _) = attitude_from_mavlink(&attitude_to_mavlink(rotation, DVec3::ZERO, 0));

@@ -66,4 +66,8 @@ pub enum EventKind {
     PluginOutput,
     /// Anything else worth a person's attention.
     Note,
+    /// A person lets a vehicle take off that waits for it ([`super::FlightPhase::Waiting`]).
+    Start,
+    /// A person ends the flight: it brakes, then lands.
+    Land,
 }

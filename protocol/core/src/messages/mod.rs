@@ -30,8 +30,8 @@ pub use event::{Event, EventKind};
 pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
-    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, Limits,
-    PoseSample, Purpose, ToRuntime, ToServer, Welcome,
+    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, ImuReading,
+    Limits, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ToRuntime, ToServer, Welcome,
 };
 pub use setpoint::{Axes, InvalidSetpoint, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};
@@ -56,6 +56,8 @@ pub type Text = heapless::String<192>;
 
 /// Most cameras of one vehicle.
 pub const MAX_CAMERAS: usize = 8;
+/// Most no-fly boxes of an arena.
+pub const MAX_NO_FLY: usize = 8;
 
 /// Returns `text` cut to what a bounded string holds, at a character boundary.
 pub fn bounded<const N: usize>(text: &str) -> heapless::String<N> {

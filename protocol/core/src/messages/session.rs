@@ -1,9 +1,9 @@
 //! The conversation between runtime and server on the control stream.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-use super::{Event, MAX_CAMERAS, Name, Telemetry, Text, Timing};
+use super::{Event, MAX_CAMERAS, MAX_NO_FLY, Name, Telemetry, Text, Timing};
 use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 use crate::time::{HostTime, ServerTime};
 
@@ -105,6 +105,8 @@ pub enum ToServer {
     Heard(u64),
     /// Reports where images get their age. 1 Hz.
     Timing(Timing),
+    /// What the autopilot's IMU felt, oldest first; each reading once. 25 to 50 Hz.
+    Imu(heapless::Vec<ImuReading, MAX_IMU_BATCH>),
 }
 
 /// Server to client.
@@ -155,15 +157,61 @@ pub struct PoseSample {
     pub twist: Twist,
     /// Raised by one whenever the pose jumped for another reason than motion.
     pub resets: u8,
+    /// How far the position may be off, one standard deviation an axis; 0 is not known. [m, world]
+    pub position_sigma_m: Vec3,
+    /// How far the attitude may be off, about each axis; 0 is not known. [rad, body]
+    pub rotation_sigma_rad: Vec3,
 }
 
 impl PoseSample {
+    /// Makes the sample of a vehicle that stands still, of which nobody says how far it may be off.
+    pub const fn still(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
+        let twist = Twist { linear_mps: DVec3::ZERO, angular_radps: DVec3::ZERO };
+        let (position_sigma_m, rotation_sigma_rad) = (Vec3::ZERO, Vec3::ZERO);
+        Self { stamp, world_from_body, twist, resets: 0, position_sigma_m, rotation_sigma_rad }
+    }
+
     /// Whether every number in it is one to work with.
     pub fn is_valid(&self) -> bool {
         let Twist { linear_mps, angular_radps } = self.twist;
-        self.world_from_body.is_valid() && linear_mps.is_finite() && angular_radps.is_finite()
+        self.world_from_body.is_valid()
+            && linear_mps.is_finite()
+            && angular_radps.is_finite()
+            && self.position_sigma_m.is_finite()
+            && self.rotation_sigma_rad.is_finite()
     }
 }
+
+/// Ages of the newest pose from which a flight does not go on as it was.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PoseAges {
+    /// The guard holds. [s]
+    pub hold_after_s: f64,
+    /// The guard lands. [s]
+    pub land_after_s: f64,
+}
+
+impl Default for PoseAges {
+    /// At 5 m/s 0.15 s are 0.75 m flown blind, and 30 packets of a 200 Hz mocap missed; after 0.5 s
+    /// ArduCopter's own estimate is still good for a landing in place (it lasts 7 s, measured).
+    fn default() -> Self {
+        Self { hold_after_s: 0.15, land_after_s: 0.5 }
+    }
+}
+
+/// A reading of the autopilot's accelerometer and gyroscope.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ImuReading {
+    /// When it was made.
+    pub stamp: ServerTime,
+    /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
+    pub accel_mps2: DVec3,
+    /// Angular velocity. [rad/s, body]
+    pub gyro_radps: DVec3,
+}
+
+/// Most readings of one [`ToServer::Imu`].
+pub const MAX_IMU_BATCH: usize = 8;
 
 /// One camera that the server draws.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -234,6 +282,10 @@ pub struct ArenaInfo {
     pub name: Name,
     /// Keep-in volume for the body's surface. [world]
     pub geofence: Volume,
+    /// Keep-out volumes for the body's surface. [world]
+    pub no_fly: heapless::Vec<Volume, MAX_NO_FLY>,
+    /// Height of the floor. [m, world]
+    pub floor_z_m: f64,
     /// Limits of motion.
     pub limits: Limits,
     /// Radius of the sphere that encloses the vehicle. [m]
@@ -249,6 +301,8 @@ pub struct ArenaInfo {
     /// Whether plugins get the vehicle's pose and velocity. Where not, they are not in the plugin
     /// process's memory at all.
     pub ground_truth: bool,
+    /// When the guard holds, and when it lands, for want of a pose.
+    pub pose_ages: PoseAges,
     /// Whether plugins may ask for [`Setpoint::AttitudeRate`](super::Setpoint::AttitudeRate).
     pub attitude_rate: bool,
     /// The cameras, in the order of their index on the wire.

@@ -22,6 +22,8 @@ pub enum FlightPhase {
     Landing,
     /// On the ground and disarmed after a flight.
     Landed,
+    /// On the ground, everything ready; takes off when a person presses start.
+    Waiting,
 }
 
 /// What the autopilot says of the vehicle, in our frames.

@@ -94,7 +94,7 @@ mod tests {
     use crate::geometry::{Intrinsics, Pose, Twist, Volume, body_from_forward_cam};
     use crate::messages::*;
     use crate::time::{HostTime, ServerTime};
-    use glam::{DQuat, DVec3};
+    use glam::{DQuat, DVec3, Vec3};
     use std::vec::Vec;
 
     fn widest_arena() -> ArenaInfo {
@@ -103,13 +103,16 @@ mod tests {
             intrinsics: Intrinsics::from_horizontal_fov(8192, 8192, 1.2),
             body_from_cam: body_from_forward_cam(DVec3::splat(0.1), 0.3),
         };
+        let volume = Volume::Cuboid {
+            center_m: DVec3::splat(1.1),
+            half_m: DVec3::splat(2.2),
+            rotation: DQuat::from_rotation_x(0.4),
+        };
         ArenaInfo {
             name: bounded(&"x".repeat(99)),
-            geofence: Volume::Cuboid {
-                center_m: DVec3::splat(1.1),
-                half_m: DVec3::splat(2.2),
-                rotation: DQuat::from_rotation_x(0.4),
-            },
+            geofence: volume,
+            no_fly: core::iter::repeat_n(volume, MAX_NO_FLY).collect(),
+            floor_z_m: 0.7,
             limits: Limits {
                 max_tilt_deg: Some(30.0),
                 max_altitude_m: Some(3.3),
@@ -121,6 +124,7 @@ mod tests {
             goal_radius_m: 1.0,
             time_limit_s: 99.0,
             ground_truth: true,
+            pose_ages: PoseAges::default(),
             attitude_rate: true,
             cameras: core::iter::repeat_n(camera, MAX_CAMERAS).collect(),
         }
@@ -251,6 +255,8 @@ mod tests {
             world_from_body: Pose::new(DVec3::splat(1.1), DQuat::from_rotation_x(0.4)),
             twist: Twist { linear_mps: DVec3::splat(2.2), angular_radps: DVec3::splat(3.3) },
             resets: 3,
+            position_sigma_m: Vec3::splat(4.4),
+            rotation_sigma_rad: Vec3::splat(5.5),
         };
         // Far below the smallest packet of QUIC, 1200 bytes.
         let datagram = encode_body(&Datagram::Pose(pose), &mut buffer);

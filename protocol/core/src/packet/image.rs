@@ -27,9 +27,10 @@ pub struct ImageHeader {
     pub distortion_model: u8,
     /// Counts the server's ticks; equal for all cameras of a tick.
     pub seq: U64,
-    /// When the pose the image was drawn for was measured. [ns, server]
+    /// When the newest pose behind the image was measured: its age counts from here. [ns, server]
     pub pose_ns: U64,
-    /// The instant the image shows. [ns, server]
+    /// The instant the image shows: what was known of the motion is moved on to it, so it may be
+    /// later than all other stamps. [ns, server]
     pub exposure_ns: U64,
     /// Rendering began. [ns, server]
     pub render_start_ns: U64,
@@ -83,7 +84,7 @@ impl ImageHeader {
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZIM";
 
-    /// Makes a header with all stamps but the pose's zero.
+    /// Makes a header of an image that shows the instant of its pose, with all other stamps zero.
     pub fn new(
         seq: u64,
         camera: u8,
@@ -172,6 +173,11 @@ impl ImageHeader {
             DVec3::from_array(self.mount_m.map(F64::get)),
             DQuat::from_array(self.mount_xyzw.map(F64::get)),
         )
+    }
+
+    /// Returns the instant that the image shows.
+    pub fn exposure_stamp(&self) -> ServerTime {
+        ServerTime::from_ns(self.exposure_ns.get())
     }
 
     /// Returns the pose's stamp.

@@ -20,7 +20,7 @@ pub const PLANE_ALIGN: usize = 64;
 #[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
 pub struct CameraHeader {
-    /// When the pose that this image shows was measured. [ns, host]
+    /// When the newest pose behind this image was measured. [ns, host]
     pub pose_ns: u64,
     /// When the runtime had the decoded image. [ns, host]
     pub ready_ns: u64,
@@ -44,7 +44,8 @@ pub struct CameraHeader {
     pub depth_offset: u32,
     /// The lens: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
     pub distortion_model: u32,
-    reserved: u32,
+    /// By how much later than `pose_ns` the instant is that the image shows. [ns]
+    pub ahead_ns: i32,
 }
 
 /// Most IMU samples in one observation: 0.6 s at 100 Hz, so that a plugin that skips images for as

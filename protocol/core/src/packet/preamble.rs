@@ -133,19 +133,19 @@ mod tests {
 
     #[test]
     fn the_older_side_is_named() {
-        check(*b"VZFL\x04\x00\x01\x00", Party::Runtime, Ok(Party::Server));
+        check(*b"VZFL\x06\x00\x01\x00", Party::Runtime, Ok(Party::Server));
         check(
-            *b"VZFL\x05\x00\x01\x00",
+            *b"VZFL\x07\x00\x01\x00",
             Party::Runtime,
-            Err("server speaks protocol 5, this runtime 4: update the runtime"),
+            Err("server speaks protocol 7, this runtime 6: update the runtime"),
         );
         check(
             *b"VZFL\x00\x00\x02\x00",
             Party::Server,
-            Err("runtime speaks protocol 0, this server 4: update the runtime"),
+            Err("runtime speaks protocol 0, this server 6: update the runtime"),
         );
         let stranger = "the other side does not speak VizFlyt; check the address and port";
         check(*b"HTTP/1.1", Party::Server, Err(stranger));
-        check(*b"VZFL\x04\x00\x09\x00", Party::Server, Err(stranger));
+        check(*b"VZFL\x06\x00\x09\x00", Party::Server, Err(stranger));
     }
 }

@@ -1,5 +1,6 @@
 mod failsafes;
 mod pitfalls;
+mod signed;
 
 use glam::DVec3;
 use vizflyt_protocol::mavlink::dialect::{

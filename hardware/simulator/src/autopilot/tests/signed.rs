@@ -1,0 +1,77 @@
+//! A key given over USB, and what is heard afterwards.
+
+use super::*;
+use vizflyt_protocol::mavlink::dialect::SETUP_SIGNING_DATA;
+use vizflyt_protocol::mavlink::{
+    MAX_PACKET, MavHeader, Signer, SigningKey, SigningTime, Verifier, encode,
+};
+
+const START: SigningTime = SigningTime::from_units(5_000_000_000);
+const TELEMETRY: usize = 1;
+
+fn give(c: &mut Companion, secret_key: [u8; 32], initial_timestamp: u64) {
+    c.send(&MavMessage::SETUP_SIGNING(SETUP_SIGNING_DATA {
+        target_system: 1,
+        target_component: 1,
+        secret_key,
+        initial_timestamp,
+    }));
+}
+
+/// Asks for GUIDED over a link, and whether it was obeyed.
+fn obeyed(c: &mut Companion, link: usize, mode: CopterMode, signer: Option<&mut Signer>) -> bool {
+    let message = MavMessage::SET_MODE(SET_MODE_DATA {
+        custom_mode: mode as u32,
+        target_system: 1,
+        ..Default::default()
+    });
+    let header = MavHeader { system_id: 255, component_id: 190, sequence: 0 };
+    let mut buffer = [0; MAX_PACKET];
+    let mut len = encode(header, &message, &mut buffer).len();
+    if let Some(signer) = signer {
+        len = signer.sign(START.plus_us(c.lab.now().as_ns() / 1000), &mut buffer, len);
+    }
+    c.lab.handle_mavlink(link, &buffer[..len]);
+    c.lab.tick();
+    c.mode() == mode
+}
+
+#[test]
+fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
+    let mut c = Companion::new(SimulationConfig::default());
+    let key = SigningKey::new([7; 32]);
+    assert!(obeyed(&mut c, TELEMETRY, CopterMode::AltHold, None), "everybody, before");
+    give(&mut c, [7; 32], START.units());
+    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, None), "unsigned");
+    let mut other = Signer::new(SigningKey::new([8; 32]), 0);
+    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut other)), "another key");
+    let mut owner = Signer::new(key.clone(), 0);
+    assert!(obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut owner)));
+    assert!(obeyed(&mut c, 0, CopterMode::AltHold, None), "USB is trusted");
+    assert_eq!(c.lab.report().mavlink_packets_refused, 2);
+
+    // What it sends is signed, with stamps that go on after a reboot.
+    let mut judge = Verifier::new(key);
+    let mut heard = |c: &mut Companion| {
+        let mut buffer = [0; MAX_PACKET];
+        let mut count = 0;
+        for _ in 0..800 {
+            c.lab.tick();
+            while let Some(packet) = c.lab.poll_mavlink(&mut buffer) {
+                judge.check(START, packet).unwrap();
+                count += 1;
+            }
+        }
+        count
+    };
+    assert!(heard(&mut c) > 10);
+    c.lab.reboot();
+    for _ in 0..4000 {
+        c.lab.tick();
+    }
+    assert!(heard(&mut c) > 10);
+    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is kept");
+
+    give(&mut c, [0; 32], 0);
+    assert!(obeyed(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends it");
+}
