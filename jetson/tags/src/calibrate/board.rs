@@ -1,0 +1,89 @@
+//! What is held before a camera: where its corners are on it.
+
+use std::path::Path;
+
+use glam::{DVec2, DVec3};
+
+use super::Refused;
+use crate::checkers::Checkerboard;
+use crate::detection::Detection;
+use crate::file::{self, FileError};
+use crate::layout::TagLayout;
+
+/// A board to calibrate with.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Board {
+    /// Tags on a plane, any of which may be seen.
+    Tags(TagLayout),
+    /// A checkerboard, which must be seen as a whole.
+    Checkers(Checkerboard),
+}
+
+impl From<TagLayout> for Board {
+    fn from(layout: TagLayout) -> Self {
+        Self::Tags(layout)
+    }
+}
+
+impl From<Checkerboard> for Board {
+    fn from(board: Checkerboard) -> Self {
+        Self::Checkers(board)
+    }
+}
+
+impl Board {
+    /// Reads its file: a layout of tags, or a `[checkerboard]`.
+    ///
+    /// # Errors
+    /// As [`TagLayout::read`] and [`Checkerboard::read`].
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        file::read(path, |text| {
+            let table: toml::Table = toml::from_str(text)?;
+            if table.contains_key("checkerboard") {
+                return Checkerboard::parse(text).map(Self::Checkers);
+            }
+            TagLayout::parse(text).map(Self::Tags)
+        })
+    }
+
+    pub(super) fn check(&self) -> Result<(), Refused> {
+        let Self::Tags(layout) = self else { return Ok(()) };
+        let flat = layout
+            .tags
+            .iter()
+            .all(|tag| tag.position_m.z.abs() < 1e-6 && (tag.normal() - DVec3::Z).length() < 1e-6);
+        if flat {
+            return Ok(());
+        }
+        let why = "the board is not flat: its tags differ in height or direction".into();
+        let add = vec!["calibrate with a board of `vizflyt tags print board`".into()];
+        Err(Refused { why, add })
+    }
+
+    /// Returns how many corners make a view: of fewer the homography is shaky.
+    pub(super) fn least_corners(&self) -> usize {
+        match self {
+            Self::Tags(_) => 4 * LEAST_TAGS,
+            Self::Checkers(board) => board.count(),
+        }
+    }
+
+    /// Returns the corners of its tags, on the board and in the image. [m, board] [px]
+    pub(super) fn corners_of(&self, detections: &[Detection]) -> Vec<(DVec2, DVec2)> {
+        let Self::Tags(layout) = self else { return Vec::new() };
+        let known = detections.iter().filter_map(|detection| {
+            let tag = layout.find(detection.family, detection.id)?;
+            Some(tag.corners_m().map(DVec3::truncate).into_iter().zip(detection.corners_px))
+        });
+        known.flatten().collect()
+    }
+
+    /// Returns the corners of a checkerboard likewise.
+    pub(super) fn checkers(&self, corners_px: &[DVec2]) -> Vec<(DVec2, DVec2)> {
+        let Self::Checkers(board) = self else { return Vec::new() };
+        board.corners_m().into_iter().zip(corners_px.iter().copied()).collect()
+    }
+}
+
+/// Tags that a view must have.
+const LEAST_TAGS: usize = 4;

@@ -1,0 +1,104 @@
+//! From images to a lens: detection, choice of views, and a second look at the chosen ones.
+
+use super::{Board, Calibrated, Calibrator, LensModel, Refused, Verdict};
+use crate::detect::{Detector, DetectorSettings};
+use crate::family::TagFamily;
+use crate::image::Gray;
+use vizflyt_protocol::geometry::Intrinsics;
+
+/// Takes images of a board until they say enough of the lens.
+///
+/// Corners are measured along edges that are straight behind the lens; at first nobody knows the lens.
+/// So chosen images are kept, and looked at again once a first lens is found.
+pub struct Session {
+    board: Board,
+    model: LensModel,
+    /// None for a checkerboard.
+    detector: Option<Detector>,
+    calibrator: Option<Calibrator>,
+    kept: Vec<Gray>,
+}
+
+impl Session {
+    /// Begins with a board.
+    pub fn new(board: impl Into<Board>, model: LensModel) -> Self {
+        let board = board.into();
+        let detector = match &board {
+            Board::Tags(layout) => {
+                let mut families: Vec<TagFamily> =
+                    layout.tags.iter().map(|tag| tag.family).collect();
+                families.sort_unstable();
+                families.dedup();
+                Some(Detector::new(&families, DetectorSettings::default()))
+            }
+            Board::Checkers(_) => None,
+        };
+        Self { board, model, detector, calibrator: None, kept: Vec::new() }
+    }
+
+    /// Takes an image; with `is_stream`, as [`Calibrator::add`].
+    ///
+    /// # Errors
+    /// [`Refused`] if it is of another size than those before, or the board is no board.
+    pub fn take(&mut self, image: Gray, is_stream: bool) -> Result<Verdict, Refused> {
+        let size = [image.width_px(), image.height_px()];
+        let calibrator = match &mut self.calibrator {
+            Some(calibrator) => calibrator,
+            none => none.insert(Calibrator::new(self.board.clone(), size)?),
+        };
+        if calibrator.size_px != size {
+            let [width, height] = calibrator.size_px;
+            let why = format!(
+                "an image of {}x{} follows images of {width}x{height}",
+                image.width_px(),
+                image.height_px()
+            );
+            let add = vec!["calibrate with images of one size, the one that will be used".into()];
+            return Err(Refused { why, add });
+        }
+        let rough = Intrinsics::from_horizontal_fov(size[0], size[1], 1.2);
+        let verdict = match (&self.board, &mut self.detector) {
+            (Board::Checkers(board), _) => {
+                calibrator.add_checkers(board.find(&image).as_deref(), is_stream)
+            }
+            (Board::Tags(_), Some(detector)) => {
+                calibrator.add(&detector.search(&image, &rough, false), is_stream)
+            }
+            (Board::Tags(_), None) => Verdict::TooFewTags,
+        };
+        if verdict == Verdict::Kept && self.detector.is_some() {
+            self.kept.push(image);
+        }
+        Ok(verdict)
+    }
+
+    /// Returns what has been gathered; `None` before the first image.
+    pub fn progress(&self) -> Option<&Calibrator> {
+        self.calibrator.as_ref()
+    }
+
+    /// Returns the lens.
+    ///
+    /// # Errors
+    /// [`Refused`] for images that do not determine one well: it says what to add.
+    pub fn finish(mut self) -> Result<Calibrated, Refused> {
+        let Some(calibrator) = self.calibrator else {
+            return Err(Refused {
+                why: "there is no image".into(),
+                add: vec!["show the board to the camera".into()],
+            });
+        };
+        let first = calibrator.finish(self.model)?;
+        // A checkerboard's corners are measured without a lens.
+        let Some(detector) = &mut self.detector else { return Ok(first) };
+        let mut again = Calibrator::new(self.board.clone(), calibrator.size_px)?;
+        for image in &self.kept {
+            again.add(&detector.search(image, &first.intrinsics, true), false);
+        }
+        // The second look may lose a view that the first just found: then the first lens holds.
+        match again.finish(self.model) {
+            Ok(second) if second.calibration.rms_px <= first.calibration.rms_px => Ok(second),
+            _ => Ok(first),
+        }
+    }
+}

@@ -1,0 +1,143 @@
+//! YUV4MPEG2, raw images on a pipe: what `ffmpeg -f yuv4mpegpipe` and GStreamer's `y4menc` print
+//! (mjpegtools, yuv4mpeg(5)). Of it, the brightness; chroma is skipped.
+
+use super::decode::check;
+use crate::image::Gray;
+
+/// Cuts a stream of bytes into images.
+///
+/// ```
+/// let mut stream = vizflyt_tags::capture::Y4m::default();
+/// stream.push(b"YUV4MPEG2 W2 H1 F30:1 Cmono\nFRAME XSTAMP_NS=7\n\x10\x20");
+/// let (stamp_ns, image) = stream.poll().unwrap().unwrap();
+/// assert_eq!((stamp_ns, image.pixels()), (Some(7), &[0x10, 0x20][..]));
+/// assert_eq!(stream.rate_hz(), Some(30.0));
+/// ```
+#[derive(Debug, Default)]
+pub struct Y4m {
+    bytes: Vec<u8>,
+    head: Option<Head>,
+    /// Of the image whose pixels come next.
+    image: Option<ImageHead>,
+}
+
+/// What stands before an image.
+#[derive(Clone, Copy, Debug)]
+struct ImageHead {
+    stamp_ns: Option<u64>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Head {
+    width: u32,
+    height: u32,
+    chroma: usize,
+    rate_hz: Option<f64>,
+}
+
+impl Y4m {
+    /// Takes bytes.
+    pub fn push(&mut self, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    /// Returns images a second, once the head has come, if it says so.
+    pub fn rate_hz(&self) -> Option<f64> {
+        self.head.and_then(|head| head.rate_hz)
+    }
+
+    /// Returns the next whole image, and its `XSTAMP_NS`; `None` if bytes are missing.
+    ///
+    /// # Errors
+    /// What is wrong, in words; the stream cannot be followed further.
+    pub fn poll(&mut self) -> Result<Option<(Option<u64>, Gray)>, String> {
+        let head = match self.head {
+            Some(head) => head,
+            None => match self.line()? {
+                Some(line) => *self.head.insert(parse_head(&line)?),
+                None => return Ok(None),
+            },
+        };
+        let ImageHead { stamp_ns } = match self.image {
+            Some(head) => head,
+            None => match self.line()? {
+                Some(line) => *self.image.insert(parse_image(&line)?),
+                None => return Ok(None),
+            },
+        };
+        let count = head.width as usize * head.height as usize;
+        if self.bytes.len() < count + head.chroma {
+            return Ok(None);
+        }
+        let pixels = self.bytes[..count].to_vec();
+        self.bytes.drain(..count + head.chroma);
+        self.image = None;
+        let image = Gray::new(head.width, head.height, pixels);
+        Ok(image.map(|image| (stamp_ns, image)))
+    }
+
+    /// Takes a line, without its end.
+    fn line(&mut self) -> Result<Option<String>, String> {
+        let Some(end) = self.bytes.iter().take(MAX_LINE).position(|&b| b == b'\n') else {
+            if self.bytes.len() >= MAX_LINE {
+                return Err(
+                    "this is no YUV4MPEG2 stream; let ffmpeg or GStreamer's y4menc write it".into(),
+                );
+            }
+            return Ok(None);
+        };
+        let line = String::from_utf8_lossy(&self.bytes[..end]).into_owned();
+        self.bytes.drain(..=end);
+        Ok(Some(line))
+    }
+}
+
+fn parse_head(line: &str) -> Result<Head, String> {
+    let mut words = line.split(' ');
+    if words.next() != Some("YUV4MPEG2") {
+        return Err("this is no YUV4MPEG2 stream; let ffmpeg or GStreamer's y4menc write it".into());
+    }
+    let (mut width, mut height, mut rate_hz, mut colours) = (0, 0, None, "420");
+    for word in words.filter(|word| !word.is_empty()) {
+        let Some((tag, value)) = word.split_at_checked(1) else { continue };
+        match tag {
+            "W" => width = value.parse().map_err(|_| format!("width {value:?} is no number"))?,
+            "H" => height = value.parse().map_err(|_| format!("height {value:?} is no number"))?,
+            "F" => rate_hz = parse_rate(value),
+            "C" => colours = value,
+            _ => {}
+        }
+    }
+    check(width, height)?;
+    let (across, down) = (width.div_ceil(2) as usize, height.div_ceil(2) as usize);
+    let (width_px, height_px) = (width as usize, height as usize);
+    let chroma = match colours {
+        "mono" => 0,
+        "420" | "420jpeg" | "420mpeg2" | "420paldv" => 2 * across * down,
+        "422" => 2 * across * height_px,
+        "444" => 2 * width_px * height_px,
+        "444alpha" => 3 * width_px * height_px,
+        other => {
+            return Err(format!("colours {other:?} are unknown; write mono or 420, of 8 bits"));
+        }
+    };
+    Ok(Head { width, height, chroma, rate_hz })
+}
+
+fn parse_rate(value: &str) -> Option<f64> {
+    let (images, seconds) = value.split_once(':')?;
+    let rate_hz = images.parse::<f64>().ok()? / seconds.parse::<f64>().ok()?;
+    (rate_hz > 0.0 && rate_hz.is_finite()).then_some(rate_hz)
+}
+
+fn parse_image(line: &str) -> Result<ImageHead, String> {
+    let mut words = line.split(' ');
+    if words.next() != Some("FRAME") {
+        return Err("an image does not begin where the one before ends: bytes are missing".into());
+    }
+    let mut stamps = words.filter_map(|word| word.strip_prefix("XSTAMP_NS="));
+    Ok(ImageHead { stamp_ns: stamps.find_map(|ns| ns.parse().ok()) })
+}
+
+/// Heads are some 60 bytes long.
+const MAX_LINE: usize = 1024;

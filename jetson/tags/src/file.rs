@@ -1,0 +1,129 @@
+//! What layout and camera files have in common: how they are refused, and poses in them.
+
+use std::fmt::Display;
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use glam::{DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::geometry::{Frame, Pose};
+
+/// Why a layout or camera file is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum FileError {
+    /// The file cannot be read or written.
+    #[error("{path}: {error}")]
+    Io {
+        /// Which file.
+        path: String,
+        /// What the system says.
+        error: std::io::Error,
+    },
+    /// Syntax, type, absent or unknown key; the text points at line and column.
+    #[error("{0}")]
+    Toml(#[from] toml::de::Error),
+    /// The value cannot be written as TOML.
+    #[error("{0}")]
+    Unwritable(#[from] toml::ser::Error),
+    /// A value that cannot work.
+    #[error("{key} = {value}: {advice}")]
+    Invalid {
+        /// Where in the file: `tags[1].size_m`.
+        key: String,
+        /// What it says.
+        value: String,
+        /// What is wrong and what to do.
+        advice: String,
+    },
+    /// Another of these, in a file.
+    #[error("{path}: {error}")]
+    In {
+        /// Which file.
+        path: String,
+        /// What is wrong in it.
+        error: Box<FileError>,
+    },
+}
+
+/// A pose as files write it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseConfig {
+    /// Origin. [m]
+    pub position_m: DVec3,
+    /// Unit quaternion, Hamilton, xyzw.
+    pub rotation_xyzw: DQuat,
+}
+
+impl PoseConfig {
+    /// Returns it as files write it.
+    pub fn new<A: Frame, B: Frame>(a_from_b: Pose<A, B>) -> Self {
+        Self { position_m: a_from_b.translation_m, rotation_xyzw: a_from_b.rotation }
+    }
+
+    /// Returns the pose; it has been [checked](Self::check).
+    pub fn pose<A: Frame, B: Frame>(&self) -> Pose<A, B> {
+        Pose::new(self.position_m, self.rotation_xyzw.normalize())
+    }
+
+    /// Checks that it is one; `key` names a field.
+    ///
+    /// # Errors
+    /// [`FileError::Invalid`].
+    pub fn check(&self, key: impl Fn(&str) -> String) -> Result<(), FileError> {
+        let p_m = self.position_m;
+        if !(p_m.is_finite() && p_m.abs().max_element() <= MAX_COORDINATE_M) {
+            let advice = format!("give three finite numbers within {MAX_COORDINATE_M} m");
+            return Err(invalid(key("position_m"), p_m, advice));
+        }
+        let q = self.rotation_xyzw;
+        if !((q.length() - 1.0).abs() <= QUATERNION_TOLERANCE) {
+            let advice = "give a quaternion x, y, z, w of length 1; no turn is [0, 0, 0, 1]";
+            return Err(invalid(key("rotation_xyzw"), q, advice));
+        }
+        Ok(())
+    }
+}
+
+pub(crate) fn invalid(
+    key: impl Into<String>,
+    value: impl Display,
+    advice: impl Into<String>,
+) -> FileError {
+    FileError::Invalid { key: key.into(), value: value.to_string(), advice: advice.into() }
+}
+
+pub(crate) fn check_number(
+    key: &str,
+    value: f64,
+    unit: &str,
+    range: RangeInclusive<f64>,
+) -> Result<(), FileError> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    let (low, high) = range.into_inner();
+    Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
+}
+
+/// Reads a file and says in any error which one it was.
+pub(crate) fn read<T>(
+    path: &Path,
+    parse: impl Fn(&str) -> Result<T, FileError>,
+) -> Result<T, FileError> {
+    let named = || path.display().to_string();
+    let text =
+        std::fs::read_to_string(path).map_err(|error| FileError::Io { path: named(), error })?;
+    parse(&text).map_err(|error| FileError::In { path: named(), error: Box::new(error) })
+}
+
+/// Writes a file.
+pub(crate) fn write(path: &Path, text: &str) -> Result<(), FileError> {
+    std::fs::write(path, text)
+        .map_err(|error| FileError::Io { path: path.display().to_string(), error })
+}
+
+/// Positions further out than this are typing errors. [m]
+const MAX_COORDINATE_M: f64 = 1000.0;
+/// Files written by hand round a quaternion to three digits.
+const QUATERNION_TOLERANCE: f64 = 2e-3;

@@ -1,0 +1,492 @@
+//! From images to the vehicle's pose. Sans-IO.
+//!
+//! What enters: grey images with the instant of their exposure, as many cameras at once as have one. What
+//! leaves: the vehicle's pose at the newest of these instants with its covariance, or why there is none;
+//! and what was seen where, for the live view. Called once per set of images, 30 to 120 times a second.
+//!
+//! - [`config`]: the file that names cameras and layouts;
+//! - [`region`]: where tags should be in an image, by where the vehicle should be;
+//! - [`track`]: how the vehicle moves, and both answers where corners leave two open.
+//!
+//! Cameras that were not exposed together are carried to one instant by the vehicle's motion: webcams
+//! run free, and at 2 m/s half an image's interval is 3 cm.
+
+mod config;
+mod region;
+mod track;
+
+pub use config::{LocateConfig, LocateSetup, SIMULATED, SensorConfig};
+
+use std::collections::HashMap;
+
+use glam::{DMat3, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::time::HostTime;
+
+use crate::camera::{Mounting, TagCamera};
+use crate::detect::{Detector, DetectorSettings, Region};
+use crate::detection::Detection;
+use crate::family::TagFamily;
+use crate::image::Gray;
+use crate::layout::{CORNERS, LayoutFrame, Tag, TagLayout};
+use crate::solve::{self, Sight, Sighting};
+use region::Expected;
+use track::Track;
+
+/// What locating needs to know beside tags and cameras; the defaults serve.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocateSettings {
+    /// How tags are looked for.
+    pub detector: DetectorSettings,
+    /// How far a corner may be off, one standard deviation. [px]
+    pub corner_sigma_px: f64,
+    /// Poses that leave corners further off than this are refused: a layout, a lens or a camera's place is
+    /// wrong. Root mean square. [px]
+    pub most_rms_px: f64,
+    /// The vehicle never leans further than this: rules out answers on their heads. [rad]
+    pub most_tilt_rad: f64,
+    /// What print, survey and lens leave uncertain whatever the corners say; added to the covariance. [m]
+    pub floor_m: f64,
+    /// Likewise. [rad]
+    pub floor_rad: f64,
+    /// Images of other cameras are used up to this long after their exposure. [s]
+    pub most_lag_s: f64,
+}
+
+impl Default for LocateSettings {
+    fn default() -> Self {
+        Self {
+            detector: DetectorSettings::default(),
+            corner_sigma_px: 0.12,
+            most_rms_px: 3.0,
+            most_tilt_rad: 1.1,
+            floor_m: 0.002,
+            floor_rad: 0.002,
+            most_lag_s: 0.035,
+        }
+    }
+}
+
+/// Why a locator cannot be made.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum LocateError {
+    /// No camera, or no layout.
+    #[error("{0} cameras and {1} layouts: give one of each at least")]
+    Nothing(usize, usize),
+    /// A camera whose place is not known.
+    #[error(
+        "camera {0:?} has neither world_from_cam nor body_from_cam; `vizflyt tags survey` finds it"
+    )]
+    Unmounted(String),
+    /// A tag that is in two layouts.
+    #[error("tag {1} of {0} is in two layouts; print each once")]
+    Twice(TagFamily, u32),
+    /// Tags that no camera can use.
+    #[error("{0}")]
+    Useless(&'static str),
+}
+
+/// An image and when it was exposed.
+#[derive(Clone, Copy, Debug)]
+pub struct View<'a> {
+    /// Index of the camera.
+    pub camera: usize,
+    /// Middle of the exposure.
+    pub stamp: HostTime,
+    /// What it saw, in the size of the camera's intrinsics.
+    pub image: &'a Gray,
+}
+
+/// The vehicle's pose.
+#[derive(Clone, Copy, Debug)]
+pub struct Located {
+    /// When it was there.
+    pub stamp: HostTime,
+    /// Where.
+    pub world_from_body: Pose<World, Body>,
+    /// Standard deviation of the position. [m, world]
+    pub position_sigma_m: DVec3,
+    /// Standard deviation of the attitude, about the vehicle's axes. [rad, body]
+    pub rotation_sigma_rad: DVec3,
+    /// Covariance of both, position first, without the floors. [m, world; rad, body]
+    pub covariance: [[f64; 6]; 6],
+    /// How many tags it rests on; one in two cameras counts twice.
+    pub tags: usize,
+    /// In how many cameras.
+    pub cameras: usize,
+    /// Root mean square distance of corners from where the pose puts them. [px]
+    pub rms_px: f64,
+}
+
+/// Why there is no pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Unlocated {
+    /// No tag of a layout is in the images.
+    NoTag,
+    /// Tags do not lead to any pose.
+    NoPose,
+    /// Corners lie too far from where the best pose puts them, root mean square. [px]
+    Residuals(f64),
+    /// One tag, and two poses that explain it: more images will tell.
+    Ambiguous,
+    /// The images are older than those before.
+    Old,
+}
+
+/// What one camera saw.
+#[derive(Clone, Debug)]
+pub struct Look {
+    /// Index of the camera.
+    pub camera: usize,
+    /// When.
+    pub stamp: HostTime,
+    /// Where it was looked; the whole image if nothing.
+    pub region: Option<Region>,
+    /// Tags of the layouts.
+    pub seen: Vec<Seen>,
+    /// Tags of no layout, or of one that this camera cannot use.
+    pub strangers: Vec<Detection>,
+}
+
+/// A tag of a layout in an image.
+#[derive(Clone, Copy, Debug)]
+pub struct Seen {
+    /// The tag.
+    pub detection: Detection,
+    /// Where the pose puts its corners; absent without one. [px]
+    pub expected_px: Option<[DVec2; 4]>,
+}
+
+/// What came of a set of images.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// The pose, or why there is none.
+    pub located: Result<Located, Unlocated>,
+    /// What each camera saw.
+    pub looks: Vec<Look>,
+}
+
+/// Locates one vehicle.
+pub struct Locator {
+    stations: Vec<Station>,
+    tags: HashMap<(TagFamily, u32), (LayoutFrame, Tag)>,
+    detector: Detector,
+    track: Track,
+    settings: LocateSettings,
+}
+
+struct Station {
+    camera: TagCamera,
+    /// What it saw last.
+    kept: Option<(HostTime, Vec<Detection>)>,
+    /// Images since it last saw a tag.
+    misses: u32,
+}
+
+impl Locator {
+    /// Makes a locator of these cameras, whose indices views have, and tags.
+    ///
+    /// # Errors
+    /// See [`LocateError`].
+    pub fn new(
+        cameras: Vec<TagCamera>,
+        layouts: &[TagLayout],
+        settings: LocateSettings,
+    ) -> Result<Self, LocateError> {
+        if cameras.is_empty() || layouts.is_empty() {
+            return Err(LocateError::Nothing(cameras.len(), layouts.len()));
+        }
+        let mut tags = HashMap::new();
+        for layout in layouts {
+            for tag in &layout.tags {
+                if tags.insert((tag.family, tag.id), (layout.frame, *tag)).is_some() {
+                    return Err(LocateError::Twice(tag.family, tag.id));
+                }
+            }
+        }
+        let (mut fixed, mut carried) = (false, false);
+        for camera in &cameras {
+            match camera.mounting {
+                Mounting::World(_) => fixed = true,
+                Mounting::Body(_) => carried = true,
+                Mounting::Unknown => return Err(LocateError::Unmounted(camera.name.clone())),
+            }
+        }
+        let on_vehicle = layouts.iter().any(|layout| layout.frame == LayoutFrame::Body);
+        let in_room = layouts.iter().any(|layout| layout.frame == LayoutFrame::World);
+        if !(fixed && on_vehicle || carried && in_room) {
+            return Err(LocateError::Useless(if fixed {
+                "the cameras are fixed in the room and so are the tags; add the layout of the cube on the vehicle"
+            } else {
+                "the cameras are on the vehicle and so are the tags; add the surveyed layout of the room"
+            }));
+        }
+        let mut families: Vec<TagFamily> = tags.keys().map(|&(family, _)| family).collect();
+        families.sort_unstable();
+        families.dedup();
+        let detector = Detector::new(&families, settings.detector.clone());
+        let stations =
+            cameras.into_iter().map(|camera| Station { camera, kept: None, misses: 0 }).collect();
+        Ok(Self { stations, tags, detector, track: Track::default(), settings })
+    }
+
+    /// Returns the cameras, in the order of their indices.
+    pub fn cameras(&self) -> impl ExactSizeIterator<Item = &TagCamera> {
+        self.stations.iter().map(|station| &station.camera)
+    }
+
+    /// Takes images of one or more cameras, at most one of each, exposed at nearly the same time.
+    ///
+    /// # Panics
+    /// If there is no view, a camera has no such index, or an image is not of the camera's size.
+    pub fn handle_images(&mut self, views: &[View]) -> Outcome {
+        let stamp = views.iter().map(|view| view.stamp).max().expect("there is a view");
+        let mut expected = self.track.predict(stamp).map(|pose| (pose, self.track.doubt_m(stamp)));
+        let mut looks = Vec::with_capacity(views.len());
+        for view in views {
+            looks.push(self.look(view, expected.as_ref()));
+            if expected.is_none() && looks.iter().any(|look: &Look| !look.seen.is_empty()) {
+                // Found by one camera, it is looked for in the right place by the others.
+                let sightings = self.sightings(stamp);
+                let motion = self.track.motion().unwrap_or_default();
+                if let Some(solved) = solve::solve(&sightings, &motion, None)
+                    && solved.other.is_none()
+                    && solved.best.rms_px <= self.settings.most_rms_px
+                {
+                    expected = Some((solved.best.world_from_body, region::FOUND_DOUBT_M));
+                }
+            }
+        }
+        let located = self.locate(stamp, &looks);
+        if let Ok(located) = &located {
+            for look in &mut looks {
+                self.expect(look, located);
+            }
+        }
+        Outcome { located, looks }
+    }
+
+    fn look(&mut self, view: &View, expected: Option<&(Pose<World, Body>, f64)>) -> Look {
+        let is_seen_elsewhere = self.is_seen_elsewhere(view);
+        let station = &mut self.stations[view.camera];
+        let k = station.camera.intrinsics;
+        let size = (view.image.width_px(), view.image.height_px());
+        assert_eq!(size, (k.width_px, k.height_px), "images have the size of their intrinsics");
+        let expected = expected.map_or(Expected::Unknown, |(pose, doubt_m)| {
+            region::expect(&station.camera, self.tags.values(), pose, *doubt_m)
+        });
+        // Where it is not found, the whole image is searched, but seldom: something is in the way. Not while
+        // another camera sees the vehicle: then the place is right, and a search of this image (140 ms at
+        // every pixel) would only hold up the other's.
+        let search = match expected {
+            Expected::Unknown => true,
+            Expected::OutOfView => false,
+            Expected::Within(_) => !is_seen_elsewhere && station.misses % 7 == 2,
+        };
+        let (region, found) = if search {
+            // Every other search is a fine one: it finds tags half as large, in four times the time.
+            let fine = station.misses % 2 == 1;
+            (None, self.detector.search(view.image, &k, fine))
+        } else if let Expected::Within(region) = expected {
+            (Some(region), self.detector.look(view.image, &region, &k))
+        } else {
+            (None, Vec::new())
+        };
+        let usable = |tag: &Detection| {
+            self.tags
+                .get(&(tag.family, tag.id))
+                .is_some_and(|(frame, _)| sees(&station.camera.mounting, *frame))
+        };
+        let (known, strangers): (Vec<Detection>, Vec<Detection>) =
+            found.into_iter().partition(usable);
+        station.misses = if known.is_empty() { station.misses.wrapping_add(1) } else { 0 };
+        if station.kept.as_ref().is_none_or(|(kept, _)| *kept <= view.stamp) {
+            station.kept = Some((view.stamp, known.clone()));
+        }
+        let seen =
+            known.into_iter().map(|detection| Seen { detection, expected_px: None }).collect();
+        Look { camera: view.camera, stamp: view.stamp, region, seen, strangers }
+    }
+
+    /// Whether a camera other than this view's saw the vehicle in its newest image, not long ago.
+    fn is_seen_elsewhere(&self, view: &View) -> bool {
+        self.stations.iter().enumerate().any(|(index, station)| {
+            let newest = station.kept.as_ref().filter(|_| index != view.camera);
+            newest.is_some_and(|(at, tags)| {
+                !tags.is_empty() && view.stamp.seconds_since(*at).abs() < SEEN_LATELY_S
+            })
+        })
+    }
+
+    /// Returns what all cameras saw around an instant.
+    fn sightings(&self, stamp: HostTime) -> Vec<Sighting<'_>> {
+        let mut all = Vec::new();
+        for station in &self.stations {
+            let Some((at, tags)) = &station.kept else { continue };
+            let lag_s = stamp.seconds_since(*at);
+            if lag_s.abs() > self.most_lag_s() {
+                continue;
+            }
+            for tag in tags {
+                let Some((_, placed)) = self.tags.get(&(tag.family, tag.id)) else { continue };
+                let sight = match station.camera.mounting {
+                    Mounting::World(world_from_cam) => {
+                        Sight::OutsideIn { world_from_cam, body_from_tag: placed.frame_from_tag() }
+                    }
+                    Mounting::Body(body_from_cam) => {
+                        Sight::InsideOut { body_from_cam, world_from_tag: placed.frame_from_tag() }
+                    }
+                    Mounting::Unknown => continue,
+                };
+                // What the motion in between may be off moves all corners together: as much is learnt from
+                // them all as from one.
+                let edge_px = tag.corners_px[0].distance(tag.corners_px[2]) / 2f64.sqrt();
+                let px_per_m = edge_px / placed.size_m;
+                let corners = (4 * tags.len()) as f64;
+                let carried_px = lag_s.abs() * SPEED_DOUBT_MPS * px_per_m * corners.sqrt();
+                let sigma_px = self.settings.corner_sigma_px.hypot(carried_px);
+                all.push(Sighting {
+                    camera: &station.camera.intrinsics,
+                    sight,
+                    size_m: placed.size_m,
+                    corners_px: tag.corners_px,
+                    sigma_px,
+                    lag_s,
+                });
+            }
+        }
+        all
+    }
+
+    /// Returns how far apart in time images are used together. [s]
+    fn most_lag_s(&self) -> f64 {
+        // What moves in an unknown way is where it was for one exposure only.
+        if self.track.motion().is_some() { self.settings.most_lag_s } else { TOGETHER_S }
+    }
+
+    fn locate(&mut self, stamp: HostTime, looks: &[Look]) -> Result<Located, Unlocated> {
+        if looks.iter().all(|look| look.seen.is_empty()) {
+            return Err(Unlocated::NoTag);
+        }
+        if self.track.newest().is_some_and(|newest| stamp <= newest) {
+            return Err(Unlocated::Old);
+        }
+        let mut sightings = self.sightings(stamp);
+        let expected = self.track.predict(stamp);
+        let motion = self.track.motion().unwrap_or_default();
+        let most_off = sightings.len() / 3;
+        let mut off = 0;
+        let solved = loop {
+            let solved =
+                solve::solve(&sightings, &motion, expected.as_ref()).ok_or(Unlocated::NoPose)?;
+            if solved.best.rms_px <= self.settings.most_rms_px {
+                break solved;
+            }
+            // A few tags that do not fit the others are misread, or have moved: without them.
+            let pose = &solved.best.world_from_body;
+            let worst = sightings
+                .iter()
+                .map(|sighting| solve::residual_px(sighting, &motion, pose))
+                .enumerate()
+                .max_by(|a, b| a.1.total_cmp(&b.1));
+            match worst {
+                Some((index, _)) if off < most_off => drop(sightings.swap_remove(index)),
+                _ => return Err(Unlocated::Residuals(solved.best.rms_px)),
+            }
+            off += 1;
+        };
+        let tags = sightings.len();
+        let cameras = self
+            .stations
+            .iter()
+            .filter(|station| {
+                station.kept.as_ref().is_some_and(|(at, tags)| {
+                    !tags.is_empty() && stamp.seconds_since(*at).abs() <= self.most_lag_s()
+                })
+            })
+            .count();
+        let fit = self
+            .track
+            .update(stamp, &solved, self.settings.most_tilt_rad)
+            .ok_or(Unlocated::Ambiguous)?;
+        let (sigma_m, sigma_rad) = fit.sigmas();
+        let floored = |sigma: DVec3, floor: f64| {
+            DVec3::new(sigma.x.hypot(floor), sigma.y.hypot(floor), sigma.z.hypot(floor))
+        };
+        Ok(Located {
+            stamp,
+            world_from_body: fit.world_from_body,
+            position_sigma_m: floored(sigma_m, self.settings.floor_m),
+            rotation_sigma_rad: floored(sigma_rad, self.settings.floor_rad),
+            covariance: fit.covariance,
+            tags,
+            cameras,
+            rms_px: fit.rms_px,
+        })
+    }
+
+    /// Fills in where the pose puts the corners.
+    fn expect(&self, look: &mut Look, located: &Located) {
+        let camera = &self.stations[look.camera].camera;
+        let lag_s = located.stamp.seconds_since(look.stamp);
+        let pose = self.track.motion().unwrap_or_default().carry(&located.world_from_body, -lag_s);
+        for seen in &mut look.seen {
+            let key = (seen.detection.family, seen.detection.id);
+            let Some((_, tag)) = self.tags.get(&key) else { continue };
+            seen.expected_px = project_tag(camera, tag, &pose, 1.0);
+        }
+    }
+}
+
+/// Returns whether a camera can use tags of a layout in this frame.
+fn sees(mounting: &Mounting, frame: LayoutFrame) -> bool {
+    matches!(
+        (mounting, frame),
+        (Mounting::World(_), LayoutFrame::Body) | (Mounting::Body(_), LayoutFrame::World)
+    )
+}
+
+/// Returns the corners of a tag, grown about its middle by `scale`, in a camera; `None` unless all are
+/// ahead of it and its printed face is seen at more than a grazing angle.
+fn project_tag(
+    camera: &TagCamera,
+    tag: &Tag,
+    world_from_body: &Pose<World, Body>,
+    scale: f64,
+) -> Option<[DVec2; 4]> {
+    let (rotation, at) = match camera.mounting {
+        Mounting::World(world_from_cam) => {
+            let cam_from_body = world_from_cam.inverse() * *world_from_body;
+            (cam_from_body.rotation, cam_from_body.translation_m)
+        }
+        Mounting::Body(body_from_cam) => {
+            let cam_from_world = (*world_from_body * body_from_cam).inverse();
+            (cam_from_world.rotation, cam_from_world.translation_m)
+        }
+        Mounting::Unknown => return None,
+    };
+    let turn = DMat3::from_quat(rotation);
+    let middle = turn * tag.position_m + at;
+    let normal = turn * tag.normal();
+    if !(normal.dot(middle) < -GRAZING * middle.length()) {
+        return None;
+    }
+    let mut corners = [DVec2::ZERO; 4];
+    for (corner, c) in corners.iter_mut().zip(CORNERS) {
+        let p = tag.position_m + tag.rotation_xyzw * (c * tag.size_m * scale).extend(0.0);
+        *corner = camera.intrinsics.project(turn * p + at)?;
+    }
+    Some(corners)
+}
+
+/// Three images of a slow webcam: what one of them saw then is still a reason to trust the track. [s]
+const SEEN_LATELY_S: f64 = 0.2;
+/// Exposures closer than this are one. [s]
+const TOGETHER_S: f64 = 0.001;
+/// What the vehicle's estimated velocity may be off. [m/s]
+const SPEED_DOUBT_MPS: f64 = 0.1;
+/// Cosine to a tag's normal below which it cannot be read: 81 degrees.
+const GRAZING: f64 = 0.15;
+
+#[cfg(test)]
+mod tests;

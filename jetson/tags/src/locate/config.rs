@@ -1,0 +1,236 @@
+//! The file that `vizflyt tags locate` reads: which cameras, which tags.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::LocateSettings;
+use crate::camera::TagCamera;
+use crate::file::{self, FileError, check_number, invalid};
+use crate::layout::TagLayout;
+use crate::simulated::Sensor;
+
+/// What is located, by what. Paths are relative to the file.
+///
+/// ```
+/// use vizflyt_tags::locate::LocateConfig;
+/// let config = LocateConfig::parse(
+///     "cameras = [\"west.toml\", \"east.toml\"]\nlayouts = [\"cube.toml\"]\n",
+/// )
+/// .unwrap();
+/// assert_eq!(config.object, "vizflyt");
+/// assert_eq!(config.corner_sigma_px, 0.12);
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LocateConfig {
+    /// Name of the vehicle in the poses that are sent.
+    #[serde(default = "default_object")]
+    pub object: String,
+    /// One to eight camera files.
+    pub cameras: Vec<PathBuf>,
+    /// Files with the tags of the vehicle's cube, of the mat, of the walls.
+    pub layouts: Vec<PathBuf>,
+    /// How far a detected corner may be off, one standard deviation. [px]
+    #[serde(default = "default_sigma")]
+    pub corner_sigma_px: f64,
+    /// Poses that leave corners further off than this, root mean square, are refused. [px]
+    #[serde(default = "default_rms")]
+    pub most_rms_px: f64,
+    /// The vehicle never leans further than this. [deg]
+    #[serde(default = "default_tilt")]
+    pub most_tilt_deg: f64,
+    /// How simulated cameras (`source = "simulated"`) take images.
+    #[serde(default)]
+    pub simulated: SensorConfig,
+}
+
+/// As [`Sensor`], in the units of files.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SensorConfig {
+    /// Images a second.
+    pub rate_hz: f64,
+    /// How long the shutter is open.
+    pub exposure_ms: f64,
+    /// Standard deviation of the optics' blur.
+    pub blur_px: f64,
+    /// Standard deviation of the sensor's noise, in grey levels of 255.
+    pub noise: f64,
+}
+
+impl Default for SensorConfig {
+    fn default() -> Self {
+        let Sensor { rate_hz, exposure_s, blur_px, noise, .. } = Sensor::default();
+        Self { rate_hz, exposure_ms: exposure_s * 1e3, blur_px, noise }
+    }
+}
+
+impl SensorConfig {
+    /// Returns the sensor of one of `count` cameras, which are exposed in turn.
+    pub fn sensor(&self, index: usize, count: usize) -> Sensor {
+        Sensor {
+            rate_hz: self.rate_hz,
+            phase: index as f64 / count as f64,
+            exposure_s: self.exposure_ms * 1e-3,
+            blur_px: self.blur_px,
+            noise: self.noise,
+            ..Sensor::default()
+        }
+    }
+}
+
+/// All that a configuration names, read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocateSetup {
+    /// Name of the vehicle in the poses that are sent.
+    pub object: String,
+    /// The cameras.
+    pub cameras: Vec<TagCamera>,
+    /// The tags.
+    pub layouts: Vec<TagLayout>,
+    /// The rest.
+    pub settings: LocateSettings,
+    /// How simulated cameras take images.
+    pub simulated: SensorConfig,
+}
+
+impl LocateConfig {
+    /// Reads a configuration from TOML.
+    ///
+    /// # Errors
+    /// [`FileError::Toml`] for what is none, [`FileError::Invalid`] for a value that cannot work.
+    pub fn parse(text: &str) -> Result<Self, FileError> {
+        let config: Self = toml::from_str(text)?;
+        for (key, count, most) in [
+            ("cameras", config.cameras.len(), MOST_CAMERAS),
+            ("layouts", config.layouts.len(), MOST_LAYOUTS),
+        ] {
+            if !(1..=most).contains(&count) {
+                return Err(invalid(key, format!("{count} files"), format!("name 1 to {most}")));
+            }
+        }
+        if !(1..=MOST_NAME_BYTES).contains(&config.object.len()) {
+            let advice = format!("give a name of 1 to {MOST_NAME_BYTES} bytes");
+            return Err(invalid("object", format!("{:?}", config.object), advice));
+        }
+        check_number("corner_sigma_px", config.corner_sigma_px, "px", 0.01..=10.0)?;
+        check_number("most_rms_px", config.most_rms_px, "px", 0.1..=100.0)?;
+        check_number("most_tilt_deg", config.most_tilt_deg, "deg", 5.0..=180.0)?;
+        let sensor = &config.simulated;
+        check_number("simulated.rate_hz", sensor.rate_hz, "Hz", 1.0..=240.0)?;
+        let most_ms = 1e3 / sensor.rate_hz;
+        check_number("simulated.exposure_ms", sensor.exposure_ms, "ms", 0.0..=most_ms)?;
+        check_number("simulated.blur_px", sensor.blur_px, "px", 0.0..=20.0)?;
+        check_number("simulated.noise", sensor.noise, "grey levels", 0.0..=100.0)?;
+        Ok(config)
+    }
+}
+
+impl LocateSetup {
+    /// Reads a configuration file and the files that it names.
+    ///
+    /// # Errors
+    /// As [`LocateConfig::parse`], and [`FileError::Io`]; the file is named.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        let config = file::read(path, LocateConfig::parse)?;
+        let beside = |name: &PathBuf| path.parent().unwrap_or(Path::new("")).join(name);
+        let cameras = config.cameras.iter().map(|name| TagCamera::read(&beside(name)));
+        let layouts = config.layouts.iter().map(|name| TagLayout::read(&beside(name)));
+        Ok(Self {
+            object: config.object.clone(),
+            cameras: cameras.collect::<Result<_, _>>()?,
+            layouts: layouts.collect::<Result<_, _>>()?,
+            settings: LocateSettings {
+                corner_sigma_px: config.corner_sigma_px,
+                most_rms_px: config.most_rms_px,
+                most_tilt_rad: config.most_tilt_deg.to_radians(),
+                ..LocateSettings::default()
+            },
+            simulated: config.simulated,
+        })
+    }
+
+    /// Returns the simulated lab: webcams at both ends of the netted hall, a cube on the vehicle.
+    pub fn simulated(cameras: usize, object: &str) -> Self {
+        let simulated = |camera| TagCamera { source: Some(SIMULATED.into()), ..camera };
+        Self {
+            object: object.into(),
+            cameras: crate::simulated::webcams(cameras).into_iter().map(simulated).collect(),
+            layouts: vec![crate::simulated::cube()],
+            settings: LocateSettings::default(),
+            simulated: SensorConfig::default(),
+        }
+    }
+}
+
+fn default_object() -> String {
+    "vizflyt".into()
+}
+
+fn default_sigma() -> f64 {
+    LocateSettings::default().corner_sigma_px
+}
+
+fn default_rms() -> f64 {
+    LocateSettings::default().most_rms_px
+}
+
+fn default_tilt() -> f64 {
+    LocateSettings::default().most_tilt_rad.to_degrees()
+}
+
+/// The source of a camera that is drawn by the truth.
+pub const SIMULATED: &str = "simulated";
+/// As many as one computer's USB carries.
+const MOST_CAMERAS: usize = 8;
+/// A cube, a mat, and some walls.
+const MOST_LAYOUTS: usize = 16;
+/// As the motion capture's names.
+const MOST_NAME_BYTES: usize = 24;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_work_is_refused_by_name() {
+        let good = "cameras = [\"a.toml\"]\nlayouts = [\"b.toml\"]\n";
+        let check = |text: &str, part: &str| {
+            let error = LocateConfig::parse(text).expect_err(text).to_string();
+            assert!(error.contains(part), "{error:?} lacks {part:?}");
+        };
+        LocateConfig::parse(good).unwrap();
+        check("cameras = []\nlayouts = [\"b.toml\"]", "cameras = 0 files: name 1 to 8");
+        check(&format!("{good}corner_sigma_px = 0.0"), "corner_sigma_px");
+        check(&format!("{good}most_tilt_deg = nan"), "most_tilt_deg");
+        check(&format!("{good}object = \"\""), "object");
+        check(&format!("{good}camera = 1"), "camera");
+        check(&format!("{good}[simulated]\nexposure_ms = 40.0"), "exposure_ms");
+    }
+
+    #[test]
+    fn a_folder_of_files_is_read_and_a_missing_one_is_named() {
+        let folder = std::env::temp_dir().join(format!("vizflyt-locate-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let setup = LocateSetup::simulated(2, "wasp");
+        for (camera, name) in setup.cameras.iter().zip(["a.toml", "b.toml"]) {
+            camera.write(&folder.join(name)).unwrap();
+        }
+        let text =
+            "object = \"wasp\"\ncameras = [\"a.toml\", \"b.toml\"]\nlayouts = [\"c.toml\"]\n";
+        let path = folder.join("tags.toml");
+        std::fs::write(&path, text).unwrap();
+        let error = LocateSetup::read(&path).unwrap_err().to_string();
+        assert!(error.contains("c.toml"), "{error}");
+        setup.layouts[0].write(&folder.join("c.toml")).unwrap();
+        let read = LocateSetup::read(&path).unwrap();
+        let lenses = |setup: &LocateSetup| {
+            let lens = |camera: &TagCamera| (camera.name.clone(), camera.intrinsics);
+            setup.cameras.iter().map(lens).collect::<Vec<_>>()
+        };
+        assert_eq!(lenses(&read), lenses(&setup));
+        assert_eq!((read.layouts[0].tags.len(), &*read.object), (5, "wasp"));
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+}

@@ -1,0 +1,157 @@
+use super::*;
+use crate::simulated::{Sensor, SimulatedCamera, Truth, belly_camera, cube, mat, webcams};
+use glam::DQuat;
+
+fn at(ms: u64) -> HostTime {
+    HostTime::from_ns(3_000_000_000 + ms * 1_000_000)
+}
+
+/// Returns what one camera sees of a vehicle that moves as told, by milliseconds.
+fn images(
+    camera: &TagCamera,
+    layouts: &[TagLayout],
+    pose_at: impl Fn(f64) -> Pose<World, Body>,
+    until_ms: u64,
+) -> Vec<(HostTime, Gray)> {
+    let mut simulated = SimulatedCamera::new(camera.clone(), Sensor::default());
+    let mut truth = Truth::default();
+    let mut all = Vec::new();
+    for ms in 0..until_ms {
+        truth.push(at(ms), pose_at(ms as f64 * 1e-3));
+        all.extend(simulated.expose(&truth, layouts, false));
+    }
+    all
+}
+
+fn locator(cameras: Vec<TagCamera>, layouts: &[TagLayout]) -> Locator {
+    Locator::new(cameras, layouts, LocateSettings::default()).expect("sound")
+}
+
+#[test]
+fn what_cannot_be_located_is_refused_by_name() {
+    let check = |cameras: Vec<TagCamera>, layouts: &[TagLayout], part: &str| {
+        let error = Locator::new(cameras, layouts, LocateSettings::default()).err();
+        let error = error.expect(part).to_string();
+        assert!(error.contains(part), "{error:?} lacks {part:?}");
+    };
+    let floor = mat(DVec2::ZERO, DVec2::ONE);
+    check(Vec::new(), &[cube()], "0 cameras");
+    check(webcams(1), &[], "0 layouts");
+    check(webcams(2), std::slice::from_ref(&floor), "add the layout of the cube");
+    check(vec![belly_camera()], &[cube()], "add the surveyed layout");
+    check(webcams(1), &[cube(), cube()], "tag36h11 is in two layouts");
+    let unmounted = TagCamera { mounting: Mounting::Unknown, ..belly_camera() };
+    check(vec![unmounted], &[floor], "\"belly\" has neither");
+}
+
+#[test]
+fn one_far_face_is_open_until_it_is_decided_and_is_then_true() {
+    let camera = webcams(1).remove(0);
+    // The tail's tag alone, seen nearly from the front, 5 m away.
+    let face = TagLayout { tags: vec![cube().tags[2]], ..cube() };
+    let pose_at = |t_s: f64| {
+        let turn = DQuat::from_rotation_z(-0.35 + 0.5 * t_s) * DQuat::from_rotation_y(0.3);
+        Pose::new(DVec3::new(4.6, 0.2 * t_s, 1.6), turn)
+    };
+    let layouts = [face];
+    let mut locator = locator(vec![camera.clone()], &layouts);
+    let (mut open, mut located) = (0, 0);
+    for (stamp, image) in images(&camera, &layouts, pose_at, 1500) {
+        match locator.handle_images(&[View { camera: 0, stamp, image: &image }]).located {
+            Ok(found) => {
+                located += 1;
+                let truth = pose_at(stamp.seconds_since(at(0)));
+                let angle = found.world_from_body.rotation.angle_between(truth.rotation);
+                assert!(angle < 0.35, "{angle} rad off at {stamp:?}: the false one");
+            }
+            Err(Unlocated::Ambiguous) => open += 1,
+            Err(other) => panic!("{other:?}"),
+        }
+    }
+    println!("{open} open, {located} located");
+    assert!(located > 20, "{open} open, {located} located");
+}
+
+#[test]
+fn strangers_lead_nowhere_and_absence_is_said() {
+    let camera = webcams(1).remove(0);
+    let mut other = cube();
+    for tag in &mut other.tags {
+        tag.id += 50;
+    }
+    let pose_at = |_| Pose::new(DVec3::new(4.0, 0.0, 1.5), DQuat::IDENTITY);
+    let mut locator = locator(vec![camera.clone()], &[cube()]);
+    for (stamp, image) in images(&camera, &[other], pose_at, 100) {
+        let outcome = locator.handle_images(&[View { camera: 0, stamp, image: &image }]);
+        assert_eq!(outcome.located.err(), Some(Unlocated::NoTag));
+        assert!(outcome.looks[0].strangers.iter().all(|tag| tag.id >= 50));
+        assert!(!outcome.looks[0].strangers.is_empty());
+    }
+}
+
+#[test]
+fn it_is_found_again_elsewhere_and_old_images_are_refused() {
+    let camera = webcams(1).remove(0);
+    // It is carried away between two images.
+    let pose_at = |t_s: f64| {
+        let y_m = if t_s < 0.3 { -0.6 } else { 0.8 };
+        Pose::new(DVec3::new(4.0, y_m, 1.5), DQuat::from_rotation_z(0.5))
+    };
+    let all = images(&camera, &[cube()], pose_at, 1100);
+    let mut locator = locator(vec![camera.clone()], &[cube()]);
+    let mut last = None;
+    for (stamp, image) in &all {
+        let outcome = locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+        if let Ok(found) = outcome.located {
+            let truth = pose_at(stamp.seconds_since(at(0)));
+            let off_m = found.world_from_body.translation_m.distance(truth.translation_m);
+            assert!(off_m < 0.05, "{off_m} m at {stamp:?}");
+            // What the pose says is where the corners are.
+            for seen in &outcome.looks[0].seen {
+                let expected = seen.expected_px.expect("there is a pose");
+                let off = expected[0].distance(seen.detection.corners_px[0]);
+                assert!(off < 1.0, "{off} px");
+            }
+            last = Some(*stamp);
+        }
+    }
+    assert!(last.expect("it was found").seconds_since(at(0)) > 0.9, "found again");
+    let (stamp, image) = &all[3];
+    let outcome = locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+    assert!(matches!(outcome.located, Err(Unlocated::Old | Unlocated::NoTag)));
+}
+
+#[test]
+fn a_camera_at_whose_border_it_is_does_not_hold_up_the_one_that_sees_it() {
+    // Near the hall's east end: its own camera sees a part of the cube, and finds no whole tag.
+    let cameras = webcams(2);
+    let pose_at = |t_s: f64| {
+        let drift = DVec3::new((3.0 * t_s).sin(), (2.0 * t_s).cos(), 0.0) * 0.03;
+        Pose::new(DVec3::new(9.3, 1.2, 1.4) + drift, DQuat::from_rotation_z(0.2 * t_s))
+    };
+    let mut all: Vec<_> = (0..2)
+        .flat_map(|index| {
+            let shots = images(&cameras[index], &[cube()], pose_at, 1100);
+            shots.into_iter().map(move |(stamp, image)| (stamp, index, image))
+        })
+        .collect();
+    all.sort_by_key(|(stamp, index, _)| (*stamp, *index));
+    let mut locator = locator(cameras, &[cube()]);
+    let (mut hidden, mut found) = (0, 0);
+    for (stamp, camera, image) in &all {
+        let outcome = locator.handle_images(&[View { camera: *camera, stamp: *stamp, image }]);
+        if stamp.seconds_since(at(0)) < 0.2 {
+            continue;
+        }
+        let look = &outcome.looks[0];
+        match camera {
+            0 => found += u32::from(outcome.located.is_ok()),
+            _ if look.seen.is_empty() => {
+                hidden += 1;
+                assert!(look.region.is_some(), "{stamp:?}: the whole image was searched");
+            }
+            _ => {}
+        }
+    }
+    assert!(found > 20 && hidden > 12, "{found} found by one, {hidden} hidden from the other");
+}

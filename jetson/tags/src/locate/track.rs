@@ -1,0 +1,186 @@
+//! How the vehicle moves, and which of two answers is true.
+//!
+//! Where one square is all that is seen, two poses explain it. Both are kept, each with a penalty in the
+//! units of [`crate::solve::Fit::cost`]: what its corners cost more than the other's, summed over the
+//! images, and what it would have turned against its own motion. The false one tilts the other way with
+//! every motion, and its penalty grows; a second tag ends it at once.
+
+use std::collections::VecDeque;
+
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::time::HostTime;
+
+use crate::solve::{Fit, Motion, Solved};
+
+/// What is known of the vehicle's way.
+#[derive(Debug, Default)]
+pub(super) struct Track {
+    /// The likelier first; two at most.
+    hypotheses: Vec<Hypothesis>,
+}
+
+#[derive(Clone, Debug)]
+struct Hypothesis {
+    /// Newest last.
+    past: VecDeque<(HostTime, Pose<World, Body>)>,
+    penalty: f64,
+}
+
+impl Track {
+    /// Returns when it was last seen.
+    pub(super) fn newest(&self) -> Option<HostTime> {
+        self.hypotheses.first().and_then(Hypothesis::newest).map(|(stamp, _)| stamp)
+    }
+
+    /// Returns where the vehicle should be; `None` if it was not seen for too long.
+    pub(super) fn predict(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
+        self.hypotheses.first()?.predict(stamp)
+    }
+
+    /// Returns how far from there it may be. [m]
+    pub(super) fn doubt_m(&self, stamp: HostTime) -> f64 {
+        let Some(newest) = self.newest() else { return f64::INFINITY };
+        let dt_s = stamp.seconds_since(newest).abs();
+        LEAST_DOUBT_M + SPEED_DOUBT_MPS * dt_s + 0.5 * ACCELERATION_DOUBT_MPS2 * dt_s * dt_s
+    }
+
+    /// Returns how it moves; `None` before some poses tell.
+    pub(super) fn motion(&self) -> Option<Motion> {
+        self.hypotheses.first()?.motion()
+    }
+
+    /// Takes an answer; returns the fit to be believed, or `None` while two are open.
+    pub(super) fn update(
+        &mut self,
+        stamp: HostTime,
+        solved: &Solved,
+        most_tilt_rad: f64,
+    ) -> Option<Fit> {
+        let stale = |h: &Hypothesis| h.predict(stamp).is_none();
+        if self.hypotheses.iter().all(stale) {
+            self.hypotheses.clear();
+        }
+        let fits = [Some(solved.best), solved.other];
+        let mut next: Vec<(Hypothesis, Fit)> = Vec::with_capacity(2);
+        for fit in fits.into_iter().flatten() {
+            let pose = fit.world_from_body;
+            let up = (pose.rotation * DVec3::Z).z.clamp(-1.0, 1.0);
+            let leans = if up.acos() > most_tilt_rad { IMPOSSIBLE } else { 0.0 };
+            let own = fit.cost - solved.best.cost + leans;
+            let from = self
+                .hypotheses
+                .iter()
+                .map(|h| (KEPT * h.penalty + h.surprise(stamp, &pose), h))
+                .min_by(|a, b| a.0.total_cmp(&b.0));
+            let (penalty, past) = match from {
+                Some((before, h)) => (before + own, h.past.clone()),
+                None => (own, VecDeque::new()),
+            };
+            let mut hypothesis = Hypothesis { past, penalty };
+            hypothesis.push(stamp, pose);
+            next.push((hypothesis, fit));
+        }
+        next.sort_by(|a, b| a.0.penalty.total_cmp(&b.0.penalty));
+        let least = next.first()?.0.penalty;
+        for (hypothesis, _) in &mut next {
+            hypothesis.penalty -= least;
+        }
+        next.retain(|(hypothesis, _)| hypothesis.penalty < HOPELESS);
+        let believed = match &next[..] {
+            [(_, fit)] => Some(*fit),
+            [(_, fit), (second, _)] if second.penalty >= DECIDED => Some(*fit),
+            _ => None,
+        };
+        self.hypotheses = next.into_iter().map(|(hypothesis, _)| hypothesis).collect();
+        believed
+    }
+}
+
+impl Hypothesis {
+    fn newest(&self) -> Option<(HostTime, Pose<World, Body>)> {
+        self.past.back().copied()
+    }
+
+    fn push(&mut self, stamp: HostTime, pose: Pose<World, Body>) {
+        self.past.push_back((stamp, pose));
+        while self.past.front().is_some_and(|(old, _)| stamp.seconds_since(*old) > MOTION_SPAN_S)
+            || self.past.len() > MOST_KEPT
+        {
+            self.past.pop_front();
+        }
+    }
+
+    fn predict(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
+        let (newest, pose) = self.newest()?;
+        let dt_s = stamp.seconds_since(newest);
+        (dt_s.abs() <= FORGET_AFTER_S).then(|| self.motion().unwrap_or_default().carry(&pose, dt_s))
+    }
+
+    /// Returns straight lines through the latest poses, by least squares.
+    fn motion(&self) -> Option<Motion> {
+        let (newest, pose) = self.newest()?;
+        if self.past.len() < 3 {
+            return None;
+        }
+        let n = self.past.len() as f64;
+        let times = self.past.iter().map(|(stamp, _)| stamp.seconds_since(newest));
+        let mean_s = times.clone().sum::<f64>() / n;
+        let spread: f64 = times.map(|t| (t - mean_s).powi(2)).sum();
+        if !(spread > 1e-9) {
+            return None;
+        }
+        let (mut v, mut omega) = (DVec3::ZERO, DVec3::ZERO);
+        for (stamp, past) in &self.past {
+            let weight = (stamp.seconds_since(newest) - mean_s) / spread;
+            v += weight * (past.translation_m - pose.translation_m);
+            omega += weight * turn(pose.rotation, past.rotation);
+        }
+        Some(Motion { v_world_mps: v, omega_body_radps: omega })
+    }
+
+    /// Returns what a pose costs as the next of this one's.
+    fn surprise(&self, stamp: HostTime, pose: &Pose<World, Body>) -> f64 {
+        let (Some(expected), Some((newest, _))) = (self.predict(stamp), self.newest()) else {
+            return MOST_SURPRISE;
+        };
+        let dt_s = stamp.seconds_since(newest).abs();
+        let sigma_rad = TURN_SIGMA_RAD + TURN_SIGMA_RADPS * dt_s;
+        let angle = expected.rotation.angle_between(pose.rotation);
+        (0.5 * (angle / sigma_rad).powi(2)).min(MOST_SURPRISE)
+    }
+}
+
+/// Returns the turn from one attitude to another about the axes of the first. [rad]
+fn turn(from: DQuat, to: DQuat) -> DVec3 {
+    let q = from.conjugate() * to;
+    // Both signs are the same attitude; this one is the shorter way.
+    (if q.w < 0.0 { -q } else { q }).to_scaled_axis()
+}
+
+/// Poses of this span make the motion: at 30 Hz five of them. [s]
+const MOTION_SPAN_S: f64 = 0.14;
+/// And no more than this many.
+const MOST_KEPT: usize = 32;
+/// After this long a vehicle can be anywhere. [s]
+const FORGET_AFTER_S: f64 = 0.4;
+/// Noise of the prediction from one image to the next. [m]
+const LEAST_DOUBT_M: f64 = 0.04;
+/// What its velocity may be off. [m/s]
+const SPEED_DOUBT_MPS: f64 = 0.5;
+/// What it may accelerate unforeseen. [m/s^2]
+const ACCELERATION_DOUBT_MPS2: f64 = 10.0;
+/// How far the attitude may be from the foreseen, for noise. [rad]
+const TURN_SIGMA_RAD: f64 = 0.05;
+/// And for what the vehicle may turn unforeseen. [rad/s]
+const TURN_SIGMA_RADPS: f64 = 1.0;
+/// One image decides little against motion: it may have been misread.
+const MOST_SURPRISE: f64 = 10.0;
+/// Of what was learnt before, how much stays from image to image.
+const KEPT: f64 = 0.97;
+/// An answer that is e^4 times likelier is believed.
+const DECIDED: f64 = 4.0;
+/// One that is e^14 times less likely is dropped.
+const HOPELESS: f64 = 14.0;
+/// Penalty of what cannot be.
+const IMPOSSIBLE: f64 = 20.0;

@@ -1,0 +1,156 @@
+//! A mat of tags on the floor or a wall, over as many sheets as it takes; and the board to calibrate
+//! with, which is a mat on one sheet.
+
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Pose, World};
+
+use super::sheet::{FOOT_MM, MARGIN_MM, Sheet};
+use super::{Paper, PrintError, Printed, check_ids, check_positive, check_rim, scale};
+use crate::family::TagFamily;
+use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
+
+/// A grid of tags, flat: columns to the east, rows to the north, its middle at `middle_m`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mat {
+    /// Which tags.
+    pub family: TagFamily,
+    /// Id of the tag at the lower left; ids count to the right, then up.
+    pub first_id: u32,
+    /// Tags side by side.
+    pub columns: u32,
+    /// Tags above one another.
+    pub rows: u32,
+    /// From one tag's middle to the next one's. [mm]
+    pub pitch_mm: f64,
+    /// Edge of a tag's black square. [mm]
+    pub tag_mm: f64,
+    /// Middle of the grid. [m, world]
+    pub middle_m: DVec3,
+    /// What to print on.
+    pub paper: Paper,
+    /// What the printed scale bar measures. [mm]
+    pub bar_mm: f64,
+}
+
+impl Mat {
+    /// Returns the board to calibrate with: as many tags of this size as one sheet has room for, from
+    /// `first_id` on, half a white cell more apart than they need.
+    ///
+    /// # Errors
+    /// [`PrintError`] for what does not fit or makes no sense.
+    pub fn board(
+        family: TagFamily,
+        first_id: u32,
+        tag_mm: f64,
+        paper: Paper,
+        bar_mm: f64,
+    ) -> Result<Self, PrintError> {
+        check_positive("tag_mm", tag_mm)?;
+        let needed = family
+            .cells(0)
+            .map_or(1.25, |cells| (f64::from(cells.across()) + 0.5) / f64::from(cells.border()));
+        let pitch_mm = tag_mm * needed;
+        let [width, height] = paper.room_mm();
+        let (columns, rows) = ((width / pitch_mm) as u32, (height / pitch_mm) as u32);
+        if columns == 0 || rows == 0 {
+            let (what, room_mm) = ("a tag with its rim", width);
+            return Err(PrintError::TooLarge { what, size_mm: pitch_mm, paper, room_mm });
+        }
+        let middle_m = DVec3::ZERO;
+        Ok(Self { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm })
+    }
+
+    /// Returns its sheets, row by row from the lower left, and its layout.
+    ///
+    /// # Errors
+    /// [`PrintError`] for what does not fit or makes no sense.
+    pub fn print(&self) -> Result<Printed, PrintError> {
+        check_positive("pitch_mm", self.pitch_mm)?;
+        check_positive("tag_mm", self.tag_mm)?;
+        if self.columns == 0 || self.rows == 0 {
+            let advice = "give 1 or more";
+            return Err(PrintError::Invalid { name: "columns, rows", value: 0.0, advice });
+        }
+        if !(self.middle_m.is_finite() && self.middle_m.abs().max_element() <= 900.0) {
+            let (name, value) = ("middle_m", self.middle_m.length());
+            return Err(PrintError::Invalid { name, value, advice: "give metres within the room" });
+        }
+        let count = u64::from(self.columns) * u64::from(self.rows);
+        check_ids(self.family, self.first_id, count)?;
+        check_rim(self.family, "the distance from tag to tag", self.tag_mm, self.pitch_mm)?;
+        let scale = scale(self.bar_mm)?;
+        let [width, height] = self.paper.room_mm();
+        // Whole tags on each sheet.
+        let (across, up) = ((width / self.pitch_mm) as u32, (height / self.pitch_mm) as u32);
+        if across == 0 || up == 0 {
+            let (what, size_mm, room_mm) = ("a tag with its gap", self.pitch_mm, width.min(height));
+            return Err(PrintError::TooLarge { what, size_mm, paper: self.paper, room_mm });
+        }
+        let (sheets_across, sheets_up) = (self.columns.div_ceil(across), self.rows.div_ceil(up));
+        let mut sheets = Vec::new();
+        for sheet_row in 0..sheets_up {
+            for sheet_column in 0..sheets_across {
+                let column = sheet_column * across;
+                let row = sheet_row * up;
+                let title = format!(
+                    "row {} of {sheets_up}, column {} of {sheets_across}",
+                    sheet_row + 1,
+                    sheet_column + 1
+                );
+                let mut sheet = Sheet::new(self.paper, &title);
+                let columns = across.min(self.columns - column);
+                let rows = up.min(self.rows - row);
+                self.draw(&mut sheet, [column, row], [columns, rows]);
+                sheets.push(sheet);
+            }
+        }
+        Ok(Printed { sheets, layout: self.layout(scale) })
+    }
+
+    fn draw(&self, sheet: &mut Sheet, first: [u32; 2], count: [u32; 2]) {
+        let [left, low] = [MARGIN_MM, MARGIN_MM + FOOT_MM];
+        for row in 0..count[1] {
+            for column in 0..count[0] {
+                let at = |i: u32| (f64::from(i) + 0.5) * self.pitch_mm;
+                let id = self.id(first[0] + column, first[1] + row);
+                sheet.tag(self.family, id, [left + at(column), low + at(row)], self.tag_mm);
+            }
+        }
+        let [width, height] = count.map(|n| f64::from(n) * self.pitch_mm);
+        sheet.crop_marks([left, low, width, height]);
+        let rows: Vec<String> = (first[1]..first[1] + count[1])
+            .map(|row| {
+                let [from, to] = [first[0], first[0] + count[0] - 1].map(|c| self.id(c, row));
+                if from == to { from.to_string() } else { format!("{from}-{to}") }
+            })
+            .collect();
+        let text = format!(
+            "{} {}; cut along the marks, join edge to edge; this edge is north",
+            self.family,
+            rows.join(", ")
+        );
+        let top = (low + height + 1.5).min(self.paper.size_mm()[1] - 4.0);
+        sheet.text([left + 8.0, top], 2.4, &text);
+    }
+
+    fn id(&self, column: u32, row: u32) -> u32 {
+        self.first_id + row * self.columns + column
+    }
+
+    fn layout(&self, scale: f64) -> TagLayout {
+        let mut tags = Vec::new();
+        for row in 0..self.rows {
+            for column in 0..self.columns {
+                // From the grid's middle.
+                let along = |i: u32, n: u32| {
+                    (f64::from(i) - (f64::from(n) - 1.0) / 2.0) * self.pitch_mm * scale / 1000.0
+                };
+                let offset = DVec3::new(along(column, self.columns), along(row, self.rows), 0.0);
+                let pose: Pose<World, Square> = Pose::new(self.middle_m + offset, DQuat::IDENTITY);
+                let size_m = self.tag_mm * scale / 1000.0;
+                tags.push(Tag::new(self.family, self.id(column, row), size_m, pose));
+            }
+        }
+        TagLayout { frame: LayoutFrame::World, tags }
+    }
+}

@@ -1,0 +1,154 @@
+use super::*;
+use crate::layout::LayoutFrame;
+use glam::DVec3;
+
+fn cube() -> Cube {
+    Cube {
+        family: TagFamily::Tag36h11,
+        first_id: 4,
+        faces: 5,
+        face_mm: 160.0,
+        tag_mm: 120.0,
+        middle_m: DVec3::new(0.0, 0.0, 0.1),
+        paper: Paper::A4,
+        bar_mm: BAR_MM,
+    }
+}
+
+fn mat() -> Mat {
+    Mat {
+        family: TagFamily::Tag36h11,
+        first_id: 100,
+        columns: 3,
+        rows: 4,
+        pitch_mm: 90.0,
+        tag_mm: 60.0,
+        middle_m: DVec3::ZERO,
+        paper: Paper::A4,
+        bar_mm: BAR_MM,
+    }
+}
+
+/// The shade at a place of a sheet: whether a black box covers it.
+fn is_black(sheet: &Sheet, [x, y]: [f64; 2]) -> bool {
+    sheet.shapes.iter().any(|shape| match shape {
+        Shape::Boxes(boxes) => {
+            boxes.iter().any(|&[l, b, w, h]| (l..l + w).contains(&x) && (b..b + h).contains(&y))
+        }
+        _ => false,
+    })
+}
+
+#[test]
+fn a_cube_s_tags_sit_on_its_faces_upright_and_are_drawn_cell_by_cell() {
+    let printed = cube().print().unwrap();
+    assert_eq!(printed.sheets.len(), 5);
+    assert_eq!(printed.layout.frame, LayoutFrame::Body);
+    printed.layout.validate().unwrap();
+    for (tag, (name, out, up)) in printed.layout.tags.iter().zip(CUBE_FACES) {
+        assert!((tag.normal() - out).length() < 1e-12, "{name}");
+        assert!((tag.position_m - DVec3::Z * 0.1 - out * 0.08).length() < 1e-12, "{name}");
+        assert!((tag.rotation_xyzw * DVec3::Y - up).length() < 1e-12, "{name}");
+        assert_eq!(tag.size_m, 0.12);
+    }
+    let cells = TagFamily::Tag36h11.cells(4).unwrap();
+    // Middle of the only face: margin, flap, half a face; above the foot.
+    let [x, y] = [10.0 + 8.0 + 80.0, 10.0 + 18.0 + 8.0 + 80.0];
+    for row in 0..10 {
+        for column in 0..10 {
+            let at = |i: u32| (f64::from(i) + 0.5 - 5.0) * 15.0;
+            let black = is_black(&printed.sheets[0], [x + at(column), y - at(row)]);
+            assert_eq!(black, !cells.is_white(column, row), "column {column}, row {row}");
+        }
+    }
+}
+
+#[test]
+fn a_mat_over_several_sheets_has_every_tag_once_at_its_place() {
+    let printed = mat().print().unwrap();
+    // Two by two tags on a sheet of 190 x 259 mm.
+    assert_eq!(printed.sheets.len(), 4);
+    let tags = &printed.layout.tags;
+    assert_eq!(tags.iter().map(|tag| tag.id).collect::<Vec<_>>(), (100..112).collect::<Vec<_>>());
+    assert!((tags[0].position_m - DVec3::new(-0.09, -0.135, 0.0)).length() < 1e-12);
+    assert!((tags[11].position_m - DVec3::new(0.09, 0.135, 0.0)).length() < 1e-12);
+    printed.layout.validate().unwrap();
+    let drawn: usize = printed
+        .sheets
+        .iter()
+        .map(|sheet| sheet.shapes.iter().filter(|s| matches!(s, Shape::Boxes(_))).count() - 1)
+        .sum();
+    assert_eq!(drawn, 12);
+}
+
+#[test]
+fn a_printer_that_scales_scales_the_layout() {
+    let printed = Mat { bar_mm: 98.0, ..mat() }.print().unwrap();
+    let tags = &printed.layout.tags;
+    assert!((tags[0].size_m - 0.0588).abs() < 1e-12);
+    assert!((tags[1].position_m - tags[0].position_m - DVec3::X * 0.0882).length() < 1e-12);
+    // The sheets stay: they are what was printed.
+    assert_eq!(printed.sheets, mat().print().unwrap().sheets);
+}
+
+#[test]
+fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
+    for paper in [Paper::A4, Paper::Letter, Paper::A3] {
+        for family in TagFamily::ALL {
+            let board = Mat::board(family, 0, 30.0, paper, BAR_MM).unwrap();
+            let count = board.columns * board.rows;
+            if count > family.ids() {
+                assert!(matches!(board.print(), Err(PrintError::Ids { .. })));
+                continue;
+            }
+            let printed = board.print().unwrap();
+            assert_eq!(printed.sheets.len(), 1, "{family} on {paper}");
+            let [width, height] = paper.size_mm();
+            let inside = |x: f64, y: f64| (0.0..=width).contains(&x) && (0.0..=height).contains(&y);
+            for shape in &printed.sheets[0].shapes {
+                match shape {
+                    Shape::Boxes(boxes) => {
+                        assert!(
+                            boxes
+                                .iter()
+                                .all(|b| inside(b[0], b[1]) && inside(b[0] + b[2], b[1] + b[3]))
+                        );
+                    }
+                    Shape::Line { from, to, .. } => {
+                        assert!(inside(from[0], from[1]) && inside(to[0], to[1]));
+                    }
+                    Shape::Text { at, .. } => assert!(inside(at[0], at[1])),
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn what_cannot_be_printed_is_refused_by_name() {
+    let refused = |result: Result<Printed, PrintError>, parts: &[&str]| {
+        let error = result.unwrap_err().to_string();
+        for part in parts {
+            assert!(error.contains(part), "{error:?} lacks {part:?}");
+        }
+    };
+    refused(Cube { face_mm: 200.0, ..cube() }.print(), &["200 mm", "A4", "174 mm"]);
+    refused(Cube { tag_mm: 140.0, ..cube() }.print(), &["140.0 mm", "175.0 mm", "160.0 mm"]);
+    refused(Cube { first_id: 583, ..cube() }.print(), &["tag36h11", "0 to 586", "583"]);
+    refused(Cube { faces: 7, ..cube() }.print(), &["faces = 7"]);
+    refused(Cube { bar_mm: 10.0, ..cube() }.print(), &["bar_mm = 10", "90 to 110"]);
+    refused(Cube { tag_mm: f64::NAN, ..cube() }.print(), &["tag_mm = NaN"]);
+    refused(Mat { pitch_mm: 60.0, ..mat() }.print(), &["75.0 mm", "from tag to tag"]);
+    refused(Mat { columns: 100_000, rows: 100_000, ..mat() }.print(), &["too many"]);
+    refused(Mat { pitch_mm: 300.0, ..mat() }.print(), &["300 mm", "190 mm"]);
+}
+
+#[test]
+fn a_pdf_has_a_page_for_each_sheet_of_its_size() {
+    let printed = mat().print().unwrap();
+    let bytes = pdf("mat", &printed.sheets);
+    let text = String::from_utf8_lossy(&bytes);
+    assert!(text.starts_with("%PDF-"));
+    assert_eq!(text.matches("/MediaBox [0 0 595.2756 841.8898]").count(), 4);
+    assert!(text.contains("/Count 4") && text.contains("/PrintScaling /None"));
+}

@@ -1,0 +1,295 @@
+//! Levenberg-Marquardt over the reprojection error of all corners.
+//!
+//! Six unknowns: the position moves in world axes, the attitude turns about body axes, so that the
+//! covariance comes out in the axes in which poses are sent and fused. Corners count by a Cauchy loss:
+//! one that is far off (a misread tag, a shadow over an edge) hardly pulls.
+
+use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
+
+use super::{Motion, Sight, Sighting};
+use crate::layout::CORNERS;
+
+/// A pose and how well it explains the corners.
+#[derive(Clone, Copy, Debug)]
+pub struct Fit {
+    /// The vehicle's pose.
+    pub world_from_body: Pose<World, Body>,
+    /// Covariance of position (three, world axes) and attitude (three, about body axes). [m, rad]
+    pub covariance: [[f64; 6]; 6],
+    /// Root mean square distance of corners from where the pose puts them. [px]
+    pub rms_px: f64,
+    /// Half the sum of squares in units of sigma, robust.
+    pub cost: f64,
+}
+
+impl Fit {
+    /// Returns one standard deviation of each of the six unknowns. [m, world; rad, body]
+    pub fn sigmas(&self) -> (DVec3, DVec3) {
+        let sigma = |i: usize| self.covariance[i][i].max(0.0).sqrt();
+        (DVec3::new(sigma(0), sigma(1), sigma(2)), DVec3::new(sigma(3), sigma(4), sigma(5)))
+    }
+}
+
+/// Returns the robust cost of a pose; infinite where a tag would lie behind its camera.
+pub(super) fn cost(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, Body>) -> f64 {
+    let mut total = 0.0;
+    for sighting in sightings {
+        let at = motion.carry(pose, -sighting.lag_s);
+        for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+            let p_cam = in_cam(sighting, &at, (*corner * sighting.size_m).extend(0.0)).0;
+            let Some(seen) = project(sighting.camera, p_cam) else { return f64::INFINITY };
+            total += loss((seen.0 - measured).length_squared() / sighting.sigma_px.powi(2)).0;
+        }
+    }
+    total
+}
+
+/// See [`super::residual_px`].
+pub(super) fn residual_px(sighting: &Sighting, motion: &Motion, pose: &Pose<World, Body>) -> f64 {
+    let at = motion.carry(pose, -sighting.lag_s);
+    let mut sum = 0.0;
+    for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+        let p_cam = in_cam(sighting, &at, (*corner * sighting.size_m).extend(0.0)).0;
+        let Some(seen) = project(sighting.camera, p_cam) else { return f64::INFINITY };
+        sum += (seen.0 - measured).length_squared();
+    }
+    (sum / 4.0).sqrt()
+}
+
+/// Returns the nearest minimum; `None` where the corners do not determine one.
+pub(super) fn adjust(
+    sightings: &[Sighting],
+    motion: &Motion,
+    start: Pose<World, Body>,
+) -> Option<Fit> {
+    let mut pose = start;
+    let mut normal = Normal::at(sightings, motion, &pose)?;
+    let mut damping = 1e-4;
+    for _ in 0..MOST_ROUNDS {
+        let Some(change) = normal.step(damping) else {
+            damping *= 10.0;
+            if damping > 1e6 {
+                return None;
+            }
+            continue;
+        };
+        let moved = Pose::new(
+            pose.translation_m + DVec3::new(change[0], change[1], change[2]),
+            (pose.rotation * DQuat::from_scaled_axis(DVec3::new(change[3], change[4], change[5])))
+                .normalize(),
+        );
+        match Normal::at(sightings, motion, &moved) {
+            Some(better) if better.cost <= normal.cost => {
+                let gained = normal.cost - better.cost;
+                let small = change.iter().all(|x| x.abs() < 1e-7);
+                (pose, normal) = (moved, better);
+                damping = (damping * 0.2).max(1e-9);
+                if small || gained < 1e-6 * (1.0 + normal.cost) {
+                    break;
+                }
+            }
+            _ => {
+                damping *= 8.0;
+                if damping > 1e6 {
+                    break;
+                }
+            }
+        }
+    }
+    let mut covariance = normal.inverse()?;
+    // Corners that scatter more than they should say that sigma was too small; never that it was
+    // too large: few corners agree by chance.
+    let freedom = (2 * normal.corners).saturating_sub(6).max(1);
+    let scale = (normal.square_sum / freedom as f64).max(1.0);
+    for row in &mut covariance {
+        for value in row {
+            *value *= scale;
+        }
+    }
+    let corners = normal.corners as f64;
+    let fit = Fit {
+        world_from_body: pose,
+        covariance,
+        rms_px: (normal.square_sum_px2 / corners).sqrt(),
+        cost: normal.cost,
+    };
+    (pose.is_valid() && fit.cost.is_finite()).then_some(fit)
+}
+
+/// The normal equations at a pose.
+struct Normal {
+    /// Lower triangle of `J^T W J`.
+    matrix: [[f64; 6]; 6],
+    /// `J^T W r`.
+    gradient: [f64; 6],
+    cost: f64,
+    /// Weighted, in units of sigma.
+    square_sum: f64,
+    square_sum_px2: f64,
+    corners: usize,
+}
+
+impl Normal {
+    fn at(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, Body>) -> Option<Self> {
+        let mut n = Self {
+            matrix: [[0.0; 6]; 6],
+            gradient: [0.0; 6],
+            cost: 0.0,
+            square_sum: 0.0,
+            square_sum_px2: 0.0,
+            corners: 0,
+        };
+        for sighting in sightings {
+            let at = motion.carry(pose, -sighting.lag_s);
+            // A turn of the pose that is asked for turns the earlier one about the same vehicle axes, up to
+            // what the vehicle turns in the lag: a degree, which costs a round, not exactness.
+            for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+                let p_tag = (*corner * sighting.size_m).extend(0.0);
+                let (p_cam, by_position, by_turn) = in_cam(sighting, &at, p_tag);
+                let (seen, by_point) = project(sighting.camera, p_cam)?;
+                let off_px = seen - measured;
+                let scaled = off_px / sighting.sigma_px;
+                let (loss, weight) = loss(scaled.length_squared());
+                n.cost += loss;
+                n.square_sum += weight * scaled.length_squared();
+                n.square_sum_px2 += off_px.length_squared();
+                n.corners += 1;
+                for (row, residual) in by_point.iter().zip([scaled.x, scaled.y]) {
+                    let position = by_position.transpose() * *row / sighting.sigma_px;
+                    let turn = by_turn.transpose() * *row / sighting.sigma_px;
+                    let j = [position.x, position.y, position.z, turn.x, turn.y, turn.z];
+                    for a in 0..6 {
+                        n.gradient[a] += weight * j[a] * residual;
+                        for b in 0..=a {
+                            n.matrix[a][b] += weight * j[a] * j[b];
+                        }
+                    }
+                }
+            }
+        }
+        (n.corners > 0 && n.cost.is_finite()).then_some(n)
+    }
+
+    fn step(&self, damping: f64) -> Option<[f64; 6]> {
+        let mut damped = self.matrix;
+        for i in 0..6 {
+            damped[i][i] += damping * self.matrix[i][i] + 1e-12;
+        }
+        let l = cholesky(&damped)?;
+        Some(solve_with(&l, &self.gradient.map(|g| -g)))
+    }
+
+    fn inverse(&self) -> Option<[[f64; 6]; 6]> {
+        let l = cholesky(&self.matrix)?;
+        let mut inverse = [[0.0; 6]; 6];
+        for i in 0..6 {
+            let mut unit = [0.0; 6];
+            unit[i] = 1.0;
+            inverse[i] = solve_with(&l, &unit);
+        }
+        inverse.iter().flatten().all(|value| value.is_finite()).then_some(inverse)
+    }
+}
+
+/// Returns a point of the tag in the camera's frame, and how it changes with the vehicle's position and
+/// with turns about the vehicle's axes.
+fn in_cam(sighting: &Sighting, pose: &Pose<World, Body>, p_tag: DVec3) -> (DVec3, DMat3, DMat3) {
+    let rotation = DMat3::from_quat(pose.rotation);
+    match &sighting.sight {
+        Sight::OutsideIn { world_from_cam, body_from_tag } => {
+            let p_body = body_from_tag.transform_point(p_tag);
+            let cam_from_world = world_from_cam.inverse();
+            let p_cam = cam_from_world.transform_point(pose.transform_point(p_body));
+            let by_world = DMat3::from_quat(cam_from_world.rotation);
+            (p_cam, by_world, by_world * rotation * -cross(p_body))
+        }
+        Sight::InsideOut { body_from_cam, world_from_tag } => {
+            let p_world = world_from_tag.transform_point(p_tag);
+            let p_body = rotation.transpose() * (p_world - pose.translation_m);
+            let cam_from_body = body_from_cam.inverse();
+            let by_body = DMat3::from_quat(cam_from_body.rotation);
+            let p_cam = cam_from_body.transform_point(p_body);
+            (p_cam, by_body * -rotation.transpose(), by_body * cross(p_body))
+        }
+    }
+}
+
+/// Returns the pixel of a point and how it changes with the point: two rows.
+fn project(camera: &Intrinsics, p_cam: DVec3) -> Option<(DVec2, [DVec3; 2])> {
+    if !(p_cam.z > NEAREST_M) {
+        return None;
+    }
+    let slope = p_cam.truncate() / p_cam.z;
+    // Far outside of what a lens shows its polynomial turns back; starts there lead nowhere.
+    if !(slope.length_squared() < 100.0) {
+        return None;
+    }
+    let (distorted, bend) = camera.distortion.distort(slope);
+    let focal = DVec2::new(camera.fx_px, camera.fy_px);
+    let pixel = focal * distorted + DVec2::new(camera.cx_px, camera.cy_px);
+    let by_slope = DMat2::from_diagonal(focal) * bend;
+    let (x, y) = (by_slope.x_axis, by_slope.y_axis);
+    let row = |a: f64, b: f64| DVec3::new(a, b, -(a * slope.x + b * slope.y)) / p_cam.z;
+    Some((pixel, [row(x.x, y.x), row(x.y, y.y)]))
+}
+
+/// Returns the matrix whose product with `b` is `a x b`.
+fn cross(a: DVec3) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::new(0.0, a.z, -a.y),
+        DVec3::new(-a.z, 0.0, a.x),
+        DVec3::new(a.y, -a.x, 0.0),
+    )
+}
+
+/// Returns the Cauchy loss of a squared residual in units of sigma, and the weight it leaves.
+fn loss(square: f64) -> (f64, f64) {
+    let c2 = ROBUST_SIGMAS * ROBUST_SIGMAS;
+    (0.5 * c2 * (square / c2).ln_1p(), 1.0 / (1.0 + square / c2))
+}
+
+/// Returns the lower triangle whose product with its transpose is the matrix (of which the lower
+/// triangle is read); `None` unless it is positive.
+fn cholesky(matrix: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
+    let mut l = [[0.0; 6]; 6];
+    for i in 0..6 {
+        for j in 0..=i {
+            let known: f64 = (0..j).map(|k| l[i][k] * l[j][k]).sum();
+            let rest = matrix[i][j] - known;
+            if i == j {
+                if !(rest > 0.0) {
+                    return None;
+                }
+                l[i][i] = rest.sqrt();
+            } else {
+                l[i][j] = rest / l[j][j];
+            }
+        }
+    }
+    Some(l)
+}
+
+fn solve_with(l: &[[f64; 6]; 6], right: &[f64; 6]) -> [f64; 6] {
+    let mut x = *right;
+    for i in 0..6 {
+        for k in 0..i {
+            x[i] -= l[i][k] * x[k];
+        }
+        x[i] /= l[i][i];
+    }
+    for i in (0..6).rev() {
+        for k in i + 1..6 {
+            x[i] -= l[k][i] * x[k];
+        }
+        x[i] /= l[i][i];
+    }
+    x
+}
+
+/// Corners off by more than this many sigma lose their pull.
+const ROBUST_SIGMAS: f64 = 4.0;
+/// Nothing is in focus closer than this. [m]
+const NEAREST_M: f64 = 0.02;
+/// It converges in five to ten.
+const MOST_ROUNDS: usize = 40;

@@ -1,0 +1,220 @@
+//! Fixed cameras, from images of a surveyed mat or of a cube that is carried about.
+
+use glam::DVec2;
+use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
+
+use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose, cube_pose};
+use crate::bundle::{Bundle, Rigid, Role, Seen};
+use crate::detection::Detection;
+use crate::layout::{CORNERS, TagLayout};
+
+/// What a fixed camera saw. Images of the same number in all cameras were taken at the same time, while
+/// the cube was held still.
+#[derive(Clone, Debug)]
+pub struct CameraImages {
+    /// What it is called.
+    pub name: String,
+    /// Its lens.
+    pub intrinsics: Intrinsics,
+    /// Tags in each image.
+    pub images: Vec<Vec<Detection>>,
+}
+
+/// Where a fixed camera is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PlacedCamera {
+    /// Its pose.
+    pub world_from_cam: Pose<World, Cam>,
+    /// Root mean square distance of corners in its images from where the answer puts them, misread tags
+    /// left out. [px]
+    pub rms_px: f64,
+    /// One standard deviation of its position, about the world's axes as the camera sees them. [m]
+    pub sigma_m: f64,
+    /// Corners it saw.
+    pub corners: usize,
+}
+
+/// Returns where cameras are. The mat gives the `world` frame; cameras that do not see it are placed by
+/// the cube, at moments when cameras already placed see it, too.
+///
+/// # Errors
+/// [`SurveyError`] if a camera is tied to nothing, or what was seen contradicts itself.
+pub fn cameras(
+    cameras: &[CameraImages],
+    mat: &TagLayout,
+    cube: Option<&TagLayout>,
+) -> Result<Vec<PlacedCamera>, SurveyError> {
+    let mut placed: Vec<Option<Pose<World, Cam>>> =
+        cameras.iter().map(|camera| by_mat(camera, mat)).collect();
+    let moments = cameras.iter().map(|camera| camera.images.len()).max().unwrap_or(0);
+    let mut bodies: Vec<Option<Pose<World, Body>>> = vec![None; moments];
+    if let Some(cube) = cube {
+        loop {
+            for (moment, body) in bodies.iter_mut().enumerate() {
+                if body.is_none() {
+                    *body = cube_at(cameras, &placed, cube, moment);
+                }
+            }
+            let mut grown = false;
+            for (camera, pose) in cameras.iter().zip(&mut placed) {
+                if pose.is_none() {
+                    *pose = by_cube(camera, cube, &bodies);
+                    grown |= pose.is_some();
+                }
+            }
+            if !grown {
+                break;
+            }
+        }
+    }
+    if let Some((camera, _)) = cameras.iter().zip(&placed).find(|(_, pose)| pose.is_none()) {
+        return Err(SurveyError::Unplaced { name: camera.name.clone() });
+    }
+    let start: Vec<Pose<World, Cam>> = placed.into_iter().flatten().collect();
+    adjust(cameras, &start, mat, cube, &bodies)
+}
+
+/// Places a camera by the image that shows most of the mat.
+fn by_mat(camera: &CameraImages, mat: &TagLayout) -> Option<Pose<World, Cam>> {
+    let known = |image: &Vec<Detection>| -> Vec<_> {
+        image
+            .iter()
+            .filter_map(|d| {
+                let tag = mat.find(d.family, d.id)?;
+                Some((tag.frame_from_tag::<World>(), tag.size_m, d.corners_px))
+            })
+            .collect()
+    };
+    let best = camera.images.iter().map(known).max_by_key(Vec::len)?;
+    camera_pose(&camera.intrinsics, &best).map(|(pose, _)| pose)
+}
+
+/// Returns where the cube was, by all cameras that are placed.
+fn cube_at(
+    cameras: &[CameraImages],
+    placed: &[Option<Pose<World, Cam>>],
+    cube: &TagLayout,
+    moment: usize,
+) -> Option<Pose<World, Body>> {
+    let mut seen = Vec::new();
+    for (camera, pose) in cameras.iter().zip(placed) {
+        let (Some(pose), Some(image)) = (pose, camera.images.get(moment)) else { continue };
+        for d in image {
+            if let Some(tag) = cube.find(d.family, d.id) {
+                let body_from_tag = tag.frame_from_tag::<Body>();
+                seen.push((&camera.intrinsics, *pose, body_from_tag, tag.size_m, d.corners_px));
+            }
+        }
+    }
+    let solved = cube_pose(&seen)?;
+    // A single face may be seen in two ways: wait for a moment that says which.
+    solved.other.is_none().then_some(solved.best.world_from_body)
+}
+
+/// Places a camera by the cube at the moment that agrees best with the others.
+fn by_cube(
+    camera: &CameraImages,
+    cube: &TagLayout,
+    bodies: &[Option<Pose<World, Body>>],
+) -> Option<Pose<World, Cam>> {
+    let seen: Vec<(Pose<World, Body>, &Vec<Detection>)> = bodies
+        .iter()
+        .zip(&camera.images)
+        .filter_map(|(body, image)| Some(((*body)?, image)))
+        .collect();
+    let tags = |(body, image): &(Pose<World, Body>, &Vec<Detection>)| -> Vec<_> {
+        image
+            .iter()
+            .filter_map(|d| {
+                let tag = cube.find(d.family, d.id)?;
+                Some((*body * tag.frame_from_tag::<Body>(), tag.size_m, d.corners_px))
+            })
+            .collect()
+    };
+    let all: Vec<_> = seen.iter().flat_map(tags).collect();
+    // All moments at once are one large, spread-out mat.
+    let by_all = camera_pose(&camera.intrinsics, &all).map(|(pose, _)| pose);
+    let by_each = seen.iter().filter_map(|moment| camera_pose(&camera.intrinsics, &tags(moment)));
+    let cost = |pose: &Pose<World, Cam>| -> f64 {
+        let cam_from_world = pose.inverse();
+        all.iter()
+            .flat_map(|(world_from_tag, size_m, corners_px)| {
+                CORNERS.iter().zip(corners_px).map(|(corner, pixel)| {
+                    let p_world = world_from_tag.transform_point((*corner * *size_m).extend(0.0));
+                    let p_cam = cam_from_world.transform_point(p_world);
+                    let far = 100.0;
+                    camera
+                        .intrinsics
+                        .project(p_cam)
+                        .map_or(far, |p: DVec2| p.distance(*pixel).min(far))
+                })
+            })
+            .sum()
+    };
+    by_all
+        .into_iter()
+        .chain(by_each.map(|(pose, _)| pose))
+        .min_by(|a, b| cost(a).total_cmp(&cost(b)))
+}
+
+fn adjust(
+    cameras: &[CameraImages],
+    start: &[Pose<World, Cam>],
+    mat: &TagLayout,
+    cube: Option<&TagLayout>,
+    bodies: &[Option<Pose<World, Body>>],
+) -> Result<Vec<PlacedCamera>, SurveyError> {
+    let mut bundle = Bundle { loss_px: LOSS_PX, ..Bundle::default() };
+    let world = bundle.pose(Rigid::IDENTITY, Role::Fixed);
+    let numbers: Vec<usize> =
+        start.iter().map(|pose| bundle.pose(pose.inverse(), Role::Shared)).collect();
+    let moments: Vec<Option<usize>> =
+        bodies.iter().map(|body| body.map(|body| bundle.pose(body, Role::View))).collect();
+    for (lens, (camera, &left)) in cameras.iter().zip(&numbers).enumerate() {
+        bundle.lenses.push((camera.intrinsics, false));
+        for (moment, image) in camera.images.iter().enumerate() {
+            for d in image {
+                let on_cube = || {
+                    let tag = cube?.find(d.family, d.id)?;
+                    Some((tag, (*moments.get(moment)?)?))
+                };
+                let on_mat = mat.find(d.family, d.id).map(|tag| (tag, world));
+                let Some((tag, right)) = on_mat.or_else(on_cube) else { continue };
+                for (point_m, pixel) in tag.corners_m().into_iter().zip(d.corners_px) {
+                    bundle.seen.push(Seen { lens, left, right, point_m, pixel });
+                }
+            }
+        }
+    }
+    let advice = "show each camera more tags of the mat, or the cube in more places";
+    let solution = bundle.solve().ok_or(SurveyError::Undetermined { advice })?;
+    let mut placed = Vec::new();
+    for (lens, number) in numbers.into_iter().enumerate() {
+        let residuals: Vec<f64> = bundle
+            .seen
+            .iter()
+            .filter(|seen| seen.lens == lens)
+            .filter_map(|seen| bundle.residual(seen))
+            .map(DVec2::length_squared)
+            .collect();
+        let corners = residuals.len();
+        let rms =
+            |squares: &[f64]| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+        let good: Vec<f64> =
+            residuals.iter().copied().filter(|square| *square <= LOSS_PX * LOSS_PX).collect();
+        let rms_px = rms(&good);
+        if (corners - good.len()) as f64 > MOST_OUTLIERS * corners as f64 {
+            return Err(SurveyError::Contradiction {
+                rms_px: rms(&residuals),
+                most_px: LOSS_PX,
+                advice: "was the cube held still, are the layouts those that were printed, and is \
+                         each camera's file its own?",
+            });
+        }
+        let cam_from_world: Pose<Cam, World> = bundle.poses[number].0.into();
+        let sigma_m = solution.position_sigma_m(number).length();
+        let world_from_cam = cam_from_world.inverse();
+        placed.push(PlacedCamera { world_from_cam, rms_px, sigma_m, corners });
+    }
+    Ok(placed)
+}

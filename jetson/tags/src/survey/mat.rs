@@ -1,0 +1,378 @@
+//! The tags of a mat, or of any room, from images of one camera.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+
+use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose};
+use crate::bundle::{Bundle, Role, Seen};
+use crate::detection::Detection;
+use crate::family::TagFamily;
+use crate::layout::{CORNERS, LayoutFrame, Square, Tag, TagLayout};
+
+/// What names a tag.
+type Key = (TagFamily, u32);
+
+/// A surveyed mat.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Surveyed {
+    /// Where the tags are. [world]
+    pub layout: TagLayout,
+    /// What is known of each, in the layout's order.
+    pub residuals: Vec<TagResidual>,
+    /// Images used.
+    pub images: usize,
+    /// Root mean square distance of corners from where the answer puts them, misread tags left out. [px]
+    pub rms_px: f64,
+    /// The same on the tags. [m]
+    pub rms_m: f64,
+    /// Tags that were seen or expected, and are not in the layout: why.
+    pub left_out: Vec<(TagFamily, u32, &'static str)>,
+}
+
+/// How well a tag's place is known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TagResidual {
+    /// Images that show it.
+    pub images: usize,
+    /// Root mean square distance of its corners from where the answer puts them. [m]
+    pub rms_m: f64,
+    /// One standard deviation of its position, seen from the tag best seen of all. [m]
+    pub sigma_m: f64,
+    /// How far it lies from where the layout printed it; none for a tag that was not on it. [m]
+    pub moved_m: Option<f64>,
+}
+
+/// Returns where tags are, from what one camera saw of them.
+///
+/// `printed` is the layout they were printed by: it gives their sizes, a place to start from, and the
+/// `world` frame. Tags of the family and size of `others` that are not on it are surveyed, too. The
+/// frame is the one that fits all tags of `printed` best, or, with `anchor`, the one in which that tag
+/// lies exactly as printed.
+///
+/// # Errors
+/// [`SurveyError`] if too little was seen, or what was seen contradicts itself.
+pub fn mat(
+    lens: &Intrinsics,
+    printed: &TagLayout,
+    others: Option<(TagFamily, f64)>,
+    anchor: Option<(TagFamily, u32)>,
+    images: &[Vec<Detection>],
+) -> Result<Surveyed, SurveyError> {
+    let size_m = |key: Key| -> Option<f64> {
+        let on_mat = printed.find(key.0, key.1).map(|tag| tag.size_m);
+        on_mat.or_else(|| others.and_then(|(family, size_m)| (family == key.0).then_some(size_m)))
+    };
+    // Known tags of each image; one tag alone ties nothing together.
+    let images: Vec<Vec<(Key, [DVec2; 4])>> = images
+        .iter()
+        .map(|image| {
+            let known = image.iter().filter(|d| size_m((d.family, d.id)).is_some());
+            known.map(|d| ((d.family, d.id), d.corners_px)).collect::<Vec<_>>()
+        })
+        .filter(|image| image.len() >= 2)
+        .collect();
+    if images.len() < LEAST_IMAGES {
+        return Err(SurveyError::TooFew {
+            what: "images",
+            found: images.len(),
+            needed: LEAST_IMAGES,
+            advice: "carry the camera over the mat so that two tags or more are in every image",
+        });
+    }
+    let mut start = Start::new(printed);
+    start.grow(lens, &images, &size_m);
+    let mut left_out = Vec::new();
+    let counts = count(&images, &start.cameras);
+    let keys: Vec<Key> = start.tags.keys().copied().collect();
+    for key in keys {
+        let seen = counts.get(&key).copied().unwrap_or(0);
+        if seen < LEAST_SIGHTINGS {
+            start.tags.remove(&key);
+            let why = if seen == 0 { "in no image" } else { "in one image only" };
+            left_out.push((key.0, key.1, why));
+        }
+    }
+    for key in images.iter().flatten().map(|(key, _)| *key).collect::<BTreeSet<_>>() {
+        if !start.tags.contains_key(&key) && !left_out.iter().any(|l| (l.0, l.1) == key) {
+            left_out.push((key.0, key.1, "never seen together with tags of the mat"));
+        }
+    }
+    if start.tags.len() < 2 {
+        return Err(SurveyError::TooFew {
+            what: "tags",
+            found: start.tags.len(),
+            needed: 2,
+            advice: "every tag must be in several images, each with another tag",
+        });
+    }
+    let (bundle, numbers, solution) = adjust(lens, &start, &images, &size_m, &counts)?;
+    if !(solution.outliers <= MOST_OUTLIERS) {
+        return Err(SurveyError::Contradiction {
+            rms_px: solution.all_rms_px,
+            most_px: LOSS_PX,
+            advice: "is the camera file the one of this camera and resolution, and the layout the \
+                     one that was printed?",
+        });
+    }
+    let found: BTreeMap<Key, Pose<World, Square>> =
+        numbers.iter().map(|(key, number)| (*key, bundle.poses[*number].0.into())).collect();
+    let world_from_found = match anchor {
+        None => best_fit(printed, &found),
+        Some((family, id)) => {
+            let missing = SurveyError::Anchor { family, id };
+            let tag = printed.find(family, id).ok_or(missing.clone())?;
+            let found = found.get(&(family, id)).ok_or(missing)?;
+            tag.frame_from_tag::<World>() * found.inverse()
+        }
+    };
+    let mut layout = TagLayout { frame: LayoutFrame::World, tags: Vec::new() };
+    let mut residuals = Vec::new();
+    for (&(family, id), found_from_tag) in &found {
+        let size_m = size_m((family, id)).unwrap_or(1.0);
+        let tag = Tag::new(family, id, size_m, world_from_found * *found_from_tag);
+        let number = numbers[&(family, id)];
+        let rms_m = rms_m(&bundle, lens, |seen| seen.right == number);
+        residuals.push(TagResidual {
+            images: counts.get(&(family, id)).copied().unwrap_or(0),
+            rms_m,
+            sigma_m: solution.position_sigma_m(number).length(),
+            moved_m: printed.find(family, id).map(|p| p.position_m.distance(tag.position_m)),
+        });
+        layout.tags.push(tag);
+    }
+    Ok(Surveyed {
+        layout,
+        residuals,
+        images: start.cameras.iter().flatten().count(),
+        rms_px: solution.rms_px,
+        rms_m: rms_m(&bundle, lens, |_| true),
+        left_out,
+    })
+}
+
+/// Where tags and cameras are, roughly.
+struct Start {
+    tags: BTreeMap<Key, Pose<World, Square>>,
+    /// Of each image, if it is tied to the others.
+    cameras: Vec<Option<Pose<World, Cam>>>,
+}
+
+impl Start {
+    fn new(printed: &TagLayout) -> Self {
+        let tags =
+            printed.tags.iter().map(|t| ((t.family, t.id), t.frame_from_tag::<World>())).collect();
+        Self { tags, cameras: Vec::new() }
+    }
+
+    /// Places cameras by the tags known, and further tags by the cameras placed, until nothing is added.
+    fn grow(
+        &mut self,
+        lens: &Intrinsics,
+        images: &[Vec<(Key, [DVec2; 4])>],
+        size_m: &impl Fn(Key) -> Option<f64>,
+    ) {
+        self.cameras = vec![None; images.len()];
+        // One tag leaves two poses open; cameras that see one only come last.
+        for least in [2, 1] {
+            loop {
+                let mut grown = false;
+                for (image, camera) in images.iter().zip(&mut self.cameras) {
+                    if camera.is_some() {
+                        continue;
+                    }
+                    let known: Vec<_> = image
+                        .iter()
+                        .filter_map(|(key, px)| Some((*self.tags.get(key)?, size_m(*key)?, *px)))
+                        .collect();
+                    if known.len() >= least
+                        && let Some((pose, _)) = camera_pose(lens, &known)
+                    {
+                        *camera = Some(pose);
+                        grown = true;
+                    }
+                }
+                let unknown: BTreeSet<Key> = images
+                    .iter()
+                    .zip(&self.cameras)
+                    .filter(|(_, camera)| camera.is_some())
+                    .flat_map(|(image, _)| image.iter().map(|(key, _)| *key))
+                    .filter(|key| !self.tags.contains_key(key))
+                    .collect();
+                for key in unknown {
+                    if let Some(pose) = self.place(lens, images, key, size_m(key).unwrap_or(1.0)) {
+                        self.tags.insert(key, pose);
+                        grown = true;
+                    }
+                }
+                if !grown {
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Returns where a tag is: of the two poses that each image gives, the one that all agree on best.
+    fn place(
+        &self,
+        lens: &Intrinsics,
+        images: &[Vec<(Key, [DVec2; 4])>],
+        key: Key,
+        size_m: f64,
+    ) -> Option<Pose<World, Square>> {
+        let sightings: Vec<(Pose<World, Cam>, [DVec2; 4])> = images
+            .iter()
+            .zip(&self.cameras)
+            .filter_map(|(image, camera)| {
+                let (_, corners_px) = image.iter().find(|(other, _)| *other == key)?;
+                Some(((*camera)?, *corners_px))
+            })
+            .collect();
+        let cost = |world_from_tag: &Pose<World, Square>| -> f64 {
+            let off = |(camera, corners_px): &(Pose<World, Cam>, [DVec2; 4])| -> f64 {
+                let cam_from_tag = camera.inverse() * *world_from_tag;
+                CORNERS
+                    .iter()
+                    .zip(corners_px)
+                    .map(|(corner, pixel)| {
+                        let p_cam = cam_from_tag.transform_point((*corner * size_m).extend(0.0));
+                        let far = 100.0;
+                        lens.project(p_cam).map_or(far, |p| p.distance(*pixel).min(far))
+                    })
+                    .sum()
+            };
+            sightings.iter().map(off).sum()
+        };
+        let mut best: Option<(f64, Pose<World, Square>)> = None;
+        for (world_from_cam, corners_px) in sightings.iter().take(MOST_STARTS) {
+            // The camera's pose as seen from the tag, where the tag is the room.
+            let Some((_, solved)) = camera_pose(lens, &[(Pose::IDENTITY, size_m, *corners_px)])
+            else {
+                continue;
+            };
+            for fit in [Some(solved.best), solved.other].into_iter().flatten() {
+                let p = fit.world_from_body;
+                let tag_from_cam: Pose<Square, Cam> = Pose::new(p.translation_m, p.rotation);
+                let pose = *world_from_cam * tag_from_cam.inverse();
+                let cost = cost(&pose);
+                if best.is_none_or(|(least, _)| cost < least) {
+                    best = Some((cost, pose));
+                }
+            }
+        }
+        best.map(|(_, pose)| pose)
+    }
+}
+
+/// Returns in how many placed images each tag is.
+fn count(
+    images: &[Vec<(Key, [DVec2; 4])>],
+    cameras: &[Option<Pose<World, Cam>>],
+) -> BTreeMap<Key, usize> {
+    let mut counts = BTreeMap::new();
+    for (image, _) in images.iter().zip(cameras).filter(|(_, camera)| camera.is_some()) {
+        for (key, _) in image {
+            *counts.entry(*key).or_insert(0) += 1;
+        }
+    }
+    counts
+}
+
+type Adjusted = (Bundle, BTreeMap<Key, usize>, crate::bundle::Solution);
+
+fn adjust(
+    lens: &Intrinsics,
+    start: &Start,
+    images: &[Vec<(Key, [DVec2; 4])>],
+    size_m: &impl Fn(Key) -> Option<f64>,
+    counts: &BTreeMap<Key, usize>,
+) -> Result<Adjusted, SurveyError> {
+    let mut bundle = Bundle { lenses: vec![(*lens, false)], loss_px: LOSS_PX, ..Bundle::default() };
+    // The tag best seen holds the frame while the others move.
+    let held = start.tags.keys().max_by_key(|key| counts.get(key)).copied();
+    let numbers: BTreeMap<Key, usize> = start
+        .tags
+        .iter()
+        .map(|(key, pose)| {
+            let role = if Some(*key) == held { Role::Fixed } else { Role::Shared };
+            (*key, bundle.pose(*pose, role))
+        })
+        .collect();
+    for (image, camera) in images.iter().zip(&start.cameras) {
+        let Some(world_from_cam) = camera else { continue };
+        let tags =
+            || image.iter().filter_map(|(key, px)| Some((numbers.get(key)?, size_m(*key)?, px)));
+        // Tags without a place may have left an image with too few.
+        if tags().count() < 1 {
+            continue;
+        }
+        let left = bundle.pose(world_from_cam.inverse(), Role::View);
+        for (&right, size_m, corners_px) in tags() {
+            for (corner, &pixel) in CORNERS.iter().zip(corners_px) {
+                let point_m = (*corner * size_m).extend(0.0);
+                bundle.seen.push(Seen { lens: 0, left, right, point_m, pixel });
+            }
+        }
+    }
+    let solution = bundle.solve().ok_or(SurveyError::Undetermined {
+        advice: "carry the camera over the whole mat, nearer, and look at it from several sides",
+    })?;
+    Ok((bundle, numbers, solution))
+}
+
+/// Returns the distance of corners from where the answer puts them, at the corner. [m]
+fn rms_m(bundle: &Bundle, lens: &Intrinsics, which: impl Fn(&Seen) -> bool) -> f64 {
+    let (mut sum, mut count) = (0.0, 0u32);
+    for seen in bundle.seen.iter().filter(|seen| which(seen)) {
+        if let Some(residual) = bundle.residual(seen) {
+            let focal_px = 0.5 * (lens.fx_px + lens.fy_px);
+            sum += (residual.length() * bundle.depth_m(seen) / focal_px).powi(2);
+            count += 1;
+        }
+    }
+    (sum / f64::from(count.max(1))).sqrt()
+}
+
+/// Returns the motion that lays the corners found onto those printed, by least squares; only of tags
+/// that are both.
+fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> Pose<World, World> {
+    let mut pairs: Vec<(DVec3, DVec3)> = Vec::new();
+    for tag in &printed.tags {
+        if let Some(pose) = found.get(&(tag.family, tag.id)) {
+            let corners = Tag::new(tag.family, tag.id, tag.size_m, *pose).corners_m();
+            pairs.extend(corners.into_iter().zip(tag.corners_m()));
+        }
+    }
+    let count = pairs.len().max(1) as f64;
+    let middle_found = pairs.iter().map(|p| p.0).sum::<DVec3>() / count;
+    let middle_printed = pairs.iter().map(|p| p.1).sum::<DVec3>() / count;
+    // Gauss and Newton: what was found lies within centimetres of what was printed.
+    let mut q = DQuat::IDENTITY;
+    for _ in 0..20 {
+        let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+        for (from, to) in &pairs {
+            let arm = q * (*from - middle_found);
+            let off = (*to - middle_printed) - arm;
+            right += arm.cross(off);
+            normal += DMat3::from_diagonal(DVec3::splat(arm.length_squared()))
+                - DMat3::from_cols(arm * arm.x, arm * arm.y, arm * arm.z);
+        }
+        let turn = normal.inverse() * right;
+        if !turn.is_finite() {
+            break;
+        }
+        q = (DQuat::from_scaled_axis(turn) * q).normalize();
+        if turn.length() < 1e-13 {
+            break;
+        }
+    }
+    Pose::new(middle_printed - q * middle_found, q)
+}
+
+/// Fewer images say little.
+const LEAST_IMAGES: usize = 5;
+/// A tag in fewer images is not checked by anything.
+const LEAST_SIGHTINGS: usize = 2;
+/// Images from which a tag's place is tried.
+const MOST_STARTS: usize = 10;

@@ -1,0 +1,80 @@
+//! Which images of a video are worth surveying with.
+
+use vizflyt_protocol::geometry::Intrinsics;
+
+use crate::detection::Detection;
+
+/// Keeps images that differ from the one kept before: a video shows the same thing thirty times a
+/// second, and a survey takes as long as it has images.
+#[derive(Clone, Debug, Default)]
+pub struct Picker {
+    images: Vec<Vec<Detection>>,
+}
+
+impl Picker {
+    /// Takes the tags of the next image, and keeps them if they say something new.
+    pub fn offer(&mut self, image: Vec<Detection>, lens: &Intrinsics) {
+        if image.len() < 2 || self.is_full() {
+            return;
+        }
+        let is_new = self.images.last().is_none_or(|last| {
+            let mut moved_px: f64 = 0.0;
+            let mut common = 0;
+            for now in &image {
+                let same = |old: &&Detection| (old.family, old.id) == (now.family, now.id);
+                if let Some(old) = last.iter().find(same) {
+                    common += 1;
+                    moved_px = moved_px.max(old.corners_px[0].distance(now.corners_px[0]));
+                }
+            }
+            common < image.len() || moved_px > MOVED * f64::from(lens.width_px)
+        });
+        if is_new {
+            self.images.push(image);
+        }
+    }
+
+    /// Returns the tags of the images kept.
+    pub fn images(&self) -> &[Vec<Detection>] {
+        &self.images
+    }
+
+    /// Whether more images would not help any more.
+    pub fn is_full(&self) -> bool {
+        self.images.len() >= MOST_IMAGES
+    }
+}
+
+/// A tag must have moved by so much. [share of the image's width]
+const MOVED: f64 = 0.03;
+/// Some seconds of computing for a mat of a hundred tags.
+const MOST_IMAGES: usize = 300;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::family::TagFamily;
+    use glam::DVec2;
+
+    #[test]
+    fn an_image_is_kept_if_a_tag_moved_or_came() {
+        let lens = Intrinsics::from_horizontal_fov(1000, 700, 1.2);
+        let tag = |id: u32, x: f64| Detection {
+            family: TagFamily::Tag36h11,
+            id,
+            corners_px: [DVec2::new(x, 0.0); 4],
+            hamming: 0,
+            margin: 50.0,
+        };
+        let mut picker = Picker::default();
+        picker.offer(vec![tag(1, 0.0)], &lens);
+        assert!(picker.images().is_empty(), "one tag ties nothing together");
+        picker.offer(vec![tag(1, 0.0), tag(2, 50.0)], &lens);
+        picker.offer(vec![tag(1, 10.0), tag(2, 60.0)], &lens);
+        assert_eq!(picker.images().len(), 1);
+        picker.offer(vec![tag(1, 35.0), tag(2, 50.0)], &lens);
+        assert_eq!(picker.images().len(), 2);
+        picker.offer(vec![tag(1, 35.0), tag(3, 50.0)], &lens);
+        assert_eq!(picker.images().len(), 3);
+    }
+}
