@@ -3,10 +3,12 @@
 //! `cargo bench -p vizflyt-arena`
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use glam::{DVec3, Quat, Vec3};
+use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_arena::collision::sweep;
+use vizflyt_arena::config::BodyPart;
 use vizflyt_arena::grid::Grid;
-use vizflyt_arena::{BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
+use vizflyt_arena::{BakeSpec, BodyShape, DistanceField, Ellipsoid, OccupancyGrid};
+use vizflyt_protocol::geometry::Pose;
 
 /// Trunks of flat Gaussians over 40 m x 14 m, `splats` in all.
 fn forest(splats: usize) -> Vec<Ellipsoid> {
@@ -32,7 +34,7 @@ fn forest(splats: usize) -> Vec<Ellipsoid> {
 
 fn spec() -> BakeSpec {
     let grid = Grid::covering(DVec3::new(-1.5, -7.5, 0.0), DVec3::new(41.5, 7.5, 4.5), 0.05);
-    BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 }
+    BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 }
 }
 
 fn rules(criterion: &mut Criterion) {
@@ -56,12 +58,23 @@ fn rules(criterion: &mut Criterion) {
     criterion.bench_function("query", |bencher| {
         bencher.iter(|| field.obstacle_distance_m(next()));
     });
-    criterion.bench_function("swept tick, 6 m/s at 200 Hz", |bencher| {
-        bencher.iter(|| {
-            let from = next();
-            sweep(&field, from, from + DVec3::new(0.03, 0.0, 0.0), 0.12)
+    // A frame's arms with their rotors, and its hub: 37 balls.
+    let arm = |y_m: f64| BodyPart {
+        from_m: DVec3::new(-0.09, -y_m, 0.0),
+        to_m: Some(DVec3::new(0.09, y_m, 0.0)),
+        radius_m: 0.03,
+    };
+    let hub = BodyPart { from_m: DVec3::ZERO, to_m: None, radius_m: 0.05 };
+    let frame = BodyShape::of_parts(&[arm(0.09), arm(-0.09), hub]);
+    for (name, body) in [("sphere", BodyShape::sphere(0.12)), ("two arms and a hub", frame)] {
+        criterion.bench_function(&format!("swept tick, {name}, 6 m/s at 200 Hz"), |bencher| {
+            bencher.iter(|| {
+                let from = Pose::new(next(), DQuat::from_rotation_z(0.3));
+                let to_m = from.translation_m + DVec3::X * 0.03;
+                sweep(&field, &body, &from, &Pose::new(to_m, DQuat::from_rotation_z(0.33)))
+            });
         });
-    });
+    }
 }
 
 criterion_group!(benches, rules);

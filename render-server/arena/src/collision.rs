@@ -1,11 +1,13 @@
-//! Does the body's sphere touch an obstacle between one pose and the next?
+//! Does the body touch an obstacle between one pose and the next?
 //!
-//! Conservative advancement: from a point whose clearance is c the sphere can move by c and touch
-//! nothing, so the walk takes few queries in the open and short ones near obstacles, and no speed
-//! or rate tunnels through anything. Budget: 10 us a tick.
+//! Conservative advancement: from a pose whose clearance is c nothing of the body can move by less
+//! than c and touch anything, so the walk takes few queries in the open and short steps near
+//! obstacles, and no speed, turn or rate tunnels through anything. Budget: 10 us a tick.
 
 use glam::DVec3;
+use vizflyt_protocol::geometry::{Body, Pose, World};
 
+use crate::body::BodyShape;
 use crate::distance::DistanceField;
 
 /// What a sweep found.
@@ -21,7 +23,7 @@ pub struct Sweep {
 /// The first touch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// Where the body's centre was. [m, world]
+    /// Where the body's origin was. [m, world]
     pub p_world_m: DVec3,
     /// Part of the way, 0 to 1.
     pub fraction: f64,
@@ -29,45 +31,70 @@ pub struct Contact {
     pub clearance_m: f64,
 }
 
-/// Sweeps a sphere of `radius_m` from one point to another [m, world]; equal points are one check.
-/// The floor is no obstacle here.
+/// Sweeps a body from one pose to another, straight and by the shortest turn; equal poses are one
+/// check. The floor is no obstacle here.
 ///
-/// A coordinate that is not a number is a contact: unknown is not safe.
-pub fn sweep(field: &DistanceField, from_m: DVec3, to_m: DVec3, radius_m: f64) -> Sweep {
-    let way_m = to_m - from_m;
-    let length_m = way_m.length();
-    let least_step_m = LEAST_STEP_VOXELS * field.grid().voxel_m;
+/// A number that is none is a contact: unknown is not safe.
+pub fn sweep(
+    field: &DistanceField,
+    body: &BodyShape,
+    from: &Pose<World, Body>,
+    to: &Pose<World, Body>,
+) -> Sweep {
+    let motion_m = body.motion_m(from, to);
+    advance(motion_m, least_step_m(field), |fraction, least_m| {
+        let at = from.interpolate(to, fraction);
+        let clearance_m = body.clearance_m(&at, least_m, |p_m| field.obstacle_distance_m(p_m));
+        (at.translation_m, clearance_m)
+    })
+}
+
+/// Returns the shortest step worth taking against a field; also how deep a first contact may lie.
+/// [m]
+pub fn least_step_m(field: &DistanceField) -> f64 {
+    LEAST_STEP_VOXELS * field.grid().voxel_m
+}
+
+/// Walks a motion in which nothing of the body moves by more than `motion_m` relative to the
+/// obstacles. `clearance_m` is given the part of the way, 0 to 1, and the least clearance so far,
+/// and returns where the body's origin is then [m, world] and its clearance, for which, where it
+/// exceeds the least so far, any smaller number that still does will do. [m]
+pub fn advance(
+    motion_m: f64,
+    least_step_m: f64,
+    mut clearance_m: impl FnMut(f64, f64) -> (DVec3, f64),
+) -> Sweep {
     let mut least_m = f64::INFINITY;
     let mut done_m = 0.0;
     loop {
-        let fraction = if length_m > 0.0 { (done_m / length_m).min(1.0) } else { 1.0 };
-        let p_world_m = from_m + way_m * fraction;
-        let clearance_m = field.obstacle_distance_m(p_world_m) - radius_m;
+        let fraction = if motion_m > 0.0 { (done_m / motion_m).min(1.0) } else { 1.0 };
+        let (p_world_m, clearance_m) = clearance_m(fraction, least_m);
         least_m = least_m.min(clearance_m);
         // Positively stated, so that NaN is a contact.
-        if !(clearance_m > 0.0) {
+        if !(clearance_m > 0.0 && motion_m.is_finite()) {
             let contact = Contact { p_world_m, fraction, clearance_m };
             return Sweep { clearance_m: least_m, contact: Some(contact) };
         }
-        if done_m >= length_m {
+        if done_m >= motion_m {
             return Sweep { clearance_m: least_m, contact: None };
         }
-        done_m = (done_m + (clearance_m * TRUST).max(least_step_m)).min(length_m);
+        done_m = (done_m + (clearance_m * TRUST).max(least_step_m)).min(motion_m);
     }
 }
 
 /// Part of the clearance that a step takes: interpolation between quantised voxels may rise a
 /// little faster than true distance.
 const TRUST: f64 = 0.8;
-/// Shortest step; also how deep a first contact may lie. Obstacles are a voxel thick at least.
-/// [voxels]
+/// See [`least_step_m`]. Obstacles are a voxel thick at least. [voxels]
 const LEAST_STEP_VOXELS: f64 = 0.25;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::BodyPart;
     use crate::grid::Grid;
     use crate::occupancy::occupancy_of;
+    use glam::DQuat;
     use proptest::prelude::*;
     use vizflyt_protocol::geometry::Volume;
 
@@ -80,6 +107,34 @@ mod tests {
     fn field() -> DistanceField {
         let grid = Grid::covering(DVec3::ZERO, DVec3::new(4.0, 2.0, 2.0), 0.05);
         DistanceField::of(occupancy_of(grid, 0.0, |p| TRUNK.signed_distance_m(p) < 0.0))
+    }
+
+    fn sweep(field: &DistanceField, from_m: DVec3, to_m: DVec3, radius_m: f64) -> Sweep {
+        let at = |p_m| Pose::new(p_m, DQuat::IDENTITY);
+        super::sweep(field, &BodyShape::sphere(radius_m), &at(from_m), &at(to_m))
+    }
+
+    /// Arms of 0.4 m along y, a hub.
+    fn arms() -> BodyShape {
+        let arm = BodyPart { from_m: DVec3::Y * -0.2, to_m: Some(DVec3::Y * 0.2), radius_m: 0.02 };
+        BodyShape::of_parts(&[arm, BodyPart { from_m: DVec3::ZERO, to_m: None, radius_m: 0.05 }])
+    }
+
+    #[test]
+    fn a_body_that_turns_on_the_spot_touches_with_its_arm() {
+        let field = field();
+        // 0.25 m from the trunk's face; arms along y pass it, and reach it half way of the turn.
+        let p_m = DVec3::new(1.65, 1.0, 1.0);
+        let at = |yaw: f64| Pose::new(p_m, DQuat::from_rotation_z(yaw));
+        let near = DVec3::new(1.72, 1.0, 1.0);
+        let near_at = |yaw: f64| Pose::new(near, DQuat::from_rotation_z(yaw));
+        assert_eq!(super::sweep(&field, &arms(), &at(0.0), &at(3.0)).contact, None);
+        assert_eq!(super::sweep(&field, &arms(), &near_at(0.0), &near_at(0.1)).contact, None);
+        let found = super::sweep(&field, &arms(), &near_at(0.0), &near_at(3.0));
+        let contact = found.contact.unwrap();
+        assert!((0.2..0.5).contains(&contact.fraction), "{contact:?}");
+        let lost = Pose::new(p_m, DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0));
+        assert!(super::sweep(&field, &arms(), &at(0.0), &lost).contact.is_some());
     }
 
     #[test]
@@ -116,6 +171,25 @@ mod tests {
                 .map(|n| TRUNK.signed_distance_m(from.lerp(to, f64::from(n) / 1000.0)) - 0.12)
                 .fold(f64::INFINITY, f64::min);
             let found = sweep(&field(), from, to, 0.12);
+            prop_assert!(truth > -0.05 || found.contact.is_some());
+            prop_assert!(truth < 0.05 || found.contact.is_none());
+        }
+
+        /// So does a body that turns on its way.
+        #[test]
+        fn turning_sweeps_agree_with_dense_truth(
+            a in (0.3..3.7f64, 0.3..1.7f64, 0.3..1.7f64), b in (0.3..3.7f64, 0.3..1.7f64, 0.3..1.7f64),
+            turns in prop::array::uniform2(prop::array::uniform3(-2.0..2.0f64)),
+        ) {
+            let pose = |p, turn| Pose::new(DVec3::from(p), DQuat::from_scaled_axis(DVec3::from(turn)));
+            let (from, to) = (pose(a, turns[0]), pose(b, turns[1]));
+            let body = arms();
+            let distance_m = |p_m| TRUNK.signed_distance_m(p_m);
+            let truth = (0..=1000)
+                .map(|n| from.interpolate(&to, f64::from(n) / 1000.0))
+                .map(|at| body.clearance_m(&at, f64::INFINITY, distance_m))
+                .fold(f64::INFINITY, f64::min);
+            let found = super::sweep(&field(), &body, &from, &to);
             prop_assert!(truth > -0.05 || found.contact.is_some());
             prop_assert!(truth < 0.05 || found.contact.is_none());
         }

@@ -7,16 +7,32 @@
 
 use std::path::{Path, PathBuf};
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
-use vizflyt_protocol::messages::{ArenaInfo, Limits, MAX_CAMERAS, bounded};
+use vizflyt_protocol::messages::{ArenaInfo, Limits, MAX_CAMERAS, MAX_NO_FLY, PoseAges, bounded};
 
+use crate::pose::PoseConfig;
+
+mod body;
 mod camera;
-mod validate;
+mod line;
+mod localization;
+mod no_fly;
+mod object;
+mod rules;
+pub(crate) mod validate;
 mod vehicle;
 
+pub use body::BodyPart;
 pub use camera::{CameraConfig, LensConfig};
+pub use line::line_of;
+pub use localization::{
+    Alignment, Axes, Driver, Euler, LocalizationConfig, MAX_SOURCES, Nose, Offset, Units, UpAxis,
+};
+pub use no_fly::NoFly;
+pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};
+pub use rules::RulesConfig;
 pub use validate::ConfigError;
 pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
@@ -50,17 +66,35 @@ pub struct ArenaConfig {
     pub geofence: Geofence,
     /// What the guard enforces.
     pub limits: Limits,
+    /// Parts of the vehicle within its sphere; without any, the sphere is the vehicle.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub body: Vec<BodyPart>,
+    /// Boxes that the body's surface must stay out of, up to 8.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub no_fly: Vec<NoFly>,
     /// How obstacles are baked from the scene.
     #[serde(default)]
     pub occupancy: Occupancy,
+    /// How poses are fused, when they count as lost, and for which moment images are drawn.
+    #[serde(default, skip_serializing_if = "PoseConfig::is_default")]
+    pub pose: PoseConfig,
     /// The cameras, in the order of their index on the wire; 1 to 8.
     pub cameras: Vec<CameraConfig>,
     /// The vehicles, up to 8; without any, the server's command line names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<VehicleConfig>,
+    /// Where poses come from, up to 8; without any, the server's command line says, else Vicon.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub localization: Vec<LocalizationConfig>,
     /// The course's gates in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<StageConfig>,
+    /// What is fined.
+    #[serde(default, skip_serializing_if = "RulesConfig::is_default")]
+    pub rules: RulesConfig,
+    /// What moves by itself, up to 32.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub objects: Vec<ObjectConfig>,
 }
 
 /// `[spawn]`: where the vehicle stands at the start.
@@ -104,18 +138,22 @@ pub struct Occupancy {
     pub min_opacity: f64,
     /// Height of the floor; below is solid. [m, world]
     pub floor_z_m: f64,
+    /// What hangs in the air with fewer splats in its volume is a floater of training; 0 keeps
+    /// all. [1/m^3]
+    pub min_splats_per_m3: f64,
 }
 
 impl Default for Occupancy {
     /// 5 cm resolves a thin trunk at 1 byte a voxel; 0.3 is below what trained surfaces have and
-    /// above what trained haze has; the floor is the world's z = 0.
+    /// above what trained haze has; the floor is the world's z = 0. A surface of splats as large as
+    /// 0.2 m still has 300 in a cubic metre of its voxels, a blob of haze fewer than 5.
     fn default() -> Self {
-        Self { voxel_m: 0.05, min_opacity: 0.3, floor_z_m: 0.0 }
+        Self { voxel_m: 0.05, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 }
     }
 }
 
-/// `[[stages]]`: a rectangular opening to fly through.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// `[[stages]]`: an opening to fly through: a rectangle, or a polygon in it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
     /// Its name; at most 32 bytes.
@@ -128,6 +166,22 @@ pub struct StageConfig {
     pub width_m: f64,
     /// Height of the opening, across width and normal. [m]
     pub height_m: f64,
+    /// Corners of the opening, to the left and up from its centre as one flies through; within width
+    /// and height. Without any it is the rectangle. [m]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub polygon_m: Vec<DVec2>,
+    /// Depth of the opening along the passage, its centre in the middle: it counts when both its faces
+    /// were passed. [m]
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub thickness_m: f64,
+    /// What the body's centre must keep from the opening's edge for the passage to count. [m]
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub clearance_m: f64,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
 }
 
 impl ArenaConfig {
@@ -158,10 +212,10 @@ impl ArenaConfig {
     ///
     /// # Errors
     /// [`ConfigError::Toml`] with line and column for syntax, types, absent and unknown keys;
-    /// [`ConfigError::Invalid`] for values that cannot work.
+    /// [`ConfigError::Invalid`] for values that cannot work, with the line of the key.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text)?;
-        config.validate()?;
+        config.validate().map_err(|error| error.in_text(text))?;
         Ok(config)
     }
 
@@ -191,6 +245,8 @@ impl ArenaConfig {
         ArenaInfo {
             name: bounded(&self.name),
             geofence: self.geofence(),
+            no_fly: self.no_fly.iter().map(NoFly::volume).take(MAX_NO_FLY).collect(),
+            floor_z_m: self.occupancy.floor_z_m,
             limits: self.limits,
             body_radius_m: self.body_radius_m,
             takeoff_height_m: self.takeoff_height_m,
@@ -198,6 +254,10 @@ impl ArenaConfig {
             goal_radius_m: self.goal.map_or(0.0, |goal| goal.radius_m),
             time_limit_s: self.time_limit_s,
             ground_truth: self.ground_truth,
+            pose_ages: PoseAges {
+                hold_after_s: self.pose.hold_after_s,
+                land_after_s: self.pose.land_after_s,
+            },
             attitude_rate: self.attitude_rate,
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
         }

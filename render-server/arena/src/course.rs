@@ -1,6 +1,6 @@
 //! The course: openings to pass in order, then the goal.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use crate::config::{ArenaConfig, Goal, StageConfig};
 
@@ -21,6 +21,8 @@ pub struct Course {
     stages: Vec<Opening>,
     goal: Option<Goal>,
     next: usize,
+    /// Whether the vehicle is within the thickness of the next stage.
+    entered: bool,
     finished: bool,
     told_too_early: bool,
 }
@@ -32,23 +34,29 @@ impl Course {
             stages: config.stages.iter().map(Opening::new).collect(),
             goal: config.goal,
             next: 0,
+            entered: false,
             finished: false,
             told_too_early: false,
         }
     }
 
-    /// Takes the way of the body's centre between two poses; returns what it achieved. [m, world]
+    /// Takes the way of the body's centre between two poses; returns what it achieved. Call it with
+    /// the same way until it returns nothing: the last stage may be the end. [m, world]
     pub fn advance(&mut self, from_m: DVec3, to_m: DVec3) -> Option<Progress> {
         if self.finished {
             return None;
         }
         if let Some(stage) = self.stages.get(self.next)
-            && stage.is_passed(from_m, to_m)
+            && stage.is_passed(from_m, to_m, &mut self.entered)
         {
             self.next += 1;
             return Some(Progress::Stage(self.next - 1));
         }
-        let goal = self.goal?;
+        let Some(goal) = self.goal else {
+            // Without a goal the last stage is the finish; without stages either, there is none.
+            self.finished = !self.stages.is_empty() && self.next == self.stages.len();
+            return self.finished.then_some(Progress::Finished);
+        };
         if !(distance_to_segment_m(goal.position_m, from_m, to_m) <= goal.radius_m) {
             return None;
         }
@@ -61,15 +69,18 @@ impl Course {
     }
 }
 
-/// A rectangle in space with a direction.
-#[derive(Clone, Copy, Debug)]
+/// A polygon in space with a direction.
+#[derive(Clone, Debug)]
 struct Opening {
     center_m: DVec3,
     normal: DVec3,
-    /// Unit vector along the width, level.
+    /// Unit vector along the width, level, to the left as one flies through.
     across: DVec3,
-    half_width_m: f64,
-    half_height_m: f64,
+    up: DVec3,
+    /// [m, along across and up]
+    corners_m: Vec<DVec2>,
+    half_thickness_m: f64,
+    clearance_m: f64,
 }
 
 impl Opening {
@@ -77,25 +88,63 @@ impl Opening {
         let normal = stage.normal.normalize_or(DVec3::X);
         // A gate in the floor has no level width of its own; any will do.
         let across = DVec3::Z.cross(normal).normalize_or(DVec3::Y);
+        let (x, y) = (stage.width_m / 2.0, stage.height_m / 2.0);
+        let rectangle =
+            [DVec2::new(x, y), DVec2::new(-x, y), DVec2::new(-x, -y), DVec2::new(x, -y)];
+        let given = &stage.polygon_m;
         Self {
             center_m: stage.center_m,
             normal,
             across,
-            half_width_m: stage.width_m / 2.0,
-            half_height_m: stage.height_m / 2.0,
+            up: normal.cross(across),
+            corners_m: if given.is_empty() { rectangle.to_vec() } else { given.clone() },
+            half_thickness_m: stage.thickness_m / 2.0,
+            clearance_m: stage.clearance_m,
         }
     }
 
-    /// Whether the way crosses the rectangle in its direction.
-    fn is_passed(&self, from_m: DVec3, to_m: DVec3) -> bool {
-        let before_m = self.normal.dot(from_m - self.center_m);
-        let after_m = self.normal.dot(to_m - self.center_m);
+    /// Whether the way leads out of the opening's far face; `entered` keeps whether it has come in by
+    /// the near one.
+    fn is_passed(&self, from_m: DVec3, to_m: DVec3, entered: &mut bool) -> bool {
+        if let Some(inside) = self.crossing(-self.half_thickness_m, from_m, to_m) {
+            *entered = inside;
+        } else if self.crossing(-self.half_thickness_m, to_m, from_m).is_some() {
+            // Back out again.
+            *entered = false;
+        }
+        self.crossing(self.half_thickness_m, from_m, to_m) == Some(true)
+            && std::mem::replace(entered, false)
+    }
+
+    /// Returns whether the way crosses a face within the polygon, or beside it; `None` if it does not
+    /// cross the face in the direction of passage.
+    fn crossing(&self, face_m: f64, from_m: DVec3, to_m: DVec3) -> Option<bool> {
+        let before_m = self.normal.dot(from_m - self.center_m) - face_m;
+        let after_m = self.normal.dot(to_m - self.center_m) - face_m;
         if !(before_m < 0.0 && after_m >= 0.0) {
-            return false;
+            return None;
         }
         let at_m = from_m.lerp(to_m, before_m / (before_m - after_m)) - self.center_m;
-        let up = self.normal.cross(self.across);
-        at_m.dot(self.across).abs() <= self.half_width_m && at_m.dot(up).abs() <= self.half_height_m
+        Some(self.holds(DVec2::new(at_m.dot(self.across), at_m.dot(self.up))))
+    }
+
+    /// Whether a point of the plane is in the polygon and keeps clear of its edge.
+    fn holds(&self, p_m: DVec2) -> bool {
+        let mut inside = false;
+        for (n, &b_m) in self.corners_m.iter().enumerate() {
+            let a_m = self.corners_m[(n + self.corners_m.len() - 1) % self.corners_m.len()];
+            // Counts the edges that a ray to the left crosses.
+            if (a_m.y > p_m.y) != (b_m.y > p_m.y)
+                && p_m.x < a_m.x + (p_m.y - a_m.y) / (b_m.y - a_m.y) * (b_m.x - a_m.x)
+            {
+                inside = !inside;
+            }
+            let edge_m = distance_to_segment_m(p_m.extend(0.0), a_m.extend(0.0), b_m.extend(0.0));
+            if edge_m < self.clearance_m {
+                return false;
+            }
+        }
+        inside
     }
 }
 
@@ -118,17 +167,23 @@ mod tests {
             normal: DVec3::X,
             width_m: 1.0,
             height_m: 0.8,
+            ..StageConfig::default()
         }];
         Course::new(&config)
     }
 
     fn check(way: &[[f64; 3]], expected: &[Progress]) {
         let mut course = course();
-        let found: Vec<_> = way
-            .windows(2)
-            .filter_map(|pair| course.advance(pair[0].into(), pair[1].into()))
-            .collect();
-        assert_eq!(found, expected);
+        assert_eq!(found(&mut course, way), expected);
+    }
+
+    fn found(course: &mut Course, way: &[[f64; 3]]) -> Vec<Progress> {
+        way.windows(2)
+            .flat_map(|pair| {
+                std::iter::from_fn(|| course.advance(pair[0].into(), pair[1].into()))
+                    .collect::<Vec<_>>()
+            })
+            .collect()
     }
 
     #[test]
@@ -142,6 +197,55 @@ mod tests {
         check(&[[5., 0., 1.], [1., 0., 1.]], &[]);
         // Back and through again counts.
         check(&[[5., 0., 1.], [1., 0., 1.], [5., 0., 1.]], &[Progress::Stage(0)]);
+    }
+
+    #[test]
+    fn polygons_thickness_and_clearance_count() {
+        let mut config = arena();
+        config.goal = None;
+        let stage = StageConfig {
+            name: "triangle".into(),
+            center_m: DVec3::new(3.0, 0.0, 1.0),
+            normal: DVec3::X,
+            width_m: 2.0,
+            height_m: 2.0,
+            // Its right angle is to the left and above.
+            polygon_m: vec![DVec2::new(1., 1.), DVec2::new(-1., 1.), DVec2::new(1., -1.)],
+            ..StageConfig::default()
+        };
+        let passes = |stage: &StageConfig, way: &[[f64; 3]]| {
+            let mut config = config.clone();
+            config.stages = vec![stage.clone()];
+            !found(&mut Course::new(&config), way).is_empty()
+        };
+        let straight = |y: f64, z: f64| [[2., y, z], [4., y, z]];
+        assert!(passes(&stage, &straight(0.5, 1.5)));
+        assert!(!passes(&stage, &straight(-0.5, 0.5)), "beyond the long side");
+        assert!(!passes(&stage, &straight(1.5, 1.5)), "outside of the rectangle too");
+        let clear = StageConfig { clearance_m: 0.2, ..stage.clone() };
+        assert!(passes(&clear, &straight(0.5, 1.5)));
+        assert!(!passes(&clear, &straight(0.9, 1.5)), "0.1 m from its side");
+        let thick = StageConfig { thickness_m: 1.0, ..stage };
+        assert!(passes(&thick, &straight(0.5, 1.5)));
+        assert!(!passes(&thick, &[[2., 0.5, 1.5], [3.2, 0.5, 1.5]]), "still inside");
+        let sideways = [[2., 1.5, 1.5], [3., 1.5, 1.5], [3., 0.5, 1.5], [4., 0.5, 1.5]];
+        assert!(!passes(&thick, &sideways), "not by its near face");
+        let back = [[2., 0.5, 1.5], [3., 0.5, 1.5], [2., 0.5, 1.5], [2., 1.5, 1.5], [4., 1.5, 1.5]];
+        assert!(!passes(&thick, &back));
+        let slowly = [[2., 0.5, 1.5], [3., 0.5, 1.5], [3.2, 0.5, 1.5], [4., 0.5, 1.5]];
+        assert!(passes(&thick, &slowly));
+    }
+
+    #[test]
+    fn without_a_goal_the_last_stage_is_the_finish() {
+        let mut course = course();
+        course.goal = None;
+        let through = [Progress::Stage(0), Progress::Finished];
+        let way = [[1., 0., 1.], [2., 0., 1.], [5., 0., 1.], [9., 0., 1.]];
+        assert_eq!(found(&mut course, &way), through);
+        let mut neither = Course { stages: Vec::new(), ..course.clone() };
+        neither.finished = false;
+        assert_eq!(found(&mut neither, &way), []);
     }
 
     #[test]

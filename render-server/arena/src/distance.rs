@@ -10,6 +10,7 @@
 //! kept in steps of a fifth of a voxel, from -7.9 to +43.1 voxels: 2.15 m at 5 cm. The byte is
 //! exact to a tenth of a voxel, and the trilinear query between centres to about half of one.
 
+pub use file::{FIELD_HEADER, FieldError};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -300,5 +301,6 @@ impl Envelope {
     }
 }
 
+mod file;
 #[cfg(test)]
 mod tests;

@@ -1,31 +1,53 @@
-//! The geofence, looked at with the velocity of the moment: a vehicle that can no longer stop
-//! inside is as good as outside.
+//! The geofence, the ceiling and the no-fly boxes, looked at with the velocity of the moment: a
+//! vehicle that can no longer stop before them is as good as beyond.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::Limits;
 
-/// What the fence says to a position and velocity.
-#[derive(Clone, Copy, Debug, PartialEq)]
+use crate::config::ArenaConfig;
+
+/// What a boundary says to a position and velocity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum FenceVerdict {
-    /// The vehicle stops inside with room to spare.
+    /// The vehicle stops before it with room to spare.
     Inside,
-    /// It stops inside, but only just.
+    /// It stops before it, but only just.
     Near,
-    /// It is outside, or cannot stop inside.
+    /// It is beyond, or cannot stop before it.
     Breach,
 }
 
-/// The verdict with its numbers.
+/// The verdict of the boundary that matters most, with its numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FenceCheck {
+pub struct FenceCheck<'a> {
+    /// Which boundary: `the geofence`, `the ceiling`, a no-fly box's name.
+    pub boundary: &'a str,
     /// What to think of it.
     pub verdict: FenceVerdict,
-    /// From the body's surface to the fence; negative is outside. [m]
+    /// From the body's surface to the boundary; negative is beyond. [m]
     pub margin_m: f64,
-    /// From the body's surface to the fence where the vehicle would come to rest, braking along
-    /// its way over `v^2 / 2a`; negative is outside. [m]
+    /// From the body's surface to the boundary where the vehicle would come to rest, braking along
+    /// its way over `v^2 / 2a`, or where it passes nearest; negative is beyond. [m]
     pub margin_at_rest_m: f64,
+}
+
+/// All that bounds where a vehicle may be.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Boundaries {
+    all: Vec<(String, Boundary)>,
+    radius_m: f64,
+    limits: Limits,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Boundary {
+    /// The body's surface stays inside: net, walls.
+    KeepIn(Volume),
+    /// The body's surface stays outside.
+    KeepOut(Volume),
+    /// The body's centre stays below. [m, world]
+    Ceiling(f64),
 }
 
 /// Room, now or at rest, below which a person should be told. [m]
@@ -34,54 +56,164 @@ const NEAR_M: f64 = 0.3;
 /// millimetres of noise. Only what it fails to hold is judged. [m]
 const TOLERANCE_M: f64 = 0.1;
 
-/// Judges a position [m, world] and velocity [m/s, world] of a body of `radius_m`.
-pub fn check(
-    fence: &Volume,
-    limits: &Limits,
-    radius_m: f64,
-    p_world_m: DVec3,
-    v_world_mps: DVec3,
-) -> FenceCheck {
-    let margin_at = |p_m: DVec3| -fence.signed_distance_m(p_m) - radius_m;
-    let margin_m = margin_at(p_world_m);
-    // The place of rest, not the nearest side: low over the floor, the floor is always nearest,
-    // however fast the vehicle flies at the wall ahead.
-    let way_m = v_world_mps * (v_world_mps.length() / (2.0 * limits.max_acceleration_mps2));
-    let margin_at_rest_m = margin_at(p_world_m + way_m);
-    // A number that is none counts as a breach; a volume's distance may lose it on the way.
-    let known = p_world_m.is_finite() && v_world_mps.is_finite();
-    let verdict = if !(known && margin_m >= 0.0 && margin_at_rest_m + TOLERANCE_M >= 0.0) {
-        FenceVerdict::Breach
-    } else if margin_m.min(margin_at_rest_m) < NEAR_M {
-        FenceVerdict::Near
-    } else {
-        FenceVerdict::Inside
-    };
-    FenceCheck { verdict, margin_m, margin_at_rest_m }
+impl Boundaries {
+    /// Returns those of an arena.
+    pub fn of(config: &ArenaConfig) -> Self {
+        let mut all = vec![("the geofence".to_owned(), Boundary::KeepIn(config.geofence()))];
+        all.extend(
+            config
+                .limits
+                .max_altitude_m
+                .map(|z_m| ("the ceiling".to_owned(), Boundary::Ceiling(z_m))),
+        );
+        all.extend(config.no_fly.iter().map(|keep_out| {
+            (format!("the no-fly box {}", keep_out.name), Boundary::KeepOut(keep_out.volume()))
+        }));
+        Self { all, radius_m: config.body_radius_m, limits: config.limits }
+    }
+
+    /// Judges the way from one position to the next [m, world], and the velocity at its end
+    /// [m/s, world]; returns the boundary that is worst. Sinking does not count towards the geofence:
+    /// its floor is where vehicles land.
+    pub fn check(&self, from_m: DVec3, to_m: DVec3, v_world_mps: DVec3) -> FenceCheck<'_> {
+        let least_m = |check: &FenceCheck<'_>| check.margin_m.min(check.margin_at_rest_m);
+        let check = |(name, boundary)| self.check_one(name, boundary, from_m, to_m, v_world_mps);
+        let (first, others) = self.all.split_first().expect("there is a geofence");
+        let mut worst = check((&first.0, &first.1));
+        for (name, boundary) in others {
+            let other = check((name, boundary));
+            let nearer = other.verdict == worst.verdict && least_m(&other) < least_m(&worst);
+            if other.verdict > worst.verdict || nearer {
+                worst = other;
+            }
+        }
+        worst
+    }
+
+    fn check_one<'a>(
+        &self,
+        name: &'a str,
+        boundary: &Boundary,
+        from_m: DVec3,
+        to_m: DVec3,
+        v_world_mps: DVec3,
+    ) -> FenceCheck<'a> {
+        // The place of rest, not the nearest side: low over the floor, the floor is always nearest,
+        // however fast the vehicle flies at the wall ahead.
+        let rest_m = |v_mps: DVec3| {
+            to_m + v_mps * (v_mps.length() / (2.0 * self.limits.max_acceleration_mps2))
+        };
+        let level_mps = v_world_mps.with_z(v_world_mps.z.max(0.0));
+        let (margin_m, margin_at_rest_m) = match boundary {
+            Boundary::KeepIn(volume) => {
+                let margin_at = |p_m| -volume.signed_distance_m(p_m) - self.radius_m;
+                (margin_at(to_m), margin_at(rest_m(level_mps)))
+            }
+            Boundary::Ceiling(z_m) => (z_m - to_m.z, z_m - rest_m(level_mps).z),
+            // A box may lie between two poses, or between here and the place of rest.
+            Boundary::KeepOut(volume) => {
+                let nearest = |a, b| least_distance_m(volume, a, b) - self.radius_m;
+                (nearest(from_m, to_m), nearest(to_m, rest_m(v_world_mps)))
+            }
+        };
+        // A number that is none counts as a breach; a volume's distance may lose it on the way.
+        let known = to_m.is_finite() && v_world_mps.is_finite();
+        let verdict = if !(known && margin_m >= 0.0 && margin_at_rest_m + TOLERANCE_M >= 0.0) {
+            FenceVerdict::Breach
+        } else if margin_m.min(margin_at_rest_m) < NEAR_M {
+            FenceVerdict::Near
+        } else {
+            FenceVerdict::Inside
+        };
+        FenceCheck { boundary: name, verdict, margin_m, margin_at_rest_m }
+    }
+}
+
+/// Returns the least signed distance to a volume on the way from `a_m` to `b_m`: volumes are convex,
+/// so it falls, then rises. [m, world]
+fn least_distance_m(volume: &Volume, a_m: DVec3, b_m: DVec3) -> f64 {
+    let at = |t: f64| volume.signed_distance_m(a_m.lerp(b_m, t));
+    let (mut low, mut high) = (0.0, 1.0);
+    // (2/3)^30 of the way is micrometres.
+    for _ in 0..30 {
+        let (third, two_thirds) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+        if at(third) < at(two_thirds) {
+            high = two_thirds;
+        } else {
+            low = third;
+        }
+    }
+    // Not `min`, which would drop a NaN.
+    [at(0.0), at(0.5 * (low + high)), at(1.0)]
+        .into_iter()
+        .fold(f64::INFINITY, |least, new| if least < new || least.is_nan() { least } else { new })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn verdict(p: [f64; 3], v: [f64; 3]) -> FenceVerdict {
+    fn boundaries() -> Boundaries {
         let room = Volume::aabb(DVec3::ZERO, DVec3::new(10.0, 4.0, 3.0));
-        let limits = Limits::new(6.0, 8.0);
-        check(&room, &limits, 0.1, p.into(), v.into()).verdict
+        let table = Volume::aabb(DVec3::new(4.0, 1.0, 0.0), DVec3::new(4.1, 3.0, 1.0));
+        let all = vec![
+            ("the geofence".to_owned(), Boundary::KeepIn(room)),
+            ("the ceiling".to_owned(), Boundary::Ceiling(2.5)),
+            ("the no-fly box shelf".to_owned(), Boundary::KeepOut(table)),
+        ];
+        Boundaries { all, radius_m: 0.1, limits: Limits::new(6.0, 8.0) }
+    }
+
+    fn check(p: [f64; 3], v: [f64; 3], boundary: &str, expected: FenceVerdict) {
+        let boundaries = boundaries();
+        let found = boundaries.check(p.into(), p.into(), v.into());
+        assert_eq!(found.verdict, expected, "{found:?}");
+        if expected != FenceVerdict::Inside {
+            assert_eq!(found.boundary, boundary, "{found:?}");
+        }
     }
 
     #[test]
     fn speed_toward_the_fence_counts() {
+        use FenceVerdict::{Breach, Inside, Near};
+        let fence = "the geofence";
         // 1.1 m to the side x = 10, 0.1 m of body: 1 m left; 4 m/s needs 1 m, 4.5 m/s 1.27 m.
-        assert_eq!(verdict([8.9, 2.0, 1.5], [0.0, 0.0, 0.0]), FenceVerdict::Inside);
-        assert_eq!(verdict([8.9, 2.0, 1.5], [4.0, 0.0, 0.0]), FenceVerdict::Near);
-        assert_eq!(verdict([8.9, 2.0, 1.5], [4.5, 0.0, 0.0]), FenceVerdict::Breach);
-        assert_eq!(verdict([8.9, 2.0, 1.5], [-6.0, 0.0, 0.0]), FenceVerdict::Inside);
+        check([8.9, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Inside);
+        check([8.9, 2.0, 1.5], [4.0, 0.0, 0.0], fence, Near);
+        check([8.9, 2.0, 1.5], [4.5, 0.0, 0.0], fence, Breach);
+        check([8.9, 2.0, 1.5], [-6.0, 0.0, 0.0], fence, Inside);
         // The floor is nearer than the wall, and parallel to the way.
-        assert_eq!(verdict([8.9, 2.0, 0.6], [4.5, 0.0, 0.0]), FenceVerdict::Breach);
-        assert_eq!(verdict([8.9, 2.0, 0.6], [0.0, 4.5, 0.0]), FenceVerdict::Inside);
-        assert_eq!(verdict([8.9, 2.0, 1.5], [f64::NAN, 0.0, 0.0]), FenceVerdict::Breach);
-        assert_eq!(verdict([9.95, 2.0, 1.5], [0.0, 0.0, 0.0]), FenceVerdict::Breach);
-        assert_eq!(verdict([f64::NAN, 2.0, 1.5], [0.0, 0.0, 0.0]), FenceVerdict::Breach);
+        check([8.9, 2.0, 0.6], [4.5, 0.0, 0.0], fence, Breach);
+        check([8.9, 2.0, 0.6], [0.0, 4.5, 0.0], fence, Inside);
+        check([8.9, 2.0, 1.5], [f64::NAN, 0.0, 0.0], fence, Breach);
+        check([9.95, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Breach);
+        check([f64::NAN, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Breach);
+        // Landing is no breach.
+        check([8.9, 2.0, 0.45], [0.0, 0.0, -2.5], fence, Inside);
+    }
+
+    #[test]
+    fn the_ceiling_is_the_centre_s() {
+        let ceiling = "the ceiling";
+        check([8.0, 2.0, 2.0], [0.0, 0.0, 0.0], ceiling, FenceVerdict::Inside);
+        check([8.0, 2.0, 2.3], [0.0, 0.0, 0.0], ceiling, FenceVerdict::Near);
+        check([8.0, 2.0, 2.0], [0.0, 0.0, 3.5], ceiling, FenceVerdict::Breach);
+        check([8.0, 2.0, 2.51], [0.0, 0.0, 0.0], ceiling, FenceVerdict::Breach);
+    }
+
+    #[test]
+    fn a_thin_box_is_not_jumped_over() {
+        let shelf = "the no-fly box shelf";
+        check([3.0, 2.0, 0.5], [0.0, 0.0, 0.0], shelf, FenceVerdict::Inside);
+        check([3.0, 2.0, 0.5], [4.5, 0.0, 0.0], shelf, FenceVerdict::Breach);
+        // It would come to rest beyond, through it.
+        check([3.3, 2.0, 0.5], [5.5, 0.0, 0.0], shelf, FenceVerdict::Breach);
+        check([3.3, 2.0, 1.5], [5.5, 0.0, 0.0], shelf, FenceVerdict::Inside);
+        // Down onto it, and beside it.
+        check([4.05, 2.0, 1.2], [0.0, 0.0, -2.0], shelf, FenceVerdict::Breach);
+        check([4.05, 2.0, 1.05], [0.0, 0.0, 0.0], shelf, FenceVerdict::Breach);
+        let boundaries = boundaries();
+        let jump = boundaries.check([3.5, 2.0, 0.5].into(), [4.5, 2.0, 0.5].into(), DVec3::ZERO);
+        assert_eq!((jump.boundary, jump.verdict), (shelf, FenceVerdict::Breach), "{jump:?}");
     }
 }

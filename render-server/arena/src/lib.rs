@@ -4,21 +4,34 @@
 //! Read in this order:
 //! - [`config`]: `arena.toml` as validated types; also what the runtime is told of the arena;
 //! - [`occupancy`], [`distance`]: splats baked into voxels, and the distance to them;
+//! - [`objects`]: where what moves by itself is at any instant;
+//! - [`obstacles`], [`neighbours`]: what must not be touched: still, moving, other vehicles;
 //! - [`pose`]: which measurements are believed, and the twist;
-//! - [`collision`], [`fence`], [`course`]: one rule each;
-//! - [`referee`]: all of it for one vehicle, as one state machine.
+//! - [`body`], [`collision`], [`fence`], [`course`]: one rule each;
+//! - [`check`]: whether a course can be flown at all;
+//! - [`referee`]: all of it for one vehicle, as one state machine;
+//! - [`verdict`]: what a flight was worth, by all that happened in it.
 
+pub mod body;
+pub mod check;
 pub mod collision;
 pub mod config;
 pub mod course;
 pub mod distance;
 pub mod fence;
 pub mod grid;
+pub mod neighbours;
+pub mod objects;
+pub mod obstacles;
 pub mod occupancy;
 pub mod pose;
 pub mod referee;
+pub mod verdict;
 
+pub use body::BodyShape;
 pub use config::{ArenaConfig, ConfigError};
 pub use distance::{DistanceField, ObstacleSlice};
+pub use objects::MovingObjects;
+pub use obstacles::Obstacles;
 pub use occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
 pub use referee::Referee;

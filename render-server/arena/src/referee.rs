@@ -2,42 +2,58 @@
 //! events out. The server calls it for every pose, 200 Hz; a call takes a few microseconds.
 //!
 //! ```text
-//! measurement -> pose gate -> on the floor?  -> nothing is judged
+//! measurement -> pose filter -> on the floor?  -> nothing is judged
 //!                             in the air     -> collision, fence, course, time -> events
 //! ```
 //! A flight begins when the body's centre rises 0.3 m above the start. Each thing that ends a
 //! flight is said once; after it nothing more is judged until [`Referee::restart`].
 
 use std::collections::VecDeque;
-use std::sync::Arc;
 
 use glam::DVec3;
-use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
-use vizflyt_protocol::messages::{Event, EventKind, Limits, PoseSample, bounded};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::messages::{Event, EventKind, PoseSample, bounded};
 use vizflyt_protocol::time::ServerTime;
 
-use crate::collision::sweep;
+use crate::body::BodyShape;
 use crate::config::ArenaConfig;
 use crate::course::{Course, Progress};
-use crate::distance::{DistanceField, ObstacleSlice};
-use crate::fence::{self, FenceVerdict};
-use crate::pose::{PoseChange, PoseGate, Rejected};
+use crate::distance::ObstacleSlice;
+use crate::fence::{Boundaries, FenceVerdict};
+use crate::neighbours::{Neighbour, Passage};
+use crate::obstacles::{Obstacles, Touched, Visit};
+use crate::pose::{ImuReading, Measured, Motion, PoseChange, PoseFilter, PoseQuality, Rejected};
 
 /// Rise that counts as take-off; a vehicle that rocks on its legs does not reach it. [m]
-const AIRBORNE_M: f64 = 0.3;
+pub(crate) const AIRBORNE_M: f64 = 0.3;
 /// A descent faster than this onto the floor is a crash; ArduCopter lands with 0.5 m/s. [m/s]
 const CRASH_MPS: f64 = 1.5;
+
+/// What a body met; by number where there are several.
+#[derive(Clone, Copy, Debug)]
+enum Met {
+    Still,
+    Floor,
+    Object(usize),
+    Vehicle(usize),
+}
 
 /// Judges one vehicle.
 #[derive(Debug)]
 pub struct Referee {
     config: ArenaConfig,
-    fence: Volume,
-    limits: Limits,
-    field: Arc<DistanceField>,
-    gate: PoseGate,
+    body: BodyShape,
+    boundaries: Boundaries,
+    obstacles: Obstacles,
+    /// From which the objects' motions count.
+    epoch: ServerTime,
+    /// The other vehicles, by their number; none where this one's is.
+    neighbours: Vec<Option<Neighbour>>,
+    filter: PoseFilter,
+    /// Resets of the pose that have been taken note of.
+    resets: u8,
     course: Course,
-    last_m: Option<DVec3>,
+    last: Option<(ServerTime, Pose<World, Body>)>,
     took_off: Option<ServerTime>,
     over: bool,
     near_fence: bool,
@@ -47,15 +63,19 @@ pub struct Referee {
 
 impl Referee {
     /// Makes a referee for an arena with its baked obstacles, which the referees of several vehicles
-    /// share; no flight has begun.
-    pub fn new(config: &ArenaConfig, field: impl Into<Arc<DistanceField>>) -> Self {
+    /// share; no flight has begun. The motions of objects count from the clock's 0, see
+    /// [`Self::counting_from`].
+    pub fn new(config: &ArenaConfig, obstacles: impl Into<Obstacles>) -> Self {
         Self {
-            fence: config.geofence(),
-            limits: config.limits,
-            field: field.into(),
-            gate: PoseGate::default(),
+            body: BodyShape::of(config),
+            boundaries: Boundaries::of(config),
+            obstacles: obstacles.into(),
+            epoch: ServerTime::ZERO,
+            neighbours: Vec::new(),
+            filter: PoseFilter::new(&config.pose),
+            resets: 0,
             course: Course::new(config),
-            last_m: None,
+            last: None,
             took_off: None,
             over: false,
             near_fence: false,
@@ -63,6 +83,21 @@ impl Referee {
             events: VecDeque::new(),
             config: config.clone(),
         }
+    }
+
+    /// Counts the motions of objects from `epoch`, as those who draw them do.
+    #[must_use]
+    pub fn counting_from(mut self, epoch: ServerTime) -> Self {
+        self.epoch = epoch;
+        self
+    }
+
+    /// Takes where another vehicle is, by the number it is given here; `None` forgets it.
+    pub fn handle_neighbour(&mut self, number: usize, neighbour: Option<Neighbour>) {
+        if self.neighbours.len() <= number {
+            self.neighbours.resize(number + 1, None);
+        }
+        self.neighbours[number] = neighbour;
     }
 
     /// Forgets the flight: the next rise from the floor begins a new one.
@@ -75,30 +110,48 @@ impl Referee {
     }
 
     /// Takes a measurement of the vehicle; returns the pose if it is believed.
-    pub fn handle_measurement(
-        &mut self,
-        stamp: ServerTime,
-        world_from_body: Pose<World, Body>,
-    ) -> Result<PoseSample, Rejected> {
-        let sample = self.gate.handle_measurement(stamp, world_from_body)?;
-        self.report_change(stamp);
-        let to_m = world_from_body.translation_m;
+    pub fn handle_measurement(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
+        let known = self.filter.newest().map(|newest| newest.stamp);
+        let sample = self.filter.handle_pose(measured)?;
+        self.report_change(sample.stamp);
+        if known.is_some_and(|known| sample.stamp <= known) && sample.resets == self.resets {
+            // Of the past: what followed from it has been judged.
+            return Ok(sample);
+        }
+        let to = sample.world_from_body;
         // After a reset the way between the poses was not flown.
-        let from_m = self.last_m.replace(to_m).filter(|_| !is_jump(&sample)).unwrap_or(to_m);
-        self.judge(&sample, from_m, to_m);
+        let jumped = std::mem::replace(&mut self.resets, sample.resets) != sample.resets;
+        let here = (sample.stamp, to);
+        let from = self.last.replace(here).filter(|_| !jumped).unwrap_or(here);
+        self.judge(&sample, from);
         Ok(sample)
+    }
+
+    /// Takes a reading of the autopilot's IMU.
+    pub fn handle_imu(&mut self, reading: &ImuReading) {
+        self.filter.handle_imu(reading);
+    }
+
+    /// Returns how the vehicle moves by all that was measured.
+    pub fn motion(&mut self) -> Option<Motion> {
+        self.filter.motion()
+    }
+
+    /// Returns how good the localization is at `now`.
+    pub fn quality(&self, now: ServerTime) -> PoseQuality {
+        self.filter.quality(now)
     }
 
     /// Notices silence and the time limit. Call at [`Self::poll_timeout`].
     pub fn handle_timeout(&mut self, now: ServerTime) {
-        self.gate.handle_timeout(now);
+        self.filter.handle_timeout(now);
         self.report_change(now);
         self.judge_time(now);
     }
 
     /// Returns when [`Self::handle_timeout`] has something to do.
     pub fn poll_timeout(&self) -> Option<ServerTime> {
-        match (self.gate.poll_timeout(), self.time_limit()) {
+        match (self.filter.poll_timeout(), self.time_limit()) {
             (Some(a), Some(b)) => Some(a.min(b)),
             (a, b) => a.or(b),
         }
@@ -116,12 +169,15 @@ impl Referee {
 
     /// Returns the newest believed pose.
     pub fn newest(&self) -> Option<&PoseSample> {
-        self.gate.newest()
+        self.filter.newest()
     }
 
-    /// Returns the distance from the body's surface at a point to the nearest obstacle. [m, world]
+    /// Returns the distance from the body's surface at a point to the nearest obstacle, as all are
+    /// at the newest pose. [m, world]
     pub fn clearance_m(&self, p_world_m: DVec3) -> f64 {
-        self.field.obstacle_distance_m(p_world_m) - self.config.body_radius_m
+        let at = self.newest().map_or(self.epoch, |newest| newest.stamp);
+        let distance_m = self.obstacles.distance_m(self.since_epoch_ns(at), p_world_m);
+        distance_m - self.config.body_radius_m
     }
 
     /// Returns the least clearance of this flight so far; infinite before it. [m]
@@ -131,10 +187,16 @@ impl Referee {
 
     /// Returns the obstacles at a height, for the page's top view. [m, world]
     pub fn obstacle_slice(&self, z_m: f64) -> ObstacleSlice {
-        self.field.obstacle_slice(z_m)
+        self.obstacles.still.obstacle_slice(z_m)
     }
 
-    fn judge(&mut self, sample: &PoseSample, from_m: DVec3, to_m: DVec3) {
+    fn since_epoch_ns(&self, at: ServerTime) -> i64 {
+        at.as_ns().wrapping_sub(self.epoch.as_ns()).cast_signed()
+    }
+
+    fn judge(&mut self, sample: &PoseSample, (since, from): (ServerTime, Pose<World, Body>)) {
+        let to = &sample.world_from_body;
+        let (from_m, to_m) = (from.translation_m, to.translation_m);
         let risen_m = to_m.z - self.config.spawn.position_m.z;
         if self.took_off.is_none() && risen_m > AIRBORNE_M {
             self.took_off = Some(sample.stamp);
@@ -142,24 +204,54 @@ impl Referee {
         if !self.is_judging() {
             return;
         }
-        self.judge_collision(sample, from_m, to_m);
-        self.judge_fence(sample, to_m);
+        self.judge_collision(sample, since, &from);
+        self.judge_fence(sample, from_m, to_m);
         self.judge_course(sample, from_m, to_m);
         self.judge_time(sample.stamp);
     }
 
-    fn judge_collision(&mut self, sample: &PoseSample, from_m: DVec3, to_m: DVec3) {
-        let radius_m = self.config.body_radius_m;
-        let found = sweep(&self.field, from_m, to_m, radius_m);
+    fn judge_collision(
+        &mut self,
+        sample: &PoseSample,
+        since: ServerTime,
+        from: &Pose<World, Body>,
+    ) {
+        let to = &sample.world_from_body;
+        let visit = |at: ServerTime, pose: &Pose<World, Body>| Visit {
+            since_epoch_ns: self.since_epoch_ns(at),
+            world_from_body: *pose,
+        };
+        let (mut found, touched) =
+            self.obstacles.sweep(&self.body, &visit(since, from), &visit(sample.stamp, to));
+        let mut met = match touched {
+            Touched::Still => Met::Still,
+            Touched::Object(index) => Met::Object(index),
+        };
+        let passage =
+            |stamp, pose: &Pose<World, Body>| Passage { stamp, p_world_m: pose.translation_m };
+        let way = (passage(since, from), passage(sample.stamp, to));
+        for (number, neighbour) in self.neighbours.iter().enumerate() {
+            let Some(neighbour) = neighbour else { continue };
+            let other = neighbour.sweep(way.0, way.1, self.body.radius_m());
+            found.clearance_m = found.clearance_m.min(other.clearance_m);
+            let first = found.contact.map_or(f64::INFINITY, |contact| contact.fraction);
+            if let Some(contact) = other.contact.filter(|contact| contact.fraction < first) {
+                found.contact = Some(contact);
+                met = Met::Vehicle(number);
+            }
+        }
         self.least_clearance_m = self.least_clearance_m.min(found.clearance_m);
-        let floor_m = to_m.z - radius_m - self.field.floor_z_m();
+        let to_m = to.translation_m;
+        let floor_z_m = self.obstacles.still.floor_z_m();
+        let floor_m = self.body.clearance_m(to, f64::INFINITY, |p_m| p_m.z - floor_z_m);
         let descent_mps = -sample.twist.linear_mps.z;
         let contact = match found.contact {
-            Some(touch) => Some((touch.p_world_m, touch.clearance_m, "an obstacle")),
-            None if floor_m <= 0.0 && descent_mps > CRASH_MPS => Some((to_m, floor_m, "the floor")),
+            Some(touch) => Some((touch.p_world_m, touch.clearance_m, met)),
+            None if floor_m <= 0.0 && descent_mps > CRASH_MPS => Some((to_m, floor_m, Met::Floor)),
             None => None,
         };
-        if let Some((p_world_m, clearance_m, what)) = contact {
+        if let Some((p_world_m, clearance_m, met)) = contact {
+            let what = self.describe(met);
             let p = p_world_m;
             let text = format!(
                 "collision with {what} at ({:.2}, {:.2}, {:.2}) m, at {:.1} m/s",
@@ -172,28 +264,40 @@ impl Referee {
         }
     }
 
-    fn judge_fence(&mut self, sample: &PoseSample, p_world_m: DVec3) {
+    fn describe(&self, met: Met) -> String {
+        match met {
+            Met::Still => "an obstacle".to_owned(),
+            Met::Floor => "the floor".to_owned(),
+            Met::Object(index) => {
+                format!("'{}'", self.obstacles.objects.names().nth(index).unwrap_or_default())
+            }
+            Met::Vehicle(number) => {
+                let neighbour = self.neighbours.get(number).and_then(Option::as_ref);
+                format!("vehicle '{}'", neighbour.map_or("", |neighbour| &neighbour.name))
+            }
+        }
+    }
+
+    fn judge_fence(&mut self, sample: &PoseSample, from_m: DVec3, p_world_m: DVec3) {
         let v_mps = sample.twist.linear_mps;
-        // The floor is part of the fence's box; landing toward it is not a breach.
-        let v_mps = if v_mps.z < 0.0 { v_mps.with_z(0.0) } else { v_mps };
-        let found =
-            fence::check(&self.fence, &self.limits, self.config.body_radius_m, p_world_m, v_mps);
+        let found = self.boundaries.check(from_m, p_world_m, v_mps);
+        let (boundary, verdict) = (found.boundary, found.verdict);
         let margin_m = found.margin_m;
-        match found.verdict {
+        match verdict {
             FenceVerdict::Inside => self.near_fence = false,
             FenceVerdict::Near => {
                 if !std::mem::replace(&mut self.near_fence, true) {
-                    let text = format!("close to the geofence: {margin_m:.2} m left");
+                    let text = format!("close to {boundary}: {margin_m:.2} m left");
                     self.tell(sample.stamp, EventKind::Note, &text);
                 }
             }
             FenceVerdict::Breach => {
                 let text = if margin_m < 0.0 {
-                    format!("left the geofence by {:.2} m", -margin_m)
+                    format!("beyond {boundary} by {:.2} m", -margin_m)
                 } else {
                     format!(
-                        "cannot stop inside the geofence: {margin_m:.2} m left, and at {:.1} m/s \
-                         it would come to rest {:.2} m outside",
+                        "cannot stop before {boundary}: {margin_m:.2} m left, and at {:.1} m/s it \
+                         would go {:.2} m beyond",
                         v_mps.length(),
                         -found.margin_at_rest_m
                     )
@@ -205,22 +309,25 @@ impl Referee {
 
     fn judge_course(&mut self, sample: &PoseSample, from_m: DVec3, to_m: DVec3) {
         let seconds = self.seconds(sample.stamp);
-        let name = |index: usize| self.config.stages[index].name.clone();
-        match self.course.advance(from_m, to_m) {
-            Some(Progress::Stage(index)) => {
-                let name = name(index);
-                let kind = EventKind::Stage { index: index as u8, name: bounded(&name) };
-                self.tell(sample.stamp, kind, &format!("passed {name} after {seconds:.1} s"));
+        while let Some(progress) = self.course.advance(from_m, to_m) {
+            match progress {
+                Progress::Stage(index) => {
+                    let name = self.config.stages[index].name.clone();
+                    let kind = EventKind::Stage { index: index as u8, name: bounded(&name) };
+                    self.tell(sample.stamp, kind, &format!("passed {name} after {seconds:.1} s"));
+                }
+                Progress::Finished => {
+                    let what =
+                        if self.config.goal.is_some() { "reached the goal" } else { "finished" };
+                    let text = format!("{what} after {seconds:.1} s");
+                    self.end(sample.stamp, EventKind::Finished { seconds }, &text);
+                }
+                Progress::GoalTooEarly(index) => {
+                    let name = &self.config.stages[index].name;
+                    let text = format!("at the goal, but {name} is not passed yet");
+                    self.tell(sample.stamp, EventKind::Note, &text);
+                }
             }
-            Some(Progress::Finished) => {
-                let text = format!("reached the goal after {seconds:.1} s");
-                self.end(sample.stamp, EventKind::Finished { seconds }, &text);
-            }
-            Some(Progress::GoalTooEarly(index)) => {
-                let text = format!("at the goal, but {} is not passed yet", name(index));
-                self.tell(sample.stamp, EventKind::Note, &text);
-            }
-            None => {}
         }
     }
 
@@ -242,13 +349,19 @@ impl Referee {
     }
 
     fn report_change(&mut self, now: ServerTime) {
-        match self.gate.poll_change() {
-            Some(PoseChange::Lost(age_s)) => {
-                let text = format!("no pose for {:.0} ms", age_s * 1e3);
+        match self.filter.poll_change() {
+            Some(PoseChange::Lost(age_s, why)) => {
+                let why = why.map_or_else(String::new, |why| format!(": {why}"));
+                let text = format!("no pose for {:.0} ms{why}", age_s * 1e3);
                 self.tell(now, EventKind::PoseLost { age_s }, &text);
             }
             Some(PoseChange::Regained) => {
                 self.tell(now, EventKind::PoseRegained, "poses are back");
+            }
+            Some(PoseChange::ImuLeftOut) => {
+                let text = "the autopilot's IMU contradicts the poses and is left out: is the \
+                            object's frame turned against the autopilot?";
+                self.tell(now, EventKind::Note, text);
             }
             None => {}
         }
@@ -265,11 +378,6 @@ impl Referee {
         // Bounded: each kind of end is said once a flight, and the server drains after every call.
         self.events.push_back(Event { stamp, kind, text: bounded(text) });
     }
-}
-
-/// Whether the gate started afresh with this sample: a lone measurement has no twist.
-fn is_jump(sample: &PoseSample) -> bool {
-    sample.resets > 0 && sample.twist == vizflyt_protocol::geometry::Twist::default()
 }
 
 #[cfg(test)]

@@ -99,7 +99,7 @@ fn hall(random: &mut Random) -> (Vec<Volume>, Vec<Ellipsoid>) {
 
 fn bake(splats: Vec<Ellipsoid>, max_m: DVec3, voxel_m: f64) -> DistanceField {
     let grid = Grid::covering(DVec3::ZERO, max_m, voxel_m);
-    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 };
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
     DistanceField::of(OccupancyGrid::bake(splats, &spec))
 }
 
@@ -141,7 +141,7 @@ fn a_wall_has_no_hole_and_lies_within_a_voxel_wherever_its_plane_lies() {
         let (center_m, half_m) = (DVec3::new(x_m, 1.0, 1.0), DVec3::new(0.001, 0.9, 0.9));
         let wall = over_box(center_m, half_m, DQuat::IDENTITY, &mut random);
         let grid = Grid::covering(DVec3::ZERO, DVec3::splat(2.0), 0.05);
-        let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 };
+        let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
         let baked = OccupancyGrid::bake(wall, &spec);
         for (y, z) in (8..32).flat_map(|y| (8..32).map(move |z| (y, z))) {
             let solid = |&x: &usize| baked.is_occupied([x, y, z]);
@@ -188,9 +188,38 @@ fn trunks_are_solid_with_their_feet_and_litter_is_floor() {
 }
 
 #[test]
+fn haze_in_the_air_goes_however_large_and_a_thin_thing_of_many_splats_stays() {
+    let grid = Grid::covering(DVec3::ZERO, DVec3::splat(3.0), 0.05);
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
+    let counts = |splats: &[Ellipsoid], spec: &BakeSpec| {
+        OccupancyGrid::bake(splats.iter().copied(), spec).counts()
+    };
+    let blob = |z: f32| Ellipsoid {
+        center_m: Vec3::new(1.5, 1.5, z),
+        scales_m: Vec3::splat(0.4),
+        rotation: Quat::IDENTITY,
+        opacity: 0.8,
+    };
+    let haze = counts(&[blob(1.6), blob(1.7)], &spec);
+    assert!(haze.occupied == 0 && haze.floating > 1000, "{haze:?}");
+    let kept = counts(&[blob(1.6)], &BakeSpec { min_splats_per_m3: 0.0, ..spec });
+    assert!(kept.occupied > 1000, "{kept:?}");
+    // On the floor it may be a stone; at the side of the grid, a part of something.
+    assert!(counts(&[blob(0.2)], &spec).occupied > 1000);
+    let aside = Ellipsoid { center_m: Vec3::new(0.1, 1.5, 1.6), ..blob(0.0) };
+    assert!(counts(&[aside], &spec).occupied > 1000);
+    // A hanging board.
+    let mut random = Random(3);
+    let half_m = DVec3::new(0.02, 0.4, 0.4);
+    let board = over_box(DVec3::splat(1.5), half_m, DQuat::IDENTITY, &mut random);
+    let board = counts(&board, &spec);
+    assert!(board.floating == 0 && board.occupied > 200, "{board:?}");
+}
+
+#[test]
 fn a_speck_in_the_air_goes_and_a_twig_on_a_trunk_stays() {
     let grid = Grid::covering(DVec3::ZERO, DVec3::splat(2.0), 0.05);
-    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 };
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
     let occupied =
         |splats: &[Ellipsoid]| OccupancyGrid::bake(splats.iter().copied(), &spec).counts().occupied;
     let mut random = Random(9);

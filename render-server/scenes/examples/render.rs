@@ -19,7 +19,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let [kind, seed, file, rest @ ..] = args.as_slice() else {
         return Err(
-            "usage: render forest|race|room SEED FILE.png [SCALE] [x,y,z,yaw,pitch]...".into()
+            "usage: render forest|race|room|moving SEED FILE.png [SCALE] [x,y,z,yaw,pitch]..."
+                .into(),
         );
     };
     let kind: SceneKind = kind.parse()?;
@@ -96,7 +97,7 @@ fn default_poses(kind: SceneKind) -> Vec<Vec<f64>> {
             [32.0, -1.0, 1.2, 0.0, 40.0],
             [36.0, 0.0, 1.2, 0.0, 0.0],
         ],
-        SceneKind::Race | SceneKind::Room => [
+        SceneKind::Race | SceneKind::Room | SceneKind::Moving => [
             [0.9, 0.0, 1.2, 0.0, 0.0],
             [3.2, 0.6, 1.4, 0.0, 0.0],
             [5.0, -0.5, 1.5, 30.0, 0.0],

@@ -11,8 +11,10 @@
 mod canvas;
 mod forest;
 mod hall;
+pub mod projects;
 mod random;
 mod solids;
+mod variant;
 mod write;
 
 use core::fmt;
@@ -20,8 +22,9 @@ use core::str::FromStr;
 
 use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_splat::Splats;
+use vizflyt_splat::{RigidObject, Splats};
 
+pub use variant::{UnknownVariant, Variant};
 pub use write::{WriteError, Written};
 
 /// What can be generated.
@@ -29,15 +32,17 @@ pub use write::{WriteError, Written};
 pub enum SceneKind {
     /// 40 m of trees between start and goal.
     Forest,
-    /// Three racing windows, a wall with a gap, and a window for a rotating hand, in the net.
+    /// Three racing windows, a wall with a gap, and a window with a rotating hand, in the net.
     Race,
     /// The 11 x 4.5 x 3.65 m netted lab, empty.
     Room,
+    /// The lab with a sliding door, a pendulum and a second drone.
+    Moving,
 }
 
 impl SceneKind {
     /// Every kind.
-    pub const ALL: [Self; 3] = [Self::Forest, Self::Race, Self::Room];
+    pub const ALL: [Self; 4] = [Self::Forest, Self::Race, Self::Room, Self::Moving];
 
     /// Returns the kind's name as the command line takes it.
     pub fn name(self) -> &'static str {
@@ -45,6 +50,7 @@ impl SceneKind {
             Self::Forest => "forest",
             Self::Race => "race",
             Self::Room => "room",
+            Self::Moving => "moving",
         }
     }
 }
@@ -68,7 +74,7 @@ impl FromStr for SceneKind {
 
 /// A name that is no [`SceneKind`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no generated scene is called '{0}'; give forest, race or room")]
+#[error("no generated scene is called '{0}'; give forest, race, room or moving")]
 pub struct UnknownScene(pub String);
 
 /// A generated place.
@@ -80,6 +86,12 @@ pub struct Generated {
     pub arena: ArenaConfig,
     /// The true obstacles, and the floor as a half space; not the fence. [m, world]
     pub truth: Vec<Volume>,
+    /// What moves, in the order of `arena.objects`. [m, object]
+    pub objects: Vec<RigidObject>,
+    /// The true solids of each object. [m, object]
+    pub true_objects: Vec<Vec<Volume>>,
+    /// Whether plugins may read the map: then [`Self::write`] stores `map.json` too.
+    pub map_is_known: bool,
 }
 
 /// Generates a scene; the same kind and seed give the same result on every machine.
@@ -99,6 +111,7 @@ pub fn generate(kind: SceneKind, seed: u64) -> Generated {
         SceneKind::Forest => forest::build(seed),
         SceneKind::Race => hall::build_race(seed),
         SceneKind::Room => hall::build_room(seed),
+        SceneKind::Moving => hall::build_moving(seed),
     }
 }
 

@@ -18,6 +18,8 @@ pub struct Written {
     pub arena: PathBuf,
     /// The true solids: a JSON array of `Volume`.
     pub truth: PathBuf,
+    /// The same, for plugins, where the map is known.
+    pub map: Option<PathBuf>,
 }
 
 /// Why a scene could not be stored.
@@ -43,8 +45,9 @@ pub enum WriteError {
 }
 
 impl Generated {
-    /// Writes `scene.ply`, `arena.toml` and `truth.json` into a folder, which is made if absent;
-    /// replaces what has these names.
+    /// Writes `scene.ply`, the splats of each object, `arena.toml`, `truth.json` and
+    /// `truth-objects.json` into a folder, which is made if absent, and `map.json` where the map is
+    /// known; replaces what has these names.
     ///
     /// # Errors
     /// [`WriteError::Io`] and [`WriteError::Splats`] name the file that could not be written.
@@ -58,9 +61,19 @@ impl Generated {
             scene: dir.join(&self.arena.scene),
             arena: dir.join("arena.toml"),
             truth: dir.join("truth.json"),
+            map: self.map_is_known.then(|| dir.join("map.json")),
         };
         ply::write(&written.scene, &self.splats)?;
+        for (config, object) in self.arena.objects.iter().zip(&self.objects) {
+            ply::write(dir.join(&config.scene), &object.splats)?;
+        }
+        let objects = dir.join("truth-objects.json");
+        fs::write(&objects, serde_json::to_string(&self.true_objects)?)
+            .map_err(io_error(&objects))?;
         let truth = serde_json::to_string(&self.truth)?;
+        if let Some(map) = &written.map {
+            fs::write(map, &truth).map_err(io_error(map))?;
+        }
         fs::write(&written.truth, truth).map_err(io_error(&written.truth))?;
         // The arena last: where it stands, the rest is complete.
         let arena = self.arena.to_toml()?;

@@ -45,6 +45,7 @@ pub mod gpu;
 mod harmonics;
 mod image;
 mod limits;
+pub mod models;
 mod rasterizer;
 mod reference;
 mod resilient;

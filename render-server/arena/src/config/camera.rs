@@ -85,6 +85,10 @@ pub struct CameraConfig {
     /// When the network is short, the images of cameras with a higher number go first.
     #[serde(default, skip_serializing_if = "is_normal")]
     pub priority: i32,
+    /// Whether its images come with depth; if not said, they do. Depth that a course withholds does
+    /// not leave the server: plugins get "no return" in every pixel.
+    #[serde(default = "yes", skip_serializing_if = "is_yes")]
+    pub depth: bool,
 }
 
 /// `distortion`: a lens, with the coefficients as OpenCV prints them; those not given are 0.
@@ -166,6 +170,7 @@ impl CameraConfig {
             near_m: Self::NEAR_M,
             rate_hz: None,
             priority: 0,
+            depth: true,
         }
     }
 
@@ -290,6 +295,15 @@ fn is_zero(value: &f64) -> bool {
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
 fn is_normal(priority: &i32) -> bool {
     *priority == 0
+}
+
+fn yes() -> bool {
+    true
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+fn is_yes(value: &bool) -> bool {
+    *value
 }
 
 /// A camera further from the body than this is a typing error. [m]

@@ -74,6 +74,40 @@ fn conversions_keep_frames_and_units() {
 }
 
 #[test]
+fn bodies_and_no_fly_boxes_are_read_and_checked() {
+    let parts = r#"
+[[body]]
+from_m = [0.0, -0.08, 0.0]
+to_m = [0.0, 0.08, 0.0]
+radius_m = 0.03
+[[body]]
+from_m = [0.0, 0.0, 0.02]
+radius_m = 0.06
+[[no_fly]]
+name = "table"
+min_m = [5.0, -1.0, 0.0]
+max_m = [6.0, 1.0, 0.8]
+"#;
+    let text = format!("{FOREST}{parts}");
+    let arena = ArenaConfig::parse(&text).unwrap();
+    assert_eq!((arena.body.len(), arena.body[1].to_m), (2, None));
+    let info = arena.info();
+    assert!((info.no_fly[0].signed_distance_m(DVec3::new(5.5, 0.0, 1.0)) - 0.2).abs() < 1e-12);
+    assert_eq!(ArenaConfig::parse(&arena.to_toml().unwrap()).unwrap(), arena);
+    let refused = |from: &str, to: &str, part: &str| {
+        assert!(text.contains(from), "{from}");
+        let message = ArenaConfig::parse(&text.replace(from, to)).unwrap_err().to_string();
+        assert!(message.contains(part), "{message:?} lacks {part:?}");
+    };
+    refused("[0.0, 0.08, 0.0]", "[0.0, 0.1, 0.0]", "body[0].to_m");
+    refused("radius_m = 0.06", "radius_m = nan", "body[1].radius_m = NaN");
+    refused("max_m = [6.0, 1.0, 0.8]", "max_m = [6.0, -1.0, 0.8]", "no_fly[0].max_m");
+    refused("min_m = [5.0, -1.0, 0.0]", "min_m = [1.05, -1.0, 0.0]", "spawn at");
+    refused("max_m = [6.0, 1.0, 0.8]", "max_m = [12.0, 1.0, 1.2]", "stage window 1");
+    refused("name = \"table\"", "name = \"\"", "no_fly[0].name");
+}
+
+#[test]
 fn toml_errors_point_at_the_line() {
     check_refused("time_limit_s = 60.0", "time_limit = 60.0", &["line 6", "time_limit"]);
     check_refused("radius_m = 1.0", "radius_m = \"one\"", &["line 12", "f64"]);

@@ -4,10 +4,10 @@ use std::collections::HashSet;
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use vizflyt_protocol::messages::MAX_CAMERAS;
 
-use super::{ArenaConfig, Spawn};
+use super::{ArenaConfig, Spawn, StageConfig};
 
 /// Why an `arena.toml` is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -19,7 +19,7 @@ pub enum ConfigError {
     #[error("{0}")]
     Unwritable(#[from] toml::ser::Error),
     /// A value that cannot work.
-    #[error("{key} = {value}: {advice}")]
+    #[error("{key} = {value}: {advice}{}", in_line(*line))]
     Invalid {
         /// Where in the file: `geofence.max_m`, `cameras[1].name`.
         key: String,
@@ -27,27 +27,49 @@ pub enum ConfigError {
         value: String,
         /// What is wrong and what to do.
         advice: String,
+        /// The line of the key, from 1, where the value came from a text.
+        line: Option<usize>,
     },
 }
 
-pub(super) fn invalid(
+fn in_line(line: Option<usize>) -> String {
+    line.map_or_else(String::new, |line| format!(" (line {line})"))
+}
+
+impl ConfigError {
+    /// Returns the error with the line of its key in the text that was read.
+    pub(super) fn in_text(self, text: &str) -> Self {
+        match self {
+            Self::Invalid { key, value, advice, .. } => {
+                let line = super::line_of(text, &key);
+                Self::Invalid { key, value, advice, line }
+            }
+            other => other,
+        }
+    }
+}
+
+pub(crate) fn invalid(
     key: impl Into<String>,
     value: impl Display,
     advice: impl Into<String>,
 ) -> ConfigError {
-    ConfigError::Invalid { key: key.into(), value: value.to_string(), advice: advice.into() }
+    let (key, value, advice) = (key.into(), value.to_string(), advice.into());
+    ConfigError::Invalid { key, value, advice, line: None }
 }
 
 /// Positions further out than this are typing errors: f32 splats keep 0.1 mm up to here. [m]
 const MAX_COORDINATE_M: f64 = 1000.0;
 /// Bytes of [`vizflyt_protocol::messages::Name`].
 const MAX_NAME_BYTES: usize = 32;
+/// Corners of a stage at most: finer than anyone draws.
+const MAX_CORNERS: usize = 128;
 /// `EventKind::Stage` counts in u8.
 const MAX_STAGES: usize = 255;
 /// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
 const MAX_VOXELS: f64 = 4e8;
 
-pub(super) fn check_number(
+pub(crate) fn check_number(
     key: &str,
     value: f64,
     unit: &str,
@@ -83,6 +105,29 @@ pub(super) fn check_name<'a>(
     Ok(())
 }
 
+fn check_polygon(stage: &StageConfig, key: &str) -> Result<(), ConfigError> {
+    let corners = &stage.polygon_m;
+    if corners.is_empty() {
+        return Ok(());
+    }
+    if !(3..=MAX_CORNERS).contains(&corners.len()) {
+        let advice = format!("give 3 to {MAX_CORNERS} corners, or none for a rectangle");
+        return Err(invalid(key, format!("{} of them", corners.len()), advice));
+    }
+    let half_m = DVec2::new(stage.width_m, stage.height_m) / 2.0 + 1e-9;
+    for (n, corner) in corners.iter().enumerate() {
+        // Positively stated, so that NaN is refused.
+        if !corner.abs().cmple(half_m).all() {
+            let advice = format!(
+                "must lie within width_m = {} and height_m = {} about the centre",
+                stage.width_m, stage.height_m
+            );
+            return Err(invalid(format!("{key}[{n}]"), corner, advice));
+        }
+    }
+    Ok(())
+}
+
 impl ArenaConfig {
     /// Checks every value, and the values against each other.
     ///
@@ -105,11 +150,17 @@ impl ArenaConfig {
         if let Some(altitude_m) = self.limits.max_altitude_m {
             check_number("limits.max_altitude_m", altitude_m, "m", 0.1..=100.0)?;
         }
+        self.pose.check()?;
         self.check_fence_and_points()?;
+        self.check_body()?;
         self.check_occupancy()?;
         self.check_cameras()?;
         self.check_vehicles()?;
-        self.check_stages()
+        self.check_localization()?;
+        self.check_stages()?;
+        self.check_no_fly()?;
+        self.check_objects()?;
+        self.check_rules()
     }
 
     fn check_fence_and_points(&self) -> Result<(), ConfigError> {
@@ -169,6 +220,8 @@ impl ArenaConfig {
         let occupancy = &self.occupancy;
         check_number("occupancy.voxel_m", occupancy.voxel_m, "m", 0.01..=0.5)?;
         check_number("occupancy.min_opacity", occupancy.min_opacity, "", 0.0..=1.0)?;
+        let least = occupancy.min_splats_per_m3;
+        check_number("occupancy.min_splats_per_m3", least, "per m^3 (0 keeps all)", 0.0..=1e6)?;
         let limit = -MAX_COORDINATE_M..=MAX_COORDINATE_M;
         check_number("occupancy.floor_z_m", occupancy.floor_z_m, "m", limit)?;
         if !(occupancy.floor_z_m < self.geofence.max_m.z) {
@@ -220,6 +273,10 @@ impl ArenaConfig {
             let size_m = 2.0 * self.body_radius_m..=100.0;
             check_number(&key("width_m"), stage.width_m, "m", size_m.clone())?;
             check_number(&key("height_m"), stage.height_m, "m", size_m)?;
+            check_number(&key("thickness_m"), stage.thickness_m, "m", 0.0..=100.0)?;
+            let most_m = stage.width_m.min(stage.height_m) / 2.0;
+            check_number(&key("clearance_m"), stage.clearance_m, "m", 0.0..=most_m)?;
+            check_polygon(stage, &key("polygon_m"))?;
             if !(self.geofence().signed_distance_m(stage.center_m) < 0.0) {
                 let advice = format!(
                     "must be inside the geofence {} to {}",

@@ -16,8 +16,11 @@ pub(super) enum Connectivity {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Component {
     pub(super) voxels: usize,
-    low: [u32; 3],
-    high: [u32; 3],
+    /// Splats counted in it.
+    pub(super) splats: u32,
+    /// Its box: first voxel on each axis, and the one after the last.
+    pub(super) low: [u32; 3],
+    pub(super) high: [u32; 3],
 }
 
 impl Component {
@@ -42,6 +45,8 @@ pub(super) struct Runs {
     first: Vec<u32>,
     /// Union-find forest.
     parent: Vec<u32>,
+    /// Splats counted in each run.
+    splats: Vec<u32>,
 }
 
 impl Runs {
@@ -63,7 +68,8 @@ impl Runs {
         }
         first.push(runs.len() as u32);
         let parent = (0..runs.len() as u32).collect();
-        let mut this = Self { size: grid.size, all: runs, first, parent };
+        let splats = vec![0; runs.len()];
+        let mut this = Self { size: grid.size, all: runs, first, parent, splats };
         for x in 0..nx {
             for y in 0..ny {
                 // The neighbours that come before; the others meet this column from their side.
@@ -123,6 +129,16 @@ impl Runs {
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
+    /// Counts a splat in the component that holds a voxel, if one does.
+    pub(super) fn count(&mut self, [x, y, z]: [usize; 3]) {
+        let column = x * self.size[1] + y;
+        let (first, end) = (self.first[column] as usize, self.first[column + 1] as usize);
+        let after = self.all[first..end].partition_point(|run| usize::from(run.end) <= z);
+        if first + after < end && usize::from(self.all[first + after].start) <= z {
+            self.splats[first + after] += 1;
+        }
+    }
+
     /// Writes `value` into the cells of the components that `chosen` picks; returns how many.
     pub(super) fn overwrite(
         mut self,
@@ -130,7 +146,7 @@ impl Runs {
         value: u8,
         chosen: impl Fn(&Component) -> bool,
     ) -> usize {
-        let none = Component { voxels: 0, low: [u32::MAX; 3], high: [0; 3] };
+        let none = Component { voxels: 0, splats: 0, low: [u32::MAX; 3], high: [0; 3] };
         let mut components = vec![none; self.all.len()];
         let [nx, ny, nz] = self.size;
         for column in 0..nx * ny {
@@ -141,6 +157,7 @@ impl Runs {
                 let (x, y) = ((column / ny) as u32, (column % ny) as u32);
                 let component = &mut components[root];
                 component.voxels += (end - start) as usize;
+                component.splats += self.splats[index as usize];
                 for (axis, (low, high)) in [(x, x + 1), (y, y + 1), (start, end)].iter().enumerate()
                 {
                     component.low[axis] = component.low[axis].min(*low);

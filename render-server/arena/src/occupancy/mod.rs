@@ -7,8 +7,9 @@
 //!    [`WIDENING`] so that a surface thinner than a voxel is still seen at voxel centres.
 //! 2. Slabs of x planes in parallel: transmittance at a voxel's centre is the product of
 //!    `1 - alpha` over the splats within [`CUTOFF`] standard deviations; opaque enough is occupied.
-//! 3. Small isolated components are floaters of training and go; small enclosed voids (the inside
-//!    of a trunk) become solid.
+//! 3. Floaters of training go: small isolated components, and those that hang in the air with few
+//!    splats for their volume (a blob of haze). Small enclosed voids (the inside of a trunk) become
+//!    solid.
 //! 4. The band above the floor takes what stands above it: grass and litter vanish, trunks keep
 //!    their feet. The floor itself is a plane, no voxels.
 //!
@@ -18,6 +19,8 @@
 //! overlapping, opacity 0.5 is crossed at 1.1 w to 2 w, that is 0.4 to 0.7 voxels for a thin disc:
 //! a layer without holes whose faces lie within one voxel of the plane.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use glam::{DVec3, Mat3, Quat, Vec3};
 use rayon::prelude::*;
 
@@ -25,8 +28,9 @@ use crate::config::ArenaConfig;
 use crate::grid::Grid;
 
 mod components;
+mod object;
 
-use components::{Connectivity, Runs};
+use components::{Component, Connectivity, Runs};
 
 /// A Gaussian as the baker needs it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -50,6 +54,8 @@ pub struct BakeSpec {
     pub min_opacity: f32,
     /// Height of the floor. [m, world]
     pub floor_z_m: f64,
+    /// What hangs in the air with fewer splats in its volume is a floater; 0 keeps all. [1/m^3]
+    pub min_splats_per_m3: f32,
 }
 
 impl BakeSpec {
@@ -63,6 +69,7 @@ impl BakeSpec {
             grid: Grid::covering(min_m, max_m, occupancy.voxel_m),
             min_opacity: occupancy.min_opacity as f32,
             floor_z_m: occupancy.floor_z_m,
+            min_splats_per_m3: occupancy.min_splats_per_m3 as f32,
         }
     }
 }
@@ -95,6 +102,15 @@ pub struct OccupancyGrid {
 impl OccupancyGrid {
     /// Bakes splats.
     pub fn bake(ellipsoids: impl IntoIterator<Item = Ellipsoid>, spec: &BakeSpec) -> Self {
+        Self::bake_with(ellipsoids, spec, &|_| ())
+    }
+
+    /// Bakes splats; `progress` hears the share that is done, 0 to 1, from any thread.
+    pub fn bake_with(
+        ellipsoids: impl IntoIterator<Item = Ellipsoid>,
+        spec: &BakeSpec,
+        progress: &(dyn Fn(f64) + Sync),
+    ) -> Self {
         let grid = spec.grid;
         let mut counts = BakeCounts::default();
         let mut prepared = Vec::new();
@@ -107,21 +123,28 @@ impl OccupancyGrid {
         counts.splats_used = prepared.len();
 
         let mut cells = vec![0; grid.voxels()];
-        splat_into(&prepared, &grid, &mut cells);
+        progress(SPLATS_READ);
+        splat_into(&prepared, &grid, &mut cells, &|share| {
+            progress(SPLATS_READ + (SPLATS_LAID - SPLATS_READ) * share);
+        });
+        let mut runs = Runs::of(&cells, &grid, 1, Connectivity::Corners);
+        for splat in &prepared {
+            if let Some(voxel) = splat.voxel(&grid, &cells) {
+                runs.count(voxel);
+            }
+        }
         drop(prepared);
-
-        let floater_voxels = (FLOATER_EXTENT_M / grid.voxel_m).round() as usize;
-        counts.floating = Runs::of(&cells, &grid, 1, Connectivity::Corners).overwrite(
-            &mut cells,
-            0,
-            |component| component.extent() < floater_voxels,
-        );
+        let floaters = Floaters::of(spec);
+        counts.floating =
+            runs.overwrite(&mut cells, 0, |component| floaters.contain(component, &grid));
+        progress(FLOATERS_GONE);
         stand_on_floor(&mut cells, spec);
         let void_voxels = (VOID_M3 / grid.voxel_m.powi(3)) as usize;
         counts.enclosed =
             Runs::of(&cells, &grid, 0, Connectivity::Faces)
                 .overwrite(&mut cells, 1, |component| component.voxels < void_voxels);
         counts.occupied = cells.iter().map(|&cell| usize::from(cell)).sum();
+        progress(1.0);
         Self { grid, cells, floor_z_m: spec.floor_z_m, counts }
     }
 
@@ -138,6 +161,37 @@ impl OccupancyGrid {
     /// Whether a voxel is occupied.
     pub fn is_occupied(&self, voxel: [usize; 3]) -> bool {
         self.cells[self.grid.index(voxel)] == 1
+    }
+}
+
+/// What of the occupied is a leftover of training.
+struct Floaters {
+    /// Below this extent. [voxels]
+    extent: usize,
+    /// With fewer splats in a voxel, if it hangs in the air.
+    splats_per_voxel: f32,
+    /// Hanging means above this layer.
+    floor_layers: usize,
+}
+
+impl Floaters {
+    fn of(spec: &BakeSpec) -> Self {
+        let voxel_m = spec.grid.voxel_m;
+        Self {
+            extent: (FLOATER_EXTENT_M / voxel_m).round() as usize,
+            splats_per_voxel: spec.min_splats_per_m3 * voxel_m.powi(3) as f32,
+            floor_layers: floor_layers(spec),
+        }
+    }
+
+    /// Small, or a thin haze that touches neither the floor nor the end of what is known: there it
+    /// may go on.
+    fn contain(&self, component: &Component, grid: &Grid) -> bool {
+        let hangs = component.low[2] as usize > self.floor_layers
+            && component.low.iter().all(|&low| low > 0)
+            && component.high.iter().zip(grid.size).all(|(&high, size)| (high as usize) < size);
+        let sparse = (component.splats as f32) < self.splats_per_voxel * component.voxels as f32;
+        component.extent() < self.extent || hangs && sparse
     }
 }
 
@@ -191,6 +245,19 @@ impl Prepared {
         Some(Self { center, form, opacity: opacity.min(0.999), half })
     }
 
+    /// Returns the occupied voxel that holds the centre, or one beside it: the middle of a thin disc
+    /// may lie between voxel centres.
+    fn voxel(&self, grid: &Grid, cells: &[u8]) -> Option<[usize; 3]> {
+        let beside = [Vec3::ZERO, Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z];
+        let size = Vec3::from_array(grid.size.map(|n| n as f32));
+        beside.into_iter().find_map(|aside| {
+            let at = (self.center + aside).floor();
+            let inside = at.cmpge(Vec3::ZERO).all() && at.cmplt(size).all();
+            let voxel = at.to_array().map(|n| n as usize);
+            (inside && cells[grid.index(voxel)] == 1).then_some(voxel)
+        })
+    }
+
     /// Returns the voxels whose centres lie between `low` and `high` on an axis of `size`.
     fn span(center: f32, half: f32, size: usize) -> std::ops::Range<usize> {
         let first = (center - half - 0.5).ceil().max(0.0) as usize;
@@ -227,7 +294,7 @@ impl Prepared {
 }
 
 /// Marks voxels whose centre is opaque.
-fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8]) {
+fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8], progress: &(dyn Fn(f64) + Sync)) {
     let slabs = grid.size[0].div_ceil(SLAB_PLANES);
     let slabs_of = |splat: &Prepared| {
         let xs = Prepared::span(splat.center.x, splat.half.x, grid.size[0]);
@@ -251,9 +318,12 @@ fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8]) {
             next[slab] += 1;
         }
     }
+    let done = AtomicUsize::new(0);
     cells.par_chunks_mut(SLAB_PLANES * grid.plane()).enumerate().for_each_init(
         Vec::new,
         |transmittance: &mut Vec<f32>, (slab, cells)| {
+            let before = done.fetch_add(1, Ordering::Relaxed);
+            progress(before as f64 / slabs as f64);
             let members = &members[starts[slab]..starts[slab + 1]];
             if members.is_empty() {
                 return;
@@ -274,15 +344,19 @@ fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8]) {
 
 /// Gives the band above the floor what stands right above the band.
 fn stand_on_floor(cells: &mut [u8], spec: &BakeSpec) {
-    let grid = &spec.grid;
-    let band_top_m = spec.floor_z_m + FLOOR_BAND_M;
-    // Layers whose centre lies below the top of the band.
-    let layers = ((band_top_m - grid.min_m.z) / grid.voxel_m - 0.5).ceil().max(0.0) as usize;
-    let layers = layers.min(grid.size[2] - 1);
-    for column in cells.chunks_exact_mut(grid.size[2]) {
+    let layers = floor_layers(spec);
+    for column in cells.chunks_exact_mut(spec.grid.size[2]) {
         let above = column[layers];
         column[..layers].fill(above);
     }
+}
+
+/// Returns how many layers lie in the band above the floor, by their centres.
+fn floor_layers(spec: &BakeSpec) -> usize {
+    let grid = &spec.grid;
+    let band_top_m = spec.floor_z_m + FLOOR_BAND_M;
+    let layers = ((band_top_m - grid.min_m.z) / grid.voxel_m - 0.5).ceil().max(0.0) as usize;
+    layers.min(grid.size[2] - 1)
 }
 
 /// Standard deviation by which splats are widened, so that a thin surface leaves no holes between
@@ -297,6 +371,10 @@ const OPAQUE: f32 = 0.5;
 /// Obstacles this far outside the geofence are baked too: the body's surface may touch the fence,
 /// and a vehicle that left it still wants to know. [m]
 const MARGIN_M: f64 = 0.5;
+/// Parts of the work that are done with the splats read, laid into voxels, and the floaters gone.
+const SPLATS_READ: f64 = 0.1;
+const SPLATS_LAID: f64 = 0.8;
+const FLOATERS_GONE: f64 = 0.9;
 /// Occupied components whose largest side is shorter are floaters of training. [m]
 const FLOATER_EXTENT_M: f64 = 0.25;
 /// Free components smaller than this are voids inside something solid. [m^3]

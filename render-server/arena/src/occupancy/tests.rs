@@ -18,7 +18,7 @@ fn disc(center: DVec3, normal: DVec3, spread_m: f32) -> Ellipsoid {
 
 fn field(splats: Vec<Ellipsoid>) -> DistanceField {
     let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
-    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 };
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
     DistanceField::of(OccupancyGrid::bake(splats, &spec))
 }
 
@@ -99,7 +99,11 @@ fn faint_splats_floaters_and_litter_are_no_obstacles() {
         .collect();
     let counts = |splats: Vec<Ellipsoid>| {
         let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
-        OccupancyGrid::bake(splats, &BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0 }).counts()
+        OccupancyGrid::bake(
+            splats,
+            &BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 },
+        )
+        .counts()
     };
     let found = counts(faint);
     assert_eq!((found.occupied, found.splats_left_out), (0, 400));
@@ -131,7 +135,7 @@ proptest! {
             opacity,
         };
         let grid = Grid::covering(DVec3::splat(-0.5), DVec3::splat(0.5), 0.1);
-        let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: -0.5 };
+        let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: -0.5, min_splats_per_m3: 30.0 };
         let baked = OccupancyGrid::bake([strange], &spec);
         prop_assert!(baked.counts().occupied <= grid.voxels());
         let field = DistanceField::of(baked);

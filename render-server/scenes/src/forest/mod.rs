@@ -13,7 +13,8 @@ mod site;
 
 use glam::DVec3;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, Geofence, Goal, Occupancy, Spawn};
+use vizflyt_arena::config::{CameraConfig, Geofence, Goal, Occupancy, RulesConfig, Spawn};
+use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::messages::Limits;
 
 use crate::Generated;
@@ -42,7 +43,14 @@ fn build_layers(seed: u64, layers: &[fn(&mut Canvas, &Site, &Light)]) -> Generat
         layer(&mut canvas, &site, &light);
     }
     backdrop::paint_backdrop(&mut canvas, &site);
-    Generated { splats: canvas.finish(), arena: arena(&site), truth: solids.into_volumes() }
+    Generated {
+        splats: canvas.finish(),
+        arena: arena(&site),
+        truth: solids.into_volumes(),
+        objects: Vec::new(),
+        true_objects: Vec::new(),
+        map_is_known: false,
+    }
 }
 
 fn arena(site: &Site) -> ArenaConfig {
@@ -61,10 +69,16 @@ fn arena(site: &Site) -> ArenaConfig {
             max_m: DVec3::new(41.0, FENCE_Y_M, 4.0),
         },
         limits: Limits::new(6.0, 8.0),
+        body: Vec::new(),
+        no_fly: Vec::new(),
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        pose: PoseConfig::default(),
         vehicles: Vec::new(),
+        localization: Vec::new(),
         stages: Vec::new(),
+        objects: Vec::new(),
+        rules: RulesConfig::default(),
     }
 }
 

@@ -56,6 +56,7 @@ impl GapWall {
             normal: DVec3::X,
             width_m: 2.0 * right.min(left),
             height_m: 2.0 * self.half_height_m,
+            ..StageConfig::default()
         }
     }
 

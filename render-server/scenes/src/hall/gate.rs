@@ -30,6 +30,7 @@ impl Gate {
             normal: self.rotation() * DVec3::X,
             width_m: self.opening_m.x,
             height_m: self.opening_m.y,
+            ..StageConfig::default()
         }
     }
 
@@ -79,6 +80,11 @@ impl Gate {
                 Some(Look::matt(if axle { paint(0xd8b23a) } else { colour }))
             });
         }
+    }
+
+    /// Returns a point given in the gate's axes (x along the passage, z up) from its middle. [m, world]
+    pub(crate) fn at(&self, offset_m: DVec3) -> DVec3 {
+        self.center_m + self.rotation() * offset_m
     }
 
     fn rotation(&self) -> DQuat {

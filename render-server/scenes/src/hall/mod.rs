@@ -8,13 +8,17 @@ mod furniture;
 mod gap;
 mod gate;
 mod light;
+mod moving;
 mod panel;
+mod pillars;
 mod shell;
 mod texture;
 
 use glam::{DVec2, DVec3};
+use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{Geofence, Goal, Occupancy, Spawn, StageConfig};
+use vizflyt_arena::config::{Geofence, Goal, Occupancy, RulesConfig, Spawn, StageConfig};
+use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::Limits;
 
@@ -26,8 +30,30 @@ use crate::solids::Solids;
 use gap::GapWall;
 use gate::Gate;
 use light::HallLight;
-use panel::{Block, Painter};
+use moving::{HAND_M, Made, Movers};
+use panel::{Block, Grain, Look, Painter};
+use pillars::Pillars;
 use shell::{NET_MAX_M, NET_MIN_M, Shell};
+
+/// What stands in the net, along the flight in this order.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct Layout {
+    /// Racing windows; at most as many as have colours, three.
+    pub(crate) windows: usize,
+    /// Whether a wall with a gap follows them.
+    pub(crate) gap: bool,
+    /// Whether a window with a rotating hand comes last.
+    pub(crate) hand: bool,
+    /// Whether pillars stand where there is room.
+    pub(crate) pillars: bool,
+    /// Whether a door slides in a doorway.
+    pub(crate) door: bool,
+    /// Whether a pendulum swings across the way.
+    pub(crate) pendulum: bool,
+    /// Whether another drone flies to and fro.
+    pub(crate) drone: bool,
+}
 
 /// Returns the empty netted room of a seed.
 pub(crate) fn build_room(seed: u64) -> Generated {
@@ -35,11 +61,23 @@ pub(crate) fn build_room(seed: u64) -> Generated {
     build(seed, "room", &Course::default(), goal, 3.0)
 }
 
-/// Returns the race of a seed.
+/// Returns the race of a seed: everything that stands in a course, one behind the other.
 pub(crate) fn build_race(seed: u64) -> Generated {
-    let course = Course::draw(seed);
+    let layout = Layout { windows: 3, gap: true, hand: true, ..Layout::default() };
+    build_course(seed, "race", layout)
+}
+
+/// Returns the net of a seed with things in it that move by themselves.
+pub(crate) fn build_moving(seed: u64) -> Generated {
+    let layout = Layout { door: true, pendulum: true, drone: true, ..Layout::default() };
+    build_course(seed, "moving", layout)
+}
+
+/// Returns the net of a seed with a layout in it.
+pub(crate) fn build_course(seed: u64, name: &str, layout: Layout) -> Generated {
+    let course = Course::draw(seed, layout);
     let goal = Goal { position_m: DVec3::new(10.3, 0.0, 1.2), radius_m: 0.5 };
-    build(seed, "race", &course, goal, 4.0)
+    build(seed, name, &course, goal, 4.0)
 }
 
 /// What stands in the net.
@@ -48,10 +86,13 @@ struct Course {
     windows: Vec<Gate>,
     gap: Option<GapWall>,
     hand: Option<Gate>,
+    pillars: Pillars,
+    doorway: Vec<Block>,
+    movers: Movers,
 }
 
 impl Course {
-    fn draw(seed: u64) -> Self {
+    fn draw(seed: u64, layout: Layout) -> Self {
         let mut rng = Rng::new(seed, 31);
         let mut side = if rng.chance(0.5) { 1.0 } else { -1.0 };
         let mut windows = Vec::new();
@@ -61,8 +102,13 @@ impl Course {
             } else {
                 DVec2::splat(rng.range(1.0, 1.35))
             };
-            // The lower bar stays a hand above the floor, the upper below the net.
-            let z_m = rng.range(0.25 + opening_m.y / 2.0 + 0.2, 1.85);
+            // The lower bar stays a hand above the floor, the upper below the net; a hand that
+            // turns needs its own length below the motor.
+            let z_m = if with_hub {
+                HAND_M + 0.06 + opening_m.y / 2.0 + rng.range(0.0, 0.2)
+            } else {
+                rng.range(0.25 + opening_m.y / 2.0 + 0.2, 1.85)
+            };
             Gate {
                 center_m: DVec3::new(x_m + rng.spread(0.1), side * rng.range(0.1, 0.75), z_m),
                 yaw_rad: rng.spread(20f64.to_radians()),
@@ -71,16 +117,34 @@ impl Course {
                 with_hub,
             }
         };
+        let mut places = layout.places_m().into_iter();
         let colours = [(0xd81f2a, 0xf6f2ea), (0x1f54d8, 0xf2d21f), (0xe0218a, 0x1c1c22)];
-        for (n, (bar, stripe)) in colours.into_iter().enumerate() {
-            let x_m = 2.3 + 1.65 * n as f64;
+        for ((bar, stripe), x_m) in colours.into_iter().zip(places.by_ref().take(layout.windows)) {
             windows.push(place(&mut rng, x_m, side, (paint(bar), paint(stripe)), false));
             side = -side;
         }
-        let gap = GapWall::draw(seed, &mut rng, 7.25, side);
+        let gap = layout.gap.then(|| places.next()).flatten();
+        let gap = gap.map(|x_m| GapWall::draw(seed, &mut rng, x_m, side));
+        let hand = layout.hand.then(|| places.next()).flatten();
         let colours = (paint(0xf08a12), paint(0x14181c));
-        let hand = place(&mut rng, 8.95, -side, colours, true);
-        Self { windows, gap: Some(gap), hand: Some(hand) }
+        let hand = hand.map(|x_m| place(&mut rng, x_m, -side, colours, true));
+        let pillars = if layout.pillars { Pillars::draw(seed) } else { Pillars::default() };
+        let mut movers = Movers::default();
+        if let Some(gate) = &hand {
+            movers.add_hand(seed, gate);
+        }
+        let mut doorway = Vec::new();
+        if layout.door {
+            movers.add_door(seed, DOOR_M);
+            doorway.extend(moving::doorway(DOOR_M));
+        }
+        if layout.pendulum {
+            movers.add_pendulum(seed, PENDULUM_M);
+        }
+        if layout.drone {
+            movers.add_drone(seed, DRONE_M);
+        }
+        Self { windows, gap, hand, pillars, doorway, movers }
     }
 
     fn gates(&self) -> impl Iterator<Item = &Gate> {
@@ -99,14 +163,38 @@ impl Course {
 
     fn blocks(&self) -> Vec<Block> {
         let gap = self.gap.iter().flat_map(GapWall::blocks);
-        self.gates().flat_map(Gate::blocks).chain(gap).collect()
+        let others = self.pillars.blocks().chain(self.doorway.iter().copied());
+        self.gates().flat_map(Gate::blocks).chain(gap).chain(others).collect()
     }
 
     fn casters(&self) -> Vec<Block> {
         let gap = self.gap.iter().flat_map(GapWall::casters);
-        self.gates().flat_map(Gate::blocks).chain(gap).collect()
+        let others = self.pillars.blocks().chain(self.doorway.iter().copied());
+        self.gates().flat_map(Gate::blocks).chain(gap).chain(others).collect()
     }
 }
+
+impl Layout {
+    /// Returns where things stand along x: evenly from the first to the last; one alone stands in
+    /// the middle. [m, world]
+    fn places_m(self) -> Vec<f64> {
+        let count = self.windows + usize::from(self.gap) + usize::from(self.hand);
+        if count == 1 {
+            return vec![f64::midpoint(FIRST_M, LAST_M)];
+        }
+        let step_m = (LAST_M - FIRST_M) / count.saturating_sub(1).max(1) as f64;
+        (0..count).map(|n| FIRST_M + step_m * n as f64).collect()
+    }
+}
+
+/// Where the first thing to fly through stands along x. [m, world]
+const FIRST_M: f64 = 2.3;
+/// And the last: enough room behind it to stop before the net. [m, world]
+const LAST_M: f64 = 8.95;
+/// Where what moves stands along x. [m, world]
+const DOOR_M: f64 = 3.4;
+const PENDULUM_M: f64 = 5.9;
+const DRONE_M: f64 = 8.3;
 
 fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64) -> Generated {
     let shell = Shell::plan(seed);
@@ -129,6 +217,15 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
     if let Some(gap) = &course.gap {
         gap.paint(&mut painter);
     }
+    course.pillars.paint(&mut painter);
+    for block in &course.doorway {
+        let grain = Grain { coarse_m: 0.12, fine_m: 0.05 };
+        painter.cuboid(block, grain, &[4], &|_, p| {
+            let tone = 0.85 + 0.3 * noise2(seed ^ 0x84, p / 0.09);
+            Some(Look::matt(paint(0x9a8f80) * tone))
+        });
+    }
+    let made = course.movers.make(&mut painter);
 
     let splats = painter.canvas.finish();
     let arena = ArenaConfig {
@@ -143,12 +240,27 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         goal: Some(goal),
         geofence: Geofence { min_m: NET_MIN_M - DVec3::Z * 0.5, max_m: NET_MAX_M },
         limits: Limits::new(max_speed_mps, 6.0),
+        body: Vec::new(),
+        no_fly: Vec::new(),
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        pose: PoseConfig::default(),
         vehicles: Vec::new(),
+        localization: Vec::new(),
         stages: course.stages(),
+        rules: RulesConfig::default(),
+        objects: made.iter().map(|made| made.config.clone()).collect(),
     };
-    Generated { splats, arena, truth: solids.into_volumes() }
+    let (objects, true_objects) =
+        made.into_iter().map(|Made { object, truth, .. }| (object, truth)).unzip();
+    Generated {
+        splats,
+        arena,
+        truth: solids.into_volumes(),
+        objects,
+        true_objects,
+        map_is_known: false,
+    }
 }
 
 /// Returns the colour of the floor mats: one-metre tiles with seams, scuffs, and a ring at each
@@ -176,10 +288,20 @@ fn mats(seed: u64, at: DVec2, pads_m: &[DVec3]) -> DVec3 {
 mod tests {
     use super::*;
 
+    const RACE: Layout = Layout {
+        windows: 3,
+        gap: true,
+        hand: true,
+        pillars: false,
+        door: false,
+        pendulum: false,
+        drone: false,
+    };
+
     #[test]
     fn fifty_courses_can_be_flown() {
         for seed in 0..50 {
-            let course = Course::draw(seed);
+            let course = Course::draw(seed, RACE);
             let volumes: Vec<Volume> = course.blocks().iter().map(Block::volume).collect();
             let clearance_m = |p_m: DVec3| {
                 volumes.iter().map(|v| v.signed_distance_m(p_m)).fold(f64::MAX, f64::min)
@@ -214,7 +336,7 @@ mod tests {
 
     #[test]
     fn courses_differ_by_seed() {
-        assert_ne!(Course::draw(1).stages(), Course::draw(2).stages());
-        assert_eq!(Course::draw(1).stages(), Course::draw(1).stages());
+        assert_ne!(Course::draw(1, RACE).stages(), Course::draw(2, RACE).stages());
+        assert_eq!(Course::draw(1, RACE).stages(), Course::draw(1, RACE).stages());
     }
 }

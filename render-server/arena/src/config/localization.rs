@@ -1,0 +1,618 @@
+//! `[[localization]]`: where poses come from, and how the stream's numbers become poses of the
+//! vehicle in the `world` frame.
+//!
+//! ```text
+//! stream's position * units -> axes -> offset ----------------> position  [m, world]
+//! stream's rotation (euler) -> axes on both sides -> nose -----> attitude  (body to world)
+//! ```
+//! Each setting is something a person can see in the room, so that `vizflyt doctor localization`
+//! can name the one to change.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::net::Ipv4Addr;
+use std::str::FromStr;
+
+use glam::{DMat3, DQuat, DVec3, EulerRot};
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+
+use super::ArenaConfig;
+use super::validate::{ConfigError, check_number, check_position, invalid};
+
+/// `[[localization]]`: one source of poses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LocalizationConfig {
+    /// What sends them.
+    pub driver: Driver,
+    /// Where they come from or arrive, as the driver reads it; its usual address if not said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub address: Option<String>,
+    /// Length unit of the stream; the driver's own if not said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub units: Option<Units>,
+    /// The stream's axis that points up; a short form of `axes`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub up: Option<UpAxis>,
+    /// Which of the stream's axes the world's x, y and z are: `xyz` if not said, `x-zy` for y up.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub axes: Option<Axes>,
+    /// Vicon: the order in which its three angles turn about the fixed axes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub euler: Option<Euler>,
+    /// Which of the object's axes points along the vehicle's nose; x if not said.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub nose: Nose,
+    /// Where the stream's origin is in the world, and how it is turned there.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub offset: Offset,
+    /// Where the tracked point is on the vehicle. [m, body]
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub pivot_m: DVec3,
+    /// Names of the vehicles' objects in the stream, where they differ from the vehicles' names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub objects: BTreeMap<String, String>,
+    /// NatNet by multicast: our address in the network that it comes from, where there are several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub interface: Option<Ipv4Addr>,
+}
+
+/// Who sends poses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Driver {
+    /// Vicon Tracker's UDP object stream.
+    Vicon,
+    /// OptiTrack Motive's NatNet 3 and 4.
+    Natnet,
+    /// VizFlyt's own pose packet: JSON over UDP, from any program.
+    Json,
+    /// An autopilot's own estimate over MAVLink.
+    Mavlink,
+}
+
+impl Driver {
+    /// Every driver.
+    pub const ALL: [Self; 4] = [Self::Vicon, Self::Natnet, Self::Json, Self::Mavlink];
+
+    /// Returns the name by which it is chosen.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vicon => "vicon",
+            Self::Natnet => "natnet",
+            Self::Json => "json",
+            Self::Mavlink => "mavlink",
+        }
+    }
+
+    /// Returns where its stream usually arrives.
+    pub fn usual_address(self) -> &'static str {
+        match self {
+            Self::Vicon => "0.0.0.0:51001",
+            // Motive's multicast group and data port, unless someone changed them.
+            Self::Natnet => "239.255.42.99:1511",
+            Self::Json => "0.0.0.0:51002",
+            Self::Mavlink => "0.0.0.0:14560",
+        }
+    }
+
+    /// Returns the length unit that it has unless somebody changed it.
+    pub fn usual_units(self) -> Units {
+        if self == Self::Vicon { Units::Millimetres } else { Units::Metres }
+    }
+}
+
+impl fmt::Display for Driver {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A length unit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Units {
+    /// Metres.
+    #[serde(rename = "m")]
+    Metres,
+    /// Centimetres.
+    #[serde(rename = "cm")]
+    Centimetres,
+    /// Millimetres.
+    #[serde(rename = "mm")]
+    Millimetres,
+}
+
+impl Units {
+    /// Every unit.
+    pub const ALL: [Self; 3] = [Self::Metres, Self::Centimetres, Self::Millimetres];
+
+    /// Returns how many metres one is. [m]
+    pub fn metres(self) -> f64 {
+        match self {
+            Self::Metres => 1.0,
+            Self::Centimetres => 1e-2,
+            Self::Millimetres => 1e-3,
+        }
+    }
+}
+
+impl fmt::Display for Units {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Metres => "m",
+            Self::Centimetres => "cm",
+            Self::Millimetres => "mm",
+        })
+    }
+}
+
+/// Which axis of a stream points up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UpAxis {
+    /// As in the world.
+    Z,
+    /// As Motive does unless told otherwise: x right, y up, z towards the viewer.
+    Y,
+}
+
+impl UpAxis {
+    /// Returns the same as axes.
+    pub fn axes(self) -> Axes {
+        match self {
+            Self::Z => Axes::IDENTITY,
+            Self::Y => Axes([(0, false), (2, true), (1, false)]),
+        }
+    }
+}
+
+/// Which of the stream's axes the world's x, y and z are, each possibly turned round: `x-zy` says
+/// that the world's y is the stream's -z, and its z the stream's y.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Axes([(usize, bool); 3]);
+
+impl Axes {
+    /// `xyz`: the stream's axes are the world's.
+    pub const IDENTITY: Self = Self([(0, false), (1, false), (2, false)]);
+
+    /// Returns all 48, half of them mirrors.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+        orders.into_iter().flat_map(|order| {
+            (0..8).map(move |signs| {
+                Self(std::array::from_fn(|row| (order[row], signs >> row & 1 == 1)))
+            })
+        })
+    }
+
+    /// Returns the matrix that takes the stream's coordinates to the world's.
+    pub fn matrix(self) -> DMat3 {
+        let mut rows = [DVec3::ZERO; 3];
+        for (row, (axis, turned)) in rows.iter_mut().zip(self.0) {
+            row[axis] = if turned { -1.0 } else { 1.0 };
+        }
+        DMat3::from_cols(rows[0], rows[1], rows[2]).transpose()
+    }
+
+    /// Whether left and right are exchanged.
+    pub fn is_mirror(self) -> bool {
+        self.matrix().determinant() < 0.0
+    }
+}
+
+impl FromStr for Axes {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || {
+            format!("'{text}': name each of x, y and z once, with a minus where it is turned: x-zy")
+        };
+        let mut found = Vec::with_capacity(3);
+        let mut turned = false;
+        for letter in text.chars() {
+            match letter {
+                '-' if !turned => turned = true,
+                'x' | 'y' | 'z' => {
+                    found.push((letter as usize - 'x' as usize, std::mem::take(&mut turned)));
+                }
+                _ => return Err(wrong()),
+            }
+        }
+        let axes: [(usize, bool); 3] = found.try_into().map_err(|_| wrong())?;
+        let mut seen = axes.map(|(axis, _)| axis);
+        seen.sort_unstable();
+        if turned || seen != [0, 1, 2] { Err(wrong()) } else { Ok(Self(axes)) }
+    }
+}
+
+impl fmt::Display for Axes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|&(axis, turned)| {
+            write!(f, "{}{}", if turned { "-" } else { "" }, ["x", "y", "z"][axis])
+        })
+    }
+}
+
+/// Text form through `Display` and `FromStr`.
+macro_rules! as_text {
+    ($($type:ty),*) => {$(
+        impl Serialize for $type {
+            fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                serializer.collect_str(self)
+            }
+        }
+        impl<'de> Deserialize<'de> for $type {
+            fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
+            }
+        }
+    )*};
+}
+as_text!(Axes, Euler, Nose);
+
+/// How three angles about x, y and z make a rotation.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Euler {
+    /// `xyz`: about the fixed x first, then the fixed y, then the fixed z: `Rz Ry Rx`.
+    #[default]
+    Xyz,
+    /// `xzy`: `Ry Rz Rx`.
+    Xzy,
+    /// `yxz`: `Rz Rx Ry`.
+    Yxz,
+    /// `yzx`: `Rx Rz Ry`.
+    Yzx,
+    /// `zxy`: `Ry Rx Rz`.
+    Zxy,
+    /// `zyx`: `Rx Ry Rz`, the same as turns about the object's own x, then y, then z.
+    Zyx,
+    /// `vector`: the three are an axis, its length the angle.
+    Vector,
+}
+
+impl Euler {
+    /// Every way.
+    pub const ALL: [Self; 7] =
+        [Self::Xyz, Self::Xzy, Self::Yxz, Self::Yzx, Self::Zxy, Self::Zyx, Self::Vector];
+
+    /// Returns the name by which it is chosen.
+    pub fn name(self) -> &'static str {
+        ["xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "vector"][self as usize]
+    }
+
+    /// The same order as glam has it: about moving axes, so read backwards.
+    fn moving(self) -> Option<EulerRot> {
+        Some(match self {
+            Self::Xyz => EulerRot::ZYX,
+            Self::Xzy => EulerRot::YZX,
+            Self::Yxz => EulerRot::ZXY,
+            Self::Yzx => EulerRot::XZY,
+            Self::Zxy => EulerRot::YXZ,
+            Self::Zyx => EulerRot::XYZ,
+            Self::Vector => return None,
+        })
+    }
+
+    /// Returns where about x, y and z the order's first, second and third turn are, as glam has it.
+    fn places(self) -> [usize; 3] {
+        match self {
+            Self::Xyz | Self::Vector => [2, 1, 0],
+            Self::Xzy => [1, 2, 0],
+            Self::Yxz => [2, 0, 1],
+            Self::Yzx => [0, 2, 1],
+            Self::Zxy => [1, 0, 2],
+            Self::Zyx => [0, 1, 2],
+        }
+    }
+
+    /// Returns the rotation of angles about x, y and z. [rad]
+    pub fn rotation(self, angles_rad: DVec3) -> DQuat {
+        let Some(order) = self.moving() else { return DQuat::from_scaled_axis(angles_rad) };
+        let [a, b, c] = self.places().map(|axis| angles_rad[axis]);
+        DQuat::from_euler(order, a, b, c)
+    }
+
+    /// Returns the angles about x, y and z of a rotation. [rad]
+    pub fn angles(self, rotation: DQuat) -> DVec3 {
+        let Some(order) = self.moving() else { return rotation.to_scaled_axis() };
+        let (a, b, c) = rotation.to_euler(order);
+        let mut angles_rad = DVec3::ZERO;
+        for (axis, value) in self.places().into_iter().zip([a, b, c]) {
+            angles_rad[axis] = value;
+        }
+        angles_rad
+    }
+}
+
+impl fmt::Display for Euler {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Euler {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|euler| euler.name() == text);
+        found.ok_or_else(|| format!("'{text}': write {}", Self::ALL.map(Self::name).join(", ")))
+    }
+}
+
+/// Which of the object's level axes points along the vehicle's nose.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Nose {
+    /// `x`: the object's axes are the body's.
+    #[default]
+    PlusX,
+    /// `y`
+    PlusY,
+    /// `-x`
+    MinusX,
+    /// `-y`
+    MinusY,
+}
+
+impl Nose {
+    /// Every one, counter-clockwise.
+    pub const ALL: [Self; 4] = [Self::PlusX, Self::PlusY, Self::MinusX, Self::MinusY];
+
+    /// Returns the name by which it is chosen.
+    pub fn name(self) -> &'static str {
+        ["x", "y", "-x", "-y"][self as usize]
+    }
+
+    /// Returns the rotation of body axes into the object's.
+    pub fn object_from_body(self) -> DQuat {
+        DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2 * f64::from(self as u8))
+    }
+}
+
+impl fmt::Display for Nose {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Nose {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|nose| nose.name() == text);
+        found.ok_or_else(|| format!("'{text}': write x, y, -x or -y"))
+    }
+}
+
+/// `offset`: where the stream's origin is in the world.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Offset {
+    /// Where it is. [m, world]
+    pub position_m: DVec3,
+    /// How far its x axis is turned from the world's, counter-clockwise. [deg]
+    pub yaw_deg: f64,
+}
+
+/// What takes a stream's numbers to poses; made by [`LocalizationConfig::alignment`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Alignment {
+    /// Metres per unit of the stream. [m]
+    pub unit_m: f64,
+    /// The stream's axes.
+    pub axes: Axes,
+    /// The object's nose.
+    pub nose: Nose,
+    /// The stream's origin.
+    pub offset: Offset,
+    /// The tracked point. [m, body]
+    pub pivot_m: DVec3,
+}
+
+impl Alignment {
+    /// Returns where the vehicle is, given the object's position and the rotation of its axes into
+    /// the stream's, both as streamed.
+    ///
+    /// ```
+    /// use glam::{DQuat, DVec3};
+    /// use vizflyt_arena::config::LocalizationConfig;
+    /// // Motive as installed, y up: 1 m up is y, and a turn to the left is one about y.
+    /// let config = LocalizationConfig::parse("natnet:1.2.3.4,up=y").unwrap();
+    /// let left = DQuat::from_rotation_y(0.5);
+    /// let pose = config.alignment().world_from_body(DVec3::new(0.0, 1.0, 2.0), left);
+    /// assert!((pose.translation_m - DVec3::new(0.0, -2.0, 1.0)).length() < 1e-12);
+    /// assert!((pose.rotation.to_scaled_axis() - DVec3::Z * 0.5).length() < 1e-12);
+    /// ```
+    pub fn world_from_body(&self, p_stream: DVec3, stream_from_object: DQuat) -> Pose<World, Body> {
+        let turn = DQuat::from_rotation_z(self.offset.yaw_deg.to_radians());
+        let axes = self.axes.matrix();
+        let p_m = turn * (axes * (p_stream * self.unit_m)) + self.offset.position_m;
+        let rotation = (turn * conjugated(axes, stream_from_object) * self.nose.object_from_body())
+            .normalize();
+        Pose::new(p_m - rotation * self.pivot_m, rotation)
+    }
+
+    /// Returns what was streamed: the way back.
+    pub fn streamed(&self, pose: &Pose<World, Body>) -> (DVec3, DQuat) {
+        let turn = DQuat::from_rotation_z(self.offset.yaw_deg.to_radians()).conjugate();
+        let back = self.axes.matrix().transpose();
+        let p_m = pose.translation_m + pose.rotation * self.pivot_m - self.offset.position_m;
+        let rotation = turn * pose.rotation * self.nose.object_from_body().conjugate();
+        (back * (turn * p_m) / self.unit_m, conjugated(back, rotation))
+    }
+}
+
+/// Returns a rotation as seen from axes that are exchanged, turned or mirrored.
+fn conjugated(axes: DMat3, rotation: DQuat) -> DQuat {
+    // The axis of a rotation is a pseudovector: a mirror turns the sense.
+    let axis = axes.determinant() * (axes * rotation.xyz());
+    DQuat::from_xyzw(axis.x, axis.y, axis.z, rotation.w)
+}
+
+impl LocalizationConfig {
+    /// Makes a source with everything as usual.
+    pub fn new(driver: Driver) -> Self {
+        Self {
+            driver,
+            address: None,
+            units: None,
+            up: None,
+            axes: None,
+            euler: None,
+            nose: Nose::default(),
+            offset: Offset::default(),
+            pivot_m: DVec3::ZERO,
+            objects: BTreeMap::new(),
+            interface: None,
+        }
+    }
+
+    /// Reads `DRIVER[:ADDRESS][,KEY=VALUE...]`, as the command line has it; keys and values are those
+    /// of `[[localization]]`, lists in brackets: `pivot_m=[0.02,0,0.05]`.
+    ///
+    /// # Errors
+    /// Says what is wrong, and what could stand there.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let (head, settings) = text.split_once(',').unwrap_or((text, ""));
+        let (driver, address) = head.split_once(':').map_or((head, None), |(d, a)| (d, Some(a)));
+        let mut table = toml::Table::new();
+        table.insert("driver".to_owned(), driver.into());
+        if let Some(address) = address {
+            table.insert("address".to_owned(), address.into());
+        }
+        let mut settings = settings;
+        while !settings.is_empty() {
+            let (setting, rest) = first_setting(settings);
+            settings = rest;
+            if setting.is_empty() {
+                continue;
+            }
+            let (key, value) = setting
+                .split_once('=')
+                .ok_or_else(|| format!("'{setting}': write KEY=VALUE, as units=mm"))?;
+            let read = toml::Value::from_str(value).ok();
+            if value.starts_with('[') && read.is_none() {
+                return Err(format!("'{setting}': write a place as [x,y,z]"));
+            }
+            // Names are text even if they are numbers.
+            let value = read
+                .filter(|value| value.is_str() || !key.starts_with("objects."))
+                .unwrap_or_else(|| value.into());
+            insert(&mut table, key, value)?;
+        }
+        let config: Self = table.try_into().map_err(|error: toml::de::Error| {
+            format!(
+                "{}; write DRIVER:ADDRESS,KEY=VALUE; drivers are {}",
+                error.message(),
+                Driver::ALL.map(Driver::name).join(", ")
+            )
+        })?;
+        config.check("--pose").map_err(|error| error.to_string())?;
+        Ok(config)
+    }
+
+    /// Returns where its stream arrives.
+    pub fn address(&self) -> &str {
+        self.address.as_deref().unwrap_or(self.driver.usual_address())
+    }
+
+    /// Returns the axes, said in either way.
+    pub fn stream_axes(&self) -> Axes {
+        self.axes.unwrap_or_else(|| self.up.map_or(Axes::IDENTITY, UpAxis::axes))
+    }
+
+    /// Returns what takes the stream's numbers to poses.
+    pub fn alignment(&self) -> Alignment {
+        Alignment {
+            unit_m: self.units.unwrap_or(self.driver.usual_units()).metres(),
+            axes: self.stream_axes(),
+            nose: self.nose,
+            offset: self.offset,
+            pivot_m: self.pivot_m,
+        }
+    }
+
+    /// Returns the name of a vehicle's object in the stream.
+    pub fn object_of<'a>(&'a self, vehicle: &'a str) -> &'a str {
+        self.objects.get(vehicle).map_or(vehicle, String::as_str)
+    }
+
+    fn check(&self, key: &str) -> Result<(), ConfigError> {
+        if let (Some(_), Some(axes)) = (self.up, self.axes) {
+            let advice = "`up` is a short form of `axes`: leave one of them out";
+            return Err(invalid(format!("{key}.axes"), axes, advice));
+        }
+        if self.euler.is_some() && self.driver != Driver::Vicon {
+            let advice = "only Vicon streams angles; the others stream quaternions";
+            return Err(invalid(format!("{key}.euler"), self.euler.unwrap_or_default(), advice));
+        }
+        if let Some(interface) = self.interface.filter(|_| self.driver != Driver::Natnet) {
+            let advice = "only NatNet comes by multicast; for others, put it into `address`";
+            return Err(invalid(format!("{key}.interface"), interface, advice));
+        }
+        check_position(&format!("{key}.offset.position_m"), self.offset.position_m)?;
+        check_position(&format!("{key}.pivot_m"), self.pivot_m)?;
+        check_number(
+            &format!("{key}.offset.yaw_deg"),
+            self.offset.yaw_deg,
+            "degrees",
+            -360.0..=360.0,
+        )
+    }
+}
+
+/// Cuts the first setting off several, KEY=VALUE and commas: those within a list's brackets, or quotes, part nothing.
+fn first_setting(settings: &str) -> (&str, &str) {
+    let value = settings.find('=').map_or(settings.len(), |equals| equals + 1);
+    let within = match settings[value..].chars().next() {
+        // Of nested lists nothing is made: no setting is one.
+        Some('[') => Some(settings[value..].find(']').unwrap_or(settings.len() - value)),
+        Some(quote @ ('"' | '\'')) => settings[value + 1..].find(quote).map(|end| end + 1),
+        _ => None,
+    };
+    // Before the sign there may be a comma still: of a setting without a value.
+    let comma = settings[..value].find(',');
+    let comma = comma.or_else(|| {
+        let from = value + within.unwrap_or(0);
+        settings[from..].find(',').map(|place| from + place)
+    });
+    comma.map_or((settings, ""), |comma| (&settings[..comma], &settings[comma + 1..]))
+}
+
+/// Puts a value under a key of one or several parts: `offset.yaw_deg`.
+fn insert(table: &mut toml::Table, key: &str, value: toml::Value) -> Result<(), String> {
+    let Some((outer, inner)) = key.split_once('.') else {
+        table.insert(key.to_owned(), value);
+        return Ok(());
+    };
+    let inside = table.entry(outer).or_insert_with(|| toml::Table::new().into());
+    let inside = inside.as_table_mut().ok_or_else(|| format!("'{outer}' is no table"))?;
+    insert(inside, inner, value)
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
+impl ArenaConfig {
+    pub(super) fn check_localization(&self) -> Result<(), ConfigError> {
+        if self.localization.len() > MAX_SOURCES {
+            let advice = format!("give at most {MAX_SOURCES} [[localization]]");
+            return Err(invalid(
+                "localization",
+                format!("{} of them", self.localization.len()),
+                advice,
+            ));
+        }
+        self.localization
+            .iter()
+            .enumerate()
+            .try_for_each(|(index, source)| source.check(&format!("localization[{index}]")))
+    }
+}
+
+/// Sources of one server at most.
+pub const MAX_SOURCES: usize = 8;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,147 @@
+use super::*;
+use proptest::prelude::*;
+
+fn check(text: &str, expected: &str) {
+    let error = LocalizationConfig::parse(text).unwrap_err();
+    assert!(error.contains(expected), "{text}: {error}");
+}
+
+#[test]
+fn the_command_line_says_what_the_file_says() {
+    let line = "natnet:0.0.0.0:1511,up=y,units=cm,nose=-y,offset.yaw_deg=90,pivot_m=[0.0;0.0]";
+    check(line, "write a place as [x,y,z]");
+    let line = line.split_once(",pivot").unwrap().0;
+    let found = LocalizationConfig::parse(&format!("{line},objects.bee=Body 7")).unwrap();
+    let file = r#"
+        driver = "natnet"
+        address = "0.0.0.0:1511"
+        up = "y"
+        units = "cm"
+        nose = "-y"
+        offset = { yaw_deg = 90 }
+        objects = { bee = "Body 7" }
+    "#;
+    assert_eq!(found, toml::from_str(file).unwrap());
+    assert_eq!((found.object_of("bee"), found.object_of("ant")), ("Body 7", "ant"));
+    let number = LocalizationConfig::parse("natnet,objects.bee=7").unwrap();
+    assert_eq!(number.object_of("bee"), "7");
+    let again: LocalizationConfig = toml::from_str(&toml::to_string(&found).unwrap()).unwrap();
+    assert_eq!(again, found);
+    let line = "json:0.0.0.0:5,pivot_m=[0.02,0,-0.05],offset.position_m=[1.0, -2, 0.5],offset.yaw_deg=90,objects.bee='a,b'";
+    let found = LocalizationConfig::parse(line).unwrap();
+    let file = r#"
+        driver = "json"
+        address = "0.0.0.0:5"
+        pivot_m = [0.02, 0, -0.05]
+        offset = { position_m = [1.0, -2, 0.5], yaw_deg = 90 }
+        objects = { bee = "a,b" }
+    "#;
+    assert_eq!(found, toml::from_str(file).unwrap());
+    let plain = LocalizationConfig::parse("vicon").unwrap();
+    assert_eq!(plain, LocalizationConfig::new(Driver::Vicon));
+    assert_eq!((plain.address(), plain.alignment().unit_m), ("0.0.0.0:51001", 1e-3));
+}
+
+#[test]
+fn what_cannot_be_is_named() {
+    check("vicom:1.2.3.4", "drivers are vicon, natnet, json, mavlink");
+    check("json,units=yd", "unknown variant `yd`");
+    check("json,units", "write KEY=VALUE");
+    check("json,units,pivot_m=[0,0,0]", "'units': write KEY=VALUE");
+    check("json,pivot_m=[0,0,units=cm", "'pivot_m=[0,0,units=cm': write a place as [x,y,z]");
+    check("json,pivot_m=[0;0;0]", "write a place as [x,y,z]");
+    check("json,pivot_m=[0,0]", "write DRIVER:ADDRESS,KEY=VALUE");
+    check("json,pivot_m=0", "write DRIVER:ADDRESS,KEY=VALUE");
+    check("json,pivot_m=[0,0,nan]", "pivot_m");
+    check("json,offset.position_m=[0,0,1e9]", "offset.position_m");
+    check("json,axes=xxy", "name each of x, y and z once");
+    check("json,axes=x-z-", "name each of x, y and z once");
+    check("natnet,up=y,axes=xyz", "leave one of them out");
+    check("json,euler=zyx", "only Vicon streams angles");
+    check("vicon,euler=xyx", "write xyz, xzy,");
+    check("json,interface=1.2.3.4", "only NatNet comes by multicast");
+    check("json,nose=z", "write x, y, -x or -y");
+    check("json,offset.yaw_deg=1000", "give a number from -360 to 360");
+    check("json,colour=red", "colour");
+}
+
+#[test]
+fn there_are_48_axes_half_of_them_mirrors() {
+    let all: std::collections::HashSet<_> = Axes::all().collect();
+    assert_eq!((all.len(), all.iter().filter(|axes| axes.is_mirror()).count()), (48, 24));
+    for axes in all {
+        assert_eq!(axes.to_string().parse(), Ok(axes));
+    }
+    assert_eq!(UpAxis::Y.axes().to_string(), "x-zy");
+    assert!("x-yz".parse::<Axes>().unwrap().is_mirror());
+}
+
+fn rotation() -> impl Strategy<Value = DQuat> {
+    prop::array::uniform4(-1.0..1.0f64)
+        .prop_filter("too short", |q| q.iter().map(|v| v * v).sum::<f64>() > 1e-2)
+        .prop_map(|q| DQuat::from_array(q).normalize())
+}
+
+fn alignment() -> impl Strategy<Value = Alignment> {
+    (0usize..48, 0usize..4, -180.0..180.0f64, 0usize..3).prop_map(|(axes, nose, yaw_deg, unit)| {
+        Alignment {
+            unit_m: Units::ALL[unit].metres(),
+            axes: Axes::all().nth(axes).unwrap(),
+            nose: Nose::ALL[nose],
+            offset: Offset { position_m: DVec3::new(1.0, -2.0, 0.5), yaw_deg },
+            pivot_m: DVec3::new(0.02, 0.0, 0.05),
+        }
+    })
+}
+
+proptest! {
+    /// Whatever is written, it is read or refused; and what has been read reads the same as a file.
+    #[test]
+    fn no_text_breaks_the_reader(text in r#"json(,(pivot_m|offset.position_m|objects.a|units|x)?=?[\[\]"',0-9.a-z-]{0,12}){0,4}"#) {
+        if let Ok(found) = LocalizationConfig::parse(&text) {
+            let again: LocalizationConfig = toml::from_str(&toml::to_string(&found).unwrap()).unwrap();
+            prop_assert_eq!(again, found);
+        }
+    }
+
+    #[test]
+    fn poses_go_there_and_back(a in alignment(), q in rotation(), p in prop::array::uniform3(-5.0..5.0f64)) {
+        let pose = a.world_from_body(DVec3::from(p), q);
+        prop_assert!(pose.is_valid());
+        let (p_back, q_back) = a.streamed(&pose);
+        prop_assert!((p_back - DVec3::from(p)).length() < 1e-6, "{p_back}");
+        prop_assert!(q_back.dot(q).abs() > 1.0 - 1e-9);
+    }
+
+    /// Whatever the axes: a point of the object is where its streamed coordinates say, and the sense
+    /// of turns is right in a mirror too.
+    #[test]
+    fn points_of_the_object_are_carried_along(a in alignment(), q in rotation(), v in prop::array::uniform3(-1.0..1.0f64)) {
+        let a = Alignment { unit_m: 1.0, nose: Nose::PlusX, pivot_m: DVec3::ZERO, ..a };
+        // A vector of the object, as the stream's axes have it, and as the world's do.
+        let v = DVec3::from(v);
+        let turn = DQuat::from_rotation_z(a.offset.yaw_deg.to_radians());
+        let in_world = turn * (a.axes.matrix() * (q * v));
+        let pose = a.world_from_body(DVec3::ZERO, q);
+        prop_assert!((pose.rotate(a.axes.matrix() * v) - in_world).length() < 1e-9);
+    }
+
+    #[test]
+    fn angles_make_the_rotation_that_has_them(q in rotation(), which in 0usize..7) {
+        let euler = Euler::ALL[which];
+        let again = euler.rotation(euler.angles(q));
+        prop_assert!(again.dot(q).abs() > 1.0 - 1e-6, "{euler}");
+    }
+
+    #[test]
+    fn orders_are_of_fixed_axes(a in prop::array::uniform3(-1.5..1.5f64)) {
+        let angles = DVec3::from(a);
+        let [x, y, z] = [DQuat::from_rotation_x(a[0]), DQuat::from_rotation_y(a[1]), DQuat::from_rotation_z(a[2])];
+        for (euler, expected) in [
+            (Euler::Xyz, z * y * x), (Euler::Xzy, y * z * x), (Euler::Yxz, z * x * y),
+            (Euler::Yzx, x * z * y), (Euler::Zxy, y * x * z), (Euler::Zyx, x * y * z),
+        ] {
+            prop_assert!(euler.rotation(angles).dot(expected).abs() > 1.0 - 1e-9, "{}", euler);
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! `[rules]`: what a flight is fined for, beside what ends it.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use super::validate::{ConfigError, check_number, check_position, invalid};
+use super::{ArenaConfig, Geofence};
+
+/// `[rules]`: a start box, and seconds that are added to the time. All of it may be left out: then
+/// nothing is fined.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RulesConfig {
+    /// The body's centre must be in this box at take-off. [m, world]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start_box: Option<Geofence>,
+    /// For a take-off outside of the start box. [s]
+    pub false_start_s: f64,
+    /// Nearer to an obstacle than this is a near miss; 0 is none. [m]
+    pub near_miss_m: f64,
+    /// For each near miss: of one, until it is over. [s]
+    pub near_miss_s: f64,
+}
+
+impl RulesConfig {
+    pub(super) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Returns the fines of a flight: by where it took off [m, world], and its clearances in the order
+    /// of time [m]. [s]
+    ///
+    /// ```
+    /// use glam::DVec3;
+    /// use vizflyt_arena::config::{Geofence, RulesConfig};
+    /// let rules = RulesConfig {
+    ///     start_box: Some(Geofence { min_m: DVec3::ZERO, max_m: DVec3::ONE }),
+    ///     false_start_s: 5.0,
+    ///     near_miss_m: 0.1,
+    ///     near_miss_s: 2.0,
+    /// };
+    /// let clearances_m = [0.5, 0.09, 0.08, 0.5, 0.05];
+    /// assert_eq!(rules.penalty_s(Some(DVec3::splat(0.5)), clearances_m), 4.0);
+    /// assert_eq!(rules.penalty_s(Some(DVec3::splat(1.5)), clearances_m), 9.0);
+    /// assert_eq!(rules.penalty_s(None, []), 0.0);
+    /// ```
+    pub fn penalty_s(
+        &self,
+        took_off_m: Option<DVec3>,
+        clearances_m: impl IntoIterator<Item = f64>,
+    ) -> f64 {
+        let outside = |start: &Geofence, p_m: DVec3| {
+            !(p_m.cmpge(start.min_m).all() && p_m.cmple(start.max_m).all())
+        };
+        let false_start =
+            self.start_box.is_some_and(|start| took_off_m.is_some_and(|p_m| outside(&start, p_m)));
+        let (mut near_misses, mut near) = (0_u32, false);
+        for clearance_m in clearances_m {
+            let now_near = clearance_m < self.near_miss_m;
+            near_misses += u32::from(now_near && !near);
+            near = now_near;
+        }
+        let start_s = if false_start { self.false_start_s } else { 0.0 };
+        start_s + f64::from(near_misses) * self.near_miss_s
+    }
+}
+
+impl ArenaConfig {
+    pub(super) fn check_rules(&self) -> Result<(), ConfigError> {
+        let rules = &self.rules;
+        for (key, value) in
+            [("rules.false_start_s", rules.false_start_s), ("rules.near_miss_s", rules.near_miss_s)]
+        {
+            check_number(key, value, "s", 0.0..=86400.0)?;
+        }
+        check_number("rules.near_miss_m", rules.near_miss_m, "m (0 is none)", 0.0..=2.0)?;
+        let Some(start) = &rules.start_box else { return Ok(()) };
+        check_position("rules.start_box.min_m", start.min_m)?;
+        check_position("rules.start_box.max_m", start.max_m)?;
+        if !start.min_m.cmplt(start.max_m).all() {
+            let advice = format!("must exceed min_m = {} on each axis", start.min_m);
+            return Err(invalid("rules.start_box.max_m", start.max_m, advice));
+        }
+        let spawn_m = self.spawn.position_m;
+        if !(spawn_m.cmpge(start.min_m).all() && spawn_m.cmple(start.max_m).all()) {
+            let advice =
+                format!("the vehicle starts at {spawn_m}, outside of it; move one of them");
+            return Err(invalid("rules.start_box.min_m", start.min_m, advice));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,349 @@
+//! Where the objects of an arena are at any instant: the one clock for picture and referee.
+//!
+//! ```text
+//! [[objects]] of arena.toml, seed -> MovingObjects
+//! nanoseconds since the arena's epoch -> a pose for each object
+//! ```
+//! Pure: the same instant gives the same bits on every machine, however often and in whatever order
+//! it is asked. The epoch is the server's start of the arena, or 0 of a lock-step run. Budget: 0.1 us
+//! for each object; the render thread asks once an image, the referee a few times a pose.
+
+use std::f64::consts::TAU;
+
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Object, Pose, World};
+
+use crate::config::{ArenaConfig, MotionConfig, ObjectConfig};
+
+/// The objects of an arena, each with its motion.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MovingObjects {
+    objects: Vec<MovingObject>,
+}
+
+/// No point of an object moves faster than `linear_mps` plus `angular_radps` times its distance from
+/// the object's origin.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TopSpeed {
+    /// Of the origin. [m/s]
+    pub linear_mps: f64,
+    /// About it. [rad/s]
+    pub angular_radps: f64,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct MovingObject {
+    name: String,
+    rest: Pose<World, Object>,
+    motion: Motion,
+    period_ns: u64,
+    /// What of the period had passed at the epoch.
+    phase_ns: u64,
+}
+
+/// As [`MotionConfig`], ready to be asked.
+#[derive(Clone, Debug, PartialEq)]
+enum Motion {
+    Rotation {
+        /// Unit. [object]
+        axis: DVec3,
+    },
+    Oscillation {
+        slide_m: DVec3,
+        /// Unit, or zero. [object]
+        axis: DVec3,
+        swing_rad: f64,
+    },
+    /// The corners of one round, the first of them again at the end, and how far along each is.
+    Path { corners_m: Vec<DVec3>, along_m: Vec<f64>, speed_mps: f64 },
+}
+
+impl MovingObjects {
+    /// Takes an arena's objects; phases that the arena does not say are drawn from the seed.
+    ///
+    /// ```
+    /// use vizflyt_arena::config::{MotionConfig, ObjectConfig};
+    /// use vizflyt_arena::objects::MovingObjects;
+    /// use glam::DVec3;
+    /// let hand = ObjectConfig {
+    ///     name: "hand".into(),
+    ///     scene: "hand.ply".into(),
+    ///     position_m: DVec3::new(5.0, 0.0, 1.0),
+    ///     yaw_deg: 0.0,
+    ///     phase_s: Some(0.0),
+    ///     motion: MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 },
+    /// };
+    /// let objects = MovingObjects::of(&[hand], 7);
+    /// // A quarter of the turn later what pointed up points to -y.
+    /// let pose = objects.placements(1_000_000_000)[0].unwrap();
+    /// assert!((pose.rotate(DVec3::Z) - DVec3::NEG_Y).length() < 1e-12);
+    /// ```
+    pub fn new(config: &ArenaConfig, seed: u64) -> Self {
+        Self::of(&config.objects, seed)
+    }
+
+    /// As [`Self::new`], of objects alone.
+    pub fn of(objects: &[ObjectConfig], seed: u64) -> Self {
+        let of = |(index, object): (usize, &ObjectConfig)| MovingObject::new(object, index, seed);
+        Self { objects: objects.iter().enumerate().map(of).collect() }
+    }
+
+    /// Returns how many there are.
+    pub fn len(&self) -> usize {
+        self.objects.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.objects.is_empty()
+    }
+
+    /// Returns one of them alone, on the same clock.
+    #[must_use]
+    pub fn only(&self, index: usize) -> Self {
+        Self { objects: vec![self.objects[index].clone()] }
+    }
+
+    /// Returns their names, in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.objects.iter().map(|object| &*object.name)
+    }
+
+    /// Returns where an object is, this long after the epoch, or before it. [ns]
+    pub fn placement(&self, index: usize, since_epoch_ns: i64) -> Pose<World, Object> {
+        self.objects[index].at(since_epoch_ns)
+    }
+
+    /// Returns where all are, as a renderer wants it. [ns]
+    pub fn placements(&self, since_epoch_ns: i64) -> Vec<Option<Pose<World, Object>>> {
+        let mut placements = Vec::with_capacity(self.len());
+        self.place(since_epoch_ns, &mut placements);
+        placements
+    }
+
+    /// Appends where all are; for a loop that brings its own memory. [ns]
+    pub fn place(&self, since_epoch_ns: i64, placements: &mut Vec<Option<Pose<World, Object>>>) {
+        placements.extend(self.objects.iter().map(|object| Some(object.at(since_epoch_ns))));
+    }
+
+    /// Returns how fast an object moves at most.
+    pub fn top_speed(&self, index: usize) -> TopSpeed {
+        self.objects[index].top_speed()
+    }
+}
+
+impl MovingObject {
+    fn new(config: &ObjectConfig, index: usize, seed: u64) -> Self {
+        let (motion, period_s) = match &config.motion {
+            MotionConfig::Rotation { axis, period_s } => {
+                (Motion::Rotation { axis: axis.normalize_or(DVec3::Z) }, *period_s)
+            }
+            MotionConfig::Oscillation { slide_m, axis, swing_deg, period_s } => {
+                let axis = axis.normalize_or_zero();
+                let swing_rad = if axis == DVec3::ZERO { 0.0 } else { swing_deg.to_radians() };
+                (Motion::Oscillation { slide_m: *slide_m, axis, swing_rad }, *period_s)
+            }
+            MotionConfig::Path { points_m, speed_mps, closed } => {
+                let mut corners_m = points_m.clone();
+                if *closed {
+                    corners_m.extend(points_m.first());
+                } else {
+                    corners_m.extend(points_m.iter().rev().skip(1));
+                }
+                let mut length_m = 0.0;
+                let mut along_m = vec![0.0];
+                for pair in corners_m.windows(2) {
+                    length_m += (pair[1] - pair[0]).length();
+                    along_m.push(length_m);
+                }
+                (Motion::Path { corners_m, along_m, speed_mps: *speed_mps }, length_m / speed_mps)
+            }
+        };
+        let period_ns = ((period_s * 1e9).round() as u64).max(1);
+        let phase_ns = match config.phase_s {
+            Some(phase_s) => (phase_s * 1e9).round() as u64 % period_ns,
+            None => lot(seed, index as u64) % period_ns,
+        };
+        let yaw_rad = config.yaw_deg.to_radians();
+        let rest = Pose::new(config.position_m, turn(DVec3::Z, yaw_rad));
+        Self { name: config.name.clone(), rest, motion, period_ns, phase_ns }
+    }
+
+    fn at(&self, since_epoch_ns: i64) -> Pose<World, Object> {
+        // In whole nanoseconds, and wide enough for any instant: no bit is lost as time goes by.
+        let ns = i128::from(since_epoch_ns) + i128::from(self.phase_ns);
+        let into_ns = ns.rem_euclid(i128::from(self.period_ns)) as u64;
+        let share = into_ns as f64 / self.period_ns as f64;
+        let (offset_m, rotation) = match &self.motion {
+            Motion::Rotation { axis } => (DVec3::ZERO, turn(*axis, TAU * share)),
+            Motion::Oscillation { slide_m, axis, swing_rad } => {
+                let side = libm::sin(TAU * share);
+                (*slide_m * side, turn(*axis, *swing_rad * side))
+            }
+            Motion::Path { corners_m, along_m, .. } => {
+                let way_m = share * along_m[along_m.len() - 1];
+                // The last corner that is behind; the first is, at 0.
+                let n = along_m.partition_point(|&at_m| at_m <= way_m).clamp(1, along_m.len() - 1);
+                let leg_m = along_m[n] - along_m[n - 1];
+                let part = if leg_m > 0.0 { (way_m - along_m[n - 1]) / leg_m } else { 0.0 };
+                (corners_m[n - 1].lerp(corners_m[n], part.clamp(0.0, 1.0)), DQuat::IDENTITY)
+            }
+        };
+        let Pose { translation_m, rotation: rest, .. } = self.rest;
+        Pose::new(translation_m + rest * offset_m, (rest * rotation).normalize())
+    }
+
+    fn top_speed(&self) -> TopSpeed {
+        let turns_radps = TAU / (self.period_ns as f64 * 1e-9);
+        match &self.motion {
+            Motion::Rotation { .. } => TopSpeed { linear_mps: 0.0, angular_radps: turns_radps },
+            Motion::Oscillation { slide_m, swing_rad, .. } => TopSpeed {
+                linear_mps: slide_m.length() * turns_radps,
+                angular_radps: swing_rad.abs() * turns_radps,
+            },
+            Motion::Path { speed_mps, .. } => {
+                TopSpeed { linear_mps: *speed_mps, angular_radps: 0.0 }
+            }
+        }
+    }
+}
+
+/// Returns a rotation about a unit axis; with `libm`, so that it is the same on every machine.
+fn turn(axis: DVec3, angle_rad: f64) -> DQuat {
+    let (sin, cos) = libm::sincos(angle_rad / 2.0);
+    DQuat::from_xyzw(axis.x * sin, axis.y * sin, axis.z * sin, cos)
+}
+
+/// Returns a number drawn for the `index`-th object of a seed (SplitMix64, Steele et al. 2014).
+fn lot(seed: u64, index: u64) -> u64 {
+    let mut z = seed.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn object(motion: MotionConfig, phase_s: Option<f64>) -> ObjectConfig {
+        ObjectConfig {
+            name: "thing".into(),
+            scene: "thing.ply".into(),
+            position_m: DVec3::new(1.0, 2.0, 3.0),
+            yaw_deg: 90.0,
+            phase_s,
+            motion,
+        }
+    }
+
+    fn one(motion: MotionConfig) -> MovingObjects {
+        MovingObjects::of(&[object(motion, Some(0.0))], 0)
+    }
+
+    const S: i64 = 1_000_000_000;
+
+    #[test]
+    fn a_hand_turns_evenly_and_for_ever() {
+        let hand = one(MotionConfig::Rotation { axis: DVec3::X * 3.0, period_s: 6.0 });
+        // At rest turned to the left, the hand turns in the plane of x and z.
+        let up_at = |ns| hand.placement(0, ns).rotate(DVec3::Z);
+        assert!((up_at(0) - DVec3::Z).length() < 1e-12);
+        assert!((up_at(S * 3 / 2) - DVec3::X).length() < 1e-12);
+        assert!((up_at(3 * S) + DVec3::Z).length() < 1e-12);
+        // A year later, to the nanosecond: the same bits.
+        let year = 5_256_000 * 6 * S;
+        for ns in [0, 1, 17, S, 6 * S - 1] {
+            assert_eq!(hand.placement(0, year + ns), hand.placement(0, ns));
+            assert_eq!(hand.placement(0, ns - year), hand.placement(0, ns));
+        }
+        // A microsecond is seen: a metre along the hand it is 1 um of way.
+        let moved_m = (up_at(1001) - up_at(1)).length();
+        assert!((moved_m / (TAU / 6.0 * 1e-6) - 1.0).abs() < 1e-6, "{moved_m}");
+    }
+
+    #[test]
+    fn doors_slide_pendulums_swing_and_drones_go_round() {
+        let door = one(MotionConfig::Oscillation {
+            slide_m: DVec3::X * 0.8,
+            axis: DVec3::ZERO,
+            swing_deg: 0.0,
+            period_s: 4.0,
+        });
+        let far = door.placement(0, S);
+        assert!((far.translation_m - DVec3::new(1.0, 2.8, 3.0)).length() < 1e-12);
+        assert!((door.placement(0, 3 * S).translation_m.y - 1.2).abs() < 1e-12);
+        let pendulum = one(MotionConfig::Oscillation {
+            slide_m: DVec3::ZERO,
+            axis: DVec3::X,
+            swing_deg: 90.0,
+            period_s: 4.0,
+        });
+        let down = pendulum.placement(0, S).rotate(DVec3::NEG_Z);
+        assert!((down - DVec3::NEG_X).length() < 1e-12, "{down}");
+        let points_m = vec![DVec3::ZERO, DVec3::X, DVec3::X + DVec3::Y];
+        let path =
+            |closed| one(MotionConfig::Path { points_m: points_m.clone(), speed_mps: 1.0, closed });
+        let at = |objects: &MovingObjects, s: f64| {
+            // In the object's axes at rest, from its rest.
+            let offset_m =
+                objects.placement(0, (s * 1e9) as i64).translation_m - DVec3::new(1.0, 2.0, 3.0);
+            DVec3::new(offset_m.y, -offset_m.x, offset_m.z)
+        };
+        let back = path(false);
+        assert!((at(&back, 1.5) - DVec3::new(1.0, 0.5, 0.0)).length() < 1e-9);
+        assert!((at(&back, 2.5) - DVec3::new(1.0, 0.5, 0.0)).length() < 1e-9);
+        assert!((at(&back, 3.5) - DVec3::new(0.5, 0.0, 0.0)).length() < 1e-9);
+        let round = path(true);
+        let corner = 2.0 + 0.5 * 2f64.sqrt();
+        assert!((at(&round, corner) - DVec3::new(0.5, 0.5, 0.0)).length() < 1e-9);
+    }
+
+    #[test]
+    fn phases_come_from_the_seed_unless_they_are_said() {
+        let motion = MotionConfig::Rotation { axis: DVec3::X, period_s: 6.0 };
+        let drawn = |seed| MovingObjects::of(&[object(motion.clone(), None)], seed);
+        assert_eq!(drawn(3), drawn(3));
+        assert_ne!(drawn(3).placements(0), drawn(4).placements(0));
+        let said = |seed| MovingObjects::of(&[object(motion.clone(), Some(7.5))], seed);
+        assert_eq!(said(3), said(4));
+        assert_eq!(said(3).placements(0), one(motion.clone()).placements(S * 3 / 2));
+    }
+
+    fn motions() -> impl Strategy<Value = MotionConfig> {
+        let vector = || prop::array::uniform3(-2.0..2.0f64).prop_map(DVec3::from);
+        prop_oneof![
+            (vector(), 0.05..20.0f64)
+                .prop_map(|(axis, period_s)| MotionConfig::Rotation { axis, period_s }),
+            (vector(), vector(), -180.0..180.0f64, 0.05..20.0f64).prop_map(
+                |(slide_m, axis, swing_deg, period_s)| MotionConfig::Oscillation {
+                    slide_m,
+                    axis,
+                    swing_deg,
+                    period_s
+                }
+            ),
+            (prop::collection::vec(vector(), 2..6), 0.01..10.0f64, any::<bool>()).prop_map(
+                |(points_m, speed_mps, closed)| MotionConfig::Path { points_m, speed_mps, closed }
+            ),
+        ]
+    }
+
+    proptest! {
+        /// Poses are poses at any instant, and nothing outruns its top speed.
+        #[test]
+        fn no_point_is_faster_than_the_top_speed(
+            motion in motions(), ns in any::<i64>(), step_ns in 1..2_000_000_000i64,
+            p in prop::array::uniform3(-2.0..2.0f64).prop_map(DVec3::from),
+        ) {
+            let objects = MovingObjects::of(&[object(motion, None)], 5);
+            let (a, b) = (objects.placement(0, ns), objects.placement(0, ns.saturating_add(step_ns)));
+            prop_assert!(a.is_valid() && b.is_valid());
+            let TopSpeed { linear_mps, angular_radps } = objects.top_speed(0);
+            let most_m = (linear_mps + angular_radps * p.length()) * step_ns as f64 * 1e-9;
+            let moved_m = (a.transform_point(p) - b.transform_point(p)).length();
+            prop_assert!(moved_m <= most_m * (1.0 + 1e-6) + 1e-8, "{} m of {} m", moved_m, most_m);
+        }
+    }
+}

@@ -1,0 +1,475 @@
+//! Judges measurements by what the filter expects, and keeps the history that late ones need.
+
+use glam::{DMat3, DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, Twist, World};
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::time::ServerTime;
+
+use super::covariance::squares;
+use super::estimate::{Doubt, Estimate};
+use super::history::{History, Input, Record};
+use super::motion::Motion;
+use super::quality::{Fading, PoseQuality, Rejects};
+use super::source::{ClaimKind, Source};
+use super::{ImuReading, MAX_SOURCES, Measured, PoseConfig, PoseSigma, Rejected};
+
+/// What changed about the sources of poses.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PoseChange {
+    /// No believed pose for so long [s], and why the last one was not believed, if one came.
+    Lost(f64, Option<Rejected>),
+    /// Poses are back.
+    Regained,
+    /// The IMU contradicts the poses and is left out from now on.
+    ImuLeftOut,
+}
+
+/// The pose of one vehicle. See [the module](super).
+#[derive(Clone, Debug)]
+pub struct PoseFilter {
+    config: PoseConfig,
+    history: History,
+    sources: [Source; MAX_SOURCES],
+    newest: Option<PoseSample>,
+    /// Why the last measurement was not believed, if it was not.
+    rejected: Option<Rejected>,
+    resets: u8,
+    lost: bool,
+    change: Option<PoseChange>,
+    imu: Imu,
+    /// Intervals of believed poses, and their innovations. [standard deviations]
+    believed: Fading,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Imu {
+    last: Option<ServerTime>,
+    /// How far the gyroscope has turned since the start, less its bias.
+    turned: DQuat,
+    read: u32,
+    refused: u32,
+    left_out: bool,
+}
+
+/// What to make of a measurement.
+enum Verdict {
+    Fits {
+        sigmas: f64,
+    },
+    /// A motion that the model did not foresee.
+    Kink(Doubt),
+    /// The pose changed for another reason than motion.
+    Reset,
+    Rejected(Rejected),
+}
+
+impl Default for PoseFilter {
+    fn default() -> Self {
+        Self::new(&PoseConfig::default())
+    }
+}
+
+impl PoseFilter {
+    /// Makes a filter that knows nothing yet.
+    pub fn new(config: &PoseConfig) -> Self {
+        Self {
+            config: *config,
+            history: History::default(),
+            sources: Default::default(),
+            newest: None,
+            rejected: None,
+            resets: 0,
+            lost: false,
+            change: None,
+            imu: Imu::default(),
+            believed: Fading::default(),
+        }
+    }
+
+    /// Takes a measurement; returns the newest sample if it is believed. Of a measurement of the
+    /// past, that is the former sample by what is now known.
+    pub fn handle_pose(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
+        let index = usize::from(measured.source).min(MAX_SOURCES - 1);
+        match self.take(index, measured) {
+            Ok(sigmas) => {
+                if let Some((_, estimate)) = self.history.newest() {
+                    self.sources[index].believe(measured, estimate, self.imu.turned);
+                }
+                self.believed.add(measured.stamp, sigmas);
+                self.rejected = None;
+                if std::mem::take(&mut self.lost) {
+                    self.change = Some(PoseChange::Regained);
+                }
+                let newest = self.history.newest_pose();
+                let sample = newest.map(|(stamp, estimate)| self.sample(stamp, estimate));
+                self.newest = sample.or(self.newest);
+                self.newest.ok_or(Rejected::Invalid)
+            }
+            Err(reason) => {
+                self.sources[index].reject(&reason);
+                if reason != Rejected::Stale {
+                    self.rejected = Some(reason);
+                }
+                Err(reason)
+            }
+        }
+    }
+
+    /// Returns by how many standard deviations a believed measurement was off.
+    fn take(&mut self, index: usize, measured: &Measured) -> Result<f64, Rejected> {
+        let Measured { stamp, world_from_body: pose, .. } = *measured;
+        if !pose.is_valid() || pose.translation_m.abs().max_element() > FURTHEST_M {
+            return Err(Rejected::Invalid);
+        }
+        self.sources[index].check_stamp(measured)?;
+        let sigma = self.sigma(measured);
+        let long_ago =
+            self.newest.is_none_or(|newest| stamp.seconds_since(newest.stamp) > BEGIN_ANEW_AFTER_S);
+        if long_ago && self.sources[index].pending(measured).is_none() {
+            self.begin(stamp, &pose, &sigma);
+            return Ok(0.0);
+        }
+        if !self.history.reaches(stamp) {
+            return Err(Rejected::Stale);
+        }
+        let imu = &mut self.imu;
+        let prior = self.history.at(stamp, |estimate, record| imu.weigh(estimate, record));
+        let Some(prior) = prior else { return Err(Rejected::Stale) };
+        let noise = self.sources[index].noise_factor();
+        let verdict = self.judge(index, measured, &sigma, &prior);
+        let taken = match verdict {
+            Verdict::Fits { sigmas } => {
+                self.put(stamp, &pose, self.variances(&sigma, &prior, noise), None);
+                Ok(sigmas)
+            }
+            Verdict::Kink(doubt) => {
+                self.put(stamp, &pose, self.variances(&sigma, &prior, noise), Some(doubt));
+                Ok(self.config.gate_sigmas)
+            }
+            Verdict::Reset => {
+                self.resets = self.resets.wrapping_add(1);
+                self.begin(stamp, &pose, &sigma);
+                return Ok(self.config.gate_sigmas);
+            }
+            Verdict::Rejected(reason) => Err(reason),
+        };
+        self.settle();
+        if self.history.newest().is_some_and(|(_, estimate)| !estimate.is_finite()) {
+            // Not seen yet; what was measured is better than no pose at all.
+            self.begin(stamp, &pose, &sigma);
+        }
+        taken
+    }
+
+    /// Takes in what came since a pose was last asked for.
+    fn settle(&mut self) {
+        let imu = &mut self.imu;
+        self.history.settle(|estimate, record| imu.weigh(estimate, record));
+        if self.imu.read < IMU_TRIAL || self.imu.left_out {
+            return;
+        }
+        let newest = self.history.newest();
+        let biased = newest.is_some_and(|(_, newest)| newest.is_biased_beyond_belief());
+        if biased || 2 * self.imu.refused > self.imu.read {
+            self.imu.left_out = true;
+            self.change.get_or_insert(PoseChange::ImuLeftOut);
+        }
+        (self.imu.read, self.imu.refused) = (0, 0);
+    }
+
+    fn judge(
+        &mut self,
+        index: usize,
+        measured: &Measured,
+        sigma: &PoseSigma,
+        prior: &Estimate,
+    ) -> Verdict {
+        let Measured { stamp, world_from_body: pose, .. } = *measured;
+        if let Err(frozen) = self.sources[index].check_frozen(measured, self.imu.turned) {
+            return Verdict::Rejected(frozen);
+        }
+        let noise = self.sources[index].noise_factor();
+        let (variance_m2, variance_rad2) = self.variances(sigma, prior, noise);
+        let place = prior.position_innovation(pose.translation_m, variance_m2);
+        let attitude = prior.attitude_innovation(pose.rotation, variance_rad2);
+        let sigmas = place.sigmas.max(attitude.sigmas);
+        let gate = self.config.gate_sigmas;
+        // The longer nothing is believed, the more would fit; what did not at first must prove true.
+        let pending = self.sources[index].pending(measured).map(|claim| claim.kind);
+        let denied = matches!(pending, Some(ClaimKind::Jump(_) | ClaimKind::Flip));
+        if !denied && place.residual.length() < LEARNS_WITHIN_M {
+            self.sources[index].learn(sigmas);
+        }
+        if sigmas <= gate && !denied {
+            return Verdict::Fits { sigmas };
+        }
+        let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
+        let trusted = self.sources.iter().enumerate().find(|(other, source)| {
+            let age_s = source.believed_at.map(|at| stamp.seconds_since(at).abs());
+            *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
+        });
+        if let Some((other, _)) = trusted {
+            let other = other as u8;
+            return Verdict::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
+        }
+        let newest = self.newest.map_or(stamp, |newest| newest.stamp);
+        let dt_s = stamp.seconds_since(newest).abs().max(LEAST_DT_S);
+        let speed_mps = distance_m / dt_s;
+        // A gyroscope would have felt a turn.
+        let felt = self.imu_is_fresh(stamp) && angle_rad > FELT_RAD;
+        let kind = if place.sigmas > gate && speed_mps > MOST_KINK_MPS {
+            ClaimKind::Jump(speed_mps)
+        } else if attitude.sigmas > gate && (felt || angle_rad / dt_s > MOST_TURN_RADPS) {
+            ClaimKind::Flip
+        } else {
+            ClaimKind::Kink(dt_s)
+        };
+        let claim = self.sources[index].claim(measured, kind);
+        match claim.kind {
+            ClaimKind::Jump(_)
+                if claim.count >= JUMP_CONFIRMED && claim.lasted_s() >= JUMP_LASTS_S =>
+            {
+                Verdict::Reset
+            }
+            ClaimKind::Flip if claim.lasted_s() >= self.config.flip_believed_after_s => {
+                Verdict::Reset
+            }
+            ClaimKind::Kink(dt_s) if claim.count >= KINK_CONFIRMED => {
+                Verdict::Kink(Doubt { distance_m, angle_rad, dt_s })
+            }
+            ClaimKind::Jump(speed_mps) => {
+                Verdict::Rejected(Rejected::Jump { distance_m, speed_mps })
+            }
+            ClaimKind::Flip => Verdict::Rejected(Rejected::Flip(angle_rad)),
+            ClaimKind::Kink(_) => Verdict::Rejected(Rejected::Outlier(sigmas)),
+        }
+    }
+
+    /// Forgets what led here and begins with this pose.
+    fn begin(&mut self, stamp: ServerTime, pose: &Pose<World, Body>, sigma: &PoseSigma) {
+        let former = self.history.newest().map(|(_, estimate)| *estimate);
+        let fresh = Estimate::new(pose, sigma);
+        let estimate = former
+            .filter(Estimate::is_finite)
+            .map_or(fresh, |former| fresh.with_biases_of(&former));
+        let input = Input::Pose {
+            p_world_m: pose.translation_m,
+            rotation: pose.rotation,
+            variance_m2: squares(sigma.position_m),
+            variance_rad2: squares(sigma.rotation_rad),
+            doubt: None,
+        };
+        self.history.begin(stamp, input, &estimate);
+    }
+
+    fn put(
+        &mut self,
+        stamp: ServerTime,
+        pose: &Pose<World, Body>,
+        (variance_m2, variance_rad2): (DMat3, DMat3),
+        doubt: Option<Doubt>,
+    ) {
+        let (p_world_m, rotation) = (pose.translation_m, pose.rotation);
+        let input = Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, doubt };
+        let imu = &mut self.imu;
+        self.history.put(stamp, input, |estimate, record| imu.weigh(estimate, record));
+    }
+
+    /// Returns the sigma to work with: what the source says, within what can be.
+    fn sigma(&self, measured: &Measured) -> PoseSigma {
+        let settings = self.config.sigma();
+        let said = measured.sigma.filter(|sigma| {
+            let least = sigma.position_m.min_element().min(sigma.rotation_rad.min_element());
+            sigma.position_m.is_finite() && sigma.rotation_rad.is_finite() && least > 0.0
+        });
+        let sigma = said.unwrap_or(settings);
+        PoseSigma {
+            position_m: sigma.position_m.clamp(DVec3::splat(1e-5), DVec3::splat(10.0)),
+            rotation_rad: sigma.rotation_rad.clamp(DVec3::splat(1e-5), DVec3::splat(3.0)),
+        }
+    }
+
+    /// Returns the variances of a measurement: its own, times what its source has taught, and what a stamp that is off makes of a
+    /// vehicle that moves. [m^2, world], [rad^2, body]
+    fn variances(&self, sigma: &PoseSigma, prior: &Estimate, noise: f64) -> (DMat3, DMat3) {
+        let moved_m = prior.v_world_mps * self.config.stamp_sigma_s;
+        let turned_rad = prior.omega_body_radps * self.config.stamp_sigma_s;
+        let outer = |v: DVec3| DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+        (
+            squares(sigma.position_m) * noise + outer(moved_m),
+            squares(sigma.rotation_rad) * noise + outer(turned_rad),
+        )
+    }
+
+    /// Takes a reading of the autopilot's IMU. One that is too old, or comes before any pose, is
+    /// let go. What follows from it waits until a pose is asked for: readings come late, and several at once, and each
+    /// would take in again all that is newer.
+    pub fn handle_imu(&mut self, reading: &ImuReading) {
+        let ImuReading { stamp, accel_mps2, gyro_radps } = *reading;
+        let plausible = accel_mps2.is_finite()
+            && gyro_radps.is_finite()
+            && accel_mps2.length() < MOST_ACCEL_MPS2
+            && gyro_radps.length() < MOST_GYRO_RADPS;
+        let newer = self.imu.last.is_none_or(|last| stamp > last);
+        let known = self.newest.is_some_and(|newest| {
+            stamp.seconds_since(newest.stamp) < BEGIN_ANEW_AFTER_S && self.history.reaches(stamp)
+        });
+        if !self.config.imu || self.imu.left_out || !(plausible && newer && known) {
+            return;
+        }
+        if let (Some(last), Some((_, estimate))) = (self.imu.last, self.history.newest()) {
+            let dt_s = stamp.seconds_since(last).min(MOST_IMU_GAP_S);
+            let turn = DQuat::from_scaled_axis(estimate.without_bias(gyro_radps) * dt_s);
+            self.imu.turned = (self.imu.turned * turn).normalize();
+        }
+        self.imu.last = Some(stamp);
+        let input = Input::Imu { accel_mps2, gyro_radps };
+        let imu = &mut self.imu;
+        self.history.put(stamp, input, |estimate, record| imu.weigh(estimate, record));
+    }
+
+    /// Notices silence. Call at [`Self::poll_timeout`].
+    pub fn handle_timeout(&mut self, now: ServerTime) {
+        if let Some(newest) = self.newest {
+            let age_s = now.seconds_since(newest.stamp);
+            if age_s >= self.config.hold_after_s && !self.lost {
+                self.lost = true;
+                self.change = Some(PoseChange::Lost(age_s, self.rejected));
+            }
+        }
+    }
+
+    /// Returns when [`Self::handle_timeout`] has something to do; `None` while poses are lost or
+    /// none has come.
+    pub fn poll_timeout(&self) -> Option<ServerTime> {
+        let newest = self.newest.filter(|_| !self.lost)?;
+        // A nanosecond later: the sum is rounded.
+        Some(newest.stamp.plus_seconds(self.config.hold_after_s).plus_ns(1))
+    }
+
+    /// Returns a change of the source once.
+    pub fn poll_change(&mut self) -> Option<PoseChange> {
+        self.change.take()
+    }
+
+    /// Returns the newest believed pose.
+    pub fn newest(&self) -> Option<&PoseSample> {
+        self.newest.as_ref()
+    }
+
+    /// Returns how the vehicle moves by all that was read.
+    pub fn motion(&mut self) -> Option<Motion> {
+        self.settle();
+        self.history.newest().map(|(stamp, estimate)| Motion::of(stamp, estimate))
+    }
+
+    /// Returns the pose at another time, at most 0.2 s from the newest reading.
+    pub fn predict(&mut self, at: ServerTime) -> Option<Pose<World, Body>> {
+        Some(self.motion()?.at(at))
+    }
+
+    /// Returns how good the localization is at `now`.
+    pub fn quality(&self, now: ServerTime) -> PoseQuality {
+        let Some(newest) = self.newest else { return PoseQuality::default() };
+        let sources = self.sources.iter().enumerate();
+        let sigma = self.history.newest_pose().map(|(_, estimate)| estimate.sigma());
+        PoseQuality {
+            age_ms: Some(now.seconds_since(newest.stamp) * 1e3),
+            rate_hz: self.believed.rate_hz(now),
+            position_sigma_mm: sigma.map_or(0.0, |s| s.position_m.max_element() * 1e3),
+            rotation_sigma_deg: sigma.map_or(0.0, |s| s.rotation_rad.max_element().to_degrees()),
+            innovation_sigmas: self.believed.value(),
+            speed_mps: newest.twist.linear_mps.length(),
+            imu: self.imu_is_fresh(newest.stamp),
+            resets: self.resets,
+            sources: sources.filter_map(|(i, source)| source.quality(i as u8, now)).collect(),
+        }
+    }
+
+    /// Returns what was turned away so far, of all sources.
+    pub fn rejected(&self) -> Rejects {
+        self.sources.iter().fold(Rejects::default(), |sum, source| sum.and(source.rejected()))
+    }
+
+    fn imu_is_fresh(&self, stamp: ServerTime) -> bool {
+        let age_s = self.imu.last.map(|last| stamp.seconds_since(last));
+        !self.imu.left_out && age_s.is_some_and(|age_s| age_s < IMU_SILENT_S)
+    }
+
+    fn sample(&self, stamp: ServerTime, estimate: &Estimate) -> PoseSample {
+        let sigma = estimate.sigma();
+        PoseSample {
+            stamp,
+            world_from_body: estimate.pose(),
+            twist: Twist {
+                linear_mps: estimate.v_world_mps,
+                angular_radps: estimate.omega_body_radps,
+            },
+            resets: self.resets,
+            position_sigma_m: sigma.position_m.as_vec3(),
+            rotation_sigma_rad: sigma.rotation_rad.as_vec3(),
+        }
+    }
+}
+
+impl Imu {
+    /// Takes a reading in, and counts those of the IMU that come for the first time.
+    fn weigh(&mut self, estimate: &mut Estimate, record: &Record) {
+        match record.input {
+            Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, doubt } => {
+                if let Some(doubt) = &doubt {
+                    estimate.doubt(doubt);
+                }
+                estimate.read_position(p_world_m, variance_m2);
+                estimate.read_attitude(rotation, variance_rad2);
+            }
+            Input::Imu { accel_mps2, gyro_radps } => {
+                let turned = estimate.read_gyro(gyro_radps, GYRO_SIGMA_RADPS, IMU_GATE_SIGMAS);
+                let pushed = estimate.read_accel(accel_mps2, ACCEL_SIGMA_MPS2, IMU_GATE_SIGMAS);
+                if !record.is_known {
+                    self.read += 1;
+                    self.refused += u32::from(!(turned && pushed));
+                }
+            }
+        }
+    }
+}
+
+/// Positions beyond this are no room's. [m]
+const FURTHEST_M: f64 = 1e4;
+/// After such a pause nothing of the former motion holds. [s]
+const BEGIN_ANEW_AFTER_S: f64 = 1.0;
+/// A source that was believed so lately is believed against another. [s]
+const TRUSTED_FOR_S: f64 = 0.15;
+/// What is further off is no noise of a localization that flies. [m]
+const LEARNS_WITHIN_M: f64 = 0.3;
+/// Measurements closer together say nothing of speed. [s]
+const LEAST_DT_S: f64 = 1e-4;
+/// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
+/// [m/s]
+const MOST_KINK_MPS: f64 = 15.0;
+/// Racing drones turn by 2000 degrees a second. [rad/s]
+const MOST_TURN_RADPS: f64 = 35.0;
+/// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
+const FELT_RAD: f64 = 0.2;
+/// A jump that stays put for so many measurements, over so long, is the truth (a moved origin, a
+/// regained object). [s]
+const JUMP_CONFIRMED: u32 = 10;
+const JUMP_LASTS_S: f64 = 0.02;
+/// One measurement off is an outlier, a second one like it is a motion.
+const KINK_CONFIRMED: u32 = 2;
+/// Noise of a flight controller's gyroscope with the motors running. [rad/s]
+const GYRO_SIGMA_RADPS: f64 = 0.03;
+/// Noise of its accelerometer with the motors running: mostly vibration. [m/s^2]
+const ACCEL_SIGMA_MPS2: f64 = 0.6;
+/// Inertial readings further from the expected are left out one by one.
+const IMU_GATE_SIGMAS: f64 = 6.0;
+/// Beyond 16 g and 2300 degrees a second sensors saturate. [m/s^2], [rad/s]
+const MOST_ACCEL_MPS2: f64 = 160.0;
+const MOST_GYRO_RADPS: f64 = 40.0;
+/// Readings further apart are not integrated. [s]
+const MOST_IMU_GAP_S: f64 = 0.1;
+/// Readings after which the IMU as a whole is judged: two seconds' worth.
+const IMU_TRIAL: u32 = 200;
+/// An IMU that has been silent for so long takes no part. [s]
+const IMU_SILENT_S: f64 = 0.3;

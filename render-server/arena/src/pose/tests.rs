@@ -1,0 +1,385 @@
+use glam::DQuat;
+use proptest::prelude::*;
+
+use super::*;
+
+fn at(seconds: f64) -> ServerTime {
+    ServerTime::from_ns(1_000_000_000).plus_seconds(seconds)
+}
+
+fn pose(p: DVec3) -> Pose<World, Body> {
+    Pose::new(p, DQuat::IDENTITY)
+}
+
+fn measured(t: f64, p: DVec3) -> Measured {
+    Measured::new(at(t), pose(p))
+}
+
+/// A filter that has seen a vehicle fly straight ahead for a second, at 200 Hz.
+fn flying(speed_mps: f64) -> PoseFilter {
+    let mut filter = PoseFilter::default();
+    for i in 0..=200 {
+        let t = 0.005 * f64::from(i);
+        filter.handle_pose(&measured(t, DVec3::X * speed_mps * t)).unwrap();
+    }
+    filter
+}
+
+proptest! {
+    #[test]
+    fn a_constant_twist_is_found(v in prop::array::uniform3(-8.0..8.0f64), w in prop::array::uniform3(-3.0..3.0f64), hz in 30.0..500.0f64) {
+        let (v, w) = (DVec3::from(v), DVec3::from(w));
+        let mut filter = PoseFilter::default();
+        for i in 0..150 {
+            let t = f64::from(i) / hz;
+            let truth = Pose::new(v * t, DQuat::from_scaled_axis(w * t));
+            filter.handle_pose(&Measured::new(at(t), truth)).unwrap();
+        }
+        let twist = filter.newest().unwrap().twist;
+        prop_assert!((twist.linear_mps - v).length() < 1e-2, "{:?}", twist);
+        prop_assert!((twist.angular_radps - w).length() < 1e-2, "{:?}", twist);
+        let ahead = filter.predict(at(149.0 / hz + 0.03)).unwrap();
+        prop_assert!((ahead.translation_m - v * (149.0 / hz + 0.03)).length() < 1e-3);
+    }
+
+    /// Whatever comes, in whatever order: every number that leaves is one to work with.
+    #[test]
+    fn nothing_poisons_the_filter(
+        steps in prop::collection::vec((0u8..4, -0.3..0.5f64, prop::array::uniform3(-20.0..20.0f64), prop::array::uniform3(-9.0..9.0f64), -1e-3..0.5f64), 1..120)
+    ) {
+        let mut filter = PoseFilter::default();
+        let mut t = 1.0;
+        for (kind, dt, a, b, sigma) in steps {
+            t += dt;
+            let (a, b) = (DVec3::from(a), DVec3::from(b));
+            if kind == 3 {
+                let reading = ImuReading { stamp: at(t), accel_mps2: a * 10.0, gyro_radps: b };
+                filter.handle_imu(&reading);
+            } else {
+                let sigma = PoseSigma { position_m: DVec3::splat(sigma), rotation_rad: b };
+                let said = Measured {
+                    source: kind,
+                    sigma: (kind > 0).then_some(sigma),
+                    ..Measured::new(at(t), Pose::new(a, DQuat::from_scaled_axis(b)))
+                };
+                let _ = filter.handle_pose(&said);
+            }
+            if let Some(sample) = filter.newest() {
+                prop_assert!(sample.is_valid(), "{:?}", sample);
+                prop_assert!(filter.predict(at(t + 0.03)).unwrap().is_valid());
+                let quality = filter.quality(at(t));
+                prop_assert!(quality.position_sigma_mm.is_finite() && quality.rate_hz.is_finite());
+            }
+        }
+    }
+}
+
+#[test]
+fn poison_and_old_poses_are_turned_away() {
+    let mut filter = PoseFilter::default();
+    let nan = measured(0.0, DVec3::new(f64::NAN, 0.0, 0.0));
+    assert_eq!(filter.handle_pose(&nan), Err(Rejected::Invalid));
+    filter.handle_pose(&measured(1.0, DVec3::ZERO)).unwrap();
+    assert_eq!(filter.handle_pose(&measured(1.0, DVec3::ZERO)), Err(Rejected::Stale));
+    assert_eq!(filter.handle_pose(&measured(0.5, DVec3::ZERO)), Err(Rejected::Stale));
+    assert_eq!((filter.rejected().stale, filter.rejected().invalid), (2, 1));
+}
+
+#[test]
+fn a_jump_is_turned_away_until_it_proves_true() {
+    let mut filter = PoseFilter::default();
+    filter.handle_pose(&measured(0.0, DVec3::ZERO)).unwrap();
+    let far = DVec3::new(5.0, 0.0, 0.0);
+    // One swapped marker, then back. The motion is hardly known yet.
+    for i in 1..=20 {
+        filter.handle_pose(&measured(0.005 * f64::from(i), DVec3::ZERO)).unwrap();
+    }
+    let jumped = filter.handle_pose(&measured(0.105, far));
+    assert!(
+        matches!(jumped, Err(Rejected::Jump { distance_m, .. }) if (distance_m - 5.0).abs() < 0.01),
+        "{jumped:?}"
+    );
+    assert_eq!(filter.handle_pose(&measured(0.110, DVec3::ZERO)).unwrap().resets, 0);
+    // A moved origin stays.
+    let mut accepted = None;
+    for i in 1..=20 {
+        if let Ok(sample) = filter.handle_pose(&measured(0.110 + 0.005 * f64::from(i), far)) {
+            accepted = Some((i, sample));
+            break;
+        }
+    }
+    let (count, sample) = accepted.expect("a lasting jump is believed");
+    assert_eq!(count, 10);
+    assert_eq!((sample.resets, sample.twist.linear_mps), (1, DVec3::ZERO));
+}
+
+#[test]
+fn packets_bunched_after_a_pause_are_no_speed() {
+    let mut filter = PoseFilter::default();
+    // 2 m/s, read in time for 0.2 s; then 0.1 s of packets read at once.
+    let place = |i| DVec3::X * 2.0 * 0.005 * f64::from(i);
+    for i in 0..40 {
+        filter.handle_pose(&measured(0.005 * f64::from(i), place(i))).unwrap();
+    }
+    for i in 40..60 {
+        // Those that come at a jump's speed are turned away; the others make no great one.
+        let _ = filter.handle_pose(&measured(0.3 + 1e-4 * f64::from(i - 40), place(i)));
+        let speed_mps = filter.newest().unwrap().twist.linear_mps.length();
+        assert!(speed_mps < 3.0, "{speed_mps} m/s after packet {i}");
+    }
+}
+
+#[test]
+fn silence_is_noticed_once_and_its_end_too() {
+    let mut filter = PoseFilter::default();
+    assert_eq!(filter.poll_timeout(), None);
+    filter.handle_pose(&measured(0.0, DVec3::ZERO)).unwrap();
+    filter.handle_timeout(at(0.1));
+    assert_eq!(filter.poll_change(), None);
+    let due = filter.poll_timeout().unwrap();
+    filter.handle_timeout(due);
+    assert!(matches!(filter.poll_change(), Some(PoseChange::Lost(age_s, None)) if age_s > 0.14));
+    filter.handle_timeout(at(1.0));
+    assert_eq!((filter.poll_change(), filter.poll_timeout()), (None, None));
+    filter.handle_pose(&measured(2.0, DVec3::ZERO)).unwrap();
+    assert_eq!(filter.poll_change(), Some(PoseChange::Regained));
+}
+
+#[test]
+fn a_lone_outlier_is_left_out_and_a_bump_is_followed() {
+    let mut filter = flying(2.0);
+    let off = filter.handle_pose(&measured(1.005, DVec3::new(2.01, 0.03, 0.0)));
+    assert!(matches!(off, Err(Rejected::Outlier(sigmas)) if sigmas > 6.0), "{off:?}");
+    let back = filter.handle_pose(&measured(1.010, DVec3::X * 2.02)).unwrap();
+    assert!(back.world_from_body.translation_m.y.abs() < 1e-3);
+    // Against a post: it bounces off at 5 m/s.
+    let mut last = Err(Rejected::Stale);
+    for i in 1..=20 {
+        let t = 0.005 * f64::from(i);
+        last = filter.handle_pose(&measured(1.010 + t, DVec3::X * (2.02 - 5.0 * t)));
+    }
+    let sample = last.unwrap();
+    assert!((sample.twist.linear_mps.x + 5.0).abs() < 0.3 && sample.resets == 0, "{sample:?}");
+    assert_eq!(filter.rejected().outlier, 2);
+}
+
+#[test]
+fn swapped_markers_flip_the_attitude_and_are_not_believed_in_flight() {
+    let mut filter = flying(1.0);
+    let flipped = |t: f64| {
+        Measured::new(at(t), Pose::new(DVec3::X * t, DQuat::from_rotation_z(120f64.to_radians())))
+    };
+    let mut believed_after_s = None;
+    for i in 1..400 {
+        let t = 1.0 + 0.005 * f64::from(i);
+        match filter.handle_pose(&flipped(t)) {
+            Err(Rejected::Flip(angle_rad)) => assert!((angle_rad.to_degrees() - 120.0).abs() < 1.0),
+            Err(other) => panic!("{other}"),
+            Ok(sample) => {
+                assert_eq!(sample.resets, 1);
+                believed_after_s = Some(t - 1.0);
+                break;
+            }
+        }
+        filter.handle_timeout(at(t));
+    }
+    // By then the vehicle has been told to hold and to land.
+    assert!(believed_after_s.is_some_and(|s| s > 0.9), "{believed_after_s:?}");
+    // The flip's end came with the news of the loss and of its reason.
+    assert_eq!(filter.poll_change(), Some(PoseChange::Regained));
+}
+
+#[test]
+fn the_loss_says_why() {
+    let mut filter = flying(1.0);
+    for i in 1..40 {
+        let t = 1.0 + 0.005 * f64::from(i);
+        let _ = filter.handle_pose(&measured(t, DVec3::X));
+        filter.handle_timeout(at(t));
+    }
+    let Some(PoseChange::Lost(_, Some(why))) = filter.poll_change() else { panic!("not lost") };
+    assert!(why.to_string().contains("the stream is frozen"), "{why}");
+    // The same numbers from a vehicle that stands are nothing to worry about.
+    let mut filter = flying(0.0);
+    for i in 1..1000 {
+        filter.handle_pose(&measured(1.0 + 0.005 * f64::from(i), DVec3::ZERO)).unwrap();
+    }
+}
+
+#[test]
+fn a_stream_that_froze_at_rest_is_betrayed_by_the_gyroscope() {
+    let mut filter = flying(0.0);
+    let mut frozen = 0;
+    for i in 1..100 {
+        let t = 1.0 + 0.01 * f64::from(i);
+        let gyro_radps = DVec3::Z * 0.5;
+        let accel_mps2 = DVec3::Z * 9.81;
+        filter.handle_imu(&ImuReading { stamp: at(t), accel_mps2, gyro_radps });
+        let result = filter.handle_pose(&measured(t, DVec3::ZERO));
+        frozen += u32::from(matches!(result, Err(Rejected::Frozen(_))));
+    }
+    assert!(frozen > 50, "{frozen}");
+}
+
+#[test]
+fn clocks_that_jump_are_named() {
+    let mut filter = flying(1.0);
+    let late = Measured { arrival: at(3.2), ..measured(1.005, DVec3::X) };
+    assert!(matches!(filter.handle_pose(&late), Err(Rejected::Clock(s)) if s > 2.0));
+    let early = Measured { arrival: at(1.005), ..measured(1.3, DVec3::X) };
+    assert!(matches!(filter.handle_pose(&early), Err(Rejected::Clock(s)) if s < 0.0));
+    let back = Measured { arrival: at(1.005), ..measured(0.5, DVec3::X) };
+    assert!(matches!(filter.handle_pose(&back), Err(Rejected::ClockJump(s)) if s > 0.4));
+    assert_eq!(filter.rejected().clock, 3);
+    filter.handle_pose(&measured(1.01, DVec3::X * 1.01)).unwrap();
+}
+
+#[test]
+fn of_two_sources_that_disagree_the_one_is_kept_and_the_other_named() {
+    let mut filter = flying(1.0);
+    for i in 1..100 {
+        let t = 1.0 + 0.01 * f64::from(i);
+        filter.handle_pose(&measured(t, DVec3::X * t)).unwrap();
+        let other = Measured { source: 1, ..measured(t, DVec3::new(t, 0.4, 0.0)) };
+        let result = filter.handle_pose(&other);
+        let Err(Rejected::Disagree { other: 0, distance_m, .. }) = result else {
+            panic!("{result:?}")
+        };
+        assert!((distance_m - 0.4).abs() < 0.01);
+    }
+    let quality = filter.quality(at(2.0));
+    assert_eq!(quality.sources[1].rejected.disagree, 99);
+    assert!((quality.rate_hz - 100.0).abs() < 20.0, "{}", quality.rate_hz);
+}
+
+#[test]
+fn what_comes_late_is_put_where_it_belongs() {
+    // The same readings in order, and with one source 40 ms late: the same in the end.
+    let truth = |t: f64| Pose::new(DVec3::new((2.0 * t).sin(), t, 1.0), DQuat::from_rotation_z(t));
+    let prompt = |t: f64| Measured::new(at(t), truth(t));
+    let slow = |t: f64| Measured { source: 1, arrival: at(t + 0.04), ..prompt(t) };
+    let (mut ordered, mut delayed) = (PoseFilter::default(), PoseFilter::default());
+    for i in 0..200 {
+        let t = 0.01 * f64::from(i);
+        ordered.handle_pose(&prompt(t)).unwrap();
+        delayed.handle_pose(&prompt(t)).unwrap();
+        ordered.handle_pose(&slow(t + 0.003)).unwrap();
+        if i >= 4 {
+            let former = delayed.newest().unwrap().stamp;
+            let sample = delayed.handle_pose(&slow(t - 0.037)).unwrap();
+            assert_eq!(sample.stamp, former);
+        }
+    }
+    for i in 197..=200 {
+        delayed.handle_pose(&slow(0.01 * f64::from(i) - 0.007)).unwrap();
+    }
+    let (a, b) = (ordered.newest().unwrap(), delayed.newest().unwrap());
+    assert_eq!(a.stamp, b.stamp);
+    let off_m = (a.world_from_body.translation_m - b.world_from_body.translation_m).length();
+    assert!(off_m < 1e-6, "{off_m}");
+}
+
+#[test]
+fn an_imu_that_contradicts_the_poses_is_left_out() {
+    let mut filter = PoseFilter::default();
+    let mut left_out = false;
+    for i in 0..1000 {
+        let t = 0.005 * f64::from(i);
+        let turned = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(2.0 * t));
+        let _ = filter.handle_pose(&Measured::new(at(t), turned));
+        // Its z axis is taken for another.
+        let (accel_mps2, gyro_radps) = (DVec3::X * 9.81, DVec3::X * 2.0);
+        filter.handle_imu(&ImuReading { stamp: at(t + 0.001), accel_mps2, gyro_radps });
+        left_out |= filter.poll_change() == Some(PoseChange::ImuLeftOut);
+    }
+    assert!(left_out && !filter.quality(at(5.0)).imu);
+    let twist = filter.newest().unwrap().twist;
+    assert!((twist.angular_radps - DVec3::Z * 2.0).length() < 0.01, "{twist:?}");
+}
+
+#[test]
+fn the_error_is_as_great_as_the_filter_says() {
+    // 2 mm and 0.2 degrees of noise by a fixed generator; the truth within three sigmas.
+    let mut seed = 1u64;
+    let mut noise = move || {
+        let mut sum = 0.0;
+        for _ in 0..12 {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            sum += (seed >> 33) as f64 / f64::from(1u32 << 31);
+        }
+        sum - 6.0
+    };
+    let mut filter = PoseFilter::default();
+    let (mut within, mut count) = (0, 0);
+    for i in 0..2000 {
+        let t = 0.01 * f64::from(i);
+        let truth = DVec3::new((0.8 * t).sin(), (0.5 * t).cos(), 1.0);
+        let p = truth + DVec3::new(noise(), noise(), noise()) * 2e-3;
+        let sigma = PoseSigma { position_m: DVec3::splat(2e-3), rotation_rad: DVec3::splat(3e-3) };
+        let turned = DQuat::from_scaled_axis(DVec3::new(noise(), noise(), noise()) * 3e-3);
+        let said = Measured { sigma: Some(sigma), ..Measured::new(at(t), Pose::new(p, turned)) };
+        let sample = filter.handle_pose(&said).unwrap();
+        let sigma_m = filter.quality(at(t)).position_sigma_mm / 1e3;
+        let off = sample.world_from_body.translation_m - truth;
+        count += 3;
+        within += [off.x, off.y, off.z].iter().filter(|off| off.abs() < 2.0 * sigma_m).count();
+    }
+    let share = within as f64 / f64::from(count);
+    assert!((0.93..=1.0).contains(&share), "{share}");
+    let quality = filter.quality(at(20.0));
+    assert!(quality.position_sigma_mm < 2.0 && quality.innovation_sigmas < 3.0, "{quality:?}");
+}
+
+#[test]
+fn a_source_that_is_worse_than_it_says_is_believed_less_and_not_turned_away() {
+    // Ten times the noise it says.
+    let mut seed = 5u64;
+    let mut noise = move || {
+        let mut sum = 0.0;
+        for _ in 0..12 {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            sum += (seed >> 33) as f64 / f64::from(1u32 << 31);
+        }
+        sum - 6.0
+    };
+    let mut filter = PoseFilter::default();
+    let mut late = 0;
+    for i in 0..2000 {
+        let t = 0.01 * f64::from(i);
+        let truth = DVec3::new((0.8 * t).sin(), (0.5 * t).cos(), 1.0);
+        let p = truth + DVec3::new(noise(), noise(), noise()) * 6e-3;
+        let turned = DQuat::from_scaled_axis(DVec3::new(noise(), noise(), noise()) * 0.026);
+        let result = filter.handle_pose(&Measured::new(at(t), Pose::new(p, turned)));
+        late += u32::from(i >= 1000 && result.is_err());
+    }
+    assert!(late < 10, "{late} of the last 1000 were turned away");
+    let quality = filter.quality(at(20.0));
+    assert!(quality.position_sigma_mm > 1.0, "{quality:?}");
+}
+
+#[test]
+fn the_guides_settings_are_the_defaults() {
+    #[derive(serde::Deserialize)]
+    struct File {
+        pose: PoseConfig,
+    }
+    let guide = include_str!("../../../../docs/guides/pose.md");
+    let (_, block) = guide.split_once("```toml\n").unwrap();
+    let (block, _) = block.split_once("```").unwrap();
+    let file: File = toml::from_str(block).unwrap();
+    assert_eq!(file.pose, PoseConfig::default());
+}
+
+#[test]
+fn settings_that_cannot_work_are_refused_by_name() {
+    let refused = |config: PoseConfig, key: &str| {
+        let error = config.check().unwrap_err().to_string();
+        assert!(error.starts_with(&format!("pose.{key} = ")), "{error}");
+    };
+    let usual = PoseConfig::default();
+    usual.check().unwrap();
+    refused(PoseConfig { hold_after_s: f64::NAN, ..usual }, "hold_after_s");
+    refused(PoseConfig { hold_after_s: 0.6, ..usual }, "land_after_s");
+    refused(PoseConfig { gate_sigmas: 1.0, ..usual }, "gate_sigmas");
+    refused(PoseConfig { position_sigma_m: 0.0, ..usual }, "position_sigma_m");
+}

@@ -1,0 +1,322 @@
+//! What a flight is worth: the events and samples of one flight, and the arena's rules, to a
+//! verdict. Pure: graded and live flights are judged by the same code.
+//!
+//! ```text
+//! events (referee, runtime) --> the first that ends the flight --> outcome, time
+//!                           \-> stages passed, and when
+//! samples (pose, clearance) --> take-off, least clearance, top speed, way
+//! ```
+//! The timer starts at take-off and stops at the end: the finish, a collision, or whatever else
+//! comes first (VizFlyt paper, section IV, project 5). The score is the share of the course that was
+//! passed; a goal is its last part.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::{Event, EventKind, FlightPhase};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::config::ArenaConfig;
+use crate::referee::AIRBORNE_M;
+
+/// How a flight ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The course was flown to its end.
+    Finished,
+    /// The body touched an obstacle, or the floor too fast.
+    Collided,
+    /// It left the geofence, or could not have stopped inside.
+    Geofence,
+    /// The course's time was over.
+    Timeout,
+    /// It was landed before the end, by the plugin or by a person.
+    Landed,
+    /// The plugin crashed, hung or gave up.
+    PluginFailed,
+    /// It never took off, or something else than the plugin failed.
+    Error,
+}
+
+impl Outcome {
+    /// Returns the name as it stands in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Finished => "finished",
+            Self::Collided => "collided",
+            Self::Geofence => "geofence",
+            Self::Timeout => "timeout",
+            Self::Landed => "landed",
+            Self::PluginFailed => "plugin_failed",
+            Self::Error => "error",
+        }
+    }
+}
+
+impl core::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+/// Where the vehicle was at one moment of a flight.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sample {
+    /// When.
+    pub stamp: ServerTime,
+    /// The body's centre. [m, world]
+    pub p_world_m: DVec3,
+    /// Velocity. [m/s, world]
+    pub v_world_mps: DVec3,
+    /// Heading: from x, counter-clockwise. [rad, world]
+    pub yaw_rad: f64,
+    /// From the body's surface to the nearest obstacle; negative is penetration. [m]
+    pub clearance_m: f64,
+}
+
+/// A part of the course.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StageVerdict {
+    /// Its name in `arena.toml`.
+    pub name: String,
+    /// When it was passed, since take-off; `None` if it was not. [s]
+    pub passed_s: Option<f64>,
+}
+
+/// What a flight was worth.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Verdict {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Why, in one sentence.
+    pub reason: String,
+    /// How many stages were passed.
+    pub stages_passed: usize,
+    /// The stages in order.
+    pub stages: Vec<StageVerdict>,
+    /// From take-off to the end; 0 without a take-off. [s]
+    pub seconds: f64,
+    /// Added to the time for offences. [s]
+    pub penalty_s: f64,
+    /// 0 to 100.
+    pub score: f64,
+    /// Least distance of the body's surface to an obstacle in flight; `None` without one. [m]
+    pub min_clearance_m: Option<f64>,
+    /// [m/s]
+    pub max_speed_mps: f64,
+    /// Way flown. [m]
+    pub path_m: f64,
+}
+
+/// Judges a flight in `arena` by all that happened, each in order of time.
+///
+/// ```
+/// use vizflyt_arena::verdict::{Outcome, judge};
+/// # let arena = vizflyt_arena::ArenaConfig::parse(r#"
+/// # name = "room"
+/// # scene = "scene.ply"
+/// # body_radius_m = 0.12
+/// # takeoff_height_m = 1.2
+/// # spawn = { position_m = [1, 2, 0] }
+/// # geofence = { min_m = [0, 0, -0.5], max_m = [11, 4.5, 3.65] }
+/// # limits = { max_speed_mps = 3.0, max_acceleration_mps2 = 6.0 }
+/// # [[cameras]]
+/// # name = "front"
+/// # width_px = 320
+/// # height_px = 240
+/// # horizontal_fov_deg = 90.0
+/// # position_m = [0.06, 0, 0.02]
+/// # "#).unwrap();
+/// // Nothing happened at all: the vehicle never took off.
+/// let verdict = judge(&arena, &[], &[]);
+/// assert_eq!((verdict.outcome, verdict.score), (Outcome::Error, 0.0));
+/// ```
+pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdict {
+    let airborne_m = arena.spawn.position_m.z + AIRBORNE_M;
+    let took_off = samples.iter().find(|sample| sample.p_world_m.z > airborne_m);
+    let took_off_m = took_off.map(|sample| sample.p_world_m);
+    let took_off = took_off.map(|sample| sample.stamp);
+    let end = events.iter().find_map(|event| Some((ending(event)?, event)));
+    let (outcome, reason) = match (end, took_off) {
+        (Some((outcome, event)), _) => (outcome, event.text.as_str().to_owned()),
+        (None, Some(_)) => landed(events),
+        (None, None) => (Outcome::Error, "the vehicle never took off".to_owned()),
+    };
+    let last = samples.last().map(|sample| sample.stamp);
+    let landing = || events.iter().find(|event| is_landing(event)).map(|event| event.stamp);
+    let ended = end.map(|(_, event)| event.stamp).or_else(landing).or(last);
+    let since = |stamp: ServerTime| took_off.map_or(0.0, |at| stamp.seconds_since(at).max(0.0));
+
+    let mut stages: Vec<StageVerdict> = (arena.stages.iter())
+        .map(|stage| StageVerdict { name: stage.name.clone(), passed_s: None })
+        .collect();
+    for event in events.iter().filter(|event| ended.is_none_or(|ended| event.stamp <= ended)) {
+        if let EventKind::Stage { index, .. } = event.kind
+            && let Some(stage) = stages.get_mut(usize::from(index))
+        {
+            stage.passed_s.get_or_insert(since(event.stamp));
+        }
+    }
+    let stages_passed = stages.iter().filter(|stage| stage.passed_s.is_some()).count();
+    let in_flight = |sample: &&Sample| {
+        took_off.is_some_and(|at| sample.stamp >= at)
+            && ended.is_none_or(|ended| sample.stamp <= ended)
+    };
+    let flown: Vec<&Sample> = samples.iter().filter(in_flight).collect();
+    // Without a goal the last stage is the finish.
+    let has_goal = arena.goal.is_some();
+    let parts = stages.len() + usize::from(has_goal);
+    let passed = stages_passed + usize::from(has_goal && outcome == Outcome::Finished);
+    Verdict {
+        outcome,
+        reason,
+        stages_passed,
+        stages,
+        seconds: ended.map_or(0.0, since),
+        penalty_s: arena.rules.penalty_s(took_off_m, flown.iter().map(|s| s.clearance_m)),
+        score: 100.0 * passed as f64 / parts.max(1) as f64,
+        min_clearance_m: flown.iter().map(|s| s.clearance_m).reduce(f64::min),
+        max_speed_mps: flown.iter().map(|s| s.v_world_mps.length()).fold(0.0, f64::max),
+        path_m: flown.windows(2).map(|w| w[0].p_world_m.distance(w[1].p_world_m)).sum(),
+    }
+}
+
+/// Returns how a flight ended that only its landing ended, and why.
+fn landed(events: &[Event]) -> (Outcome, String) {
+    let landing = events.iter().position(is_landing);
+    let before = &events[..landing.unwrap_or(events.len())];
+    let lost = before.iter().rev().find_map(|event| match event.kind {
+        EventKind::PoseLost { .. } => Some(Some(event)),
+        EventKind::PoseRegained => Some(None),
+        _ => None,
+    });
+    match (lost.flatten(), landing) {
+        // That the pose is lost is no choice of the plugin's.
+        (Some(lost), _) => (Outcome::Error, lost.text.as_str().to_owned()),
+        (None, Some(landing)) => {
+            let text = events[landing].text.as_str();
+            (Outcome::Landed, text.strip_prefix("landing: ").unwrap_or(text).to_owned())
+        }
+        (None, None) => (Outcome::Landed, "not over when its record ends".to_owned()),
+    }
+}
+
+/// Returns the outcome of a flight that this event ends.
+fn ending(event: &Event) -> Option<Outcome> {
+    match event.kind {
+        EventKind::Collision { .. } => Some(Outcome::Collided),
+        EventKind::Geofence { .. } => Some(Outcome::Geofence),
+        EventKind::Finished { .. } => Some(Outcome::Finished),
+        EventKind::TimeLimit => Some(Outcome::Timeout),
+        EventKind::EmergencyStop => Some(Outcome::Landed),
+        EventKind::PluginFailed => Some(Outcome::PluginFailed),
+        _ => None,
+    }
+}
+
+fn is_landing(event: &Event) -> bool {
+    matches!(event.kind, EventKind::Phase(FlightPhase::Landing | FlightPhase::Landed))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::StageConfig;
+    use crate::referee::tests::arena;
+    use vizflyt_protocol::messages::bounded;
+
+    fn at(s: f64) -> ServerTime {
+        ServerTime::ZERO.plus_seconds(1.0 + s)
+    }
+
+    fn event(s: f64, kind: EventKind) -> Event {
+        Event { stamp: at(s), kind, text: bounded("why") }
+    }
+
+    fn stage(s: f64, index: u8) -> Event {
+        event(s, EventKind::Stage { index, name: bounded("gate") })
+    }
+
+    fn course() -> ArenaConfig {
+        let mut config = arena();
+        let gate = |name: &str, x: f64| StageConfig {
+            name: name.into(),
+            center_m: DVec3::new(x, 0.0, 1.0),
+            normal: DVec3::X,
+            width_m: 1.0,
+            height_m: 0.8,
+            ..StageConfig::default()
+        };
+        config.stages = vec![gate("first", 2.0), gate("second", 4.0), gate("third", 6.0)];
+        config
+    }
+
+    /// Rises for a second, then flies along x at 2 m/s; clearance falls by 0.1 m a second.
+    fn samples(seconds: u32) -> Vec<Sample> {
+        let at_tick = |tick: u32| {
+            let s = f64::from(tick) / 10.0;
+            let x = (s - 1.0).max(0.0) * 2.0;
+            Sample {
+                stamp: at(s),
+                p_world_m: DVec3::new(x, 0.0, s.min(1.0)) + course().spawn.position_m,
+                v_world_mps: if s > 1.0 { DVec3::X * 2.0 } else { DVec3::Z },
+                yaw_rad: 0.0,
+                clearance_m: 1.0 - s * 0.1,
+            }
+        };
+        (0..=seconds * 10).map(at_tick).collect()
+    }
+
+    #[test]
+    fn the_first_thing_that_ends_a_flight_is_its_outcome() {
+        let p_world_m = DVec3::ZERO;
+        let hit = EventKind::Collision { p_world_m, clearance_m: -0.01 };
+        let events = [stage(2.0, 0), event(3.4, hit), event(3.5, EventKind::PluginFailed)];
+        let verdict = judge(&course(), &events, &samples(6));
+        assert_eq!((verdict.outcome, verdict.reason.as_str()), (Outcome::Collided, "why"));
+        // Off the ground 0.4 s after the first sample; what came after the contact does not count.
+        assert!((verdict.seconds - 3.0).abs() < 1e-6, "{}", verdict.seconds);
+        assert_eq!((verdict.stages_passed, verdict.score), (1, 25.0));
+        assert!((verdict.stages[0].passed_s.unwrap() - 1.6).abs() < 1e-6);
+        assert_eq!(verdict.stages[1].passed_s, None);
+        assert!((verdict.min_clearance_m.unwrap() - 0.66).abs() < 0.01);
+        assert!((verdict.path_m - 5.4).abs() < 0.11, "{}", verdict.path_m);
+    }
+
+    #[test]
+    fn a_finish_is_the_last_part_of_the_score() {
+        let finished = EventKind::Finished { seconds: 4.6 };
+        let mut events = vec![stage(2.0, 0), stage(3.0, 1), stage(4.0, 2)];
+        events.push(event(5.0, finished));
+        let verdict = judge(&course(), &events, &samples(6));
+        assert_eq!((verdict.outcome, verdict.stages_passed), (Outcome::Finished, 3));
+        assert_eq!(verdict.score, 100.0);
+        // A stage after the end is none.
+        let late = [event(3.0, EventKind::TimeLimit), stage(3.5, 0)];
+        let verdict = judge(&course(), &late, &samples(6));
+        assert_eq!((verdict.outcome, verdict.stages_passed), (Outcome::Timeout, 0));
+    }
+
+    #[test]
+    fn landing_early_ends_the_time() {
+        let landing = event(2.4, EventKind::Phase(FlightPhase::Landing));
+        let verdict = judge(&course(), std::slice::from_ref(&landing), &samples(6));
+        assert_eq!(verdict.outcome, Outcome::Landed);
+        assert!((verdict.seconds - 2.0).abs() < 1e-6);
+        // For want of a pose it is nobody's choice; one that came back does not count.
+        let lost = event(2.0, EventKind::PoseLost { age_s: 0.2 });
+        let back = event(2.1, EventKind::PoseRegained);
+        let blind = judge(&course(), &[lost.clone(), landing.clone()], &samples(6));
+        assert_eq!(blind.outcome, Outcome::Error);
+        let seen = judge(&course(), &[lost, back, landing], &samples(6));
+        assert_eq!(seen.outcome, Outcome::Landed);
+    }
+
+    #[test]
+    fn on_the_ground_there_is_nothing_to_judge() {
+        let verdict = judge(&course(), &[], &samples(0));
+        assert_eq!((verdict.outcome, verdict.min_clearance_m), (Outcome::Error, None));
+        let failed = judge(&course(), &[event(0.0, EventKind::PluginFailed)], &[]);
+        assert_eq!((failed.outcome, failed.seconds), (Outcome::PluginFailed, 0.0));
+    }
+}

@@ -1,0 +1,251 @@
+//! The course's projects: what stands in the net, what the vehicle sees and may know, and the rules,
+//! from one file of text each (`render-server/scenes/projects/*.toml`).
+//!
+//! ```text
+//! projects/p5.toml -> Project -> generate(seed, level, variant) -> Generated
+//! ```
+//! The place comes from the seed, as [`generate`](crate::generate) makes it; sensors come from the
+//! level, light from the variant. Called once per flight.
+
+use core::fmt;
+use core::str::FromStr;
+
+use serde::Deserialize;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_arena::config::{CameraConfig, RulesConfig};
+use vizflyt_protocol::messages::Limits;
+
+use crate::hall::{self, Layout};
+use crate::variant::Variant;
+use crate::{Generated, forest};
+
+/// The names of all projects, in the order of the course.
+pub const NAMES: [&str; 5] = ["p2", "p3", "p4", "p5", "forest"];
+
+/// One project of the course.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Project {
+    name: &'static str,
+    text: &'static str,
+    plan: Plan,
+}
+
+/// Whom a course is for: with which sensors it is flown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Level {
+    /// Undergraduate: images with depth.
+    #[default]
+    Ug,
+    /// Graduate: images without depth.
+    G,
+}
+
+impl Level {
+    /// Every level.
+    pub const ALL: [Self; 2] = [Self::Ug, Self::G];
+
+    /// Returns the level's name as the command line takes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ug => "ug",
+            Self::G => "g",
+        }
+    }
+}
+
+impl fmt::Display for Level {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Level {
+    type Err = UnknownLevel;
+
+    fn from_str(text: &str) -> Result<Self, UnknownLevel> {
+        let known = Self::ALL.into_iter().find(|level| level.name() == text);
+        known.ok_or_else(|| UnknownLevel(text.to_owned()))
+    }
+}
+
+/// A name that is no [`Level`].
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("no level is called '{0}'; give ug (with depth) or g (without)")]
+pub struct UnknownLevel(pub String);
+
+/// A name that is no [`Project`].
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("there is no project '{0}'; there are: {all}", all = NAMES.join(", "))]
+pub struct UnknownProject(pub String);
+
+/// The whole of a project's file.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Plan {
+    title: String,
+    task: String,
+    place: Place,
+    finish: Finish,
+    #[serde(default)]
+    known_map: bool,
+    ground_truth: bool,
+    time_limit_s: f64,
+    limits: Limits,
+    #[serde(default)]
+    rules: RulesConfig,
+    levels: Levels,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Place {
+    Forest,
+    Net(Layout),
+}
+
+/// When a flight has finished.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+enum Finish {
+    /// In the goal, all stages passed.
+    #[serde(rename = "goal")]
+    Goal,
+    /// With the last stage passed.
+    #[serde(rename = "last stage")]
+    LastStage,
+}
+
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Levels {
+    ug: Suite,
+    g: Suite,
+}
+
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Suite {
+    cameras: Vec<CameraConfig>,
+}
+
+impl Project {
+    /// Returns the project of a name.
+    ///
+    /// ```
+    /// use vizflyt_scenes::projects::{Level, Project};
+    /// use vizflyt_scenes::Variant;
+    /// let race = Project::named("p5").unwrap();
+    /// let generated = race.generate(3, Level::Ug, Variant::Day);
+    /// let names: Vec<_> = generated.arena.stages.iter().map(|stage| &*stage.name).collect();
+    /// assert_eq!(names, ["window 1", "window 2", "gap", "clock hand"]);
+    /// assert!(!generated.arena.ground_truth);
+    /// assert!(Project::named("p9").unwrap_err().to_string().contains("p2, p3, p4, p5, forest"));
+    /// ```
+    ///
+    /// # Errors
+    /// [`UnknownProject`], which says the names that there are.
+    ///
+    /// # Panics
+    /// If a project's file in this program is wrong, which a test excludes.
+    pub fn named(name: &str) -> Result<Self, UnknownProject> {
+        let (name, text) = FILES
+            .into_iter()
+            .find(|(known, _)| *known == name)
+            .ok_or_else(|| UnknownProject(name.to_owned()))?;
+        let plan = toml::from_str(text).unwrap_or_else(|error| panic!("{name}.toml: {error}"));
+        Ok(Self { name, text, plan })
+    }
+
+    /// Returns every project.
+    pub fn all() -> impl Iterator<Item = Self> {
+        NAMES.into_iter().filter_map(|name| Self::named(name).ok())
+    }
+
+    /// Returns its name: `p5`.
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// Returns what it is about, in a few words.
+    pub fn title(&self) -> &str {
+        &self.plan.title
+    }
+
+    /// Returns what is to be done, in a few sentences.
+    pub fn task(&self) -> &str {
+        self.plan.task.trim()
+    }
+
+    /// Returns the text of its file, all of its rules: what a grade vouches for.
+    pub fn text(&self) -> &'static str {
+        self.text
+    }
+
+    /// Generates the project's place of a seed, with the sensors of a level, in a variant's light.
+    /// The same arguments give the same result on every machine.
+    pub fn generate(&self, seed: u64, level: Level, variant: Variant) -> Generated {
+        let plan = &self.plan;
+        let mut generated = match plan.place {
+            Place::Forest => forest::build(seed),
+            Place::Net(layout) => hall::build_course(seed, self.name, layout),
+        };
+        let suite = match level {
+            Level::Ug => &plan.levels.ug,
+            Level::G => &plan.levels.g,
+        };
+        let arena = &mut generated.arena;
+        *arena = ArenaConfig {
+            name: self.name.to_owned(),
+            time_limit_s: plan.time_limit_s,
+            ground_truth: plan.ground_truth,
+            limits: plan.limits,
+            rules: plan.rules,
+            cameras: suite.cameras.clone(),
+            goal: arena.goal.filter(|_| plan.finish == Finish::Goal),
+            ..arena.clone()
+        };
+        generated.map_is_known = plan.known_map;
+        variant.apply(&mut generated);
+        generated
+    }
+}
+
+/// The projects' files, by name.
+const FILES: [(&str, &str); 5] = [
+    ("p2", include_str!("../projects/p2.toml")),
+    ("p3", include_str!("../projects/p3.toml")),
+    ("p4", include_str!("../projects/p4.toml")),
+    ("p5", include_str!("../projects/p5.toml")),
+    ("forest", include_str!("../projects/forest.toml")),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_project_makes_a_valid_arena() {
+        for (project, name) in Project::all().zip(NAMES) {
+            assert_eq!(project.name(), name);
+            assert!(!project.title().is_empty() && project.task().len() > 40, "{name}");
+            for level in Level::ALL {
+                let generated = project.generate(3, level, Variant::Day);
+                let arena = &generated.arena;
+                arena.validate().unwrap_or_else(|error| panic!("{name}: {error}"));
+                assert_eq!(arena.name, name);
+                let depth = arena.cameras.iter().all(|camera| camera.depth);
+                assert_eq!(depth, level == Level::Ug, "{name} {level}");
+                // A flight can end well: in a goal or with the last stage.
+                assert!(arena.goal.is_some() || !arena.stages.is_empty(), "{name}");
+            }
+        }
+        assert_eq!(Project::all().count(), NAMES.len());
+    }
+
+    #[test]
+    fn levels_parse_and_print() {
+        for level in Level::ALL {
+            assert_eq!(level.to_string().parse(), Ok(level));
+        }
+        assert!("x".parse::<Level>().unwrap_err().to_string().contains("'x'"));
+    }
+}
