@@ -4,9 +4,12 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::Args;
+use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::messages::{Grant, MAX_GRANTED, bounded};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
+use crate::dashboard::Login;
+use crate::leaderboard::{Database, UnknownDatabase};
 use crate::pace::Adapt;
 use crate::render::RendererKind;
 use crate::scene::Up;
@@ -20,6 +23,10 @@ pub struct ServeArgs {
     /// arena.toml, its folder, or a bare scene file, for which an arena is made up
     pub arena: PathBuf,
 
+    /// Folder of scenes, each a folder with an arena.toml, among which the instructor chooses on the page
+    #[arg(long, value_name = "DIR")]
+    pub scenes: Option<PathBuf>,
+
     /// Where runtimes connect (UDP)
     #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4433")]
     pub quic: SocketAddr,
@@ -28,9 +35,16 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
 
-    /// Where Vicon Tracker's UDP object stream arrives
-    #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:51001")]
-    pub vicon: SocketAddr,
+    /// Where Vicon Tracker's UDP object stream arrives [default: 0.0.0.0:51001, unless arena.toml has
+    /// [[localization]] or --pose is given]
+    #[arg(long, value_name = "ADDR")]
+    pub vicon: Option<SocketAddr>,
+
+    /// A source of poses instead of arena.toml's: vicon, natnet, json or mavlink,
+    /// with the keys of [[localization]], as natnet:239.255.42.99:1511,up=y or
+    /// 'vicon,pivot_m=[0.02,0,0.05]'; repeat for more
+    #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", value_parser = LocalizationConfig::parse)]
+    pub pose: Vec<LocalizationConfig>,
 
     /// A vehicle: its object's name in the localization system; repeat for more
     /// [default: the [[vehicles]] of arena.toml, else vizflyt]
@@ -79,6 +93,14 @@ pub struct ServeArgs {
     #[arg(long, value_name = "METRES", value_parser = scale)]
     pub scale: Option<f64>,
 
+    /// Vehicles fly in nets of their own: in the twin they neither see nor touch each other
+    #[arg(long)]
+    pub apart: bool,
+
+    /// Draws where in their motion objects begin of which arena.toml does not say it
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+
     /// Open a pairing at the start and print its code: `instructor`, or `team:VEHICLE`
     #[arg(long, value_name = "ROLE", value_parser = grant)]
     pub pair: Option<Grant>,
@@ -88,10 +110,23 @@ pub struct ServeArgs {
     #[arg(long)]
     pub print_page_keys: bool,
 
+    /// Who must log in on the page; `vizflyt password` sets the instructor's password
+    #[arg(long, value_enum, default_value_t)]
+    pub login: Login,
+
     /// Folder of this server's key and of paired.toml, which says who may connect
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
+
+    /// Where flights are written down: a file, postgres://USER:PASSWORD@HOST/NAME, or none
+    /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite]
+    #[arg(long, value_name = "FILE|URL|none", value_parser = kept)]
+    pub leaderboard: Option<Kept>,
+
+    /// A team's official runs on a course, at most; further ones are practice [default: as many as it likes]
+    #[arg(long, value_name = "N")]
+    pub official_attempts: Option<u32>,
 
     /// Print JSON lines on standard output: ready, events, report
     #[arg(long)]
@@ -100,6 +135,19 @@ pub struct ServeArgs {
     /// End when standard input ends
     #[arg(long, hide = true)]
     pub lifeline: bool,
+}
+
+/// Where flights are written down.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Kept {
+    /// There.
+    In(Database),
+    /// Nowhere.
+    Nowhere,
+}
+
+fn kept(text: &str) -> Result<Kept, UnknownDatabase> {
+    if text == "none" { Ok(Kept::Nowhere) } else { text.parse().map(Kept::In) }
 }
 
 /// How colour is stored.
@@ -127,6 +175,18 @@ pub enum Depth {
 }
 
 impl ServeArgs {
+    /// Returns where poses come from: what the command line says, else what `arena.toml` says, else
+    /// Vicon.
+    pub fn localization(&self, arena: Vec<LocalizationConfig>) -> Vec<LocalizationConfig> {
+        let vicon = self.vicon.map(|address| LocalizationConfig {
+            address: Some(address.to_string()),
+            ..LocalizationConfig::new(Driver::Vicon)
+        });
+        let said: Vec<_> = vicon.into_iter().chain(self.pose.clone()).collect();
+        let vicon = || vec![LocalizationConfig::new(Driver::Vicon)];
+        [said, arena].into_iter().find(|sources| !sources.is_empty()).unwrap_or_else(vicon)
+    }
+
     /// Returns how images are encoded.
     pub fn encode_options(&self) -> EncodeOptions {
         EncodeOptions {
@@ -173,7 +233,11 @@ fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
 }
 
-pub(crate) fn scale(text: &str) -> Result<f64, String> {
+/// Reads metres per unit of a bare scene.
+///
+/// # Errors
+/// What is no number, or no scale that a scene has.
+pub fn scale(text: &str) -> Result<f64, String> {
     number(text, 1e-4, 1e4)
 }
 
@@ -221,7 +285,17 @@ mod tests {
         assert_eq!(parse("a.toml --pair instructor").unwrap().pair, Some(Grant::Instructor));
         let team = Grant::Team { vehicles: ["ant", "bee"].map(bounded).into_iter().collect() };
         assert_eq!(parse("a.toml --pair team:ant,bee").unwrap().pair, Some(team));
+        let sources = |words: &str, arena: &[&str]| {
+            let arena = arena.iter().map(|text| LocalizationConfig::parse(text).unwrap());
+            let said = parse(words).unwrap().localization(arena.collect());
+            said.iter().map(|s| format!("{}:{}", s.driver, s.address())).collect::<Vec<_>>()
+        };
+        assert_eq!(sources("a.toml", &[]), ["vicon:0.0.0.0:51001"]);
+        assert_eq!(sources("a.toml", &["natnet"]), ["natnet:239.255.42.99:1511"]);
+        let both = sources("a.toml --pose json:0.0.0.0:7 --vicon 0.0.0.0:8", &["natnet"]);
+        assert_eq!(both, ["vicon:0.0.0.0:8", "json:0.0.0.0:7"]);
         for wrong in [
+            "a.toml --pose radio",
             "a.toml --max-rate nan",
             "a.toml --max-rate 0",
             "a.toml --quality 0",

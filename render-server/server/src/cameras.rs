@@ -171,7 +171,9 @@ fn changed(
     if let Value::Object(keys) = &mut value {
         keys.entry("name").or_insert_with(|| name.into());
     }
-    let new: CameraConfig = serde_json::from_value(value)?;
+    let mut new: CameraConfig = serde_json::from_value(value)?;
+    // Depth that the course withholds is not had by asking.
+    new.depth &= set.configs[index].depth;
     if new.name != name {
         return Err(ChangeError::Renamed(new.name));
     }

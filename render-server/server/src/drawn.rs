@@ -39,9 +39,11 @@ pub struct DrawnImage {
     pub camera: usize,
     /// Its tick, counted from 1.
     pub seq: u64,
-    /// When the pose was measured.
+    /// When the newest pose behind it was measured.
     pub pose: ServerTime,
-    /// The pose drawn from.
+    /// The instant it shows.
+    pub shown: ServerTime,
+    /// The pose drawn from: that of the instant.
     pub world_from_body: Option<Pose<World, Body>>,
     /// The vehicle's cameras as they were drawn with.
     pub set: Option<Arc<CameraSet>>,

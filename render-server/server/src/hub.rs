@@ -10,8 +10,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
 pub use vizflyt_arena::config::MAX_VEHICLES;
+use vizflyt_arena::pose::Predict;
 
 use crate::drivers::SourceCounters;
+use crate::leaderboard::Leaderboard;
+use crate::moving::Moving;
 use crate::outlet::Outlet;
 use crate::pace::Adapt;
 use crate::stats::{Report, Stats};
@@ -35,6 +38,14 @@ pub struct Hub {
     pub outlet: Outlet,
     /// What may be lowered toward a runtime whose link is too slow.
     pub adapt: Adapt,
+    /// For which moment images are drawn.
+    pub predict: Predict,
+    /// What moves in the twin.
+    pub moving: Moving,
+    /// Where flights are written down; `None` if they are not.
+    pub leaderboard: Option<Leaderboard>,
+    /// What the sources of poses are called, by their index.
+    pub source_names: Vec<String>,
     /// What the localization delivered, of all vehicles.
     pub source: Mutex<SourceCounters>,
 }
@@ -60,6 +71,10 @@ impl Hub {
             stats: Stats::default(),
             outlet: Outlet::new(&cameras),
             adapt: Adapt::default(),
+            predict: Predict::default(),
+            moving: Moving::default(),
+            leaderboard: None,
+            source_names: Vec::new(),
             source: Mutex::default(),
         }
     }

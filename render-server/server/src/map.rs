@@ -2,7 +2,8 @@
 //!
 //! A picture of the twin seen straight down from far above (so that a perspective camera is as good
 //! as a parallel one), without what lies above the flight: crowns and ceilings would hide the
-//! trunks and the floor. Over it, what is solid at flight height, as one bit per cell.
+//! trunks and the floor. Over it, what is solid at flight height, as one bit per cell. For the view
+//! in space, the surface of what is solid, as cells.
 
 use axum::body::Bytes;
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -22,6 +23,8 @@ pub struct Map {
     pub max_m: [f64; 2],
     /// What is solid at flight height.
     pub obstacles: Obstacles,
+    /// The surface of what is solid: [`shell`].
+    pub shell: Bytes,
 }
 
 /// A grid of solid cells.
@@ -63,6 +66,61 @@ impl Obstacles {
             }
         }
         Self { origin_m: min_m.to_array(), cell_m, width, height, bits: base64(&bits) }
+    }
+}
+
+/// Returns the surface of what is `solid` in a box, as cells for the page: little-endian, the box's
+/// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
+/// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MOST_SHELL`].
+///
+/// `solid` says whether anything solid is within a distance [m] of a point [m, world].
+pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64) -> bool) -> Bytes {
+    let span = (max_m - min_m).max(DVec3::splat(1e-3));
+    let mut cell_m = cell_m.max((span.element_product() / MOST_SAMPLES).cbrt());
+    cell_m = cell_m.max(span.max_element() / f64::from(u16::MAX));
+    loop {
+        let [nx, ny, nz] = (span / cell_m).ceil().to_array().map(|n| (n as usize).max(1));
+        let at = |x: usize, y: usize, z: usize| (z * ny + y) * nx + x;
+        let mut is_solid = vec![false; nx * ny * nz];
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in 0..nx {
+                    let p = min_m + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell_m;
+                    is_solid[at(x, y, z)] = solid(p, cell_m / 2.0);
+                }
+            }
+        }
+        let hidden = |x: usize, y: usize, z: usize| {
+            let inside = x > 0 && y > 0 && z > 0 && x + 1 < nx && y + 1 < ny && z + 1 < nz;
+            inside
+                && [
+                    at(x - 1, y, z),
+                    at(x + 1, y, z),
+                    at(x, y - 1, z),
+                    at(x, y + 1, z),
+                    at(x, y, z - 1),
+                    at(x, y, z + 1),
+                ]
+                .iter()
+                .all(|&neighbour| is_solid[neighbour])
+        };
+        let mut bytes = Vec::new();
+        for value in [min_m.x, min_m.y, min_m.z, cell_m] {
+            bytes.extend_from_slice(&(value as f32).to_le_bytes());
+        }
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in (0..nx).filter(|&x| is_solid[at(x, y, z)] && !hidden(x, y, z)) {
+                    for place in [x, y, z] {
+                        bytes.extend_from_slice(&(place as u16).to_le_bytes());
+                    }
+                }
+            }
+        }
+        if bytes.len() <= 16 + 6 * MOST_SHELL {
+            return bytes.into();
+        }
+        cell_m *= 1.25;
     }
 }
 
@@ -147,6 +205,10 @@ const DISTANCE: f64 = 30.0;
 /// A map wider than this is drawn coarser. [px]
 const WANTED_SIDE_PX: u32 = 1200;
 const MOST_SIDE_PX: u32 = 2048;
+/// Tenths of a second to look through. [cells]
+const MOST_SAMPLES: f64 = 400_000.0;
+/// What a phone draws without a jerk; 360 KB.
+const MOST_SHELL: usize = 60_000;
 /// 64 KB of bits at most.
 const MOST_CELLS: usize = 720;
 
@@ -172,6 +234,21 @@ mod tests {
         assert_eq!(found.bits, base64(&[0b1100_0000]));
         let coarse = Obstacles::scan(DVec2::ZERO, DVec2::new(7200.0, 1.0), 0.1, solid);
         assert_eq!((coarse.width, coarse.height), (MOST_CELLS, 1));
+    }
+
+    #[test]
+    fn a_shell_is_the_surface_of_what_is_solid() {
+        // A cube of 5 x 5 x 5 cells in the middle of 9 x 9 x 9: 125 less the 27 inside.
+        let cube = |p: DVec3, _| (p - 0.45).abs().max_element() < 0.25;
+        let bytes = shell(DVec3::ZERO, DVec3::splat(0.9), 0.1, cube);
+        let f32_at = |k: usize| f32::from_le_bytes(bytes[4 * k..4 * k + 4].try_into().unwrap());
+        assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
+        assert_eq!((bytes.len() - 16) / 6, 125 - 27);
+        assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
+        // A hall of walls is drawn in cells as coarse as it takes; nothing at all is an empty list.
+        let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_, _| true);
+        assert!(all.len() <= 16 + 6 * MOST_SHELL && all.len() > 1000);
+        assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_, _| false).len(), 16);
     }
 
     #[test]

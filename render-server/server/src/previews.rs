@@ -23,6 +23,8 @@ pub struct Preview {
     pub colour: Vec<u8>,
     /// JPEG of the depth image, coloured by [`depth_colour`].
     pub depth: Vec<u8>,
+    /// JPEG of which object is seen where, coloured by [`id_colour`]; empty where none was seen yet.
+    pub ids: Vec<u8>,
 }
 
 /// Makes previews until the server stops.
@@ -78,6 +80,8 @@ struct Stage {
     depth_mm: Vec<u16>,
     coloured: Vec<u8>,
     small: Vec<u8>,
+    /// Whether an object has been seen: a scene without any needs no picture of them.
+    has_objects: bool,
     palette: Vec<[u8; 3]>,
 }
 
@@ -88,6 +92,7 @@ impl Stage {
             depth_mm: Vec::new(),
             coloured: Vec::new(),
             small: Vec::new(),
+            has_objects: false,
             palette: (0..PALETTE_SIZE).map(|k| depth_colour(palette_depth_mm(k))).collect(),
         }
     }
@@ -100,10 +105,18 @@ impl Stage {
             self.coloured.extend_from_slice(&self.palette[palette_index(mm)]);
         }
         let size = [image.width_px, image.height_px];
-        Ok(Preview {
-            colour: jpeg(&self.rgb, size, &mut self.small)?,
-            depth: jpeg(&self.coloured, size, &mut self.small)?,
-        })
+        let colour = jpeg(&self.rgb, size, &mut self.small)?;
+        let depth = jpeg(&self.coloured, size, &mut self.small)?;
+        self.has_objects |= image.ids.iter().any(|&id| id != 0);
+        let mut ids = Vec::new();
+        if self.has_objects {
+            self.coloured.clear();
+            for (&id, &mm) in image.ids.iter().zip(&self.depth_mm) {
+                self.coloured.extend_from_slice(&id_colour(id, mm));
+            }
+            ids = jpeg(&self.coloured, size, &mut self.small)?;
+        }
+        Ok(Preview { colour, depth, ids })
     }
 }
 
@@ -163,6 +176,29 @@ pub fn depth_colour(depth_mm: u16) -> [u8; 3] {
     [mix(a[0], b[0]), mix(a[1], b[1]), mix(a[2], b[2])]
 }
 
+/// Returns the colour of an object on the page, by its id; what stands still is grey, darker with
+/// depth.
+pub fn id_colour(id: u16, depth_mm: u16) -> [u8; 3] {
+    match id {
+        0 => {
+            let [r, g, b] = depth_colour(depth_mm).map(u16::from);
+            [((r + g + b) / 9) as u8; 3]
+        }
+        id => IDS[usize::from(id - 1) % IDS.len()],
+    }
+}
+
+/// Colours that are told apart with any colour vision (Okabe and Ito, 2008).
+const IDS: [[u8; 3]; 7] = [
+    [230, 159, 0],
+    [86, 180, 233],
+    [0, 158, 115],
+    [240, 228, 66],
+    [0, 114, 178],
+    [213, 94, 0],
+    [204, 121, 167],
+];
+
 /// The palette is indexed by depth in steps of 16 mm, no return apart.
 fn palette_index(mm: u16) -> usize {
     if mm == 0 { 0 } else { 1 + usize::from(mm >> 4) }
@@ -209,6 +245,27 @@ mod tests {
             let off = found.iter().zip(expected).map(|(a, b)| a.abs_diff(b)).max();
             assert!(off.is_some_and(|off| off <= 8), "{mm} mm: {found:?} for {expected:?}");
         }
+    }
+
+    #[test]
+    fn objects_get_a_picture_once_one_was_seen() {
+        let image = |id: u16| RgbdImage {
+            width_px: 16,
+            height_px: 16,
+            rgb: vec![0.5; 16 * 16 * 3],
+            alpha: vec![1.0; 256],
+            depth_expected_m: vec![2.0; 256],
+            depth_median_m: vec![2.0; 256],
+            ids: vec![id; 256],
+        };
+        let mut stage = Stage::new();
+        assert!(stage.preview(&image(0)).unwrap().ids.is_empty());
+        assert!(!stage.preview(&image(3)).unwrap().ids.is_empty());
+        // Out of sight it is still a picture, so that the last one does not stay.
+        assert!(!stage.preview(&image(0)).unwrap().ids.is_empty());
+        assert_eq!(id_colour(1, 0), id_colour(8, 9000), "they come again");
+        assert_ne!(id_colour(1, 0), id_colour(2, 0));
+        assert_eq!(id_colour(0, 0), [0; 3]);
     }
 
     fn check_shrunk(width: u32, height: u32, expected: [u32; 2]) {

@@ -1,34 +1,40 @@
 //! Starts everything, says when it is ready, and ends it in order.
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use glam::DVec2;
 use serde::Serialize;
+use tracing::warn;
+use vizflyt_arena::config::Driver;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
 use vizflyt_protocol::messages::Grant;
-use vizflyt_splat::{Chosen, Rasterizer, Splats};
+use vizflyt_splat::{Chosen, Rasterizer, Scene as Drawn, Splats};
 use vizflyt_trust::KeysFolder;
 
-use crate::args::ServeArgs;
+use crate::args::{Kept, ServeArgs};
 use crate::cameras::Cameras;
-use crate::dashboard::PageKeys;
+use crate::dashboard::messages::Rates;
+use crate::dashboard::{Access, Logins, Page, PageKeys};
 use crate::door::Door;
 use crate::drawn::Ticks;
-use crate::drivers::{PoseSource, ViconUdp};
+use crate::drivers::{self, Opened, PoseSource};
 use crate::events::Origin;
 use crate::hub::{Hub, RendererInfo, lock};
+use crate::leaderboard::{Database, Leaderboard, record};
 use crate::mailbox::Mailbox;
 use crate::map::{self, Map, Obstacles};
+use crate::moving::{Moving, vehicle_models};
 use crate::render::choose;
-use crate::scene::{self, Scene};
+use crate::scene::{self, Scene, Scenes};
 use crate::stats::Report;
 use crate::stop::Stop;
 use crate::transport;
 use crate::vehicle::Vehicle;
-use crate::{dashboard, encode, previews, tick};
+use crate::{clock, dashboard, encode, previews, tick};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -40,13 +46,14 @@ use crate::{dashboard, encode, previews, tick};
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn serve(args: ServeArgs) -> Result<()> {
     let stop = Stop::default();
+    let mut args = args;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("net")
         .enable_all()
         .build()
         .context("cannot start tokio")?;
-    let result = runtime.block_on(run(&args, &stop));
+    let result = runtime.block_on(rounds(&mut args, &stop));
     stop.set();
     // Not awaited: a task stuck in a system call must not hold up the end.
     runtime.shutdown_background();
@@ -60,7 +67,11 @@ struct Ready<'a> {
     ready: &'static str,
     quic: SocketAddr,
     http: String,
-    vicon: SocketAddr,
+    /// Where Vicon's stream must be sent, if that is a source.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    vicon: Option<SocketAddr>,
+    /// Where poses come from.
+    pose: Vec<ReadySource>,
     fingerprint: &'a str,
     /// How many computers may connect.
     paired: usize,
@@ -72,6 +83,13 @@ struct Ready<'a> {
     renderer: &'a str,
     /// Why it is this renderer.
     renderer_reason: &'a str,
+}
+
+/// A source of poses, as it is printed when the server is ready.
+#[derive(Debug, Serialize)]
+struct ReadySource {
+    driver: Driver,
+    address: String,
 }
 
 /// A vehicle, as it is printed when the server is ready.
@@ -91,16 +109,66 @@ impl ReadyVehicle {
     }
 }
 
-async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
+/// Serves one scene after another, until the end of the program.
+async fn rounds(args: &mut ServeArgs, stop: &Stop) -> Result<()> {
     stop.on_signals(args.lifeline)?;
+    let logins = Logins::new().map_err(anyhow::Error::msg)?;
+    let mut former = None;
+    loop {
+        let scenes = Arc::new(Scenes::new(args.scenes.as_deref(), &args.arena));
+        let round = run(args, &scenes, &logins, former.is_some(), &stop.child()).await;
+        if stop.is_set() {
+            return round;
+        }
+        match (round, scenes.take_chosen(), former.take()) {
+            (Ok(()), Some(arena), _) => former = Some(std::mem::replace(&mut args.arena, arena)),
+            // The new one cannot be loaded: the lab goes on with the one that could.
+            (Err(error), _, Some(arena)) => {
+                warn!("{error:#}; back to {}", arena.display());
+                args.arena = arena;
+            }
+            (round, _, _) => return round,
+        }
+    }
+}
+
+/// Serves one scene, until it is to end or another one is chosen. With `again`, a former round was
+/// a moment ago, and its last tasks may still hold the sockets.
+async fn run(
+    args: &mut ServeArgs,
+    scenes: &Arc<Scenes>,
+    logins: &Arc<Logins>,
+    again: bool,
+    stop: &Stop,
+) -> Result<()> {
     // Sockets first: a taken port is told before the scene is loaded.
     let door = Arc::new(Door::open(KeysFolder::open(args.keys.as_deref())?)?);
-    let endpoint = transport::bind(args.quic, &door.identity, args.congestion)?;
+    let mut tries = if again { BIND_TRIES } else { 0 };
+    let (endpoint, listener, sources) = loop {
+        let bound = async {
+            let endpoint = transport::bind(args.quic, &door.identity, args.congestion)?;
+            let listener = dashboard::bind(args.http).await?;
+            let sources = drivers::open(&args.localization(scene::localization(&args.arena)?))?;
+            anyhow::Ok((endpoint, listener, sources))
+        };
+        match bound.await {
+            Err(_) if tries > 0 => tries -= 1,
+            bound => break bound?,
+        }
+        tokio::time::sleep(BIND_EVERY).await;
+    };
     let quic = endpoint.local_addr().context("QUIC has no address")?;
-    let listener = dashboard::bind(args.http).await?;
-    let http = format!("http://{}", listener.local_addr().context("the page has no address")?);
-    let vicon = ViconUdp::bind(args.vicon)?;
-    let vicon_address = vicon.address();
+    let http = listener.local_addr().context("the page has no address")?;
+    let vicon = sources.iter().find(|source| source.driver() == Driver::Vicon);
+    let vicon = vicon.and_then(Opened::socket);
+    // The next round is found where this one is.
+    (args.quic, args.http) = (quic, http);
+    args.vicon = args.vicon.and(vicon);
+    let http = format!("http://{http}");
+    let pose = sources
+        .iter()
+        .map(|source| ReadySource { driver: source.driver(), address: source.address() });
+    let pose = pose.collect();
 
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading));
@@ -115,10 +183,16 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     });
     let mut hub = Hub::new(vehicles.collect(), renderer, stop.clone());
     hub.adapt = args.adapt;
+    hub.predict = twin.arena.pose.predict;
+    hub.moving = twin.moving;
+    hub.leaderboard = open_leaderboard(args).await;
+    hub.source_names =
+        sources.iter().map(|source| format!("{} {}", source.driver(), source.address())).collect();
     let hub = Arc::new(hub);
     let renderer = lock(&hub.renderer).clone();
     let names: Vec<_> = hub.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
-    let threads = start_threads(args, &hub, rasterizer, twin.referees, vicon.of(&names))?;
+    let threads =
+        start_threads(args, &hub, rasterizer, twin.referees, drivers::track(sources, &names)?)?;
 
     let fingerprint = door.identity.fingerprint().to_string();
     let vehicles = hub.vehicles.iter().zip(&twin.flying);
@@ -130,7 +204,8 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
             ready: "server",
             quic,
             http: http.clone(),
-            vicon: vicon_address,
+            vicon,
+            pose,
             fingerprint: &fingerprint,
             paired: door.paired().clients.len(),
             spawn: vehicles.first().map_or([0.0; 4], |vehicle| vehicle.spawn),
@@ -141,21 +216,32 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
         },
     );
 
-    let page_keys = PageKeys::keep(&door.folder, &names)?;
+    let access = Arc::new(Access::new(&door.folder, &names, args.login, logins.clone())?);
     if args.print_page_keys || !args.http.ip().is_loopback() {
-        print_page_keys(&page_keys, &http, &names, args.json);
+        print_page_keys(access.keys(), &http, &names, args.json);
     }
-    let page = tokio::spawn(dashboard::serve(
-        hub.clone(),
-        door.clone(),
-        page_keys,
-        twin.map,
-        twin.arena.stages,
-        quic.port(),
-        listener,
-    ));
-    if let Some(grant) = &args.pair {
-        open_pairing(&door, grant, quic.port(), args.json)?;
+    let page = Page {
+        hub: hub.clone(),
+        map: twin.map,
+        stages: twin.arena.stages,
+        boot: clock::now(),
+        rates: Rates::of(hub.vehicles.len()),
+        access,
+        door: door.clone(),
+        quic_port: quic.port(),
+        scenes: scenes.clone(),
+        team_tries: Mutex::default(),
+    };
+    let page = tokio::spawn(dashboard::serve(page, listener));
+    if let Some(grant) = args.pair.take() {
+        open_pairing(&door, &grant, quic.port(), args.json)?;
+    }
+    let mut recorders = tokio::task::JoinSet::new();
+    for (vehicle, (_, arena)) in hub.vehicles.iter().zip(&twin.flying) {
+        if let Some(board) = &hub.leaderboard {
+            let (board, vehicle) = (board.clone(), vehicle.clone());
+            recorders.spawn(record(board, vehicle, arena.clone(), args.official_attempts));
+        }
     }
     let rights = tokio::spawn({
         let door = door.clone();
@@ -171,12 +257,29 @@ async fn run(args: &ServeArgs, stop: &Stop) -> Result<()> {
     rights.abort();
     page.abort();
     printers.shutdown().await;
+    recorders.shutdown().await;
     for thread in threads {
         // A thread that panicked has said so on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
     report(args.json, &hub.report());
     Ok(())
+}
+
+/// Opens the database of runs. Without one the lab flies all the same: a warning says why.
+async fn open_leaderboard(args: &ServeArgs) -> Option<Leaderboard> {
+    let database = match &args.leaderboard {
+        Some(Kept::Nowhere) => return None,
+        Some(Kept::In(database)) => database.clone(),
+        None => Database::File(Database::default_file()?),
+    };
+    match Leaderboard::open(&database).await {
+        Ok(board) => Some(board),
+        Err(error) => {
+            warn!("flights are not written down: {error}");
+            None
+        }
+    }
 }
 
 /// Prints the addresses by which others open the page.
@@ -226,11 +329,12 @@ struct Twin {
     /// Each vehicle's name, and the arena as it has it.
     flying: Vec<(String, ArenaConfig)>,
     referees: Vec<Referee>,
+    moving: Moving,
     map: Map,
 }
 
 fn prepare(args: &ServeArgs) -> Result<Twin> {
-    let Scene { arena, splats, .. } = scene::load(&args.arena, args.up, args.scale)?;
+    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, args.up, args.scale)?;
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
         .iter()
@@ -238,11 +342,19 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
         .collect();
     let obstacles = Arc::new(scene::bake(&splats, &arena));
     let map = draw_map(&splats, &arena, &obstacles);
-    let renderer = choose(&splats, args.renderer)?;
+    let obstacles = scene::obstacles(&arena, &objects, obstacles, args.seed);
+    let together = if args.apart { 0 } else { flying.len() };
+    objects.extend(vehicle_models(together));
+    let renderer = choose(Drawn { splats: &splats, objects: &objects }, args.renderer)?;
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
-    let referees = flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone())).collect();
-    Ok(Twin { arena, renderer, flying, referees, map })
+    // Pictures and referees count what moves from the same instant.
+    let epoch = clock::now();
+    let moving = Moving::new(epoch, obstacles.objects.clone(), &objects, together);
+    let referees =
+        flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone()).counting_from(epoch));
+    let referees = referees.collect();
+    Ok(Twin { arena, renderer, flying, referees, moving, map })
 }
 
 fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map {
@@ -252,7 +364,17 @@ fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map 
         field.obstacle_distance_m(p.extend(flight_m)) < 0.0
     });
     let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M);
-    Map { jpeg: jpeg.unwrap_or_default(), min_m: min.to_array(), max_m: max.to_array(), obstacles }
+    let (low, high) = (arena.geofence.min_m, arena.geofence.max_m);
+    let shell = map::shell(low, high, arena.occupancy.voxel_m, |p, within_m| {
+        field.obstacle_distance_m(p) < within_m
+    });
+    Map {
+        shell,
+        jpeg: jpeg.unwrap_or_default(),
+        min_m: min.to_array(),
+        max_m: max.to_array(),
+        obstacles,
+    }
 }
 
 fn start_threads(
@@ -260,7 +382,7 @@ fn start_threads(
     hub: &Arc<Hub>,
     mut renderer: Box<dyn Rasterizer>,
     mut referees: Vec<Referee>,
-    mut source: impl PoseSource + 'static,
+    mut source: Box<dyn PoseSource>,
 ) -> Result<Vec<JoinHandle<()>>> {
     let newest = Arc::new(Mailbox::default());
     let ticks = Arc::new(Ticks::default());
@@ -277,7 +399,7 @@ fn start_threads(
     Ok(vec![
         start(
             "pose",
-            Box::new(move || tick::poses(&pose_hub, &mut source, &mut referees, &pose_newest)),
+            Box::new(move || tick::poses(&pose_hub, &mut *source, &mut referees, &pose_newest)),
         )?,
         start(
             "render",
@@ -324,7 +446,9 @@ fn announce(json: bool, ready: &Ready<'_>) {
     say(&format!("arena        {}", ready.arena));
     say(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
     say(&format!("page         {}", ready.http));
-    say(&format!("vicon        {} (UDP object stream)", ready.vicon));
+    for source in &ready.pose {
+        say(&format!("{:<12} {} (poses)", source.driver.name(), source.address));
+    }
     for vehicle in &ready.vehicles {
         let named = match &*ready.vehicles {
             [one] if one.name == "vizflyt" => String::new(),
@@ -365,5 +489,8 @@ fn say(text: &str) {
     let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
+/// How often a socket that a former round may still hold is asked for, and how often at most.
+const BIND_EVERY: Duration = Duration::from_millis(100);
+const BIND_TRIES: u32 = 50;
 /// What hangs this far above the flight is still drawn on the map. [m]
 const MAP_HEADROOM_M: f64 = 0.4;

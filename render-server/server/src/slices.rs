@@ -74,6 +74,7 @@ impl Packer {
         let (k, body_from_cam) = (&info.intrinsics, &info.body_from_cam);
         let mut header =
             ImageHeader::new(slot.seq, camera as u8, slot.pose, k, body_from_cam, &world_from_body);
+        header.exposure_ns = slot.shown.as_ns().into();
         header.together = together.into();
         header.render_start_ns = slot.render_start.as_ns().into();
         header.render_end_ns = slot.render_end.as_ns().into();
@@ -84,13 +85,20 @@ impl Packer {
         if self.broadcast.is_empty() {
             return Ok(None);
         }
-        let result = self.slices(&slot.image).context("cannot encode");
+        let withheld = !set.configs[camera].depth;
+        let result = self.slices(&slot.image, withheld).context("cannot encode");
         let end = clock::now();
         outlet.end(&mut self.broadcast, result.is_ok().then_some(end));
         result.map(|()| Some((start, end)))
     }
 
-    fn slices(&mut self, image: &RgbdImage) -> Result<(), vizflyt_rgbd::EncodeError> {
+    /// Depth that is `withheld` is sent as "no return" everywhere: for plugins that is an image like
+    /// any other, and it takes no room.
+    fn slices(
+        &mut self,
+        image: &RgbdImage,
+        withheld: bool,
+    ) -> Result<(), vizflyt_rgbd::EncodeError> {
         let parts = Parts { color: true, depth: true, ..Parts::default() };
         let (width, height) = (image.width_px, image.height_px);
         let mut buffer = self.buffer();
@@ -104,6 +112,9 @@ impl Packer {
             let rows = info.slice_rows(slice);
             image.write_rgb8_rows(rows.clone(), &mut self.rgb);
             image.write_depth_mm_rows(DepthKind::Median, rows.clone(), &mut self.depth_mm);
+            if withheld {
+                self.depth_mm.fill(0);
+            }
             let view = ImageView {
                 width,
                 height: rows.end - rows.start,

@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
+use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::histogram::Histogram;
 use vizflyt_protocol::messages::{StageTimes, Timing};
 use vizflyt_protocol::time::ServerTime;
@@ -17,7 +18,7 @@ use vizflyt_protocol::time::ServerTime;
 use crate::accounts::Account;
 use crate::clock;
 use crate::drivers::SourceCounters;
-use crate::hub::{Hub, RendererInfo};
+use crate::hub::{Hub, RendererInfo, lock};
 use crate::vehicle::{ImageCounters, Vehicle};
 
 /// Everything measured; shared by all threads.
@@ -125,6 +126,8 @@ pub struct Answer {
     pub images: Vec<CameraAccount>,
     /// How the connection fares.
     pub connection: Option<Connection>,
+    /// How good the localization is.
+    pub pose: PoseQuality,
 }
 
 /// Percentiles of the server's own stages. [ms]
@@ -210,6 +213,7 @@ impl Answer {
             timing: vehicle.timing.borrow().clone(),
             images: vehicle.accounts(),
             connection: vehicle.connection(),
+            pose: lock(&vehicle.quality).clone(),
         }
     }
 }
@@ -245,6 +249,8 @@ pub struct Report {
     pub sent_mb: f64,
     /// What the localization delivered.
     pub source: SourceCounters,
+    /// How good it was in the end, by vehicle.
+    pub pose: BTreeMap<String, PoseQuality>,
     /// Peak resident memory of this process. [MB]
     pub peak_rss_mb: f64,
     /// Which renderer drew.
@@ -284,6 +290,10 @@ impl Stats {
             images_late: total(|images| &images.late),
             sent_mb: total(|images| &images.bytes) as f64 / 1e6,
             source,
+            pose: vehicles
+                .iter()
+                .map(|vehicle| (vehicle.name.as_str().to_owned(), lock(&vehicle.quality).clone()))
+                .collect(),
             peak_rss_mb: peak_rss_mb().unwrap_or(0.0),
             renderer: renderer.name.clone(),
             renderer_reason: renderer.reason.clone(),

@@ -18,6 +18,20 @@ impl Default for Stop {
 }
 
 impl Stop {
+    /// Returns one that is set when this one is, and may be set before. Must run within a tokio
+    /// runtime.
+    pub fn child(&self) -> Self {
+        let (parent, child) = (self.clone(), Self::default());
+        let heir = child.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                () = parent.wait() => heir.set(),
+                () = heir.wait() => {}
+            }
+        });
+        child
+    }
+
     /// Asks everything to end.
     pub fn set(&self) {
         self.0.send_replace(true);

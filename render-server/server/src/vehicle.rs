@@ -8,14 +8,21 @@
 //! ```
 //! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
 
-use std::net::SocketAddr;
+mod seat;
+mod trail;
+
+pub use seat::{RuntimeInfo, Seat, WatcherSeat};
+pub use trail::Trail;
+
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use tokio::sync::{Notify, watch};
+use tokio::sync::watch;
+use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, HeardEvents, Hello, MAX_CAMERAS, Name,
-    PoseSample, Telemetry, Text, Timing, bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, ImuReading, MAX_CAMERAS, Name,
+    PoseSample, Telemetry, Timing, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -25,10 +32,12 @@ use crate::clock;
 use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
-use crate::outlet::MOST_WATCHERS;
+use crate::leaderboard::{Attempt, Samples};
 use crate::pace::{self, Level};
 use crate::previews::Preview;
 use crate::stats::{CameraAccount, Connection};
+
+use seat::SeatState;
 
 /// One vehicle in the arena.
 #[derive(Debug)]
@@ -53,8 +62,19 @@ pub struct Vehicle {
     pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
     /// Where the vehicle was.
     pub trail: Mutex<Trail>,
+    /// Where the present flight was, for its verdict.
+    pub samples: Mutex<Samples>,
+    /// Whose its next flights are.
+    pub checked_in: Mutex<Option<CheckIn>>,
     /// What the localization delivered of it.
     pub source: Mutex<SourceCounters>,
+    /// How good it is, by the pose filter.
+    pub quality: Mutex<PoseQuality>,
+    /// What its autopilot's IMU felt that the pose thread has not taken yet, oldest first.
+    imu: Mutex<VecDeque<ImuReading>>,
+    /// From the start of drawing until the plugin is given the image, by the runtime's newest
+    /// report; 0 is not known. [ns]
+    seen_after_ns: AtomicU64,
     /// Its images on their way.
     pub images: ImageCounters,
     /// How its images are made, by what its runtime's link carries: number of a [`pace::level`].
@@ -77,6 +97,15 @@ pub struct ImageCounters {
     pub cameras: [Tally; MAX_CAMERAS],
 }
 
+/// A team that flies a vehicle.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckIn {
+    /// Its name.
+    pub team: String,
+    /// What its flights count as.
+    pub attempt: Attempt,
+}
+
 /// How the present flight goes.
 #[derive(Clone, Debug, Default)]
 pub struct Flight {
@@ -86,36 +115,6 @@ pub struct Flight {
     pub landed: Option<ServerTime>,
     /// The event that decided it: the first that makes the guard land.
     pub outcome: Option<Event>,
-}
-
-#[derive(Debug, Default)]
-struct SeatState {
-    sessions: u64,
-    taken: Option<RuntimeInfo>,
-    /// The runtime's connection, and when it began.
-    connection: Option<(quinn::Connection, ServerTime)>,
-    /// Index of the first event of the present flight.
-    flight_start: u64,
-    /// Drawn by lot by the runtime that sits, or sat last.
-    boot: u64,
-    /// What was heard of its events.
-    heard: HeardEvents,
-    watchers: usize,
-    /// How many flights have begun; the pose thread starts its referee anew with each.
-    flights: u64,
-}
-
-/// The runtime that flies.
-#[derive(Clone, Debug)]
-pub struct RuntimeInfo {
-    /// Session number.
-    pub id: u64,
-    /// Where it is.
-    pub address: SocketAddr,
-    /// Which program.
-    pub program: Text,
-    heard_ns: Arc<AtomicU64>,
-    evicted: Arc<Notify>,
 }
 
 impl Vehicle {
@@ -133,7 +132,12 @@ impl Vehicle {
             timing: watch::Sender::new(None),
             previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
             trail: Mutex::default(),
+            samples: Mutex::default(),
+            checked_in: Mutex::default(),
             source: Mutex::default(),
+            quality: Mutex::default(),
+            imu: Mutex::new(VecDeque::with_capacity(IMU_WAITING)),
+            seen_after_ns: AtomicU64::new(0),
             images: ImageCounters::default(),
             level: AtomicUsize::new(0),
             seat: Mutex::default(),
@@ -173,6 +177,7 @@ impl Vehicle {
             | EventKind::TimeLimit
             | EventKind::EmergencyStop
             | EventKind::PluginFailed
+            | EventKind::Land
                 if provisional =>
             {
                 flight.outcome = Some(event.clone());
@@ -204,7 +209,35 @@ impl Vehicle {
     /// Takes the runtime's report of times.
     pub fn report_timing(&self, timing: Timing) {
         lock(&self.ledger).report(&timing.cameras);
+        let seen = &timing.waterfall;
+        let seen_after_ms = seen.age.p50 - seen.stages.pose.p50;
+        if seen.images > 0 && seen_after_ms > 0.0 {
+            self.seen_after_ns.store((f64::from(seen_after_ms) * 1e6) as u64, Ordering::Relaxed);
+        }
         self.timing.send_replace(Some(timing));
+    }
+
+    /// Returns how long after the start of drawing the plugin is given an image, by the runtime's
+    /// newest report. [s]
+    pub fn seen_after_s(&self) -> Option<f64> {
+        let ns = self.seen_after_ns.load(Ordering::Relaxed);
+        (ns > 0).then_some(ns as f64 * 1e-9)
+    }
+
+    /// Takes what the autopilot's IMU felt; of more than wait, the oldest go.
+    pub fn feel(&self, readings: &[ImuReading]) {
+        let mut waiting = lock(&self.imu);
+        for &reading in readings {
+            if waiting.len() == IMU_WAITING {
+                waiting.pop_front();
+            }
+            waiting.push_back(reading);
+        }
+    }
+
+    /// Returns the oldest reading of the IMU that waits.
+    pub fn next_feeling(&self) -> Option<ImuReading> {
+        lock(&self.imu).pop_front()
     }
 
     /// Returns what became of the images of the present flight, by camera.
@@ -257,87 +290,78 @@ impl Vehicle {
         self.lock_seat().flights
     }
 
+    /// Returns the index of the present flight's first event.
+    pub fn first_event(&self) -> u64 {
+        self.lock_seat().flight_start
+    }
+
     /// Presses the stop button; returns whether a runtime is there to obey.
     pub fn emergency_stop(&self, by: &str) -> bool {
         self.tell(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
         self.runtime().is_some()
     }
 
-    /// Gives the seat of the vehicle to a runtime.
-    ///
-    /// A runtime that has been silent for [`SILENT_S`] loses it to the newcomer: it is the same
-    /// one after an outage, or it is dead. If the former flight was under way, or the newcomer is
-    /// the runtime of that flight, it is told every event since that flight's start that it has not
-    /// heard, so that no collision is lost with a connection. Otherwise a new flight begins.
+    /// Lets a runtime that waits for it take off.
     ///
     /// # Errors
     /// The reason to refuse, for a person.
-    pub fn sit(self: &Arc<Self>, hello: &Hello, address: SocketAddr) -> Result<Seat, String> {
-        let now = clock::now();
-        let mut state = self.lock_seat();
-        if let Some(first) = &state.taken {
-            let heard = ServerTime::from_ns(first.heard_ns.load(Ordering::Relaxed));
-            if !(now.seconds_since(heard) > SILENT_S) {
-                return Err(format!(
-                    "vehicle '{}' is flown by {} at {}; stop that runtime first",
-                    self.name, first.program, first.address
-                ));
-            }
-            first.evicted.notify_one();
+    pub fn start(&self, by: &str) -> Result<(), String> {
+        if self.runtime().is_none() {
+            return Err(format!("no runtime flies '{}'; start one with --wait", self.name));
         }
-        state.sessions += 1;
-        let resumed = self.under_way() || state.boot == hello.boot;
-        state.boot = hello.boot;
-        if !resumed {
-            state.flights += 1;
-            state.flight_start = self.events.next_index();
-            self.telemetry.send_replace(None);
-            self.timing.send_replace(None);
-            lock(&self.ledger).begin(&self.images.cameras);
-            lock(&self.trail).clear();
-            *lock(&self.flight) = Flight::default();
-        }
-        let info = RuntimeInfo {
-            id: state.sessions,
-            address,
-            program: hello.program.clone(),
-            heard_ns: Arc::new(AtomicU64::new(now.as_ns())),
-            evicted: Arc::new(Notify::new()),
-        };
-        state.taken = Some(info.clone());
-        state.connection = None;
-        let heard_events = state.heard;
-        let first_event = state.flight_start;
-        Ok(Seat {
-            vehicle: self.clone(),
-            info,
-            resumed,
-            first_event,
-            boot: hello.boot,
-            heard_events,
-        })
-    }
-
-    /// Lets someone watch.
-    ///
-    /// # Errors
-    /// The reason to refuse, for a person.
-    pub fn watch(self: &Arc<Self>) -> Result<WatcherSeat, String> {
-        let mut state = self.lock_seat();
-        if state.watchers >= MOST_WATCHERS {
+        let phase = self.phase();
+        if phase != FlightPhase::Waiting {
             return Err(format!(
-                "vehicle '{}' has {MOST_WATCHERS} watchers already; end one first",
-                self.name
+                "'{}' does not wait for a start: it is {}",
+                self.name,
+                word(phase)
             ));
         }
-        state.watchers += 1;
-        state.sessions += 1;
-        let (id, first_event) = (state.sessions, state.flight_start);
-        Ok(WatcherSeat { vehicle: self.clone(), id, first_event })
+        self.tell(EventKind::Start, &format!("start pressed on {by}"));
+        Ok(())
+    }
+
+    /// Ends the flight: the vehicle brakes, then lands.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn land(&self, by: &str) -> Result<(), String> {
+        if self.runtime().is_none() {
+            return Err(format!("no runtime flies '{}': nobody to land it", self.name));
+        }
+        self.tell(EventKind::Land, &format!("land pressed on {by}"));
+        Ok(())
+    }
+
+    /// Begins the run anew, on the ground: course, clock, path and figures.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn reset(&self, by: &str) -> Result<(), String> {
+        let mut state = self.lock_seat();
+        if self.under_way() {
+            return Err(format!("'{}' is {}; land it first", self.name, word(self.phase())));
+        }
+        self.begin(&mut state);
+        drop(state);
+        self.note(&format!("the run was reset on {by}"));
+        Ok(())
+    }
+
+    /// Begins a flight.
+    fn begin(&self, state: &mut SeatState) {
+        state.flights += 1;
+        state.flight_start = self.events.next_index();
+        self.telemetry.send_replace(None);
+        self.timing.send_replace(None);
+        lock(&self.ledger).begin(&self.images.cameras);
+        lock(&self.trail).clear();
+        *lock(&self.samples) = Samples::default();
+        *lock(&self.flight) = Flight::default();
     }
 
     /// Whether a flight had begun and not ended when its runtime was last heard.
-    fn under_way(&self) -> bool {
+    pub fn under_way(&self) -> bool {
         use FlightPhase::{Flying, Holding, Landing, TakingOff};
         matches!(self.phase(), TakingOff | Flying | Holding | Landing)
     }
@@ -347,268 +371,21 @@ impl Vehicle {
     }
 }
 
-/// The right to fly the vehicle; given back when dropped.
-#[derive(Debug)]
-pub struct Seat {
-    /// Which vehicle.
-    pub vehicle: Arc<Vehicle>,
-    /// Who sits.
-    pub info: RuntimeInfo,
-    /// Whether the flight goes on after an outage.
-    pub resumed: bool,
-    /// The first event to tell.
-    pub first_event: u64,
-    /// Tells this runtime's events from those of another run.
-    boot: u64,
-    /// What had been heard of the runtime's events.
-    pub heard_events: HeardEvents,
-}
-
-/// The right to watch the vehicle; given back when dropped.
-#[derive(Debug)]
-pub struct WatcherSeat {
-    /// Which vehicle.
-    pub vehicle: Arc<Vehicle>,
-    /// Session number.
-    pub id: u64,
-    /// The first event to tell.
-    pub first_event: u64,
-}
-
-impl Drop for WatcherSeat {
-    fn drop(&mut self) {
-        self.vehicle.lock_seat().watchers -= 1;
+/// Returns the phase in a word or two.
+fn word(phase: FlightPhase) -> &'static str {
+    match phase {
+        FlightPhase::Connecting => "connecting",
+        FlightPhase::Preparing => "preparing",
+        FlightPhase::Waiting => "waiting for its start",
+        FlightPhase::TakingOff => "taking off",
+        FlightPhase::Flying => "flying",
+        FlightPhase::Holding => "holding",
+        FlightPhase::Landing => "landing",
+        FlightPhase::Landed => "landed",
     }
 }
 
-impl Seat {
-    /// Takes note of the runtime's event `seq`; returns whether it is new.
-    pub fn hear(&self, seq: u64) -> bool {
-        self.vehicle.lock_seat().heard.hear(self.boot, seq)
-    }
-
-    /// Notes that the runtime has been heard at `now`.
-    pub fn heard(&self, now: ServerTime) {
-        self.info.heard_ns.store(now.as_ns(), Ordering::Relaxed);
-    }
-
-    /// Notes over which connection the runtime speaks.
-    pub fn speaks_over(&self, connection: &quinn::Connection) {
-        let mut state = self.vehicle.lock_seat();
-        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
-            state.connection = Some((connection.clone(), clock::now()));
-        }
-    }
-
-    /// Completes when a newcomer has taken the seat.
-    pub async fn evicted(&self) {
-        self.info.evicted.notified().await;
-    }
-}
-
-impl Drop for Seat {
-    fn drop(&mut self) {
-        let mut state = self.vehicle.lock_seat();
-        if state.taken.as_ref().is_some_and(|taken| taken.id == self.info.id) {
-            state.taken = None;
-            state.connection = None;
-        }
-    }
-}
-
-/// The path of the vehicle since the flight began, thinned so that it stays small for ever.
-#[derive(Debug)]
-pub struct Trail {
-    /// (x, y, z [m, world], speed [m/s]), oldest first.
-    pub points: Vec<[f32; 4]>,
-    spacing_m: f32,
-}
-
-impl Default for Trail {
-    fn default() -> Self {
-        Self { points: Vec::new(), spacing_m: LEAST_SPACING_M }
-    }
-}
-
-impl Trail {
-    /// Adds where the vehicle is, if it has moved enough.
-    pub fn add(&mut self, sample: &PoseSample) {
-        let p = sample.world_from_body.translation_m.as_vec3();
-        let far = self
-            .points
-            .last()
-            .is_none_or(|&[x, y, z, _]| p.distance(glam::Vec3::new(x, y, z)) >= self.spacing_m);
-        if !far {
-            return;
-        }
-        if self.points.len() >= MOST_POINTS {
-            let mut keep = false;
-            self.points.retain(|_| {
-                keep = !keep;
-                keep
-            });
-            self.spacing_m *= 2.0;
-        }
-        self.points.push([p.x, p.y, p.z, sample.twist.linear_mps.length() as f32]);
-    }
-
-    fn clear(&mut self) {
-        *self = Self::default();
-    }
-}
-
-/// Runtimes report ten times a second; ten reports missed are an outage. [s]
-const SILENT_S: f64 = 1.0;
-/// About the vehicle's radius. [m]
-const LEAST_SPACING_M: f32 = 0.05;
-/// 32 KB; 100 m of path at the finest spacing.
-const MOST_POINTS: usize = 2048;
-
+/// Readings of the IMU that wait for the pose thread at most: 0.6 s at 100 Hz.
+const IMU_WAITING: usize = 64;
 #[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-    use glam::{DQuat, DVec3};
-    use vizflyt_protocol::geometry::{Pose, Twist, Volume};
-    use vizflyt_protocol::messages::{Limits, Purpose};
-
-    pub(crate) fn named(index: usize, name: &str) -> Vehicle {
-        let arena = ArenaInfo {
-            name: bounded("test"),
-            geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
-            limits: Limits::new(1.0, 1.0),
-            body_radius_m: 0.1,
-            takeoff_height_m: 1.0,
-            goal_m: None,
-            goal_radius_m: 1.0,
-            time_limit_s: 0.0,
-            ground_truth: true,
-            attitude_rate: false,
-            cameras: [].into_iter().collect(),
-        };
-        let cameras = Cameras::new(Vec::new());
-        Vehicle::new(index, name, arena, cameras)
-    }
-
-    fn vehicle() -> Arc<Vehicle> {
-        Arc::new(named(0, "vizflyt"))
-    }
-
-    fn hello(boot: u64) -> Hello {
-        Hello {
-            vehicle: bounded("vizflyt"),
-            purpose: Purpose::Fly,
-            program: bounded("runtime 0.1"),
-            boot,
-            heard_events: HeardEvents::default(),
-        }
-    }
-
-    fn address() -> SocketAddr {
-        "127.0.0.1:9".parse().unwrap()
-    }
-
-    #[test]
-    fn one_vehicle_has_one_runtime() {
-        let vehicle = vehicle();
-        let first = vehicle.sit(&hello(1), address()).unwrap();
-        let refusal = vehicle.sit(&hello(2), address()).unwrap_err();
-        assert_eq!(
-            refusal,
-            "vehicle 'vizflyt' is flown by runtime 0.1 at 127.0.0.1:9; stop that runtime first"
-        );
-        drop(first);
-        assert!(vehicle.runtime().is_none());
-        assert!(vehicle.sit(&hello(3), address()).is_ok());
-    }
-
-    #[tokio::test]
-    async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
-        let vehicle = vehicle();
-        vehicle.tell(EventKind::Note, "before the flight");
-        let first = vehicle.sit(&hello(4), address()).unwrap();
-        assert_eq!((first.first_event, first.resumed, vehicle.flights()), (1, false, 1));
-        vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
-        vehicle.tell(EventKind::EmergencyStop, "stop");
-        // As if it had last been heard two seconds ago.
-        first.heard(clock::now().plus_seconds(-2.0));
-        let second = vehicle.sit(&hello(5), address()).unwrap();
-        first.evicted().await;
-        assert_eq!((second.first_event, second.resumed, vehicle.flights()), (1, true, 1));
-        drop(first);
-        assert_eq!(vehicle.runtime().map(|runtime| runtime.id), Some(second.info.id));
-        drop(second);
-        // After the landing the next runtime begins a new flight.
-        assert!(vehicle.flight().outcome.is_some_and(|event| event.text == "stop"));
-        vehicle.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
-        let third = vehicle.sit(&hello(6), address()).unwrap();
-        assert_eq!((third.first_event, third.resumed, vehicle.flights()), (2, false, 2));
-        assert!(vehicle.flight().outcome.is_none() && vehicle.telemetry.borrow().is_none());
-    }
-
-    #[test]
-    fn the_same_runtime_goes_on_with_its_flight_and_tells_each_event_once() {
-        let vehicle = vehicle();
-        let first = vehicle.sit(&hello(7), address()).unwrap();
-        assert!(first.hear(1) && first.hear(2) && !first.hear(1));
-        drop(first);
-        // An outage on the ground; the stop button is pressed meanwhile.
-        vehicle.tell(EventKind::EmergencyStop, "stop");
-        let second = vehicle.sit(&hello(7), address()).unwrap();
-        assert_eq!((second.first_event, second.resumed, vehicle.flights()), (0, true, 1));
-        assert_eq!(second.heard_events, HeardEvents { boot: 7, seq: 2 });
-        assert!(!second.hear(2) && second.hear(3));
-        drop(second);
-        // Another run of the runtime: a new flight, and its events count anew.
-        let third = vehicle.sit(&hello(8), address()).unwrap();
-        assert_eq!((third.first_event, third.resumed, vehicle.flights()), (1, false, 2));
-        assert_eq!(third.heard_events.of(8), 0);
-        assert!(third.hear(1));
-    }
-
-    #[test]
-    fn watchers_are_bounded_and_leave_room_behind() {
-        let vehicle = vehicle();
-        let mut watchers: Vec<_> = (0..MOST_WATCHERS).map(|_| vehicle.watch().unwrap()).collect();
-        let refusal = vehicle.watch().unwrap_err();
-        assert!(refusal.starts_with("vehicle 'vizflyt' has 8 watchers already"), "{refusal}");
-        assert!(vehicle.sit(&hello(1), address()).is_ok(), "the runtime's seat is another");
-        watchers.pop();
-        assert!(vehicle.watch().is_ok());
-    }
-
-    #[test]
-    fn the_first_decisive_event_is_the_outcome_and_a_lost_pose_only_if_it_stays_lost() {
-        let vehicle = vehicle();
-        let outcome = || vehicle.flight().outcome.map(|event| event.text.as_str().to_owned());
-        let lost = EventKind::PoseLost { age_s: 0.2 };
-        vehicle.tell(lost.clone(), "on the ground");
-        assert_eq!(outcome(), None);
-        vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
-        vehicle.tell(lost.clone(), "a hiccup");
-        assert_eq!(outcome().as_deref(), Some("a hiccup"));
-        vehicle.tell(EventKind::PoseRegained, "back");
-        assert_eq!(outcome(), None);
-        vehicle.tell(lost.clone(), "lost");
-        vehicle.tell(EventKind::Finished { seconds: 9.0 }, "goal");
-        vehicle.tell(EventKind::EmergencyStop, "later");
-        vehicle.tell(lost, "later still");
-        assert_eq!(outcome().as_deref(), Some("goal"));
-    }
-
-    #[test]
-    fn a_trail_keeps_its_ends_and_stays_small() {
-        let mut trail = Trail::default();
-        for k in 0..20_000 {
-            trail.add(&PoseSample {
-                stamp: ServerTime::ZERO,
-                world_from_body: Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY),
-                twist: Twist::default(),
-                resets: 0,
-            });
-        }
-        assert!(trail.points.len() <= MOST_POINTS);
-        assert_eq!(trail.points[0][0], 0.0);
-        assert!(trail.points.last().unwrap()[0] > 398.0);
-        assert!(trail.points.is_sorted_by(|a, b| a[0] < b[0]));
-    }
-}
+pub(crate) mod tests;

@@ -8,6 +8,7 @@ use std::net::{SocketAddr, TcpStream};
 
 use serde_json::Value;
 use support::{PATIENCE, Server, write_arena};
+use vizflyt_server::dashboard::Takes as Said;
 
 /// The server, and the cookies of those who were given a key.
 struct Lab {
@@ -22,9 +23,16 @@ const STRANGER: &str = "vizflyt_key=00000000000000000000000000000000";
 
 impl Lab {
     fn start() -> Self {
+        Self::start_with(&[])
+    }
+
+    fn start_with(options: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let more = "[[vehicles]]\nname = \"ant\"\n[[vehicles]]\nname = \"bee\"\n";
-        let server = Server::start(&write_arena(folder.path(), more), &["--print-page-keys"]);
+        let server = Server::start(
+            &write_arena(folder.path(), more),
+            &[&["--print-page-keys"], options].concat(),
+        );
         let mut links = ["instructor", "team of 'ant'"].map(|whose| {
             server.line(|line| {
                 let key = &line["page_key"];
@@ -48,10 +56,12 @@ impl Lab {
         Self { server, instructor, ants, _folder: folder }
     }
 
-    /// Asks as our own page would.
+    /// Asks as our own page would: with the token that belongs to the cookie.
     fn ask(&self, request: &str, cookie: &str) -> (u16, String) {
-        let origin = format!("Origin: http://{}\r\n", self.server.http);
-        ask(self.server.http, request, cookie, &origin)
+        let token = standing(self.server.http, cookie)["token"].as_str().map(str::to_owned);
+        let token = token.map_or_else(String::new, |t| format!("X-VizFlyt-Token: {t}\r\n"));
+        let more = format!("Origin: http://{}\r\n{token}", self.server.http);
+        ask(self.server.http, request, cookie, &more)
     }
 
     fn status(&self, request: &str, cookie: &str) -> u16 {
@@ -94,6 +104,40 @@ fn ask(address: SocketAddr, request: &str, cookie: &str, more: &str) -> (u16, St
     (answer.split(' ').nth(1).unwrap().parse().unwrap(), answer)
 }
 
+/// Returns what the page is told of who looks at it.
+fn standing(address: SocketAddr, cookie: &str) -> Value {
+    let (status, answer) = ask(address, "GET /api/session", cookie, "");
+    assert_eq!(status, 200, "{answer}");
+    assert_eq!(header(&answer, "cache-control").as_deref(), Some("no-store"));
+    serde_json::from_str(answer.split_once("\r\n\r\n").unwrap().1).unwrap()
+}
+
+/// Logs in; returns the status, the cookie, and the answer.
+fn log_in(address: SocketAddr, password: &str) -> (u16, String, String) {
+    let body = serde_json::json!({ "password": password }).to_string();
+    let (status, answer) = raw(
+        address,
+        &format!(
+            "POST /api/login HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n\
+             Connection: close\r\nContent-Length: {}\r\n\r\n{body}",
+            body.len()
+        ),
+    );
+    let cookie = header(&answer, "set-cookie").unwrap_or_default();
+    (status, cookie, answer)
+}
+
+/// Sends bytes; returns the status and the whole answer.
+fn raw(address: SocketAddr, request: &str) -> (u16, String) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let answer = String::from_utf8_lossy(&answer).into_owned();
+    (answer.split(' ').nth(1).unwrap().parse().unwrap(), answer)
+}
+
 fn header(answer: &str, name: &str) -> Option<String> {
     answer.lines().take_while(|line| !line.is_empty()).find_map(|line| {
         let (key, value) = line.split_once(": ")?;
@@ -118,10 +162,29 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /app.js", Takes::Nothing),
     ("GET /map.js", Takes::Nothing),
     ("GET /cameras.js", Takes::Nothing),
+    ("GET /space.js", Takes::Nothing),
+    ("GET /controls.js", Takes::Nothing),
+    ("GET /three.module.min.js", Takes::Nothing),
+    ("GET /three.core.min.js", Takes::Nothing),
     ("GET /waterfall.js", Takes::Nothing),
     ("GET /pairing.js", Takes::Nothing),
     ("GET /icon.svg", Takes::Nothing),
+    ("GET /leaderboard.js", Takes::Nothing),
+    ("GET /standings.js", Takes::Nothing),
+    ("GET /wall", Takes::Nothing),
+    ("GET /wall.css", Takes::Nothing),
+    ("GET /wall.js", Takes::Nothing),
+    ("GET /api/leaderboard", Takes::AnyKey),
+    // By the team's token, whoever brings it.
+    ("PUT /api/vehicles/ant/team", Takes::Nothing),
+    ("POST /api/vehicles/ant/team", Takes::All),
+    ("DELETE /api/vehicles/ant/team", Takes::Ants),
+    ("GET /enter", Takes::Nothing),
+    ("GET /api/session", Takes::Nothing),
+    ("POST /api/login", Takes::Nothing),
+    ("POST /api/logout", Takes::AnyKey),
     ("GET /api/map", Takes::AnyKey),
+    ("GET /api/shell", Takes::AnyKey),
     ("GET /api/vehicles", Takes::AnyKey),
     ("GET /ws?vehicle=ant", Takes::Ants),
     ("GET /ws?vehicle=bee", Takes::Bees),
@@ -133,12 +196,18 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /api/vehicles/ant/cameras", Takes::Ants),
     ("GET /api/vehicles/bee/cameras", Takes::Bees),
     ("POST /api/vehicles/ant/estop", Takes::Ants),
+    ("POST /api/vehicles/ant/start", Takes::All),
+    ("POST /api/vehicles/ant/reset", Takes::All),
+    ("POST /api/vehicles/ant/land", Takes::Ants),
+    ("POST /api/vehicles/bee/land", Takes::Bees),
     ("POST /api/vehicles/bee/estop", Takes::Bees),
     ("POST /api/vehicles/%62ee/estop", Takes::Bees),
     ("PUT /api/vehicles/ant/cameras/front", Takes::All),
     ("PATCH /api/vehicles/ant/cameras/front", Takes::All),
     ("POST /api/estop", Takes::All),
     ("GET /api/pairing", Takes::All),
+    ("GET /api/scenes", Takes::All),
+    ("PUT /api/scene", Takes::All),
     ("POST /api/pairing", Takes::All),
     ("DELETE /api/pairing", Takes::All),
     ("GET /api/cameras", Takes::All),
@@ -152,14 +221,153 @@ fn every_route_knows_a_stranger_a_team_and_the_instructor() {
     let lab = Lab::start();
     for &(request, takes) in ROUTES {
         let stranger = lab.status(request, STRANGER);
-        assert_eq!(stranger == 401, takes != Takes::Nothing, "stranger: {request}: {stranger}");
+        // Entering without a key is refused as such.
+        let is_refused = takes != Takes::Nothing || request == "GET /enter";
+        assert_eq!(stranger == 401, is_refused, "stranger: {request}: {stranger}");
         let team = lab.status(request, &lab.ants);
         let may = matches!(takes, Takes::Nothing | Takes::AnyKey | Takes::Ants);
         assert_eq!(team == 403, !may, "team: {request}: {team}");
         for boss in [lab.instructor.as_str(), ""] {
             let status = lab.status(request, boss);
-            assert!(status != 401 && status != 403, "instructor: {request}: {status}");
+            let is_let_in = (status != 401 || request == "GET /enter") && status != 403;
+            assert!(is_let_in, "instructor: {request}: {status}");
         }
+    }
+}
+
+/// The table that makes the router is the table that is walked: a new route fails here until it is
+/// said above what it takes.
+#[test]
+fn every_route_of_the_server_is_walked() {
+    for (method, path, takes) in vizflyt_server::dashboard::routes() {
+        let is_it = |asked: &str| {
+            let (m, p) = asked.split_once(' ').unwrap();
+            let parts: Vec<_> = p.split('?').next().unwrap().split('/').collect();
+            let wanted: Vec<_> = path.split('/').collect();
+            let fits = |(part, want): (&&str, &&str)| want.starts_with('{') || part == want;
+            m == method && parts.len() == wanted.len() && parts.iter().zip(&wanted).all(fits)
+        };
+        let expected: Vec<_> = ROUTES.iter().filter(|(asked, _)| is_it(asked)).collect();
+        assert!(!expected.is_empty(), "{method} {path} is walked by no test");
+        for (asked, expected) in expected {
+            let fits = match expected {
+                Takes::Nothing => takes == Said::Nothing,
+                Takes::AnyKey => takes == Said::Key,
+                Takes::Ants | Takes::Bees => takes == Said::Vehicle,
+                // A vehicle that is not named is any.
+                Takes::All => matches!(takes, Said::Everything | Said::Vehicle),
+            };
+            assert!(fits, "{asked}: {takes:?}, not {expected:?}");
+        }
+    }
+}
+
+/// What changes something takes the token of its cookie; the stop button does not.
+#[test]
+fn a_cookie_without_its_token_changes_nothing() {
+    let lab = Lab::start();
+    let address = lab.server.http;
+    let origin = format!("Origin: http://{address}\r\n");
+    let of_the_team = standing(address, &lab.ants)["token"].as_str().unwrap().to_owned();
+    assert_eq!(of_the_team.len(), 64);
+    assert_eq!(
+        standing(address, "")["token"],
+        Value::Null,
+        "the server's own computer has no cookie"
+    );
+    for request in [
+        "POST /api/pairing",
+        "DELETE /api/pairing",
+        "PUT /api/vehicles/ant/cameras/front",
+        "PATCH /api/vehicles/ant/cameras/front",
+        "POST /api/vehicles/ant/start",
+        "POST /api/vehicles/ant/land",
+        "POST /api/vehicles/ant/reset",
+        "POST /api/vehicles/ant/team",
+        "DELETE /api/vehicles/ant/team",
+        "PUT /api/scene",
+        "POST /api/logout",
+    ] {
+        for token in ["", "00", &of_the_team] {
+            let more = format!("{origin}X-VizFlyt-Token: {token}\r\n");
+            let (status, answer) = ask(address, request, &lab.instructor, &more);
+            assert!(status == 403 && answer.contains("X-VizFlyt-Token"), "{request}: {answer}");
+        }
+        let status = lab.status(request, &lab.instructor);
+        assert!(![401, 403].contains(&status), "{request}: {status}");
+    }
+    assert_eq!(ask(address, "POST /api/vehicles/ant/estop", &lab.instructor, &origin).0, 409);
+}
+
+#[test]
+fn the_password_opens_a_session_that_ends_with_it() {
+    let lab = Lab::start_with(&["--login", "always"]);
+    let (address, folder) = (lab.server.http, lab.server.keys());
+    // Here too nobody is the instructor without a login.
+    assert_eq!(lab.status("GET /api/pairing", ""), 401);
+    let (status, cookie, answer) = log_in(address, "correct horse battery");
+    assert_eq!((status, cookie.as_str()), (409, ""), "{answer}");
+    assert!(answer.contains("vizflyt password"));
+    assert_eq!(standing(address, "")["password"], false);
+    vizflyt_server::dashboard::set_password(&folder, "correct horse battery").unwrap();
+    assert_eq!(standing(address, "")["password"], true);
+    let (status, cookie, answer) = log_in(address, "correct horse");
+    assert!(status == 401 && cookie.is_empty() && answer.contains("not the password"), "{answer}");
+    let (status, cookie, answer) = log_in(address, "correct horse battery");
+    assert_eq!(status, 200, "{answer}");
+    for part in ["HttpOnly", "SameSite=Strict", "Path=/"] {
+        assert!(cookie.contains(part) && !cookie.contains("Secure"), "{cookie}");
+    }
+    let cookie = cookie.split(';').next().unwrap().to_owned();
+    let told = standing(address, &cookie);
+    assert_eq!((&told["role"], &told["by"]), (&"instructor".into(), &"password".into()));
+    assert_eq!(lab.status("GET /api/pairing", &cookie), 200);
+    // Out again; and another password ends who came by the former.
+    assert_eq!(lab.status("POST /api/logout", &cookie), 204);
+    assert_eq!(lab.status("GET /api/pairing", &cookie), 401);
+    let cookie = log_in(address, "correct horse battery").1;
+    let cookie = cookie.split(';').next().unwrap().to_owned();
+    assert_eq!(lab.status("GET /api/pairing", &cookie), 200);
+    vizflyt_server::dashboard::set_password(&folder, "another one altogether").unwrap();
+    assert_eq!(lab.status("GET /api/pairing", &cookie), 401);
+    assert_eq!(log_in(address, "correct horse battery").0, 401);
+    assert_eq!(log_in(address, "another one altogether").0, 200);
+    // Guessing on comes to its end, and the right one waits then too.
+    let guesses: Vec<_> = (0..30).map(|k| log_in(address, &format!("guess {k}")).0).collect();
+    assert!(
+        guesses.contains(&429) && guesses.iter().all(|s| [401, 429].contains(s)),
+        "{guesses:?}"
+    );
+}
+
+#[test]
+fn what_is_too_large_or_climbs_out_of_its_folder_is_refused() {
+    let lab = Lab::start();
+    let address = lab.server.http;
+    for path in [
+        "/../Cargo.toml",
+        "/..%2fCargo.toml",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/style.css/../../keys/server.key",
+        "/api/vehicles/..%2f..%2fant/cameras",
+        "/api/vehicles/ant/cameras/..%2f..",
+        "//etc/passwd",
+    ] {
+        let request =
+            format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+        let (status, answer) = raw(address, &request);
+        assert!((400..500).contains(&status), "{path}: {status}");
+        assert!(!answer.contains("root:") && !answer.contains("BEGIN"), "{path}");
+    }
+    for request in [
+        "POST /api/login",
+        "POST /api/pairing",
+        "PUT /api/vehicles/ant/cameras/front",
+        "PATCH /api/vehicles/ant/cameras/front",
+    ] {
+        let (status, answer) =
+            support::send_json(address, request, None, &format!("\"{}\"", "x".repeat(1 << 20)));
+        assert_eq!(status, 413, "{request}: {answer}");
     }
 }
 

@@ -8,16 +8,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use glam::{DQuat, DVec3};
-use vizflyt_arena::ArenaConfig;
-use vizflyt_protocol::geometry::{Pose, Twist};
+use vizflyt_arena::{ArenaConfig, MovingObjects};
+use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::cameras::Cameras;
 use vizflyt_server::drawn::Ticks;
 use vizflyt_server::hub::{Hub, RendererInfo};
 use vizflyt_server::mailbox::Mailbox;
+use vizflyt_server::moving::Moving;
 use vizflyt_server::stop::Stop;
-use vizflyt_server::tick::{self, Poses};
+use vizflyt_server::tick::{self, Localized, Poses};
 use vizflyt_server::vehicle::Vehicle;
 use vizflyt_splat::{Camera, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload};
 
@@ -59,6 +60,11 @@ takeoff_height_m = 1.2
 spawn = { position_m = [0, 0, 0] }
 geofence = { min_m = [-5, -5, -0.5], max_m = [5, 5, 4] }
 limits = { max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }
+[[objects]]
+name = "door"
+scene = "door.ply"
+position_m = [1, 0, 0]
+motion = { kind = "oscillation", slide_m = [0, 1, 0], period_s = 3.0 }
 [[cameras]]
 name = "front"
 width_px = 64
@@ -88,12 +94,9 @@ struct Everyone {
 
 impl Everyone {
     fn poses(at: u64) -> Poses {
-        let sample = PoseSample {
-            stamp: ServerTime::from_ns(at),
-            world_from_body: Pose::new(DVec3::Z, DQuat::IDENTITY),
-            twist: Twist::default(),
-            resets: 0,
-        };
+        let stamp = ServerTime::from_ns(at);
+        let still = Pose::new(DVec3::Z, DQuat::IDENTITY);
+        let sample = Localized::still(PoseSample::still(stamp, still));
         let mut poses = Poses::default();
         // Now and then one vehicle is not seen.
         poses[0] = Some(sample);
@@ -109,13 +112,16 @@ impl Rasterizer for Everyone {
 
     fn render(
         &mut self,
-        _: &[Placement],
+        placements: &[Placement],
         cameras: &[Camera],
         images: &mut [RgbdImage],
     ) -> Result<PassTimes, RenderError> {
         for (camera, image) in cameras.iter().zip(images) {
             image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
+        // The door, and of the two vehicles the other one, if it has been seen.
+        assert!(placements.len() == 3 && placements[0].is_some());
+        assert!(placements[1..].contains(&None));
         self.calls += 1;
         self.images += cameras.len();
         match self.calls {
@@ -151,7 +157,10 @@ fn drawing_allocates_nothing_once_it_is_warm() {
     let vehicle =
         |index, name| Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()));
     let vehicles = vec![vehicle(0, "wasp"), vehicle(1, "bee")];
-    let hub = Arc::new(Hub::new(vehicles, RendererInfo::default(), Stop::default()));
+    let mut hub = Hub::new(vehicles, RendererInfo::default(), Stop::default());
+    let objects = MovingObjects::new(&arena, 0);
+    hub.moving = Moving::new(ServerTime::ZERO, objects, &[], 2);
+    let hub = Arc::new(hub);
     hub.outlet.viewer_came(0);
     hub.outlet.viewer_came(1);
     vizflyt_server::hub::lock(&hub.renderer).name = "nothing".to_owned();

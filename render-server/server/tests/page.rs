@@ -4,7 +4,7 @@ mod support;
 
 use quinn::TransportConfig;
 use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
-use vizflyt_protocol::messages::{EventKind, ToRuntime};
+use vizflyt_protocol::messages::{EventKind, FlightPhase, Telemetry, ToRuntime, ToServer};
 
 /// Messages within which what is waited for must come: a minute's worth.
 const MANY: usize = 2000;
@@ -151,4 +151,45 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
     let mut socket = Socket::open(server.http, &own).ok().unwrap();
     let state = socket.message("state");
     assert_eq!(state["outcome"]["kind"], "emergency_stop");
+}
+
+// Two threads: the page's socket is read blocking, and the client's packets must leave meanwhile.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn start_land_and_reset_are_refused_with_the_reason_or_reach_the_runtime() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let press = |what: &str| {
+        send_json(server.http, &format!("POST /api/vehicles/vizflyt/{what}"), None, "")
+    };
+    assert_eq!(press("start").0, 409);
+    assert!(press("land").1.contains("nobody to land it"));
+    assert_eq!(press("reset").0, 202, "on the ground, with nobody there");
+    let mut socket = Socket::open(server.http, &format!("http://{}", server.http)).ok().unwrap();
+    let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
+    for (phase, name) in [
+        (FlightPhase::Preparing, "preparing"),
+        (FlightPhase::Waiting, "waiting"),
+        (FlightPhase::Flying, "flying"),
+    ] {
+        client.say(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
+        assert!((0..MANY).any(|_| socket.message("state")["report"]["phase"] == name));
+        let statuses = ["start", "land", "reset"].map(|what| press(what).0);
+        let expected = match phase {
+            FlightPhase::Preparing => [409, 202, 202],
+            FlightPhase::Waiting => [202, 202, 202],
+            _ => [409, 202, 409],
+        };
+        assert_eq!(statuses, expected, "{name}");
+    }
+    let mut kinds = Vec::new();
+    while kinds.len() < 4 {
+        let kind = client
+            .until(|message| match message {
+                ToRuntime::Event { event, .. } => Some(event.kind),
+                _ => None,
+            })
+            .await;
+        kinds.push(kind);
+    }
+    assert_eq!(kinds, [EventKind::Land, EventKind::Start, EventKind::Land, EventKind::Land]);
 }

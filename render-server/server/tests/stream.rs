@@ -21,6 +21,9 @@ fn usual() -> TransportConfig {
     TransportConfig::default()
 }
 
+/// Images are drawn for up to 0.2 s later, at 200 frames a second or less.
+const AHEAD_FRAMES: f64 = 40.0;
+
 #[tokio::test]
 async fn images_follow_the_poses() {
     let folder = tempfile::tempdir().unwrap();
@@ -33,6 +36,7 @@ async fn images_follow_the_poses() {
     for _ in 0..20 {
         let (header, payload, trailer) = client.whole_image().await;
         // Streams may finish out of order, but the stamps within an image never do.
+        assert!(header.exposure_stamp() > header.pose_stamp(), "it shows when it is seen");
         let stamps = [header.pose_ns, header.render_start_ns, header.render_end_ns]
             .map(zerocopy::byteorder::little_endian::U64::get);
         assert!(stamps.is_sorted(), "{stamps:?}");
@@ -41,12 +45,12 @@ async fn images_follow_the_poses() {
         assert!(ends.iter().all(|&end| end >= stamps[2]), "{stamps:?} {ends:?}");
         assert!(header.seq.get() > seq || header.pose_ns.get() < pose_ns);
         (seq, pose_ns) = (header.seq.get(), header.pose_ns.get());
-        // Drawn from a pose that was sent, through the camera's extrinsics.
+        // Drawn from where the vehicle flies, through the camera's extrinsics.
         let p = header.world_from_cam().translation_m;
         let frame = (0.06 - p.x) / STEP_M;
-        assert!((frame - frame.round()).abs() < 1e-6, "x = {}", p.x);
-        assert!(frame.round() <= f64::from(emitter.sent.load(Ordering::Relaxed)) + 1.0);
-        assert!((p.y, p.z) == (0.0, HEIGHT_M + 0.02), "{p}");
+        let sent = f64::from(emitter.sent.load(Ordering::Relaxed));
+        assert!((-1.0..=sent + AHEAD_FRAMES).contains(&frame), "x = {}", p.x);
+        assert!(p.y.abs() < 1e-3 && (p.z - HEIGHT_M - 0.02).abs() < 1e-3, "{p}");
         // The wall is seen where it is: camera z of its middle.
         let info = peek(&payload).unwrap();
         assert_eq!((info.width, info.height), (160, 120));

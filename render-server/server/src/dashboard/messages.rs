@@ -5,6 +5,7 @@ use std::sync::atomic::Ordering;
 use serde::Serialize;
 use serde_json::{Map, Value};
 use vizflyt_arena::config::{CameraConfig, StageConfig};
+use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
 use vizflyt_protocol::messages::{Event, StageTimes, Telemetry};
 use vizflyt_protocol::time::ServerTime;
@@ -16,6 +17,7 @@ use crate::drivers::SourceCounters;
 use crate::events::{Entry, Origin};
 use crate::hub::{RendererInfo, lock};
 use crate::map::Obstacles;
+use crate::moving::{Moving, Outline};
 use crate::stats::Rate;
 use crate::vehicle::Vehicle;
 
@@ -95,9 +97,26 @@ pub(super) struct State {
     images_late: u64,
     source: SourceCounters,
     source_hz: f64,
+    quality: PoseQuality,
     flight_s: Option<f64>,
     landed: bool,
     outcome: Option<OutcomeLine>,
+    /// What moves, where it is now.
+    objects: Vec<ObjectLine>,
+}
+
+/// An object of the arena: a box in its own frame, and where that is.
+#[derive(Debug, Serialize)]
+struct ObjectLine {
+    name: String,
+    /// In images of ids.
+    id: u16,
+    p_world_m: [f64; 3],
+    /// Object to world.
+    q_xyzw: [f64; 4],
+    /// Least and greatest corner. [m, object]
+    min_m: [f32; 3],
+    max_m: [f32; 3],
 }
 
 #[derive(Debug, Serialize)]
@@ -111,6 +130,8 @@ struct OutcomeLine {
 struct PoseLine {
     p_world_m: [f64; 3],
     yaw_rad: f64,
+    /// Body to world, xyzw.
+    rotation: [f64; 4],
     v_world_mps: [f64; 3],
     age_s: f64,
 }
@@ -138,7 +159,7 @@ struct VehicleRates {
 
 impl Rates {
     /// Returns those of this many vehicles.
-    pub(super) fn of(vehicles: usize) -> Self {
+    pub(crate) fn of(vehicles: usize) -> Self {
         let vehicles = std::iter::repeat_with(VehicleRates::default).take(vehicles).collect();
         Self { ticks: Rate::default(), vehicles }
     }
@@ -187,6 +208,7 @@ pub(super) fn camera_keys(config: &CameraConfig) -> Map<String, Value> {
     keys.insert("near_m".to_owned(), config.near_m.into());
     keys.insert("yaw_deg".to_owned(), config.yaw_deg.into());
     keys.insert("roll_deg".to_owned(), config.roll_deg.into());
+    keys.insert("depth".to_owned(), config.depth.into());
     keys
 }
 
@@ -215,6 +237,7 @@ pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
         pose: (*vehicle.pose.borrow()).map(|sample| PoseLine {
             p_world_m: sample.world_from_body.translation_m.to_array(),
             yaw_rad: yaw_of(sample.world_from_body.rotation),
+            rotation: sample.world_from_body.rotation.to_array(),
             v_world_mps: sample.twist.linear_mps.to_array(),
             age_s: now.seconds_since(sample.stamp),
         }),
@@ -232,13 +255,32 @@ pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
         stream_mbit_s: rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
         images_late: total(&vehicle.images.late),
         source,
+        quality: lock(&vehicle.quality).clone(),
         source_hz: rates.poses.of(source.poses, now),
         flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
         landed: flight.landed.is_some(),
         outcome: flight
             .outcome
             .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
+        objects: objects(&hub.moving, now),
     }))
+}
+
+fn objects(moving: &Moving, now: ServerTime) -> Vec<ObjectLine> {
+    let since_epoch_ns = moving.since_epoch_ns(now);
+    let named = moving.objects.names().zip(&moving.outlines).enumerate();
+    let line = |(index, (name, outline)): (usize, (&str, &Outline))| {
+        let pose = moving.objects.placement(index, since_epoch_ns);
+        ObjectLine {
+            name: name.to_owned(),
+            id: outline.id,
+            p_world_m: pose.translation_m.to_array(),
+            q_xyzw: pose.rotation.to_array(),
+            min_m: outline.min_m,
+            max_m: outline.max_m,
+        }
+    };
+    named.map(line).collect()
 }
 
 /// The runtime may stamp zero before it knows our clock: that reads as the start.

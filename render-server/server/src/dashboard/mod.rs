@@ -6,18 +6,30 @@
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
 //!                  vehicle, if none is named
 //! GET /api/map     the top view: a JPEG drawn at the start
+//! GET /api/shell   what is solid, as cells, for the view in space ([`crate::map::shell`])
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
 //! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
 //! POST /api/vehicles/V/estop          EmergencyStop to its runtime
+//! POST /api/vehicles/V/start          lets it take off, if it waits for that
+//! POST /api/vehicles/V/land           ends its flight: it brakes, then lands
+//! POST /api/vehicles/V/reset          on the ground: course, clock, path and figures begin anew
 //! GET /api/vehicles/V/cameras         its cameras of this moment, JSON
 //! PUT /api/vehicles/V/cameras/NAME    a whole camera, by the keys of `[[cameras]]`; from the next
 //!                                     tick on
 //! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
 //! ```
-//! Whoever is not on this computer needs a key, for everything but the page's own files ([`access`]):
+//! ```text
+//! GET /api/leaderboard        the standings of the course, JSON; GET /wall shows them large ([`leaderboard`])
+//! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
+//! ```
+//! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]).
+//! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
+//! ([`access`]); all routes are in one table ([`routes`]):
 //! ```text
 //! GET /enter?key=K     exchanges a key for a cookie
+//! GET /api/session     who the server takes the viewer for, and the token of whoever has a cookie
+//! POST /api/login, /api/logout     the instructor's password for a session ([`login`])
 //! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`pairing`])
 //! ```
 //! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
@@ -25,34 +37,43 @@
 
 mod access;
 mod cameras;
-mod messages;
+mod leaderboard;
+mod login;
+pub(crate) mod messages;
 pub(crate) mod origin;
 mod pairing;
+mod routes;
+mod scenes;
+mod sessions;
 mod stats;
 mod vehicles;
 mod viewer;
 
-pub use access::PageKeys;
+pub use access::{Access, Login, Logins, PageKeys, Takes};
+pub use login::set_password;
+pub use routes::list as routes;
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, Result};
-use axum::Router;
-use axum::extract::{DefaultBodyLimit, Query, State, WebSocketUpgrade};
+use axum::Extension;
+use axum::body::Bytes;
+use axum::extract::{Query, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
-use axum::middleware;
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post, put};
 use serde::Deserialize;
 use tokio::net::TcpListener;
 use tracing::warn;
 use vizflyt_arena::config::StageConfig;
 use vizflyt_protocol::time::ServerTime;
 
+use self::access::Shown;
 use crate::door::Door;
 use crate::hub::Hub;
+use crate::limits::Limiter;
 use crate::map::Map;
+use crate::scene::Scenes;
 use crate::vehicle::Vehicle;
 
 /// What the page's handlers share.
@@ -66,11 +87,15 @@ pub(crate) struct Page {
     pub(crate) boot: ServerTime,
     pub(crate) rates: messages::Rates,
     /// Who may see and do what.
-    keys: PageKeys,
+    pub(crate) access: Arc<Access>,
     /// Who may connect, and pairing.
-    door: Arc<Door>,
+    pub(crate) door: Arc<Door>,
     /// Where runtimes connect.
-    quic_port: u16,
+    pub(crate) quic_port: u16,
+    /// Who tried team tokens that are none.
+    pub(crate) team_tries: Mutex<Limiter>,
+    /// The scenes to choose from.
+    pub(crate) scenes: Arc<Scenes>,
 }
 
 /// Binds the page's address.
@@ -88,51 +113,14 @@ pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
 }
 
 /// Serves the page until the server stops.
-pub async fn serve(
-    hub: Arc<Hub>,
-    door: Arc<Door>,
-    keys: PageKeys,
-    map: Map,
-    stages: Vec<StageConfig>,
-    quic_port: u16,
-    listener: TcpListener,
-) -> Result<()> {
-    let stop = hub.stop.clone();
-    let (boot, rates) = (crate::clock::now(), messages::Rates::of(hub.vehicles.len()));
-    let page = Arc::new(Page { hub, map, stages, boot, rates, keys, door, quic_port });
-    let router = router(page).into_make_service_with_connect_info::<SocketAddr>();
+pub(crate) async fn serve(page: Page, listener: TcpListener) -> Result<()> {
+    let stop = page.hub.stop.clone();
+    let router = routes::router(Arc::new(page)).into_make_service_with_connect_info::<SocketAddr>();
     // Dropped at the stop rather than drained: WebSockets would drain for ever.
     tokio::select! {
         served = axum::serve(listener, router) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
     }
-}
-
-fn router(page: Arc<Page>) -> Router {
-    Router::new()
-        .route("/", get(async || file("text/html; charset=utf-8", INDEX)))
-        .route("/style.css", get(async || file("text/css; charset=utf-8", STYLE)))
-        .route("/app.js", get(async || file("text/javascript; charset=utf-8", APP)))
-        .route("/map.js", get(async || file("text/javascript; charset=utf-8", MAP)))
-        .route("/cameras.js", get(async || file("text/javascript; charset=utf-8", CAMERAS)))
-        .route("/waterfall.js", get(async || file("text/javascript; charset=utf-8", WATERFALL)))
-        .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
-        .route("/api/map", get(map))
-        .route("/api/stats", get(stats::get))
-        .route("/api/estop", post(vehicles::stop_all))
-        .route("/api/vehicles", get(vehicles::list))
-        .route("/api/vehicles/{vehicle}/estop", post(vehicles::stop))
-        .route("/api/vehicles/{vehicle}/cameras", get(cameras::list))
-        .route("/api/vehicles/{vehicle}/cameras/{name}", put(cameras::put).patch(cameras::patch))
-        .route("/pairing.js", get(async || file("text/javascript; charset=utf-8", PAIRING)))
-        .route("/api/pairing", get(pairing::standing).post(pairing::open).delete(pairing::shut))
-        .route("/enter", get(access::enter))
-        .route("/ws", get(watch))
-        // Also before routes that are not there: what exists is nobody's business.
-        .layer(middleware::from_fn_with_state(page.clone(), access::guard))
-        // A camera takes some hundred bytes.
-        .layer(DefaultBodyLimit::max(16 << 10))
-        .with_state(page)
 }
 
 pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {
@@ -146,9 +134,17 @@ pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {
 }
 
 async fn map(State(page): State<Arc<Page>>) -> Response {
-    let mut response = page.map.jpeg.clone().into_response();
+    picture("image/jpeg", page.map.jpeg.clone())
+}
+
+async fn shell(State(page): State<Arc<Page>>) -> Response {
+    picture("application/octet-stream", page.map.shell.clone())
+}
+
+fn picture(kind: &'static str, bytes: Bytes) -> Response {
+    let mut response = bytes.into_response();
     let headers = response.headers_mut();
-    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("image/jpeg"));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
     for (name, value) in GUARDS {
         headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
     }
@@ -174,6 +170,7 @@ struct Watched {
 async fn watch(
     State(page): State<Arc<Page>>,
     Query(watched): Query<Watched>,
+    Extension(shown): Extension<Shown>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
 ) -> Response {
@@ -189,7 +186,7 @@ async fn watch(
         // Viewers have nothing to say: a byte limit keeps a hostile one small.
         Ok(upgrade) => upgrade
             .max_message_size(1024)
-            .on_upgrade(async move |socket| viewer::run(page, vehicle, socket).await),
+            .on_upgrade(async move |socket| viewer::run(page, vehicle, shown, socket).await),
         Err(rejection) => rejection.into_response(),
     }
 }
@@ -199,13 +196,6 @@ pub(crate) fn refuse(refusal: &origin::Refusal) -> Response {
     (StatusCode::FORBIDDEN, refusal.to_string()).into_response()
 }
 
-const INDEX: &str = include_str!("page/index.html");
-const STYLE: &str = include_str!("page/style.css");
-const APP: &str = include_str!("page/app.js");
-const CAMERAS: &str = include_str!("page/cameras.js");
-const PAIRING: &str = include_str!("page/pairing.js");
-const MAP: &str = include_str!("page/map.js");
-const WATERFALL: &str = include_str!("page/waterfall.js");
 pub(crate) const ICON: &str = include_str!("page/icon.svg");
 
 /// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.

@@ -1,4 +1,4 @@
-use super::*;
+use super::routes::{APP, CAMERAS, INDEX, MAP, PAIRING, WATERFALL};
 
 #[test]
 fn the_page_refers_only_to_files_that_are_served() {

@@ -67,6 +67,52 @@ pub(super) async fn stop(
     }
 }
 
+/// Lets a vehicle take off.
+pub(super) async fn start(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::start, "it takes off")
+}
+
+/// Lands a vehicle in order.
+pub(super) async fn land(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::land, "it brakes and lands")
+}
+
+/// Begins a vehicle's run anew.
+pub(super) async fn reset(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::reset, "the run begins anew")
+}
+
+fn tell(
+    page: &Page,
+    name: &str,
+    headers: &HeaderMap,
+    order: impl FnOnce(&Vehicle, &str) -> Result<(), String>,
+    done: &'static str,
+) -> Response {
+    if let Err(refusal) = origin::check(headers) {
+        return refuse(&refusal);
+    }
+    match vehicle(page, name) {
+        Ok(vehicle) => match order(vehicle, "the page") {
+            Ok(()) => (StatusCode::ACCEPTED, done).into_response(),
+            Err(why) => (StatusCode::CONFLICT, why).into_response(),
+        },
+        Err(none) => *none,
+    }
+}
+
 /// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
 /// flight is told.
 fn press(vehicles: &[Arc<Vehicle>]) -> Response {

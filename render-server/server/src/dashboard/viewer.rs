@@ -10,6 +10,7 @@ use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::debug;
 
+use super::access::Shown;
 use super::{Page, messages};
 use crate::hub::lock;
 use crate::previews::Preview;
@@ -32,7 +33,12 @@ impl Drop for Presence<'_> {
 }
 
 /// Tells one viewer everything of a vehicle until it leaves, stalls, or the server stops.
-pub(super) async fn run(page: Arc<Page>, vehicle: Arc<Vehicle>, mut socket: WebSocket) {
+pub(super) async fn run(
+    page: Arc<Page>,
+    vehicle: Arc<Vehicle>,
+    shown: Shown,
+    mut socket: WebSocket,
+) {
     if page.hub.outlet.viewers() >= MOST_VIEWERS {
         debug!("page: {MOST_VIEWERS} viewers already");
         return;
@@ -40,10 +46,19 @@ pub(super) async fn run(page: Arc<Page>, vehicle: Arc<Vehicle>, mut socket: WebS
     let presence = Presence::new(&page, &vehicle);
     tokio::select! {
         _ = tell(&page, &vehicle, &mut socket) => {}
+        () = right_ends(&page, &shown) => {}
         () = page.hub.stop.wait() => {}
     }
     drop(presence);
     let _ = timeout(Duration::from_millis(200), socket.send(Frame::Close(None))).await;
+}
+
+/// Completes when the viewer is logged out.
+async fn right_ends(page: &Page, shown: &Shown) {
+    let mut look = interval(LOOK_EVERY);
+    while page.access.holds(shown) {
+        look.tick().await;
+    }
 }
 
 /// Returns `None` when the viewer is gone.
@@ -114,9 +129,12 @@ async fn send_json(socket: &mut WebSocket, message: &impl Serialize) -> Option<(
     send(socket, Frame::Text(text.into())).await
 }
 
-/// Binary message: kind (0 colour, 1 depth), camera, then JPEG.
+/// Binary message: kind (0 colour, 1 depth, 2 objects), camera, then JPEG.
 async fn send_preview(socket: &mut WebSocket, camera: usize, preview: &Preview) -> Option<()> {
-    for (kind, jpeg) in [(0u8, &preview.colour), (1, &preview.depth)] {
+    for (kind, jpeg) in [(0u8, &preview.colour), (1, &preview.depth), (2, &preview.ids)] {
+        if jpeg.is_empty() {
+            continue;
+        }
         let mut bytes = Vec::with_capacity(2 + jpeg.len());
         bytes.extend_from_slice(&[kind, camera as u8]);
         bytes.extend_from_slice(jpeg);
@@ -129,6 +147,8 @@ async fn send(socket: &mut WebSocket, frame: Frame) -> Option<()> {
     timeout(PATIENCE, socket.send(frame)).await.ok()?.ok()
 }
 
+/// Who is logged out sees no more after this long.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// 20 Hz: smooth to the eye.
 const EVERY: Duration = Duration::from_millis(50);
 /// A viewer that takes nothing for this long is gone.

@@ -9,21 +9,20 @@
 //! Tracker pads packets to a block size: bytes after the last item are ignored. Items with
 //! another id are skipped by their size.
 //!
-//! Rotation: turns about the fixed x, then the fixed y, then the fixed z axis,
-//! `R = Rz(rz) * Ry(ry) * Rx(rx)`. To check it on site: tilt the object 30 degrees nose-up, turn it
-//! by 90 degrees of yaw; the page must show the nose turned and the horizon tilted, not rolled.
+//! Rotation: unless the setting `euler` says otherwise, turns about the fixed x, then the fixed y,
+//! then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on
+//! site.
 //!
 //! Stamps: the stream carries a frame counter but no time, and Tracker's clock is not ours. So a
 //! pose is stamped with its arrival on CLOCK_MONOTONIC, less the jitter that the frame counter
 //! reveals ([`super::frame_clock`]). The constant part of Tracker's own delay (a few ms) stays in.
 
-use std::collections::BTreeSet;
-
-use glam::{DQuat, DVec3};
-use vizflyt_protocol::geometry::Pose;
+use glam::DVec3;
+use vizflyt_arena::config::{Euler, LocalizationConfig};
 use vizflyt_protocol::time::ServerTime;
 
-use super::frame_clock::FrameClock;
+use super::roster::{MOST_NAMES, Roster};
+use super::udp::{PoseStream, Silence};
 use super::{Measurement, SourceCounters};
 use crate::hub::MAX_VEHICLES;
 
@@ -32,11 +31,11 @@ use crate::hub::MAX_VEHICLES;
 pub struct ViconObject<'a> {
     /// Name, without the padding; Tracker writes ASCII, but any byte may come.
     pub name: &'a [u8],
-    /// Where it is. [m, world]
-    pub p_world_m: DVec3,
-    /// Rotation of its axes into the world's, or `None` if Tracker did not see the object (it
-    /// then sends zeros).
-    pub rotation: Option<DQuat>,
+    /// Where it is, in the stream's unit (Tracker's is the millimetre).
+    pub p_stream: DVec3,
+    /// Angles about x, y and z, or `None` if Tracker did not see the object (it then sends zeros).
+    /// [rad]
+    pub angles_rad: Option<DVec3>,
 }
 
 /// Why bytes are no packet of the stream.
@@ -112,162 +111,80 @@ fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
     }
     let [x, y, z, rx, ry, rz] = values;
     let seen = values != [0.0; 6];
-    let rotation =
-        DQuat::from_rotation_z(rz) * DQuat::from_rotation_y(ry) * DQuat::from_rotation_x(rx);
     Some(ViconObject {
         name,
-        p_world_m: DVec3::new(x, y, z) * 1e-3,
-        rotation: seen.then_some(rotation.normalize()),
+        p_stream: DVec3::new(x, y, z),
+        angles_rad: seen.then_some(DVec3::new(rx, ry, rz)),
     })
 }
 
 /// Selects our vehicles from the stream, keeps the counters, and notices what is wrong.
 #[derive(Debug)]
 pub struct ViconStream {
-    objects: Vec<Tracked>,
-    bad_packets: u64,
-    /// What the newest packet yielded.
-    measured: Vec<Measurement>,
-    others: BTreeSet<String>,
-    warned_of_others: bool,
-    warned_of_bad: bool,
-    warnings: Vec<String>,
-}
-
-/// One vehicle's object. Tracker counts all objects' frames together, but several simulators that
-/// send to one server each count their own.
-#[derive(Debug)]
-struct Tracked {
-    name: String,
-    clock: FrameClock,
-    last_frame: Option<u32>,
-    counters: SourceCounters,
+    roster: Roster,
+    euler: Euler,
 }
 
 impl ViconStream {
-    /// Makes a stream that yields the poses of the objects named, the first at index 0, and so on;
+    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on;
     /// at most [`MAX_VEHICLES`].
-    pub fn new(names: &[&str]) -> Self {
-        let tracked = |name: &&str| Tracked {
-            name: (*name).to_owned(),
-            clock: FrameClock::default(),
-            last_frame: None,
-            counters: SourceCounters::default(),
-        };
-        Self {
-            objects: names.iter().take(MAX_VEHICLES).map(tracked).collect(),
-            bad_packets: 0,
-            measured: Vec::with_capacity(MAX_VEHICLES),
-            others: BTreeSet::new(),
-            warned_of_others: false,
-            warned_of_bad: false,
-            warnings: Vec::new(),
-        }
+    pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
+        let roster = Roster::new(config, source, vehicles);
+        Self { roster, euler: config.euler.unwrap_or_default() }
     }
+}
 
-    /// Takes one UDP packet that arrived at `now`; returns the poses of our vehicles that are in it
-    /// and newer than the last.
-    pub fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
-        self.measured.clear();
+impl PoseStream for ViconStream {
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.roster.begin();
         let mut found = [None; MAX_VEHICLES];
-        let mut other = None;
-        let parsed = parse(bytes, |object| {
-            let named = |tracked: &Tracked| tracked.name.as_bytes() == object.name;
-            match self.objects.iter().position(named) {
-                Some(vehicle) => found[vehicle] = Some(object),
-                None => other = Some(object.name),
-            }
+        let mut others = heapless::Vec::<_, MOST_NAMES>::new();
+        let parsed = parse(bytes, |object| match self.roster.find(object.name) {
+            Some(vehicle) => found[vehicle] = Some(object),
+            None => drop(others.push(object.name)),
         });
         let frame = match parsed {
             Ok(frame) => frame,
             Err(error) => {
-                self.notice_bad(error);
+                let advice =
+                    "is something other than Tracker's UDP object stream sent to this port?";
+                self.roster.bad(&error, advice);
                 return &[];
             }
         };
-        if found.iter().all(Option::is_none) {
-            self.notice_other(other);
-            return &[];
+        if found.iter().all(Option::is_none) && !others.is_empty() {
+            let names = others.iter().filter_map(|name| std::str::from_utf8(name).ok());
+            self.roster.others(names, "rename the object in Tracker, or set `objects`");
         }
-        for (vehicle, (tracked, object)) in self.objects.iter_mut().zip(found).enumerate() {
+        for (vehicle, object) in found.into_iter().enumerate() {
             let Some(object) = object else { continue };
-            if !tracked.is_next(frame) {
+            if !self.roster.is_next(vehicle, frame, now) {
                 continue;
             }
-            let Some(rotation) = object.rotation else {
-                tracked.counters.occluded += 1;
+            let Some(angles_rad) = object.angles_rad else {
+                self.roster.occluded(vehicle);
                 continue;
             };
-            tracked.counters.poses += 1;
-            self.measured.push(Measurement {
-                vehicle,
-                stamp: tracked.clock.stamp(frame, now),
-                arrival: now,
-                world_from_body: Pose::new(object.p_world_m, rotation),
-            });
+            let stamp = self.roster.stamp(vehicle, frame, now);
+            let pose = (object.p_stream, self.euler.rotation(angles_rad));
+            self.roster.measure(vehicle, (stamp, now), pose, None);
         }
-        &self.measured
+        self.roster.measured()
     }
 
-    fn notice_bad(&mut self, error: ViconError) {
-        self.bad_packets += 1;
-        if !std::mem::replace(&mut self.warned_of_bad, true) {
-            self.warnings.push(format!(
-                "vicon: {error}; is something other than Tracker's UDP object stream sent to this \
-                 port? (further bad packets are only counted)"
-            ));
-        }
+    fn next_warning(&mut self) -> Option<String> {
+        self.roster.next_warning()
     }
 
-    fn notice_other(&mut self, other: Option<&[u8]>) {
-        let poses = self.objects.iter().any(|tracked| tracked.counters.poses > 0);
-        if poses || self.warned_of_others {
-            return;
-        }
-        let Some(name) = other else { return };
-        self.warned_of_others = true;
-        if self.others.len() < MOST_NAMES {
-            self.others.insert(String::from_utf8_lossy(name).into_owned());
-        }
-        let quoted = |name: &String| format!("'{name}'");
-        let others: Vec<_> = self.others.iter().map(quoted).collect();
-        let ours: Vec<_> = self.objects.iter().map(|tracked| quoted(&tracked.name)).collect();
-        self.warnings.push(format!(
-            "vicon: object {} streams, but {} was asked for; rename the object in Tracker, or start \
-             the server with --vehicle",
-            others.join(", "),
-            ours.join(", "),
-        ));
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        self.roster.counters(vehicle)
     }
 
-    /// Returns the next thing a person should know, each once.
-    pub fn next_warning(&mut self) -> Option<String> {
-        (!self.warnings.is_empty()).then(|| self.warnings.remove(0))
-    }
-
-    /// Returns the counters of a vehicle.
-    pub fn counters(&self, vehicle: usize) -> SourceCounters {
-        let own = self.objects.get(vehicle).map_or_else(SourceCounters::default, |t| t.counters);
-        SourceCounters { bad_packets: self.bad_packets, ..own }
-    }
-}
-
-impl Tracked {
-    /// Takes the next frame's number; returns whether it is newer than the last, and counts.
-    fn is_next(&mut self, frame: u32) -> bool {
-        if let Some(last) = self.last_frame {
-            let ahead = frame.wrapping_sub(last).cast_signed();
-            // A counter that falls back by more than any reordering is Tracker restarted.
-            if ahead <= 0 && ahead > -RESTART_FRAMES {
-                self.counters.stale_packets += 1;
-                return false;
-            }
-            if (2..RESTART_FRAMES).contains(&ahead) {
-                self.counters.lost_frames += (ahead - 1) as u64;
-            }
+    fn silence(&self) -> Silence {
+        Silence {
+            at_first: "in Tracker enable the UDP object stream to this computer and set it to Live",
+            later: "set Tracker to Live, then retry",
         }
-        self.last_frame = Some(frame);
-        true
     }
 }
 
@@ -278,10 +195,6 @@ const NAME_SIZE: usize = 24;
 const OBJECT_SIZE: usize = 72;
 /// No lab is a thousand kilometres wide [mm], and no angle has this many turns [rad].
 const MOST: f64 = 1e9;
-/// Ten seconds at 200 Hz: beyond any reordering on a LAN.
-const RESTART_FRAMES: i32 = 2000;
-/// Names remembered for the warning.
-const MOST_NAMES: usize = 8;
 
 #[cfg(test)]
 mod tests;

@@ -15,7 +15,8 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, Geofence, Occupancy, Spawn};
+use vizflyt_arena::config::{CameraConfig, Geofence, Occupancy, RulesConfig, Spawn};
+use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
@@ -64,8 +65,12 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
             max_m: DVec3::new(max_m.x, max_m.y, max_m.z.max(TAKEOFF_HEIGHT_M + 1.0)),
         },
         limits: Limits::new(2.0, 4.0),
+        body: Vec::new(),
+        no_fly: Vec::new(),
         occupancy: Occupancy::default(),
+        pose: PoseConfig::default(),
         vehicles: Vec::new(),
+        localization: Vec::new(),
         cameras: vec![CameraConfig::ahead(
             "front",
             [320, 240],
@@ -73,6 +78,8 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
             DVec3::new(0.06, 0.0, 0.02),
         )],
         stages: Vec::new(),
+        objects: Vec::new(),
+        rules: RulesConfig::default(),
     }
 }
 

@@ -9,10 +9,14 @@
 
 mod bake;
 mod bare;
+mod choose;
+mod objects;
 mod orient;
 
-pub use bake::bake;
+pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
 pub use bare::{align, default_arena};
+pub use choose::Scenes;
+pub use objects::{bounds_m, obstacles};
 pub use orient::{Up, WorldFromScene};
 
 use std::path::{Path, PathBuf};
@@ -21,8 +25,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use tracing::{info, warn};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_splat::Splats;
+use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_splat::format::{self, Loaded, Progress};
+use vizflyt_splat::{RigidObject, Splats};
 
 /// A loaded twin.
 #[derive(Debug)]
@@ -31,6 +36,8 @@ pub struct Scene {
     pub arena: ArenaConfig,
     /// The twin. [m, world]
     pub splats: Splats,
+    /// What moves in it, in the arena's order. [m, object]
+    pub objects: Vec<RigidObject>,
     /// How the scene's file was turned, scaled and moved to become the twin.
     pub world_from_scene: WorldFromScene,
 }
@@ -60,6 +67,14 @@ pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
     Ok((scene, loaded))
 }
 
+/// Returns where an arena's poses come from, as its file says; a bare scene says nothing.
+pub fn localization(path: &Path) -> Result<Vec<LocalizationConfig>> {
+    match named(path)? {
+        Named::Arena(path) => Ok(read_arena(&path)?.localization),
+        Named::Scene(_) => Ok(Vec::new()),
+    }
+}
+
 fn named(path: &Path) -> Result<Named> {
     if !path.exists() {
         bail!(
@@ -82,12 +97,15 @@ fn named(path: &Path) -> Result<Named> {
     Ok(if is_toml { Named::Arena(path.to_owned()) } else { Named::Scene(path.to_owned()) })
 }
 
-/// Returns an arena and where its scene lies.
-fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
+fn read_arena(path: &Path) -> Result<ArenaConfig> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let arena =
-        ArenaConfig::parse(&text).with_context(|| format!("{} is wrong", path.display()))?;
+    ArenaConfig::parse(&text).with_context(|| format!("{} is wrong", path.display()))
+}
+
+/// Returns an arena and where its scene lies.
+fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
+    let arena = read_arena(path)?;
     let scene = arena.scene_path(path);
     if !scene.exists() {
         bail!(
@@ -103,7 +121,8 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
 fn with_arena(path: &Path) -> Result<Scene> {
     let (arena, scene) = parse_arena(path)?;
     let world_from_scene = WorldFromScene::IDENTITY;
-    Ok(Scene { splats: read(&scene)?.splats, arena, world_from_scene })
+    let objects = objects::read_all(&arena, path, |path| Ok(read(path)?.splats))?;
+    Ok(Scene { splats: read(&scene)?.splats, arena, objects, world_from_scene })
 }
 
 fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
@@ -119,7 +138,7 @@ fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
         if scale.is_none() { " (a guess; set --scale and --up)" } else { "" },
         arena.spawn.position_m
     );
-    Ok(Scene { arena, splats, world_from_scene })
+    Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene })
 }
 
 /// Reads a scene file of any format; how far it has come goes to the log, if it takes long.

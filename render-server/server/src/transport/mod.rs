@@ -13,7 +13,6 @@ mod control;
 mod greeting;
 mod images;
 mod lan;
-mod limits;
 mod pairing;
 mod session;
 
@@ -39,9 +38,9 @@ use tracing::{debug, warn};
 use vizflyt_protocol::messages::close;
 use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 
-use self::limits::Limiter;
 use crate::door::Door;
 use crate::hub::{Hub, lock};
+use crate::limits::Limiter;
 use crate::pace::is_near;
 
 /// Who decides how fast to send.

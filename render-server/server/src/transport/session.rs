@@ -221,6 +221,7 @@ async fn up(
             (ToServer::Timing(timing), Some(seat)) => {
                 seat.vehicle.report_timing(timing);
             }
+            (ToServer::Imu(readings), Some(seat)) => seat.vehicle.feel(&readings),
             (ToServer::Event { seq, event }, Some(seat)) => {
                 if seat.hear(seq) {
                     seat.vehicle.log(Origin::Page, event);

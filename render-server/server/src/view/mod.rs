@@ -133,7 +133,8 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
 }
 
 fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, splats, world_from_scene } = scene::load(&args.scene, args.up, args.scale)?;
+    let Scene { arena, splats, world_from_scene, .. } =
+        scene::load(&args.scene, args.up, args.scale)?;
     let Chosen { rasterizer, reason } = choose(&splats, args.renderer)?;
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;

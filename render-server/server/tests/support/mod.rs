@@ -107,12 +107,15 @@ impl Server {
         // A test may bring a folder of its own.
         let own_keys = (!more.iter().any(|option| option.starts_with("--keys")))
             .then(|| format!("--keys={}", keys.path().join("keys").display()));
+        let nowhere = (!more.iter().any(|option| option.starts_with("--leaderboard")))
+            .then_some("--leaderboard=none");
         let free = "127.0.0.1:0";
         let mut child = Command::new(env!("CARGO_BIN_EXE_vizflyt-server"))
             .arg(arena)
             .args(["--json", "--lifeline", "--quic", free, "--http", free, "--vicon", free])
             .args(more)
             .args(own_keys)
+            .args(nowhere)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -175,6 +178,12 @@ impl Server {
     pub fn terminate(&self) {
         let done = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
         assert!(done.success());
+    }
+
+    /// Kills it, as a power cut would.
+    pub fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
     }
 
     /// Waits for the end and returns the exit status.

@@ -1,55 +1,24 @@
 use super::*;
 
-fn need(request: &str) -> Need {
-    let (method, uri) = request.split_once(' ').unwrap();
-    Need::of(&method.parse().unwrap(), &uri.parse().unwrap())
-}
-
 fn vehicle(name: &str) -> Need {
     Need::Vehicle(name.to_owned())
 }
 
 #[test]
-fn every_request_takes_what_it_should() {
-    for open in ["GET /", "GET /app.js", "HEAD /style.css", "GET /enter?key=x"] {
-        assert_eq!(need(open), Need::Nothing, "{open}");
+fn a_vehicle_is_the_one_that_the_path_or_the_query_names_beyond_doubt() {
+    let need = |path: &str, uri: &str| Need::of(Takes::Vehicle, path, &uri.parse().unwrap());
+    for uri in ["/ws?vehicle=ant", "/ws?x=1&vehicle=ant", "/ws?vehicle=%61nt"] {
+        assert_eq!(need("/ws", uri), vehicle("ant"), "{uri}");
     }
-    for any in ["GET /api/map", "GET /api/vehicles", "HEAD /api/map"] {
-        assert_eq!(need(any), Need::Key, "{any}");
+    for uri in ["/api/vehicles/ant/estop", "/api/vehicles/%61nt/estop?vehicle=bee"] {
+        assert_eq!(need("/api/vehicles/{vehicle}/estop", uri), vehicle("ant"), "{uri}");
     }
-    for own in [
-        "GET /ws?vehicle=ant",
-        "GET /ws?x=1&vehicle=ant",
-        "GET /ws?vehicle=%61nt",
-        "GET /api/stats?vehicle=ant",
-        "GET /api/vehicles/ant/cameras",
-        "GET /api/vehicles/%61nt/cameras",
-        "POST /api/vehicles/ant/estop",
-    ] {
-        assert_eq!(need(own), vehicle("ant"), "{own}");
+    for uri in
+        ["/ws", "/ws?vehicle=ant&vehicle=bee", "/ws?vehicle=ant&%76ehicle=bee", "/ws?vehicle=%6"]
+    {
+        assert_eq!(need("/ws", uri), Need::Everything, "{uri}");
     }
-    for all in [
-        "GET /ws",
-        "GET /ws?vehicle=ant&vehicle=bee",
-        "GET /ws?vehicle=ant&%76ehicle=bee",
-        "GET /ws?vehicle=%6",
-        "POST /",
-        "POST /app.js",
-        "POST /api/estop",
-        "GET /api/pairing",
-        "POST /api/pairing",
-        "PUT /api/vehicles/ant/cameras/front",
-        "PATCH /api/vehicles/ant/cameras/front",
-        "GET /api/vehicles/ant/estop",
-        "GET /api/vehicles/ant/cameras/front",
-        "GET /api/vehicles/ant/cameras/../../bee/cameras",
-        "GET /api/of-tomorrow",
-        "GET /api",
-        "GET /x/app.js",
-        "GET /nothing",
-    ] {
-        assert_eq!(need(all), Need::Everything, "{all}");
-    }
+    assert_eq!(need("/api/vehicles/{vehicle}/estop", "/api/vehicles/%6/estop"), Need::Everything);
 }
 
 #[test]
@@ -72,16 +41,19 @@ fn a_team_meets_its_own_vehicles_needs_alone() {
 fn who_shows_a_key_is_judged_by_it_and_who_shows_none_by_where_it_is() {
     let root = tempfile::tempdir().unwrap();
     let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
-    let keys = PageKeys::keep(&folder, &["ant", "bee"]).unwrap();
-    let links = keys.links("http://h", &["ant", "bee"]);
+    let access =
+        |login| Access::new(&folder, &["ant", "bee"], login, Logins::new().unwrap()).unwrap();
+    let (remote, always) = (access(Login::Remote), access(Login::Always));
+    let links = remote.keys().links("http://h", &["ant", "bee"]);
     let key = |index: usize| links[index].1.strip_prefix("http://h/enter?key=").unwrap().to_owned();
-    let judge = |from: &str, cookie: &str| {
+    let judged_by = |access: &Access, from: &str, cookie: &str| {
         let mut headers = HeaderMap::new();
         if !cookie.is_empty() {
             headers.insert(header::COOKIE, cookie.parse().unwrap());
         }
-        keys.judge(from.parse().unwrap(), &headers)
+        access.judge(from.parse().unwrap(), &headers).map(|shown| shown.viewer)
     };
+    let judge = |from: &str, cookie: &str| judged_by(&remote, from, cookie);
     let of = |index: usize| format!("other=1; vizflyt_key={}", key(index));
     let team = |name: &str| Some(Viewer::Team(name.to_owned()));
     for from in ["127.0.0.1", "192.168.1.7", "::1"] {
@@ -93,6 +65,10 @@ fn who_shows_a_key_is_judged_by_it_and_who_shows_none_by_where_it_is() {
     for home in ["127.0.0.1", "::1", "::ffff:127.0.0.1"] {
         assert_eq!(judge(home, ""), Some(Viewer::Instructor));
         assert_eq!(judge(home, "other=1"), Some(Viewer::Instructor));
+        // A session that has ended is as none.
+        assert_eq!(judge(home, "vizflyt_session=gone"), Some(Viewer::Instructor));
+        assert_eq!(judged_by(&always, home, ""), None, "{home}");
+        assert_eq!(judged_by(&always, home, &of(0)), Some(Viewer::Instructor));
     }
     for away in ["192.168.1.7", "10.0.0.1", "0.0.0.0", "2001:db8::1"] {
         assert_eq!(judge(away, ""), None, "{away}");
@@ -118,6 +94,28 @@ fn keys_are_kept_made_for_new_vehicles_and_checked() {
     let same = "instructor = \"aaaaaaaaaaaaaaaaaaaa\"\n[vehicles]\nant = \"aaaaaaaaaaaaaaaaaaaa\"";
     folder.write(FILE, same).unwrap();
     assert!(PageKeys::keep(&folder, &[]).unwrap_err().to_string().contains("the same"));
+}
+
+proptest::proptest! {
+    /// Whatever comes as address, cookie or token is taken apart without a slip, and opens nothing.
+    #[test]
+    fn what_strangers_send_is_taken_apart_and_opens_nothing(
+        text in "[ -~]{0,80}",
+        bytes in proptest::collection::vec(32u8..=255, 0..80),
+    ) {
+        if let Ok(uri) = format!("/ws?{}", encoded(&text).replace("%3D", "=")).parse::<Uri>() {
+            let _ = asked(&uri);
+        }
+        proptest::prop_assert_eq!(decoded(&encoded(&text)), Some(text.clone()));
+        let _ = decoded(&text);
+        let mut headers = HeaderMap::new();
+        if let Ok(value) = HeaderValue::from_bytes(&bytes) {
+            headers.insert(header::COOKIE, value);
+        }
+        let _ = (cookie(&headers, KEY), cookie(&headers, SESSION));
+        let logins = Logins::new().unwrap();
+        proptest::prop_assert!(!logins.tokens.fits("cookie", &text));
+    }
 }
 
 #[test]

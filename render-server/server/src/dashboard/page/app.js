@@ -2,6 +2,8 @@
 // connection comes back by itself, and what was last known stays on the screen.
 
 import { CameraForm } from "/cameras.js";
+import { ask, showOrders } from "/controls.js";
+import { showLeaderboard } from "/leaderboard.js";
 import { TopView } from "/map.js";
 
 const $ = (id) => document.getElementById(id);
@@ -11,12 +13,54 @@ const form = new CameraForm($("camera-form"), $("camera-said"));
 const wanted = new URLSearchParams(location.search).get("vehicle");
 const shown = { vehicle: null, pose: null, state: null, camera: 0, cameras: [], boot: null, events: new Set(), outcome: null };
 
+// ---- the view in space --------------------------------------------------------------------
+let space = null;
+function spaceStyle() {
+  const css = getComputedStyle(document.documentElement);
+  const read = (name) => css.getPropertyValue(name).trim();
+  return {
+    theme: document.documentElement.dataset.theme, text: read("--text"), accent: read("--accent"), good: read("--good"),
+    warn: read("--warn"), bad: read("--bad"), muted: read("--muted"), floor: read("--floor"),
+    solidLow: read("--solid-low"), solidHigh: read("--solid-high"),
+  };
+}
+/** Shows the view in space, or the top view; fetches what draws it when it is first asked for. */
+async function pickView(inSpace) {
+  if (inSpace && !space) {
+    try {
+      const { SpaceView } = await import("/space.js");
+      space = new SpaceView($("space"));
+      if (shown.arena) space.setArena(shown.arena, spaceStyle());
+    } catch {
+      inSpace = false;
+      $("view-space").disabled = true;
+      $("view-space").title = "this browser has no WebGL 2";
+    }
+  }
+  $("map").hidden = inSpace;
+  $("space").hidden = !inSpace;
+  $("view-top").setAttribute("aria-pressed", !inSpace);
+  $("view-space").setAttribute("aria-pressed", inSpace);
+  (inSpace ? space : view).resize();
+}
+for (const [id, inSpace] of [["view-top", false], ["view-space", true]])
+  $(id).addEventListener("click", () => {
+    localStorage.setItem("view", inSpace ? "space" : "top");
+    pickView(inSpace);
+  });
+/** What was chosen last; else space, where a graphics card draws it. */
+async function firstView() {
+  const chosen = localStorage.getItem("view");
+  pickView(chosen ? chosen === "space" : (await import("/space.js")).hasCard());
+}
+
 // ---- theme -------------------------------------------------------------------------------
 const wantsLight = matchMedia("(prefers-color-scheme: light)");
 function applyTheme() {
   const theme = localStorage.getItem("theme") ?? (wantsLight.matches ? "light" : "dark");
   document.documentElement.dataset.theme = theme;
   view.restyle();
+  if (space && shown.arena) space.setArena(shown.arena, spaceStyle());
 }
 wantsLight.addEventListener("change", applyTheme);
 $("theme").addEventListener("click", () => {
@@ -36,7 +80,13 @@ async function stop(all = false) {
   try {
     // Before the page knows whose it is, the button stops whoever flies.
     const where = all || shown.vehicle == null ? "/api/estop" : `${api()}/estop`;
-    const answer = await fetch(where, { method: "POST" });
+    // Not through `order`: the stop button waits for nothing.
+    let answer = await fetch(where, { method: "POST" });
+    // The server is changing its scene: this connection is the former one's.
+    for (let tries = 0; answer.status === 503 && tries < 20; tries++) {
+      await new Promise((done) => setTimeout(done, 250));
+      answer = await fetch(where, { method: "POST" });
+    }
     say(await answer.text());
     if (!answer.ok) banner("warn", "Not stopped", $("said").textContent);
   } catch {
@@ -49,7 +99,7 @@ $("estop-all").addEventListener("click", () => stop(true));
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
   // Space on another focused control is that control's own.
-  const control = event.target.closest?.("button, input, select, summary");
+  const control = event.target.closest?.("button, input, select, summary, textarea");
   const elsewhere = control && control !== $("estop");
   if (event.code === "Escape" || (event.code === "Space" && !elsewhere)) {
     event.preventDefault();
@@ -76,6 +126,7 @@ function connect() {
   socket.onmessage = ({ data }) => (typeof data === "string" ? hear(JSON.parse(data)) : look(data));
   socket.onclose = () => {
     link("bad", "server gone, reconnecting");
+    if (!opened) ask().then(({ role }) => role || link("warn", "not logged in"));
     document.body.dataset.stale = "";
     if (!opened && wanted != null) missing();
     setTimeout(connect, wait_ms);
@@ -135,6 +186,9 @@ function hearArena(arena) {
   showVehicles(arena.vehicles, arena.vehicle);
   $("arena").textContent = arena.name;
   $("vehicle").textContent = arena.vehicle;
+  shown.arena = arena;
+  space?.setArena(arena, spaceStyle());
+  showStages();
   $("speed-top").textContent = `${Math.max(1, arena.max_speed_mps)} m/s`;
   view.setArena(arena);
   shown.cameras = arena.cameras;
@@ -171,10 +225,23 @@ function hearTrail({ points }) {
 }
 
 // ---- pictures ----------------------------------------------------------------------------
-const busy = [false, false];
+const busy = [false, false, false];
+/** Which picture the second figure shows: 1 depth, 2 objects. */
+let second = 1;
+$("depth-kind").addEventListener("click", () => {
+  second = second === 1 ? 2 : 1;
+  put("depth-kind", second === 1 ? "depth" : "objects");
+  $("depth-kind").setAttribute("aria-label", second === 1 ? "show objects instead of depth" : "show depth instead of objects");
+  document.querySelector(".depth-scale").hidden = second !== 1;
+});
 async function look(data) {
   const [kind, camera] = new Uint8Array(data, 0, 2);
   if (camera !== shown.camera || busy[kind]) return;
+  if (kind === 2) {
+    $("depth-kind").hidden = false;
+    $("depth-word").hidden = true;
+  }
+  if (kind !== 0 && kind !== second) return;
   busy[kind] = true;
   try {
     const image = await createImageBitmap(new Blob([new Uint8Array(data, 2)], { type: "image/jpeg" }));
@@ -193,11 +260,12 @@ async function look(data) {
 const TONES = {
   collision: "bad", geofence: "bad", emergency_stop: "bad", plugin_failed: "bad", pose_lost: "bad",
   finished: "good", stage: "good", pose_regained: "good", time_limit: "warn", phase: "go",
-  plugin_output: "code", note: "",
+  plugin_output: "code", note: "", start: "go", land: "warn",
 };
 const TITLES = {
   collision: "Collision", geofence: "Left the geofence", emergency_stop: "Stopped by hand",
   plugin_failed: "Plugin failed", pose_lost: "Pose lost", finished: "Finished", time_limit: "Time is up",
+  land: "Landed by hand",
 };
 const kindOf = (kind) => (typeof kind === "string" ? kind : Object.keys(kind)[0]);
 const clock = (s) => `${Math.floor(s / 60)}:${(s % 60).toFixed(1).padStart(4, "0")}`;
@@ -214,8 +282,10 @@ function hearEvents({ events }) {
     line.dataset.tone = TONES[kindOf(event.kind)] ?? "";
     line.append(time, text);
     list.append(line);
-    if (kindOf(event.kind) === "stage" && view.arena?.stages[event.kind.stage.index])
+    if (kindOf(event.kind) === "stage" && view.arena?.stages[event.kind.stage.index]) {
       view.arena.stages[event.kind.stage.index].passed = true;
+      showStages();
+    }
   }
   while (list.childElementCount > 400) list.firstChild.remove();
   follow();
@@ -231,6 +301,31 @@ $("events").addEventListener("scroll", ({ target }) => {
 });
 new ResizeObserver(follow).observe($("events"));
 
+for (const button of document.querySelectorAll("[data-feed]"))
+  button.addEventListener("click", () => {
+    $("events").dataset.feed = button.dataset.feed;
+    for (const other of document.querySelectorAll("[data-feed]")) other.setAttribute("aria-pressed", other === button);
+    follow();
+  });
+
+// ---- stages ------------------------------------------------------------------------------
+/** A light for each stage of the course: passed, the next one, those after it. */
+function showStages() {
+  const stages = shown.arena?.stages ?? [];
+  const next = stages.findIndex((stage) => !stage.passed);
+  $("stages").hidden = !stages.length;
+  $("stages").replaceChildren(
+    ...stages.map((stage, k) => {
+      const light = document.createElement("li");
+      light.textContent = stage.name;
+      light.dataset.light = stage.passed ? "passed" : k === next ? "next" : "";
+      if (k === next) light.setAttribute("aria-current", "step");
+      light.setAttribute("aria-label", `${stage.name}: ${stage.passed ? "passed" : k === next ? "next" : "to come"}`);
+      return light;
+    }),
+  );
+}
+
 function banner(tone, title, text) {
   const box = $("outcome");
   box.hidden = false;
@@ -243,6 +338,7 @@ function banner(tone, title, text) {
 const PHASES = {
   connecting: ["idle", "connecting"], preparing: ["warn", "preparing"], taking_off: ["go", "taking off"],
   flying: ["good", "flying"], holding: ["warn", "holding"], landing: ["warn", "landing"], landed: ["idle", "landed"],
+  waiting: ["go", "ready to start"],
 };
 const lines = { altitude: [], speed: [], age: [] };
 // Adding zero turns -0 into 0: a vehicle on the floor is not at "-0.00".
@@ -262,8 +358,11 @@ function hearState(state) {
     // A new flight on the same server: its trail starts afresh.
     view.trail = [];
     $("outcome").hidden = true;
+    for (const stage of shown.arena?.stages ?? []) stage.passed = false;
+    showStages();
   }
   shown.flown = state.flight_s != null;
+  showOrders(shown.vehicle, state);
   if (pose) {
     shown.pose = { ...pose, received: live ? now : -1e9 };
     const speed = Math.hypot(...pose.v_world_mps);
@@ -279,6 +378,9 @@ function hearState(state) {
   $("phase").dataset.tone = phaseTone;
   put("phase-text", phaseText);
   put("clock", clock(state.flight_s ?? 0));
+  const left_s = shown.arena?.time_limit_s > 0 && state.flight_s != null && !state.landed
+    ? Math.max(0, shown.arena.time_limit_s - state.flight_s) : null;
+  put("clock-left", left_s == null ? "" : `${Math.ceil(left_s)} s left`);
 
   const images = report?.images;
   put("age", images?.delivered ? fixed(images.age_ms_p50, 1) : "–");
@@ -300,8 +402,19 @@ function hearState(state) {
   put("poses", fixed(state.source_hz, 0));
   tone("poses", live ? "" : "bad");
   const { bad_packets, lost_frames, occluded } = state.source;
+  const quality = state.quality;
+  const tags = state.source.tags;
+  $("tags-view").hidden = !tags?.view;
+  if (tags?.view) $("tags-view").href = `//${tags.view}/`;
+  const off = quality?.age_ms == null ? "" : `±${fixed(quality.position_sigma_mm, 1)} mm${quality.imu ? ", IMU" : ""}`;
   put("pose-note", !pose ? "no pose yet" : !live ? `lost ${fixed(pose.age_s, 1)} s`
-    : bad_packets ? `${bad_packets} bad` : lost_frames ? `${lost_frames} lost` : occluded ? `${occluded} unseen` : "");
+    : bad_packets ? `${bad_packets} bad` : lost_frames ? `${lost_frames} lost` : occluded ? `${occluded} unseen` : off);
+  $("pose-panel").title = (quality?.sources ?? []).map((source) => {
+    const not = Object.entries(source.rejected).filter(([, count]) => count).map(([why, count]) => `${count} ${why}`);
+    return `${source.name || `source ${source.source}`}: ${fixed(source.rate_hz, 0)} Hz, ${fixed(source.latency_ms, 1)} ms late, ` +
+      `${source.believed} believed${not.length ? `, not: ${not.join(", ")}` : ""}`;
+  }).concat(quality?.age_ms == null ? [] : [`innovation ${fixed(quality.innovation_sigmas, 1)} sigma, attitude ±${fixed(quality.rotation_sigma_deg, 2)}°, ${quality.resets} resets`])
+    .concat(tags ? [`${tags.tags} tags in ${tags.cameras} cameras, corners ${fixed(tags.rms_px, 2)} px off, ${fixed(tags.image_ms, 1)} ms an image`] : []).join("\n");
   put("renderer", `renderer: ${state.renderer.name} (${state.renderer.reason})`);
   put("runtime", state.runtime ? `${state.runtime.program} at ${state.runtime.address}` : "no runtime connected");
 
@@ -314,6 +427,12 @@ function hearState(state) {
     const ended = state.landed ? "; the vehicle has landed" : "";
     banner(TONES[kind] || "warn", TITLES[kind] ?? kind, state.outcome.text + ended);
   }
+  // Whoever looks from across the room sees it, too.
+  document.body.dataset.outcome = state.outcome ? TONES[kindOf(state.outcome.kind)] || "warn" : "";
+  // When the vehicle changes, a flight is decided, and when it has landed: the standings may be others.
+  const decided = `${shown.vehicle} ${state.outcome?.stamp_ns ?? state.outcome?.text} ${state.landed}`;
+  if (decided !== shown.decided) showLeaderboard(shown.vehicle);
+  shown.decided = decided;
   shown.outcome = state.outcome;
 }
 
@@ -357,7 +476,8 @@ function drawLine(name, now, colour) {
 let lines_at = 0;
 function frame(now) {
   const crashed = ["collision", "geofence"].includes(shown.outcome && kindOf(shown.outcome.kind));
-  view.draw(shown.pose, now, crashed);
+  if ($("space").hidden) view.draw(shown.pose, now, crashed, shown.state?.objects);
+  else space.draw({ pose: shown.pose, now, crashed, trail: view.trail, objects: shown.state?.objects });
   if (now - lines_at > 100 && view.style) {
     lines_at = now;
     for (const name of Object.keys(lines)) drawLine(name, now, view.style.accent);
@@ -365,5 +485,6 @@ function frame(now) {
   requestAnimationFrame(frame);
 }
 
+firstView();
 connect();
 requestAnimationFrame(frame);

@@ -1,6 +1,8 @@
 // The cameras panel: one form for the camera that is shown. What is applied takes effect with the
 // next image; another page's change fills the form anew unless someone is typing in it.
 
+import { order } from "/controls.js";
+
 const CALIBRATED = ["fx_px", "fy_px", "cx_px", "cy_px"];
 const NUMBERS = ["width_px", "height_px", "near_m", "tilt_deg", "yaw_deg", "roll_deg"];
 const LENS = { "brown-conrady": ["k1", "k2", "p1", "p2", "k3"], "kannala-brandt": ["k1", "k2", "k3", "k4"] };
@@ -55,6 +57,8 @@ export class CameraForm {
     const model = form.model.value;
     if (model === "fov") camera.horizontal_fov_deg = number("horizontal_fov_deg");
     else for (const name of CALIBRATED) camera[name] = number(name);
+    // What the form does not show stays as it is.
+    for (const name of ["priority", "depth"]) if (this.camera[name] != null) camera[name] = this.camera[name];
     if (LENS[model]) {
       camera.distortion = { model };
       for (const name of LENS[model]) camera.distortion[name] = number(name);
@@ -66,11 +70,7 @@ export class CameraForm {
     if (!this.camera) return;
     let text, good = false;
     try {
-      const answer = await fetch(`${this.vehicle}/cameras/${encodeURIComponent(this.camera.name)}`, {
-        method: "PUT",
-        headers: { "content-type": "application/json" },
-        body: JSON.stringify(this.read()),
-      });
+      const answer = await order("PUT", `${this.vehicle}/cameras/${encodeURIComponent(this.camera.name)}`, this.read());
       good = answer.ok;
       text = good ? "applied" : await answer.text();
     } catch {

@@ -36,6 +36,21 @@ function obstacleCanvas({ width, height, bits }, style) {
   return canvas;
 }
 
+/** Returns the convex hull of points in the plane (Andrew's monotone chain). */
+function hull(points) {
+  const sorted = points.toSorted((a, b) => a[0] - b[0] || a[1] - b[1]);
+  const cross = (o, a, b) => (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0]);
+  const chain = (list) => {
+    const out = [];
+    for (const p of list) {
+      while (out.length >= 2 && cross(out.at(-2), out.at(-1), p) <= 0) out.pop();
+      out.push(p);
+    }
+    return out.slice(0, -1);
+  };
+  return [...chain(sorted), ...chain(sorted.toReversed())];
+}
+
 export class TopView {
   constructor(canvas) {
     this.canvas = canvas;
@@ -96,7 +111,7 @@ export class TopView {
     if (this.trail.length > 3000) this.trail = this.trail.filter((_, k) => k % 2 === 0);
   }
 
-  draw(pose, now, crashed) {
+  draw(pose, now, crashed, objects) {
     const { g, style, arena, ratio } = this;
     if (!arena || !this.scale) return;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -105,6 +120,7 @@ export class TopView {
     this.drawFence(crashed);
     for (const stage of arena.stages) this.drawStage(stage);
     if (arena.goal_m) this.drawGoal(now);
+    for (const object of objects ?? []) this.drawObject(object);
     this.drawTrail();
     if (pose) this.drawVehicle(pose, now);
     this.drawScaleBar();
@@ -164,6 +180,26 @@ export class TopView {
     g.lineTo(...b);
     g.stroke();
     g.lineCap = "butt";
+  }
+
+  /** A moving object, as the box around it. */
+  drawObject({ min_m, max_m, p_world_m, q_xyzw: [x, y, z, w] }) {
+    const { g, style } = this;
+    // The box's corners, turned by the quaternion, seen from above: their outermost lines.
+    const corners = [];
+    for (const a of [min_m[0], max_m[0]])
+      for (const b of [min_m[1], max_m[1]])
+        for (const c of [min_m[2], max_m[2]])
+          corners.push([
+            p_world_m[0] + (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * w) * b + 2 * (x * z + y * w) * c,
+            p_world_m[1] + 2 * (x * y + z * w) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * w) * c,
+          ]);
+    g.strokeStyle = style.bad;
+    g.lineWidth = 2;
+    g.beginPath();
+    hull(corners).forEach((p, k) => (k ? g.lineTo(...this.at(p)) : g.moveTo(...this.at(p))));
+    g.closePath();
+    g.stroke();
   }
 
   drawGoal(now) {

@@ -1,5 +1,7 @@
 // Pairing a computer: a button for the instructor, a code to read out, and what came of it.
 
+import { order, panel } from "/controls.js";
+
 const make = (tag, props = {}, ...children) => {
   const node = Object.assign(document.createElement(tag), props);
   node.append(...children);
@@ -7,7 +9,7 @@ const make = (tag, props = {}, ...children) => {
 };
 
 const ask = async (method, body) => {
-  const answer = await fetch("/api/pairing", { method, body: body && JSON.stringify(body) });
+  const answer = await (method === "GET" ? fetch("/api/pairing") : order(method, "/api/pairing", body));
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();
 };
@@ -19,17 +21,14 @@ news.setAttribute("role", "status");
 const command = make("kbd");
 const begin = make("button", { type: "button", className: "ghost worded", textContent: "show a code" });
 const end = make("button", { type: "button", className: "ghost worded", textContent: "close" });
-const dialog = make(
-  "dialog",
-  { className: "panel pairing" },
-  make("h2", { textContent: "pair a computer" }),
+const dialog = panel(
+  "pair a computer",
   make("label", {}, "it shall fly and watch ", right),
   code,
   make("p", { className: "muted" }, "On the other computer run ", command, " and type the code."),
   news,
   make("p", { className: "choices" }, begin, end),
 );
-document.body.append(dialog);
 
 let timer = 0;
 let opened = false;
@@ -72,19 +71,17 @@ dialog.addEventListener("close", () => {
   if (opened) act("DELETE");
 });
 
-async function openDialog() {
+async function openDialog({ currentTarget }) {
+  const button = currentTarget;
   const vehicles = await (await fetch("/api/vehicles")).json();
   right.replaceChildren(
     ...vehicles.map(({ name }) => new Option(`'${name}'`, `team:${name}`)),
     new Option("everything (an instructor)", "instructor"),
   );
   await look();
-  dialog.showModal();
+  dialog.open_from(button);
   timer = setInterval(look, 1000);
 }
-
-// Space and escape are the stop button's elsewhere; here they belong to the dialog.
-dialog.addEventListener("keydown", (event) => event.stopPropagation());
 
 // Whoever may not pair does not see the button.
 const known = await fetch("/api/pairing");

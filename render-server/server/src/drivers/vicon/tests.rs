@@ -1,5 +1,11 @@
 use super::*;
+use glam::DQuat;
 use proptest::prelude::*;
+use vizflyt_arena::config::Driver;
+
+fn stream(vehicles: &[&str]) -> ViconStream {
+    ViconStream::new(&LocalizationConfig::new(Driver::Vicon), 0, vehicles)
+}
 
 /// Writes a packet as Tracker does.
 fn packet(frame: u32, objects: &[(&str, [f64; 6])]) -> Vec<u8> {
@@ -34,7 +40,7 @@ fn millimetres_become_metres_and_angles_a_rotation() {
     let yaw = std::f64::consts::FRAC_PI_2;
     let bytes = packet(7, &[("vizflyt", [1000.0, -2000.0, 1500.0, 0.0, 0.0, yaw])]);
     assert_eq!(bytes.len(), 5 + 75);
-    let pose = only(&mut ViconStream::new(&["vizflyt"]), at(0), &bytes).unwrap();
+    let pose = only(&mut stream(&["vizflyt"]), at(0), &bytes).unwrap();
     assert_eq!(pose.world_from_body.translation_m, DVec3::new(1.0, -2.0, 1.5));
     // A quarter turn to the left: the nose points along y.
     assert!((pose.world_from_body.rotate(DVec3::X) - DVec3::Y).length() < 1e-12);
@@ -45,13 +51,14 @@ fn millimetres_become_metres_and_angles_a_rotation() {
 fn rotations_are_about_fixed_x_then_y_then_z() {
     let bytes = packet(7, &[("v", [1.0, 0.0, 0.0, 0.3, -0.4, 2.0])]);
     let mut found = None;
-    parse(&bytes, |object| found = object.rotation).unwrap();
+    parse(&bytes, |object| found = object.angles_rad).unwrap();
     // The matrix written out from R = Rz Ry Rx, first column: (cos z cos y, sin z cos y, -sin y).
-    let nose = found.unwrap() * DVec3::X;
+    let rotation: DQuat = Euler::Xyz.rotation(found.unwrap());
+    let nose = rotation * DVec3::X;
     let (y, z) = (-0.4f64, 2.0f64);
     assert!((nose - DVec3::new(z.cos() * y.cos(), z.sin() * y.cos(), -y.sin())).length() < 1e-12);
     // And third row: (-sin y, cos y sin x, cos y cos x).
-    let up = found.unwrap().conjugate() * DVec3::Z;
+    let up = rotation.conjugate() * DVec3::Z;
     let x = 0.3f64;
     assert!((up - DVec3::new(-y.sin(), y.cos() * x.sin(), y.cos() * x.cos())).length() < 1e-12);
 }
@@ -64,7 +71,7 @@ fn the_named_object_is_found_among_several_with_padding_and_foreign_items() {
     bytes.extend_from_slice(&[9, 4, 0, 1, 2, 3, 4]); // an item of unknown id, 4 bytes
     bytes.extend_from_slice(&packet(1, &[("vizflyt", [5000.0, 0.0, 0.0, 0.0, 0.0, 0.0])])[5..]);
     bytes.resize(512, 0);
-    let pose = only(&mut ViconStream::new(&["vizflyt"]), at(0), &bytes).unwrap();
+    let pose = only(&mut stream(&["vizflyt"]), at(0), &bytes).unwrap();
     assert_eq!(pose.world_from_body.translation_m.x, 5.0);
 }
 
@@ -81,24 +88,24 @@ fn found(stream: &mut ViconStream, bytes: &[u8]) -> Vec<(usize, f64)> {
 
 #[test]
 fn each_vehicle_gets_its_own_object_from_one_packet_or_several() {
-    let mut stream = ViconStream::new(&["wasp", "bee"]);
+    let mut together = stream(&["wasp", "bee"]);
     let x = |x_m: f64| [x_m * 1e3, 0.0, 0.0, 0.0, 0.0, 0.0];
     let both = packet(1, &[("bee", x(2.0)), ("wand", x(9.0)), ("wasp", x(1.0))]);
-    assert_eq!(found(&mut stream, &both), [(0, 1.0), (1, 2.0)]);
+    assert_eq!(found(&mut together, &both), [(0, 1.0), (1, 2.0)]);
     // One unseen does not hold up the other, and each keeps its own count.
     let hidden = packet(2, &[("bee", [0.0; 6]), ("wasp", x(1.0))]);
-    assert_eq!(found(&mut stream, &hidden), [(0, 1.0)]);
-    assert_eq!(found(&mut stream, &packet(3, &[("wasp", x(1.0))])), [(0, 1.0)]);
-    assert_eq!(found(&mut stream, &packet(3, &[("bee", x(2.0))])), [(1, 2.0)]);
-    assert_eq!(found(&mut stream, &packet(3, &[("bee", x(2.0))])), []);
+    assert_eq!(found(&mut together, &hidden), [(0, 1.0)]);
+    assert_eq!(found(&mut together, &packet(3, &[("wasp", x(1.0))])), [(0, 1.0)]);
+    assert_eq!(found(&mut together, &packet(3, &[("bee", x(2.0))])), [(1, 2.0)]);
+    assert_eq!(found(&mut together, &packet(3, &[("bee", x(2.0))])), []);
     // Simulators of their own count their own frames.
-    let mut apart = ViconStream::new(&["wasp", "bee"]);
+    let mut apart = stream(&["wasp", "bee"]);
     for frame in 1..5 {
         assert_eq!(found(&mut apart, &packet(1000 + frame, &[("wasp", x(1.0))])), [(0, 1.0)]);
         assert_eq!(found(&mut apart, &packet(frame, &[("bee", x(2.0))])), [(1, 2.0)]);
     }
     assert_eq!(apart.counters(0), SourceCounters { poses: 4, ..SourceCounters::default() });
-    let counters = [0, 1].map(|vehicle| stream.counters(vehicle));
+    let counters = [0, 1].map(|vehicle| together.counters(vehicle));
     assert_eq!(counters.map(|c| (c.poses, c.occluded, c.stale_packets)), [(3, 0, 0), (2, 1, 1)]);
     let all = counters[0].and(counters[1]);
     assert_eq!((all.poses, all.occluded, all.lost_frames), (5, 1, 0));
@@ -121,7 +128,7 @@ fn faults_are_named() {
 
 #[test]
 fn another_objects_name_stands_in_the_warning_once() {
-    let mut stream = ViconStream::new(&["vizflyt"]);
+    let mut stream = stream(&["vizflyt"]);
     for frame in 0..10 {
         let bytes = packet(frame, &[("drone", [1.0; 6])]);
         assert_eq!(stream.handle_packet(at(u64::from(frame)), &bytes), []);
@@ -136,7 +143,7 @@ fn another_objects_name_stands_in_the_warning_once() {
 
 #[test]
 fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
-    let mut stream = ViconStream::new(&["v"]);
+    let mut stream = stream(&["v"]);
     let mut feed = |frame: u32, values: [f64; 6]| {
         !stream.handle_packet(at(0), &packet(frame, &[("v", values)])).is_empty()
     };
@@ -156,7 +163,7 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
             stale_packets: 2,
             lost_frames: 2,
             occluded: 1,
-            rejected: 0
+            ..SourceCounters::default()
         }
     );
     assert!(stream.next_warning().unwrap().starts_with("vicon: item 0 needs"));
@@ -166,7 +173,7 @@ proptest! {
     #[test]
     fn any_bytes_parse_or_fail_cleanly(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
         let _ = parse(&bytes, |_| ());
-        let _ = ViconStream::new(&["v"]).handle_packet(at(0), &bytes);
+        let _ = stream(&["v"]).handle_packet(at(0), &bytes);
     }
 
     /// Any one byte changed in a good packet never panics, and poses stay valid.
@@ -174,7 +181,7 @@ proptest! {
     fn poses_that_come_out_are_valid(at_byte in 0usize..80, value in any::<u8>()) {
         let mut bytes = packet(9, &[("v", [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])]);
         bytes[at_byte] = value;
-        for pose in ViconStream::new(&["v"]).handle_packet(at(0), &bytes) {
+        for pose in stream(&["v"]).handle_packet(at(0), &bytes) {
             prop_assert!(pose.world_from_body.is_valid());
         }
     }

@@ -1,4 +1,5 @@
-//! What strangers may cost: connections that came to nothing are counted by address, pure.
+//! What strangers may cost: attempts that came to nothing (connections, logins) are counted by
+//! address, pure.
 //!
 //! Only addresses that proved to be their own are charged (a handshake was completed), so nobody
 //! can use up another's. Memory is bounded: addresses that have paid back are forgotten, and when
@@ -10,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// Remembers who was turned away.
 #[derive(Debug, Default)]
-pub(super) struct Limiter {
+pub(crate) struct Limiter {
     debts: HashMap<IpAddr, Debt>,
     /// Of all addresses that found no place.
     others: Option<Debt>,
@@ -24,13 +25,13 @@ struct Debt {
 
 impl Limiter {
     /// Whether an address has attempts left.
-    pub(super) fn may_try(&self, now: Instant, address: IpAddr) -> bool {
+    pub(crate) fn may_try(&self, now: Instant, address: IpAddr) -> bool {
         let debt = self.debts.get(&place(address)).or(self.others.as_ref());
         debt.is_none_or(|debt| debt.owed(now) + EACH <= EACH * BURST)
     }
 
     /// Takes one attempt.
-    pub(super) fn charge(&mut self, now: Instant, address: IpAddr) {
+    pub(crate) fn charge(&mut self, now: Instant, address: IpAddr) {
         let place = place(address);
         if self.debts.len() >= MOST_PLACES && !self.debts.contains_key(&place) {
             self.debts.retain(|_, debt| debt.owed(now) > Duration::ZERO);

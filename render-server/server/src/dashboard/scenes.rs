@@ -1,0 +1,82 @@
+//! Changing the scene from the page: `GET /api/scenes` lists those to choose from, `PUT /api/scene`
+//! changes to one. For the instructor alone ([`super::routes`]), and while nobody flies.
+//!
+//! A scene is chosen by its name in that list: no path ever comes from a request.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::extract::rejection::BytesRejection;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+
+use super::{Page, origin, refuse};
+
+/// What there is to choose from.
+#[derive(Debug, Serialize)]
+struct Choice {
+    /// The one that is shown now; nothing if it is none of them.
+    now: Option<String>,
+    scenes: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Wish {
+    name: String,
+}
+
+/// Tells which scenes there are.
+pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
+    let scenes = page.scenes.clone();
+    // Reads a folder.
+    let found = tokio::task::spawn_blocking(move || Choice {
+        now: scenes.current(),
+        scenes: scenes.list().into_iter().map(|(name, _)| name).collect(),
+    });
+    match found.await {
+        Ok(choice) => Json(choice).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// Changes to a scene.
+pub(super) async fn change(
+    State(page): State<Arc<Page>>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    let body = match body {
+        Ok(body) => body,
+        Err(rejection) => return rejection.into_response(),
+    };
+    let Wish { name } = match serde_json::from_slice(&body) {
+        Ok(wish) => wish,
+        Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
+    };
+    if let Some(flying) = page.hub.vehicles.iter().find(|vehicle| vehicle.under_way()) {
+        let text = format!("'{}' flies; land it first", flying.name);
+        return (StatusCode::CONFLICT, text).into_response();
+    }
+    let scenes = page.scenes.clone();
+    let chosen = name.clone();
+    // Reads a folder and the arena.
+    let chosen = tokio::task::spawn_blocking(move || scenes.choose(&chosen)).await;
+    match chosen {
+        Ok(Ok(())) => {
+            page.hub.note(&format!("the scene is changed to '{name}' on the page"));
+            // The server ends this round of serving, and begins the next one with that scene.
+            page.hub.stop.set();
+            (StatusCode::ACCEPTED, "the scene changes; the page comes back by itself")
+                .into_response()
+        }
+        Ok(Err(why)) => (StatusCode::CONFLICT, why).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}

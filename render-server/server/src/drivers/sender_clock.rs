@@ -1,0 +1,157 @@
+//! Maps stamps of another computer's clock to the server's, from one-way packets. Sans-IO.
+//!
+//! arrival = stamp + offset + delay, with delay >= 0. The least `arrival - stamp` of the last
+//! seconds is the offset and the least delay together, so what remains in a mapped stamp is that
+//! constant delay (0.1 ms on a cable). Ten seconds of a crystal's 50 ppm are 0.5 ms.
+
+use vizflyt_protocol::time::ServerTime;
+
+/// Relates a sender's clock to ours.
+#[derive(Clone, Debug)]
+pub struct SenderClock {
+    /// The least `arrival - stamp` of each of the last seconds, and which second it was. [ns]
+    buckets: [Option<(u64, i64)>; BUCKETS],
+    /// Since when everything has come late.
+    late_since: Option<ServerTime>,
+    last: Option<ServerTime>,
+    jump_s: Option<f64>,
+}
+
+impl Default for SenderClock {
+    fn default() -> Self {
+        Self { buckets: [None; BUCKETS], late_since: None, last: None, jump_s: None }
+    }
+}
+
+impl SenderClock {
+    /// Takes what the sender's clock showed when a packet left, and when the packet came; returns
+    /// when it left, on our clock. Never later than `arrival`. [ns, sender]
+    pub fn map(&mut self, sent_ns: u64, arrival: ServerTime) -> ServerTime {
+        // Clocks of any two computers are less than 292 years apart.
+        let offset_ns = arrival.as_ns().wrapping_sub(sent_ns).cast_signed();
+        let second = arrival.as_ns() / 1_000_000_000;
+        if let Some(least_ns) = self.least_ns(second) {
+            let late_s = offset_ns.wrapping_sub(least_ns) as f64 * 1e-9;
+            // Set forward, a clock makes packets arrive before they could; set back, all of them
+            // late from then on, where a burst after a pause ends in an instant.
+            self.late_since =
+                if late_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
+            let slipped =
+                self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S);
+            if slipped || late_s < -SLIP_S {
+                // Its clock moved by as much as its packets seem to come early.
+                self.jump_s = Some(-late_s);
+                self.buckets = [None; BUCKETS];
+                self.late_since = None;
+            }
+        }
+        let bucket = &mut self.buckets[(second % BUCKETS as u64) as usize];
+        match bucket {
+            Some((at, least_ns)) if *at == second => *least_ns = (*least_ns).min(offset_ns),
+            _ => *bucket = Some((second, offset_ns)),
+        }
+        let least_ns = self.least_ns(second).unwrap_or(offset_ns);
+        ServerTime::from_ns(sent_ns.wrapping_add_signed(least_ns)).min(arrival)
+    }
+
+    /// As [`Self::map`], never earlier than what it returned before.
+    pub fn map_in_order(&mut self, sent_ns: u64, arrival: ServerTime) -> ServerTime {
+        let mapped = self.map(sent_ns, arrival);
+        let mapped = self.last.map_or(mapped, |last| mapped.max(last));
+        self.last = Some(mapped);
+        mapped
+    }
+
+    /// Returns by how much the sender's clock has jumped, forward if positive; each jump once. [s]
+    pub fn take_jump_s(&mut self) -> Option<f64> {
+        self.jump_s.take()
+    }
+
+    fn least_ns(&self, second: u64) -> Option<i64> {
+        let recent = |&&(at, _): &&(u64, i64)| second.wrapping_sub(at) < BUCKETS as u64;
+        self.buckets.iter().flatten().filter(recent).map(|&(_, least_ns)| least_ns).min()
+    }
+}
+
+/// Seconds remembered.
+const BUCKETS: usize = 10;
+/// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
+const SLIP_S: f64 = 0.02;
+const SLIP_LASTS_S: f64 = 0.3;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The sender's clock is ours less this. [ns]
+    const APART_NS: u64 = 77_000_000_000;
+
+    fn truth(index: u64) -> ServerTime {
+        ServerTime::from_ns(100_000_000_000 + index * 10_000_000)
+    }
+
+    proptest! {
+        #[test]
+        fn jitter_is_removed(delays in prop::collection::vec(100_000i64..8_000_000, 300..400)) {
+            let mut clock = SenderClock::default();
+            for (index, delay) in delays.into_iter().enumerate() {
+                let sent = truth(index as u64);
+                let mapped = clock.map(sent.as_ns() - APART_NS, sent.plus_ns(delay));
+                // Once a prompt one has come, all are right but for the least delay.
+                if index > 200 {
+                    let off_s = mapped.seconds_since(sent);
+                    prop_assert!((0.0..1.5e-3).contains(&off_s), "{off_s}");
+                }
+            }
+            prop_assert_eq!(clock.take_jump_s(), None);
+        }
+
+        #[test]
+        fn whatever_comes_nothing_is_from_the_future(input in prop::collection::vec((any::<u64>(), 0i64..1_000_000_000), 1..100)) {
+            let (mut clock, mut now, mut last) = (SenderClock::default(), truth(0), ServerTime::ZERO);
+            for (sent_ns, wait_ns) in input {
+                now = now.plus_ns(wait_ns);
+                let mapped = clock.map_in_order(sent_ns, now);
+                prop_assert!(mapped <= now && mapped >= last);
+                last = mapped;
+                let _ = clock.take_jump_s();
+            }
+        }
+    }
+
+    #[test]
+    fn a_clock_that_is_set_is_followed_and_named() {
+        for jump_s in [3.0, -3.0, 0.05, -0.05] {
+            let mut clock = SenderClock::default();
+            let shown = |index: u64, set_s: f64| {
+                ServerTime::from_ns(truth(index).as_ns() - APART_NS).plus_seconds(set_s).as_ns()
+            };
+            for index in 0..100 {
+                clock.map(shown(index, 0.0), truth(index));
+            }
+            let mut jumps = Vec::new();
+            for index in 100..200 {
+                clock.map(shown(index, jump_s), truth(index));
+                jumps.extend(clock.take_jump_s());
+            }
+            assert_eq!(jumps.len(), 1, "{jump_s}: {jumps:?}");
+            assert!((jumps[0] - jump_s).abs() < 1e-3, "{jump_s}: {jumps:?}");
+            let last = clock.map(shown(200, jump_s), truth(200));
+            assert!(last.seconds_since(truth(200)).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn a_burst_after_a_pause_is_no_jump() {
+        let mut clock = SenderClock::default();
+        for index in 0..100 {
+            clock.map(truth(index).as_ns() - APART_NS, truth(index));
+        }
+        for index in 100..150 {
+            let mapped = clock.map(truth(index).as_ns() - APART_NS, truth(150));
+            assert!(mapped.seconds_since(truth(index)).abs() < 1e-6);
+        }
+        assert_eq!(clock.take_jump_s(), None);
+    }
+}

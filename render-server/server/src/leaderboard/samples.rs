@@ -1,0 +1,86 @@
+//! Where one flight was, for its verdict: kept while it flies, 50 a second at most.
+
+use glam::EulerRot;
+use vizflyt_arena::verdict::Sample;
+use vizflyt_protocol::messages::PoseSample;
+
+/// The samples of a flight, oldest first.
+#[derive(Debug)]
+pub struct Samples {
+    kept: Vec<Sample>,
+    apart_s: f64,
+    least_clearance_m: f64,
+}
+
+impl Default for Samples {
+    fn default() -> Self {
+        Self { kept: Vec::new(), apart_s: LEAST_APART_S, least_clearance_m: f64::INFINITY }
+    }
+}
+
+impl Samples {
+    /// Adds where the vehicle is, if the last is long enough ago; with its clearance there, and the least of the
+    /// flight so far, swept. [m]
+    pub fn add(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
+        self.least_clearance_m = least_clearance_m;
+        let last = self.kept.last().map(|sample| sample.stamp);
+        if last.is_some_and(|last| pose.stamp.seconds_since(last) < self.apart_s) {
+            return;
+        }
+        if self.kept.len() >= MOST {
+            // An hour in the air keeps its shape at half the rate.
+            let mut keep = false;
+            self.kept.retain(|_| {
+                keep = !keep;
+                keep
+            });
+            self.apart_s *= 2.0;
+        }
+        self.kept.push(Sample {
+            stamp: pose.stamp,
+            p_world_m: pose.world_from_body.translation_m,
+            v_world_mps: pose.twist.linear_mps,
+            yaw_rad: pose.world_from_body.rotation.to_euler(EulerRot::ZYX).0,
+            clearance_m,
+        });
+    }
+
+    /// Returns them.
+    pub fn kept(&self) -> &[Sample] {
+        &self.kept
+    }
+
+    /// Returns the least clearance of the flight so far, swept between all poses; `None` before it. [m]
+    pub fn least_clearance_m(&self) -> Option<f64> {
+        self.least_clearance_m.is_finite().then_some(self.least_clearance_m)
+    }
+}
+
+/// 50 Hz: 10 cm at 5 m/s.
+const LEAST_APART_S: f64 = 0.019;
+/// A quarter of an hour at 50 Hz: 4 MB.
+const MOST: usize = 45_000;
+
+#[cfg(test)]
+mod tests {
+    use vizflyt_protocol::geometry::Pose;
+    use vizflyt_protocol::time::ServerTime;
+
+    use super::*;
+
+    #[test]
+    fn memory_is_bounded_and_the_flight_keeps_its_ends() {
+        let mut samples = Samples::default();
+        let start = ServerTime::from_ns(1);
+        for n in 0..200_000_u32 {
+            let stamp = start.plus_seconds(f64::from(n) * 0.005);
+            let at = Pose::new(glam::DVec3::X * f64::from(n), glam::DQuat::IDENTITY);
+            samples.add(&PoseSample::still(stamp, at), 1.0, 0.5);
+        }
+        let kept = samples.kept();
+        assert!((MOST / 2..=MOST).contains(&kept.len()), "{}", kept.len());
+        assert!(kept.is_sorted_by(|a, b| a.stamp < b.stamp));
+        assert!(kept[0].p_world_m.x < 100.0 && kept[kept.len() - 1].p_world_m.x > 199_900.0);
+        assert_eq!(samples.least_clearance_m(), Some(0.5));
+    }
+}

@@ -1,0 +1,152 @@
+//! The database on a file, and on a `PostgreSQL` server where `VIZFLYT_TEST_POSTGRES` names one.
+
+use super::*;
+
+/// An official run that has ended.
+pub(crate) fn run(team: &str, stages_passed: u32, seconds: f64) -> Run {
+    Run {
+        id: format!("{team} {stages_passed} {seconds}"),
+        team: Some(team.to_owned()),
+        course: "race".to_owned(),
+        vehicle: "vizflyt".to_owned(),
+        attempt: Attempt::Official,
+        state: RunState::Ended,
+        began_unix_ms: 0,
+        ended_unix_ms: Some(1000),
+        outcome: "finished".to_owned(),
+        stages_passed,
+        stages: 5,
+        seconds: Some(seconds),
+        penalty_s: 0.0,
+        min_clearance_m: Some(0.2),
+    }
+}
+
+fn new(team: Option<&str>, attempt: Attempt) -> NewRun {
+    NewRun {
+        team: team.map(str::to_owned),
+        course: "race".to_owned(),
+        vehicle: "vizflyt".to_owned(),
+        attempt,
+    }
+}
+
+fn end(stages_passed: u32) -> RunEnd {
+    RunEnd {
+        outcome: "finished".to_owned(),
+        stages_passed,
+        stages: 5,
+        seconds: Some(31.5),
+        penalty_s: 2.0,
+        min_clearance_m: Some(f64::INFINITY),
+        verdict: "{\"score\":1}".to_owned(),
+    }
+}
+
+async fn file() -> (tempfile::TempDir, Leaderboard) {
+    let folder = tempfile::tempdir().unwrap();
+    let database = Database::File(folder.path().join("a class?").join("runs 100%.sqlite"));
+    (folder, Leaderboard::open(&database).await.unwrap())
+}
+
+/// Everything that the two databases must do alike.
+async fn behaves(board: &Leaderboard) {
+    let token = board.add_team("wasps").await.unwrap();
+    assert_eq!(board.team_of(&token).await.unwrap().as_deref(), Some("wasps"));
+    assert_eq!(board.team_of("guessed").await.unwrap(), None);
+    let taken = board.add_team("wasps").await.unwrap_err().to_string();
+    assert!(taken.contains("there is a team 'wasps' already"), "{taken}");
+    for wrong in ["", " x", "a\nb", &"x".repeat(41)] {
+        assert!(matches!(board.add_team(wrong).await, Err(LeaderboardError::Name(_))), "{wrong:?}");
+    }
+    let stranger = board.begin(&new(Some("bees"), Attempt::Practice), None).await.unwrap_err();
+    assert_eq!(stranger.to_string(), "there is no team 'bees'; the teams are: wasps");
+
+    let practice = board.begin(&new(Some("wasps"), Attempt::Practice), Some(1)).await.unwrap();
+    let official = board.begin(&new(Some("wasps"), Attempt::Official), Some(1)).await.unwrap();
+    let spent = board.begin(&new(Some("wasps"), Attempt::Official), Some(1)).await.unwrap_err();
+    assert!(spent.to_string().contains("has flown its 1 official attempts on 'race'"), "{spent}");
+    let nobody = board.begin(&new(None, Attempt::Practice), None).await.unwrap();
+    board.end(&official, &end(4)).await.unwrap();
+    board.heard(&practice).await.unwrap();
+
+    let runs = board.runs(Some("race")).await.unwrap();
+    let state = |id: &str| runs.iter().find(|run| run.id == id).unwrap();
+    assert_eq!(state(&practice).state, RunState::Flying);
+    assert_eq!(state(&nobody).team, None);
+    let ended = state(&official);
+    assert_eq!((ended.state, ended.stages_passed, ended.seconds), (RunState::Ended, 4, Some(31.5)));
+    assert_eq!(ended.min_clearance_m, None, "no infinity is kept");
+    assert!(board.runs(Some("forest")).await.unwrap().is_empty());
+    assert_eq!(board.courses().await.unwrap(), ["race"]);
+    assert_eq!(board.verdict(&official).await.unwrap().as_deref(), Some("{\"score\":1}"));
+    assert_eq!(board.verdict("none").await.unwrap(), None);
+    assert_eq!(standings(&runs, "race", Attempt::Official)[0].seconds, Some(33.5));
+
+    // Two minutes on, nobody has heard of the runs that still fly.
+    board.cut_off_unheard(state(&practice).began_unix_ms + 120_000).await.unwrap();
+    let runs = board.runs(None).await.unwrap();
+    let cut_off = runs.iter().filter(|run| run.state == RunState::CutOff).count();
+    assert_eq!((runs.len(), cut_off), (3, 2));
+    board.end(&practice, &end(1)).await.unwrap();
+
+    board.retire_team("wasps").await.unwrap();
+    assert_eq!(board.team_of(&token).await.unwrap(), None);
+    assert!(board.teams().await.unwrap()[0].retired);
+    assert!(board.retire_team("bees").await.is_err());
+}
+
+#[tokio::test]
+async fn a_file_keeps_teams_and_runs() {
+    let (folder, board) = file().await;
+    behaves(&board).await;
+    let database = board.database().clone();
+    drop(board);
+    let again = Leaderboard::open(&database).await.unwrap();
+    assert_eq!(again.runs(None).await.unwrap().len(), 3);
+    drop(folder);
+}
+
+#[tokio::test]
+async fn a_postgres_server_keeps_them_alike() {
+    let Ok(url) = std::env::var("VIZFLYT_TEST_POSTGRES") else {
+        eprintln!(
+            "skipped: VIZFLYT_TEST_POSTGRES names no server; tests/leaderboard/run starts one"
+        );
+        return;
+    };
+    let board = Leaderboard::open(&url.parse().unwrap()).await.unwrap();
+    behaves(&board).await;
+}
+
+#[tokio::test]
+async fn two_programs_share_a_file() {
+    let (_folder, board) = file().await;
+    let other = Leaderboard::open(board.database()).await.unwrap();
+    board.add_team("wasps").await.unwrap();
+    // Both begin and end runs at once; nothing is lost, nobody waits for ever.
+    let fly = |board: Leaderboard| async move {
+        for _ in 0..20 {
+            let id = board.begin(&new(Some("wasps"), Attempt::Practice), None).await.unwrap();
+            board.end(&id, &end(1)).await.unwrap();
+        }
+    };
+    let (one, two) = tokio::join!(tokio::spawn(fly(board.clone())), tokio::spawn(fly(other)));
+    one.and(two).unwrap();
+    let runs = board.runs(None).await.unwrap();
+    assert_eq!(runs.iter().filter(|run| run.state == RunState::Ended).count(), 40);
+}
+
+#[tokio::test]
+async fn what_cannot_be_opened_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("notes.txt");
+    std::fs::write(
+        &file,
+        "these are my notes, and no database at all, although they are long enough",
+    )
+    .unwrap();
+    let error = Leaderboard::open(&Database::File(file.clone())).await.unwrap_err().to_string();
+    assert!(error.contains("notes.txt") && error.contains("not a database"), "{error}");
+    assert!(std::fs::read_to_string(&file).unwrap().starts_with("these are my notes"));
+}

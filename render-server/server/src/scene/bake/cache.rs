@@ -1,0 +1,207 @@
+//! Baked obstacles, kept by what they were baked from.
+//!
+//! A file's name is the hash of the splats' geometry and of how they are baked, so a scene or a
+//! setting that changed is another file. It begins with a checksum: what does not match, or does
+//! not read, is baked anew and replaced. Files come whole (written aside, then renamed); the ones
+//! used longest ago go when the folder grows over [`MOST_BYTES`].
+
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use ring::digest::{Context, SHA256, SHA256_OUTPUT_LEN};
+use vizflyt_arena::{BakeSpec, DistanceField};
+use vizflyt_splat::Splats;
+
+/// A folder of baked obstacles.
+#[derive(Clone, Debug)]
+pub struct BakeCache {
+    folder: PathBuf,
+}
+
+/// What a bake is known by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BakeKey([u8; SHA256_OUTPUT_LEN]);
+
+/// What the cache has of a key.
+#[derive(Debug)]
+pub(super) enum Kept {
+    Field(DistanceField),
+    Nothing,
+    /// Why the file is no good.
+    Broken(String),
+}
+
+impl BakeKey {
+    /// Returns the key of a scene baked like this.
+    pub fn of(splats: &Splats, spec: &BakeSpec) -> Self {
+        let mut hash = Context::new(&SHA256);
+        hash.update(BAKER);
+        let BakeSpec { grid, min_opacity, floor_z_m, min_splats_per_m3 } = spec;
+        let numbers = [grid.min_m.x, grid.min_m.y, grid.min_m.z, grid.voxel_m, *floor_z_m];
+        for number in numbers {
+            hash.update(&number.to_le_bytes());
+        }
+        for n in grid.size {
+            hash.update(&(n as u64).to_le_bytes());
+        }
+        for number in [min_opacity, min_splats_per_m3] {
+            hash.update(&number.to_le_bytes());
+        }
+        // A block of splats at a time: a call for each costs more than the hash.
+        let mut block = Vec::with_capacity(SPLATS_AT_ONCE * SPLAT_BYTES);
+        for first in (0..splats.len()).step_by(SPLATS_AT_ONCE) {
+            block.clear();
+            for k in first..splats.len().min(first + SPLATS_AT_ONCE) {
+                let (mean, scale) = (splats.means_m[k].to_array(), splats.scales_m[k].to_array());
+                let rotation = splats.rotations[k].to_array();
+                let numbers = mean.iter().chain(&scale).chain(&rotation).copied();
+                let numbers = numbers.chain([splats.opacities[k]]);
+                for number in numbers {
+                    block.extend_from_slice(&number.to_le_bytes());
+                }
+            }
+            hash.update(&block);
+        }
+        Self(digest(hash))
+    }
+
+    fn name(&self) -> String {
+        let mut name = String::with_capacity(2 * self.0.len() + EXTENSION.len() + 1);
+        for byte in self.0 {
+            // Writing to a string does not fail.
+            let _ = write!(name, "{byte:02x}");
+        }
+        name + "." + EXTENSION
+    }
+}
+
+impl BakeCache {
+    /// Keeps files in a folder, which is made when there is something to keep.
+    pub fn at(folder: impl Into<PathBuf>) -> Self {
+        Self { folder: folder.into() }
+    }
+
+    /// Keeps files in `$XDG_CACHE_HOME/vizflyt/obstacles`, or under `~/.cache`; `None` if neither is
+    /// known.
+    pub fn of_user() -> Option<Self> {
+        let path =
+            |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+        let caches = path("XDG_CACHE_HOME").or_else(|| Some(path("HOME")?.join(".cache")))?;
+        Some(Self::at(caches.join("vizflyt/obstacles")))
+    }
+
+    /// Returns where the bake of a key lies, if it is kept.
+    pub fn path(&self, key: &BakeKey) -> PathBuf {
+        self.folder.join(key.name())
+    }
+
+    /// Throws away the bake of a scene, so that the next one is done anew.
+    ///
+    /// # Errors
+    /// A file that is there and cannot be removed.
+    pub fn forget(&self, splats: &Splats, spec: &BakeSpec) -> io::Result<()> {
+        match fs::remove_file(self.path(&BakeKey::of(splats, spec))) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+            _ => Ok(()),
+        }
+    }
+
+    pub(super) fn read(&self, key: &BakeKey) -> Kept {
+        let path = self.path(key);
+        let bytes = match fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Kept::Nothing,
+            Err(error) => return Kept::Broken(error.to_string()),
+        };
+        match parse(&bytes) {
+            Ok(field) => {
+                // What was used last is thrown away last; a clock that cannot be set costs a bake.
+                let _ = File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
+                Kept::Field(field)
+            }
+            Err(why) => Kept::Broken(why),
+        }
+    }
+
+    /// Keeps a bake; returns where.
+    pub(super) fn write(&self, key: &BakeKey, field: &DistanceField) -> io::Result<PathBuf> {
+        fs::create_dir_all(&self.folder)?;
+        let path = self.path(key);
+        let aside = path.with_extension(format!("{}.part", std::process::id()));
+        let (header, codes) = field.as_bytes();
+        let written = File::create(&aside).and_then(|mut file| {
+            file.write_all(&checksum(&[&header, codes]))?;
+            file.write_all(&header)?;
+            file.write_all(codes)?;
+            fs::rename(&aside, &path)
+        });
+        if written.is_err() {
+            let _ = fs::remove_file(&aside);
+        }
+        written?;
+        self.shrink(&path);
+        Ok(path)
+    }
+
+    /// Throws away what was used longest ago while there is too much, but not `newest`.
+    fn shrink(&self, newest: &Path) {
+        let Ok(entries) = fs::read_dir(&self.folder) else { return };
+        let mut files: Vec<_> = entries
+            .filter_map(|entry| {
+                let (path, about) = (entry.as_ref().ok()?.path(), entry.ok()?.metadata().ok()?);
+                let ours = path.extension().is_some_and(|extension| extension == EXTENSION);
+                ours.then_some((about.modified().ok()?, about.len(), path))
+            })
+            .collect();
+        files.sort();
+        let mut bytes: u64 = files.iter().map(|(_, len, _)| len).sum();
+        for (_, len, path) in files {
+            if bytes <= MOST_BYTES {
+                break;
+            }
+            if path != newest && fs::remove_file(&path).is_ok() {
+                bytes -= len;
+            }
+        }
+    }
+}
+
+/// Reads a file of the cache: a checksum, then the field.
+///
+/// # Errors
+/// Why it is no good.
+pub fn parse(bytes: &[u8]) -> Result<DistanceField, String> {
+    let (sum, field) = bytes
+        .split_first_chunk::<SHA256_OUTPUT_LEN>()
+        .ok_or_else(|| format!("it has only {} bytes", bytes.len()))?;
+    if checksum(&[field]) != *sum {
+        return Err("its checksum does not match".into());
+    }
+    DistanceField::from_bytes(field).map_err(|error| error.to_string())
+}
+
+fn checksum(parts: &[&[u8]]) -> [u8; SHA256_OUTPUT_LEN] {
+    let mut hash = Context::new(&SHA256);
+    for part in parts {
+        hash.update(part);
+    }
+    digest(hash)
+}
+
+fn digest(hash: Context) -> [u8; SHA256_OUTPUT_LEN] {
+    let mut bytes = [0; SHA256_OUTPUT_LEN];
+    bytes.copy_from_slice(hash.finish().as_ref());
+    bytes
+}
+
+/// Names the baker: raise the number with any change of what is baked from the same splats.
+const BAKER: &[u8] = b"vizflyt obstacles 1";
+const EXTENSION: &str = "field";
+/// Splats hashed at once, and the bytes of one.
+const SPLATS_AT_ONCE: usize = 4096;
+const SPLAT_BYTES: usize = 44;
+/// A forest is 24 MB. [bytes]
+const MOST_BYTES: u64 = 1 << 30;

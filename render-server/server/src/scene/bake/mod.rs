@@ -1,0 +1,97 @@
+//! Obstacles for the referee, from the splats; kept for the next start.
+
+mod cache;
+#[cfg(test)]
+mod tests;
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use tracing::{info, warn};
+use vizflyt_arena::occupancy::BakeCounts;
+use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
+use vizflyt_splat::Splats;
+
+use cache::Kept;
+pub use cache::{BakeCache, BakeKey, parse as parse_kept};
+
+/// Obstacles, and how they came about.
+#[derive(Debug)]
+pub struct Baked {
+    /// The obstacles.
+    pub field: DistanceField,
+    /// What the baker did; `None` if they were kept from an earlier bake.
+    pub counts: Option<BakeCounts>,
+    /// Where they are kept now.
+    pub kept_at: Option<PathBuf>,
+    /// How long it took.
+    pub took: Duration,
+}
+
+/// Returns the obstacles of a scene as its arena asks: those kept by an earlier start, else baked
+/// and kept.
+pub fn bake(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
+    let spec = BakeSpec::of(arena);
+    info!("baking obstacles: {} splats into {} voxels", splats.len(), spec.grid.voxels());
+    let baked = bake_with(splats, &spec, BakeCache::of_user().as_ref(), &|_| ());
+    let took_ms = baked.took.as_secs_f64() * 1e3;
+    match (&baked.counts, &baked.kept_at) {
+        (None, Some(path)) => info!("obstacles read in {took_ms:.0} ms from {}", path.display()),
+        (Some(counts), _) => info!(
+            "obstacles baked in {took_ms:.0} ms: {} voxels solid, {:.1} MB; left out {} faint or \
+             outside splats and {} floating voxels",
+            counts.occupied,
+            baked.field.memory_bytes() as f64 / 1e6,
+            counts.splats_left_out,
+            counts.floating
+        ),
+        (None, None) => {}
+    }
+    baked.field
+}
+
+/// Returns the obstacles of splats: from `cache`, else baked and put there. `progress` hears the
+/// share that is done, 0 to 1, from any thread.
+pub fn bake_with(
+    splats: &Splats,
+    spec: &BakeSpec,
+    cache: Option<&BakeCache>,
+    progress: &(dyn Fn(f64) + Sync),
+) -> Baked {
+    let start = Instant::now();
+    let key = cache.map(|cache| (cache, BakeKey::of(splats, spec)));
+    if let Some((cache, key)) = &key {
+        match cache.read(key) {
+            Kept::Field(field) => {
+                progress(1.0);
+                let kept_at = Some(cache.path(key));
+                return Baked { field, counts: None, kept_at, took: start.elapsed() };
+            }
+            Kept::Nothing => {}
+            Kept::Broken(why) => {
+                warn!("{} is no good and is baked anew: {why}", cache.path(key).display());
+            }
+        }
+    }
+    let ellipsoids = (0..splats.len()).map(|k| Ellipsoid {
+        center_m: splats.means_m[k],
+        scales_m: splats.scales_m[k],
+        rotation: splats.rotations[k],
+        opacity: splats.opacities[k],
+    });
+    let grid = OccupancyGrid::bake_with(ellipsoids, spec, &|share| progress(GRID_SHARE * share));
+    let counts = Some(grid.counts());
+    let field = DistanceField::of(grid);
+    let kept_at = key.and_then(|(cache, key)| match cache.write(&key, &field) {
+        Ok(path) => Some(path),
+        Err(error) => {
+            warn!("the baked obstacles are not kept: {}: {error}", cache.path(&key).display());
+            None
+        }
+    });
+    progress(1.0);
+    Baked { field, counts, kept_at, took: start.elapsed() }
+}
+
+/// Part of the work that the grid is; the rest is distances.
+const GRID_SHARE: f64 = 0.7;

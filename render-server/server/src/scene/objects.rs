@@ -1,0 +1,91 @@
+//! The objects of an arena: read from beside it, and baked into distance fields of their own.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Result, bail};
+use glam::{DVec3, Vec3};
+use tracing::info;
+use vizflyt_arena::grid::Grid;
+use vizflyt_arena::objects::MovingObjects;
+use vizflyt_arena::obstacles::Obstacles;
+use vizflyt_arena::{ArenaConfig, DistanceField, Ellipsoid, OccupancyGrid};
+use vizflyt_splat::{RigidObject, Splats};
+
+/// Reads an arena's objects; they are numbered from 1, in its order.
+pub(super) fn read_all(
+    arena: &ArenaConfig,
+    arena_toml: &Path,
+    read: impl Fn(&Path) -> Result<Splats>,
+) -> Result<Vec<RigidObject>> {
+    let folder = arena_toml.parent().unwrap_or(Path::new(""));
+    let objects = arena.objects.iter().zip(1..);
+    let object = |(config, id): (&vizflyt_arena::config::ObjectConfig, u16)| {
+        let path = folder.join(&config.scene);
+        if !path.exists() {
+            bail!(
+                "the object '{}' of {} is in '{}', but there is no {}; correct its `scene`",
+                config.name,
+                arena_toml.display(),
+                config.scene,
+                path.display()
+            );
+        }
+        Ok(RigidObject { id, splats: read(&path)? })
+    };
+    objects.map(object).collect()
+}
+
+/// Returns what must not be touched: what stands still as baked already, and each object with a field
+/// baked in its own frame; phases that the arena does not say are drawn from the seed.
+pub fn obstacles(
+    arena: &ArenaConfig,
+    objects: &[RigidObject],
+    still: Arc<DistanceField>,
+    seed: u64,
+) -> Obstacles {
+    let bake = |object: &RigidObject| Arc::new(bake_object(&object.splats, arena));
+    let moving: Vec<_> = objects.iter().map(bake).collect();
+    if !moving.is_empty() {
+        let bytes: usize = moving.iter().map(|field| field.memory_bytes()).sum();
+        info!("{} objects baked, {:.1} MB", moving.len(), bytes as f64 / 1e6);
+    }
+    Obstacles::new(still, moving, MovingObjects::new(arena, seed))
+}
+
+/// Returns the least and greatest corner of an object's splats, to three deviations. [m, object]
+pub fn bounds_m(splats: &Splats) -> (Vec3, Vec3) {
+    let reach = |k: usize| Vec3::splat(3.0 * splats.scales_m[k].max_element());
+    let (mut low, mut high) = (Vec3::splat(f32::MAX), Vec3::splat(f32::MIN));
+    for (k, &mean_m) in splats.means_m.iter().enumerate() {
+        low = low.min(mean_m - reach(k));
+        high = high.max(mean_m + reach(k));
+    }
+    if low.cmple(high).all() { (low, high) } else { (Vec3::ZERO, Vec3::ZERO) }
+}
+
+fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
+    let (low_m, high_m) = bounds_m(splats);
+    let (low_m, high_m) = (low_m.as_dvec3() - MARGIN_M, high_m.as_dvec3() + MARGIN_M);
+    let of_size = |voxel_m: f64| ((high_m - low_m) / voxel_m).element_product();
+    let mut voxel_m = arena.occupancy.voxel_m.min(VOXEL_M);
+    if of_size(voxel_m) > MOST_VOXELS {
+        voxel_m = ((high_m - low_m).element_product() / MOST_VOXELS).cbrt();
+    }
+    let grid = Grid::covering(low_m, high_m, voxel_m);
+    let ellipsoids = (0..splats.len()).map(|k| Ellipsoid {
+        center_m: splats.means_m[k],
+        scales_m: splats.scales_m[k],
+        rotation: splats.rotations[k],
+        opacity: splats.opacities[k],
+    });
+    let min_opacity = arena.occupancy.min_opacity as f32;
+    DistanceField::of(OccupancyGrid::bake_object(ellipsoids, grid, min_opacity))
+}
+
+/// Finer than a scene's: objects are small, and a hand of 3 cm must not grow to 10. [m]
+const VOXEL_M: f64 = 0.02;
+/// Within this of an object its field says the distance to it; further away, a lower bound. [m]
+const MARGIN_M: DVec3 = DVec3::splat(0.5);
+/// Larger objects get coarser voxels: 16 MB each.
+const MOST_VOXELS: f64 = 1.6e7;

@@ -1,0 +1,122 @@
+//! Flights through a running server onto the leaderboard: check-in, verdict, standings, and a server that is killed.
+
+mod support;
+
+use quinn::TransportConfig;
+use serde_json::Value;
+use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
+use vizflyt_protocol::messages::{FlightPhase, Telemetry, ToServer};
+use vizflyt_server::leaderboard::{Attempt, Database, Leaderboard, Run, RunState};
+
+/// Looks at the board until it is as wanted: what is told over QUIC is written down by another task.
+async fn until(board: &Leaderboard, wanted: impl Fn(&[Run]) -> bool) -> Vec<Run> {
+    for _ in 0..600 {
+        let runs = board.runs(None).await.unwrap();
+        if wanted(&runs) {
+            return runs;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("the board stays as it is: {:?}", board.runs(None).await.unwrap());
+}
+
+fn put(server: &Server, body: &str) -> (u16, String) {
+    send_json(server.http, "PUT /api/vehicles/vizflyt/team", None, body)
+}
+
+fn standings(server: &Server) -> Value {
+    let (status, answer) = http(server.http, "GET /api/leaderboard HTTP/1.1");
+    assert_eq!(status, 200, "{answer}");
+    serde_json::from_str(answer.split_once("\r\n\r\n").unwrap().1).unwrap()
+}
+
+/// Reports phases, each heard of by the server before the next.
+async fn report(client: &mut Client, socket: &mut Socket, phases: &[(FlightPhase, &str)]) {
+    for &(phase, name) in phases {
+        client.say(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
+        while socket.message("state")["report"]["phase"] != name {}
+    }
+}
+
+// Two threads: one waits for the page's answers while the other keeps the connection alive.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_team_checks_in_flies_and_stands() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("runs.sqlite");
+    let board = Leaderboard::open(&Database::File(file.clone())).await.unwrap();
+    let token = board.add_team("wasps").await.unwrap();
+    let option = format!("--leaderboard={}", file.display());
+    let arena = write_arena(folder.path(), "");
+    let server = Server::start(&arena, &[&option, "--official-attempts=1"]);
+
+    // Wrong tokens: said so, and bounded.
+    let (status, text) = put(&server, r#"{"token": "guess"}"#);
+    assert_eq!((status, text.as_str()), (401, "no team has this token"));
+    assert_eq!(put(&server, r#"{"attempt": "official"}"#).0, 400);
+    let (status, text) = put(&server, &format!(r#"{{"token": "{token}", "attempt": "official"}}"#));
+    assert_eq!((status, text.as_str()), (200, "wasps flies vizflyt next: official"));
+    assert_eq!(standings(&server)["vehicles"][0]["team"], "wasps");
+
+    let _emitter = Emitter::start(server.vicon, "vizflyt");
+    let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
+    let own = format!("http://{}", server.http);
+    let mut socket = Socket::open(server.http, &own).ok().unwrap();
+    report(&mut client, &mut socket, &[(FlightPhase::Flying, "flying")]).await;
+    let flying = until(&board, |runs| runs.len() == 1).await;
+    assert_eq!((flying[0].state, flying[0].attempt), (RunState::Flying, Attempt::Official));
+    assert_eq!(flying[0].team.as_deref(), Some("wasps"));
+    let landing = [(FlightPhase::Landing, "landing"), (FlightPhase::Landed, "landed")];
+    report(&mut client, &mut socket, &landing).await;
+    until(&board, |runs| runs[0].state == RunState::Ended).await;
+    let stand = standings(&server);
+    assert_eq!(stand["official"][0]["team"], "wasps");
+    assert_eq!(stand["official"][0]["stages_passed"], 0);
+    let verdict = board.verdict(&flying[0].id).await.unwrap().unwrap();
+    let verdict: Value = serde_json::from_str(&verdict).unwrap();
+    assert!(verdict["outcome"].is_string() && verdict["seconds"].is_number(), "{verdict}");
+
+    // A second flight: its one official attempt is flown, so this is practice.
+    let (status, text) = send_json(server.http, "POST /api/vehicles/vizflyt/reset", Some(&own), "");
+    assert_eq!(status, 202, "{text}");
+    report(&mut client, &mut socket, &[(FlightPhase::Flying, "flying")]).await;
+    let runs = until(&board, |runs| runs.len() == 2).await;
+    let second = runs.iter().find(|run| run.id != flying[0].id).unwrap();
+    assert_eq!((second.attempt, second.state), (Attempt::Practice, RunState::Flying));
+
+    // Killed in the middle of it: the first run is whole, the second has no verdict.
+    server.kill();
+    let again = Leaderboard::open(&Database::File(file)).await.unwrap();
+    let after = again.runs(None).await.unwrap();
+    assert_eq!(after.len(), 2);
+    assert!(after.iter().any(|run| run.id == flying[0].id && run.state == RunState::Ended));
+    assert!(after.iter().any(|run| run.id == second.id && run.state == RunState::Flying));
+}
+
+#[test]
+fn the_instructor_names_teams_and_nobody_flies_for_a_stranger() {
+    let folder = tempfile::tempdir().unwrap();
+    let option = format!("--leaderboard={}", folder.path().join("runs.sqlite").display());
+    let server = Server::start(&write_arena(folder.path(), ""), &[&option]);
+    let own = format!("http://{}", server.http);
+    let seat =
+        |body: &str| send_json(server.http, "POST /api/vehicles/vizflyt/team", Some(&own), body);
+    let (status, text) = seat(r#"{"team": "bees"}"#);
+    assert!(status == 404 && text.contains("vizflyt leaderboard team add NAME"), "{text}");
+    for _ in 0..20 {
+        put(&server, r#"{"token": "guess"}"#);
+    }
+    assert_eq!(put(&server, r#"{"token": "guess"}"#).0, 429);
+}
+
+#[test]
+fn a_lab_without_a_leaderboard_flies_all_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let notes = folder.path().join("notes.txt");
+    std::fs::write(&notes, "these are my notes and no database, although they are long enough")
+        .unwrap();
+    let option = format!("--leaderboard={}", notes.display());
+    let server = Server::start(&write_arena(folder.path(), ""), &[&option]);
+    let (status, answer) = http(server.http, "GET /api/leaderboard HTTP/1.1");
+    assert!(status == 404 && answer.contains("no runs are kept here"), "{answer}");
+    assert!(std::fs::read_to_string(&notes).unwrap().starts_with("these are my notes"));
+}
