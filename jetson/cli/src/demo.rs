@@ -7,25 +7,31 @@ use anyhow::Result;
 use clap::Args;
 
 use crate::lab::{self, LabArgs, LabFlight};
+use crate::plugins;
 use crate::terminal::tell;
 
 /// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt demo                                  fly the forest and watch it in the browser
-  vizflyt demo --scene race --seed 3            another scene, another course
+  vizflyt demo --scene race --seed 3            windows, a gap and a hand, by the plugin race
   vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
   vizflyt demo --through-bridge                 MAVLink goes through the vehicle's Wi-Fi bridge, emulated
+  vizflyt demo --localization natnet            the motion capture is an OptiTrack
+  vizflyt demo --localization tags              no motion capture: two simulated webcams see AprilTags
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
     #[command(flatten)]
     lab: LabArgs,
-    /// Plugin to fly: whatever `vizflyt fly` takes.
-    #[arg(long, default_value = "avoid")]
-    plugin: String,
+    /// Plugin to fly: whatever `vizflyt fly` takes [default: race in the race and in projects p3 to p5, else avoid].
+    #[arg(long)]
+    plugin: Option<String>,
     /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]
     #[arg(long)]
     seconds: Option<f64>,
+    /// Takes off when `start` is pressed on the page, not by itself.
+    #[arg(long)]
+    wait: bool,
     /// Writes the flight's figures to this file as JSON.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
@@ -37,9 +43,13 @@ pub(crate) struct DemoArgs {
 /// Runs the demo; success only if the flight finished.
 pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     // The demo is the same on every computer: nobody's jetson.toml counts.
-    let mut fly = vec![args.plugin.clone().into(), "--no-config".into()];
+    let plugin = args.plugin.as_deref().unwrap_or(plugins::default_for(args.lab.scene()));
+    let mut fly = vec![plugin.into(), "--no-config".into()];
     if let Some(seconds) = args.seconds {
         fly.push(format!("--seconds={seconds}").into());
+    }
+    if args.wait {
+        fly.push("--wait".into());
     }
     let flight = LabFlight {
         lab: &args.lab,

@@ -1,19 +1,24 @@
 //! `vizflyt`: the one command people type. Each subcommand is a library of its own; this file only
 //! reads the command line and starts one.
 
+mod arena;
 mod bench;
 mod bridge;
 mod demo;
 mod doctor;
 mod fly;
+mod grade;
 mod lab;
+mod leaderboard;
 mod new;
 mod pair;
+mod password;
 mod plugins;
 mod project;
 mod replay;
 mod scene;
 mod stats;
+mod tags;
 mod terminal;
 mod vehicle;
 
@@ -48,20 +53,27 @@ enum Command {
     New(new::NewArgs),
     /// Flies a plugin: in the simulated lab, or in the real one if it is configured.
     Fly(fly::FlyArgs),
+    /// Flies a project's course again and again in lock-step, and says what the plugin is worth.
+    Grade(grade::GradeArgs),
     /// The render server: pose in, RGB-D out, page and events.
     Serve(vizflyt_server::ServeArgs),
     /// Makes this computer and a render server known to each other, once, by a short code.
     Pair(pair::PairArgs),
-    /// Finds what is wrong before it flies: the autopilot's parameters.
+    Password(password::PasswordArgs),
+    /// Finds what is wrong before it flies: the autopilot's parameters, the localization's axes.
     Doctor(doctor::DoctorArgs),
     /// What is set up on the vehicle once: the key for MAVLink signing.
     Vehicle(vehicle::VehicleArgs),
+    /// Teams, runs and standings of the lab's flights.
+    Leaderboard(leaderboard::LeaderboardArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
     /// The Wi-Fi bridge of a vehicle: emulated here, or asked over the network.
     Bridge(bridge::BridgeArgs),
     /// Makes scenes, looks at them, draws them.
     Scene(scene::SceneArgs),
+    Arena(arena::ArenaArgs),
+    Tags(tags::TagsArgs),
     /// Measures how fast this machine draws.
     Bench(bench::BenchArgs),
     /// Where images get their age, stage by stage, and why images were skipped.
@@ -78,7 +90,9 @@ fn main() -> ExitCode {
     let cli = Cli::parse();
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
         // These tell their own story; logs would drown it.
-        Command::Demo(_) | Command::Fly(_) | Command::Replay(_) => "warn".to_owned(),
+        Command::Demo(_) | Command::Fly(_) | Command::Replay(_) | Command::Grade(_) => {
+            "warn".to_owned()
+        }
         // What they print is the result; a load of seconds still shows its progress.
         Command::Bench(_) => "warn,vizflyt_server::scene=info".to_owned(),
         _ => "info,quinn=warn".to_owned(),
@@ -101,13 +115,18 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Demo(args) => demo::run(&args, log_level),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => fly::run(args, log_level),
+        Command::Grade(args) => grade::run(&args),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
+        Command::Password(args) => password::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Vehicle(args) => vehicle::run(&args),
+        Command::Leaderboard(args) => leaderboard::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Bridge(args) => bridge::run(args).map(|()| ExitCode::SUCCESS),
         Command::Scene(args) => scene::run(args),
+        Command::Arena(args) => arena::run(&args),
+        Command::Tags(args) => tags::run(&args),
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),
         Command::Replay(args) => replay::run(&args),

@@ -9,6 +9,8 @@ use clap::{Args, ValueEnum};
 pub(crate) enum BuiltIn {
     /// Flies to the goal through obstacles, by a potential field on the depth image.
     Avoid,
+    /// Flies windows, a gap and a rotating hand from images alone.
+    Race,
 }
 
 impl BuiltIn {
@@ -24,6 +26,11 @@ pub(crate) fn is_built_in(name: &str) -> bool {
     !name.contains('/') && BuiltIn::from_str(name, true).is_ok()
 }
 
+/// Returns the built-in that flies a scene or a project of the course.
+pub(crate) fn default_for(scene: &str) -> &'static str {
+    if matches!(scene, "race" | "p3" | "p4" | "p5") { "race" } else { "avoid" }
+}
+
 /// Arguments of the hidden `vizflyt plugin`.
 #[derive(Args, Debug)]
 pub(crate) struct PluginArgs {
@@ -37,5 +44,6 @@ pub(crate) struct PluginArgs {
 pub(crate) fn run(args: &PluginArgs) -> ExitCode {
     match args.name {
         BuiltIn::Avoid => vizflyt_sdk::attach(vizflyt_avoid::Avoid::default(), &args.service),
+        BuiltIn::Race => vizflyt_sdk::attach(vizflyt_race::Race::default(), &args.service),
     }
 }

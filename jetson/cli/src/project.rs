@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use serde::Deserialize;
 use vizflyt_runtime::config::parse_strict;
+use vizflyt_scenes::projects::{self, Level};
 
 /// The whole of `vizflyt.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -22,11 +23,41 @@ pub(crate) struct Project {
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct LabConfig {
-    /// forest, race, room; or the path of a scene folder, an arena.toml or a scene file, relative
+    /// forest, race, room, moving; or the path of a scene folder, an arena.toml or a scene file, relative
     /// to the folder.
     pub scene: Option<String>,
+    /// Instead of a scene, a project of the course: p2, p3, p4, p5 or forest.
+    project: Option<String>,
+    /// Whom the project is for: ug or g.
+    level: Option<String>,
     /// Seed of the generated scene and of the simulator's noise.
     pub seed: Option<u64>,
+}
+
+impl LabConfig {
+    /// Returns the name of the course's project, if one is flown.
+    ///
+    /// # Errors
+    /// If no project has this name, or a scene is given too.
+    pub(crate) fn project(&self) -> Result<Option<String>> {
+        let Some(name) = &self.project else { return Ok(None) };
+        if self.scene.is_some() {
+            bail!("{FILE} gives both a scene and the project '{name}'; remove one of them");
+        }
+        let project = projects::Project::named(name).with_context(|| FILE.to_owned())?;
+        Ok(Some(project.name().to_owned()))
+    }
+
+    /// Returns whom the project is for, if that is said.
+    ///
+    /// # Errors
+    /// If there is no such level.
+    pub(crate) fn level(&self) -> Result<Option<Level>> {
+        self.level
+            .as_deref()
+            .map(|level| level.parse().with_context(|| FILE.to_owned()))
+            .transpose()
+    }
 }
 
 /// Its file's name.

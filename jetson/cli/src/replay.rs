@@ -1,6 +1,9 @@
 //! `vizflyt replay`: a flight's log to a plugin, and where its answers differ from the flight's.
 
+mod poses;
+
 use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -8,7 +11,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
-use vizflyt_runtime::log::read::{LogReader, RecordedFlight};
+use vizflyt_runtime::log::read::{LogReader, RecordedFlight, RecordedPoses};
 use vizflyt_runtime::replay::{Differs, FlownPlugin, Plan, ReplayOptions, ReplayReport, replay};
 use vizflyt_runtime::supervisor::Stream;
 
@@ -23,6 +26,7 @@ use crate::terminal::tell;
   vizflyt replay flights/2026-11-21T04-09-21.123Z.mcap
   vizflyt replay flight.mcap --plugin ./my_plugin.py    how another plugin had answered
   vizflyt replay flight.mcap --answers one.jsonl        all answers; cmp tells two runs apart
+  vizflyt replay flight.mcap --poses-to 127.0.0.1:51002 only its poses, to `vizflyt serve ARENA --pose json`
 
 Nothing is flown. Status 0 if the plugin came to the end of the log, 1 if it failed.")]
 pub(crate) struct ReplayArgs {
@@ -35,6 +39,13 @@ pub(crate) struct ReplayArgs {
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT", requires = "plugin")]
     plugin_arguments: Vec<OsString>,
+    /// Sends the flight's poses there at its pace, as packets that `vizflyt serve --pose json` reads, and
+    /// nothing else
+    #[arg(long, value_name = "HOST:PORT", conflicts_with_all = ["plugin", "all", "answers", "report"])]
+    poses_to: Option<SocketAddr>,
+    /// The name of the vehicle in those packets
+    #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "poses_to")]
+    object: String,
     /// At the flight's pace, instead of as fast as the plugin answers
     #[arg(long)]
     realtime: bool,
@@ -57,6 +68,12 @@ pub(crate) struct ReplayArgs {
 pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     let cannot = || format!("cannot replay {}", args.log.display());
     let reader = LogReader::open(&args.log).with_context(cannot)?;
+    if let Some(to) = args.poses_to {
+        let sent =
+            poses::send(RecordedPoses::new(reader), to, &args.object).with_context(cannot)?;
+        tell(format!("{sent} poses sent to {to}"));
+        return Ok(ExitCode::SUCCESS);
+    }
     let plan = Plan::read(RecordedFlight::new(reader, false)).with_context(cannot)?;
     let (plugin, arguments) = match &args.plugin {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use vizflyt_arena::pose::{PoseQuality, Rejects};
 use vizflyt_protocol::messages::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Timing,
 };
@@ -154,7 +155,59 @@ fn of_answer(answer: &Answer) -> Result<String> {
     if let Some(connection) = &answer.connection {
         out += &of_connection(connection);
     }
+    out += &of_pose(&answer.pose);
     Ok(out)
+}
+
+/// Returns how good the localization is.
+fn of_pose(pose: &PoseQuality) -> String {
+    let Some(age_ms) = pose.age_ms else { return "\npose        none yet\n".to_owned() };
+    let mut out = format!(
+        "\npose        {:.0} Hz, {age_ms:.0} ms old; within {:.1} mm and {:.2} degrees (one sigma); \
+         {} IMU\n",
+        pose.rate_hz,
+        pose.position_sigma_mm,
+        pose.rotation_sigma_deg,
+        if pose.imu { "with" } else { "without" },
+    );
+    for source in &pose.sources {
+        let name = if source.name.is_empty() {
+            format!("source {}", source.source)
+        } else {
+            source.name.clone()
+        };
+        let _ = writeln!(
+            out,
+            "  {name}: {:.0} Hz, {:.1} ms late, {} believed, {} rejected{}",
+            source.rate_hz,
+            source.latency_ms,
+            source.believed,
+            source.rejected.total(),
+            of_rejects(&source.rejected)
+        );
+    }
+    out
+}
+
+/// Returns the reasons that occurred, in brackets.
+fn of_rejects(rejects: &Rejects) -> String {
+    let Rejects { invalid, stale, clock, outlier, jump, flip, frozen, disagree } = *rejects;
+    let reasons = [
+        (invalid, "no pose"),
+        (stale, "not newer"),
+        (clock, "wrong clock"),
+        (outlier, "outliers"),
+        (jump, "jumps"),
+        (flip, "flips"),
+        (frozen, "frozen"),
+        (disagree, "against another source"),
+    ];
+    let said: Vec<_> = reasons
+        .iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, reason)| format!("{count} {reason}"))
+        .collect();
+    if said.is_empty() { String::new() } else { format!(" ({})", said.join(", ")) }
 }
 
 fn of_timing(timing: &Timing, with_arrivals: bool) -> String {
@@ -381,9 +434,11 @@ mod tests {
         let error = get("http://127.0.0.1:1/page", "/").unwrap_err();
         assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
-                       "images": [], "connection": null}"#;
+                       "images": [], "connection": null, "pose": POSE}"#;
         let server = serde_json::to_string(&vizflyt_server::stats::ServerStages::default());
-        let mut answer = parse(&json.replace("SERVER", &server.unwrap())).unwrap();
+        let pose = serde_json::to_string(&vizflyt_arena::pose::PoseQuality::default());
+        let json = json.replace("SERVER", &server.unwrap()).replace("POSE", &pose.unwrap());
+        let mut answer = parse(&json).unwrap();
         let error = of_answer(&answer).unwrap_err();
         assert!(error.to_string().contains("no runtime flies 'wasp'"), "{error}");
         answer.runtime = Some("runtime 0.1 at 127.0.0.1:9".to_owned());

@@ -1,4 +1,9 @@
-//! What people see outside a flight: lines on standard output, and the page in a browser.
+//! What people see outside a flight: lines on standard output, and the page in a browser; and how they end
+//! a command.
+
+use std::io::Read;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 
@@ -35,6 +40,27 @@ pub(crate) fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) ->
         });
     });
     Ok(())
+}
+
+/// Returns a flag that is set on SIGINT and SIGTERM, and with `lifeline` by the end of standard input: then the
+/// parent has gone.
+pub(crate) fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    on_interrupt(move || {
+        set.store(true, Ordering::Relaxed);
+        false
+    })?;
+    if lifeline {
+        let set = Arc::clone(&flag);
+        std::thread::spawn(move || {
+            let mut buffer = [0; 256];
+            // Bytes mean nothing; the end, or an error, means that the parent has gone.
+            while matches!(std::io::stdin().read(&mut buffer), Ok(length) if length > 0) {}
+            set.store(true, Ordering::Relaxed);
+        });
+    }
+    Ok(flag)
 }
 
 /// Opens the page where there is a desktop; the address is printed in any case.

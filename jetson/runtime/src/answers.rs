@@ -2,6 +2,7 @@
 //! than a plugin that answers images can have to say.
 
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -53,28 +54,49 @@ impl Valve {
     }
 }
 
-/// Reads until `stop`, and passes messages to `tell`. `anew` is set when another process begins.
-pub(crate) fn read(
-    ipc: &RuntimeEnd,
-    stop: &AtomicBool,
-    anew: &AtomicBool,
-    tell: impl Fn(FromPlugin),
-) {
-    let mut valve = Valve::new(Instant::now());
-    while !stop.load(Ordering::Relaxed) {
-        if ipc.wait(Duration::from_millis(100)).is_err() {
-            // No event comes any more; poll instead.
-            thread::sleep(Duration::from_millis(1));
+/// What the plugins of one offer say, one process after another.
+#[derive(Debug)]
+pub(crate) struct Answers {
+    ipc: Arc<RuntimeEnd>,
+    /// Another process begins: what the former one did is forgotten.
+    anew: AtomicBool,
+    valve: Mutex<Valve>,
+}
+
+impl Answers {
+    pub(crate) fn new(ipc: Arc<RuntimeEnd>) -> Self {
+        Self { ipc, anew: AtomicBool::new(false), valve: Mutex::new(Valve::new(Instant::now())) }
+    }
+
+    /// Another process speaks from now on.
+    pub(crate) fn begin_anew(&self) {
+        self.anew.store(true, Ordering::Relaxed);
+    }
+
+    /// Reads until `stop`, and passes messages to `tell`.
+    pub(crate) fn read(&self, stop: &AtomicBool, tell: impl Fn(FromPlugin)) {
+        while !stop.load(Ordering::Relaxed) {
+            if self.ipc.wait(Duration::from_millis(100)).is_err() {
+                // No event comes any more; poll instead.
+                thread::sleep(Duration::from_millis(1));
+            }
+            self.drain(&tell);
         }
+    }
+
+    /// Passes on what has come. Once it returns, `tell` has been given all that was sent before the call,
+    /// by whichever thread: a plugin's last word is not lost to the news of its end.
+    pub(crate) fn drain(&self, tell: impl Fn(FromPlugin)) {
+        let mut valve = self.valve.lock().unwrap_or_else(PoisonError::into_inner);
         // At most a queue full, so that `stop` is seen whatever the plugin does.
         for _ in 0..256 {
-            let received = match ipc.receive() {
+            let received = match self.ipc.receive() {
                 Ok(Some(message)) => Ok(message),
                 Err(IpcError::Message(error)) => Err(error.to_string()),
                 Ok(None) | Err(_) => break,
             };
-            if anew.swap(false, Ordering::Relaxed) {
-                valve = Valve::new(Instant::now());
+            if self.anew.swap(false, Ordering::Relaxed) {
+                *valve = Valve::new(Instant::now());
             }
             if let Some(message) = valve.take(Instant::now(), received) {
                 tell(message);

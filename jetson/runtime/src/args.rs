@@ -63,6 +63,9 @@ pub struct FlyArgs {
     /// Gives up if not in the air after this long; 0 waits for ever
     #[arg(long, value_name = "SECONDS", default_value_t = 120.0)]
     pub ready_within: f64,
+    /// Stays on the ground, once all is ready, until `start` is pressed on the server's page
+    #[arg(long)]
+    pub wait: bool,
     /// This vehicle's own limits, from `jetson.toml`
     #[arg(skip = Limits::NONE)]
     pub limits: Limits,

@@ -65,6 +65,7 @@ pub fn phase_name(phase: FlightPhase) -> &'static str {
         FlightPhase::Holding => "holding",
         FlightPhase::Landing => "landing",
         FlightPhase::Landed => "landed",
+        FlightPhase::Waiting => "waiting",
     }
 }
 

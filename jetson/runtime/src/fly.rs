@@ -100,6 +100,7 @@ pub fn fly_command(
             time_limit_s: args.seconds,
             limits: args.limits,
         },
+        waits_for_start: args.wait,
         port,
         link: args.link_settings()?,
         shared,

@@ -241,7 +241,10 @@ impl ImagePublisher {
         let (tick, ready) = (arrival.header.seq.get(), host_now());
         lane.newest = (tick, arrival.pose);
         let mut writer = ObservationWriter::resume(under_way.memory.memory(), &self.cameras)?;
-        let stamps = ImageStamps { seq: tick, pose: arrival.pose, ready };
+        let shown = arrival.header.exposure_stamp().as_ns();
+        let ahead_ns = shown.wrapping_sub(arrival.header.pose_stamp().as_ns()).cast_signed();
+        let ahead_ns = ahead_ns.clamp(i32::MIN.into(), i32::MAX.into()) as i32;
+        let stamps = ImageStamps { seq: tick, pose: arrival.pose, ready, ahead_ns };
         writer.image_ready(camera, &self.cameras[camera], stamps);
         under_way.there |= bit(camera);
         let published = &mut under_way.published;

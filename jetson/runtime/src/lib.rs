@@ -13,7 +13,7 @@
 //! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
 //! pure), [`link`] (MAVLink, sans-IO),
 //! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
-//! [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it all. [`airframe`] stands beside: the
+//! [`replay`] (a log to a plugin), [`report`], [`lockstep`] (the same flight on a virtual clock, for grades). [`fly()`] starts it all. [`airframe`] stands beside: the
 //! autopilot's parameters, read, judged and written before a flight.
 
 pub mod airframe;
@@ -28,6 +28,7 @@ pub mod fly;
 pub mod guard;
 pub mod images;
 pub mod link;
+pub mod lockstep;
 pub mod log;
 pub mod replay;
 pub mod report;

@@ -33,6 +33,11 @@ impl Steering {
         self.answer_waits = true;
     }
 
+    /// Takes note of something that must not wait for the rhythm, as the referee's verdict.
+    pub fn hurry(&mut self) {
+        self.answer_waits = true;
+    }
+
     /// Returns when the next setpoint shall leave.
     pub fn due(&self) -> HostTime {
         self.last.plus_seconds(if self.answer_waits { LEAST_S } else { MOST_S })

@@ -22,7 +22,7 @@ use glam::DVec3;
 use serde::Serialize;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::geometry::{Pose, Volume};
-use vizflyt_protocol::messages::{ArenaInfo, Limits, Purpose, bounded};
+use vizflyt_protocol::messages::{ArenaInfo, Limits, PoseAges, Purpose, bounded};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::images::ImagePublisher;
@@ -389,6 +389,8 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("bench"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -396,6 +398,7 @@ fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         cameras: [].into_iter().collect(),
     }

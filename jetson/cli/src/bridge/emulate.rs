@@ -6,8 +6,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream, UdpSocket};
 use std::os::fd::AsFd;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
@@ -16,6 +15,7 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
 use serde_json::json;
 use vizflyt_bridge::bridge::TCP_SLOTS;
+use vizflyt_bridge::settings::{Key, key_from_hex};
 use vizflyt_bridge::stats::REPORT;
 use vizflyt_bridge::storage::Store;
 use vizflyt_bridge::{Bridge, Chip, Event, Settings};
@@ -23,15 +23,17 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 use super::flash::FileFlash;
+use super::page::Page;
 use super::port::{Port, Uart};
-use crate::terminal::tell;
+use crate::terminal::{stop_flag, tell};
 
 /// Runs the bridge's firmware on this computer.
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt bridge emulate --uart pty:/tmp/uart           then: vizflyt sim --serial /tmp/uart
   vizflyt bridge emulate --uart /dev/ttyUSB0            this computer carries a real autopilot's port
-  vizflyt bridge emulate --client 127.0.0.1:14550       speaks first, to a runtime that waits there")]
+  vizflyt bridge emulate --client 127.0.0.1:14550       speaks first, to a runtime that waits there
+  vizflyt bridge emulate --page 127.0.0.1:8090          with the status page, as a browser shows it")]
 pub(crate) struct EmulateArgs {
     /// The autopilot's port: `pty` makes a pseudo-terminal, `pty:PATH` links to it by a name, PATH
     /// is a serial device.
@@ -43,6 +45,13 @@ pub(crate) struct EmulateArgs {
     /// TCP address that clients connect to; none without it.
     #[arg(long, value_name = "ADDR:PORT")]
     tcp: Option<SocketAddrV4>,
+    /// TCP address of the status page; none without it.
+    #[arg(long, value_name = "ADDR:PORT")]
+    page: Option<SocketAddrV4>,
+    /// Takes firmware at the page that this key signed, as `vizflyt bridge firmware key` prints it;
+    /// verified as on a chip, but not run.
+    #[arg(long, value_name = "HEX", requires = "page", value_parser = firmware_key)]
+    firmware_key: Option<Key>,
     /// A client that is sent to before it speaks.
     #[arg(long, value_name = "ADDR:PORT")]
     client: Option<SocketAddrV4>,
@@ -70,6 +79,8 @@ impl EmulateArgs {
             uart: Uart::Pty(None),
             listen: SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0),
             tcp: None,
+            page: None,
+            firmware_key: None,
             client: None,
             baud: Some(baud),
             settings: Vec::new(),
@@ -93,12 +104,19 @@ pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
         Some(listener) => Some(listener.local_addr()?.to_string()),
         None => None,
     };
+    let page = match &emulation.page {
+        Some(page) => Some(page.address()?.to_string()),
+        None => None,
+    };
     if args.json {
-        tell(json!({"ready": "bridge", "uart": uart, "udp": udp, "tcp": tcp}));
+        tell(json!({"ready": "bridge", "uart": uart, "udp": udp, "tcp": tcp, "page": page}));
     } else {
         tell(format!("bridge ready: autopilot at {uart}, clients at udp {udp}; Ctrl-C ends it"));
         if let Some(tcp) = tcp {
             tell(format!("              and tcp {tcp}"));
+        }
+        if let Some(page) = page {
+            tell(format!("              its page: http://{page}"));
         }
     }
     while !stop.load(Ordering::Relaxed) {
@@ -124,6 +142,7 @@ pub(crate) struct Emulation {
     pub(crate) port: Port,
     pub(crate) udp: UdpSocket,
     listener: Option<TcpListener>,
+    page: Option<Page>,
     streams: [Option<Connection>; TCP_SLOTS],
     start: Instant,
     booted: Instant,
@@ -167,6 +186,7 @@ impl Emulation {
             }
             None => None,
         };
+        let page = args.page.map(|address| Page::open(address, args.firmware_key)).transpose()?;
         let start = Instant::now();
         let bridge = Bridge::new(HostTime::ZERO, settings, chip()?);
         Ok(Self {
@@ -176,6 +196,7 @@ impl Emulation {
             port,
             udp,
             listener,
+            page,
             streams: [const { None }; TCP_SLOTS],
             start,
             booted: start,
@@ -190,6 +211,9 @@ impl Emulation {
         self.port.receive(now, |bytes| bridge.handle_uart(at, bytes))?;
         self.hear_udp(at);
         self.hear_tcp(at);
+        if self.page.as_mut().is_some_and(|page| page.turn(&self.bridge, at, now)) {
+            self.restart(at)?;
+        }
         if self.bridge.poll_timeout() <= at {
             self.bridge.handle_timeout(at);
         }
@@ -316,6 +340,9 @@ impl Emulation {
         if let Some(listener) = &self.listener {
             fds.push(PollFd::new(listener.as_fd(), PollFlags::POLLIN));
         }
+        if let Some(page) = &self.page {
+            fds.push(PollFd::new(page.fd(), PollFlags::POLLIN));
+        }
         for (slot, connection) in self.streams.iter().enumerate() {
             let Some(connection) = connection else { continue };
             let mut flags = PollFlags::POLLIN;
@@ -352,6 +379,10 @@ impl Emulation {
     }
 }
 
+fn firmware_key(text: &str) -> Result<Key, String> {
+    key_from_hex(text).map_err(|_| "it has 64 hexadecimal digits".to_owned())
+}
+
 /// Returns the settings of a start: what flash holds, then what the command line says.
 fn boot_settings(store: &mut Store<FileFlash>, overrides: &[(String, String)]) -> Result<Settings> {
     let mut settings = store.load().unwrap_or_default();
@@ -371,26 +402,6 @@ fn chip() -> Result<Chip> {
         .and_then(|mut file| file.read_exact(&mut random))
         .context("bridge: no random numbers from /dev/urandom")?;
     Ok(Chip { address: [2, 0, 0, random[0], random[1], random[2]], random })
-}
-
-/// Returns a flag that is set on SIGINT or SIGTERM, and with `lifeline` when stdin ends.
-fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
-    let flag = Arc::new(AtomicBool::new(false));
-    let set = Arc::clone(&flag);
-    crate::terminal::on_interrupt(move || {
-        set.store(true, Ordering::Relaxed);
-        false
-    })?;
-    if lifeline {
-        let set = Arc::clone(&flag);
-        std::thread::spawn(move || {
-            let mut buffer = [0; 256];
-            // Bytes mean nothing; the end, or an error, means that the parent has gone.
-            while matches!(std::io::stdin().read(&mut buffer), Ok(len) if len > 0) {}
-            set.store(true, Ordering::Relaxed);
-        });
-    }
-    Ok(flag)
 }
 
 /// Where a bridge in AP mode is, and the port it listens on.

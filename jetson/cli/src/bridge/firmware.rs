@@ -68,6 +68,8 @@ struct SignArgs {
 enum ChipName {
     /// ESP32-C3.
     Esp32c3,
+    /// This computer: `vizflyt bridge emulate --firmware-key`, to try it out.
+    Host,
 }
 
 #[derive(Args, Clone, Debug)]
@@ -132,6 +134,7 @@ fn sign(args: &SignArgs) -> Result<()> {
     }
     let target = match args.chip {
         ChipName::Esp32c3 => Target::Esp32C3,
+        ChipName::Host => Target::Host,
     };
     let signed = signed(&key, target, args.build, &image)?;
     fs::write(&args.output, &signed)

@@ -39,6 +39,11 @@ impl FileFlash {
         Ok(Self { bytes, path })
     }
 
+    /// Makes the half of a flash that does not run, erased, in memory.
+    pub(crate) fn spare(size: usize) -> Self {
+        Self { bytes: vec![0xFF; size], path: None }
+    }
+
     fn place(&mut self, from: usize, len: usize) -> Result<&mut [u8], FlashError> {
         self.bytes.get_mut(from..from + len).ok_or(FlashError)
     }

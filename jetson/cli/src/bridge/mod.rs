@@ -5,6 +5,7 @@ mod configure;
 mod emulate;
 mod firmware;
 mod flash;
+mod page;
 mod port;
 
 pub(crate) use self::emulate::{EmulateArgs, Emulation};

@@ -20,12 +20,12 @@ use plugin::Plugin;
 /// render server.
 ///
 /// PLUGIN is a folder made by `vizflyt new`, a `.py` file, a Cargo project, a program, or the name
-/// of a built-in (avoid).
+/// of a built-in (avoid, race).
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt new first --lang python && vizflyt fly first     your own plugin in the simulated lab
   vizflyt fly first --watch                                a saved file takes over in flight
-  vizflyt fly avoid --scene race --seed 3                  the built-in example, another scene
+  vizflyt fly race --scene race --seed 3                   a built-in example, another scene
   vizflyt fly first --headless --seconds 20 --report r.json
                                                            figures; status 0 if finished or landed
   vizflyt fly --attach                                     waits for `python my_plugin.py` or a debugger
@@ -63,8 +63,8 @@ pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
 
 fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Result<ExitCode> {
     let runtime = &args.runtime;
-    if args.lab.scene.is_some() || args.lab.seed.is_some() {
-        bail!("--scene and --seed are for the simulated lab; add --sim to fly there");
+    if args.lab.scene.is_some() || args.lab.seed.is_some() || args.lab.project.is_some() {
+        bail!("--scene, --project and --seed are for the simulated lab; add --sim to fly there");
     }
     let mut command = plugin.map_or(Ok(Vec::new()), Plugin::command)?;
     command.extend(runtime.plugin_arguments.iter().cloned());
@@ -114,7 +114,11 @@ fn fly_simulated(
     // What is built here is not built again behind the server's back.
     plugin.map(Plugin::command).transpose()?;
     if let Some(lab) = plugin.and_then(Plugin::lab) {
-        args.lab.scene = args.lab.scene.take().or_else(|| lab.scene.clone());
+        if args.lab.scene.is_none() && args.lab.project.is_none() {
+            args.lab.scene.clone_from(&lab.scene);
+            args.lab.project = lab.project()?;
+            args.lab.level = args.lab.level.or(lab.level()?);
+        }
         args.lab.seed = args.lab.seed.or(lab.seed);
     }
     say_lab(runtime.json, "simulated", "all on this computer; nothing can break");
@@ -123,6 +127,9 @@ fn fly_simulated(
         format!("--seconds={}", runtime.seconds).into(),
         format!("--ready-within={}", runtime.ready_within).into(),
     ];
+    if runtime.wait {
+        fly.push("--wait".into());
+    }
     if let Some(address) = runtime.foxglove {
         fly.push(format!("--foxglove={address}").into());
     }

@@ -23,6 +23,8 @@ pub(crate) enum Role {
     Simulator,
     /// `vizflyt bridge emulate`.
     Bridge,
+    /// `vizflyt tags locate`.
+    Tags,
 }
 
 impl Role {
@@ -33,6 +35,7 @@ impl Role {
             Self::Runtime => "runtime",
             Self::Simulator => "simulator",
             Self::Bridge => "bridge",
+            Self::Tags => "AprilTag localization",
         }
     }
 }

@@ -42,7 +42,12 @@ impl Drop for MemoryWatch {
 
 /// Returns the summed resident set of `root` and its descendants. [kB]
 fn family_rss_kb(root: u32) -> u64 {
-    let Ok(entries) = fs::read_dir("/proc") else { return 0 };
+    family(root).values().sum()
+}
+
+/// Returns the resident sets of `root` and its descendants, by process. [kB]
+fn family(root: u32) -> HashMap<u32, u64> {
+    let Ok(entries) = fs::read_dir("/proc") else { return HashMap::new() };
     // pid -> (parent, resident kB)
     let processes: HashMap<u32, (u32, u64)> = entries
         .filter_map(|entry| {
@@ -62,7 +67,8 @@ fn family_rss_kb(root: u32) -> u64 {
         }
         false
     };
-    processes.iter().filter(|&(&pid, _)| descends(pid)).map(|(_, &(_, rss_kb))| rss_kb).sum()
+    let of_it = processes.iter().filter(|&(&pid, _)| descends(pid));
+    of_it.map(|(&pid, &(_, rss_kb))| (pid, rss_kb)).collect()
 }
 
 /// Returns the number after `name` in the text of `/proc/PID/status`.
@@ -77,13 +83,29 @@ mod tests {
     #[test]
     #[cfg(target_os = "linux")]
     fn a_child_is_counted() {
-        let alone = family_rss_kb(std::process::id());
-        assert!(alone > 500, "this process alone has {alone} kB");
-        let mut child = std::process::Command::new("sleep").arg("30").spawn().unwrap();
-        let together = family_rss_kb(std::process::id());
-        child.kill().unwrap();
+        use std::io::{BufRead, BufReader};
+        use std::process::{Command, Stdio};
+
+        // It has memory of its own once it speaks, and waits until its input closes. A sum over this process would
+        // tell nothing: other tests of it take memory and give it back meanwhile.
+        let mut child = Command::new("sh")
+            .args(["-c", "echo up; read -r line"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut said = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut said).unwrap();
+        let own = std::process::id();
+        let together = family(own);
+        let stranger = family(child.id());
+        drop(child.stdin.take());
         child.wait().unwrap();
-        assert!(together > alone, "{together} kB with a child, {alone} kB without");
+        assert_eq!(said, "up\n");
+        assert!(together[&own] > 500, "this process has {} kB", together[&own]);
+        assert!(together[&child.id()] > 0, "the child is not counted: {together:?}");
+        assert!(!stranger.contains_key(&own), "a child's family holds its parent");
+        assert!(!family(own).contains_key(&child.id()), "a child that is gone is counted");
     }
 
     #[test]

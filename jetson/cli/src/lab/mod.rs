@@ -7,15 +7,17 @@
 //! serve     start the render server; it says which ports it got
 //! fly       start the runtime with the plugin; it says which port waits for MAVLink
 //! bridge    start the Wi-Fi bridge, if it is wanted; it says where its serial port is
+//! tags      start AprilTag localization, if it is wanted; it says where it waits for true poses
 //! sim       start the vehicle: airframe, autopilot, mocap
 //! watch     print events and status, until the runtime ends (or a person ends it all)
 //! report    join what the three measured
 //! ```
-//! The three are real processes that talk over UDP, QUIC and shared memory. This one only starts
+//! All are real processes that talk over UDP, QUIC and shared memory. This one only starts
 //! them, listens, and ends them.
 
 mod child;
 mod keys;
+mod localization;
 mod memory;
 mod prepare;
 mod report;
@@ -35,6 +37,10 @@ use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
+use vizflyt_scenes::Variant;
+use vizflyt_scenes::projects::{Level, Project, UnknownProject};
+
+use self::localization::Localization;
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
 use self::report::Parts;
@@ -45,10 +51,20 @@ pub(crate) use self::report::Report;
 /// What the simulated lab looks like.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct LabArgs {
-    /// forest, race, room; or the path of a scene folder, an arena.toml or a scene file
-    /// [default: forest].
+    /// forest, race, room, moving; or the path of a scene folder, an arena.toml or a scene file
+    /// [default: forest; room with --localization tags].
     #[arg(long)]
     pub scene: Option<String>,
+    /// A project of the course, with its place, sensors and rules: p2, p3, p4, p5 or forest; takes the
+    /// place of --scene.
+    #[arg(long, value_name = "NAME", value_parser = project_name)]
+    pub project: Option<String>,
+    /// Whom the project is for: ug, with depth, or g, without [default: ug].
+    #[arg(long, value_name = "LEVEL", requires = "project")]
+    pub level: Option<Level>,
+    /// The project's light: day, dusk or night [default: day].
+    #[arg(long, value_name = "NAME", requires = "project")]
+    pub variant: Option<Variant>,
     /// Seed of the generated scene and of the simulator's noise [default: 7].
     #[arg(long)]
     pub seed: Option<u64>,
@@ -58,6 +74,10 @@ pub(crate) struct LabArgs {
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
+    /// How the vehicle is localized: as a motion capture in one of these forms streams it, or by AprilTags
+    /// on it that two simulated webcams see.
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub localization: Localization,
     /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
     #[arg(long)]
     pub through_bridge: bool,
@@ -67,15 +87,39 @@ pub(crate) struct LabArgs {
 }
 
 impl LabArgs {
-    /// Returns the scene's name or path.
+    /// Returns the project's name, else the scene's name or path.
     pub(crate) fn scene(&self) -> &str {
-        self.scene.as_deref().unwrap_or("forest")
+        if let Some(project) = &self.project {
+            return project;
+        }
+        // A forest is larger than what two webcams see.
+        let default = if self.localization == Localization::Tags { "room" } else { "forest" };
+        self.scene.as_deref().unwrap_or(default)
+    }
+
+    /// Returns the project of the course that is flown, if one is.
+    pub(crate) fn project(&self) -> Option<Project> {
+        self.project.as_deref().and_then(|name| Project::named(name).ok())
+    }
+
+    /// Returns whom the project is for.
+    pub(crate) fn level(&self) -> Level {
+        self.level.unwrap_or_default()
+    }
+
+    /// Returns the project's light.
+    pub(crate) fn variant(&self) -> Variant {
+        self.variant.unwrap_or_default()
     }
 
     /// Returns the seed.
     pub(crate) fn seed(&self) -> u64 {
         self.seed.unwrap_or(7)
     }
+}
+
+fn project_name(name: &str) -> Result<String, UnknownProject> {
+    Project::named(name).map(|project| project.name().to_owned())
 }
 
 /// One flight in the simulated lab.
@@ -105,9 +149,14 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let interrupted = notices.clone();
     on_interrupt(move || interrupted.send(Notice::Interrupted).is_ok())?;
     let (scene, seed) = (flight.lab.scene(), flight.lab.seed());
-    let stage = Stage::prepare(scene, seed)?;
+    let stage = Stage::prepare(flight.lab)?;
+    flight.lab.localization.check(stage.fence_m)?;
     if !flight.json {
         tell(format!("scene       {scene}{}", stage.seeded(seed)));
+        if let Some(project) = flight.lab.project() {
+            let (level, variant) = (flight.lab.level(), flight.lab.variant());
+            tell(format!("project     {}: level {level}, {variant}", project.title()));
+        }
     }
     let keys = Keys::make()?;
     let mut show = Show {
@@ -167,8 +216,10 @@ impl Show {
             keys.option(),
             "--json".into(),
             "--lifeline".into(),
+            // What is simulated is nobody's run.
+            "--leaderboard=none".into(),
             "--quic=127.0.0.1:0".into(),
-            "--vicon=127.0.0.1:0".into(),
+            lab.localization.of_server(),
             // The simulator's, whoever else the arena names.
             "--vehicle=vizflyt".into(),
             format!("--http={page}").into(),
@@ -232,12 +283,27 @@ impl Show {
         } else {
             format!("--mavlink=udpout:{mavlink}")
         };
+        let poses = server["pose"][0]["address"].as_str();
+        let poses = poses.with_context(|| format!("the ready line {server} has no pose"))?;
+        let seen = if lab.localization == Localization::Tags {
+            let mut tags = Localization::of_tags(poses);
+            tags.push(self.log_level.clone());
+            let Some(tags) = self.start(Role::Tags, &tags)? else {
+                return Ok(Flown::Interrupted);
+            };
+            if !self.json {
+                tell(format!("tags        {}", text(&tags, "http")?));
+            }
+            format!("--truth-to={}", text(&tags, "truth")?)
+        } else {
+            lab.localization.of_simulator(poses)
+        };
         let mut sim: Vec<OsString> = vec![
             "sim".into(),
             "--json".into(),
             "--lifeline".into(),
             vehicle.into(),
-            format!("--vicon={}", text(&server, "vicon")?).into(),
+            seen.into(),
             format!("--spawn={}", stage.spawn).into(),
             format!("--seed={}", lab.seed()).into(),
             self.log_level.clone(),
@@ -305,6 +371,7 @@ impl Show {
                 Role::Runtime => &mut self.parts.runtime,
                 Role::Simulator => &mut self.parts.simulator,
                 Role::Bridge => &mut self.parts.bridge,
+                Role::Tags => &mut self.parts.localization,
             } = report.clone();
         }
         // The server repeats to its page what the runtime says: take each from its source.

@@ -3,10 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use glam::DVec3;
 use tempfile::TempDir;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_scenes::SceneKind;
 use vizflyt_server::scene::Up;
+
+use super::LabArgs;
 
 /// A scene on disk, ready to be served.
 pub(crate) struct Stage {
@@ -16,25 +19,33 @@ pub(crate) struct Stage {
     pub truth: Option<PathBuf>,
     /// Where the vehicle stands: `x,y,z,yaw_deg`. [m, world; deg]
     pub spawn: String,
+    /// Corners of the fence. [m, world]
+    pub fence_m: (DVec3, DVec3),
     /// Holds generated files until the flight ends.
     folder: Option<TempDir>,
 }
 
 impl Stage {
-    /// Generates the named scene, or takes the one at a path.
-    pub(crate) fn prepare(scene: &str, seed: u64) -> Result<Self> {
-        if let Ok(kind) = scene.parse::<SceneKind>() {
+    /// Generates the project's place or the named scene, or takes the one at a path.
+    pub(crate) fn prepare(lab: &LabArgs) -> Result<Self> {
+        let (scene, seed) = (lab.scene(), lab.seed());
+        let generated = match (lab.project(), scene.parse::<SceneKind>()) {
+            (Some(project), _) => Some(project.generate(seed, lab.level(), lab.variant())),
+            (None, Ok(kind)) => Some(vizflyt_scenes::generate(kind, seed)),
+            (None, Err(_)) => None,
+        };
+        if let Some(generated) = generated {
             let folder = tempfile::Builder::new()
                 .prefix("vizflyt-lab-")
                 .tempdir()
                 .context("cannot make a folder for the generated scene")?;
-            let written = vizflyt_scenes::generate(kind, seed).write(folder.path())?;
+            let written = generated.write(folder.path())?;
             return Self::at(written.arena, Some(folder));
         }
         let path = Path::new(scene);
         if !path.exists() {
             bail!(
-                "--scene '{scene}' is neither forest, race nor room, nor a path that exists; \
+                "--scene '{scene}' is neither forest, race, room nor moving, nor a path that exists; \
                  give one of the names, a folder with an arena.toml, or a scene file"
             );
         }
@@ -46,7 +57,13 @@ impl Stage {
         }
         // A bare scene: the server turns it upright and assumes an arena around it.
         let arena = vizflyt_server::scene::load(path, Up::default(), None)?.arena;
-        Ok(Self { arena: path.to_owned(), truth: None, spawn: spawn(&arena), folder: None })
+        Ok(Self {
+            arena: path.to_owned(),
+            truth: None,
+            spawn: spawn(&arena),
+            fence_m: fence_m(&arena),
+            folder: None,
+        })
     }
 
     /// Returns how the seed made it what it is, to be said behind its name.
@@ -60,8 +77,12 @@ impl Stage {
         let config =
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
-        Ok(Self { arena, truth, spawn: spawn(&config), folder })
+        Ok(Self { arena, truth, spawn: spawn(&config), fence_m: fence_m(&config), folder })
     }
+}
+
+fn fence_m(arena: &ArenaConfig) -> (DVec3, DVec3) {
+    (arena.geofence.min_m, arena.geofence.max_m)
 }
 
 /// Returns where the vehicle stands, as `vizflyt sim --spawn` reads it.

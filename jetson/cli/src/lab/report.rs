@@ -48,12 +48,17 @@ pub(crate) struct Report {
     pub max_speed_mps: f64,
     /// Least distance of the body's surface to the true geometry; absent where a scene has none. [m]
     pub min_clearance_m: Option<f64>,
+    /// How good the localization was in the end, by vehicle: rate, age, sigma, what each source
+    /// delivered and what of it was not believed.
+    pub pose: Value,
     /// Setpoints sent to the autopilot.
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received by the runtime.
     pub mavlink_packets: u64,
     /// The bridge's counters, where MAVLink passed through one.
     pub bridge: Value,
+    /// What AprilTag localization saw, where it was flown on.
+    pub localization: Value,
     /// Peak of the summed resident memory of all processes. [MB]
     pub peak_rss_mb: f64,
     /// The renderer that drew, such as `cpu avx2`.
@@ -75,6 +80,8 @@ pub(crate) struct Parts {
     pub simulator: Value,
     /// The bridge's report, if there was one.
     pub bridge: Value,
+    /// The report of AprilTag localization, if it was flown on.
+    pub localization: Value,
 }
 
 impl Parts {
@@ -123,9 +130,11 @@ impl Parts {
             mean_speed_mps: number(&self.simulator, "mean_speed_mps"),
             max_speed_mps: number(&self.simulator, "max_speed_mps"),
             min_clearance_m: self.simulator["min_clearance_m"].as_f64(),
+            pose: self.server["pose"].clone(),
             setpoints_sent: count(&self.runtime, "setpoints_sent"),
             mavlink_packets: count(&self.runtime, "mavlink_packets"),
             bridge: self.bridge.clone(),
+            localization: self.localization.clone(),
             peak_rss_mb,
             renderer: text(&self.server, "renderer").unwrap_or_default(),
             renderer_reason: text(&self.server, "renderer_reason").unwrap_or_default(),
@@ -148,6 +157,15 @@ impl Report {
             Some(clearance_m) => format!("{clearance_m:.2} m"),
             None => "not known (this scene has no true geometry)".to_owned(),
         };
+        let tags = &self.localization;
+        let tags = match (tags["located"].as_u64(), tags["error_mm_rms"].as_f64()) {
+            (Some(located), Some(error_mm)) => format!(
+                "\x20 tags        {located} poses at {:.0} Hz, {error_mm:.1} mm from the truth, {:.1} ms an image\n",
+                tags["rate_hz"].as_f64().unwrap_or(0.0),
+                tags["image_ms_p50"].as_f64().unwrap_or(0.0),
+            ),
+            _ => String::new(),
+        };
         let reason =
             if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
         format!(
@@ -155,7 +173,7 @@ impl Report {
              \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
              \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, drawn in {render:.1} ms ({renderer})\n\
              \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms; to the setpoint {setpoint:.1} ms\n\
-             \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n\
+             \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n{tags}\
              \x20 memory      {memory:.0} MB at most, all processes together\n\
              \x20 log         {log}",
             outcome = self.outcome,
@@ -190,6 +208,7 @@ mod tests {
             server: json!({"renderer": "cpu"}),
             simulator: json!({"collided": false, "min_clearance_m": 0.4}),
             bridge: Value::Null,
+            localization: Value::Null,
         }
     }
 

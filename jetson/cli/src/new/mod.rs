@@ -8,6 +8,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use vizflyt_scenes::projects::Project;
 
 use crate::fly::sources;
 use crate::plugins::BuiltIn;
@@ -26,7 +27,7 @@ pub(crate) struct NewArgs {
     /// What it is written in
     #[arg(long, value_enum)]
     lang: Language,
-    /// The course's project that it is for: its scene, gates and rules
+    /// The course's project that it is for: p2, p3, p4, p5 or forest, or a folder projects/NAME
     #[arg(long, value_name = "NAME")]
     project: Option<String>,
 }
@@ -43,20 +44,24 @@ enum Language {
 /// Makes the folder.
 pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     let name = name_of(&args.path)?;
-    let scene = match &args.project {
-        Some(project) => {
+    let place = match &args.project {
+        Some(name) if Project::named(name).is_ok() => format!("project = {name:?}"),
+        Some(name) => {
             let roots: Vec<PathBuf> = sources().into_iter().collect();
-            project::course(project, &roots)?.display().to_string()
+            let known = Project::named(name).map(|_| ()).map_err(|unknown| unknown.to_string());
+            let folder = project::course(name, &roots);
+            let folder = folder.with_context(|| known.err().unwrap_or_default())?;
+            format!("scene = {:?}", folder.display().to_string())
         }
-        None => "forest".to_owned(),
+        None => "scene = \"forest\"".to_owned(),
     };
     if args.path.exists() {
         bail!("{} is there already; give another name, or delete it", args.path.display());
     }
     let folder = args.path.display().to_string();
     let files = match args.lang {
-        Language::Python => python(&name, &folder, &scene)?,
-        Language::Rust => rust(&name, &folder, &scene)?,
+        Language::Python => python(&name, &folder, &place)?,
+        Language::Rust => rust(&name, &folder, &place)?,
     };
     for (file, text) in files {
         let path = args.path.join(file);
@@ -80,7 +85,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
 /// A file of the folder, and its text.
 type File = (&'static str, String);
 
-fn python(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
+fn python(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
     let package = sources()?.join("jetson/python").display().to_string();
     let fill = |text: &str| {
         let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
@@ -94,11 +99,11 @@ fn python(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
         ("pyrightconfig.json", fill(include_str!("../../templates/python/pyrightconfig.json"))),
         (".vscode/settings.json", fill(include_str!("../../templates/python/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/python/gitignore"))),
-        (project::FILE, lab("plugin.py", scene)),
+        (project::FILE, lab("plugin.py", place)),
     ])
 }
 
-fn rust(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
+fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
     // As JSON: a path in TOML is quoted alike.
     let sdk = format!("path = {:?}", sources()?.join("jetson/sdk").display().to_string());
     let fill = |text: &str| {
@@ -113,13 +118,13 @@ fn rust(name: &str, folder: &str, scene: &str) -> Result<Vec<File>> {
         ("README.md", fill(include_str!("../../templates/rust/README.md"))),
         (".vscode/settings.json", fill(include_str!("../../templates/rust/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/rust/gitignore"))),
-        (project::FILE, lab("Cargo.toml", scene)),
+        (project::FILE, lab("Cargo.toml", place)),
     ])
 }
 
-fn lab(plugin: &str, scene: &str) -> String {
+fn lab(plugin: &str, place: &str) -> String {
     let text = include_str!("../../templates/vizflyt.toml");
-    text.replace("{{plugin}}", plugin).replace("{{scene}}", &format!("{scene:?}"))
+    text.replace("{{plugin}}", plugin).replace("{{place}}", place)
 }
 
 /// Returns the plugin's name, if it can be one: of a folder, a crate and a class at once.
@@ -206,7 +211,10 @@ mod tests {
 
     #[test]
     fn every_blank_is_filled_and_the_readme_has_ten_lines() {
-        let both = [python("a-b", "x/a-b", "room").unwrap(), rust("a-b", "x/a-b", "room").unwrap()];
+        let both = [
+            python("a-b", "x/a-b", "scene = \"room\"").unwrap(),
+            rust("a-b", "x/a-b", "project = \"p5\"").unwrap(),
+        ];
         for (file, text) in both.iter().flatten() {
             assert!(!text.contains("{{"), "{file}: {text}");
             assert!(!text.is_empty(), "{file}");

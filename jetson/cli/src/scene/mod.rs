@@ -1,5 +1,6 @@
-//! `vizflyt scene`: makes scenes, looks at them, draws them.
+//! `vizflyt scene`: makes scenes, bakes their obstacles, looks at them, draws them.
 
+mod bake;
 pub(crate) mod camera;
 mod inspect;
 mod npy;
@@ -14,7 +15,7 @@ use vizflyt_scenes::SceneKind;
 
 use crate::terminal::{open_browser, tell};
 
-/// Makes scenes, looks at them, draws them.
+/// Makes scenes, bakes their obstacles, looks at them, draws them.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -28,7 +29,7 @@ enum SceneCommand {
   vizflyt scene generate forest --seed 7 -o my-forest
   vizflyt demo --scene my-forest")]
     Generate {
-        /// forest, race or room.
+        /// forest, race, room or moving.
         kind: SceneKind,
         /// Same seed, same scene.
         #[arg(long, default_value_t = 7)]
@@ -40,6 +41,7 @@ enum SceneCommand {
         #[arg(long)]
         force: bool,
     },
+    Bake(bake::BakeArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
     View(vizflyt_server::ViewArgs),
@@ -51,6 +53,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Generate { kind, seed, output, force } => {
             generate(kind, seed, &output, force)?;
         }
+        SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::View(args) => view(args)?,

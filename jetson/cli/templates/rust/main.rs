@@ -82,7 +82,7 @@ mod tests {
             body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
         };
         let mut buffer = ObservationBuffer::new(&[front]);
-        let stamps = ImageStamps { seq: 1, pose: HostTime::ZERO, ready: HostTime::ZERO };
+        let stamps = ImageStamps { seq: 1, ..ImageStamps::default() };
         buffer.set_image(0, stamps, |planes| {
             for row in planes.depth_mm.chunks_mut(64) {
                 row[..32].fill(left_mm);

@@ -151,7 +151,7 @@ impl Avoid {
 /// Returns the image with the pose its camera had: the vehicle's state is newer (or older) than
 /// the image by some milliseconds, over which it moved and turned at a steady rate.
 fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
-    let ahead_s = camera.stamp.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
+    let ahead_s = camera.shown.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
     let then: Pose<World, _> = Pose::new(
         vehicle.world_from_body.translation_m + vehicle.v_world_mps * ahead_s,
         vehicle.world_from_body.rotation

@@ -1,5 +1,5 @@
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::bounded;
+use vizflyt_sdk::protocol::messages::{PoseAges, bounded};
 use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, Limits, ObservationBuffer, Volume};
 
 use super::*;
@@ -13,6 +13,8 @@ fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 },
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
@@ -20,6 +22,7 @@ fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         cameras: [front].into_iter().collect(),
     }
@@ -44,7 +47,7 @@ fn see(plugin: &mut Avoid, vehicle: Option<Vehicle>, depth_mm: u16) -> Option<Se
     if let Some(vehicle) = vehicle {
         buffer.set_vehicle(&vehicle);
     }
-    let stamps = ImageStamps { seq: 1, pose: stamp, ready: stamp };
+    let stamps = ImageStamps { seq: 1, pose: stamp, ready: stamp, ahead_ns: 0 };
     buffer.set_image(0, stamps, |planes| planes.depth_mm.fill(depth_mm));
     plugin.on_image(&buffer.observation())
 }

@@ -64,6 +64,8 @@ const VERSION_S: f64 = 4.0;
 const LIST_S: f64 = 90.0;
 /// A value is asked for five times.
 const WRITE_S: f64 = 5.0;
+/// A message is with the autopilot by then, over any link. [s]
+const TAKES_S: f64 = 1.0;
 
 impl Visit {
     /// Finds the autopilot.
@@ -172,7 +174,9 @@ impl Visit {
             return Err(VisitError::Armed);
         }
         self.link.setup_signing(host_now(), signing);
-        self.transmit();
+        // The autopilot gets the time to take it: a connection closed at once, with telemetry in it that
+        // nobody has read, is reset, and the key is lost with it.
+        self.until(TAKES_S, |_, _| None::<()>);
         Ok(())
     }
 

@@ -25,9 +25,10 @@ use std::time::{Duration, Instant};
 use glam::DVec3;
 use serde_json::json;
 use vizflyt_protocol::messages::{
-    CameraInfo, Event, EventKind, FlightPhase, FromPlugin, PoseSample, ToPlugin, bounded,
+    CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ImuReading, PoseSample, ToPlugin,
+    bounded,
 };
-use vizflyt_protocol::time::HostTime;
+use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle, host_now};
 
 use crate::console::Screen;
@@ -86,6 +87,8 @@ pub struct Control {
     pub plugin_limits: PluginLimits,
     /// Limits of the flight as a whole.
     pub settings: FlightSettings,
+    /// A person must press start before it takes off.
+    pub waits_for_start: bool,
     /// The way to the autopilot.
     pub port: Arc<Port>,
     /// What a person has set of the link.
@@ -137,19 +140,24 @@ struct Loop {
     v_setpoint_mps: DVec3,
     steering: Steering,
     ticks: u64,
+    /// When the newest IMU reading was made that the server was told of.
+    imu_told: HostTime,
 }
 
 impl Control {
     /// Flies to the end. Call it on a thread that lives as long: the plugin dies with it.
     pub fn run(self, sender: SyncSender<Happening>, happenings: &Receiver<Happening>) -> Flown {
         let now = host_now();
-        let settings = self.settings;
+        let mut flight = Flight::new(self.settings, now);
+        if self.waits_for_start {
+            flight.wait_for_start();
+        }
         let link = Link::with(now, self.link.clone());
         let mut state = Loop {
             control: self,
             sender,
             link,
-            flight: Flight::new(settings, now),
+            flight,
             plugin: None,
             senses: SharedSenses::default(),
             times: ImageTimes::default(),
@@ -164,6 +172,7 @@ impl Control {
             v_setpoint_mps: DVec3::ZERO,
             steering: Steering::new(now),
             ticks: 0,
+            imu_told: HostTime::ZERO,
         };
         let outcome = state.fly(happenings);
         state.finish(outcome, happenings)
@@ -204,15 +213,7 @@ impl Loop {
 
     /// Lets the flight decide, and sends what it orders.
     fn steer(&mut self, now: HostTime) {
-        let state = self.link.state();
-        let view = LinkView {
-            connected: self.link.is_connected(),
-            armed: state.armed,
-            mode: state.mode,
-            took_off: self.link.took_off(),
-            ready_to_arm: self.link.ready_to_arm(now),
-        };
-        let orders = self.flight.tick(now, &view);
+        let orders = self.flight.tick(now, &LinkView::of(&self.link, now));
         self.steering.done(now);
         self.link.set_goal(now, orders.goal);
         let Some(setpoint) = orders.setpoint else { return self.transmit() };
@@ -319,6 +320,8 @@ impl Loop {
             StreamEvent::Event(event) => {
                 self.publish_event(now, &event);
                 self.flight.handle(now, Input::Server(event));
+                // It may have ended the flight: LAND does not wait for the next setpoint's turn.
+                self.steering.hurry();
             }
             StreamEvent::Camera(index, camera) => self.take_camera(index, &camera),
         }
@@ -339,7 +342,7 @@ impl Loop {
     }
 
     fn take_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
-        self.link.vision(now, &sample.world_from_body, stamp, sample.resets);
+        self.link.vision(now, sample, stamp);
         self.flight.handle(now, Input::Pose(Fix::of(sample, stamp)));
         if self.gives_ground_truth() {
             let vehicle = Vehicle {
@@ -362,6 +365,15 @@ impl Loop {
 
     /// Passes on what the autopilot has told of battery, IMU and attitude.
     fn sense(&mut self) {
+        let clock = &self.control.shared.clock;
+        for sample in self.link.imu().iter().filter(|sample| sample.stamp > self.imu_told) {
+            let stamp = clock.to_server(sample.stamp);
+            if stamp > ServerTime::ZERO {
+                let ImuSample { accel_mps2, gyro_radps, .. } = *sample;
+                self.control.to_server.imu(ImuReading { stamp, accel_mps2, gyro_radps });
+            }
+        }
+        self.imu_told = self.link.imu().back().map_or(self.imu_told, |newest| newest.stamp);
         let state = self.link.state();
         let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
         let withheld = self.plugin.is_some() && !self.gives_ground_truth();

@@ -13,10 +13,10 @@ use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
 use vizflyt_sdk::{ObservationWriter, host_now};
 
 use super::{Happening, Loop};
-use crate::answers;
+use crate::answers::Answers;
 use crate::flight::Input;
 use crate::images::ImagePublisher;
-use crate::supervisor::{Confinement, Restart, Supervisor};
+use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
 /// The plugin hears of us at least this often.
 const HEARTBEAT_TICKS: u64 = 20;
@@ -46,8 +46,7 @@ pub(super) struct PluginSide {
     /// The present process is on its way out, and another will be started; until when it may go
     /// by itself.
     pub(super) leaving: Option<Instant>,
-    /// Another process speaks: what the former one did is forgotten.
-    pub(super) anew: Arc<AtomicBool>,
+    pub(super) answers: Arc<Answers>,
     /// Ends its threads.
     pub(super) stop: Arc<AtomicBool>,
     pub(super) threads: Vec<JoinHandle<()>>,
@@ -71,8 +70,9 @@ impl Loop {
                 return self.flight.handle(now, Input::ServerRefused(error.to_string()));
             }
         };
-        let (stop, anew) = (Arc::default(), Arc::default());
-        let threads = self.start_threads(&ipc, &arena, &stop, &anew);
+        let stop = Arc::default();
+        let answers = Arc::new(Answers::new(Arc::clone(&ipc)));
+        let threads = self.start_threads(&ipc, &arena, &stop, &answers);
         let mut offer = None;
         if by_hand {
             match Offer::make(&service) {
@@ -96,7 +96,7 @@ impl Loop {
             arena,
             started: false,
             leaving: None,
-            anew,
+            answers,
             stop,
             threads,
         });
@@ -132,9 +132,15 @@ impl Loop {
     /// Starts the plugin's process, the first or another.
     pub(super) fn start_process(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
-        let (sender, run) = (self.sender.clone(), side.run);
+        let (sender, answers, run) = (self.sender.clone(), Arc::clone(&side.answers), side.run);
         // Lines and the end are never dropped: the loop always reads.
         let tell = move |event| {
+            if let PluginEvent::Exited(_) = &event {
+                // What it said comes before the news of its end: it may be why.
+                answers.drain(|message| {
+                    let _ = sender.send(Happening::FromPlugin(Box::new(message)));
+                });
+            }
             let _ = sender.send(Happening::Plugin(run, event));
         };
         match Supervisor::start(&side.command, &side.confinement, tell) {
@@ -172,7 +178,7 @@ impl Loop {
         let Some(side) = &mut self.plugin else { return };
         if side.leaving.take().is_some() && self.flight.can_wait_for_plugin() {
             (side.run, side.started) = (side.run + 1, false);
-            side.anew.store(true, Ordering::Relaxed);
+            side.answers.begin_anew();
             self.start_process(now);
         }
     }
@@ -208,7 +214,7 @@ impl Loop {
         ipc: &Arc<RuntimeEnd>,
         arena: &ArenaInfo,
         stop: &Arc<AtomicBool>,
-        anew: &Arc<AtomicBool>,
+        answers: &Arc<Answers>,
     ) -> Vec<JoinHandle<()>> {
         let cameras = arena.cameras.to_vec();
         let mailbox = Arc::clone(&self.control.shared.mailbox);
@@ -224,10 +230,10 @@ impl Loop {
                 },
             );
         });
-        let (ipc, sender) = (Arc::clone(ipc), self.sender.clone());
-        let (stopped, anew) = (Arc::clone(stop), Arc::clone(anew));
+        let (answers, sender, stopped) =
+            (Arc::clone(answers), self.sender.clone(), Arc::clone(stop));
         let answers = spawn("answers", move || {
-            answers::read(&ipc, &stopped, &anew, |message| {
+            answers.read(&stopped, |message| {
                 let _ = sender.send(Happening::FromPlugin(Box::new(message)));
             });
         });

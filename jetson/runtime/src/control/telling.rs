@@ -2,17 +2,17 @@
 
 use std::io::Write;
 
-use glam::DVec3;
 use serde_json::json;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Arrivals, Event, EventKind, MAX_CAMERAS, Telemetry, ToPlugin, YawTarget, bounded,
+    Arrivals, Event, EventKind, MAX_CAMERAS, Telemetry, ToPlugin, YawTarget, bounded,
 };
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::host_now;
 
 use super::Loop;
 use crate::console::Status;
+use crate::lockstep::for_plugin;
 use crate::log::Channel;
 
 /// The status line is renewed every so many ticks, a multiple of those of the reports: 2 Hz.
@@ -109,18 +109,6 @@ impl Loop {
             }),
         );
     }
-}
-
-/// Returns the event as the plugin may know it: without the place where the course withholds it.
-fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
-    let mut event = event.clone();
-    if !arena.ground_truth
-        && let EventKind::Collision { p_world_m, .. } | EventKind::Geofence { p_world_m, .. } =
-            &mut event.kind
-    {
-        *p_world_m = DVec3::ZERO;
-    }
-    event
 }
 
 /// Prints a line for a program that may have stopped listening.

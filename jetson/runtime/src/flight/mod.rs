@@ -8,6 +8,8 @@
 //!  plugin         pose, image      │                  ▼
 //!                                  └────────────▶ Landing ──▶ Landed
 //! ```
+//! Where a person is to start it ([`Flight::wait_for_start`]), the flight stays `Waiting` between
+//! preparing and taking off, for as long as everything is ready.
 //! The first cause of a landing is the flight's [`Outcome`]; landing is never taken back.
 //!
 //! Why longer than most: one state machine, read best in one place.
@@ -21,15 +23,14 @@ use std::collections::VecDeque;
 
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, Setpoint,
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Setpoint,
 };
 use vizflyt_protocol::time::HostTime;
 
 use crate::guard::{
-    Fix, Guard, HoldReason, LandReason, POSE_HOLD_S, POSE_LAND_S, Passed, RESTART_WITHIN_S,
-    SETPOINT_HOLD_S, Stance,
+    Fix, Guard, HoldReason, LandReason, Passed, RESTART_WITHIN_S, SETPOINT_HOLD_S, Stance,
 };
-use crate::link::{Goal, LinkEvent};
+use crate::link::{Goal, Link, LinkEvent};
 pub use outcome::{Outcome, OutcomeKind};
 
 /// What a person may set.
@@ -101,6 +102,20 @@ pub struct LinkView {
     pub ready_to_arm: Result<(), Cow<'static, str>>,
 }
 
+impl LinkView {
+    /// Returns what `link` knows at `now`.
+    pub fn of(link: &Link, now: HostTime) -> Self {
+        let state = link.state();
+        Self {
+            connected: link.is_connected(),
+            armed: state.armed,
+            mode: state.mode,
+            took_off: link.took_off(),
+            ready_to_arm: link.ready_to_arm(now),
+        }
+    }
+}
+
 /// What is to be done now.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Orders {
@@ -163,6 +178,8 @@ pub struct Flight {
     interrupted_at: Option<HostTime>,
     disarmed_at: Option<HostTime>,
     connected_at: HostTime,
+    /// A person must press start before it takes off.
+    waits_for_start: bool,
     reminded_at: Option<HostTime>,
     /// Why all setpoints are being refused.
     refused: Option<InvalidSetpoint>,
@@ -197,6 +214,7 @@ impl Flight {
             interrupted_at: None,
             disarmed_at: None,
             connected_at: now,
+            waits_for_start: false,
             reminded_at: None,
             refused: None,
             landed_at: None,
@@ -204,6 +222,11 @@ impl Flight {
             fence_stopped_at: None,
             notices: VecDeque::new(),
         }
+    }
+
+    /// Keeps the vehicle on the ground until a person presses start.
+    pub fn wait_for_start(&mut self) {
+        self.waits_for_start = true;
     }
 
     /// Returns the phase of flight.
@@ -267,7 +290,7 @@ impl Flight {
         }
         match self.phase {
             FlightPhase::Connecting => self.connecting(now, link),
-            FlightPhase::Preparing => self.preparing(now, link),
+            FlightPhase::Preparing | FlightPhase::Waiting => self.preparing(now, link),
             FlightPhase::TakingOff => self.taking_off(now, link),
             FlightPhase::Flying | FlightPhase::Holding => return self.flying(now, link),
             FlightPhase::Landing => self.landing(now, link),
@@ -279,7 +302,9 @@ impl Flight {
     fn goal(&self) -> Goal {
         match self.phase {
             _ if self.hands_off => Goal::Prepare,
-            FlightPhase::Connecting | FlightPhase::Preparing => Goal::Prepare,
+            FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting => {
+                Goal::Prepare
+            }
             FlightPhase::TakingOff => {
                 Goal::TakeOff(self.arena.as_ref().map_or(0.0, |a| a.takeoff_height_m as f32))
             }
@@ -316,6 +341,17 @@ impl Flight {
             }
             EventKind::EmergencyStop => {
                 self.end_now(now, OutcomeKind::Landed, "the stop button was pressed".into());
+            }
+            EventKind::Land => {
+                self.end_in_order(now, OutcomeKind::Landed, "the land button was pressed".into());
+            }
+            EventKind::Start if self.phase == FlightPhase::Waiting => {
+                self.waits_for_start = false;
+            }
+            // Not kept for later: what made it unready may be a person in the net.
+            EventKind::Start if self.waits_for_start => {
+                let why = "start was pressed before the vehicle was ready; press it again then";
+                self.notice(EventKind::Note, why.to_owned());
             }
             EventKind::Finished { .. } if self.is_airborne() => {
                 self.end_in_order(now, OutcomeKind::Finished, text);
@@ -378,7 +414,7 @@ impl Flight {
             guard.wait_for_plugin(now);
         }
         self.notice(EventKind::Note, format!("{why}; the plugin is started again"));
-        if self.phase == FlightPhase::Preparing {
+        if matches!(self.phase, FlightPhase::Preparing | FlightPhase::Waiting) {
             self.enter(now, FlightPhase::Connecting, "waiting for the plugin");
         }
         self.restart_reason = Some(why);
@@ -386,7 +422,10 @@ impl Flight {
 
     /// Whether the vehicle stands on the ground, before take-off.
     pub fn is_on_ground(&self) -> bool {
-        matches!(self.phase, FlightPhase::Connecting | FlightPhase::Preparing)
+        matches!(
+            self.phase,
+            FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting
+        )
     }
 
     /// Whether the flight can go on without a plugin for a while.
@@ -433,9 +472,10 @@ impl Flight {
             return;
         }
         let pose_age_s = self.fix.map(|fix| now.seconds_since(fix.stamp));
+        let hold_after_s = self.pose_ages().hold_after_s;
         let missing = if link.armed {
             Some("the vehicle is armed already; disarm it first")
-        } else if pose_age_s.is_none_or(|age_s| age_s > POSE_HOLD_S) {
+        } else if pose_age_s.is_none_or(|age_s| age_s > hold_after_s) {
             Some("the server has no pose of the vehicle; check the localization and --vehicle")
         } else if self.answered_at.is_none() {
             Some("the plugin has not answered an image yet")
@@ -443,11 +483,25 @@ impl Flight {
             link.ready_to_arm.as_ref().err().map(AsRef::as_ref)
         };
         match (missing, self.fix) {
+            (None, Some(_)) if self.waits_for_start => {
+                if self.phase != FlightPhase::Waiting {
+                    self.enter(now, FlightPhase::Waiting, "ready; waiting for start to be pressed");
+                }
+            }
             (None, Some(fix)) => {
                 self.start_z_m = fix.p_world_m.z;
                 self.enter(now, FlightPhase::TakingOff, "pre-arm checks passed; taking off");
             }
-            (missing, _) => self.wait_for(now, missing.unwrap_or("waiting for a pose")),
+            (missing, _) => {
+                let missing = missing.unwrap_or("waiting for a pose").to_owned();
+                if self.phase == FlightPhase::Waiting {
+                    // The time to get ready counts anew: it was ready.
+                    self.started_at = now;
+                    let why = format!("no longer ready: {missing}");
+                    self.enter(now, FlightPhase::Preparing, &why);
+                }
+                self.wait_for(now, &missing);
+            }
         }
     }
 
@@ -457,7 +511,7 @@ impl Flight {
             self.took_off_at = Some(now);
         }
         let pose_age_s = now.seconds_since(fix.stamp);
-        if pose_age_s > POSE_LAND_S {
+        if pose_age_s > arena.pose_ages.land_after_s {
             let why = format!("pose lost for {pose_age_s:.1} s during take-off");
             return self.end_now(now, OutcomeKind::Error, why);
         }
@@ -592,7 +646,7 @@ impl Flight {
     fn end_now(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
         let reason = self.decide(kind, reason);
         match self.phase {
-            FlightPhase::Connecting | FlightPhase::Preparing => {
+            FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting => {
                 self.landed_at = Some(now);
                 self.enter(now, FlightPhase::Landed, &reason);
             }
@@ -658,7 +712,9 @@ impl Flight {
                         HoldReason::Asked => "the plugin asks to hold".to_owned(),
                         HoldReason::NoSetpoint => self.why_silent(now),
                         HoldReason::Restarting => "the plugin is being started again".to_owned(),
-                        HoldReason::PoseStale => "the pose is older than 0.5 s".to_owned(),
+                        HoldReason::PoseStale => {
+                            format!("the pose is older than {} s", self.pose_ages().hold_after_s)
+                        }
                         HoldReason::Ending => {
                             self.outcome.as_ref().map_or(String::new(), |o| o.reason.clone())
                         }
@@ -688,8 +744,16 @@ impl Flight {
             LandReason::OutsideFence(outside_m) => {
                 (OutcomeKind::Geofence, format!("{outside_m:.2} m outside the geofence"))
             }
+            LandReason::InNoFly(inside_m) => {
+                (OutcomeKind::Geofence, format!("{inside_m:.2} m inside a no-fly box"))
+            }
             LandReason::Ordered => (OutcomeKind::Landed, "landing was ordered".into()),
         }
+    }
+
+    /// Ages of a pose that the arena allows.
+    fn pose_ages(&self) -> PoseAges {
+        self.arena.as_ref().map(|arena| arena.pose_ages).unwrap_or_default()
     }
 
     /// Whether the plugin is idle because no image comes.

@@ -2,7 +2,7 @@
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::{Limits, YawTarget, bounded};
+use vizflyt_protocol::messages::{Limits, PoseAges, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
 
 use vizflyt_protocol::mavlink::GuidedMotion;
@@ -41,6 +41,8 @@ pub(crate) fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0)),
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(3.0, 5.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -48,6 +50,7 @@ pub(crate) fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 30.0,
         ground_truth: true,
+        pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
         attitude_rate: false,
         cameras: heapless::Vec::new(),
     }
@@ -76,6 +79,17 @@ impl Script {
             orders: Orders { goal: Goal::Prepare, setpoint: None, answers: None },
             notices: Vec::new(),
         }
+    }
+
+    /// Ready, if a person is to start it.
+    fn waiting() -> Self {
+        let mut script = Self::new();
+        script.flight.wait_for_start();
+        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+        script.flight.handle(script.now, Input::PluginReady);
+        script.run(4.0);
+        assert_eq!(script.flight.phase(), FlightPhase::Waiting, "{:?}", script.notices);
+        script
     }
 
     fn flying() -> Self {
@@ -243,6 +257,43 @@ fn each_event_has_its_outcome() {
     check(EventKind::Geofence { p_world_m, margin_m: 0.0 }, OutcomeKind::Geofence);
     check(EventKind::TimeLimit, OutcomeKind::Timeout);
     check(EventKind::EmergencyStop, OutcomeKind::Landed);
+}
+
+#[test]
+fn the_land_button_brakes_then_lands() {
+    let mut script = Script::flying();
+    script.server(EventKind::Land, "land");
+    script.check_end(OutcomeKind::Landed, "the land button was pressed");
+}
+
+#[test]
+fn a_flight_that_waits_takes_off_when_start_is_pressed_and_not_before() {
+    let mut script = Script::waiting();
+    // Longer than it may take to get ready: waiting for a person has no end.
+    script.run(60.0);
+    assert_eq!((script.flight.phase(), script.orders.goal), (FlightPhase::Waiting, Goal::Prepare));
+    // It gets unready, and start is pressed: that start does not count when it is ready again.
+    script.link.ready_to_arm = Err("battery low".into());
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), Preparing);
+    script.server(EventKind::Start, "start");
+    script.run(1.0);
+    assert!(script.notices.iter().any(|n| n.text.contains("press it again")));
+    script.link.ready_to_arm = Ok(());
+    script.run(5.0);
+    assert_eq!(script.flight.phase(), FlightPhase::Waiting);
+    script.server(EventKind::Start, "start");
+    script.run(4.0);
+    assert_eq!(script.flight.phase(), Flying);
+}
+
+#[test]
+fn a_flight_that_waits_ends_at_once_by_either_button() {
+    for kind in [EventKind::Land, EventKind::EmergencyStop] {
+        let mut script = Script::waiting();
+        script.server(kind, "over");
+        assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+    }
 }
 
 #[test]

@@ -1,15 +1,18 @@
-//! The geofence with stopping distance: how fast the vehicle may approach each face, and the
-//! ceiling that `max_altitude_m` is.
+//! The geofence with stopping distance: how fast the vehicle may approach each face, the ceiling
+//! that `max_altitude_m` is, the floor, and the boxes that it must stay out of.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::ArenaInfo;
+use vizflyt_protocol::messages::{ArenaInfo, MAX_NO_FLY};
 
-/// The keep-in volume, shrunk by the body and a margin.
-#[derive(Clone, Copy, Debug)]
+/// The keep-in volume, shrunk by the body and a margin, and what to keep out of.
+#[derive(Clone, Debug)]
 pub(super) struct Fence {
     volume: Volume,
+    keep_out: heapless::Vec<Volume, MAX_NO_FLY>,
     body_radius_m: f64,
+    /// Least height of the body's centre while a plugin flies. [m, world]
+    floor_m: f64,
     /// Greatest height of the body's centre, if there is one. [m, world]
     ceiling_m: Option<f64>,
     /// Acceleration that the stopping distance counts on, per face. [m/s^2]
@@ -25,6 +28,11 @@ const REACTION_S: f64 = 0.3;
 /// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
 /// an autopilot's integrators carry the vehicle a decimetre too far. [m]
 const MARGIN_M: f64 = 0.2;
+/// Kept free under the body while a plugin flies; landing is the autopilot's. Less than the
+/// fence's: low flight is part of courses, and a touch there is a bump. [m]
+const FLOOR_MARGIN_M: f64 = 0.05;
+/// Turns of keeping off boxes and fence in which a corner between them settles.
+const SETTLING_TURNS: usize = 4;
 /// Along a curved face, the part of the distance left that one stopping path may not use up.
 const KEPT_SHARE: f64 = 0.9;
 /// Way back from beyond the margin, by how far beyond it is. [1/s]
@@ -36,6 +44,8 @@ impl Fence {
     pub(super) fn new(arena: &ArenaInfo, max_acceleration_mps2: f64) -> Self {
         Self {
             volume: arena.geofence,
+            keep_out: arena.no_fly.clone(),
+            floor_m: arena.floor_z_m + arena.body_radius_m + FLOOR_MARGIN_M,
             body_radius_m: arena.body_radius_m,
             ceiling_m: arena.limits.max_altitude_m,
             stopping_mps2: STOPPING_SHARE * max_acceleration_mps2,
@@ -47,9 +57,47 @@ impl Fence {
         self.volume.signed_distance_m(p_m) + self.body_radius_m
     }
 
-    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence or the
-    /// ceiling. Motion along a face is left as it is. [m/s, world]
+    /// Returns how far the body's surface reaches into a box that it must stay out of; negative
+    /// outside of all. [m]
+    pub(super) fn inside_no_fly_m(&self, p_m: DVec3) -> f64 {
+        let depth_m = |volume: &Volume| self.body_radius_m - volume.signed_distance_m(p_m);
+        self.keep_out.iter().map(depth_m).fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling,
+    /// the floor, or into a box. Motion along a face is left as it is. [m/s, world]
     pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+        let mut v = self.within(p_m, v_mps);
+        if self.keep_out.is_empty() {
+            return v;
+        }
+        // What keeps one off a box may lead to another, or to the fence: some turns settle it.
+        for _ in 0..SETTLING_TURNS {
+            for volume in &self.keep_out {
+                let (towards, most) = self.towards(volume, p_m);
+                v += towards * (most - v.dot(towards)).min(0.0);
+            }
+            v = self.within(p_m, v);
+        }
+        // Where there is no way at all, less of it: the fence stays kept, and so do the boxes.
+        let share = self.keep_out.iter().fold(1.0, |share: f64, volume| {
+            let (towards, most) = self.towards(volume, p_m);
+            let speed_mps = v.dot(towards);
+            if speed_mps > most.max(0.0) { share.min(most.max(0.0) / speed_mps) } else { share }
+        });
+        v * share
+    }
+
+    /// Returns the direction to a box, and the greatest speed that way: boxes are convex, so a
+    /// vehicle comes nearer by no more than it moves along the direction of the moment. [m/s]
+    fn towards(&self, volume: &Volume, p_m: DVec3) -> (DVec3, f64) {
+        let free_m = volume.signed_distance_m(p_m) - self.body_radius_m - MARGIN_M;
+        (-volume.outward_normal(p_m), self.approach_mps(free_m))
+    }
+
+    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling
+    /// or the floor. [m/s, world]
+    fn within(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
         match self.volume {
             // Each face on its own, so that the vehicle can slide along two into a corner.
             Volume::Cuboid { center_m, half_m, rotation } => {
@@ -63,7 +111,7 @@ impl Fence {
                     v[axis] = if least > most { 0.0 } else { v[axis].clamp(least, most) };
                 }
                 let v = rotation * v;
-                let below = self.below_ceiling(p_m, v);
+                let below = self.between_floor_and_ceiling(p_m, v);
                 // Less climb changes the way towards the walls only of a room that leans.
                 let leans = (rotation * DVec3::Z).z.abs() < 1.0 - 1e-9;
                 if leans && below != v { self.shorten(p_m, below) } else { below }
@@ -74,15 +122,17 @@ impl Fence {
                 let free_m = -self.outside_m(p_m) - MARGIN_M;
                 let most = self.approach_mps(free_m);
                 let v = v_mps + outward * (most - v_mps.dot(outward)).min(0.0);
-                self.shorten(p_m, self.below_ceiling(p_m, v))
+                self.shorten(p_m, self.between_floor_and_ceiling(p_m, v))
             }
         }
     }
 
-    /// Returns `v_mps` without a climb that would not end below the ceiling. [m/s, world]
-    fn below_ceiling(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+    /// Returns `v_mps` without a climb that would not end below the ceiling, or a descent that would
+    /// not end over the floor. [m/s, world]
+    fn between_floor_and_ceiling(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
         let most = self.ceiling_m.map(|ceiling_m| self.approach_mps(ceiling_m - MARGIN_M - p_m.z));
-        v_mps.with_z(v_mps.z.min(most.unwrap_or(f64::INFINITY)))
+        let least = -self.approach_mps(p_m.z - self.floor_m);
+        v_mps.with_z(v_mps.z.max(least).min(most.unwrap_or(f64::INFINITY)))
     }
 
     /// Returns the greatest speed towards a face that is `free_m` away from which the vehicle

@@ -2,12 +2,13 @@
 //!
 //! Called at 50 to 200 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
 //! 1. a landing, once begun, is never taken back;
-//! 2. deadlines: a pose older than 0.5 s or no setpoint for 0.5 s holds, 2 s lands;
+//! 2. deadlines: a pose older than the arena's `hold_after_s`, or no setpoint for 0.5 s, holds; a pose older
+//!    than `land_after_s`, or no setpoint for 2 s, lands;
 //! 3. what the plugin asks becomes a velocity in world axes (positions by a braking profile,
 //!    accelerations by integration, attitude rates by the acceleration that the attitude means,
 //!    trajectories by a moving point); numbers that are not finite were refused at [`Guard::ask`];
-//! 4. speed limit, acceleration limit (which also bounds tilt), then the geofence and the ceiling:
-//!    never faster towards a face than the vehicle can stop before it.
+//! 4. speed limit, acceleration limit (which also bounds tilt), then the geofence, the ceiling, the
+//!    floor and the no-fly boxes: never faster towards a face than the vehicle can stop before it.
 //!
 //! Everything leaves as a velocity, so that one slew limit and one fence rule bound all motion.
 
@@ -19,7 +20,7 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Volume, wrap_pi, yaw_of};
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Axes, InvalidSetpoint, Limits, Path, PoseSample, Setpoint, YawTarget,
+    ArenaInfo, Axes, InvalidSetpoint, Limits, Path, PoseAges, PoseSample, Setpoint, YawTarget,
 };
 use vizflyt_protocol::time::HostTime;
 
@@ -56,7 +57,7 @@ pub enum HoldReason {
     Asked,
     /// No setpoint has come for [`SETPOINT_HOLD_S`].
     NoSetpoint,
-    /// The newest pose is older than [`POSE_HOLD_S`].
+    /// The newest pose is older than [`PoseAges::hold_after_s`].
     PoseStale,
     /// The plugin is being started again.
     Restarting,
@@ -77,6 +78,8 @@ pub enum LandReason {
     PoseLost(f64),
     /// The body is outside the fence by so much. [m]
     OutsideFence(f64),
+    /// The body reaches into a no-fly box by so much. [m]
+    InNoFly(f64),
     /// Whoever called [`Guard::land`] knows why.
     Ordered,
 }
@@ -99,12 +102,9 @@ pub const SETPOINT_LAND_S: f64 = 2.0;
 /// A plugin that is started again may take so long until its first setpoint: an interpreter that
 /// loads numpy and a small model. [s]
 pub const RESTART_WITHIN_S: f64 = 10.0;
-/// Newest pose this old: hold. At 6 m/s that is 3 m flown blind. [s]
-pub const POSE_HOLD_S: f64 = 0.5;
-/// Newest pose this old: land. ArduCopter's own estimate lasts 7 s without external navigation
-/// (measured), so it still lands in place. [s]
-pub const POSE_LAND_S: f64 = 2.0;
 
+/// A pose is moved on by its velocity for so long at most. [s]
+const EXTRAPOLATED_S: f64 = 0.5;
 /// A speed below which the vehicle counts as stopped. [m/s]
 const STOPPED_MPS: f64 = 0.3;
 /// Braking before an orderly landing takes this long at most. [s]
@@ -168,6 +168,7 @@ pub struct Guard {
     /// Where the vehicle was when the plugin took over. [m, world]
     take_off_z_m: f64,
     attitude_rate_allowed: bool,
+    pose_ages: PoseAges,
     /// When the newest setpoint came, or the plugin took over.
     asked_at: HostTime,
     ticked_at: HostTime,
@@ -196,6 +197,7 @@ impl Guard {
             resolved: Resolved::Nothing,
             take_off_z_m: fix.p_world_m.z,
             attitude_rate_allowed: arena.attitude_rate,
+            pose_ages: arena.pose_ages,
             asked_at: now,
             ticked_at: now,
             ending_until: None,
@@ -296,7 +298,7 @@ impl Guard {
         let change = (v_target - self.v_command_mps).clamp_length_max(slew_mps);
         let v_slewed = self.v_command_mps + change;
         // Where the vehicle is now, not when the pose was measured.
-        let age_s = now.seconds_since(fix.stamp).clamp(0.0, POSE_HOLD_S);
+        let age_s = now.seconds_since(fix.stamp).clamp(0.0, EXTRAPOLATED_S);
         let p_now = fix.p_world_m + fix.v_world_mps * age_s;
         // The fence comes last: where it and the slew limit disagree, it wins.
         let v_inside = self.fence.limit(p_now, v_slewed);
@@ -312,12 +314,16 @@ impl Guard {
             return Stance::Landing(reason);
         }
         let pose_age_s = now.seconds_since(fix.stamp);
-        if pose_age_s > POSE_LAND_S {
+        if pose_age_s > self.pose_ages.land_after_s {
             return Stance::Landing(LandReason::PoseLost(pose_age_s));
         }
         let outside_m = self.fence.outside_m(fix.p_world_m);
         if outside_m > 0.0 {
             return Stance::Landing(LandReason::OutsideFence(outside_m));
+        }
+        let inside_m = self.fence.inside_no_fly_m(fix.p_world_m);
+        if inside_m > 0.0 {
+            return Stance::Landing(LandReason::InNoFly(inside_m));
         }
         if let Some(until) = self.ending_until {
             if now >= until || fix.v_world_mps.length() < STOPPED_MPS {
@@ -326,7 +332,7 @@ impl Guard {
             return Stance::Holding(HoldReason::Ending);
         }
         if let Some(until) = self.restarting_until {
-            return match pose_age_s > POSE_HOLD_S {
+            return match pose_age_s > self.pose_ages.hold_after_s {
                 _ if now >= until => Stance::Landing(LandReason::NoPlugin),
                 true => Stance::Holding(HoldReason::PoseStale),
                 false => Stance::Holding(HoldReason::Restarting),
@@ -336,7 +342,7 @@ impl Guard {
         if silent_s > SETPOINT_LAND_S {
             return Stance::Landing(LandReason::NoSetpoint(silent_s));
         }
-        if pose_age_s > POSE_HOLD_S {
+        if pose_age_s > self.pose_ages.hold_after_s {
             return Stance::Holding(HoldReason::PoseStale);
         }
         if silent_s > SETPOINT_HOLD_S {
@@ -574,6 +580,9 @@ pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
     if !arena.geofence.is_valid() {
         return Err("arena: geofence is not a volume".into());
     }
+    if !arena.no_fly.iter().all(Volume::is_valid) || !arena.floor_z_m.is_finite() {
+        return Err("arena: no_fly must be volumes, and floor_z_m a number".into());
+    }
     if !positive(arena.limits.max_speed_mps) || !positive(arena.limits.max_acceleration_mps2) {
         return Err("arena: limits must be positive numbers".into());
     }
@@ -593,6 +602,10 @@ pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
     }
     if !positive(arena.takeoff_height_m) {
         return Err("arena: takeoff_height_m must be a positive number".into());
+    }
+    let PoseAges { hold_after_s, land_after_s } = arena.pose_ages;
+    if !(positive(hold_after_s) && land_after_s.is_finite() && land_after_s > hold_after_s) {
+        return Err("arena: pose.land_after_s must exceed pose.hold_after_s, both positive".into());
     }
     if let Volume::Cuboid { half_m, .. } = arena.geofence
         && half_m.min_element() <= arena.body_radius_m

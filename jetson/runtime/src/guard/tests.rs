@@ -12,6 +12,8 @@ fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> Ar
     ArenaInfo {
         name: bounded("test"),
         geofence,
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(max_speed_mps, max_acceleration_mps2),
         body_radius_m: 0.12,
         takeoff_height_m: 1.0,
@@ -19,6 +21,7 @@ fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> Ar
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
+        pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
         attitude_rate: true,
         cameras: heapless::Vec::new(),
     }
@@ -153,6 +156,22 @@ fn volume() -> impl Strategy<Value = Volume> {
     ]
 }
 
+/// Boxes in the room, not where the vehicle starts.
+fn no_fly() -> impl Strategy<Value = Vec<Volume>> {
+    let corner = (-5.0..5.0f64, -3.0..3.0f64, -1.0..4.0f64);
+    let side = (0.05..2.0f64, 0.05..2.0f64, 0.05..3.0f64);
+    let keep_out = (corner, side).prop_map(|(corner, side)| {
+        let min_m = DVec3::from(corner);
+        Volume::aabb(min_m, min_m + DVec3::from(side))
+    });
+    let start_m = DVec3::Z * 2.0;
+    let away = move |volume: &Volume| volume.signed_distance_m(start_m) > 0.5;
+    prop_oneof![
+        Just(Vec::new()),
+        prop::collection::vec(keep_out.prop_filter("the vehicle starts there", away), 1..4),
+    ]
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
 
@@ -164,10 +183,13 @@ proptest! {
         max_acceleration_mps2 in 2.0..10.0f64,
         max_tilt_deg in prop::option::of(12.0..60.0f64),
         max_altitude_m in prop::option::of(2.4..6.0f64),
+        floor_z_m in -3.0..1.5f64,
+        no_fly in no_fly(),
         asked in prop::collection::vec((setpoint(), 1usize..60), 1..10),
     ) {
         let mut arena = arena(geofence, max_speed_mps, max_acceleration_mps2);
         (arena.limits.max_tilt_deg, arena.limits.max_altitude_m) = (max_tilt_deg, max_altitude_m);
+        (arena.floor_z_m, arena.no_fly) = (floor_z_m, no_fly.iter().copied().collect());
         // It could do more than it may.
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
         let mut guard = Guard::new(&arena, &vehicle.fix(time(0)), time(0));
@@ -197,13 +219,18 @@ proptest! {
                 let change_mps2 = (v - v_before).length() / TICK_S;
                 // Where slew limit and fence disagree the fence wins: at flat faces by a little,
                 // at curved ones by as much as it takes.
-                let flat = matches!(geofence, Volume::Cuboid { .. });
+                let flat = matches!(geofence, Volume::Cuboid { .. }) && no_fly.is_empty();
                 let most_mps2 = FENCE_EXCESS * acceleration_within_tilt_mps2(&arena.limits);
                 prop_assert!(!flat || change_mps2 <= most_mps2 + 1e-9, "{change_mps2}");
                 v_before = v;
                 vehicle.fly(v);
                 let outside_m = geofence.signed_distance_m(vehicle.p_m) + arena.body_radius_m;
                 prop_assert!(outside_m <= 0.0, "{outside_m} m outside at {}", vehicle.p_m);
+                prop_assert!(vehicle.p_m.z - arena.body_radius_m >= floor_z_m, "{}", vehicle.p_m);
+                for volume in &no_fly {
+                    let free_m = volume.signed_distance_m(vehicle.p_m) - arena.body_radius_m;
+                    prop_assert!(free_m >= 0.0, "{free_m} m from {volume:?} at {}", vehicle.p_m);
+                }
                 prop_assert!(vehicle.v_mps.length() <= max_speed_mps + 1e-9);
                 let tilts = max_tilt_deg.is_some_and(|most| vehicle.tilt_deg() > most + 1e-6);
                 prop_assert!(!flat || !tilts, "{} deg", vehicle.tilt_deg());
@@ -312,6 +339,50 @@ fn outside_the_fence_it_lands() {
     assert!(
         matches!(stance, Stance::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9)
     );
+}
+
+#[test]
+fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
+    let mut arena = arena(room(), 3.0, 4.0);
+    let pillar = Volume::aabb(DVec3::new(1.0, -0.5, 0.0), DVec3::new(1.5, 0.4, 4.0));
+    arena.no_fly.push(pillar).unwrap();
+    let mut guard = Guard::new(&arena, &at_rest(0), time(0));
+    let inside = Fix { p_world_m: DVec3::new(0.95, 0.0, 2.0), ..at_rest(1) };
+    let (passed, stance) = guard.tick(time(1), &inside);
+    assert_eq!(passed, Passed::Land);
+    assert!(
+        matches!(stance, Stance::Landing(LandReason::InNoFly(m)) if (m - 0.07).abs() < 1e-9),
+        "{stance:?}"
+    );
+    // Straight at it: it stops before it. Past its edge: it goes round.
+    let mut guard = Guard::new(&arena, &at_rest(0), time(0));
+    let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
+    let mut fly = |v_mps, ticks: std::ops::Range<usize>| {
+        for tick in ticks {
+            guard.ask(time(tick), velocity(v_mps)).unwrap();
+            let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+            vehicle.fly(v);
+        }
+        vehicle.p_m
+    };
+    let p_m = fly(DVec3::X * 3.0, 1..200);
+    assert!((p_m - DVec3::new(0.68, 0.0, 2.0)).length() < 0.03, "{p_m}");
+    let p_m = fly(DVec3::new(2.0, 1.0, 0.0), 200..400);
+    assert!(p_m.x > 2.0 && p_m.y > 0.7, "{p_m}");
+}
+
+#[test]
+fn a_plugin_does_not_fly_into_the_floor() {
+    // The fence reaches below it, as every arena's does: vehicles land there.
+    let deep = Volume::aabb(DVec3::new(-5.0, -3.0, -0.5), DVec3::new(5.0, 3.0, 4.0));
+    let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), time(0));
+    let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
+    for tick in 1..200 {
+        guard.ask(time(tick), velocity(DVec3::new(0.2, 0.0, -3.0))).unwrap();
+        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        vehicle.fly(v);
+    }
+    assert!((0.12..0.2).contains(&vehicle.p_m.z) && vehicle.v_mps.x > 0.1, "{}", vehicle.p_m);
 }
 
 #[test]
@@ -520,5 +591,8 @@ fn arenas_the_guard_cannot_keep_are_refused() {
     let tiny = Volume::aabb(DVec3::ZERO, DVec3::splat(0.2));
     assert!(check_arena(&arena(tiny, 3.0, 4.0)).unwrap_err().contains("too small"));
     let bad = Volume::Sphere { center_m: DVec3::ZERO, radius_m: -1.0 };
+    let mut holed = arena(room(), 3.0, 4.0);
+    holed.no_fly.push(bad).unwrap();
+    assert!(check_arena(&holed).unwrap_err().contains("no_fly"));
     assert!(check_arena(&arena(bad, 3.0, 4.0)).unwrap_err().contains("geofence"));
 }

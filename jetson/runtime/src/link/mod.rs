@@ -34,7 +34,7 @@ mod words;
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
 
-use vizflyt_protocol::geometry::{Body, Pose, World};
+use glam::DVec3;
 use vizflyt_protocol::mavlink::dialect::{
     EkfStatusFlags, MavCmd, MavMessage, MavSysStatusSensor, SETUP_SIGNING_DATA,
 };
@@ -42,7 +42,7 @@ use vizflyt_protocol::mavlink::{
     GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
     vision_to_mavlink,
 };
-use vizflyt_protocol::messages::VehicleState;
+use vizflyt_protocol::messages::{PoseSample, VehicleState};
 use vizflyt_protocol::time::{Autopilot, Host, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
@@ -134,8 +134,11 @@ pub const COMPONENT_ID: u8 = 191;
 const SECOND_S: f64 = 1.0;
 /// An autopilot silent for this long is lost: three heartbeats. [s]
 const LOST_AFTER_S: f64 = 3.0;
-/// Standard deviation stated with each pose. Mocap is better, but the filter needs slack. [m]
-const VISION_SIGMA_M: f32 = 0.02;
+/// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
+/// the autopilot's filter takes for independent. [m]
+const VISION_SIGMA_M: DVec3 = DVec3::splat(0.02);
+/// The same of attitudes: one degree. [rad]
+const VISION_SIGMA_RAD: DVec3 = DVec3::splat(0.02);
 /// Datagrams waiting at most; the driver empties the queue at once, so this is never reached.
 const OUTBOX: usize = 512;
 
@@ -332,11 +335,14 @@ impl Link {
 
     /// Feeds a localized pose, true at `stamp`, as external navigation. Call it with every pose;
     /// it passes on as many a second as are set, and none that is half a second old.
-    pub fn vision(&mut self, now: HostTime, pose: &Pose<World, Body>, stamp: HostTime, resets: u8) {
-        if self.autopilot.is_some() && pose.is_valid() && self.feed.take(now, stamp) {
+    pub fn vision(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
+        if self.autopilot.is_some() && sample.is_valid() && self.feed.take(now, stamp) {
             // The autopilot relates this clock to its own by itself.
             let usec = stamp.as_ns() / 1000;
-            let message = vision_to_mavlink(pose, usec, resets, VISION_SIGMA_M);
+            let (pose, resets) = (&sample.world_from_body, sample.resets);
+            let p_sigma_m = sample.position_sigma_m.as_dvec3().max(VISION_SIGMA_M);
+            let r_sigma_rad = sample.rotation_sigma_rad.as_dvec3().max(VISION_SIGMA_RAD);
+            let message = vision_to_mavlink(pose, usec, resets, p_sigma_m, r_sigma_rad);
             self.send(now, &MavMessage::VISION_POSITION_ESTIMATE(message));
         }
     }

@@ -8,8 +8,9 @@ mod px4;
 mod refusals;
 mod signed;
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, Vec3};
 use proptest::prelude::*;
+use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::mavlink::dialect::{
     COMMAND_ACK_DATA, COMMAND_LONG_DATA, EKF_STATUS_REPORT_DATA, GPS_GLOBAL_ORIGIN_DATA,
     HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavModeFlag, MavResult, MavSeverity,
@@ -17,6 +18,7 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::mavlink::{GuidedMotion, local_position_to_mavlink};
 use vizflyt_protocol::messages::YawTarget;
+use vizflyt_protocol::time::ServerTime;
 
 use super::*;
 
@@ -464,13 +466,18 @@ fn hover() -> GuidedSetpoint {
 fn poses_are_passed_on_at_fifty_a_second() {
     let mut script = Script::ready();
     let pose = Pose::new(DVec3::new(1.0, 2.0, 0.05), DQuat::IDENTITY);
+    let sample = PoseSample {
+        resets: 3,
+        position_sigma_m: Vec3::new(0.1, 0.2, 0.001),
+        ..PoseSample::still(ServerTime::ZERO, pose)
+    };
     for _ in 0..200 {
         script.now = script.now.plus_ns(10_000_000);
-        script.link.vision(script.now, &pose, script.now.plus_ns(-5_000_000), 3);
+        script.link.vision(script.now, &sample, script.now.plus_ns(-5_000_000));
         script.drain();
     }
-    let bad = Pose::new(DVec3::NAN, DQuat::IDENTITY);
-    script.link.vision(script.now.plus_seconds(1.0), &bad, script.now, 3);
+    let bad = PoseSample::still(ServerTime::ZERO, Pose::new(DVec3::NAN, DQuat::IDENTITY));
+    script.link.vision(script.now.plus_seconds(1.0), &bad, script.now);
     script.drain();
     let sent: Vec<_> = script
         .sent

@@ -155,6 +155,8 @@ impl FlightLog {
             EventKind::Stage { .. } | EventKind::Finished { .. } => ("course", Level::Info),
             EventKind::TimeLimit => ("course", Level::Warning),
             EventKind::Phase(_) => ("phase", Level::Info),
+            EventKind::Start => ("start button", Level::Info),
+            EventKind::Land => ("land button", Level::Warning),
             EventKind::PluginOutput => ("plugin", Level::Info),
             EventKind::Note => ("note", Level::Warning),
         };

@@ -9,10 +9,12 @@ use std::io::{BufReader, Read};
 use std::path::Path;
 use std::sync::Arc;
 
-use foxglove::messages::CompressedImage;
+use foxglove::messages::{CompressedImage, PoseInFrame};
+use glam::{DQuat, DVec3};
 use mcap::records::Record;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use prost::Message as _;
+use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::Timing;
 use vizflyt_rgbd::{DecodeError, join_jpeg};
 
@@ -61,6 +63,9 @@ pub struct LogReader<R> {
     source: R,
     reader: LinearReader,
     topics: HashMap<u16, Arc<str>>,
+    /// The chunk that is being read, and how far.
+    chunk: Vec<u8>,
+    at: usize,
     is_cut: bool,
     is_over: bool,
 }
@@ -84,10 +89,19 @@ impl<R: Read> LogReader<R> {
         // A killed runtime may leave a file without an end.
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
+            // Taken apart here: the library trusts the lengths that a chunk's records announce.
+            .with_emit_chunks(true)
             .with_record_length_limit(LONGEST_RECORD);
         let reader = LinearReader::new_with_options(options);
-        let mut log =
-            Self { source, reader, topics: HashMap::new(), is_cut: false, is_over: false };
+        let mut log = Self {
+            source,
+            reader,
+            topics: HashMap::new(),
+            chunk: Vec::new(),
+            at: 0,
+            is_cut: false,
+            is_over: false,
+        };
         // The header comes first, and nothing but an MCAP file has one.
         match log.step() {
             Ok(_) => Ok(log),
@@ -128,6 +142,11 @@ impl<R: Read> LogReader<R> {
 
     /// Reads one record; `None` if it is of no interest.
     fn step(&mut self) -> Result<Option<Entry>, Stop> {
+        if self.at < self.chunk.len() {
+            let (record, rest) = split_record(&self.chunk[self.at..])?;
+            self.at = self.chunk.len() - rest;
+            return Ok(take(&mut self.topics, record));
+        }
         loop {
             match self.reader.next_event() {
                 None => return Err(Stop::End),
@@ -144,7 +163,17 @@ impl<R: Read> LogReader<R> {
                 }
                 Some(Ok(LinearReadEvent::Record { data, opcode })) => {
                     let record = mcap::parse_record(opcode, data).map_err(Stop::Damaged)?;
-                    return Ok(take(&mut self.topics, record));
+                    let Record::Chunk { header, data } = record else {
+                        return Ok(take(&mut self.topics, record));
+                    };
+                    if !header.compression.is_empty() {
+                        let error = mcap::McapError::UnsupportedCompression(header.compression);
+                        return Err(Stop::Damaged(error));
+                    }
+                    self.chunk.clear();
+                    self.chunk.extend_from_slice(&data);
+                    self.at = 0;
+                    return Ok(None);
                 }
             }
         }
@@ -156,6 +185,17 @@ enum Stop {
     End,
     Damaged(mcap::McapError),
     Io(std::io::Error),
+}
+
+/// Returns the first record of a chunk's bytes, and how many bytes are behind it.
+fn split_record(bytes: &[u8]) -> Result<(Record<'_>, usize), Stop> {
+    let cut = || Stop::Damaged(mcap::McapError::UnexpectedEoc);
+    let (head, rest) = bytes.split_first_chunk::<9>().ok_or_else(cut)?;
+    let [opcode, length @ ..] = *head;
+    let length = usize::try_from(u64::from_le_bytes(length)).map_err(|_| cut())?;
+    let (data, behind) = rest.split_at_checked(length).ok_or_else(cut)?;
+    let record = mcap::parse_record(opcode, data).map_err(Stop::Damaged)?;
+    Ok((record, behind.len()))
 }
 
 fn take(topics: &mut HashMap<u16, Arc<str>>, record: Record<'_>) -> Option<Entry> {
@@ -195,6 +235,56 @@ pub fn read_timing(path: &Path) -> Result<Option<Timing>, LogError> {
         }
     }
     Ok(found)
+}
+
+/// One localized pose of a flight.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RecordedPose {
+    /// When it was true, since 1970. [ns]
+    pub at_ns: u64,
+    /// Where the vehicle was.
+    pub world_from_body: Pose<World, Body>,
+}
+
+/// Reads the localized poses of a flight, in the order in which they were written.
+pub struct RecordedPoses<R> {
+    reader: LogReader<R>,
+    topic: String,
+}
+
+impl<R: Read> RecordedPoses<R> {
+    /// Reads them from a log.
+    pub fn new(reader: LogReader<R>) -> Self {
+        Self { reader, topic: Channel::Pose.topic("") }
+    }
+
+    /// Returns the next pose; `None` at the end. What is no pose is left out.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    #[allow(clippy::should_implement_trait)] // Why: an error ends it.
+    pub fn next(&mut self) -> Result<Option<RecordedPose>, LogError> {
+        while let Some(entry) = self.reader.next()? {
+            let Entry::Message(message) = entry else { continue };
+            if *message.topic != *self.topic {
+                continue;
+            }
+            let Ok(logged) = PoseInFrame::decode(&*message.data) else { continue };
+            let Some((p, q)) = logged.pose.and_then(|pose| pose.position.zip(pose.orientation))
+            else {
+                continue;
+            };
+            let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
+            let pose = Pose::new(DVec3::new(p.x, p.y, p.z), rotation);
+            if pose.is_valid() {
+                return Ok(Some(RecordedPose {
+                    at_ns: message.log_time_ns,
+                    world_from_body: pose,
+                }));
+            }
+        }
+        Ok(None)
+    }
 }
 
 /// What replay needs of a log.

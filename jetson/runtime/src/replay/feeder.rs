@@ -2,23 +2,20 @@
 
 use std::collections::HashMap;
 use std::ffi::OsString;
-use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
+use vizflyt_protocol::messages::{Setpoint, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_rgbd::{Decoder, peek};
-use vizflyt_sdk::ipc::{IpcError, RuntimeEnd, SERVICE_OPTION, unique_service};
 use zerocopy::FromBytes;
 
 use super::{ReplayError, sleep_until};
+use crate::lockstep::{PluginProcess, ProcessError};
 use crate::log::Observation;
-use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
+use crate::supervisor::{PluginLimits, Stream};
 
 /// The plugin hears of us at least this often.
 const HEARTBEAT: Duration = Duration::from_millis(400);
-/// How long a plugin may take to attach and to load what it needs: models take their time.
-const READY_WITHIN: Duration = Duration::from_mins(5);
 /// Largest observation that is fed: what eight of the largest cameras need is a faulty log.
 /// [bytes]
 const LARGEST: usize = 1 << 30;
@@ -35,19 +32,11 @@ pub(super) enum Answered {
     Failed(String),
 }
 
-/// The plugin's process and our end of its shared memory.
-struct Session {
-    ipc: RuntimeEnd,
-    supervisor: Supervisor,
-    events: Receiver<PluginEvent>,
-    beaten: Instant,
-}
-
 /// Feeds one plugin process after the other, as the flight had them.
 pub(super) struct Feeder<'a> {
     command: &'a [OsString],
     answer_within: Duration,
-    session: Option<Session>,
+    process: Option<PluginProcess>,
     decoders: HashMap<u32, Decoder>,
 }
 
@@ -56,7 +45,7 @@ type Failed = String;
 
 impl<'a> Feeder<'a> {
     pub(super) fn new(command: &'a [OsString], answer_within: Duration) -> Self {
-        Self { command, answer_within, session: None, decoders: HashMap::new() }
+        Self { command, answer_within, process: None, decoders: HashMap::new() }
     }
 
     /// Sends a message; a start begins a process, and ends the one before.
@@ -68,13 +57,15 @@ impl<'a> Feeder<'a> {
         match message {
             ToPlugin::Start(_) => {
                 self.stop(line);
-                let session = self.session.insert(Session::start(self.command)?);
-                session.begin(message, line)
+                // Confined as in flight: what it could not do there it cannot do here.
+                let limits = PluginLimits::default();
+                let process = PluginProcess::start(self.command, &limits, self.answer_within)?;
+                apart(self.process.insert(process).begin(message, line))
             }
             // Ours comes at the end of the log.
             ToPlugin::Stop => Ok(Ok(())),
-            ToPlugin::Event(_) => match &mut self.session {
-                Some(session) => session.send(message, self.answer_within, line),
+            ToPlugin::Event(_) => match &mut self.process {
+                Some(process) => apart(process.send(message, line)),
                 None => Ok(Ok(())),
             },
         }
@@ -86,186 +77,42 @@ impl<'a> Feeder<'a> {
         observation: &Observation,
         line: &mut dyn FnMut(Stream, &str),
     ) -> Result<Answered, ReplayError> {
-        let Some(session) = &mut self.session else { return Ok(Answered::Undecodable) };
+        let Some(process) = &mut self.process else { return Ok(Answered::Undecodable) };
         let Some(len) = observation_len(&observation.head) else {
             return Ok(Answered::Undecodable);
         };
-        let mut memory = session.ipc.loan(len)?;
+        let mut memory = process.loan(len)?;
         if decode(observation, memory.memory(), &mut self.decoders).is_none() {
             return Ok(Answered::Undecodable);
         }
-        session.ipc.publish(memory)?;
-        session.wait_for_answer(observation.seq, self.answer_within, line)
+        let answer = apart(process.ask(observation.seq, memory, line))?;
+        Ok(answer.map_or_else(Answered::Failed, Answered::With))
     }
 
     /// Waits until then; the plugin hears that we live.
     pub(super) fn idle_until(&mut self, due: Instant, line: &mut dyn FnMut(Stream, &str)) {
         while Instant::now() < due {
             sleep_until(due.min(Instant::now() + HEARTBEAT));
-            if let Some(session) = &mut self.session {
-                session.ipc.heartbeat();
-                // An end is noticed when the next image is not answered.
-                session.pass_lines(line);
+            if let Some(process) = &mut self.process {
+                process.tend(line);
             }
         }
     }
 
     /// Ends the plugin in order.
     pub(super) fn stop(&mut self, line: &mut dyn FnMut(Stream, &str)) {
-        let Some(mut session) = self.session.take() else { return };
-        if session.ipc.plugin_attached() {
-            let _ = session.ipc.send(&ToPlugin::Stop);
+        if let Some(process) = self.process.take() {
+            process.stop(line);
         }
-        session.supervisor.end();
-        session.ipc.clean_up();
-        session.pass_lines(line);
     }
 }
 
-impl Session {
-    fn start(command: &[OsString]) -> Result<Self, ReplayError> {
-        let service = unique_service();
-        let mut command = command.to_vec();
-        // Confined as in flight: what it could not do there it cannot do here.
-        let confinement = Confinement::prepare(&PluginLimits::default(), &command);
-        let len = size_of::<ObservationHeader>();
-        let ipc = RuntimeEnd::create_for(&service, len, confinement.user_id())?;
-        command.push(format!("{SERVICE_OPTION}={service}").into());
-        let (sender, events) = channel();
-        let tell = move |event| {
-            let _ = sender.send(event);
-        };
-        let supervisor = Supervisor::start(&command, &confinement, tell).map_err(|error| {
-            let program = command.first().map(|program| program.to_string_lossy().into_owned());
-            ReplayError::Start(program.unwrap_or_default(), error)
-        })?;
-        Ok(Self { ipc, supervisor, events, beaten: Instant::now() })
-    }
-
-    /// Greets the plugin when it has attached, and waits until it is ready.
-    fn begin(
-        &mut self,
-        start: &ToPlugin,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Result<(), Failed>, ReplayError> {
-        let deadline = Instant::now() + READY_WITHIN;
-        while !self.ipc.plugin_attached() {
-            if let Some(why) = self.pass_lines(line) {
-                return Ok(Err(why));
-            }
-            if Instant::now() > deadline {
-                return Ok(Err("the plugin did not attach within five minutes".into()));
-            }
-            sleep_until(Instant::now() + Duration::from_millis(2));
-        }
-        self.ipc.send(start)?;
-        loop {
-            match self.next(line)? {
-                Some(Ok(FromPlugin::Ready { .. })) => return Ok(Ok(())),
-                Some(Ok(FromPlugin::Failed { reason })) => return Ok(Err(reason.as_str().into())),
-                Some(Err(why)) => return Ok(Err(why)),
-                None if Instant::now() > deadline => {
-                    return Ok(Err("`on_start` did not return within five minutes".into()));
-                }
-                Some(Ok(FromPlugin::Answer { .. })) | None => {}
-            }
-        }
-    }
-
-    /// Sends a message; waits for room if many have been sent since the last image.
-    fn send(
-        &mut self,
-        message: &ToPlugin,
-        within: Duration,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Result<(), Failed>, ReplayError> {
-        let deadline = Instant::now() + within;
-        loop {
-            match self.ipc.send(message) {
-                Ok(()) => return Ok(Ok(())),
-                Err(IpcError::QueueFull(_)) if Instant::now() < deadline => {
-                    self.ipc.heartbeat();
-                    if let Some(why) = self.pass_lines(line) {
-                        return Ok(Err(why));
-                    }
-                    sleep_until(Instant::now() + Duration::from_millis(2));
-                }
-                Err(IpcError::QueueFull(_)) => {
-                    let seconds = within.as_secs_f64();
-                    return Ok(Err(format!("the plugin has read no event for {seconds:.0} s")));
-                }
-                Err(error) => return Err(error.into()),
-            }
-        }
-    }
-
-    fn wait_for_answer(
-        &mut self,
-        seq: u64,
-        within: Duration,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Answered, ReplayError> {
-        let deadline = Instant::now() + within;
-        loop {
-            match self.next(line)? {
-                Some(Ok(FromPlugin::Answer { seq: found, setpoint, .. })) if found == seq => {
-                    return Ok(Answered::With(setpoint));
-                }
-                Some(Ok(FromPlugin::Failed { reason })) => {
-                    return Ok(Answered::Failed(format!("the plugin failed: {reason}")));
-                }
-                Some(Err(why)) => return Ok(Answered::Failed(why)),
-                None if Instant::now() > deadline => {
-                    let seconds = within.as_secs_f64();
-                    return Ok(Answered::Failed(format!(
-                        "the plugin has not answered image {seq} for {seconds:.0} s"
-                    )));
-                }
-                Some(Ok(_)) | None => {}
-            }
-        }
-    }
-
-    /// Returns the plugin's next message, or how it ended; `None` after a while.
-    fn next(
-        &mut self,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Option<Result<FromPlugin, Failed>>, ReplayError> {
-        if let Some(message) = self.receive()? {
-            return Ok(Some(Ok(message)));
-        }
-        self.ipc.wait(Duration::from_millis(50))?;
-        if self.beaten.elapsed() >= HEARTBEAT {
-            self.beaten = Instant::now();
-            self.ipc.heartbeat();
-        }
-        let ended = self.pass_lines(line);
-        // What it said before it ended counts.
-        if let Some(message) = self.receive()? {
-            return Ok(Some(Ok(message)));
-        }
-        Ok(ended.map(Err))
-    }
-
-    fn receive(&self) -> Result<Option<FromPlugin>, ReplayError> {
-        match self.ipc.receive() {
-            // A message that does not decode is the plugin's fault; the next one counts.
-            Err(IpcError::Message(_)) => Ok(None),
-            result => Ok(result?),
-        }
-    }
-
-    /// Passes on what the plugin printed; returns how it ended, if it has.
-    fn pass_lines(&mut self, line: &mut dyn FnMut(Stream, &str)) -> Option<Failed> {
-        let mut ended = None;
-        for event in self.events.try_iter() {
-            match event {
-                PluginEvent::Line(stream, text) => line(stream, &text),
-                PluginEvent::Note(text) => tracing::debug!("plugin: {text}"),
-                PluginEvent::Exited(sentence) => ended = Some(sentence),
-            }
-        }
-        ended
+/// Tells a plugin that failed, which is a finding, from what ends the replay.
+fn apart<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>, ReplayError> {
+    match result {
+        Ok(value) => Ok(Ok(value)),
+        Err(ProcessError::Failed(why)) => Ok(Err(why)),
+        Err(error) => Err(error.into()),
     }
 }
 

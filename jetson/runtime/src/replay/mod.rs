@@ -36,6 +36,7 @@ use self::feeder::{Answered, Feeder};
 pub use self::feeder::{decode, observation_len};
 use self::plan::Feed;
 pub use self::plan::{FlownPlugin, Plan};
+use crate::lockstep::ProcessError;
 use crate::log::read::{LogError, LogReader, Recorded, RecordedFlight};
 use crate::supervisor::Stream;
 
@@ -47,22 +48,24 @@ pub enum ReplayError {
     Log(#[from] LogError),
     /// It was written with another layout of shared memory.
     #[error(
-        "the log is of protocol {0}, this program of {PROTOCOL_VERSION}; replay it with the version \
-         that flew it"
+        "the log is of protocol {found}, written by {program}, and this program is of protocol \
+         {PROTOCOL_VERSION}: replay it with the version that flew it; --poses-to and Foxglove read it as it is"
     )]
-    Protocol(u32),
+    Protocol {
+        /// The protocol's version.
+        found: u32,
+        /// Who wrote it, as the log says.
+        program: String,
+    },
     /// It has no images.
     #[error("the log has no images: none came in that flight, or its disk was full")]
     NoImages,
     /// It does not say what the plugin flew in.
     #[error("the log does not say what the plugin flew in: the plugin never attached")]
     NoStart,
-    /// Shared memory failed.
+    /// The plugin's process cannot be started, or shared memory failed.
     #[error(transparent)]
-    Ipc(#[from] vizflyt_sdk::ipc::IpcError),
-    /// The plugin's program cannot be started.
-    #[error("the plugin {0} cannot be started: {1}")]
-    Start(String, std::io::Error),
+    Process(#[from] ProcessError),
     /// The answers cannot be written.
     #[error("answers {0} cannot be written: {1}")]
     Answers(PathBuf, std::io::Error),

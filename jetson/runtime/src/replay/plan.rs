@@ -67,12 +67,22 @@ impl Plan {
     /// If the log cannot be read, is of another protocol version, or holds no images.
     pub fn read<R: Read>(mut flight: RecordedFlight<R>) -> Result<Self, ReplayError> {
         let mut plan = Self::default();
+        let mut program = None;
         while let Some(recorded) = flight.next()? {
             match recorded {
-                Recorded::Flight(values) => plan.flown = flown(&values),
-                Recorded::Plugin(message) => plan.message(&message)?,
+                Recorded::Flight(values) => {
+                    // Said before anything is read that may be laid out otherwise.
+                    program = values.get("program").cloned();
+                    let said = values.get("protocol").and_then(|text| text.parse().ok());
+                    said.map_or(Ok(()), |said| same_protocol(said, program.as_deref()))?;
+                    plan.flown = flown(&values);
+                }
+                Recorded::Plugin(message) => {
+                    same_protocol(message.protocol, program.as_deref())?;
+                    plan.message(&message);
+                }
                 Recorded::Observation(observation) => {
-                    same_protocol(observation.protocol)?;
+                    same_protocol(observation.protocol, program.as_deref())?;
                     plan.observations += 1;
                 }
                 Recorded::Broken(_) => plan.observations += 1,
@@ -88,8 +98,7 @@ impl Plan {
         Ok(plan)
     }
 
-    fn message(&mut self, message: &PluginMessage) -> Result<(), ReplayError> {
-        same_protocol(message.protocol)?;
+    fn message(&mut self, message: &PluginMessage) {
         if message.is_to_plugin {
             // One that does not decode is of a damaged file; the rest is still of use.
             if let Ok(decoded) = decode_body(&message.body) {
@@ -101,7 +110,6 @@ impl Plan {
             self.last_entered = self.last_entered.max(entered);
             self.answers.entry(seq).or_default().push_back(Answer { seq, entered, setpoint });
         }
-        Ok(())
     }
 
     /// Returns what to do with observation `seq` that was published then; `all` feeds those too
@@ -128,8 +136,12 @@ impl Plan {
     }
 }
 
-fn same_protocol(found: u32) -> Result<(), ReplayError> {
-    if found == u32::from(PROTOCOL_VERSION) { Ok(()) } else { Err(ReplayError::Protocol(found)) }
+fn same_protocol(found: u32, program: Option<&str>) -> Result<(), ReplayError> {
+    if found == u32::from(PROTOCOL_VERSION) {
+        return Ok(());
+    }
+    let program = program.unwrap_or("a program that it does not name").to_owned();
+    Err(ReplayError::Protocol { found, program })
 }
 
 fn flown(values: &BTreeMap<String, String>) -> Option<FlownPlugin> {

@@ -1,5 +1,6 @@
 //! Replays of logs that these tests write, to a real plugin process: the example `misbehave`.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::Cursor;
 use std::path::PathBuf;
@@ -13,8 +14,10 @@ use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, peek, slice_len};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::{CameraInfo, ImageStamps, ObservationBuffer};
 
+use prost::Message as _;
+
 use super::*;
-use crate::log::{FlightLog, LoggedImage, observation_head};
+use crate::log::{FlightLog, LoggedImage, PluginMessage, observation_head};
 
 fn camera() -> CameraInfo {
     CameraInfo {
@@ -68,7 +71,7 @@ impl Flight {
         }
         let mut buffer = ObservationBuffer::new(&[camera()]);
         buffer.clear(seq);
-        let stamps = ImageStamps { seq, pose: at(ms), ready: at(ms) };
+        let stamps = ImageStamps { seq, pose: at(ms), ready: at(ms), ahead_ns: 0 };
         buffer.set_image(0, stamps, |_| {});
         let k = camera().intrinsics;
         let (mount, body) = (Pose::IDENTITY, Pose::IDENTITY);
@@ -169,6 +172,48 @@ fn logs_that_cannot_be_replayed_say_why() {
     let path = folder.path().join("x.mcap");
     fs::write(&path, "no log").unwrap();
     assert!(plan(&path).unwrap_err().to_string().contains("no MCAP file"));
+}
+
+/// Writes a log as another version may have: what it says of itself, and one message to the plugin of `protocol`.
+fn foreign_log(path: &Path, said: Option<&str>, protocol: u32) {
+    let file = fs::File::create(path).unwrap();
+    let mut log = mcap::WriteOptions::new().compression(None).create(file).unwrap();
+    if let Some(said) = said {
+        let values = [("protocol", said), ("program", "vizflyt 0.0.7")];
+        let metadata = values.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
+        log.write_metadata(&mcap::records::Metadata { name: "vizflyt.flight".into(), metadata })
+            .unwrap();
+    }
+    let body = b"of another layout".to_vec();
+    let message = PluginMessage { is_to_plugin: true, protocol, body, at_ns: 5 };
+    let channel = log.add_channel(0, "/plugin/messages", "protobuf", &BTreeMap::new()).unwrap();
+    let header = mcap::records::MessageHeader {
+        channel_id: channel,
+        sequence: 0,
+        log_time: 5,
+        publish_time: 5,
+    };
+    log.write_to_known_channel(&header, &message.encode_to_vec()).unwrap();
+    log.finish().unwrap();
+}
+
+#[test]
+fn a_log_of_another_version_says_which() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.mcap");
+    let ours = u32::from(PROTOCOL_VERSION);
+    for (said, protocol, expected) in [
+        (Some("3"), ours, "of protocol 3, written by vizflyt 0.0.7, and this program"),
+        (Some("3"), 3, "of protocol 3, written by vizflyt 0.0.7, and this program"),
+        (None, 3, "of protocol 3, written by a program that it does not name"),
+        // What it says of itself makes no sense: its messages decide.
+        (Some("x"), 70_000, "of protocol 70000, written by vizflyt 0.0.7"),
+        (Some("x"), ours, "the log has no images"),
+    ] {
+        foreign_log(&path, said, protocol);
+        let error = plan(&path).unwrap_err().to_string();
+        assert!(error.contains(expected), "{said:?}, {protocol}: {error}");
+    }
 }
 
 /// Returns the command of the example plugin, which is built beside the tests.

@@ -5,7 +5,9 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
-use vizflyt_protocol::messages::{Event, EventKind, Telemetry, Timing, ToServer};
+use vizflyt_protocol::messages::{
+    Event, EventKind, ImuReading, MAX_IMU_BATCH, Telemetry, Timing, ToServer,
+};
 
 /// Reports and events on their way to the server.
 #[derive(Debug, Default)]
@@ -18,6 +20,8 @@ pub struct Outbox {
 struct Inner {
     report: Option<Telemetry>,
     timing: Option<Timing>,
+    /// What the IMU felt and is not told yet, oldest first.
+    imu: heapless::Vec<ImuReading, MAX_IMU_BATCH>,
     /// Not yet acknowledged, oldest first.
     events: VecDeque<(u64, Event)>,
     /// Number of the newest event made.
@@ -26,6 +30,9 @@ struct Inner {
     written: u64,
     closed: bool,
 }
+
+/// Readings of the IMU that leave together: 50 messages a second at 100 Hz, 20 ms late at most.
+const IMU_TOGETHER: usize = 2;
 
 /// What there is to write now.
 #[allow(clippy::large_enum_variant)] // Why: it is taken apart at once.
@@ -50,6 +57,21 @@ impl Outbox {
     pub fn report_timing(&self, timing: Timing) {
         self.lock().timing = Some(timing);
         self.changed.notify_one();
+    }
+
+    /// Tells what the autopilot's IMU felt; of more than a batch the oldest goes.
+    pub fn imu(&self, reading: ImuReading) {
+        let mut inner = self.lock();
+        if inner.imu.is_full() {
+            inner.imu.remove(0);
+        }
+        // There is room now.
+        let _ = inner.imu.push(reading);
+        let tell = inner.imu.len() >= IMU_TOGETHER;
+        drop(inner);
+        if tell {
+            self.changed.notify_one();
+        }
     }
 
     /// Tells an event.
@@ -85,6 +107,7 @@ impl Outbox {
         inner.forget(heard);
         inner.written = heard;
         (inner.report, inner.timing) = (None, None);
+        inner.imu.clear();
     }
 
     /// Takes note that the server has heard events up to number `seq`.
@@ -126,6 +149,9 @@ impl Inner {
         }
         if let Some(report) = self.report.take() {
             return Next::Say(ToServer::Telemetry(report));
+        }
+        if self.imu.len() >= IMU_TOGETHER {
+            return Next::Say(ToServer::Imu(std::mem::take(&mut self.imu)));
         }
         if let Some(timing) = self.timing.take() {
             return Next::Say(ToServer::Timing(timing));
@@ -184,6 +210,29 @@ mod tests {
         assert_eq!(written(&outbox), "", "4 has not been heard");
         outbox.heard(4);
         assert_eq!(written(&outbox), "-");
+    }
+
+    #[test]
+    fn imu_readings_leave_together_and_the_newest_are_kept() {
+        let outbox = Outbox::default();
+        let reading = |ns| ImuReading {
+            stamp: ServerTime::from_ns(ns),
+            accel_mps2: glam::DVec3::Z,
+            gyro_radps: glam::DVec3::ZERO,
+        };
+        let next = || match outbox.lock().take() {
+            Next::Say(ToServer::Imu(batch)) => {
+                batch.iter().map(|reading| reading.stamp.as_ns()).collect::<Vec<_>>()
+            }
+            _ => Vec::new(),
+        };
+        outbox.imu(reading(1));
+        assert!(next().is_empty());
+        outbox.imu(reading(2));
+        assert_eq!(next(), [1, 2]);
+        (3..20).for_each(|ns| outbox.imu(reading(ns)));
+        assert_eq!(next(), [12, 13, 14, 15, 16, 17, 18, 19]);
+        assert!(next().is_empty());
     }
 
     #[test]

@@ -3,10 +3,10 @@
 use std::sync::mpsc::{Receiver, channel};
 
 use quinn::{Connection, RecvStream, SendStream, ServerConfig};
-use vizflyt_protocol::geometry::{Intrinsics, Pose, Twist, Volume};
+use vizflyt_protocol::geometry::{Intrinsics, Pose, Volume};
 use vizflyt_protocol::messages::{
-    ClockReply, Datagram, EventKind, Hello, Limits, Telemetry, ToRuntime, ToServer, Welcome,
-    bounded,
+    ClockReply, Datagram, EventKind, Hello, Limits, PoseAges, Telemetry, ToRuntime, ToServer,
+    Welcome, bounded,
 };
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode, encode_body};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, Party, Preamble};
@@ -136,6 +136,8 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -143,6 +145,7 @@ fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         cameras: heapless::Vec::new(),
     }
@@ -204,8 +207,7 @@ async fn a_conversation_and_an_image() {
         assert!(got.is_err() || matches!(got, Ok(Some(ToServer::Telemetry(_)))));
     }
     let stamp = ServerTime::from_ns(host_now().as_ns() + AHEAD_NS);
-    let pose =
-        PoseSample { stamp, world_from_body: Pose::IDENTITY, twist: Twist::default(), resets: 2 };
+    let pose = PoseSample { resets: 2, ..PoseSample::still(stamp, Pose::IDENTITY) };
     peer.pose(&pose);
     let StreamEvent::Pose(found, host) = client.next() else { panic!("no pose") };
     assert_eq!(found, pose);
@@ -268,12 +270,7 @@ async fn a_pose_that_was_overtaken_is_dropped() {
         let wait = Duration::from_millis(20);
         let _ = tokio::time::timeout(wait, peer.next_but_clock()).await;
     }
-    let pose = |ns: u64| PoseSample {
-        stamp: ServerTime::from_ns(AHEAD_NS + ns),
-        world_from_body: Pose::IDENTITY,
-        twist: Twist::default(),
-        resets: 0,
-    };
+    let pose = |ns: u64| PoseSample::still(ServerTime::from_ns(AHEAD_NS + ns), Pose::IDENTITY);
     let mut poison = pose(9);
     poison.twist.linear_mps.x = f64::NAN;
     peer.connection.send_datagram(vec![0xff; 40].into()).unwrap();

@@ -5,7 +5,7 @@
 //! | memory, processes | control group | `RLIMIT_DATA` and `RLIMIT_NPROC`, and counting by the supervisor |
 //! | processors | control group | it is kept off the first processor |
 //! | network, the system itself | seccomp | said once |
-//! | writing outside its folders, signalling others | Landlock | said once |
+//! | writing outside its folders, reading what is hidden, signalling others | Landlock | said once |
 //! | the runtime's user | another user, if root | it keeps root's name without root's powers |
 //!
 //! All is prepared before the fork; after it only system calls are made.
@@ -72,7 +72,7 @@ impl Confinement {
                 Vec::new()
             }
         };
-        let landlock = match writing(&own_folders, limits) {
+        let landlock = match files(&own_folders, limits) {
             Ok(Some(ruleset)) => Some(ruleset),
             Ok(None) => {
                 let note =
@@ -333,11 +333,11 @@ fn own_folders(command: &[OsString]) -> Vec<PathBuf> {
     folders
 }
 
-/// Makes the rules of writing: the plugin's folders, scratch space, and devices that compute.
-fn writing(own: &[PathBuf], limits: &PluginLimits) -> Result<Option<OwnedFd>, RulesetError> {
+/// Makes the rules of files: writing in the plugin's folders, scratch space, and devices that compute;
+/// reading everywhere but what is hidden.
+fn files(own: &[PathBuf], limits: &PluginLimits) -> Result<Option<OwnedFd>, RulesetError> {
     let mut places: Vec<PathBuf> = own.iter().chain(&limits.write).cloned().collect();
-    places.extend(["/tmp", "/dev/shm"].map(PathBuf::from));
-    places.push(std::env::temp_dir());
+    places.extend(scratch());
     let devices = ["null", "zero", "full", "tty", "pts", "ptmx", "dri", "kfd"];
     places.extend(devices.map(|device| Path::new("/dev").join(device)));
     // Graphics and video engines of NVIDIA's cards and of the Jetson: /dev/nvidia0, nvmap, nvhost-*.
@@ -349,10 +349,47 @@ fn writing(own: &[PathBuf], limits: &PluginLimits) -> Result<Option<OwnedFd>, Ru
     let rules = Ruleset::default()
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(writing)?
-        .scope(Scope::from_all(ABI::V6))?
+        .scope(Scope::from_all(ABI::V6))?;
+    // What lies where plugins make files cannot be hidden: those they make later must be readable.
+    let is_hideable = |path: &&PathBuf| !scratch().iter().any(|place| path.starts_with(place));
+    let hidden: Vec<PathBuf> =
+        limits.hide.iter().filter_map(|path| path.canonicalize().ok()).collect();
+    let hidden: Vec<PathBuf> = hidden.iter().filter(is_hideable).cloned().collect();
+    if hidden.is_empty() {
+        return Ok(rules.create()?.add_rules(path_beneath_rules(places, writing))?.into());
+    }
+    let reading = AccessFs::ReadFile | AccessFs::Execute;
+    let rules = rules
+        .handle_access(reading | AccessFs::ReadDir)?
         .create()?
-        .add_rules(path_beneath_rules(places, writing))?;
+        .add_rules(path_beneath_rules(places, writing))?
+        // Names are no secret, and interpreters look for their modules by them.
+        .add_rules(path_beneath_rules([Path::new("/")], AccessFs::ReadDir))?
+        .add_rules(path_beneath_rules(all_but(Path::new("/"), &hidden), reading))?;
     Ok(rules.into())
+}
+
+/// Returns where plugins may always write: scratch space, and shared memory.
+fn scratch() -> [PathBuf; 3] {
+    ["/tmp".into(), "/dev/shm".into(), std::env::temp_dir()]
+}
+
+/// Returns what together holds everything beneath `folder` but what is hidden. The kernel's rules can only
+/// allow, so whatever lies beside the way to a hidden place is listed.
+fn all_but(folder: &Path, hidden: &[PathBuf]) -> Vec<PathBuf> {
+    let mut listed = Vec::new();
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let path = entry.path();
+        if hidden.contains(&path) {
+            continue;
+        }
+        if hidden.iter().any(|hidden| hidden.starts_with(&path)) {
+            listed.extend(all_but(&path, hidden));
+        } else {
+            listed.push(path);
+        }
+    }
+    listed
 }
 
 /// Whether the kernel filters system calls, and answers with an error of our choice (seccomp(2)).
@@ -450,4 +487,27 @@ fn tasks_of(uid: Uid) -> u64 {
             (owner == uid.as_raw()).then_some(threads)
         })
         .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn everything_but_the_hidden_is_listed_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().canonicalize().unwrap();
+        for name in ["a/keys", "a/code", "b", "c/deep/secret", "c/deep/open"] {
+            fs::create_dir_all(root.join(name)).unwrap();
+        }
+        fs::write(root.join("a/plugin.py"), "x").unwrap();
+        let hidden = ["a/keys", "c/deep/secret"].map(|name| root.join(name));
+        let mut listed = all_but(&root, &hidden);
+        listed.sort();
+        let expected = ["a/code", "a/plugin.py", "b", "c/deep/open"].map(|name| root.join(name));
+        assert_eq!(listed, expected);
+        let mut all = all_but(&root, &[]);
+        all.sort();
+        assert_eq!(all, ["a", "b", "c"].map(|name| root.join(name)));
+    }
 }

@@ -40,6 +40,9 @@ pub struct PluginLimits {
     pub user: Option<String>,
     /// Folders it may write in, beside its own, the working folder and `/tmp`.
     pub write: Vec<PathBuf>,
+    /// Files and folders that it may not read, where the kernel has Landlock: what a grade must keep from
+    /// it.
+    pub hide: Vec<PathBuf>,
 }
 
 impl Default for PluginLimits {
@@ -59,6 +62,7 @@ impl Default for PluginLimits {
             network: false,
             user: None,
             write: Vec::new(),
+            hide: Vec::new(),
         }
     }
 }

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use vizflyt_protocol::geometry::{Intrinsics, Volume, body_from_forward_cam};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, Limits, Setpoint, ToPlugin,
-    bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, Limits, PoseAges, Setpoint,
+    ToPlugin, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::DVec3;
@@ -201,6 +201,30 @@ open({file:?}, 'w').write('x'); print('written')"
 }
 
 #[test]
+fn it_does_not_read_what_is_hidden_and_reads_the_rest() {
+    let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/var/tmp").unwrap();
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    std::fs::set_permissions(folder.path(), mode).unwrap();
+    let (secret, open) = (folder.path().join("secret"), folder.path().join("open"));
+    for folder in [&secret, &open] {
+        std::fs::create_dir(folder).unwrap();
+        std::fs::write(folder.join("x"), "read").unwrap();
+    }
+    let program = format!(
+        "print(open('{0}/x').read()); print(open('{1}/x').read())",
+        open.display(),
+        secret.display()
+    );
+    let limits = PluginLimits { hide: vec![secret], ..PluginLimits::default() };
+    let (said, sentence) = python(&limits, &program);
+    if Confinement::prepare(&limits, &[]).is_partial() {
+        assert_eq!(said, "read\nread", "without Landlock only the user's rights count: {sentence}");
+    } else {
+        assert!(said.starts_with("read\n") && said.contains("PermissionError"), "{said}");
+    }
+}
+
+#[test]
 fn it_is_not_root_and_has_no_powers() {
     let program = "
 import os
@@ -255,6 +279,8 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("test"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -262,6 +288,7 @@ fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 0.0,
         ground_truth: true,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         cameras: cameras().into_iter().collect(),
     }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use vizflyt_avoid::Avoid;
 use vizflyt_sdk::glam::{DMat3, DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::{body_from_forward_cam, wrap_pi};
-use vizflyt_sdk::protocol::messages::bounded;
+use vizflyt_sdk::protocol::messages::{PoseAges, bounded};
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, CameraInfo, HostTime, ImageStamps, Intrinsics, Limits, ObservationBuffer,
     Pose, Setpoint, Vehicle, Volume, World, YawTarget,
@@ -93,6 +93,8 @@ pub(crate) fn arena() -> ArenaInfo {
             half_m: DVec3::new(21.5, 7.0, 2.25),
             rotation: DQuat::IDENTITY,
         },
+        no_fly: [].into_iter().collect(),
+        floor_z_m: 0.0,
         limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
@@ -100,6 +102,7 @@ pub(crate) fn arena() -> ArenaInfo {
         goal_radius_m: 1.0,
         time_limit_s: 60.0,
         ground_truth: true,
+        pose_ages: PoseAges::default(),
         attitude_rate: false,
         cameras: [small_camera()].into_iter().collect(),
     }
@@ -144,7 +147,8 @@ pub(crate) fn fly(
             let known = ago(conditions.state_age_s);
             buffer.clear(tick / per_image);
             buffer.set_vehicle(&known.vehicle());
-            let stamps = ImageStamps { seq: tick, pose: pictured.stamp, ready: body.stamp };
+            let stamps =
+                ImageStamps { seq: tick, pose: pictured.stamp, ready: body.stamp, ahead_ns: 0 };
             let front = &arena.cameras[0];
             buffer.set_image(0, stamps, |planes| {
                 let world_from_cam = pictured.world_from_body() * front.body_from_cam;

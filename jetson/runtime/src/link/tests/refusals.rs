@@ -210,9 +210,10 @@ fn the_latency_of_external_navigation_is_measured_and_suggested() {
         ..Default::default()
     }));
     let pose = Pose::new(DVec3::ONE, DQuat::IDENTITY);
+    let sample = PoseSample::still(ServerTime::ZERO, pose);
     for tick in 0..400 {
         let age_ns = 55_000_000 + (tick % 5) * 2_000_000;
-        script.link.vision(script.now, &pose, script.now.plus_ns(-age_ns), 0);
+        script.link.vision(script.now, &sample, script.now.plus_ns(-age_ns));
         script.run(0.02);
     }
     script.run(2.0);

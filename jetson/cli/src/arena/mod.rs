@@ -1,0 +1,107 @@
+//! `vizflyt arena`: looks at rooms and courses before anyone flies in them.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, Subcommand};
+use vizflyt_arena::check::{Checked, check};
+use vizflyt_arena::config::line_of;
+use vizflyt_scenes::Variant;
+use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_server::scene::{self, Up};
+
+/// Looks at rooms and courses before anyone flies in them.
+#[derive(Args, Debug)]
+pub(crate) struct ArenaArgs {
+    #[command(subcommand)]
+    command: ArenaCommand,
+}
+
+#[derive(Subcommand, Debug)]
+enum ArenaCommand {
+    Check(CheckArgs),
+}
+
+/// Says whether a course can be flown: the start is free, gates fit the vehicle and the room, a way leads
+/// through all of them, and nothing that moves bars it for good.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt arena check my-room/arena.toml        errors with the line of the file; status 0 if it can be flown
+  vizflyt arena check --project p5 --seeds 20   the course's project, on seeds 0 to 19")]
+struct CheckArgs {
+    /// An arena.toml or its folder
+    #[arg(required_unless_present = "project", conflicts_with = "project")]
+    arena: Option<PathBuf>,
+    /// A project of the course: p2, p3, p4, p5 or forest
+    #[arg(long, value_name = "NAME")]
+    project: Option<String>,
+    /// This seed of the project alone
+    #[arg(long, requires = "project", conflicts_with = "seeds")]
+    seed: Option<u64>,
+    /// The project's first seeds, from 0
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    seeds: u64,
+}
+
+/// Runs `vizflyt arena`.
+pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
+    let ArenaCommand::Check(args) = &args.command;
+    let good = match (&args.project, &args.arena) {
+        (Some(project), _) => {
+            let project = Project::named(project)?;
+            let seeds = args.seed.map_or(0..args.seeds, |seed| seed..seed + 1);
+            if seeds.is_empty() {
+                bail!("--seeds 0 checks nothing; give at least 1");
+            }
+            let bad = seeds.filter(|&seed| !check_seed(&project, seed)).count();
+            bad == 0
+        }
+        (None, Some(arena)) => check_file(arena)?,
+        (None, None) => bail!("give an arena.toml, or --project"),
+    };
+    Ok(if good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn check_seed(project: &Project, seed: u64) -> bool {
+    // Levels differ in sensors, variants in light: neither changes where one can fly.
+    let generated = project.generate(seed, Level::default(), Variant::default());
+    let still = Arc::new(scene::bake(&generated.splats, &generated.arena));
+    let obstacles = scene::obstacles(&generated.arena, &generated.objects, still, seed);
+    let checked = check(&generated.arena, &obstacles);
+    say(&format!("{} seed {seed}", project.name()), generated.arena.stages.len(), &checked);
+    for finding in &checked.findings {
+        println!("  {finding}");
+    }
+    checked.findings.is_empty()
+}
+
+fn check_file(path: &Path) -> Result<bool> {
+    let file = if path.is_dir() { path.join("arena.toml") } else { path.to_owned() };
+    let text = std::fs::read_to_string(&file)
+        .with_context(|| format!("cannot read {}", file.display()))?;
+    let scene = scene::load(&file, Up::default(), None)?;
+    let still = Arc::new(scene::bake(&scene.splats, &scene.arena));
+    let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);
+    let checked = check(&scene.arena, &obstacles);
+    for finding in &checked.findings {
+        let line = line_of(&text, &finding.key).map_or_else(String::new, |line| format!(":{line}"));
+        println!("{}{line}: {finding}", file.display());
+    }
+    say(&file.display().to_string(), scene.arena.stages.len(), &checked);
+    Ok(checked.findings.is_empty())
+}
+
+fn say(what: &str, stages: usize, checked: &Checked) {
+    if !checked.findings.is_empty() {
+        println!("{what}: cannot be flown, {} found", checked.findings.len());
+        return;
+    }
+    let room = if checked.least_room_m.is_finite() {
+        format!(", {:.2} m of room in the narrowest", checked.least_room_m)
+    } else {
+        String::new()
+    };
+    println!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
+}

@@ -1,0 +1,135 @@
+//! `vizflyt doctor localization`: the pose in plain words, and the check by hand.
+
+mod check;
+mod words;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, bail};
+use clap::Args;
+use vizflyt_arena::config::{Driver, LocalizationConfig};
+use vizflyt_server::{drivers, scene};
+
+use self::check::{Check, Step, Verdict};
+use self::words::pose_in_words;
+use crate::terminal::tell;
+
+/// What is looked at.
+#[derive(Args, Debug)]
+pub(crate) struct LocalizationArgs {
+    /// arena.toml, or its folder: its [[localization]] is checked
+    arena: Option<PathBuf>,
+    /// The source that is checked, as for `vizflyt serve`
+    #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", value_parser = LocalizationConfig::parse)]
+    pose: Option<LocalizationConfig>,
+    /// The vehicle
+    #[arg(long, value_name = "NAME", default_value = "vizflyt")]
+    vehicle: String,
+    /// Only says where it is, until Ctrl-C
+    #[arg(long)]
+    watch: bool,
+    /// Gives up after so long
+    #[arg(long, value_name = "SECONDS", default_value_t = 180.0)]
+    within: f64,
+}
+
+/// Looks.
+pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
+    let config = args.source()?;
+    let mut opened = drivers::open(std::slice::from_ref(&config))?;
+    let address = opened.first_mut().map(|source| source.address()).unwrap_or_default();
+    tell(format!("listens  {} {address}", config.driver));
+    let mut source = drivers::track(opened, &[args.vehicle.as_str()])?;
+    let mut check = Check::new(config.clone());
+    let (start, mut told) = (Instant::now(), None::<Instant>);
+    let mut step = None;
+    while args.watch || start.elapsed().as_secs_f64() < args.within {
+        let now_s = start.elapsed().as_secs_f64();
+        let measured = source.receive(Duration::from_millis(100)).last().copied();
+        while let Some(warning) = source.next_warning() {
+            tell(format!("note     {warning}"));
+        }
+        let Some(measured) = measured else { continue };
+        let pose = measured.world_from_body;
+        if told.is_none_or(|at| at.elapsed() >= TELL_EVERY) {
+            told = Some(Instant::now());
+            tell(format!("pose     {}", pose_in_words(&pose)));
+        }
+        if args.watch {
+            continue;
+        }
+        if step.is_none() {
+            step = Some(check.step());
+            tell(format!("do       {}", check.step().ask()));
+        }
+        if !check.handle_pose(now_s, &pose) {
+            continue;
+        }
+        tell(format!("seen     {}", check.seen()));
+        if check.step() == Step::Done {
+            return Ok(report(&config, &check.verdict()));
+        }
+        step = Some(check.step());
+        tell(format!("do       {}", check.step().ask()));
+    }
+    let counters = source.counters(0);
+    if counters.poses == 0 {
+        bail!(
+            "no pose of '{}' has come to {} {address} within {:.0} s ({} bad packets); see the notes \
+             above, and docs/guides/localization.md",
+            config.object_of(&args.vehicle),
+            config.driver,
+            args.within,
+            counters.bad_packets
+        );
+    }
+    bail!("the check was not done within {:.0} s; --within gives more time", args.within)
+}
+
+fn report(config: &LocalizationConfig, verdict: &Verdict) -> ExitCode {
+    for line in &verdict.faults {
+        tell(format!("WRONG    {line}"));
+    }
+    for (key, value) in &verdict.change {
+        tell(format!(
+            "set      {key} = \"{value}\" in [[localization]], or --pose {}:{},...,{key}={value}",
+            config.driver,
+            config.address()
+        ));
+    }
+    if verdict.faults.is_empty() {
+        tell("right    axes, units and turns are as they must be");
+        return ExitCode::SUCCESS;
+    }
+    if verdict.change.is_empty() {
+        tell(
+            "no setting explains all of it: do it again, one motion at a time, straight up, straight \
+             towards the nose, a quarter turn to the left; then look whether the object's axes were laid \
+             along the vehicle's when it was made",
+        );
+    }
+    ExitCode::FAILURE
+}
+
+impl LocalizationArgs {
+    /// Returns the source: that of the command line, else the arena's first, else Vicon.
+    fn source(&self) -> Result<LocalizationConfig> {
+        if let Some(config) = &self.pose {
+            return Ok(config.clone());
+        }
+        let Some(arena) = &self.arena else { return Ok(LocalizationConfig::new(Driver::Vicon)) };
+        let sources = scene::localization(arena)?;
+        if sources.len() > 1 {
+            tell(format!(
+                "note     the first of {} sources is checked; --pose names another",
+                sources.len()
+            ));
+        }
+        Ok(sources.into_iter().next().unwrap_or_else(|| LocalizationConfig::new(Driver::Vicon)))
+    }
+}
+
+/// Often enough to follow, seldom enough to read.
+const TELL_EVERY: Duration = Duration::from_secs(1);

@@ -1,0 +1,379 @@
+//! The check by hand: poses of a vehicle that somebody carries in, the setting to change out. Sans-IO.
+//!
+//! ```text
+//! it stands -> lift it -> push it forward -> turn it left -> raise its nose
+//! ```
+//! A motion is over when the vehicle rests again; how far it went does not matter, so that wrong units
+//! are no hindrance. What was seen at rest is taken back to what the stream said, and every setting
+//! that there is (units, axes, nose, order of angles) is tried on it: the smallest change under which
+//! all motions look as they were done is the answer.
+
+use std::collections::VecDeque;
+use std::f64::consts::FRAC_PI_2;
+
+use glam::{DQuat, DVec3};
+use vizflyt_arena::config::{Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis};
+use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
+
+use super::words::direction;
+
+/// What is to be done next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Step {
+    /// It stands on the floor.
+    Stand,
+    /// Somebody lifts it,
+    Lift,
+    /// pushes it the way its nose points,
+    Push,
+    /// turns it left by a quarter,
+    Turn,
+    /// and raises its nose.
+    Nose,
+    /// All was seen.
+    Done,
+}
+
+impl Step {
+    /// Returns what a person is asked to do.
+    pub(super) fn ask(self) -> &'static str {
+        match self {
+            Self::Stand => "put it on the floor and let go",
+            Self::Lift => "lift it straight up, by half a metre or so, and hold it still",
+            Self::Push => {
+                "move it forward, the way its nose points, by half a metre or so; hold still"
+            }
+            Self::Turn => "turn it to the left by a quarter turn, on the spot; hold still",
+            Self::Nose => "raise its nose by some 30 degrees; hold still",
+            Self::Done => "that is all",
+        }
+    }
+
+    fn next(self) -> Self {
+        match self {
+            Self::Stand => Self::Lift,
+            Self::Lift => Self::Push,
+            Self::Push => Self::Turn,
+            Self::Turn => Self::Nose,
+            Self::Nose | Self::Done => Self::Done,
+        }
+    }
+}
+
+/// What came of it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Verdict {
+    /// What looked wrong, in words; empty if nothing did.
+    pub(super) faults: Vec<String>,
+    /// Settings to change: key and value. Empty, too, if none would help.
+    pub(super) change: Vec<(&'static str, String)>,
+}
+
+/// Follows the motions.
+#[derive(Debug)]
+pub(super) struct Check {
+    config: LocalizationConfig,
+    step: Step,
+    /// The last moments. [s]
+    window: VecDeque<(f64, Pose<World, Body>)>,
+    /// Where it rested after each step.
+    rests: Vec<Pose<World, Body>>,
+}
+
+impl Check {
+    /// Begins; poses will come as these settings make them.
+    pub(super) fn new(config: LocalizationConfig) -> Self {
+        Self { config, step: Step::Stand, window: VecDeque::new(), rests: Vec::new() }
+    }
+
+    /// Returns what is to be done.
+    pub(super) fn step(&self) -> Step {
+        self.step
+    }
+
+    /// Takes a pose; returns whether a step was seen to its end. [s]
+    pub(super) fn handle_pose(&mut self, at_s: f64, pose: &Pose<World, Body>) -> bool {
+        if self.step == Step::Done || !pose.is_valid() {
+            return false;
+        }
+        // Enough to judge by at any rate, and no more than fits.
+        if self.window.back().is_none_or(|(last_s, _)| at_s - last_s >= SAMPLE_S) {
+            self.window.push_back((at_s, *pose));
+        }
+        while self.window.front().is_some_and(|(first_s, _)| at_s - first_s > REST_S) {
+            self.window.pop_front();
+        }
+        let Some(rest) = self.rest() else { return false };
+        if !self.has_moved(&rest) {
+            return false;
+        }
+        self.rests.push(rest);
+        self.window.clear();
+        self.step = self.step.next();
+        true
+    }
+
+    /// Returns where it rests, if it does.
+    fn rest(&self) -> Option<Pose<World, Body>> {
+        let (first, last) = (self.window.front()?, self.window.back()?);
+        if self.window.len() < LEAST_SAMPLES || last.0 - first.0 < REST_S * 0.9 {
+            return None;
+        }
+        let mean = |from: usize, to: usize| {
+            let sum: DVec3 = self.window.range(from..to).map(|(_, pose)| pose.translation_m).sum();
+            sum / (to - from) as f64
+        };
+        let count = self.window.len();
+        let middle = mean(0, count);
+        let off = |(_, pose): &(f64, Pose<World, Body>)| (pose.translation_m - middle).length();
+        let extent = self.window.iter().map(off).fold(0.0, f64::max);
+        let drift = (mean(count / 2, count) - mean(0, count / 2)).length();
+        // Noise goes to and fro, motion goes on: that holds in any unit. What is little beside the
+        // motions before is rest, too.
+        let far = self.rests.iter().map(|rest| (rest.translation_m - middle).length());
+        let far = far.fold(0.0, f64::max);
+        let rests = drift <= 0.25 * extent || extent <= 0.03 * far;
+        let turned = |(_, pose): &(f64, Pose<World, Body>)| {
+            pose.rotation.dot(last.1.rotation).abs().min(1.0).acos() * 2.0
+        };
+        let turned_rad = self.window.iter().map(turned).fold(0.0, f64::max);
+        (rests && turned_rad < STILL_RAD).then(|| Pose::new(middle, last.1.rotation))
+    }
+
+    /// Returns whether the step's motion lies between the last rest and this one.
+    fn has_moved(&self, rest: &Pose<World, Body>) -> bool {
+        let Some(last) = self.rests.last() else { return true };
+        let moved = (rest.translation_m - last.translation_m).length();
+        let off = |(_, pose): &(f64, Pose<World, Body>)| {
+            (pose.translation_m - rest.translation_m).length()
+        };
+        let noise = self.window.iter().map(off).fold(0.0, f64::max);
+        let turned_rad = rest.rotation.dot(last.rotation).abs().min(1.0).acos() * 2.0;
+        match self.step {
+            Step::Stand | Step::Done => true,
+            Step::Lift => moved > 20.0 * noise + f64::MIN_POSITIVE,
+            // The lift has shown how much a motion is.
+            Step::Push => moved > 0.3 * self.lifted(),
+            Step::Turn => turned_rad > LEAST_TURN_RAD,
+            Step::Nose => turned_rad > LEAST_NOSE_RAD,
+        }
+    }
+
+    fn lifted(&self) -> f64 {
+        match &*self.rests {
+            [stood, lifted, ..] => (lifted.translation_m - stood.translation_m).length(),
+            _ => 0.0,
+        }
+    }
+
+    /// Returns what the last step looked like.
+    pub(super) fn seen(&self) -> String {
+        let moved = |a: &Pose<World, Body>, b: &Pose<World, Body>| {
+            let v = b.translation_m - a.translation_m;
+            format!("it went {} along {}", length(v.length()), direction(v))
+        };
+        match &*self.rests {
+            [] => String::new(),
+            [_] => "it stands".to_owned(),
+            [a, b] | [_, a, b] => moved(a, b),
+            [.., a, b] => {
+                let turned = (b.rotation * a.rotation.conjugate()).normalize();
+                // The short way round.
+                let turned = if turned.w < 0.0 { -turned } else { turned };
+                let turned = turned.to_scaled_axis();
+                let degrees = turned.length().to_degrees();
+                format!("it turned by {degrees:.0} degrees about {}", direction(turned))
+            }
+        }
+    }
+
+    /// Returns what is wrong, when all was seen.
+    pub(super) fn verdict(&self) -> Verdict {
+        let faults = faults(&self.rests);
+        if faults.is_empty() {
+            return Verdict::default();
+        }
+        let best = self
+            .trials()
+            .filter(|trial| self::faults(&self.under(trial)).is_empty())
+            .min_by(|a, b| self.cost(a).total_cmp(&self.cost(b)));
+        Verdict { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
+    }
+
+    /// Returns every combination of settings.
+    fn trials(&self) -> impl Iterator<Item = Trial> {
+        let vicon = self.config.driver == Driver::Vicon;
+        let eulers = if vicon { &Euler::ALL[..] } else { &Euler::ALL[..1] };
+        Units::ALL.into_iter().flat_map(move |units| {
+            Axes::all().flat_map(move |axes| {
+                Nose::ALL.into_iter().flat_map(move |nose| {
+                    eulers.iter().map(move |&euler| Trial { units, axes, nose, euler })
+                })
+            })
+        })
+    }
+
+    fn now(&self) -> Trial {
+        Trial {
+            units: self.config.units.unwrap_or(self.config.driver.usual_units()),
+            axes: self.config.stream_axes(),
+            nose: self.config.nose,
+            euler: self.config.euler.unwrap_or_default(),
+        }
+    }
+
+    /// Returns the rests as other settings had made them.
+    fn under(&self, trial: &Trial) -> Vec<Pose<World, Body>> {
+        let mut config = self.config.clone();
+        (config.units, config.up, config.axes) = (Some(trial.units), None, Some(trial.axes));
+        config.nose = trial.nose;
+        let (was, would) = (self.config.alignment(), config.alignment());
+        let reread = |rotation: DQuat| {
+            if self.config.driver == Driver::Vicon {
+                trial.euler.rotation(self.now().euler.angles(rotation))
+            } else {
+                rotation
+            }
+        };
+        let again = |pose: &Pose<World, Body>| {
+            let (p_stream, rotation) = was.streamed(pose);
+            would.world_from_body(p_stream, reread(rotation))
+        };
+        self.rests.iter().map(again).collect()
+    }
+
+    /// How much a trial changes: one for each setting, a little for what is less usual.
+    fn cost(&self, trial: &Trial) -> f64 {
+        let now = self.now();
+        let mut cost = 0.0;
+        if trial.units != now.units {
+            cost += 1.0;
+        }
+        if trial.nose != now.nose {
+            cost += 1.0;
+        }
+        if trial.axes != now.axes {
+            let usual = [UpAxis::Z.axes(), UpAxis::Y.axes()].contains(&trial.axes);
+            cost += 1.0
+                + if usual { 0.0 } else { 0.2 }
+                + if trial.axes.is_mirror() { 0.2 } else { 0.0 };
+        }
+        if trial.euler != now.euler {
+            // Vendors use these; the others are tried as well.
+            let usual = [Euler::Xyz, Euler::Zyx, Euler::Vector];
+            let place = usual.iter().position(|euler| *euler == trial.euler);
+            cost += 1.0 + 0.05 * place.unwrap_or(usual.len()) as f64;
+        }
+        cost
+    }
+
+    fn change_to(&self, trial: &Trial) -> Vec<(&'static str, String)> {
+        let now = self.now();
+        let mut change = Vec::new();
+        if trial.units != now.units {
+            change.push(("units", trial.units.to_string()));
+        }
+        if trial.axes != now.axes {
+            change.push(match trial.axes {
+                axes if self.config.axes.is_none() && axes == UpAxis::Y.axes() => {
+                    ("up", "y".to_owned())
+                }
+                axes if self.config.axes.is_none() && axes == UpAxis::Z.axes() => {
+                    ("up", "z".to_owned())
+                }
+                axes => ("axes", axes.to_string()),
+            });
+        }
+        if trial.nose != now.nose {
+            change.push(("nose", trial.nose.to_string()));
+        }
+        if trial.euler != now.euler {
+            change.push(("euler", trial.euler.to_string()));
+        }
+        change
+    }
+}
+
+/// One combination of settings.
+#[derive(Clone, Copy, Debug)]
+struct Trial {
+    units: Units,
+    axes: Axes,
+    nose: Nose,
+    euler: Euler,
+}
+
+/// Returns what does not look as it was done.
+fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
+    let [stood, lifted, pushed, turned, raised] = rests else {
+        return vec!["not all was done".to_owned()];
+    };
+    let mut faults = Vec::new();
+    let up = |pose: &Pose<World, Body>| pose.rotate(DVec3::Z);
+    if !(up(stood).z > NEARLY) {
+        faults.push(format!(
+            "it stands on the floor, and its up is {}, not +z",
+            direction(up(stood))
+        ));
+    }
+    let lift = lifted.translation_m - stood.translation_m;
+    if !(lift.z > NEARLY * lift.length()) {
+        faults.push(format!("lifted, it went along {}, not up", direction(lift)));
+    }
+    if !(HAND_M.0..HAND_M.1).contains(&lift.length()) {
+        faults.push(format!("lifted by half a metre or so, it went {}", length(lift.length())));
+    }
+    let push = pushed.translation_m - lifted.translation_m;
+    let nose = pushed.rotate(DVec3::X);
+    if !(push.dot(nose) > NEARLY * push.length()) {
+        faults.push(format!(
+            "pushed the way its nose points, it went along {}, while its nose points {}",
+            direction(push),
+            direction(nose)
+        ));
+    }
+    let left_rad = wrap_pi(yaw_of(turned.rotation) - yaw_of(pushed.rotation));
+    if !((left_rad - FRAC_PI_2).abs() < QUARTER_OFF_RAD) || !(up(turned).z > NEARLY) {
+        let how = if left_rad < 0.0 { "right" } else { "left" };
+        faults.push(format!(
+            "turned left by a quarter, it turned {how} by {:.0} degrees, and its up is {}",
+            left_rad.abs().to_degrees(),
+            direction(up(turned))
+        ));
+    }
+    let (nose_z, side_z) = (raised.rotate(DVec3::X).z, raised.rotate(DVec3::Y).z);
+    if !(nose_z > LEAST_NOSE_RAD.sin() * 0.8 && side_z.abs() < 0.5 * nose_z) {
+        faults.push(format!(
+            "with its nose raised, its nose points {:.0} degrees up and its left side {:.0}",
+            nose_z.clamp(-1.0, 1.0).asin().to_degrees(),
+            side_z.clamp(-1.0, 1.0).asin().to_degrees()
+        ));
+    }
+    faults
+}
+
+/// Returns a length in words, however wrong its unit may be. [m]
+fn length(m: f64) -> String {
+    if m < 0.01 { format!("{:.2} mm", m * 1e3) } else { format!("{m:.2} m") }
+}
+
+/// Rest lasts so long. [s]
+const REST_S: f64 = 0.8;
+/// The window's samples are this far apart; 40 Hz at most. [s]
+const SAMPLE_S: f64 = 0.025;
+/// 10 Hz is enough.
+const LEAST_SAMPLES: usize = 7;
+/// A hand trembles by less. [rad]
+const STILL_RAD: f64 = 0.06;
+/// A turn is at least 40 degrees, a raised nose 12. [rad]
+const LEAST_TURN_RAD: f64 = 0.7;
+const LEAST_NOSE_RAD: f64 = 0.21;
+/// How far a quarter turn by hand may be off: 35 degrees. [rad]
+const QUARTER_OFF_RAD: f64 = 0.61;
+/// Cosine of 30 degrees: so far a hand's motion may be off an axis.
+const NEARLY: f64 = 0.866;
+/// What "half a metre or so" may be. [m]
+const HAND_M: (f64, f64) = (0.12, 2.5);
+
+#[cfg(test)]
+mod tests;

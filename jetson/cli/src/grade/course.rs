@@ -1,0 +1,115 @@
+//! What is flown for a grade: a project's place, made from a seed.
+
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use glam::{Quat, Vec3};
+use sha2::{Digest, Sha256};
+use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Obstacles};
+use vizflyt_scenes::Variant;
+use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_server::scene::{bake_with, obstacles};
+use vizflyt_splat::{RigidObject, Splats};
+
+use super::document::hex;
+
+/// A place to fly in. It is nowhere but in this process's memory.
+pub(crate) struct Place {
+    /// The room and its rules.
+    pub arena: ArenaConfig,
+    /// What cameras see. [m, world]
+    pub splats: Splats,
+    /// What moves in it. [m, object]
+    pub objects: Vec<RigidObject>,
+    /// What stands still, as the referee judges by it.
+    pub field: Arc<DistanceField>,
+    /// That, and what moves; its clock is 0 at the start of a flight.
+    pub obstacles: Obstacles,
+    /// SHA-256 of what cameras see.
+    pub scene_sha256: String,
+    /// SHA-256 of the rules: the project's file and the arena's.
+    pub rules_sha256: String,
+}
+
+impl Place {
+    /// Makes the place of a seed.
+    ///
+    /// # Errors
+    /// If its arena cannot be written down, which a test of the projects excludes.
+    pub(crate) fn make(
+        project: &Project,
+        level: Level,
+        variant: Variant,
+        seed: u64,
+    ) -> Result<Self> {
+        let generated = project.generate(seed, level, variant);
+        // Not kept for later: on disk it would be a map for the next plugin.
+        let baked = bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, &|_| ());
+        let rules = generated.arena.to_toml().context("the arena cannot be written down")?;
+        let mut hash = Sha256::new();
+        hash.update(project.text());
+        hash.update([0]);
+        hash.update(rules);
+        let field = Arc::new(baked.field);
+        let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
+        Ok(Self {
+            scene_sha256: hash_of(&generated.splats, &generated.objects),
+            rules_sha256: hex(&hash.finalize()),
+            arena: generated.arena,
+            splats: generated.splats,
+            objects: generated.objects,
+            field,
+            obstacles,
+        })
+    }
+}
+
+fn hash_of(splats: &Splats, objects: &[RigidObject]) -> String {
+    let mut hash = Sha256::new();
+    take_all(&mut hash, splats);
+    for object in objects {
+        take_all(&mut hash, &object.splats);
+    }
+    hex(&hash.finalize())
+}
+
+fn take_all(hash: &mut Sha256, splats: &Splats) {
+    let mut bytes = Vec::with_capacity(4 << 14);
+    let mut take = |values: &mut dyn Iterator<Item = f32>| {
+        for value in values {
+            bytes.extend_from_slice(&value.to_le_bytes());
+            if bytes.len() >= 4 << 14 {
+                hash.update(&bytes);
+                bytes.clear();
+            }
+        }
+    };
+    take(&mut std::iter::once(splats.len() as f32));
+    take(&mut splats.means_m.iter().flat_map(Vec3::to_array));
+    take(&mut splats.scales_m.iter().flat_map(Vec3::to_array));
+    take(&mut splats.rotations.iter().flat_map(Quat::to_array));
+    take(&mut splats.opacities.iter().copied());
+    take(&mut splats.sh.iter().copied());
+    hash.update(&bytes);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_is_known_by_its_hashes() {
+        let project = Project::named("forest").unwrap();
+        let place = |variant, seed| Place::make(&project, Level::Ug, variant, seed).unwrap();
+        let (one, again) = (place(Variant::Day, 1), place(Variant::Day, 1));
+        assert_eq!(
+            (one.scene_sha256.as_str(), &one.rules_sha256),
+            (again.scene_sha256.as_str(), &again.rules_sha256)
+        );
+        let night = place(Variant::Night, 1);
+        assert_eq!(night.rules_sha256, one.rules_sha256, "the rules are those of the day");
+        assert_ne!(night.scene_sha256, one.scene_sha256);
+        let other = Place::make(&project, Level::G, Variant::Day, 1).unwrap();
+        assert_ne!(other.rules_sha256, one.rules_sha256);
+    }
+}

@@ -1,0 +1,219 @@
+//! The report as one folder that opens in any browser, without a network: figures, a table of all
+//! flights, and a crash card for each that did not finish.
+
+pub(crate) mod card;
+mod plot;
+
+use std::fmt::Write;
+use std::fs;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use vizflyt_arena::verdict::Outcome;
+
+use super::document::{Grade, Run};
+use super::statistics::Interval;
+
+const CSS: &str = include_str!("page.css");
+
+/// Writes `index.html` and `grade.json` into the folder. `cards` are those of [`card::write`], in the
+/// order in which they shall be read.
+pub(crate) fn write(folder: &Path, grade: &Grade, cards: &[String]) -> Result<()> {
+    fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    let write = |name: &str, text: &str| {
+        let path = folder.join(name);
+        fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+    };
+    write("grade.json", &grade.to_text()?)?;
+    write("index.html", &page(grade, cards))
+}
+
+fn page(grade: &Grade, cards: &[String]) -> String {
+    let subject = &grade.subject;
+    let title = format!("{} in {}", escape(&subject.plugin), escape(&subject.project));
+    let part = grade.shard.map_or(String::new(), |shard| {
+        format!(" <span class=\"faint\">(part {} of {})</span>", shard.index, shard.count)
+    });
+    let mut text = format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src 'self'; \
+         style-src 'unsafe-inline'\"><title>Grade: {title}</title><style>{CSS}</style></head><body>\n\
+         <h1>{title}{part}</h1><p class=\"faint\">level {}, {} flights of {}</p>\n",
+        subject.level.to_uppercase(),
+        grade.runs.len(),
+        escape(&subject.variants.join(", "))
+    );
+    text += &figures(grade);
+    text += &table(&grade.runs);
+    if !cards.is_empty() {
+        text += "<h2>Flights that did not finish</h2>\n";
+        text.extend(cards.iter().map(String::as_str));
+    }
+    text += &origins(grade);
+    text + "</body></html>\n"
+}
+
+fn figures(grade: &Grade) -> String {
+    let summary = &grade.summary;
+    let span = |found: &Interval, digits: usize, scale: f64, unit: &str| {
+        format!("95 %: {:.digits$} to {:.digits$}{unit}", found.low * scale, found.high * scale)
+    };
+    let metres = |value: Option<f64>| value.map_or("-".to_owned(), |m| format!("{m:.2} m"));
+    let seconds = |value: Option<f64>| value.map_or("-".to_owned(), |s| format!("{s:.1} s"));
+    let stages = grade.runs.first().map_or(0, |run| run.stages.len());
+    let boxes = [
+        ("Score", format!("{:.1}", summary.score.value), span(&summary.score, 1, 1.0, "")),
+        (
+            "Finished",
+            format!("{} of {}", summary.finished, summary.runs),
+            span(&summary.finish_share, 0, 100.0, " %"),
+        ),
+        (
+            "Stages passed",
+            format!("{:.2}", summary.mean_stages_passed),
+            format!("of {stages}, on average"),
+        ),
+        ("Time to finish", seconds(summary.mean_finish_s), "mean, penalties included".to_owned()),
+        ("Least clearance", metres(summary.min_clearance_m), "of all flights".to_owned()),
+    ];
+    let mut text = "<dl class=\"figures\">".to_owned();
+    for (name, value, note) in boxes {
+        let _ = write!(text, "<div><dt>{name}</dt><dd>{value}<small>{note}</small></dd></div>");
+    }
+    text + "</dl>\n"
+}
+
+fn table(runs: &[Run]) -> String {
+    let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Seed</th>\
+                    <th class=\"text\">Variant</th><th class=\"text\">Outcome</th><th>Stages</th>\
+                    <th>Time</th><th>Clearance</th><th>Speed</th><th>Score</th>\
+                    <th class=\"text\">Why</th></tr></thead><tbody>\n"
+        .to_owned();
+    for run in runs {
+        let Run { seed, variant, outcome, .. } = run;
+        let mut stages = String::new();
+        for stage in &run.stages {
+            let (class, when) = match stage.passed_s {
+                Some(s) => ("stage passed", format!("{s:.1} s")),
+                None => ("stage", "not passed".to_owned()),
+            };
+            let name = escape(&stage.name);
+            let _ = write!(
+                stages,
+                "<span class=\"{class}\" role=\"img\" title=\"{name}: {when}\" aria-label=\"{name}: \
+                 {when}\"></span>"
+            );
+        }
+        if stages.is_empty() {
+            stages += "-";
+        }
+        let seed = match outcome {
+            Outcome::Finished => seed.to_string(),
+            _ => format!("<a href=\"#{variant}-{seed}\">{seed}</a>"),
+        };
+        let clearance =
+            run.min_clearance_m.map_or("-".to_owned(), |clearance_m| format!("{clearance_m:.2} m"));
+        let why = run.cause.as_deref().unwrap_or(&run.reason);
+        let _ = writeln!(
+            text,
+            "<tr><td class=\"text\">{seed}</td><td class=\"text\">{variant}</td>\
+             <td class=\"text outcome {outcome}\">{}</td><td>{stages}</td><td>{:.1} s</td>\
+             <td>{clearance}</td><td>{:.1} m/s</td><td>{:.0}</td><td class=\"text why\">{}</td></tr>",
+            outcome.name().replace('_', " "),
+            run.seconds + run.penalty_s,
+            run.max_speed_mps,
+            run.score,
+            escape(why)
+        );
+    }
+    text + "</tbody></table></div>\n"
+}
+
+/// What was graded by what: for whoever wants to repeat it.
+fn origins(grade: &Grade) -> String {
+    let subject = &grade.subject;
+    let mut text =
+        "<h2>What this rests on</h2><p>In lock-step: nothing in it depends on how fast a \
+                    computer was.</p><div class=\"wide\"><table><tbody>"
+            .to_owned();
+    let delays = subject.delays;
+    let rows = [
+        ("Hash of all flights", grade.hash.clone()),
+        ("Plugin", subject.plugin_sha256.clone()),
+        ("Program", format!("{} {}", subject.program, subject.program_sha256)),
+        ("Renderer", subject.renderer.clone()),
+        (
+            "Time model",
+            format!(
+                "an image every {:.1} ms, {:.1} ms old when the plugin gets it; its answer counts {:.1} ms \
+                 later",
+                delays.image_period, delays.image, delays.answer
+            ),
+        ),
+        (
+            "Signed with",
+            grade.signature.as_ref().map_or("not signed".to_owned(), |signed| signed.key.clone()),
+        ),
+    ];
+    for (name, value) in rows {
+        let _ = write!(
+            text,
+            "<tr><th class=\"text\">{name}</th><td class=\"text why hash\">{}</td></tr>",
+            escape(&value)
+        );
+    }
+    text + "</tbody></table></div>\n"
+}
+
+/// Makes text of a plugin, or of anybody else, text of a page.
+pub(crate) fn escape(text: &str) -> String {
+    let mut safe = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => safe += "&amp;",
+            '<' => safe += "&lt;",
+            '>' => safe += "&gt;",
+            '"' => safe += "&quot;",
+            '\'' => safe += "&#39;",
+            // Not even line breaks reach an attribute.
+            c if c.is_control() && c != '\n' && c != '\t' => safe.push('\u{fffd}'),
+            c => safe.push(c),
+        }
+    }
+    safe
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::document::tests::{grade, run};
+    use super::*;
+
+    #[test]
+    fn what_a_plugin_says_is_text() {
+        assert_eq!(
+            escape("<b onload='x'>&\"\u{7}"),
+            "&lt;b onload=&#39;x&#39;&gt;&amp;&quot;\u{fffd}"
+        );
+        let mut grade = grade();
+        grade.runs[0].cause = Some("<script>alert(1)</script>".to_owned());
+        grade.subject.plugin = "<i>".to_owned();
+        let page = page(&grade, &[]);
+        assert!(!page.contains("<script") && !page.contains("<i>"), "{page}");
+        assert!(page.contains("&lt;script&gt;alert(1)"));
+    }
+
+    #[test]
+    fn the_page_needs_no_network_and_names_every_flight() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), &grade(), &["<section id=\"day-1\"></section>".to_owned()]).unwrap();
+        let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
+        assert!(!page.contains("://"), "it names no other place");
+        for part in ["1 of 2", "href=\"#day-1\"", "id=\"day-1\"", "too fast", "reached the goal"] {
+            assert!(page.contains(part), "no {part}");
+        }
+        let read = Grade::read(&folder.path().join("grade.json")).unwrap();
+        assert_eq!(read, grade());
+        assert!(table(&[run(5, Outcome::Finished)]).contains("<td class=\"text\">5</td>"));
+    }
+}

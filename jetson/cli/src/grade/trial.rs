@@ -1,0 +1,578 @@
+//! One graded flight on a virtual clock: simulated vehicle, runtime, referee, renderer in one thread,
+//! and the plugin in a process of its own that is waited for.
+//!
+//! ```text
+//! tick of 2.5 ms:  Simulation ──MAVLink──▶ Companion ──MAVLink──▶ Simulation
+//!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Companion
+//! image is due:    Referee's motion ─▶ where the vehicle will be when it is seen ─▶ CpuRenderer
+//! image is seen:   observation ─▶ plugin ─▶ answer; it counts `answer` later
+//! ```
+//! No wall clock decides anything but that a plugin is hung, and no order of threads anything at
+//! all: the same program, plugin, course and seed give the same bits on the same kind of processor.
+//! [`Flown::hash`] is over all of them.
+
+use std::collections::VecDeque;
+use std::ffi::OsString;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use glam::DVec3;
+use sha2::{Digest, Sha256};
+use vizflyt_arena::pose::Measured;
+use vizflyt_arena::verdict::{Sample, Verdict, judge};
+use vizflyt_arena::{ArenaConfig, Referee};
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::messages::{
+    CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint, ToPlugin,
+};
+use vizflyt_protocol::time::{HostTime, ServerTime};
+use vizflyt_runtime::flight::FlightSettings;
+use vizflyt_runtime::guard::Fix;
+use vizflyt_runtime::lockstep::{Companion, PluginProcess, ProcessError};
+use vizflyt_runtime::supervisor::{PluginLimits, Stream};
+use vizflyt_sdk::{ImageStamps, ObservationWriter};
+use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
+use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
+
+use super::course::Place;
+
+/// How long things take in a graded flight, always the same.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Delays {
+    /// From one image to the next, of cameras that do not say it themselves. [ns]
+    pub image_period_ns: i64,
+    /// From the start of drawing until the plugin is given the image, which shows the vehicle where
+    /// it is by then, as far as can be foretold. [ns]
+    pub image_ns: i64,
+    /// From when the plugin is given an image until its answer counts. [ns]
+    pub answer_ns: i64,
+}
+
+/// What is flown, and how.
+pub(crate) struct Trial<'a> {
+    /// Where.
+    pub place: &'a Place,
+    /// Of the place, and of the simulator's noise.
+    pub seed: u64,
+    /// The command that starts the plugin.
+    pub command: &'a [OsString],
+    /// What it may use.
+    pub limits: &'a PluginLimits,
+    /// By the wall clock: a plugin that takes longer for an answer has failed.
+    pub answer_within: Duration,
+    /// The time model.
+    pub delays: Delays,
+    /// Ends it.
+    pub stop: &'a AtomicBool,
+}
+
+/// One image that the plugin was given, for the report.
+#[derive(Clone, Debug)]
+pub(crate) struct Shot {
+    /// The instant that it shows.
+    pub stamp: ServerTime,
+    /// H x W x 3.
+    pub rgb: Vec<u8>,
+    /// Its size. [px]
+    pub size_px: (u32, u32),
+}
+
+/// An answer of the plugin, for the report.
+#[derive(Clone, Debug)]
+pub(crate) struct Asked {
+    /// When the plugin was given the image.
+    pub stamp: ServerTime,
+    /// What it asked for.
+    pub setpoint: Option<Setpoint>,
+    /// Least depth in the middle of the first camera's image; `None` without a return. [m]
+    pub ahead_m: Option<f64>,
+}
+
+/// What a flight leaves behind.
+#[derive(Clone, Debug)]
+pub(crate) struct Flown {
+    /// What it was worth.
+    pub verdict: Verdict,
+    /// Over all samples, setpoints, events and images.
+    pub hash: [u8; 32],
+    /// All that happened, in order.
+    pub events: Vec<Event>,
+    /// Where it was, 200 a second.
+    pub samples: Vec<Sample>,
+    /// What the plugin asked for.
+    pub asked: Vec<Asked>,
+    /// The newest images until the flight was decided.
+    pub shots: VecDeque<Shot>,
+    /// The last lines that the plugin printed.
+    pub lines: VecDeque<String>,
+    /// Images that the plugin answered.
+    pub images: u64,
+    /// Virtual time. [s]
+    pub virtual_s: f64,
+}
+
+/// Where the clocks start: far enough from zero that nothing is before it. [ns]
+const START_NS: u64 = 10_000_000_000;
+/// A vehicle that is not in the air by then never will be. [s]
+const READY_WITHIN_S: f64 = 60.0;
+/// A flight that takes longer than that, landing included, is given up. [s]
+const LONGEST_S: f64 = 900.0;
+/// Before take-off a plugin sees a picture of standing still: so many are enough. [ns]
+const GROUND_PERIOD_NS: i64 = 200_000_000;
+/// The runtime gets every second pose: 100 Hz, as over the network.
+const POSES_PER_SENT: u64 = 2;
+/// How long before the end the report shows images. [s]
+const SHOWN_S: f64 = 2.0;
+/// The time between two of them. [s]
+const SHOT_PERIOD_S: f64 = 0.1;
+/// Lines of the plugin that are kept.
+const LINES: usize = 200;
+
+impl Trial<'_> {
+    /// Flies; `None` if it is ended by [`Self::stop`]. Call it on a thread that lives as long: the
+    /// plugin dies with it.
+    ///
+    /// # Errors
+    /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
+    /// verdict.
+    pub(crate) fn fly(&self) -> Result<Option<Flown>> {
+        let mut flight = Flight::new(self)?;
+        let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
+        let mut process = Some(process);
+        let result = flight.run(&mut process);
+        if let Some(process) = process {
+            process.stop(&mut |_, text| keep(&mut flight.lines, text));
+        }
+        if !result? {
+            return Ok(None);
+        }
+        Ok(Some(flight.end()))
+    }
+}
+
+/// An image on its way to the plugin.
+struct Pending {
+    /// When the plugin is given it.
+    due: HostTime,
+    seq: u64,
+    /// Of the newest pose behind it.
+    pose: ServerTime,
+    /// What it shows.
+    shown: ServerTime,
+    /// By camera; those not drawn this time are `None`.
+    drawn: Vec<Option<Picture>>,
+}
+
+/// What a plugin gets of a camera.
+#[derive(Debug, Default)]
+struct Picture {
+    rgb: Vec<u8>,
+    depth_mm: Vec<u16>,
+    /// What is ahead, for the report; also where the plugin gets no depth. [m, cam]
+    ahead_m: Option<f64>,
+}
+
+/// An answer on its way to the guard.
+struct Answer {
+    due: HostTime,
+    seq: u64,
+    setpoint: Option<Setpoint>,
+}
+
+struct Flight<'a> {
+    trial: &'a Trial<'a>,
+    arena: &'a ArenaConfig,
+    cameras: Vec<CameraInfo>,
+    simulation: Simulation,
+    companion: Companion,
+    referee: Referee,
+    renderer: CpuRenderer,
+    images: Vec<RgbdImage>,
+    now: HostTime,
+    /// When each camera is due.
+    camera_due: Vec<HostTime>,
+    poses: u64,
+    seq: u64,
+    pending: VecDeque<Pending>,
+    answers: VecDeque<Answer>,
+    hash: Sha256,
+    events: Vec<Event>,
+    samples: Vec<Sample>,
+    asked: Vec<Asked>,
+    shots: VecDeque<Shot>,
+    lines: VecDeque<String>,
+    answered: u64,
+    is_decided: bool,
+}
+
+impl<'a> Flight<'a> {
+    fn new(trial: &'a Trial<'a>) -> Result<Self> {
+        let arena = &trial.place.arena;
+        let now = HostTime::from_ns(START_NS);
+        let config = SimulationConfig {
+            spawn_m: arena.spawn.position_m,
+            spawn_yaw_rad: arena.spawn.yaw_deg.to_radians(),
+            seed: trial.seed,
+            body_radius_m: arena.body_radius_m,
+            ..SimulationConfig::default()
+        };
+        let simulation = Simulation::new(config).context("the simulated autopilot")?;
+        let settings = FlightSettings {
+            ready_within_s: READY_WITHIN_S,
+            time_limit_s: 0.0,
+            limits: Limits::NONE,
+        };
+        let info = arena.info();
+        let (splats, objects) = (&trial.place.splats, &trial.place.objects[..]);
+        let renderer = CpuRenderer::new(Scene { splats, objects });
+        let mut hash = Sha256::new();
+        hash.update(renderer.name().as_bytes());
+        Ok(Self {
+            trial,
+            arena,
+            cameras: info.cameras.to_vec(),
+            simulation,
+            companion: Companion::new(now, &info, settings),
+            referee: Referee::new(arena, trial.place.obstacles.clone())
+                .counting_from(ServerTime::from_ns(START_NS)),
+            renderer,
+            images: Vec::new(),
+            now,
+            camera_due: vec![now; info.cameras.len()],
+            poses: 0,
+            seq: 0,
+            pending: VecDeque::new(),
+            answers: VecDeque::new(),
+            hash,
+            events: Vec::new(),
+            samples: Vec::new(),
+            asked: Vec::new(),
+            shots: VecDeque::new(),
+            lines: VecDeque::new(),
+            answered: 0,
+            is_decided: false,
+        })
+    }
+
+    /// Flies to the end; false if it is stopped.
+    fn run(&mut self, process: &mut Option<PluginProcess>) -> Result<bool> {
+        self.greet(process)?;
+        loop {
+            if self.trial.stop.load(Ordering::Relaxed) {
+                return Ok(false);
+            }
+            // Once at least: a plugin that fails at its start is an event of the flight as well.
+            self.tick(process)?;
+            if self.companion.outcome().is_some() {
+                return Ok(true);
+            }
+            let virtual_s = self.virtual_s();
+            if virtual_s > LONGEST_S {
+                bail!("the flight is not over after {virtual_s:.0} s of virtual time");
+            }
+        }
+    }
+
+    fn greet(&mut self, process: &mut Option<PluginProcess>) -> Result<()> {
+        let Some(start @ ToPlugin::Start(_)) = self.companion.poll_plugin() else {
+            bail!("there is no greeting for the plugin");
+        };
+        let result = process
+            .as_mut()
+            .map_or(Ok(()), |process| process.begin(&start, &mut lines(&mut self.lines)));
+        if self.heard(process, result)?.is_some() {
+            self.companion.plugin_ready(self.now);
+        }
+        Ok(())
+    }
+
+    fn tick(&mut self, process: &mut Option<PluginProcess>) -> Result<()> {
+        self.simulation.tick();
+        self.now = HostTime::from_ns(START_NS + self.simulation.now().as_ns());
+        let mut buffer = [0; MAX_PACKET];
+        while let Some(packet) = self.simulation.poll_mavlink(&mut buffer) {
+            self.companion.handle_mavlink(self.now, packet);
+        }
+        self.localize();
+        self.draw()?;
+        while self.pending.front().is_some_and(|pending| pending.due <= self.now) {
+            if let Some(pending) = self.pending.pop_front() {
+                self.show(process, &pending)?;
+            }
+        }
+        while self.answers.front().is_some_and(|answer| answer.due <= self.now) {
+            if let Some(Answer { seq, setpoint, .. }) = self.answers.pop_front() {
+                self.companion.answered(self.now, seq, setpoint);
+            }
+        }
+        self.companion.handle_timeout(self.now);
+        while let Some(event) = self.companion.poll_event() {
+            self.note(event);
+        }
+        while let Some(datagram) = self.companion.poll_transmit() {
+            self.hash.update(&*datagram);
+            self.simulation.handle_mavlink(0, &datagram);
+        }
+        self.hash_state();
+        Ok(())
+    }
+
+    /// Poses from the motion capture through filter and rules.
+    fn localize(&mut self) {
+        let referee = &mut self.referee;
+        self.companion.drain_imu(|reading| referee.handle_imu(&reading));
+        while let Some(sight) = self.simulation.poll_mocap() {
+            let stamp = ServerTime::from_ns(START_NS + sight.at.as_ns());
+            let arrival = self.server_now();
+            let measured = Measured { arrival, ..Measured::new(stamp, sight.world_from_body) };
+            let Ok(sample) = self.referee.handle_measurement(&measured) else { continue };
+            let p_world_m = sample.world_from_body.translation_m;
+            self.samples.push(Sample {
+                stamp: sample.stamp,
+                p_world_m,
+                v_world_mps: sample.twist.linear_mps,
+                yaw_rad: Fix::of(&sample, self.now).yaw_rad(),
+                clearance_m: self.referee.clearance_m(p_world_m),
+            });
+            self.poses += 1;
+            if self.poses.is_multiple_of(POSES_PER_SENT) {
+                self.companion.handle_pose(self.now, &sample);
+            }
+        }
+        let now = self.server_now();
+        self.referee.handle_timeout(now);
+        while let Some(event) = self.referee.poll_event() {
+            self.note(event.clone());
+            self.companion.handle_event(self.now, event);
+        }
+    }
+
+    /// Draws the cameras that are due.
+    fn draw(&mut self) -> Result<()> {
+        let phase = self.companion.phase();
+        if matches!(phase, FlightPhase::Landing | FlightPhase::Landed) {
+            return Ok(());
+        }
+        let due: Vec<usize> =
+            (0..self.cameras.len()).filter(|&i| self.camera_due[i] <= self.now).collect();
+        let (Some(motion), Some(newest), false) =
+            (self.referee.motion(), self.referee.newest(), due.is_empty())
+        else {
+            return Ok(());
+        };
+        let on_ground = matches!(phase, FlightPhase::Connecting | FlightPhase::Preparing);
+        for &index in &due {
+            let own = self.arena.cameras[index].rate_hz.map(|hz| (1e9 / hz) as i64);
+            let period_ns = own.unwrap_or(self.trial.delays.image_period_ns);
+            let period_ns = if on_ground { period_ns.max(GROUND_PERIOD_NS) } else { period_ns };
+            let next = self.camera_due[index].plus_ns(period_ns);
+            self.camera_due[index] = if next > self.now { next } else { self.now.plus_ns(1) };
+        }
+        let seen = self.now.plus_ns(self.trial.delays.image_ns);
+        let shown = motion.reach(ServerTime::from_ns(seen.as_ns()));
+        let world_from_body = motion.at(shown);
+        let cameras: Vec<Camera> = due
+            .iter()
+            .map(|&index| Camera {
+                intrinsics: self.cameras[index].intrinsics,
+                world_from_cam: world_from_body * self.cameras[index].body_from_cam,
+                near_m: self.arena.cameras[index].near_m as f32,
+                background: [0.0; 3],
+            })
+            .collect();
+        let pose = newest.stamp;
+        self.images.resize_with(cameras.len().max(self.images.len()), RgbdImage::default);
+        let images = &mut self.images[..cameras.len()];
+        // What moves is where it is at the instant that the images show, as for the referee.
+        let since_start_ns = shown.as_ns().wrapping_sub(START_NS).cast_signed();
+        let placements = self.trial.place.obstacles.objects.placements(since_start_ns);
+        self.renderer.render(&placements, &cameras, images).context("an image cannot be drawn")?;
+        let mut drawn: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
+        for (&index, image) in due.iter().zip(images) {
+            let mut picture = Picture::default();
+            image.write_rgb8(&mut picture.rgb);
+            image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
+            let k = &self.cameras[index].intrinsics;
+            let size = (k.width_px as usize, k.height_px as usize);
+            picture.ahead_m = least_ahead_m(&picture.depth_mm, size);
+            if !self.arena.cameras[index].depth {
+                // As in flight: what the course withholds is "no return" everywhere.
+                picture.depth_mm.fill(0);
+            }
+            drawn[index] = Some(picture);
+        }
+        self.seq += 1;
+        self.pending.push_back(Pending { due: seen, seq: self.seq, pose, shown, drawn });
+        Ok(())
+    }
+
+    /// Gives the plugin an image and takes its answer.
+    fn show(&mut self, process: &mut Option<PluginProcess>, pending: &Pending) -> Result<()> {
+        if process.is_none() {
+            return Ok(());
+        }
+        while let Some(message) = self.companion.poll_plugin() {
+            let Some(plugin) = process.as_mut() else { return Ok(()) };
+            let result = plugin.send(&message, &mut lines(&mut self.lines));
+            self.heard(process, result)?;
+        }
+        let Some(plugin) = process.as_mut() else { return Ok(()) };
+        let mut memory = plugin.loan(ObservationWriter::len_for(&self.cameras))?;
+        let mut writer = ObservationWriter::new(memory.memory(), pending.seq, &self.cameras)?;
+        self.companion.write(&mut writer);
+        let ahead_ns = pending.shown.as_ns().wrapping_sub(pending.pose.as_ns()) as i32;
+        for (index, picture) in pending.drawn.iter().enumerate() {
+            let (Some(picture), camera) = (picture, &self.cameras[index]) else { continue };
+            self.hash.update(&picture.rgb);
+            for depth_mm in picture.depth_mm.chunks(4096) {
+                let mut bytes = [0; 2 * 4096];
+                for (pair, mm) in bytes.chunks_exact_mut(2).zip(depth_mm) {
+                    pair.copy_from_slice(&mm.to_le_bytes());
+                }
+                self.hash.update(&bytes[..2 * depth_mm.len()]);
+            }
+            if let Some(planes) = writer.planes(index, camera) {
+                planes.rgb.copy_from_slice(&picture.rgb);
+                planes.depth_mm.copy_from_slice(&picture.depth_mm);
+            }
+            let pose = HostTime::from_ns(pending.pose.as_ns());
+            let ready = pending.due;
+            let stamps = ImageStamps { seq: pending.seq, pose, ahead_ns, ready };
+            writer.image_ready(index, camera, stamps);
+        }
+        self.companion.published(self.now, pending.seq);
+        let result = plugin.ask(pending.seq, memory, &mut lines(&mut self.lines));
+        let Some(setpoint) = self.heard(process, result)? else { return Ok(()) };
+        self.answered += 1;
+        self.hash.update(format!("{setpoint:?}").as_bytes());
+        self.keep_for_report(pending, setpoint.as_ref());
+        let due = self.now.plus_ns(self.trial.delays.answer_ns);
+        self.answers.push_back(Answer { due, seq: pending.seq, setpoint });
+        Ok(())
+    }
+
+    /// Passes on what the plugin said; one that has failed is told to the flight, and is no more.
+    fn heard<T>(
+        &mut self,
+        process: &mut Option<PluginProcess>,
+        result: Result<T, ProcessError>,
+    ) -> Result<Option<T>> {
+        match result {
+            Ok(value) => Ok(Some(value)),
+            Err(ProcessError::Failed(why)) => {
+                if let Some(process) = process.take() {
+                    process.stop(&mut lines(&mut self.lines));
+                }
+                self.companion.plugin_failed(self.now, why);
+                Ok(None)
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn keep_for_report(&mut self, pending: &Pending, setpoint: Option<&Setpoint>) {
+        if self.is_decided {
+            return;
+        }
+        let front = pending.drawn.first().and_then(Option::as_ref);
+        let k = self.cameras.first().map(|camera| camera.intrinsics);
+        let ahead_m = front.and_then(|picture| picture.ahead_m);
+        let (stamp, setpoint) = (self.server_now(), setpoint.cloned());
+        self.asked.push(Asked { stamp, setpoint, ahead_m });
+        let (Some(picture), Some(k)) = (front, k) else { return };
+        let is_due = self.shots.back().is_none_or(|shot| {
+            pending.shown.seconds_since(shot.stamp) >= SHOT_PERIOD_S - 0.5 * 2.5e-3
+        });
+        if is_due {
+            let size_px = (k.width_px, k.height_px);
+            let rgb = picture.rgb.clone();
+            self.shots.push_back(Shot { stamp: pending.shown, rgb, size_px });
+            while self.shots.front().is_some_and(|oldest| {
+                pending.shown.seconds_since(oldest.stamp) > SHOWN_S + 0.5 * SHOT_PERIOD_S
+            }) {
+                self.shots.pop_front();
+            }
+        }
+    }
+
+    fn note(&mut self, event: Event) {
+        self.is_decided |= matches!(
+            event.kind,
+            EventKind::Collision { .. }
+                | EventKind::Geofence { .. }
+                | EventKind::Finished { .. }
+                | EventKind::TimeLimit
+                | EventKind::PluginFailed
+        );
+        self.hash.update(event.stamp.as_ns().to_le_bytes());
+        self.hash.update(format!("{:?}", event.kind).as_bytes());
+        self.hash.update(event.text.as_bytes());
+        self.events.push(event);
+    }
+
+    fn hash_state(&mut self) {
+        let state = self.simulation.state();
+        let hash_vector = |hash: &mut Sha256, v: DVec3| {
+            for value in v.to_array() {
+                hash.update(value.to_le_bytes());
+            }
+        };
+        hash_vector(&mut self.hash, state.p_world_m);
+        hash_vector(&mut self.hash, state.v_world_mps);
+        for value in state.world_from_body.to_array() {
+            self.hash.update(value.to_le_bytes());
+        }
+    }
+
+    fn server_now(&self) -> ServerTime {
+        ServerTime::from_ns(self.now.as_ns())
+    }
+
+    fn virtual_s(&self) -> f64 {
+        self.now.seconds_since(HostTime::from_ns(START_NS))
+    }
+
+    fn end(mut self) -> Flown {
+        let virtual_s = self.virtual_s();
+        // Server's and runtime's, each in order, become one story.
+        self.events.sort_by_key(|event| event.stamp);
+        Flown {
+            verdict: judge(self.arena, &self.events, &self.samples),
+            hash: self.hash.finalize().into(),
+            events: self.events,
+            samples: self.samples,
+            asked: self.asked,
+            shots: self.shots,
+            lines: self.lines,
+            images: self.answered,
+            virtual_s,
+        }
+    }
+}
+
+/// Returns the tenth percentile of the depths in the middle ninth of an image: what is ahead, single
+/// pixels aside. [m, cam]
+fn least_ahead_m(depth_mm: &[u16], (width, height): (usize, usize)) -> Option<f64> {
+    let rows = depth_mm.chunks_exact(width).skip(height / 3).take(height / 3);
+    let middle = rows.flat_map(|row| &row[width / 3..2 * width / 3]);
+    let mut returns: Vec<u16> = middle.copied().filter(|&mm| mm > 0).collect();
+    if returns.is_empty() {
+        return None;
+    }
+    let nth = returns.len() / 10;
+    let (_, &mut mm, _) = returns.select_nth_unstable(nth);
+    Some(f64::from(mm) / 1000.0)
+}
+
+/// Hears what the plugin prints.
+fn lines(kept: &mut VecDeque<String>) -> impl FnMut(Stream, &str) {
+    move |_, text| keep(kept, text)
+}
+
+fn keep(kept: &mut VecDeque<String>, text: &str) {
+    if kept.len() == LINES {
+        kept.pop_front();
+    }
+    kept.push_back(text.to_owned());
+}

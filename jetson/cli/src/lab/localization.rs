@@ -1,0 +1,95 @@
+//! How the simulated lab localizes its vehicle, as arguments for those who take part.
+
+use std::ffi::OsString;
+use std::net::UdpSocket;
+
+use anyhow::{Result, bail};
+use clap::ValueEnum;
+use glam::DVec3;
+
+/// Where the server's poses come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Localization {
+    /// Vicon Tracker's UDP object stream.
+    #[default]
+    Vicon,
+    /// OptiTrack Motive's NatNet, y up.
+    Natnet,
+    /// VizFlyt's own JSON packets.
+    Json,
+    /// AprilTags on the vehicle, in the images of two simulated webcams.
+    Tags,
+}
+
+impl Localization {
+    /// Refuses a fence that reaches beyond where the vehicle can be seen. [m, world]
+    pub(crate) fn check(self, fence_m: (DVec3, DVec3)) -> Result<()> {
+        let (least_m, most_m) = fence_m;
+        let seen =
+            least_m.cmpge(HALL_M.0 - SLACK_M).all() && most_m.cmple(HALL_M.1 + SLACK_M).all();
+        if self == Self::Tags && !seen {
+            let size_m = most_m - least_m;
+            bail!(
+                "--localization tags: the two webcams see a hall of 11 x 4.5 m, and this scene is flown \
+                 in {:.0} x {:.0} m; take --scene room or race",
+                size_m.x,
+                size_m.y
+            );
+        }
+        Ok(())
+    }
+
+    /// Returns the server's option: it says which address it got.
+    pub(crate) fn of_server(self) -> OsString {
+        match self {
+            Self::Vicon => "--pose=vicon:127.0.0.1:0".into(),
+            Self::Natnet => format!("--pose=natnet:{},up=y", unused()).into(),
+            Self::Json | Self::Tags => "--pose=json:127.0.0.1:0".into(),
+        }
+    }
+
+    /// Returns the simulator's option: its motion capture streams to the server at `poses`.
+    pub(crate) fn of_simulator(self, poses: &str) -> String {
+        match self {
+            Self::Vicon => format!("--vicon={poses}"),
+            Self::Natnet => format!("--mocap=natnet:{poses}"),
+            Self::Json | Self::Tags => format!("--mocap=json:{poses}"),
+        }
+    }
+
+    /// Returns the command that sees tags and sends poses to the server at `poses`; it says where it waits
+    /// for the true poses that its cameras' images are drawn by.
+    pub(crate) fn of_tags(poses: &str) -> Vec<OsString> {
+        let words = ["tags", "locate", "--json", "--lifeline", "--simulated"];
+        let mut args: Vec<OsString> = words.map(OsString::from).to_vec();
+        args.extend([format!("--to={poses}").into(), "--http=127.0.0.1:0".into()]);
+        args
+    }
+}
+
+/// What the webcams of `vizflyt_tags::simulated` see. [m, world]
+const HALL_M: (DVec3, DVec3) = (DVec3::new(0.0, -2.25, 0.0), DVec3::new(11.0, 2.25, 3.65));
+/// Nobody flies to the very net.
+const SLACK_M: DVec3 = DVec3::splat(0.5);
+
+/// Returns an address of this computer that nobody uses: Motive waits at its own, and starts after the
+/// server, which asks it. Where even that fails, Motive's usual one.
+fn unused() -> String {
+    let found = UdpSocket::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
+    found.map_or_else(|_| "127.0.0.1:1510".to_owned(), |address| address.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tags_are_for_rooms_that_the_webcams_see() {
+        let (room, forest) = (DVec3::new(11.0, 2.25, 3.5), DVec3::new(40.0, 5.0, 4.0));
+        let least_m = DVec3::new(0.0, -2.25, 0.0);
+        assert!(Localization::Tags.check((least_m, room)).is_ok());
+        assert!(Localization::Vicon.check((least_m, forest)).is_ok());
+        let error = Localization::Tags.check((least_m, forest)).unwrap_err().to_string();
+        assert!(error.contains("flown in 40 x 7 m; take --scene room"), "{error}");
+    }
+}

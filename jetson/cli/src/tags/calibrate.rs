@@ -1,0 +1,128 @@
+//! `vizflyt tags calibrate`: a camera's lens, from images of the printed board.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, Verdict};
+use vizflyt_tags::camera::{Mounting, TagCamera};
+use vizflyt_tags::capture;
+
+use crate::terminal::{on_interrupt, tell};
+
+/// Finds a camera's focal lengths, principal point and distortion from images of the printed board, and
+/// writes the camera's file.
+#[derive(Args, Debug)]
+#[command(after_help = "Focus and zoom must not change afterwards: turn autofocus off
+(v4l2-ctl -d /dev/video0 --set-ctrl focus_automatic_continuous=0).
+Move the board slowly through the whole image, near and far, tilted to all sides; the command says
+where next, and ends by itself.")]
+pub(super) struct CalibrateArgs {
+    /// Where images come from: /dev/video0, /dev/video0:1280x720@60, a folder, a video file, - or
+    /// '| COMMAND' for YUV4MPEG2.
+    source: String,
+    /// The board's layout, as `vizflyt tags print board` or `print checkers` wrote it.
+    #[arg(long, value_name = "FILE.toml")]
+    board: PathBuf,
+    /// The camera's file.
+    #[arg(short, long, value_name = "FILE.toml")]
+    output: PathBuf,
+    /// What the camera is called; without it, the file's name.
+    #[arg(long, value_name = "NAME")]
+    name: Option<String>,
+    /// The lens is a fisheye of more than some 110 degrees.
+    #[arg(long)]
+    fisheye: bool,
+}
+
+/// Runs `vizflyt tags calibrate`.
+pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
+    let stem = args.output.file_stem().and_then(|stem| stem.to_str());
+    let Some(name) = args.name.as_deref().or(stem) else {
+        bail!("{}: give the camera's file a name", args.output.display());
+    };
+    let model = if args.fisheye { LensModel::KannalaBrandt } else { LensModel::BrownConrady };
+    let mut session = Session::new(Board::read(&args.board)?, model);
+    let mut source = capture::open(&args.source)?;
+    let is_live = source.is_live();
+    let stop = Arc::new(AtomicBool::new(false));
+    if is_live {
+        let stop = Arc::clone(&stop);
+        on_interrupt(move || {
+            stop.store(true, Ordering::Relaxed);
+            false
+        })?;
+        tell("show the board to the camera; Ctrl-C ends early");
+    }
+    let mut said = String::new();
+    while let Some(exposure) = source.next()? {
+        let verdict = session.take(exposure.image, is_live)?;
+        if let Some(calibrator) = session.progress() {
+            let line = guide(calibrator, verdict, is_live);
+            if line != said {
+                if is_live || verdict == Verdict::Kept {
+                    tell(&line);
+                }
+                said = line;
+            }
+            if is_live && calibrator.views() >= LIVE_VIEWS && calibrator.wanted().is_empty() {
+                break;
+            }
+        }
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    drop(source);
+    if let Some(calibrator) = session.progress() {
+        tell(format_args!("{} views; where corners were seen:", calibrator.views()));
+        for row in calibrator.coverage().map() {
+            tell(format_args!("  {row}"));
+        }
+    }
+    let found = session.finish().context("no camera file was written")?;
+    let (k, quality) = (found.intrinsics, found.calibration);
+    let camera = TagCamera {
+        name: name.to_owned(),
+        source: is_device(&args.source).then(|| args.source.clone()),
+        intrinsics: k,
+        mounting: Mounting::Unknown,
+        calibration: Some(quality),
+    };
+    camera.write(&args.output)?;
+    let [fx, fy, cx, cy] = found.sigma_px;
+    tell(format_args!(
+        "focal length {:.1} +- {fx:.1}, {:.1} +- {fy:.1} px; middle {:.1} +- {cx:.1}, {:.1} +- {cy:.1} px",
+        k.fx_px, k.fy_px, k.cx_px, k.cy_px
+    ));
+    tell(format_args!(
+        "corners are {:.2} px off in the {} views used, {:.2} px in those held back",
+        quality.rms_px, quality.images, quality.held_out_rms_px
+    ));
+    tell(format_args!("{}: written", args.output.display()));
+    Ok(())
+}
+
+/// Returns what to do next, in one line.
+fn guide(calibrator: &Calibrator, verdict: Verdict, is_live: bool) -> String {
+    let wanted = calibrator.wanted();
+    let next = match (verdict, wanted.first()) {
+        (Verdict::Moving | Verdict::TooFewTags | Verdict::NoBoard, _) if is_live => {
+            verdict.to_string()
+        }
+        (_, Some(wanted)) => wanted.clone(),
+        (_, None) => "more views, near and far, make it surer".into(),
+    };
+    let share = 100.0 * calibrator.coverage().share();
+    format!("{:>3} views, {share:>3.0} % of the image: {next}", calibrator.views())
+}
+
+/// Whether a source will be the same one tomorrow.
+fn is_device(source: &str) -> bool {
+    source.starts_with("/dev/") || source.starts_with('|')
+}
+
+/// A live calibration ends once it has so many views and has seen everything.
+const LIVE_VIEWS: usize = 30;

@@ -1,0 +1,313 @@
+//! Where images come from: one thread a camera, newest wins; recorded images one after the other.
+
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_server::drivers::json::PosePacket;
+use vizflyt_tags::camera::TagCamera;
+use vizflyt_tags::capture::{self, Exposure, ImageSource};
+use vizflyt_tags::image::Gray;
+use vizflyt_tags::locate::{LocateSetup, SIMULATED};
+use vizflyt_tags::simulated::{SimulatedCamera, Truth};
+
+/// An image of one camera.
+#[derive(Clone, Debug)]
+pub(super) struct Shot {
+    /// Its index.
+    pub(super) camera: usize,
+    /// Middle of the exposure.
+    pub(super) stamp: HostTime,
+    pub(super) image: Gray,
+}
+
+/// All cameras.
+pub(super) struct Sources {
+    mailbox: Arc<Mailbox>,
+    truth: Option<(SocketAddr, Arc<SharedTruth>)>,
+    /// Recordings, whose images all count; none if the cameras are live.
+    recorded: Vec<Recording>,
+}
+
+/// A folder, a video: a camera of the past.
+struct Recording {
+    name: String,
+    size: (u32, u32),
+    source: Box<dyn ImageSource>,
+    /// Its next image; `None` at its end.
+    head: Option<Exposure>,
+}
+
+/// The newest image of each camera that was not yet taken.
+#[derive(Default)]
+struct Mailbox {
+    shots: Mutex<Vec<Shot>>,
+    arrived: Condvar,
+    /// Why a camera gives no more images.
+    failed: Mutex<Option<String>>,
+}
+
+/// What the simulated cameras draw by.
+#[derive(Default)]
+struct SharedTruth {
+    truth: Mutex<Truth>,
+    arrived: Condvar,
+}
+
+impl Sources {
+    /// Opens all cameras of a setup.
+    pub(super) fn open(
+        setup: &LocateSetup,
+        truth_at: SocketAddr,
+        stop: &Arc<AtomicBool>,
+    ) -> Result<Self> {
+        let mut sources =
+            Self { mailbox: Arc::new(Mailbox::default()), truth: None, recorded: Vec::new() };
+        let is_simulated = |camera: &&TagCamera| camera.source.as_deref() == Some(SIMULATED);
+        let simulated = setup.cameras.iter().filter(is_simulated).count();
+        if simulated == setup.cameras.len() {
+            sources.simulate(setup, truth_at, stop)?;
+            return Ok(sources);
+        }
+        if simulated > 0 {
+            bail!(
+                "tags: {simulated} of {} cameras are simulated; take all or none",
+                setup.cameras.len()
+            );
+        }
+        let mut opened = Vec::new();
+        for camera in &setup.cameras {
+            let name = &camera.name;
+            let Some(source) = &camera.source else {
+                bail!(
+                    "tags: camera {name:?} has no source; add it to its file, or give --source {name}=/dev/video0"
+                );
+            };
+            let source = capture::open(source).with_context(|| format!("tags: camera {name:?}"))?;
+            opened.push((camera, source));
+        }
+        let live = opened.iter().filter(|(_, source)| source.is_live()).count();
+        if live == 0 {
+            for (camera, mut source) in opened {
+                let size = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+                let head = source.next()?;
+                sources.recorded.push(Recording { name: camera.name.clone(), size, source, head });
+            }
+            return Ok(sources);
+        }
+        if live < opened.len() {
+            bail!(
+                "tags: {live} of {} cameras are live, the others recordings; take all or none",
+                opened.len()
+            );
+        }
+        for (index, (camera, source)) in opened.into_iter().enumerate() {
+            let (mailbox, stop) = (Arc::clone(&sources.mailbox), Arc::clone(stop));
+            let (name, size) =
+                (camera.name.clone(), (camera.intrinsics.width_px, camera.intrinsics.height_px));
+            std::thread::spawn(move || {
+                if let Err(error) = read(index, &name, size, source, &mailbox, &stop) {
+                    *lock(&mailbox.failed) = Some(format!("{error:#}"));
+                }
+            });
+        }
+        Ok(sources)
+    }
+
+    fn simulate(
+        &mut self,
+        setup: &LocateSetup,
+        truth_at: SocketAddr,
+        stop: &Arc<AtomicBool>,
+    ) -> Result<()> {
+        let (socket, shared) = listen(truth_at)?;
+        let address = socket.local_addr().context("tags: the socket of the truth")?;
+        spawn_listener(socket, Arc::clone(&shared), setup.object.clone(), Arc::clone(stop));
+        for (index, camera) in setup.cameras.iter().enumerate() {
+            let sensor = setup.simulated.sensor(index, setup.cameras.len());
+            let camera = SimulatedCamera::new(camera.clone(), sensor);
+            let (shared, mailbox) = (Arc::clone(&shared), Arc::clone(&self.mailbox));
+            let (layouts, stop) = (setup.layouts.clone(), Arc::clone(stop));
+            std::thread::spawn(move || {
+                draw(index, camera, &layouts, &shared, &mailbox, &stop);
+            });
+        }
+        self.truth = Some((address, shared));
+        Ok(())
+    }
+
+    /// Returns where true poses are awaited, if a camera is simulated.
+    pub(super) fn truth(&self) -> Option<SocketAddr> {
+        self.truth.as_ref().map(|(address, _)| *address)
+    }
+
+    /// Returns the true pose at an instant, if it is known.
+    pub(super) fn true_pose(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
+        let (_, shared) = self.truth.as_ref()?;
+        lock(&shared.truth).at(stamp)
+    }
+
+    /// Whether stamps are of this computer's clock.
+    pub(super) fn is_live(&self) -> bool {
+        self.recorded.is_empty()
+    }
+
+    /// Returns the newest images in the order of their stamps, none if none came in time; `None` at the
+    /// end of all.
+    pub(super) fn next(&mut self, wait: Duration) -> Result<Option<Vec<Shot>>> {
+        if !self.recorded.is_empty() {
+            return self.next_recorded();
+        }
+        let shots = lock(&self.mailbox.shots);
+        let (mut shots, _) = self
+            .mailbox
+            .arrived
+            .wait_timeout_while(shots, wait, |shots| shots.is_empty())
+            .unwrap_or_else(PoisonError::into_inner);
+        let mut taken = std::mem::take(&mut *shots);
+        drop(shots);
+        if let Some(why) = lock(&self.mailbox.failed).take() {
+            bail!("tags: {why}");
+        }
+        taken.sort_by_key(|shot| shot.stamp);
+        Ok(Some(taken))
+    }
+
+    /// Returns the earliest images of the recordings, those of one instant together.
+    fn next_recorded(&mut self) -> Result<Option<Vec<Shot>>> {
+        let heads = self.recorded.iter().filter_map(|r| r.head.as_ref());
+        let Some(first) = heads.map(|head| head.stamp_ns).min() else { return Ok(None) };
+        let mut shots = Vec::new();
+        for (camera, recording) in self.recorded.iter_mut().enumerate() {
+            let due = |head: &Exposure| head.stamp_ns - first <= TOGETHER_NS;
+            if recording.head.as_ref().is_some_and(due)
+                && let Some(Exposure { stamp_ns, image }) = recording.head.take()
+            {
+                check_size(&recording.name, recording.size, &image)?;
+                shots.push(Shot { camera, stamp: HostTime::from_ns(stamp_ns), image });
+                recording.head = recording.source.next()?;
+            }
+        }
+        shots.sort_by_key(|shot| shot.stamp);
+        Ok(Some(shots))
+    }
+}
+
+impl Mailbox {
+    fn put(&self, shot: Shot) {
+        let mut shots = lock(&self.shots);
+        shots.retain(|kept| kept.camera != shot.camera);
+        shots.push(shot);
+        self.arrived.notify_one();
+    }
+}
+
+/// Reads one live camera until told to stop.
+fn read(
+    index: usize,
+    name: &str,
+    size: (u32, u32),
+    mut source: Box<dyn ImageSource>,
+    mailbox: &Mailbox,
+    stop: &AtomicBool,
+) -> Result<()> {
+    while !stop.load(Ordering::Relaxed) {
+        let next = source.next().with_context(|| format!("camera {name:?}"))?;
+        let Some(Exposure { stamp_ns, image }) = next else {
+            bail!("camera {name:?} gives no more images");
+        };
+        check_size(name, size, &image)?;
+        mailbox.put(Shot { camera: index, stamp: HostTime::from_ns(stamp_ns), image });
+    }
+    Ok(())
+}
+
+/// Images of another size than the lens was calibrated in would be located wrongly.
+fn check_size(name: &str, (width, height): (u32, u32), image: &Gray) -> Result<()> {
+    if (image.width_px(), image.height_px()) != (width, height) {
+        bail!(
+            "camera {name:?} gives images of {}x{}, its file is for {width}x{height}; set the camera to \
+             that size, or calibrate it in this one",
+            image.width_px(),
+            image.height_px()
+        );
+    }
+    Ok(())
+}
+
+fn listen(at: SocketAddr) -> Result<(UdpSocket, Arc<SharedTruth>)> {
+    let socket = UdpSocket::bind(at).with_context(|| {
+        format!("tags: cannot listen for the truth at {at}; is the port taken?")
+    })?;
+    socket.set_read_timeout(Some(LOOK_AT_STOP)).context("tags: the socket of the truth")?;
+    Ok((socket, Arc::new(SharedTruth::default())))
+}
+
+fn spawn_listener(
+    socket: UdpSocket,
+    shared: Arc<SharedTruth>,
+    object: String,
+    stop: Arc<AtomicBool>,
+) {
+    std::thread::spawn(move || {
+        let mut bytes = [0; 2048];
+        while !stop.load(Ordering::Relaxed) {
+            let Ok(length) = socket.recv(&mut bytes) else { continue };
+            let Ok(packet) = PosePacket::parse(&bytes[..length]) else { continue };
+            let Some(stamp_ns) = packet.stamp_ns else { continue };
+            if packet.object != object {
+                continue;
+            }
+            let pose = Pose::new(
+                DVec3::from_array(packet.position_m),
+                DQuat::from_array(packet.rotation_xyzw).normalize(),
+            );
+            lock(&shared.truth).push(HostTime::from_ns(stamp_ns), pose);
+            shared.arrived.notify_all();
+        }
+    });
+}
+
+/// Draws what one camera sees until told to stop.
+fn draw(
+    index: usize,
+    mut camera: SimulatedCamera,
+    layouts: &[vizflyt_tags::layout::TagLayout],
+    shared: &SharedTruth,
+    mailbox: &Mailbox,
+    stop: &AtomicBool,
+) {
+    while !stop.load(Ordering::Relaxed) {
+        let mut known = Truth::default();
+        {
+            let truth = lock(&shared.truth);
+            let (truth, waited) = shared
+                .arrived
+                .wait_timeout_while(truth, LOOK_AT_STOP, |truth| camera.due(truth).is_none())
+                .unwrap_or_else(PoisonError::into_inner);
+            if waited.timed_out() {
+                continue;
+            }
+            // Drawing takes long; poses arrive meanwhile.
+            known.clone_from(&truth);
+        }
+        if let Some((stamp, image)) = camera.expose(&known, layouts, true) {
+            mailbox.put(Shot { camera: index, stamp, image });
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // What a panicked thread left is whole: each change is a single step.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Recorded images closer than this were exposed together.
+const TOGETHER_NS: u64 = 2_000_000;
+/// How often threads look whether they should end.
+const LOOK_AT_STOP: Duration = Duration::from_millis(100);

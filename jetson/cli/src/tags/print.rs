@@ -1,0 +1,227 @@
+//! `vizflyt tags print`: a PDF, and the layout file beside it.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use clap::{Args, Subcommand, ValueEnum};
+use glam::DVec3;
+use vizflyt_tags::family::TagFamily;
+use vizflyt_tags::print::{BAR_MM, CUBE_FACES, Cube, Mat, Paper, Printed, checkers, pdf};
+
+use super::family;
+use crate::terminal::tell;
+
+/// Prints a cube for the vehicle, a mat for the floor, or a board or checkerboard to calibrate with: a
+/// PDF, and the layout file beside it.
+#[derive(Args, Debug)]
+#[command(after_help = "Print at 100 %, then measure the bar at the foot of a sheet. If it is not
+100.0 mm long, run the same command again with --bar-mm: the sheets stay the same, and the layout
+file says how large the tags really are.")]
+pub(super) struct PrintArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Faces with folds and flaps: tags on the vehicle, seen by cameras in the room.
+    Cube {
+        #[command(flatten)]
+        common: Common,
+        /// Id of the front face; left, back, right, top, bottom follow.
+        #[arg(long, value_name = "ID", default_value_t = 0)]
+        first_id: u32,
+        /// How many faces; 5 leaves out the bottom.
+        #[arg(long, value_name = "N", default_value_t = 5)]
+        faces: u32,
+        /// Edge of the cube. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 170.0)]
+        face_mm: f64,
+        /// Edge of a tag's black square. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 132.0)]
+        tag_mm: f64,
+        /// The cube's middle from the vehicle's: forward, left, up. [m]
+        #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
+        middle_m: DVec3,
+    },
+    /// A grid of tags over as many sheets as it takes: tags on the floor or a wall, seen by a camera
+    /// on the vehicle; also what cameras in the room are surveyed with.
+    Mat {
+        #[command(flatten)]
+        common: Common,
+        /// Id of the first tag; ids count eastwards, then northwards.
+        #[arg(long, value_name = "ID", default_value_t = 100)]
+        first_id: u32,
+        /// Tags from west to east.
+        #[arg(long, value_name = "N", default_value_t = 4)]
+        columns: u32,
+        /// Tags from south to north.
+        #[arg(long, value_name = "N", default_value_t = 6)]
+        rows: u32,
+        /// From one tag's middle to the next one's. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 95.0)]
+        pitch_mm: f64,
+        /// Edge of a tag's black square. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 70.0)]
+        tag_mm: f64,
+        /// Where the grid's middle lies in the room: east, north, up. [m]
+        #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
+        middle_m: DVec3,
+    },
+    /// One sheet full of tags, to be glued on something flat and stiff.
+    Board {
+        #[command(flatten)]
+        common: Common,
+        /// Id of the first tag.
+        #[arg(long, value_name = "ID", default_value_t = 300)]
+        first_id: u32,
+        /// Edge of a tag's black square. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 30.0)]
+        tag_mm: f64,
+    },
+    /// One sheet of black and white squares, to be glued on something flat and stiff: to calibrate with
+    /// where other programs are to use the same images. It must be seen as a whole, the board of tags
+    /// in any part.
+    Checkers {
+        /// The PDF; what is on it goes into a .toml file of the same name.
+        #[arg(short, long, value_name = "FILE.pdf")]
+        output: PathBuf,
+        /// What to print on.
+        #[arg(long, value_enum, default_value_t = PaperName::A4)]
+        paper: PaperName,
+        /// Edge of a square. [mm]
+        #[arg(long, value_name = "MM", default_value_t = 25.0)]
+        square_mm: f64,
+        /// What the printed scale bar measures. [mm]
+        #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
+        bar_mm: f64,
+    },
+}
+
+#[derive(Args, Debug)]
+struct Common {
+    /// The PDF; the layout goes into a .toml file of the same name.
+    #[arg(short, long, value_name = "FILE.pdf")]
+    output: PathBuf,
+    /// What to print on.
+    #[arg(long, value_enum, default_value_t = PaperName::A4)]
+    paper: PaperName,
+    /// Which tags.
+    #[arg(long, value_name = "NAME", default_value = "tag36h11", value_parser = family)]
+    family: TagFamily,
+    /// What the printed scale bar measures. [mm]
+    #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
+    bar_mm: f64,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum PaperName {
+    A4,
+    Letter,
+    A3,
+}
+
+impl From<PaperName> for Paper {
+    fn from(name: PaperName) -> Self {
+        match name {
+            PaperName::A4 => Self::A4,
+            PaperName::Letter => Self::Letter,
+            PaperName::A3 => Self::A3,
+        }
+    }
+}
+
+/// Runs `vizflyt tags print`.
+pub(super) fn run(args: &PrintArgs) -> Result<()> {
+    match args.what {
+        What::Cube { ref common, first_id, faces, face_mm, tag_mm, middle_m } => {
+            let &Common { family, paper, bar_mm, .. } = common;
+            let paper = paper.into();
+            let cube = Cube { family, first_id, faces, face_mm, tag_mm, middle_m, paper, bar_mm };
+            let printed = cube.print()?;
+            finish("cube", common, &printed)?;
+            for (tag, (name, ..)) in printed.layout.tags.iter().zip(CUBE_FACES) {
+                tell(format_args!("  {name:<6} {} {}", tag.family, tag.id));
+            }
+            tell(format_args!(
+                "Glue it on a cube of {:.1} mm, each name where the vehicle has it.",
+                face_mm * bar_mm / BAR_MM
+            ));
+        }
+        What::Mat { ref common, first_id, columns, rows, pitch_mm, tag_mm, middle_m } => {
+            let &Common { family, paper, bar_mm, .. } = common;
+            let paper = paper.into();
+            let mat =
+                Mat { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm };
+            finish("mat", common, &mat.print()?)?;
+            tell(format_args!(
+                "Join the sheets edge to edge, columns to the east, rows to the north; then survey it: \
+                 glued paper is off by millimetres."
+            ));
+        }
+        What::Board { ref common, first_id, tag_mm } => {
+            let &Common { family, paper, bar_mm, .. } = common;
+            let board = Mat::board(family, first_id, tag_mm, paper.into(), bar_mm)?;
+            finish("board", common, &board.print()?)?;
+            tell(format_args!(
+                "Glue it on something flat and stiff: a lens is only as straight as the board."
+            ));
+        }
+        What::Checkers { ref output, paper, square_mm, bar_mm } => {
+            let (sheet, board) = checkers(paper.into(), square_mm, bar_mm)?;
+            let file = beside(output)?;
+            write(output, &pdf("VizFlyt checkerboard", &[sheet]))?;
+            write(&file, board.to_toml()?.as_bytes())?;
+            tell(format_args!(
+                "{}: {} x {} inner corners, {:.2} mm apart",
+                output.display(),
+                board.columns,
+                board.rows,
+                board.square_m * 1e3
+            ));
+            tell(format_args!("{}: what is on it, for `tags calibrate --board`", file.display()));
+            tell(format_args!(
+                "Glue it on something flat and stiff: a lens is only as straight as the board."
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the file beside the PDF that says what is on it.
+fn beside(pdf: &Path) -> Result<PathBuf> {
+    let layout = pdf.with_extension("toml");
+    if layout == *pdf {
+        anyhow::bail!("{}: the layout is to be written there; name the PDF .pdf", pdf.display());
+    }
+    Ok(layout)
+}
+
+fn finish(title: &str, common: &Common, printed: &Printed) -> Result<()> {
+    let path = &common.output;
+    let layout = beside(path)?;
+    write(path, &pdf(&format!("VizFlyt {title}"), &printed.sheets))?;
+    write(&layout, printed.layout.to_toml()?.as_bytes())?;
+    let (sheets, tags) = (printed.sheets.len(), printed.layout.tags.len());
+    tell(format_args!(
+        "{}: {sheets} sheets of {}, {tags} tags",
+        path.display(),
+        Paper::from(common.paper)
+    ));
+    tell(format_args!("{}: where they are", layout.display()));
+    Ok(())
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Reads three numbers with commas between them.
+fn three(text: &str) -> Result<DVec3, String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .collect::<Result<_, _>>()?;
+    let [x, y, z] = numbers[..] else { return Err("give three numbers: X,Y,Z".into()) };
+    Ok(DVec3::new(x, y, z))
+}

@@ -1,0 +1,193 @@
+//! The clock's hand in a window: its pivot, angle and speed, and when the way is clear of it.
+//!
+//! What stands in cells of the window that are open at other times is the hand. Each image gives
+//! its line; lines of different angles cross at the pivot; angles over time give the speed, and the
+//! two of them when the hand is where.
+
+use std::collections::VecDeque;
+
+use vizflyt_sdk::glam::{DMat2, DVec2};
+use vizflyt_sdk::protocol::geometry::wrap_pi;
+
+/// Follows the hand of one window. Points are in the window's plane.
+#[derive(Clone, Debug, Default)]
+pub struct Hand {
+    sightings: VecDeque<Sighting>,
+    first_s: Option<f64>,
+    last_s: f64,
+    motion: Option<Motion>,
+}
+
+/// The hand in one image.
+#[derive(Clone, Copy, Debug)]
+struct Sighting {
+    at_s: f64,
+    /// Middle of what is seen of it. [m, plane]
+    middle_m: DVec2,
+    /// Unit vector along it.
+    along: DVec2,
+    /// What is seen farthest along it from the middle, to either side. [m]
+    half_m: f64,
+}
+
+/// How the hand turns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// What it turns about. [m, plane]
+    pub pivot_m: DVec2,
+    /// Angle at `at_s`, from the plane's left towards up. [rad]
+    pub angle_rad: f64,
+    /// Time of that angle. [s]
+    pub at_s: f64,
+    /// Speed of turning. [rad/s]
+    pub omega_radps: f64,
+    /// From the pivot to its tip. [m]
+    pub length_m: f64,
+}
+
+impl Motion {
+    /// Returns the hand's angle at a time. [rad]
+    pub fn angle_at(&self, at_s: f64) -> f64 {
+        wrap_pi(self.angle_rad + self.omega_radps * (at_s - self.at_s))
+    }
+
+    /// Returns the distance from a place to the hand's middle line at a time. [m]
+    pub fn distance_m(&self, within_m: DVec2, at_s: f64) -> f64 {
+        let tip = DVec2::from_angle(self.angle_at(at_s)) * self.length_m;
+        let from_pivot_m = within_m - self.pivot_m;
+        let along = (from_pivot_m.dot(tip) / tip.length_squared().max(1e-6)).clamp(0.0, 1.0);
+        from_pivot_m.distance(tip * along)
+    }
+}
+
+impl Hand {
+    /// Takes the points of an image at which something stands in the opening. [m, plane]
+    pub fn update(&mut self, now_s: f64, points_m: &[DVec2]) {
+        self.first_s.get_or_insert(now_s);
+        self.last_s = now_s;
+        while self.sightings.front().is_some_and(|first| now_s - first.at_s > REMEMBERED_S) {
+            self.sightings.pop_front();
+        }
+        if let Some(sighting) = sighting(now_s, points_m) {
+            self.sightings.push_back(sighting);
+        }
+        self.motion = self.fit();
+    }
+
+    /// Returns how it turns, once that is known.
+    pub fn motion(&self) -> Option<&Motion> {
+        self.motion.as_ref()
+    }
+
+    /// Whether a disc of `radius_m` at a place stays clear of the hand from one time to another.
+    /// A window that has been watched for long without anything in it has no hand.
+    pub fn is_clear(&self, within_m: DVec2, radius_m: f64, from_s: f64, to_s: f64) -> bool {
+        let Some(motion) = &self.motion else {
+            let watched_s = self.first_s.map_or(0.0, |first_s| self.last_s - first_s);
+            return self.sightings.is_empty() && watched_s > NO_HAND_S;
+        };
+        let steps = 24;
+        (0..=steps).all(|n| {
+            let at_s = from_s + (to_s - from_s) * f64::from(n) / f64::from(steps);
+            motion.distance_m(within_m, at_s) > radius_m + HALF_WIDTH_M
+        })
+    }
+
+    fn fit(&self) -> Option<Motion> {
+        // Pieces cut off aslant, by the image's edge, have another direction than the hand.
+        let longest_m = self.sightings.iter().map(|sighting| sighting.half_m).fold(0.0, f64::max);
+        let whole = |sighting: &&Sighting| sighting.half_m > WHOLE * longest_m;
+        let pivot_m = pivot_m(self.sightings.iter().filter(whole))?;
+        // Angles about the pivot, unwrapped, over the last seconds; then a straight line.
+        let newest_s = self.sightings.back()?.at_s;
+        let (mut n, mut t, mut tt, mut a, mut ta) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let mut last_rad: Option<f64> = None;
+        let mut length_m = 0.0_f64;
+        for sighting in self.sightings.iter().filter(whole) {
+            let from_pivot_m = sighting.middle_m - pivot_m;
+            length_m = length_m.max(from_pivot_m.length() + sighting.half_m);
+            // From the pivot to its middle: cut off aslant, its own line is a few degrees off.
+            let angle_rad = from_pivot_m.to_angle();
+            let unwrapped_rad =
+                last_rad.map_or(angle_rad, |last_rad| last_rad + wrap_pi(angle_rad - last_rad));
+            last_rad = Some(unwrapped_rad);
+            let since_s = sighting.at_s - newest_s;
+            n += 1.0;
+            t += since_s;
+            tt += since_s * since_s;
+            a += unwrapped_rad;
+            ta += since_s * unwrapped_rad;
+        }
+        let spread = n * tt - t * t;
+        if !(spread > 1e-9) {
+            return None;
+        }
+        let omega_radps = (n * ta - t * a) / spread;
+        let angle_rad = (a - omega_radps * t) / n;
+        Some(Motion {
+            pivot_m,
+            angle_rad: wrap_pi(angle_rad),
+            at_s: newest_s,
+            omega_radps,
+            length_m,
+        })
+    }
+}
+
+/// Returns where the hand's lines cross; `None` while they hardly differ. [m, plane]
+fn pivot_m<'a>(sightings: impl Iterator<Item = &'a Sighting>) -> Option<DVec2> {
+    let (mut matrix, mut right, mut count) = (DMat2::ZERO, DVec2::ZERO, 0_u32);
+    for sighting in sightings {
+        let across = sighting.along.perp();
+        let project = DMat2::from_cols(across * across.x, across * across.y);
+        matrix += project;
+        right += project * sighting.middle_m;
+        count += 1;
+    }
+    let differ = (matrix * (1.0 / f64::from(count.max(1)))).determinant();
+    (count >= FEWEST && differ > SWEPT).then(|| matrix.inverse() * right)
+}
+
+fn sighting(at_s: f64, points_m: &[DVec2]) -> Option<Sighting> {
+    if points_m.len() < FEWEST_POINTS {
+        return None;
+    }
+    let middle_m = points_m.iter().sum::<DVec2>() / points_m.len() as f64;
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for p_m in points_m {
+        let d = *p_m - middle_m;
+        xx += d.x * d.x;
+        xy += d.x * d.y;
+        yy += d.y * d.y;
+    }
+    let along = DVec2::from_angle(0.5 * (2.0 * xy).atan2(xx - yy));
+    let reach = |p_m: &DVec2| (*p_m - middle_m).dot(along).abs();
+    let across = |p_m: &DVec2| (*p_m - middle_m).dot(along.perp()).abs();
+    let half_m = points_m.iter().map(reach).fold(0.0, f64::max);
+    let wide_m = points_m.iter().map(across).sum::<f64>() / points_m.len() as f64;
+    // A speck has no direction.
+    (half_m > SHORTEST_M && half_m > 4.0 * wide_m).then_some(Sighting {
+        at_s,
+        middle_m,
+        along,
+        half_m,
+    })
+}
+
+/// Two turns at 60 degrees a second, and slower ones in part. [s]
+const REMEMBERED_S: f64 = 8.0;
+/// Watched for so long without a hand, there is none: a turn at 40 degrees a second. [s]
+const NO_HAND_S: f64 = 9.0;
+/// Half a hand's width, and the error of its predicted place. [m]
+const HALF_WIDTH_M: f64 = 0.1;
+/// Half of the shortest piece that counts. [m]
+const SHORTEST_M: f64 = 0.12;
+/// Share of the longest piece that is nearly the whole hand.
+const WHOLE: f64 = 0.7;
+const FEWEST: u32 = 12;
+const FEWEST_POINTS: usize = 8;
+/// Determinant of the lines' mean projector after a sweep of 45 degrees: (1 - sinc^2(45 deg)) / 4.
+const SWEPT: f64 = 0.045;
+
+#[cfg(test)]
+mod tests;

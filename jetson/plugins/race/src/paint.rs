@@ -1,0 +1,81 @@
+//! Colour of a pixel -> which racing window's paint it is.
+//!
+//! The course's windows are known by their colours, as the real ones are. Hue tells them apart;
+//! saturation keeps brick, mats and grey steel out. Light changes value much, hue little.
+
+/// The coloured bars of the course's windows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Paint {
+    /// Red bars, white arrowheads.
+    Red,
+    /// Blue bars, yellow arrowheads.
+    Blue,
+    /// Magenta bars, black arrowheads.
+    Magenta,
+    /// Orange bars, black arrowheads: the window with the hand.
+    Orange,
+    /// The hand itself.
+    Teal,
+}
+
+impl Paint {
+    /// The paints of windows.
+    pub const WINDOWS: [Self; 4] = [Self::Red, Self::Blue, Self::Magenta, Self::Orange];
+
+    /// Returns the paint of an sRGB pixel; `None` if it is none of them.
+    pub fn of(rgb: [u8; 3]) -> Option<Self> {
+        let [r, g, b] = rgb.map(i32::from);
+        let (most, least) = (r.max(g).max(b), r.min(g).min(b));
+        let chroma = most - least;
+        if most < DARKEST || chroma * 100 < SATURATION * most {
+            return None;
+        }
+        let sixth = |a: i32, b: i32| 60 * (a - b) / chroma;
+        let hue_deg = if most == r {
+            (sixth(g, b) + 360) % 360
+        } else if most == g {
+            sixth(b, r) + 120
+        } else {
+            sixth(r, g) + 240
+        };
+        match hue_deg {
+            342..360 | 0..6 => Some(Self::Red),
+            20..40 => Some(Self::Orange),
+            164..188 => Some(Self::Teal),
+            205..240 => Some(Self::Blue),
+            306..336 => Some(Self::Magenta),
+            _ => None,
+        }
+    }
+}
+
+/// Darker pixels have no sure hue: noise of a JPEG is about 5. Of 255.
+const DARKEST: i32 = 45;
+/// Bars have 70 % and more, brick and floor mats at most 55 %. [%]
+const SATURATION: i32 = 60;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paints_are_told_from_each_other_and_from_the_hall() {
+        let check = |rgb: u32, expected: Option<Paint>| {
+            let [_, r, g, b] = rgb.to_be_bytes();
+            for light in [30, 60, 100] {
+                let lit = [r, g, b].map(|c| (u32::from(c) * light / 100) as u8);
+                let dark = lit.iter().max().is_some_and(|&most| i32::from(most) < DARKEST);
+                assert_eq!(Paint::of(lit), expected.filter(|_| !dark), "{rgb:06x} at {light} %");
+            }
+        };
+        check(0xd8_1f2a, Some(Paint::Red));
+        check(0x1f_54d8, Some(Paint::Blue));
+        check(0xe0_218a, Some(Paint::Magenta));
+        check(0xf0_8a12, Some(Paint::Orange));
+        check(0x12_b5a6, Some(Paint::Teal));
+        // Arrowheads, chequers, steel, floor mats, plaster, brick.
+        for rgb in [0xf2_d21f, 0xf6_f2ea, 0x12_1214, 0x8b_8e93, 0x4a_6f94, 0xca_bfae, 0x8a_4a36] {
+            check(rgb, None);
+        }
+    }
+}

@@ -1,0 +1,409 @@
+//! Something upright with an opening in it, a window's frame or a wall, as a grid of what is solid
+//! and what is free.
+//!
+//! Each image says of each cell: a surface lies here, or the camera looked through. Where cells
+//! are free and the frame is around them, there is an opening; one flies through the place that is
+//! farthest from everything solid, so an unknown shape is as good as a square.
+
+use std::ops::Range;
+
+use vizflyt_sdk::glam::{DVec2, DVec3};
+
+use crate::eye::{Lattice, Sample};
+use crate::paint::Paint;
+
+/// What a screen is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A frame of bars of this paint.
+    Window(Paint),
+    /// A wall with a gap.
+    Wall,
+}
+
+impl Kind {
+    /// Returns what to call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Window(Paint::Red) => "the red window",
+            Self::Window(Paint::Blue) => "the blue window",
+            Self::Window(Paint::Magenta) => "the magenta window",
+            Self::Window(Paint::Orange) => "the window with the hand",
+            Self::Window(Paint::Teal) => "a teal window",
+            Self::Wall => "the gap",
+        }
+    }
+}
+
+/// An upright plane.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Plane {
+    /// A point of it; its z is not used. [m, home]
+    pub origin_m: DVec3,
+    /// Which way it is passed: angle of its normal from home x. [rad]
+    pub yaw_rad: f64,
+}
+
+impl Plane {
+    /// Returns the direction of passage. [home]
+    pub fn normal(&self) -> DVec3 {
+        DVec2::from_angle(self.yaw_rad).extend(0.0)
+    }
+
+    /// Returns the level direction in it, to the left of who passes. [home]
+    pub fn left(&self) -> DVec3 {
+        DVec3::Z.cross(self.normal())
+    }
+
+    /// Returns how far behind it a point lies; negative is before it. [m]
+    pub fn behind_m(&self, p_m: DVec3) -> f64 {
+        self.normal().dot(p_m - self.origin_m)
+    }
+
+    /// Returns a point's place in it: to the left of the origin, and up from the floor. [m]
+    pub fn within_m(&self, p_m: DVec3) -> DVec2 {
+        DVec2::new(self.left().dot(p_m - self.origin_m), p_m.z)
+    }
+
+    /// Returns the point of a place in it. [m, home]
+    pub fn point_m(&self, within_m: DVec2) -> DVec3 {
+        self.origin_m.with_z(within_m.y) + self.left() * within_m.x
+    }
+}
+
+/// What is known of one cell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cell {
+    /// Looked through (negative) or met (positive), newest counting most.
+    evidence: i8,
+    /// How often a surface was met here that is a bar by its paint.
+    painted: u8,
+}
+
+impl Cell {
+    /// Whether something is here now.
+    pub fn is_solid(self) -> bool {
+        self.evidence >= SURE
+    }
+
+    /// Whether nothing is here.
+    pub fn is_open(self) -> bool {
+        self.evidence <= -SURE
+    }
+
+    fn is_bar(self) -> bool {
+        self.is_solid() && self.painted >= 2
+    }
+
+    fn meet(&mut self, painted: bool) {
+        self.evidence = (self.evidence + 1).min(MOST);
+        self.painted = self.painted.saturating_add(u8::from(painted));
+    }
+
+    fn look_through(&mut self) {
+        self.evidence = (self.evidence - 1).max(-MOST);
+    }
+}
+
+/// A place to fly through.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Opening {
+    /// Where to pass. [m, home]
+    pub center_m: DVec3,
+    /// Radius of what is free around it. [m]
+    pub radius_m: f64,
+}
+
+/// A screen and what has been seen of it.
+#[derive(Clone, Debug)]
+pub struct Screen {
+    /// What it is.
+    pub kind: Kind,
+    /// Where it is.
+    pub plane: Plane,
+    /// From how near the plane was measured. [m]
+    pub range_m: f64,
+    /// The best place to pass, if there is any yet.
+    pub opening: Option<Opening>,
+    /// When it was made or last seen, on the clock of [`Self::update`]. [s]
+    pub seen_s: f64,
+    cells: Vec<Cell>,
+    room_m: Vec<f32>,
+}
+
+impl Screen {
+    /// Makes a screen of which nothing is seen yet.
+    pub fn new(kind: Kind, plane: Plane, range_m: f64, now_s: f64) -> Self {
+        let cells = vec![Cell::default(); COLUMNS * ROWS];
+        Self {
+            kind,
+            plane,
+            range_m,
+            opening: None,
+            seen_s: now_s,
+            cells,
+            room_m: vec![0.0; COLUMNS * ROWS],
+        }
+    }
+
+    /// Moves the plane to where a nearer look shows it; what was seen starts anew if it moved.
+    pub fn settle(&mut self, plane: Plane, range_m: f64) {
+        let moved_m = self.plane.behind_m(plane.origin_m).abs();
+        let turned_rad = (self.plane.yaw_rad - plane.yaw_rad).abs();
+        if range_m > SETTLE_FROM_M
+            && range_m < SETTLE_SHARE * self.range_m
+            && (moved_m > 0.03 || turned_rad > 0.04)
+        {
+            self.plane = Plane {
+                // The old place along the plane stays, so that the grid covers the same.
+                origin_m: self.plane.origin_m
+                    + plane.normal() * plane.behind_m(self.plane.origin_m) * -1.0,
+                yaw_rad: plane.yaw_rad,
+            };
+            self.cells.fill(Cell::default());
+            self.range_m = range_m;
+        }
+    }
+
+    /// Takes an image seen from `camera_m` [m, home].
+    pub fn update(&mut self, now_s: f64, camera_m: DVec3, lattice: &Lattice) {
+        let before_m = -self.plane.behind_m(camera_m);
+        if before_m < TOO_NEAR_M {
+            return;
+        }
+        let (normal, left) = (self.plane.normal(), self.plane.left());
+        let own_left_m = left.dot(camera_m - self.plane.origin_m);
+        // What moves says nothing of what stands still.
+        let still = |sample: &&Sample| sample.is_seen() && sample.paint != Some(Paint::Teal);
+        for sample in lattice.samples.iter().filter(still) {
+            let depth_m = normal.dot(sample.offset_m);
+            let deeper_m = depth_m - before_m;
+            if deeper_m < -THICK_M || depth_m < 0.05 {
+                continue;
+            }
+            let met = deeper_m <= THICK_M;
+            if !met && deeper_m < THROUGH_M {
+                continue;
+            }
+            // Where the ray meets the plane; of a surface beside it, where the surface is.
+            let share = if met { 1.0 } else { before_m / depth_m };
+            let across_m = own_left_m + left.dot(sample.offset_m) * share;
+            let up_m = camera_m.z + sample.offset_m.z * share;
+            let Some(at) = index_of(DVec2::new(across_m, up_m)) else { continue };
+            if met {
+                self.cells[at]
+                    .meet(sample.paint.is_some_and(|paint| self.kind == Kind::Window(paint)));
+                self.seen_s = now_s;
+            } else {
+                self.cells[at].look_through();
+            }
+        }
+        if before_m > KNOWN_M {
+            self.find_opening();
+        }
+    }
+
+    /// Returns the cell at a place in the plane.
+    pub fn cell(&self, within_m: DVec2) -> Option<Cell> {
+        index_of(within_m).map(|at| self.cells[at])
+    }
+
+    /// Returns the nearest solid place within `reach_m` of a point. [m, home]
+    pub fn nearest_solid_m(&self, p_m: DVec3, reach_m: f64) -> Option<DVec3> {
+        let behind_m = self.plane.behind_m(p_m);
+        if behind_m.abs() > reach_m {
+            return None;
+        }
+        let within_m = self.plane.within_m(p_m);
+        let mut best: Option<(f64, DVec2)> = None;
+        for row in span(within_m.y / CELL_M, reach_m, ROWS) {
+            for column in span((within_m.x + HALF_M) / CELL_M, reach_m, COLUMNS) {
+                let cell = self.cells[row * COLUMNS + column];
+                if !cell.is_solid() {
+                    continue;
+                }
+                let at_m = place_of(column, row);
+                let apart_m = at_m.distance(within_m);
+                if best.is_none_or(|(least_m, _)| apart_m < least_m) {
+                    best = Some((apart_m, at_m));
+                }
+            }
+        }
+        best.filter(|(apart_m, _)| apart_m.hypot(behind_m) < reach_m)
+            .map(|(_, at_m)| self.plane.point_m(at_m))
+    }
+
+    /// Returns where an image seen from `camera_m` [m, home] shows a hand. [m, plane]
+    pub fn hand_m(&self, camera_m: DVec3, lattice: &Lattice) -> Vec<DVec2> {
+        let teal = |sample: &&Sample| sample.paint == Some(Paint::Teal) && sample.is_seen();
+        let points_m = lattice.samples.iter().filter(teal).map(|sample| camera_m + sample.offset_m);
+        points_m
+            .filter(|p_m| self.plane.behind_m(*p_m).abs() < HAND_M)
+            .map(|p_m| self.plane.within_m(p_m))
+            .collect()
+    }
+
+    fn find_opening(&mut self) {
+        self.measure_room();
+        // The roomiest place that the frame is around.
+        let mut best: Option<(f32, usize)> = None;
+        for row in 0..ROWS {
+            for column in 0..COLUMNS {
+                let at = row * COLUMNS + column;
+                let room_m = self.room_m[at];
+                if room_m > LEAST_M
+                    && best.is_none_or(|(most_m, _)| room_m > most_m)
+                    && self.is_framed(column, row)
+                {
+                    best = Some((room_m, at));
+                }
+            }
+        }
+        let Some((room_m, at)) = best else {
+            // What was open stays so, seen or not, until something is there.
+            let is_solid = |opening: &Opening| {
+                self.cell(self.plane.within_m(opening.center_m)).is_some_and(Cell::is_solid)
+            };
+            self.opening = self.opening.filter(|opening| !is_solid(opening));
+            return;
+        };
+        // The middle of all that is nearly as roomy: a longish opening has a line of best places.
+        let top = place_of(at % COLUMNS, at / COLUMNS);
+        let (mut sum_m, mut count) = (DVec2::ZERO, 0.0);
+        for (near, &near_room_m) in self.room_m.iter().enumerate() {
+            let place_m = place_of(near % COLUMNS, near / COLUMNS);
+            if near_room_m > 0.93 * room_m && place_m.distance(top) < 0.3 {
+                sum_m += place_m;
+                count += 1.0;
+            }
+        }
+        let center_m = self.plane.point_m(sum_m / count);
+        self.opening = Some(Opening { center_m, radius_m: f64::from(room_m) });
+    }
+
+    /// Fills `room_m` with the distance from each open cell to the nearest that is not, by two
+    /// sweeps over the neighbours (chamfer distance: at most 4 % too small).
+    fn measure_room(&mut self) {
+        let (straight, diagonal) = (CELL_M as f32 * 0.96, CELL_M as f32 * 1.36);
+        for (room_m, cell) in self.room_m.iter_mut().zip(&self.cells) {
+            *room_m = if cell.is_open() { f32::MAX } else { 0.0 };
+        }
+        let room_m = &mut self.room_m;
+        let mut relax = |at: usize, beside: [(usize, f32); 4]| {
+            for (other, step_m) in beside {
+                room_m[at] = room_m[at].min(room_m[other] + step_m);
+            }
+        };
+        let edge = |row: usize, column: usize| {
+            row == 0 || column == 0 || row == ROWS - 1 || column == COLUMNS - 1
+        };
+        for row in 0..ROWS {
+            for column in 0..COLUMNS {
+                let at = row * COLUMNS + column;
+                if edge(row, column) {
+                    relax(at, [(at, 0.0); 4]);
+                    continue;
+                }
+                relax(
+                    at,
+                    [
+                        (at - 1, straight),
+                        (at - COLUMNS, straight),
+                        (at - COLUMNS - 1, diagonal),
+                        (at - COLUMNS + 1, diagonal),
+                    ],
+                );
+            }
+        }
+        for row in (1..ROWS - 1).rev() {
+            for column in (1..COLUMNS - 1).rev() {
+                let at = row * COLUMNS + column;
+                relax(
+                    at,
+                    [
+                        (at + 1, straight),
+                        (at + COLUMNS, straight),
+                        (at + COLUMNS + 1, diagonal),
+                        (at + COLUMNS - 1, diagonal),
+                    ],
+                );
+            }
+        }
+    }
+
+    /// Whether the frame is around a cell: something solid to both sides and above or below, which
+    /// in a window has its paint. Between a window's legs there is none.
+    fn is_framed(&self, column: usize, row: usize) -> bool {
+        let look = |along: &mut dyn Iterator<Item = usize>| self.is_met(along);
+        let sides = look(&mut (0..column).rev().map(|c| row * COLUMNS + c))
+            && look(&mut (column + 1..COLUMNS).map(|c| row * COLUMNS + c));
+        if !sides {
+            return false;
+        }
+        let below = look(&mut (0..row).rev().map(|r| r * COLUMNS + column));
+        let above = look(&mut (row + 1..ROWS).map(|r| r * COLUMNS + column));
+        match self.kind {
+            Kind::Window(_) => below || above,
+            Kind::Wall => below && above,
+        }
+    }
+
+    /// Whether the way along cells leads to the frame.
+    fn is_met(&self, along: &mut dyn Iterator<Item = usize>) -> bool {
+        let along = along.take(REACH).skip_while(|&at| !self.cells[at].is_solid());
+        match self.kind {
+            Kind::Window(_) => along.take(BAR).any(|at| self.cells[at].is_bar()),
+            Kind::Wall => along.take(BAR).filter(|&at| self.cells[at].is_solid()).count() >= 2,
+        }
+    }
+}
+
+fn index_of(within_m: DVec2) -> Option<usize> {
+    let (x, y) = ((within_m.x + HALF_M) / CELL_M, within_m.y / CELL_M);
+    let inside = x >= 0.0 && y >= 0.0 && x < COLUMNS as f64 && y < ROWS as f64;
+    inside.then(|| y as usize * COLUMNS + x as usize)
+}
+
+fn place_of(column: usize, row: usize) -> DVec2 {
+    DVec2::new((column as f64 + 0.5) * CELL_M - HALF_M, (row as f64 + 0.5) * CELL_M)
+}
+
+fn span(at: f64, reach_m: f64, count: usize) -> Range<usize> {
+    let reach = reach_m / CELL_M + 1.0;
+    let low = (at - reach).max(0.0) as usize;
+    low..((at + reach).max(0.0) as usize).min(count)
+}
+
+/// Side of a cell: a quarter of a bar. [m]
+pub const CELL_M: f64 = 0.04;
+const COLUMNS: usize = 120;
+const ROWS: usize = 84;
+/// Half the grid's width: all of the net's 4.5 m. [m]
+const HALF_M: f64 = 0.5 * CELL_M * COLUMNS as f64;
+/// Half of what counts as the plane: half a bar's thickness and the odometry's error. [m]
+const THICK_M: f64 = 0.1;
+/// A ray that ends this far behind has come through: more than a wall's thickness and the
+/// blur of its edge. [m]
+const THROUGH_M: f64 = 0.25;
+/// Nearer than this the rays graze the bars. [m]
+const TOO_NEAR_M: f64 = 0.25;
+/// Looks that make a cell sure, and the most that count.
+const SURE: i8 = 2;
+const MOST: i8 = 5;
+/// The hand turns this near to its window's plane, before it. [m]
+const HAND_M: f64 = 0.25;
+/// Nearer than this the frame is not in the image any more. [m]
+const SETTLE_FROM_M: f64 = 0.9;
+/// From here on the opening is known. [m]
+const KNOWN_M: f64 = 0.6;
+/// A plane measured from this share of the range is the better one.
+const SETTLE_SHARE: f64 = 0.8;
+/// The vehicle's radius and a hand's breadth. [m]
+const LEAST_M: f32 = 0.2;
+/// The frame is at most this far from the middle: 1.6 m.
+const REACH: usize = 40;
+/// Cells of a bar's width, and one more.
+const BAR: usize = 5;
+
+#[cfg(test)]
+mod tests;

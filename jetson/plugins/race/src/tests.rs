@@ -1,0 +1,97 @@
+use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
+use vizflyt_sdk::protocol::messages::{PoseAges, bounded};
+use vizflyt_sdk::protocol::time::ServerTime;
+use vizflyt_sdk::{
+    CameraInfo, HostTime, ImageStamps, Intrinsics, Limits, ObservationBuffer, Volume,
+};
+
+use super::*;
+
+fn arena() -> ArenaInfo {
+    let front = CameraInfo {
+        name: bounded("front"),
+        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians()),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    };
+    ArenaInfo {
+        name: bounded("test"),
+        geofence: Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 },
+        floor_z_m: 0.0,
+        no_fly: [].into_iter().collect(),
+        limits: Limits::new(4.0, 6.0),
+        body_radius_m: 0.12,
+        takeoff_height_m: 1.2,
+        goal_m: None,
+        goal_radius_m: 1.0,
+        time_limit_s: 0.0,
+        ground_truth: false,
+        pose_ages: PoseAges::default(),
+        attitude_rate: false,
+        cameras: [front].into_iter().collect(),
+    }
+}
+
+/// One observation with a floor 1 m below and a wall 6.4 m ahead.
+fn see(plugin: &mut Race, ms: u64, attitude: DQuat) -> Option<Setpoint> {
+    let arena = arena();
+    let mut buffer = ObservationBuffer::new(&arena.cameras);
+    let stamp = HostTime::from_ns(ms * 1_000_000);
+    buffer.set_vehicle(&Vehicle {
+        stamp,
+        attitude,
+        omega_body_radps: DVec3::ZERO,
+        world_from_body: None,
+        v_world_mps: None,
+    });
+    let stamps = ImageStamps { seq: ms, pose: stamp, ready: stamp, ahead_ns: 0 };
+    buffer.set_image(0, stamps, |planes| {
+        planes.rgb.fill(120);
+        for (at, depth_mm) in planes.depth_mm.iter_mut().enumerate() {
+            let slope = (at / 64) as f64 + 0.5 - 24.0;
+            *depth_mm = (32_000.0 / slope.max(5.0)) as u16;
+        }
+    });
+    plugin.on_image(&buffer.observation())
+}
+
+#[test]
+fn with_nothing_to_fly_through_it_stays_and_looks_about() {
+    let mut plugin = Race::default();
+    plugin.on_start(&arena());
+    let mut looks_rad = Vec::new();
+    for step in 0..150 {
+        match see(&mut plugin, 1000 + 40 * step, DQuat::IDENTITY) {
+            Some(Setpoint::Velocity { v_mps, yaw: YawTarget::Angle(yaw_rad), .. }) => {
+                assert!(v_mps.length() < 0.05, "{v_mps}");
+                looks_rad.push(yaw_rad);
+            }
+            other => panic!("{other:?} is no velocity with a heading"),
+        }
+    }
+    let most = looks_rad.iter().fold(0.0_f64, |most, look| most.max(*look));
+    let least = looks_rad.iter().fold(0.0_f64, |least, look| least.min(*look));
+    assert!(most > 0.8 && least < -0.8, "it looks from {least} to {most} rad");
+}
+
+#[test]
+fn the_same_image_is_answered_once() {
+    let mut plugin = Race::default();
+    plugin.on_start(&arena());
+    assert!(see(&mut plugin, 1000, DQuat::IDENTITY).is_some());
+    assert_eq!(see(&mut plugin, 1000, DQuat::IDENTITY), None);
+    assert!(see(&mut plugin, 1040, DQuat::IDENTITY).is_some());
+}
+
+#[test]
+fn after_the_finish_it_holds_and_a_broken_attitude_is_not_answered() {
+    let mut plugin = Race::default();
+    plugin.on_start(&arena());
+    assert_eq!(see(&mut plugin, 1000, DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0)), None);
+    assert_eq!(see(&mut plugin, 1010, DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0)), None);
+    plugin.on_event(&Event {
+        stamp: ServerTime::ZERO,
+        kind: EventKind::Finished { seconds: 9.0 },
+        text: bounded("finished"),
+    });
+    assert_eq!(see(&mut plugin, 1040, DQuat::IDENTITY), Some(Setpoint::Hold));
+}

@@ -1,0 +1,231 @@
+//! A plugin's process that is waited for: started, greeted, fed one observation at a time, ended.
+
+use std::ffi::OsString;
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
+use vizflyt_protocol::packet::ObservationHeader;
+use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd, SERVICE_OPTION, unique_service};
+
+use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
+
+/// The plugin hears of us at least this often.
+const HEARTBEAT: Duration = Duration::from_millis(400);
+/// How long a plugin may take to attach and to load what it needs: models take their time.
+const READY_WITHIN: Duration = Duration::from_mins(5);
+
+/// Why a plugin's process does not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum ProcessError {
+    /// Shared memory failed.
+    #[error(transparent)]
+    Ipc(#[from] IpcError),
+    /// The plugin's program cannot be started.
+    #[error("the plugin {0} cannot be started: {1}")]
+    Start(String, std::io::Error),
+    /// The plugin failed: how, in a sentence.
+    #[error("{0}")]
+    Failed(String),
+}
+
+/// Who hears what the plugin prints.
+pub type Hears<'a> = &'a mut dyn FnMut(Stream, &str);
+
+/// A plugin's process and our end of its shared memory. It dies with the thread that started it.
+#[derive(Debug)]
+pub struct PluginProcess {
+    ipc: RuntimeEnd,
+    supervisor: Supervisor,
+    events: Receiver<PluginEvent>,
+    beaten: Instant,
+    /// An answer, or the reading of an event, that takes longer is a failure.
+    within: Duration,
+}
+
+impl PluginProcess {
+    /// Starts `command` (program, then arguments), confined as in flight by `limits`.
+    ///
+    /// # Errors
+    /// [`ProcessError::Start`] and [`ProcessError::Ipc`].
+    pub fn start(
+        command: &[OsString],
+        limits: &PluginLimits,
+        within: Duration,
+    ) -> Result<Self, ProcessError> {
+        let service = unique_service();
+        let mut command = command.to_vec();
+        let confinement = Confinement::prepare(limits, &command);
+        let len = size_of::<ObservationHeader>();
+        let ipc = RuntimeEnd::create_for(&service, len, confinement.user_id())?;
+        command.push(format!("{SERVICE_OPTION}={service}").into());
+        let (sender, events) = channel();
+        let tell = move |event| {
+            let _ = sender.send(event);
+        };
+        let supervisor = Supervisor::start(&command, &confinement, tell).map_err(|error| {
+            let program = command.first().map(|program| program.to_string_lossy().into_owned());
+            ProcessError::Start(program.unwrap_or_default(), error)
+        })?;
+        Ok(Self { ipc, supervisor, events, beaten: Instant::now(), within })
+    }
+
+    /// Greets the plugin with `start` when it has attached, and waits until it is ready, five minutes
+    /// at most.
+    ///
+    /// # Errors
+    /// [`ProcessError::Failed`] if it ends, gives up or takes longer.
+    pub fn begin(&mut self, start: &ToPlugin, line: Hears<'_>) -> Result<(), ProcessError> {
+        let deadline = Instant::now() + READY_WITHIN;
+        while !self.ipc.plugin_attached() {
+            if let Some(why) = self.pass_lines(line) {
+                return Err(ProcessError::Failed(why));
+            }
+            if Instant::now() > deadline {
+                return Err(failed("the plugin did not attach within five minutes"));
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+        self.ipc.send(start)?;
+        loop {
+            match self.next(line)? {
+                Some(FromPlugin::Ready { .. }) => return Ok(()),
+                Some(FromPlugin::Failed { reason }) => return Err(failed(reason.as_str())),
+                None if Instant::now() > deadline => {
+                    return Err(failed("`on_start` did not return within five minutes"));
+                }
+                Some(FromPlugin::Answer { .. }) | None => {}
+            }
+        }
+    }
+
+    /// Sends a message; waits for room if many have been sent since the last image.
+    ///
+    /// # Errors
+    /// [`ProcessError::Failed`] if it has ended, or reads nothing.
+    pub fn send(&mut self, message: &ToPlugin, line: Hears<'_>) -> Result<(), ProcessError> {
+        let deadline = Instant::now() + self.within;
+        loop {
+            match self.ipc.send(message) {
+                Ok(()) => return Ok(()),
+                Err(IpcError::QueueFull(_)) if Instant::now() < deadline => {
+                    self.ipc.heartbeat();
+                    if let Some(why) = self.pass_lines(line) {
+                        return Err(ProcessError::Failed(why));
+                    }
+                    thread::sleep(Duration::from_millis(2));
+                }
+                Err(IpcError::QueueFull(_)) => {
+                    let seconds = self.within.as_secs_f64();
+                    let why = format!("the plugin has read no event for {seconds:.0} s");
+                    return Err(ProcessError::Failed(why));
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+
+    /// Lends shared memory for one observation of `len` bytes: zeros, aligned to 64.
+    ///
+    /// # Errors
+    /// [`ProcessError::Ipc`] if there is not so much memory.
+    pub fn loan(&self, len: usize) -> Result<LoanedObservation, ProcessError> {
+        Ok(self.ipc.loan(len)?)
+    }
+
+    /// Publishes observation `seq` and waits for its answer.
+    ///
+    /// # Errors
+    /// [`ProcessError::Failed`] if the plugin ends, gives up or takes longer than it may.
+    pub fn ask(
+        &mut self,
+        seq: u64,
+        observation: LoanedObservation,
+        line: Hears<'_>,
+    ) -> Result<Option<Setpoint>, ProcessError> {
+        self.ipc.publish(observation)?;
+        let deadline = Instant::now() + self.within;
+        loop {
+            match self.next(line)? {
+                Some(FromPlugin::Answer { seq: found, setpoint, .. }) if found == seq => {
+                    return Ok(setpoint);
+                }
+                Some(FromPlugin::Failed { reason }) => {
+                    return Err(ProcessError::Failed(format!("the plugin failed: {reason}")));
+                }
+                None if Instant::now() > deadline => {
+                    let seconds = self.within.as_secs_f64();
+                    return Err(ProcessError::Failed(format!(
+                        "the plugin has not answered image {seq} for {seconds:.0} s"
+                    )));
+                }
+                Some(_) | None => {}
+            }
+        }
+    }
+
+    /// Shows the plugin that we live, if it has not heard of us for a while; its end is noticed when the
+    /// next image is not answered.
+    pub fn tend(&mut self, line: Hears<'_>) {
+        if self.beaten.elapsed() >= HEARTBEAT {
+            self.beaten = Instant::now();
+            self.ipc.heartbeat();
+        }
+        self.pass_lines(line);
+    }
+
+    /// Ends the plugin in order.
+    pub fn stop(mut self, line: Hears<'_>) {
+        if self.ipc.plugin_attached() {
+            let _ = self.ipc.send(&ToPlugin::Stop);
+        }
+        self.supervisor.end();
+        self.ipc.clean_up();
+        self.pass_lines(line);
+    }
+
+    /// Returns the plugin's next message; `None` after a while.
+    fn next(&mut self, line: Hears<'_>) -> Result<Option<FromPlugin>, ProcessError> {
+        if let Some(message) = self.receive()? {
+            return Ok(Some(message));
+        }
+        self.ipc.wait(Duration::from_millis(50))?;
+        if self.beaten.elapsed() >= HEARTBEAT {
+            self.beaten = Instant::now();
+            self.ipc.heartbeat();
+        }
+        let ended = self.pass_lines(line);
+        // What it said before it ended counts.
+        match (self.receive()?, ended) {
+            (Some(message), _) => Ok(Some(message)),
+            (None, Some(why)) => Err(ProcessError::Failed(why)),
+            (None, None) => Ok(None),
+        }
+    }
+
+    fn receive(&self) -> Result<Option<FromPlugin>, ProcessError> {
+        match self.ipc.receive() {
+            // A message that does not decode is the plugin's fault; the next one counts.
+            Err(IpcError::Message(_)) => Ok(None),
+            result => Ok(result?),
+        }
+    }
+
+    /// Passes on what the plugin printed; returns how it ended, if it has.
+    fn pass_lines(&mut self, line: Hears<'_>) -> Option<String> {
+        let mut ended = None;
+        for event in self.events.try_iter() {
+            match event {
+                PluginEvent::Line(stream, text) => line(stream, &text),
+                PluginEvent::Note(text) => tracing::debug!("plugin: {text}"),
+                PluginEvent::Exited(sentence) => ended = Some(sentence),
+            }
+        }
+        ended
+    }
+}
+
+fn failed(why: &str) -> ProcessError {
+    ProcessError::Failed(why.to_owned())
+}
