@@ -27,6 +27,8 @@ struct Rig {
     uart: File,
     companion: UdpSocket,
     tcp: String,
+    /// Where its status page is; empty if it has none.
+    page: String,
     folder: tempfile::TempDir,
 }
 
@@ -39,7 +41,8 @@ impl Rig {
         let uart = open_uart(&ready);
         companion.connect(ready["udp"].as_str().unwrap()).unwrap();
         let tcp = ready["tcp"].as_str().unwrap().to_owned();
-        Self { bridge, uart, companion, tcp, folder }
+        let page = ready["page"].as_str().unwrap_or_default().to_owned();
+        Self { bridge, uart, companion, tcp, page, folder }
     }
 }
 
@@ -259,6 +262,64 @@ fn it_is_claimed_configured_and_keeps_its_settings() {
         .unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     assert!(said.contains("LOSS_MS            700"), "{said}");
+}
+
+#[test]
+fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let firmware = |args: &[&str]| {
+        let output =
+            Command::new(vizflyt()).args(["bridge", "firmware"]).args(args).output().unwrap();
+        let said = [output.stdout, output.stderr].concat();
+        (output.status.success(), String::from_utf8(said).unwrap())
+    };
+    let (keys, image) = (at("keys"), at("image"));
+    let (_, key) = firmware(&["key", "--keys", &keys]);
+    std::fs::write(&image, (0..200_000u32).map(|i| ((i * 31) >> 3) as u8).collect::<Vec<_>>())
+        .unwrap();
+    let sign = |chip: &str, build: &str| {
+        let signed = at(&format!("{chip}-{build}.signed"));
+        let (made, said) = firmware(&[
+            "sign", &image, "--chip", chip, "--build", build, "--keys", &keys, "-o", &signed,
+        ]);
+        assert!(made, "{said}");
+        signed
+    };
+    let rig = Rig::start(&["--page=127.0.0.1:0", "--firmware-key", key.trim()]);
+    let page = rig.page.clone();
+    let check = |file: &str, works: bool, expected: &str| {
+        let (worked, said) = firmware(&["send", file, "--bridge", &page]);
+        assert!(worked == works && said.contains(expected), "{file}: {said}");
+    };
+    let seven = sign("host", "7");
+    check(&seven, true, "verified");
+    check(&sign("host", "6"), false, "older than the one that runs");
+    check(&sign("esp32c3", "8"), false, "another chip");
+    check(&image, false, "is not signed");
+    // One bit of the program, then one of the signature.
+    for (place, expected) in [(150_000, "not what was signed"), (60, "signature is not of")] {
+        let mut bytes = std::fs::read(&seven).unwrap();
+        bytes[place] ^= 1;
+        let damaged = at("damaged.signed");
+        std::fs::write(&damaged, bytes).unwrap();
+        check(&damaged, false, expected);
+    }
+    // It is there all the while, for a browser too.
+    let shown = get(&page, "/");
+    assert!(shown.starts_with("HTTP/1.0 200") && shown.contains("no vehicle"), "{shown}");
+    assert!(get(&page, "/stats.json").contains("\"uart_packets_in\""));
+    assert!(get(&page, "/nothing").starts_with("HTTP/1.0 404"));
+    check(&seven, true, "verified");
+}
+
+fn get(address: &str, path: &str) -> String {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "GET {path} HTTP/1.0\r\n\r\n").unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    answer
 }
 
 #[test]

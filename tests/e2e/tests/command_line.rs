@@ -21,9 +21,23 @@ fn check_refused(args: &[&str], texts: &[&str]) {
 
 #[test]
 fn every_command_has_help() {
-    for command in
-        ["demo", "new", "serve", "fly", "pair", "doctor", "vehicle", "sim", "scene", "bench"]
-    {
+    for command in [
+        "demo",
+        "new",
+        "serve",
+        "fly",
+        "pair",
+        "password",
+        "doctor",
+        "vehicle",
+        "sim",
+        "scene",
+        "tags",
+        "bench",
+        "grade",
+        "leaderboard",
+        "arena",
+    ] {
         let output = run(&[command, "--help"]);
         assert!(output.status.success(), "{command}");
         assert!(output.stdout.len() > 200, "{command} --help is a stub");
@@ -54,7 +68,7 @@ fn a_scene_is_the_same_for_the_same_seed() {
 
 #[test]
 fn mistakes_are_explained() {
-    check_refused(&["demo", "--scene", "forrest"], &["forrest", "forest, race nor room"]);
+    check_refused(&["demo", "--scene", "forrest"], &["forrest", "forest, race, room nor moving"]);
     check_refused(&["scene", "generate", "swamp", "-o", "x"], &["swamp", "forest"]);
     check_refused(&["serve", "/nowhere/arena.toml"], &["/nowhere/arena.toml"]);
     check_refused(&["--log-level", "loud=x=y", "demo"], &["--log-level"]);

@@ -102,6 +102,19 @@ fn the_forest_is_flown_and_reported() {
 
 /// At least 18 of 20 generated forests are flown without touching the true geometry, at 2 m/s or
 /// more on the mean.
+/// No motion capture: webcams, tags, the filter, and everything behind them as ever.
+#[test]
+fn the_room_is_flown_on_tags_alone() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&["--localization", "tags", "--seconds", "120"]);
+    let code = demo.wait(FLIGHT);
+    let report = file.read();
+    assert_eq!(report["outcome"], "finished", "{report:#} {:#?}", demo.seen);
+    assert_eq!(code, Some(0));
+    let tags = &report["localization"];
+    assert!(tags["located"].as_u64().unwrap() > 200, "{tags:#}");
+}
+
 #[test]
 fn over_many_seeds() {
     let seeds: u64 =

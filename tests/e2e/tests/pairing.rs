@@ -16,7 +16,7 @@ struct Server {
 impl Server {
     fn start(arena: &Path, keys: &Path) -> Self {
         let mut child = Command::new(vizflyt())
-            .arg("serve")
+            .args(["serve", "--leaderboard=none"])
             .arg(arena)
             .arg("--keys")
             .arg(keys)

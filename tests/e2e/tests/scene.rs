@@ -93,6 +93,31 @@ fn png_head(path: &Path) -> (u32, u32, u8, u8) {
 }
 
 #[test]
+fn obstacles_are_baked_once_and_kept() {
+    let rig = Rig::new();
+    let bake = |more: &[&str]| {
+        let output = Command::new(vizflyt())
+            .args(["scene", "bake", &rig.at("race"), "--json"])
+            .args(more)
+            .env("XDG_CACHE_HOME", rig.at("cache"))
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice::<Value>(&output.stdout).unwrap()
+    };
+    let first = bake(&[]);
+    assert_eq!(first["kept"], json!(false));
+    assert!(first["occupied"].as_u64().unwrap() > 1000, "{first}");
+    let file = first["file"].as_str().unwrap();
+    assert!(file.starts_with(&rig.at("cache/vizflyt/obstacles")), "{file}");
+    assert_eq!(bake(&[])["kept"], json!(true));
+    assert_eq!(bake(&["--force"])["kept"], json!(false));
+    let coarse = bake(&["--voxel", "0.1"]);
+    assert!(coarse["kept"] == json!(false) && coarse["voxel_m"] == json!(0.1), "{coarse}");
+    refused(&["scene", "bake", &rig.at("race"), "--voxel", "9"], &["occupancy.voxel_m = 9"]);
+}
+
+#[test]
 fn pictures_are_written_as_png_and_as_arrays() {
     let rig = Rig::new();
     let said = good(&[

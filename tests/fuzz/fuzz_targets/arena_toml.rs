@@ -1,7 +1,9 @@
 //! An arena.toml: an error or an arena that the runtime's and the server's types accept.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_arena::ArenaConfig;
+use vizflyt_arena::config::line_of;
+use vizflyt_arena::{ArenaConfig, MovingObjects};
+use vizflyt_protocol::geometry::Pose;
 
 fuzz_target!(|text: &str| {
     if let Ok(arena) = ArenaConfig::parse(text) {
@@ -11,5 +13,13 @@ fuzz_target!(|text: &str| {
         }
         let again = ArenaConfig::parse(&arena.to_toml().unwrap()).unwrap();
         assert_eq!(again, arena);
+        for since_epoch_ns in [i64::MIN, -1, 0, 1_234_567_890, i64::MAX] {
+            let placements = MovingObjects::new(&arena, 7).placements(since_epoch_ns);
+            assert!(placements.iter().flatten().all(Pose::is_valid));
+        }
+    }
+    // Keys are looked up in texts that are no arena, too.
+    for key in ["stages[0].name", "objects[1].motion.axis", "[[", "name.name"] {
+        assert!(line_of(text, key).is_none_or(|line| line <= text.matches('\n').count() + 1));
     }
 });

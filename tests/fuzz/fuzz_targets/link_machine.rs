@@ -9,8 +9,8 @@ use vizflyt_protocol::mavlink::{
     GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, MavlinkVersion, Message, StreamDecoder,
     encode,
 };
-use vizflyt_protocol::messages::YawTarget;
-use vizflyt_protocol::time::HostTime;
+use vizflyt_protocol::messages::{PoseSample, YawTarget};
+use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::link::{COMPONENT_ID, Goal, Link, SYSTEM_ID};
 
 /// What an autopilot, another companion or a ground station may say.
@@ -55,7 +55,8 @@ impl Machine {
                 let p = [number(0), number(1), number(2)].into();
                 let pose = Pose::new(p, Default::default());
                 let stamp = self.now.plus_seconds(-f64::from(*value) * 0.01);
-                self.link.vision(self.now, &pose, stamp, *value);
+                let sample = PoseSample::still(ServerTime::ZERO, pose);
+                self.link.vision(self.now, &PoseSample { resets: *value, ..sample }, stamp);
                 let yaw = YawTarget::Angle(0.0);
                 self.link
                     .setpoint(self.now, &GuidedSetpoint { motion: GuidedMotion::Velocity(p), yaw });

@@ -1,11 +1,14 @@
 //! Vicon datagrams: counted and dropped, or a measurement of finite numbers.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
+use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::time::ServerTime;
+use vizflyt_server::drivers::udp::PoseStream;
 use vizflyt_server::drivers::vicon::ViconStream;
 
 fuzz_target!(|packets: Vec<&[u8]>| {
-    let mut source = ViconStream::new(&["vizflyt", "wasp"]);
+    let mut source =
+        ViconStream::new(&LocalizationConfig::new(Driver::Vicon), 0, &["vizflyt", "wasp"]);
     for (index, packet) in packets.into_iter().enumerate() {
         let now = ServerTime::from_ns(index as u64 * 5_000_000);
         for measurement in source.handle_packet(now, packet) {

@@ -12,9 +12,10 @@ use quinn::{Endpoint, EndpointConfig, TokioRuntime};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use vizflyt_arena::config::CameraConfig;
-use vizflyt_protocol::geometry::{Intrinsics, Pose, Twist, Volume};
+use vizflyt_protocol::geometry::{Intrinsics, Pose, Volume};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseSample, Purpose, Telemetry, bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseAges, PoseSample, Purpose, Telemetry,
+    bounded,
 };
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::ServerTime;
@@ -164,6 +165,8 @@ impl Server {
         let arena = ArenaInfo {
             name: bounded("virtual"),
             geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+            no_fly: [].into_iter().collect(),
+            floor_z_m: 0.0,
             limits: Limits::new(3.0, 4.0),
             body_radius_m: 0.1,
             takeoff_height_m: 1.0,
@@ -171,6 +174,7 @@ impl Server {
             goal_radius_m: 1.0,
             time_limit_s: 0.0,
             ground_truth: true,
+            pose_ages: PoseAges::default(),
             attitude_rate: false,
             cameras: [].into_iter().collect(),
         };
@@ -280,12 +284,8 @@ async fn localize(hub: Arc<Hub>) {
     let mut tick = interval(Duration::from_millis(5));
     loop {
         tick.tick().await;
-        hub.vehicles[0].pose.send_replace(Some(PoseSample {
-            stamp: clock::now(),
-            world_from_body: Pose::IDENTITY,
-            twist: Twist::default(),
-            resets: 0,
-        }));
+        let sample = PoseSample::still(clock::now(), Pose::IDENTITY);
+        hub.vehicles[0].pose.send_replace(Some(sample));
     }
 }
 

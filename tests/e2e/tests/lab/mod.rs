@@ -3,7 +3,7 @@
 //! through this test on their way, so it sees where each vehicle is, whatever the runtime says, and
 //! can cut either.
 //!
-//! Of `misbehave` and `linkloss`: what one of the two does not use, the other does.
+//! Of `misbehave`, `linkloss` and `chain`: what one does not use, another does.
 
 #![allow(dead_code)]
 
@@ -22,7 +22,7 @@ use glam::DVec3;
 use serde_json::Value;
 use vizflyt_e2e::vizflyt;
 use vizflyt_protocol::mavlink::StreamDecoder;
-use vizflyt_protocol::mavlink::dialect::MavMessage;
+use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage};
 use vizflyt_trust::{Client, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
 
 /// One render server for all flights of the test.
@@ -45,15 +45,44 @@ pub(crate) struct Cuts {
     pub mavlink: AtomicBool,
 }
 
+/// What a flight is to be.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Plan<'a> {
+    /// What is asked of the plugin.
+    pub how: &'static str,
+    /// Lines of jetson.toml under `[plugin]`; other tables may follow.
+    pub settings: &'a str,
+    /// More arguments for the runtime.
+    pub more: &'a [&'a str],
+    /// More arguments for the simulated vehicle, before the link that the runtime is on.
+    pub vehicle: &'a [&'a str],
+    /// Whether its MAVLink goes through an emulated bridge.
+    pub bridge: bool,
+}
+
+/// An emulated bridge.
+struct Bridge {
+    process: Process,
+    /// Its arguments.
+    args: Vec<String>,
+    /// What names its end of the serial line.
+    uart: PathBuf,
+}
+
 /// One flight, while it lasts.
 pub(crate) struct Flight {
     /// What was asked of the plugin.
     pub how: &'static str,
     simulator: Process,
+    /// The simulator's `ready` line.
+    vehicle: Value,
+    bridge: Option<Bridge>,
     runtime: Process,
     track: Track,
     /// Modes that the vehicle's own heartbeats told of.
     modes: Modes,
+    /// When the runtime commanded to land.
+    lands: Lands,
     cuts: Arc<Cuts>,
     /// Sends to the vehicle what goes round the runtime.
     aside: Aside,
@@ -87,6 +116,7 @@ pub(crate) struct Sight {
 
 type Track = Arc<Mutex<Vec<Sight>>>;
 type Modes = Arc<Mutex<Vec<(Instant, u32)>>>;
+type Lands = Arc<Mutex<Vec<Instant>>>;
 
 /// A way to the vehicle beside the runtime's.
 struct Aside {
@@ -144,6 +174,20 @@ impl Drop for Process {
 impl Lab {
     /// Starts a server of a room for these vehicles.
     pub(crate) fn open(vehicles: usize) -> Self {
+        // A fence that is soon reached: the flights are short.
+        Self::open_in(vehicles, |folder| {
+            let arena = folder.join("arena.toml");
+            let text = fs::read_to_string(&arena).unwrap();
+            let text = text
+                .replace("max_m = [11.0,", "max_m = [2.6,")
+                .replace("[goal]\nposition_m = [10.0,", "[goal]\nposition_m = [2.3,")
+                .replace("radius_m = 0.6", "radius_m = 0.01");
+            fs::write(&arena, text).unwrap();
+        })
+    }
+
+    /// Starts a server of a room that `furnish` has changed, in its folder, for these vehicles.
+    pub(crate) fn open_in(vehicles: usize, furnish: impl FnOnce(&Path)) -> Self {
         let folder = tempfile::tempdir().unwrap();
         // The plugins run as another user where this is root.
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
@@ -153,15 +197,13 @@ impl Lab {
         let made =
             Command::new(vizflyt()).args(["scene", "generate", "room", "-o", &scene]).output();
         assert!(made.unwrap().status.success());
-        // Small images, and a fence that is soon reached: the flights are short.
+        furnish(&at("scene"));
+        // Small images: several vehicles fly on one computer.
         let arena = at("scene").join("arena.toml");
         let text = fs::read_to_string(&arena).unwrap();
         let text = text
             .replace("width_px = 320", "width_px = 96")
-            .replace("height_px = 240", "height_px = 72")
-            .replace("max_m = [11.0,", "max_m = [2.6,")
-            .replace("[goal]\nposition_m = [10.0,", "[goal]\nposition_m = [2.3,")
-            .replace("radius_m = 0.6", "radius_m = 0.01");
+            .replace("height_px = 240", "height_px = 72");
         fs::write(&arena, text).unwrap();
 
         let keys = KeysFolder::open(Some(&at("server"))).unwrap();
@@ -178,6 +220,9 @@ impl Lab {
         args.extend(words("--vicon=127.0.0.1:0 --renderer=cpu --max-rate=20"));
         args.push(arena.to_str().unwrap().to_owned());
         args.push(format!("--keys={}", at("server").display()));
+        args.push("--leaderboard=none".into());
+        // They all start at one place, each in a net of its own.
+        args.push("--apart".into());
         args.extend(names.iter().map(|name| format!("--vehicle={name}")));
         let server = Process::start(&vizflyt(), &args);
         let ready = server.ready();
@@ -186,15 +231,9 @@ impl Lab {
         Self { folder, server, quic, fingerprint, vicon, packets: Arc::default() }
     }
 
-    /// Flies vehicle `index` with a plugin that does `how`, under the `[plugin]` settings given.
-    pub(crate) fn fly(
-        &self,
-        index: usize,
-        how: &'static str,
-        settings: &str,
-        more: &[&str],
-        vehicle: &[&str],
-    ) -> Flight {
+    /// Flies vehicle `index`.
+    pub(crate) fn fly(&self, index: usize, plan: Plan<'_>) -> Flight {
+        let Plan { how, settings, more, vehicle, bridge } = plan;
         let name = name(index);
         let at = |kind: &str| self.folder.path().join(format!("{name}-{kind}"));
         let config = at("jetson.toml");
@@ -222,15 +261,41 @@ impl Lab {
         let runtime = Process::start(&vizflyt().with_file_name("vizflyt-jetson"), &args);
         let mavlink = runtime.ready()["mavlink"].as_str().unwrap().to_owned();
 
-        let modes = Modes::default();
-        let (air, aside) = carry(mavlink, Arc::clone(&modes), Arc::clone(&cuts));
+        let (modes, lands) = (Modes::default(), Lands::default());
+        let seen = (Arc::clone(&modes), Arc::clone(&lands));
+        let (air, aside) = carry(mavlink, seen, Arc::clone(&cuts));
+        let bridge = bridge.then(|| {
+            let mut args = words("bridge emulate --json --lifeline --listen=127.0.0.1:0");
+            args.push(format!("--client={air}"));
+            args.push(format!("--uart=pty:{}", at("uart").display()));
+            let process = Process::start(&vizflyt(), &args);
+            process.ready();
+            Bridge { process, args, uart: at("uart") }
+        });
         let mut args = words("sim --json --lifeline --spawn=0.9,0,0,0");
-        args.push(format!("--mavlink=udpout:{air}"));
         args.extend(vehicle.iter().map(|&text| text.to_owned()));
+        args.push(match &bridge {
+            Some(bridge) => format!("--serial={}", bridge.uart.display()),
+            None => format!("--mavlink=udpout:{air}"),
+        });
         args.push(format!("--vicon={capture}"));
         args.extend([format!("--object={name}"), format!("--seed={index}")]);
         let simulator = Process::start(&vizflyt(), &args);
-        Flight { how, simulator, runtime, track, modes, cuts, aside, report: at("report"), kept }
+        let vehicle = simulator.ready();
+        Flight {
+            how,
+            simulator,
+            vehicle,
+            bridge,
+            runtime,
+            track,
+            modes,
+            lands,
+            cuts,
+            aside,
+            report: at("report"),
+            kept,
+        }
     }
 
     /// Returns an address whose packets are passed on to the server, and noted.
@@ -301,10 +366,47 @@ impl Flight {
         let _ = self.runtime.child.kill();
     }
 
+    /// Kills the bridge, as a power cut does; a serial device goes with it.
+    pub(crate) fn kill_bridge(&mut self) {
+        let bridge = self.bridge.as_mut().expect("it flies through a bridge");
+        let _ = bridge.process.child.kill();
+        let _ = bridge.process.child.wait();
+        // The kernel gives its number to the next pseudo-terminal, which is another vehicle's.
+        let _ = fs::remove_file(&bridge.uart);
+    }
+
+    /// Starts the bridge anew.
+    pub(crate) fn restart_bridge(&mut self) {
+        let bridge = self.bridge.as_mut().expect("it flies through a bridge");
+        bridge.process = Process::start(&vizflyt(), &bridge.args);
+        bridge.process.ready();
+    }
+
+    /// Returns the address or path of the vehicle's link `index`.
+    pub(crate) fn link(&self, index: usize) -> &str {
+        self.vehicle["links"][index].as_str().expect("the vehicle has this link")
+    }
+
+    /// Ends the simulator; returns its report.
+    pub(crate) fn vehicle_report(&mut self) -> Value {
+        drop(self.simulator.child.stdin.take());
+        loop {
+            let (_, line) = self.simulator.lines.recv_timeout(PATIENCE).expect("a report");
+            if line.get("report").is_some() {
+                return line["report"].clone();
+            }
+        }
+    }
+
     /// Sends a packet to the vehicle that the runtime knows nothing of.
     pub(crate) fn tell_vehicle(&self, packet: &[u8]) {
         let vehicle = lock(&self.aside.vehicle).expect("the vehicle has been heard");
         self.aside.socket.send_to(packet, vehicle).unwrap();
+    }
+
+    /// Returns when the runtime first commanded to land, if it has.
+    pub(crate) fn told_to_land(&self) -> Option<Instant> {
+        lock(&self.lands).first().copied()
     }
 
     /// Returns the newest pose.
@@ -387,7 +489,7 @@ impl Seen {
 
 /// Carries MAVLink between a vehicle, which sends to the address returned, and the runtime at
 /// `runtime`.
-fn carry(runtime: String, modes: Modes, cuts: Arc<Cuts>) -> (SocketAddr, Aside) {
+fn carry(runtime: String, (modes, lands): (Modes, Lands), cuts: Arc<Cuts>) -> (SocketAddr, Aside) {
     let to_vehicle = UdpSocket::bind("127.0.0.1:0").unwrap();
     let to_runtime = UdpSocket::bind("127.0.0.1:0").unwrap();
     let address = to_vehicle.local_addr().unwrap();
@@ -399,9 +501,17 @@ fn carry(runtime: String, modes: Modes, cuts: Arc<Cuts>) -> (SocketAddr, Aside) 
     // Both until the process ends: a packet of a vehicle or runtime that is gone does not come.
     thread::spawn(move || {
         let mut packet = [0; 2048];
+        let mut decoder = StreamDecoder::default();
         loop {
             // A runtime that is gone reports itself as refused: go on.
             let Ok(len) = from_runtime.recv(&mut packet) else { continue };
+            decoder.push(&packet[..len], |packet| {
+                if let MavMessage::COMMAND_LONG(command) = packet.message
+                    && command.command == MavCmd::MAV_CMD_NAV_LAND
+                {
+                    lock(&lands).push(Instant::now());
+                }
+            });
             if let (true, Some(vehicle)) = (is_open(&open), *lock(&known)) {
                 let _ = up.send_to(&packet[..len], vehicle);
             }

@@ -14,7 +14,7 @@ use std::sync::Mutex;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use lab::{Flight, Lab, Sight};
+use lab::{Flight, Lab, Plan, Sight};
 use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
 
@@ -23,8 +23,10 @@ use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
 enum Loss {
     /// The runtime is killed.
     Runtime,
-    /// MAVLink stops both ways: Wi-Fi, or a bridge without power. [s]
+    /// MAVLink stops both ways: Wi-Fi. [s]
     Mavlink(f64),
+    /// The bridge is killed, and started again after so long. [s]
+    Bridge(f64),
     /// The motion capture sees nothing. [s]
     Poses(f64),
     /// The server is killed.
@@ -37,69 +39,109 @@ enum Loss {
 const FOR_EVER: f64 = 1e6;
 
 /// A row of the table.
+#[derive(Debug)]
 struct Case {
     loss: Loss,
     /// How the row reads.
     name: &'static str,
     /// Who notices, and what it does.
     does: &'static str,
+    /// Whether its MAVLink goes through a bridge.
+    bridge: bool,
     /// Whether the vehicle comes down; else it flies on.
     lands: bool,
 }
 
-const CASES: [Case; 9] = [
+const CASES: [Case; 13] = [
     Case {
         loss: Loss::Runtime,
         name: "the runtime is killed",
         does: "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT",
+        bridge: false,
         lands: true,
     },
     Case {
         loss: Loss::Mavlink(FOR_EVER),
         name: "Wi-Fi dies",
         does: "autopilot: as above; runtime: LAND, unheard",
+        bridge: false,
         lands: true,
     },
     Case {
         loss: Loss::Mavlink(1.0),
-        name: "Wi-Fi is away for 1 s, or the bridge reboots in that time",
+        name: "Wi-Fi is away for 1 s",
         does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: false,
         lands: false,
     },
     Case {
         loss: Loss::Poses(0.2),
         name: "the pose stalls for 200 ms",
-        does: "nobody: the autopilot's estimate bridges it",
+        does: "runtime: holds after 0.15 s, flies on",
+        bridge: false,
         lands: false,
     },
     Case {
         loss: Loss::Poses(1.0),
         name: "the pose stalls for 1 s",
-        does: "runtime: holds after 0.5 s, flies on",
-        lands: false,
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        lands: true,
     },
     Case {
         loss: Loss::Poses(5.0),
         name: "the pose stalls for 5 s",
-        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
         lands: true,
     },
     Case {
         loss: Loss::Poses(FOR_EVER),
         name: "the pose is gone",
-        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
         lands: true,
     },
     Case {
         loss: Loss::Autopilot,
         name: "the autopilot reboots in flight",
         does: "nobody can: motors stop, it falls",
+        bridge: false,
         lands: true,
+    },
+    Case {
+        loss: Loss::Runtime,
+        name: "the runtime is killed, behind a bridge",
+        does: "bridge: LAND after 1 s",
+        bridge: true,
+        lands: true,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies, behind a bridge",
+        does: "bridge: LAND after 1 s; runtime: LAND, unheard",
+        bridge: true,
+        lands: true,
+    },
+    Case {
+        loss: Loss::Bridge(FOR_EVER),
+        name: "the bridge dies",
+        does: "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT",
+        bridge: true,
+        lands: true,
+    },
+    Case {
+        loss: Loss::Bridge(1.0),
+        name: "the bridge loses power for 1 s",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: true,
+        lands: false,
     },
     Case {
         loss: Loss::Server,
         name: "the server is killed",
-        does: "runtime: holds after 0.5 s, LAND after 2 s",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
         lands: true,
     },
 ];
@@ -145,6 +187,7 @@ const FENCE_X_M: (f64, f64) = (0.0, 2.6);
 const PATIENCE: Duration = Duration::from_mins(2);
 
 /// A row as measured.
+#[derive(Debug)]
 struct Row {
     case: &'static Case,
     /// From the loss until it stood, or came straight down. [s]
@@ -182,7 +225,11 @@ fn whatever_is_lost_the_vehicle_is_down_in_time_or_flies_on() {
 fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
     let vehicle = vehicle();
     let vehicle: Vec<&str> = vehicle.iter().map(String::as_str).collect();
-    let start = |(index, _): (usize, &Case)| lab.fly(index, "forward", "", &[], &vehicle);
+    let start = |(index, case): (usize, &Case)| {
+        let plan =
+            Plan { how: "forward", vehicle: &vehicle, bridge: case.bridge, ..Plan::default() };
+        lab.fly(index, plan)
+    };
     let flights: Vec<_> = cases.iter().enumerate().map(start).collect();
     let lab = Mutex::new(lab);
     std::thread::scope(|scope| {
@@ -239,6 +286,13 @@ fn strike(lab: &Mutex<&mut Lab>, flight: &mut Flight, loss: Loss) {
             wait("the cut", || seconds == FOR_EVER || flight.now().stamp_s - since_s >= seconds);
             flight.cuts().mavlink.store(seconds == FOR_EVER, Ordering::Relaxed);
         }
+        Loss::Bridge(seconds) => {
+            flight.kill_bridge();
+            if seconds < FOR_EVER {
+                wait("the power cut", || flight.now().stamp_s - since_s >= seconds);
+                flight.restart_bridge();
+            }
+        }
         Loss::Poses(seconds) => {
             flight.cuts().poses.store(true, Ordering::Relaxed);
             wait("the stall", || seconds == FOR_EVER || flight.now().stamp_s - since_s >= seconds);
@@ -263,7 +317,11 @@ fn strike(lab: &Mutex<&mut Lab>, flight: &mut Flight, loss: Loss) {
 /// Watches the rest of a flight.
 fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
     let over_s = match case.loss {
-        Loss::Mavlink(seconds) | Loss::Poses(seconds) if seconds < FOR_EVER => seconds,
+        Loss::Mavlink(seconds) | Loss::Bridge(seconds) | Loss::Poses(seconds)
+            if seconds < FOR_EVER =>
+        {
+            seconds
+        }
         _ => 0.0,
     };
     let since_s = |sight: &Sight| sight.stamp_s - last_good.stamp_s;
@@ -306,7 +364,8 @@ fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
     // The runtime's own end is its own test's matter; a killed one has none.
     drop(flight);
     let outside = track.iter().find(|sight| !(FENCE_X_M.0..FENCE_X_M.1).contains(&sight.p_m.x));
-    assert!(outside.is_none(), "{}: left the fence: {outside:?}", case.name);
+    let way: Vec<_> = lost.iter().step_by(40).map(|sight| (since_s(sight), sight.p_m)).collect();
+    assert!(outside.is_none(), "{}: left the fence: {outside:?}; {way:?}, {row:?}", case.name);
     row
 }
 

@@ -10,7 +10,7 @@ mod lab;
 
 use std::time::Instant;
 
-use lab::{Lab, Seen};
+use lab::{Lab, Plan, Seen};
 
 /// A misdeed, and what is to come of it.
 struct Case {
@@ -83,7 +83,7 @@ fn whatever_a_plugin_does_the_vehicle_holds_or_lands() {
     for batch in CASES.chunks(TOGETHER) {
         let start = |(index, case): (usize, &Case)| {
             let more: &[&str] = if case.flies_on() { &["--seconds=7"] } else { &[] };
-            lab.fly(index, case.how, case.settings, more, &[])
+            lab.fly(index, Plan { how: case.how, settings: case.settings, more, ..Plan::default() })
         };
         let flights: Vec<_> = batch.iter().enumerate().map(start).collect();
         for (case, flight) in batch.iter().zip(flights) {

@@ -1,0 +1,204 @@
+//! The safety chain, in flight: a wall that only the twin has is answered by LAND, and the fence is
+//! kept by whatever is left when the server, the runtime, or the guard is not there.
+//!
+//! The vehicle is watched from outside, by the motion capture's packets and its own heartbeats. Prints
+//! what it measures: `cargo test --release -p vizflyt-e2e --test chain -- --nocapture`. Times are not
+//! judged tighter than a loaded machine allows; `docs/BENCHMARKS.md` has those of a quiet one.
+
+#[path = "../lab/mod.rs"]
+mod lab;
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use glam::{DVec3, Quat, Vec3};
+use lab::{Flight, Lab, Plan};
+use serde_json::Value;
+use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavMessage};
+use vizflyt_protocol::mavlink::{
+    CopterMode, GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, encode, guided_to_mavlink,
+};
+use vizflyt_protocol::messages::YawTarget;
+use vizflyt_splat::{format, ply};
+
+/// Vehicles that fly into the wall, each twice a sample of the chain's time.
+const VEHICLES: usize = 3;
+/// Where the wall stands. [m, world]
+const WALL_X_M: f64 = 2.0;
+/// Well over what the chain takes, and over what a loaded machine adds. [s]
+const LAND_WITHIN_S: f64 = 1.0;
+/// A limit on waiting; nothing takes half as long.
+const PATIENCE: Duration = Duration::from_mins(2);
+/// Beyond the arena's fence by this much a vehicle may coast when nobody is left to brake it but the
+/// autopilot, half a second later. [m]
+const COAST_M: f64 = 0.8;
+
+/// Stands a wall across the room, of flat splats 3 cm apart.
+fn furnish(folder: &Path) {
+    let path = folder.join("scene.ply");
+    let mut scene = format::read(&path).expect("the generated scene reads").splats;
+    let coefficients = scene.sh.len() / scene.means_m.len();
+    let wall = (-60..60).flat_map(|y| (0..100).map(move |z| (y, z)));
+    for (y, z) in wall {
+        scene.means_m.push(Vec3::new(WALL_X_M as f32, 0.03 * y as f32, 0.03 * z as f32));
+        scene.scales_m.push(Vec3::new(0.004, 0.03, 0.03));
+        scene.rotations.push(Quat::IDENTITY);
+        scene.opacities.push(0.95);
+        scene.sh.extend(std::iter::repeat_n(0.3, coefficients));
+    }
+    ply::write(&path, &scene).expect("the scene is written");
+}
+
+#[test]
+fn a_wall_of_the_twin_is_answered_by_land() {
+    let lab = Lab::open_in(VEHICLES, furnish);
+    let plan = Plan { how: "forward", ..Plan::default() };
+    let mut flights: Vec<_> = (0..VEHICLES).map(|index| lab.fly(index, plan)).collect();
+    let mut took_ms = Vec::new();
+    for flight in &mut flights {
+        let lines = flight.until("collision");
+        let (_, line) = lines.last().expect("the line of the collision");
+        let at_m = collision(line);
+        // The first packet in which the vehicle is where the server says that it touched.
+        let (track, _) = flight.so_far();
+        let shown = track.iter().find(|sight| sight.p_m.x >= at_m.x - 1e-3 && sight.p_m.z > 0.3);
+        let shown = shown.expect("the motion capture saw it there").at;
+        wait("LAND", || flight.told_to_land().is_some());
+        let told = flight.told_to_land().expect("it was told");
+        let took = told.saturating_duration_since(shown);
+        assert!((at_m.x - (WALL_X_M - 0.12)).abs() < 0.1, "touched at {at_m}");
+        assert!(took.as_secs_f64() < LAND_WITHIN_S, "LAND came {took:?} after the pose");
+        took_ms.push(took.as_secs_f64() * 1e3);
+    }
+    took_ms.sort_by(f64::total_cmp);
+    println!("collision to LAND, from the packet that shows it: {took_ms:.1?} ms");
+    for flight in flights {
+        let seen = flight.wait();
+        assert_eq!(seen.report["outcome"], "collided", "{}", seen.report);
+        assert_eq!(seen.count("\"collision\""), 0, "told once, and then nothing counts");
+        let (height_m, _) = seen.end();
+        assert!(height_m < 0.1, "down, at {height_m} m");
+        let furthest_m = seen.track.iter().map(|sight| sight.p_m.x).fold(0.0, f64::max);
+        assert!(furthest_m < WALL_X_M + 0.3, "it went on to {furthest_m} m");
+    }
+}
+
+/// Reads where a line of the runtime says that the body's centre was. [m, world]
+fn collision(line: &Value) -> DVec3 {
+    fn find(value: &Value) -> Option<&Value> {
+        match value {
+            Value::Object(map) => {
+                map.get("p_world_m").or_else(|| map.values().find_map(|value| find(value)))
+            }
+            Value::Array(list) => list.iter().find_map(find),
+            _ => None,
+        }
+    }
+    let numbers = find(line).and_then(Value::as_array).expect("a place");
+    let number = |n: usize| numbers[n].as_f64().expect("a number");
+    DVec3::new(number(0), number(1), number(2))
+}
+
+#[test]
+fn without_the_server_the_runtime_keeps_the_fence() {
+    let mut lab = Lab::open(1);
+    let mut flight = outward(&lab);
+    lab.kill_server();
+    drop(lab);
+    ends_inside(&mut flight, "the server is killed", 0.0);
+}
+
+#[test]
+fn without_the_runtime_the_autopilot_lands_it() {
+    let lab = Lab::open(1);
+    let mut flight = outward(&lab);
+    flight.kill_runtime();
+    ends_inside(&mut flight, "the runtime is killed", COAST_M);
+}
+
+#[test]
+fn without_a_guard_the_autopilot_keeps_its_own_fence() {
+    let lab = Lab::open(1);
+    let mut flight = outward(&lab);
+    // Somebody else's program, which knows of no fence, takes over on the same link.
+    flight.kill_runtime();
+    let started = Instant::now();
+    let mut sequence = 0;
+    while !is_landing(&flight) {
+        assert!(started.elapsed() < PATIENCE, "it flies on: {:?}", flight.now());
+        let motion = GuidedMotion::Velocity(DVec3::X);
+        let setpoint = GuidedSetpoint { motion, yaw: YawTarget::Angle(0.0) };
+        let target = guided_to_mavlink(&setpoint, (1, 1), 0);
+        tell(&flight, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(target), &mut sequence);
+        if sequence % 20 == 1 {
+            tell(&flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
+        }
+        // The setpoints' own rate, not a wait for something.
+        std::thread::sleep(Duration::from_millis(25));
+    }
+    let reached_m = flight.now().p_m.x - START_X_M;
+    println!(
+        "without a guard: the autopilot's fence of {FENCE_RADIUS_M} m acts at {reached_m:.2} m"
+    );
+    assert!(reached_m > FENCE_RADIUS_M - 0.3, "at {reached_m} m something else landed it");
+    ends_inside(&mut flight, "no guard", COAST_M);
+}
+
+/// Returns a flight that flies at the fence, as the plugin asks.
+fn outward(lab: &Lab) -> Flight {
+    let fence = format!("--param=FENCE_RADIUS={FENCE_RADIUS_M}");
+    let vehicle = [
+        &*fence,
+        "--param=FENCE_ENABLE=1",
+        "--param=FENCE_TYPE=3",
+        "--param=FENCE_ACTION=2",
+        "--param=FENCE_ALT_MAX=3.2",
+        "--param=FENCE_MARGIN=0.3",
+        "--param=FS_GCS_ENABLE=5",
+        "--param=FS_GCS_TIMEOUT=3",
+        "--param=FS_OPTIONS=8",
+        "--param=GUID_TIMEOUT=0.5",
+    ];
+    let plan = Plan { how: "forward", vehicle: &vehicle, ..Plan::default() };
+    let mut flight = lab.fly(0, plan);
+    flight.until("\"phase\":\"flying\"");
+    wait("the way to the fence", || flight.now().p_m.x > START_X_M + 0.4);
+    flight
+}
+
+/// Waits until a vehicle is down, and expects that it has not left the fence by more than
+/// `beyond_m`.
+fn ends_inside(flight: &mut Flight, what: &str, beyond_m: f64) {
+    wait(what, || flight.now().p_m.z < 0.05);
+    let (track, modes) = flight.so_far();
+    let furthest_m = track.iter().map(|sight| sight.p_m.x).fold(0.0, f64::max);
+    println!("{what}: down, {:.2} m inside the fence at the least", FENCE_X_M - furthest_m);
+    assert!(furthest_m < FENCE_X_M + beyond_m, "{what}: it was at {furthest_m} m");
+    let land = CopterMode::Land as u32;
+    assert!(modes.iter().any(|&(_, mode)| mode == land), "{what}: {modes:?}");
+}
+
+fn is_landing(flight: &Flight) -> bool {
+    let (_, modes) = flight.so_far();
+    modes.last().is_some_and(|&(_, mode)| mode == CopterMode::Land as u32)
+}
+
+fn tell(flight: &Flight, message: &MavMessage, sequence: &mut u8) {
+    let header = MavHeader { system_id: 255, component_id: 190, sequence: *sequence };
+    *sequence = sequence.wrapping_add(1);
+    flight.tell_vehicle(encode(header, message, &mut [0; MAX_PACKET]));
+}
+
+fn wait(what: &str, done: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !done() {
+        assert!(Instant::now() < deadline, "{what}: waited in vain");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Where the lab's vehicles start, and the side of the room's fence that they fly at. [m, world]
+const START_X_M: f64 = 0.9;
+const FENCE_X_M: f64 = 2.6;
+/// The autopilot's own fence around the start: the corner of the arena's that they fly at. [m]
+const FENCE_RADIUS_M: f64 = 1.7;

@@ -1,0 +1,251 @@
+//! `vizflyt grade` as an instructor uses it: the same hash on every run, signatures, parts, reports, and
+//! what becomes of plugins that fail.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+use tempfile::TempDir;
+use vizflyt_e2e::{root, vizflyt};
+
+/// An instructor with a folder of keys, and a place for files.
+struct Rig {
+    folder: TempDir,
+}
+
+impl Rig {
+    fn new() -> Self {
+        use std::os::unix::fs::PermissionsExt;
+        let rig = Self { folder: tempfile::tempdir().unwrap() };
+        for keys in ["keys", "others"] {
+            fs::create_dir(rig.at(keys)).unwrap();
+            fs::set_permissions(rig.at(keys), fs::Permissions::from_mode(0o700)).unwrap();
+        }
+        rig
+    }
+
+    fn at(&self, name: &str) -> String {
+        self.folder.path().join(name).to_str().unwrap().to_owned()
+    }
+
+    fn run(&self, args: &[&str]) -> Output {
+        let keys = format!("--keys={}", self.at("keys"));
+        Command::new(vizflyt()).arg("grade").args(args).arg(keys).output().unwrap()
+    }
+
+    fn good(&self, args: &[&str]) -> String {
+        let output = self.run(args);
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{args:?}: {errors}");
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    fn refused(&self, args: &[&str], text: &str) {
+        let output = self.run(args);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success(), "{args:?} succeeded");
+        assert!(message.contains(text) && !message.contains("panicked"), "{args:?}: {message}");
+    }
+
+    fn grade(&self, args: &[&str]) -> Value {
+        serde_json::from_str(&self.good(args)).unwrap()
+    }
+}
+
+const FOREST: [&str; 5] = ["avoid", "--project=forest", "--seeds=2", "--image-rate=15", "--json"];
+
+fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    FOREST.iter().copied().chain(more.iter().copied()).collect()
+}
+
+#[test]
+fn two_runs_give_the_same_grade_whatever_runs_beside_them_and_parts_make_the_whole() {
+    let rig = Rig::new();
+    let one = rig.grade(&with(&["--jobs=2"]));
+    assert_eq!(one["hash"].as_str().unwrap().len(), 64);
+    let runs = one["runs"].as_array().unwrap();
+    assert_eq!(runs.len(), 2);
+    for (run, seed) in runs.iter().zip([1, 2]) {
+        assert_eq!(run["seed"], seed);
+        assert_eq!(run["outcome"], "finished", "{run}");
+        assert!(run["stages_passed"].is_u64(), "{run}");
+        assert!((5.0..60.0).contains(&run["seconds"].as_f64().unwrap()), "{run}");
+        assert!(run["min_clearance_m"].as_f64().unwrap() > 0.0, "{run}");
+    }
+    assert_ne!(runs[0]["hash"], runs[1]["hash"]);
+
+    // Again in two parts, one flight at a time: figures, hashes and signature are the same.
+    let parts = ["1/2", "2/2"].map(|shard| {
+        let file = rig.at(&format!("part-{}.json", &shard[..1]));
+        let part = rig.grade(&with(&[&format!("--shard={shard}"), "--jobs=1", "-o", &file]));
+        assert_eq!(part["runs"].as_array().unwrap().len(), 1);
+        file
+    });
+    rig.refused(&["merge", &parts[0]], "missing: 2");
+    let whole = rig.at("whole.json");
+    rig.good(&["merge", &parts[1], &parts[0], "-o", &whole]);
+    let merged: Value = serde_json::from_str(&fs::read_to_string(&whole).unwrap()).unwrap();
+    assert_eq!(merged, one);
+
+    // As signed; not after a change, and not with another's key.
+    rig.good(&["verify", &whole]);
+    let public = rig.good(&["key"]);
+    rig.good(&["verify", &whole, "--key", public.trim()]);
+    let keys = format!("--keys={}", rig.at("others"));
+    let other = Command::new(vizflyt()).args(["grade", "key", &keys]).output().unwrap();
+    let other = String::from_utf8(other.stdout).unwrap();
+    rig.refused(&["verify", &whole, "--key", other.trim()], "is signed with the key");
+    let text = fs::read_to_string(&whole).unwrap();
+    let forged = text.replacen("\"seed\": 2", "\"seed\": 3", 1);
+    assert_ne!(forged, text);
+    fs::write(&whole, forged).unwrap();
+    rig.refused(&["verify", &whole], "was changed after it was signed");
+}
+
+/// Writes a plugin that is a shell script, and returns its path.
+fn script(rig: &Rig, name: &str, text: &str) -> String {
+    use std::os::unix::fs::PermissionsExt;
+    let path = rig.at(name);
+    fs::write(&path, format!("#!/bin/sh\n{text}\n")).unwrap();
+    fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+    path
+}
+
+#[test]
+fn a_plugin_that_fails_is_graded_and_explained() {
+    let rig = Rig::new();
+    let broken = script(&rig, "broken", "echo no such model >&2; exit 3");
+    let (report, junit) = (rig.at("report"), rig.at("junit.xml"));
+    let args = [
+        broken.as_str(),
+        "--project=forest",
+        "--seeds=1",
+        "--report",
+        &report,
+        "--junit",
+        &junit,
+        "--least=50",
+        "--json",
+    ];
+    let output = rig.run(&args);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let grade: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let run = &grade["runs"][0];
+    assert_eq!((&run["outcome"], &run["score"]), (&"plugin_failed".into(), &0.0.into()));
+    let cause = run["cause"].as_str().unwrap();
+    assert!(cause.contains("exit status 3") && cause.contains("no such model"), "{cause}");
+    let page = fs::read_to_string(Path::new(&report).join("index.html")).unwrap();
+    assert!(page.contains("id=\"day-1\"") && page.contains("no such model"), "{page}");
+    let junit = fs::read_to_string(&junit).unwrap();
+    assert!(junit.contains("failures=\"1\"") && junit.contains("no such model"), "{junit}");
+    rig.good(&["verify", Path::new(&report).join("grade.json").to_str().unwrap()]);
+}
+
+#[test]
+fn what_makes_no_sense_is_refused_before_anything_is_flown() {
+    let rig = Rig::new();
+    rig.refused(&["avoid", "--project=p9"], "p2, p3, p4, p5, forest");
+    rig.refused(&["avoid", "--variants=noon"], "noon");
+    rig.refused(&["avoid", "--variants=day,day"], "twice");
+    rig.refused(&["avoid", "--shard=3/2"], "is no part");
+    rig.refused(&["avoid", "--image-rate=0"], "1 to 200 Hz");
+    rig.refused(&["./gone.py"], "there is no plugin");
+    rig.refused(&["verify", &rig.at("gone.json")], "cannot read");
+    fs::write(rig.at("noise.json"), "{}").unwrap();
+    rig.refused(&["verify", &rig.at("noise.json")], "is no grade");
+}
+
+/// Returns the code block of this language in the guide to clusters.
+fn block(language: &str) -> String {
+    let guide = fs::read_to_string(root().join("docs/guides/grading-at-scale.md")).unwrap();
+    let begin = guide.split_once(&format!("```{language}\n")).unwrap().1;
+    begin.split_once("\n```").unwrap().0.to_owned()
+}
+
+/// Runs a shell script in which `vizflyt` only says how it was called; returns what it said.
+fn called(rig: &Rig, shell: &[&str], environment: &[(&str, &str)]) -> String {
+    let tools = rig.at("tools");
+    fs::create_dir_all(&tools).unwrap();
+    script(rig, "tools/vizflyt", "echo \"$@\"");
+    let path = format!("{tools}:{}", std::env::var("PATH").unwrap());
+    let output = Command::new(shell[0])
+        .args(&shell[1..])
+        .env("PATH", path)
+        .envs(environment.iter().copied())
+        .current_dir(rig.folder.path())
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Whether the program takes these arguments, told by what it says of a project that is not there.
+fn is_understood(rig: &Rig, called: &str) -> bool {
+    let given = called.trim().replace("--project p5", "--project p9");
+    let args: Vec<&str> = given.split_whitespace().collect();
+    let output =
+        Command::new(vizflyt()).args(args).current_dir(rig.folder.path()).output().unwrap();
+    String::from_utf8_lossy(&output.stderr).contains("there is no project 'p9'")
+}
+
+#[test]
+fn the_array_script_of_the_guide_flies_its_part() {
+    let rig = Rig::new();
+    let file = script(&rig, "grade.sh", "");
+    fs::write(&file, block("bash")).unwrap();
+    let environment = [
+        ("SLURM_ARRAY_JOB_ID", "77"),
+        ("SLURM_ARRAY_TASK_ID", "3"),
+        ("SLURM_ARRAY_TASK_COUNT", "16"),
+        ("SLURM_CPUS_PER_TASK", "2"),
+        ("HOME", rig.folder.path().to_str().unwrap()),
+    ];
+    let said = called(&rig, &["bash", &file, vizflyt().to_str().unwrap(), "p5"], &environment);
+    assert!(said.contains("--shard 3/16") && said.contains("parts-77/part-3.json"), "{said}");
+    assert!(said.starts_with("grade ") && is_understood(&rig, &said), "{said}");
+    assert!(block("bash").contains("#SBATCH --array=1-16\n"));
+}
+
+#[test]
+fn the_job_of_the_guide_flies_every_part() {
+    let rig = Rig::new();
+    fs::write(rig.at("job.yaml"), block("yaml")).unwrap();
+    let convert = "import json, sys, yaml; print(json.dumps(yaml.safe_load(open(sys.argv[1]))))";
+    let output =
+        Command::new("python3").args(["-c", convert, &rig.at("job.yaml")]).output().unwrap();
+    assert!(output.status.success(), "install python3-yaml: {output:?}");
+    let job: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&job["apiVersion"], &job["kind"]), (&"batch/v1".into(), &"Job".into()));
+    let spec = &job["spec"];
+    assert_eq!(spec["completionMode"], "Indexed");
+    let parts = spec["completions"].as_u64().unwrap();
+    let pod = &spec["template"]["spec"];
+    assert_eq!(pod["restartPolicy"], "Never");
+    // Every mount has its volume.
+    let named = |list: &Value| -> Vec<String> {
+        let items = list.as_array().unwrap().iter();
+        items.map(|item| item["name"].as_str().unwrap().to_owned()).collect()
+    };
+    let volumes = named(&pod["volumes"]);
+    for container in pod["containers"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .chain(pod["initContainers"].as_array().unwrap())
+    {
+        let mounts = named(&container["volumeMounts"]);
+        assert!(mounts.iter().all(|mount| volumes.contains(mount)), "{mounts:?} {volumes:?}");
+    }
+    let container = &pod["containers"][0];
+    assert_eq!(container["command"], serde_json::json!(["/bin/sh", "-c"]));
+    let line = container["args"][0].as_str().unwrap();
+    for index in [0, parts - 1] {
+        let said =
+            called(&rig, &["sh", "-c", line], &[("JOB_COMPLETION_INDEX", &index.to_string())]);
+        assert!(said.contains(&format!("--shard {}/{parts}", index + 1)), "{said}");
+        assert!(said.contains(&format!("part-{index}.json")), "{said}");
+        let known = said.replace("/plugin", "avoid").replace("/keys/own", &rig.at("keys"));
+        assert!(is_understood(&rig, &known), "{said}");
+    }
+}

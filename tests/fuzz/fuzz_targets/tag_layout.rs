@@ -1,0 +1,24 @@
+//! A layout of tags, or a checkerboard: one sentence, or what is written and read again as it is.
+#![no_main]
+use libfuzzer_sys::fuzz_target;
+use vizflyt_tags::checkers::Checkerboard;
+use vizflyt_tags::layout::TagLayout;
+
+fuzz_target!(|text: &str| {
+    match TagLayout::parse(text) {
+        Ok(layout) => {
+            for tag in &layout.tags {
+                assert!(tag.corners_m().iter().all(|corner| corner.is_finite()));
+            }
+            assert_eq!(TagLayout::parse(&layout.to_toml().unwrap()).unwrap(), layout);
+        }
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+    match Checkerboard::parse(text) {
+        Ok(board) => {
+            assert!(board.corners_m().iter().all(|corner| corner.is_finite()));
+            assert_eq!(Checkerboard::parse(&board.to_toml().unwrap()).unwrap(), board);
+        }
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+});

@@ -1,0 +1,260 @@
+// The page in a real, headless Chromium, against the real program. See `run`.
+//
+//   node page.cjs VIZFLYT [SHOTS]
+
+const assert = require("node:assert/strict");
+const { spawn, spawnSync } = require("node:child_process");
+const fs = require("node:fs");
+const os = require("node:os");
+const path = require("node:path");
+const { chromium } = require("playwright-core");
+
+const [vizflyt, shots] = process.argv.slice(2);
+/** Bounds a test that fails; a passing one waits for what it waits for. [ms] */
+const PATIENCE = 120_000;
+const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
+const scratch = fs.mkdtempSync(path.join(os.tmpdir(), "vizflyt-page-"));
+const children = [];
+
+/** Starts the program; returns a way to wait for a line of its standard output. */
+function start(...args) {
+  const child = spawn(vizflyt, args, { stdio: ["pipe", "pipe", "inherit"] });
+  children.push(child);
+  const lines = [], waiting = new Set();
+  let rest = "";
+  child.stdout.on("data", (bytes) => {
+    const parts = (rest + bytes).split(/\r?\n|\r/);
+    rest = parts.pop();
+    lines.push(...parts);
+    for (const look of waiting) look();
+  });
+  const ended = new Promise((done) => child.on("exit", done));
+  const line = (pattern) =>
+    new Promise((done, fail) => {
+      const timer = setTimeout(() => fail(new Error(`no line ${pattern} in:\n${lines.join("\n")}`)), PATIENCE);
+      const look = () => {
+        const found = lines.map((text) => text.match(pattern)).find(Boolean);
+        if (!found) return;
+        clearTimeout(timer);
+        waiting.delete(look);
+        done(found);
+      };
+      waiting.add(look);
+      look();
+    });
+  return { child, line, ended };
+}
+
+/** Opens a page of its own that notes what it should not do. */
+async function open(browser, url, options = {}) {
+  const context = await browser.newContext({ viewport: { width: 1440, height: 900 }, ...options });
+  const page = await context.newPage();
+  page.setDefaultTimeout(PATIENCE);
+  page.faults = [];
+  page.on("pageerror", (error) => page.faults.push(`error: ${error.message}`));
+  page.on("request", (request) => {
+    const to = new URL(request.url());
+    // With the Internet unplugged all is there: nothing is asked of anyone else.
+    if (!["blob:", "data:"].includes(to.protocol) && to.host !== new URL(url).host) page.faults.push(`asks ${to.host}`);
+  });
+  await page.goto(url);
+  return page;
+}
+
+const text = (page, id) => page.locator(`#${id}`).innerText();
+const until = (page, id, pattern) =>
+  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id).textContent), [id, pattern.source]);
+
+async function shot(page, name) {
+  if (shots) await page.screenshot({ path: path.join(shots, `${name}.png`) });
+}
+
+/** Everything that can be pressed or filled says what it is, and the stop button is in sight. */
+async function checkAccess(page, size) {
+  const nameless = await page.evaluate(() =>
+    [...document.querySelectorAll("button, input, select, a[href], canvas, summary")]
+      .filter((node) => node.checkVisibility() && node.getAttribute("aria-hidden") !== "true")
+      .filter((node) => !(node.ariaLabel || node.textContent.trim() || node.labels?.[0]?.textContent.trim()))
+      .map((node) => node.outerHTML),
+  );
+  assert.deepEqual(nameless, [], `${size}: without a name`);
+  const stop = await page.locator("#estop").boundingBox();
+  const [width, height] = SIZES[size];
+  assert.ok(stop.x >= 0 && stop.x + stop.width <= width + 1, `${size}: STOP at ${JSON.stringify(stop)}`);
+  assert.ok(stop.y >= 0 && stop.y + stop.height <= height + 1, `${size}: STOP at ${JSON.stringify(stop)}`);
+  assert.ok(stop.height >= 44, `${size}: STOP is ${stop.height} px high`);
+  const over = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  assert.ok(over <= 0, `${size}: ${over} px too wide`);
+}
+
+/** Whether a canvas shows a picture rather than one colour. */
+const isPainted = (page, id) =>
+  page.waitForFunction((id) => {
+    const canvas = document.getElementById(id);
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const seen = new Set();
+    for (let k = 0; k < data.length; k += 404) seen.add((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
+    return seen.size > 20;
+  }, id);
+
+/** A flight: it waits for its start, is watched on three screens, and is stopped by the keyboard. */
+async function flight(browser) {
+  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--log", scratch, "--report", `${scratch}/report.json`);
+  const [, url] = await demo.line(/page\s+(http:\S+)/);
+  const page = await open(browser, url);
+  await until(page, "phase-text", /ready to start/);
+  assert.ok(await page.locator("#land").isHidden(), "nothing to land yet");
+  // Every screen before the start: nothing flies meanwhile, and the order of what follows is short.
+  await isPainted(page, "map");
+  // Nothing here has a graphics card: the top view comes first by itself.
+  assert.equal(await page.locator("#view-top").getAttribute("aria-pressed"), "true");
+  assert.ok((await page.locator("#stages li").count()) > 0, "stage lights");
+  assert.equal(await page.locator("#stages [aria-current]").count(), 1);
+  await checkAccess(page, "laptop");
+  await page.locator("#theme").click();
+  await shot(page, "laptop-other-theme");
+  await page.locator("#theme").click();
+  for (const size of ["phone", "projector", "laptop"]) {
+    const [width, height] = SIZES[size];
+    await page.setViewportSize({ width, height });
+    await checkAccess(page, size);
+    await shot(page, `${size}-ready`);
+  }
+  // By keyboard alone.
+  await page.locator("#start").focus();
+  await page.keyboard.press("Enter");
+  await until(page, "phase-text", /flying|holding/);
+  for (const id of ["colour", "depth"]) await isPainted(page, id);
+  assert.notEqual(await text(page, "clock"), "0:00.0");
+  assert.match(await text(page, "poses"), /^\d+$/);
+  assert.match(await text(page, "battery"), /^\d/);
+  await shot(page, "laptop-flying");
+  // Someone who types has the space bar; escape stops from anywhere.
+  await page.keyboard.press("Escape");
+  await until(page, "said", /lands/);
+  await until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/);
+  await shot(page, "laptop-stopped");
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  assert.equal(await demo.ended, 1, "a stopped flight is no success");
+  assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
+}
+
+/** A lab whose page takes a login: wrong, right, cameras, scene, pairing, out again. */
+async function lab(browser) {
+  const scenes = path.join(scratch, "scenes"), keys = path.join(scratch, "keys");
+  for (const [name, seed] of [["first", "1"], ["second", "2"]]) {
+    const made = spawnSync(vizflyt, ["scene", "generate", "room", "--seed", seed, "-o", path.join(scenes, name)]);
+    assert.equal(made.status, 0, `${made.stderr}`);
+  }
+  const set = spawnSync(vizflyt, ["password", "--keys", keys], { input: "four words for tests\n" });
+  assert.equal(set.status, 0, `${set.stderr}`);
+  const free = "127.0.0.1:0";
+  const server = start("serve", path.join(scenes, "first"), "--scenes", scenes, "--login", "always", "--keys", keys,
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+  const [, url] = await server.line(/"http":"([^"]+)"/);
+  const page = await open(browser, url);
+  await until(page, "link-text", /not logged in/);
+  assert.ok(await page.locator("#reset").isHidden());
+  await page.locator("#login").click();
+  await shot(page, "login");
+  await page.keyboard.type("not the password");
+  await page.keyboard.press("Enter");
+  await page.getByRole("alert").filter({ hasText: "this is not the password" }).waitFor();
+  assert.equal(await page.evaluate(async () => (await fetch("/api/pairing")).status), 401);
+  await page.keyboard.type("four words for tests");
+  await page.keyboard.press("Enter");
+  await until(page, "link-text", /live/);
+  // The cookie is out of reach of scripts, and without its token nothing changes.
+  assert.equal(await page.evaluate(() => document.cookie), "");
+  const bare = await page.evaluate(async () => (await fetch("/api/pairing", { method: "POST", body: '{"right":"instructor"}' })).status);
+  assert.equal(bare, 403);
+  // A camera.
+  await page.locator("#setup summary").click();
+  await page.locator("#camera-form [name=width_px]").fill("200");
+  await page.locator("#camera-form button[type=submit]").click();
+  await until(page, "camera-said", /applied/);
+  await until(page, "camera-name", /200 ×/);
+  // The view in space: drawn, and turned by keys. Not in flight: without a card it takes the processor.
+  await page.locator("#view-space").click();
+  const canvas = page.locator("#space");
+  await canvas.waitFor({ state: "visible" });
+  let blank = 0;
+  do {
+    blank += 1;
+    assert.ok(blank < 50, "the view in space stays blank");
+    await page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
+  } while ((await canvas.screenshot()).length < 20_000);
+  await canvas.press("ArrowLeft");
+  await shot(page, "laptop-space");
+  await page.locator("#view-top").click();
+  // Pairing; and the stop button works beside the panel, by mouse and by key.
+  await page.getByRole("button", { name: "pair a computer" }).click();
+  await page.getByRole("button", { name: "show a code" }).click();
+  await page.waitForFunction(() => /^\d{3}.?\d{3}$/.test(document.querySelector(".pair-code").textContent));
+  await shot(page, "pairing");
+  await page.locator("#estop").click();
+  await until(page, "said", /no runtime is connected/);
+  await page.evaluate(() => (document.getElementById("said").textContent = ""));
+  await page.keyboard.press("Escape");
+  await until(page, "said", /no runtime is connected/);
+  await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
+  // Another scene: the page comes back by itself, still logged in.
+  const before = await page.evaluate(async () => (await (await fetch("/api/scenes")).json()).now);
+  assert.equal(before, "first");
+  await page.locator("#scenes").click();
+  await page.locator("#scene-choice").selectOption("second");
+  await shot(page, "scenes");
+  await page.locator("dialog[open] button[type=submit]").click();
+  await page.waitForFunction(async () => {
+    try {
+      const answer = await fetch("/api/scenes");
+      return answer.ok && (await answer.json()).now === "second";
+    } catch {
+      return false;
+    }
+  }, null, { polling: 250 });
+  await until(page, "link-text", /live/);
+  // Another window of the same login sees no more either, once it is logged out.
+  const window = await page.context().newPage();
+  await window.goto(url);
+  await until(window, "link-text", /live/);
+  await page.locator("#logout").click();
+  await until(window, "link-text", /not logged in/);
+  await until(page, "link-text", /not logged in/);
+  assert.equal(await page.evaluate(async () => (await fetch("/api/pairing")).status), 401);
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  server.child.stdin.end();
+  assert.equal(await server.ended, 0);
+}
+
+async function main() {
+  if (shots) fs.mkdirSync(shots, { recursive: true });
+  const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
+  // Its sandbox wants rights that a container lacks; WebGL without a card is drawn in software.
+  const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
+  const browser = await chromium.launch({ executablePath, args });
+  let code = 0;
+  for (const test of [lab, flight]) {
+    const began = Date.now();
+    try {
+      await test(browser);
+      console.log(`ok    ${test.name} (${((Date.now() - began) / 1000).toFixed(0)} s)`);
+    } catch (error) {
+      code = 1;
+      console.log(`FAIL  ${test.name}: ${error.stack}`);
+      const page = browser.contexts().at(-1)?.pages()[0];
+      if (page) {
+        console.log(`      the page says: ${page.faults}`);
+        await shot(page, `failed-${test.name}`);
+      }
+    }
+  }
+  await browser.close();
+  for (const child of children) child.kill("SIGKILL");
+  fs.rmSync(scratch, { recursive: true, force: true });
+  process.exit(code);
+}
+
+main();
