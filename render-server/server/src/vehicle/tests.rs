@@ -1,9 +1,12 @@
 //! The seat, the flight's outcome, orders and reports of one vehicle.
 
+use std::net::SocketAddr;
+
 use super::*;
-use glam::{DQuat, DVec3};
-use vizflyt_protocol::geometry::{Pose, Volume};
-use vizflyt_protocol::messages::{Limits, PoseAges, Purpose};
+use crate::outlet::MOST_WATCHERS;
+use glam::DVec3;
+use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::messages::{HeardEvents, Hello, Limits, PoseAges, Purpose};
 
 pub(crate) fn named(index: usize, name: &str) -> Vehicle {
     let arena = ArenaInfo {
