@@ -199,6 +199,16 @@ async function lab(browser) {
   await page.keyboard.press("Escape");
   await until(page, "said", /no runtime is connected/);
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
+  // Light and fog: a name at once, a sight with the button, and what cannot be is told.
+  await page.locator("#environment").click();
+  await page.locator("#environment-choice").selectOption("night-fog");
+  await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).name === "night-fog");
+  assert.equal(await page.locator("#environment-sight").inputValue(), "12");
+  await page.locator("#environment-sight").fill("30");
+  await page.locator("dialog[open] button[type=submit]").click();
+  await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).fog_visibility_m === 30);
+  await shot(page, "environment");
+  await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
   // Another scene: the page comes back by itself, still logged in.
   const before = await page.evaluate(async () => (await (await fetch("/api/scenes")).json()).now);
   assert.equal(before, "first");

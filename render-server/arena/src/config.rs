@@ -16,6 +16,7 @@ use crate::pose::PoseConfig;
 
 mod body;
 mod camera;
+mod environment;
 mod line;
 mod localization;
 mod no_fly;
@@ -26,6 +27,7 @@ mod vehicle;
 
 pub use body::BodyPart;
 pub use camera::{CameraConfig, LensConfig};
+pub use environment::EnvironmentConfig;
 pub use line::line_of;
 pub use localization::{
     Alignment, Axes, Driver, Euler, LocalizationConfig, MAX_SOURCES, Nose, Offset, Units, UpAxis,
@@ -75,6 +77,9 @@ pub struct ArenaConfig {
     /// How obstacles are baked from the scene.
     #[serde(default)]
     pub occupancy: Occupancy,
+    /// Light and fog.
+    #[serde(default, skip_serializing_if = "EnvironmentConfig::is_default")]
+    pub environment: EnvironmentConfig,
     /// How poses are fused, when they count as lost, and for which moment images are drawn.
     #[serde(default, skip_serializing_if = "PoseConfig::is_default")]
     pub pose: PoseConfig,

@@ -13,7 +13,7 @@ use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage};
+use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -53,6 +53,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 * body_from_forward_cam(DVec3::ZERO, pitch_deg.to_radians()),
             near_m: 0.05,
             background: [0.0; 3],
+            air: Air::CLEAR,
         };
         let mut images = [RgbdImage::default()];
         let start = Instant::now();

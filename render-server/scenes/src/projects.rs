@@ -134,7 +134,7 @@ impl Project {
     /// use vizflyt_scenes::projects::{Level, Project};
     /// use vizflyt_scenes::Variant;
     /// let race = Project::named("p5").unwrap();
-    /// let generated = race.generate(3, Level::Ug, Variant::Day);
+    /// let generated = race.generate(3, Level::Ug, Variant::DAY);
     /// let names: Vec<_> = generated.arena.stages.iter().map(|stage| &*stage.name).collect();
     /// assert_eq!(names, ["window 1", "window 2", "gap", "clock hand"]);
     /// assert!(!generated.arena.ground_truth);
@@ -180,7 +180,7 @@ impl Project {
         self.text
     }
 
-    /// Generates the project's place of a seed, with the sensors of a level, in a variant's light.
+    /// Generates the project's place of a seed, with the sensors of a level, in the environment of a variant.
     /// The same arguments give the same result on every machine.
     pub fn generate(&self, seed: u64, level: Level, variant: Variant) -> Generated {
         let plan = &self.plan;
@@ -200,11 +200,11 @@ impl Project {
             limits: plan.limits,
             rules: plan.rules,
             cameras: suite.cameras.clone(),
+            environment: variant.environment(),
             goal: arena.goal.filter(|_| plan.finish == Finish::Goal),
             ..arena.clone()
         };
         generated.map_is_known = plan.known_map;
-        variant.apply(&mut generated);
         generated
     }
 }
@@ -228,7 +228,7 @@ mod tests {
             assert_eq!(project.name(), name);
             assert!(!project.title().is_empty() && project.task().len() > 40, "{name}");
             for level in Level::ALL {
-                let generated = project.generate(3, level, Variant::Day);
+                let generated = project.generate(3, level, Variant::DAY);
                 let arena = &generated.arena;
                 arena.validate().unwrap_or_else(|error| panic!("{name}: {error}"));
                 assert_eq!(arena.name, name);

@@ -13,6 +13,7 @@ pub use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::pose::Predict;
 
 use crate::drivers::SourceCounters;
+use crate::environment::Environment;
 use crate::leaderboard::Leaderboard;
 use crate::moving::Moving;
 use crate::outlet::Outlet;
@@ -40,6 +41,8 @@ pub struct Hub {
     pub adapt: Adapt,
     /// For which moment images are drawn.
     pub predict: Predict,
+    /// The light and the fog that images show.
+    pub environment: Environment,
     /// What moves in the twin.
     pub moving: Moving,
     /// Where flights are written down; `None` if they are not.
@@ -72,6 +75,7 @@ impl Hub {
             outlet: Outlet::new(&cameras),
             adapt: Adapt::default(),
             predict: Predict::default(),
+            environment: Environment::default(),
             moving: Moving::default(),
             leaderboard: None,
             source_names: Vec::new(),

@@ -20,6 +20,7 @@ pub mod door;
 pub mod drawn;
 pub mod drivers;
 pub mod encode;
+pub mod environment;
 pub mod events;
 pub mod hub;
 pub mod leaderboard;

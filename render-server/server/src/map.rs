@@ -10,7 +10,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
@@ -148,6 +148,7 @@ fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Ca
         world_from_cam: Pose::new(middle.extend(ceiling_m + height_m), DQuat::from_mat3(&axes)),
         near_m: height_m as f32,
         background: [0.05, 0.07, 0.09],
+        air: Air::CLEAR,
     }
 }
 

@@ -22,6 +22,7 @@ use crate::dashboard::{Access, Logins, Page, PageKeys};
 use crate::door::Door;
 use crate::drawn::Ticks;
 use crate::drivers::{self, Opened, PoseSource};
+use crate::environment::Environment;
 use crate::events::Origin;
 use crate::hub::{Hub, RendererInfo, lock};
 use crate::leaderboard::{Database, Leaderboard, record};
@@ -184,6 +185,7 @@ async fn run(
     let mut hub = Hub::new(vehicles.collect(), renderer, stop.clone());
     hub.adapt = args.adapt;
     hub.predict = twin.arena.pose.predict;
+    hub.environment = Environment::new(twin.arena.environment);
     hub.moving = twin.moving;
     hub.leaderboard = open_leaderboard(args).await;
     hub.source_names =

@@ -30,6 +30,7 @@ use crate::cameras::{CameraSet, DrawnCameras};
 use crate::clock;
 use crate::drawn::Ticks;
 use crate::drivers::{PoseSource, SourceCounters};
+use crate::environment::air;
 use crate::events::Origin;
 use crate::hub::{Hub, MAX_VEHICLES, RendererInfo, lock};
 use crate::mailbox::Mailbox;
@@ -252,6 +253,7 @@ pub fn draw(
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
         cameras.clear();
+        let air = air(&hub.environment.now());
         let mut views = [View::default(); MAX_VEHICLES];
         for (vehicle, set) in sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
@@ -279,6 +281,7 @@ pub fn draw(
                     world_from_cam: world_from_body * info.body_from_cam,
                     near_m: config.near_m as f32,
                     background: BACKGROUND,
+                    air,
                 });
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);

@@ -208,6 +208,8 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /api/pairing", Takes::All),
     ("GET /api/scenes", Takes::All),
     ("PUT /api/scene", Takes::All),
+    ("GET /api/environment", Takes::All),
+    ("PUT /api/environment", Takes::All),
     ("POST /api/pairing", Takes::All),
     ("DELETE /api/pairing", Takes::All),
     ("GET /api/cameras", Takes::All),
@@ -286,6 +288,7 @@ fn a_cookie_without_its_token_changes_nothing() {
         "POST /api/vehicles/ant/team",
         "DELETE /api/vehicles/ant/team",
         "PUT /api/scene",
+        "PUT /api/environment",
         "POST /api/logout",
     ] {
         for token in ["", "00", &of_the_team] {

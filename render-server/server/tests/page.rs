@@ -119,6 +119,42 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
     );
 }
 
+#[test]
+fn light_and_fog_are_told_and_changed_by_our_own_page_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let more = "[environment]\nlight = [0.5, 0.5, 0.5]\n";
+    let server = Server::start(&write_arena(folder.path(), more), &[]);
+    let environment = || {
+        let (status, answer) = http(server.http, "GET /api/environment HTTP/1.1");
+        let body = answer.split_once("\r\n\r\n").unwrap().1;
+        assert_eq!(status, 200, "{body}");
+        serde_json::from_str::<serde_json::Value>(body).unwrap()
+    };
+    let told = environment();
+    assert_eq!((&told["name"], &told["light"][2]), (&serde_json::Value::Null, &0.5.into()));
+    assert_eq!(told["names"][3], "fog");
+    let put = |body: &str, origin| send_json(server.http, "PUT /api/environment", origin, body);
+    let (status, answer) = put(r#"{"name": "fog"}"#, None);
+    assert!(status == 200 && answer.contains("\"name\":\"fog\""), "{answer}");
+    let text = server.line(|line| line["event"]["text"].as_str().map(str::to_owned));
+    assert_eq!(text, "light and fog are changed to: fog");
+    assert_eq!(environment()["fog_visibility_m"], 12.0);
+    assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
+    for (body, expected) in [
+        (r#"{"name": "hail"}"#, "there are day, dusk, night, fog, night-fog"),
+        (r#"{"fog": 1}"#, "invalid type"),
+        (r#"{"wind": 1}"#, "unknown field `wind`"),
+        (r#"{"light": [9, 1, 1]}"#, "environment.light = 9"),
+        ("{", "EOF"),
+    ] {
+        let (status, answer) = put(body, None);
+        assert!(status == 400 && answer.contains(expected), "{body}: {status} {answer}");
+    }
+    // What was refused has changed nothing.
+    assert_eq!(environment()["fog_visibility_m"], 20.0);
+    assert_eq!(put(r#"{"name": "day"}"#, Some("http://evil.example")).0, 403);
+}
+
 #[tokio::test]
 async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
     let folder = tempfile::tempdir().unwrap();

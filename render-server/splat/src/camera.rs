@@ -3,6 +3,7 @@
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 
+use crate::Air;
 use crate::limits::JACOBIAN_MARGIN;
 
 /// What is drawn, from where.
@@ -14,8 +15,10 @@ pub struct Camera {
     pub world_from_cam: Pose<World, Cam>,
     /// Splats nearer than this are not drawn. [m]
     pub near_m: f32,
-    /// Linear RGB shown where nothing covers the pixel.
+    /// Linear RGB shown where nothing covers the pixel, in clear air and plain light.
     pub background: [f32; 3],
+    /// What lies between the scene and the camera.
+    pub air: Air,
 }
 
 impl Camera {
@@ -32,7 +35,7 @@ impl Camera {
         if !self.background.iter().all(|v| v.is_finite()) {
             return Err(InvalidCamera::Background(self.background));
         }
-        Ok(())
+        self.air.validate()
     }
 
     /// Returns least and greatest `(x / z, y / z)` at which a splat is linearised.
@@ -101,6 +104,9 @@ pub enum InvalidCamera {
     /// The background is not finite.
     #[error("background {0:?} is not finite")]
     Background([f32; 3]),
+    /// Light or fog is not.
+    #[error("{0:?}: light and fog are finite and at least 0, at most 100")]
+    Air(Air),
 }
 
 /// Points on each side of the image at which a lens's border is found.

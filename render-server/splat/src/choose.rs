@@ -126,7 +126,7 @@ mod trial {
     use glam::{Quat, Vec3};
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
 
-    use crate::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+    use crate::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
     /// Less is no rounding: right renderers differ by 75 dB and more.
     const LEAST_DB: f64 = 50.0;
@@ -151,6 +151,7 @@ mod trial {
             world_from_cam: Pose::IDENTITY,
             near_m: 0.05,
             background: [0.1, 0.2, 0.3],
+            air: Air::CLEAR,
         };
         (splats, camera)
     }

@@ -8,7 +8,7 @@
 //! ```
 //! use glam::{Quat, Vec3};
 //! use vizflyt_protocol::geometry::{Intrinsics, Pose};
-//! use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
+//! use vizflyt_splat::{Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
 //!
 //! // One opaque grey ball of 10 cm, 2 m ahead of a camera at the origin.
 //! let splats = Splats {
@@ -24,6 +24,7 @@
 //!     world_from_cam: Pose::IDENTITY,
 //!     near_m: 0.01,
 //!     background: [0.0; 3],
+//!     air: Air::CLEAR,
 //! };
 //! let mut images = [RgbdImage::default()];
 //! CpuRenderer::new(&splats).render(&[], &[camera], &mut images)?;
@@ -35,6 +36,7 @@
 //!
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
+mod air;
 mod blocks;
 mod camera;
 mod choose;
@@ -52,6 +54,7 @@ mod resilient;
 mod scene;
 mod splats;
 
+pub use air::Air;
 pub use camera::{Camera, InvalidCamera};
 pub use choose::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
 pub use cpu::{CpuRenderer, Detail};

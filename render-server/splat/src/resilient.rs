@@ -63,7 +63,7 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
 
     use super::*;
-    use crate::Splats;
+    use crate::{Air, Splats};
 
     /// Draws `left` images through another renderer, then its device is gone.
     struct Failing {
@@ -112,6 +112,7 @@ mod tests {
             world_from_cam: Pose::IDENTITY,
             near_m: 0.01,
             background: [0.0; 3],
+            air: Air::CLEAR,
         };
         let failing = Failing { inner: CpuRenderer::new(&splats), left: 2 };
         let mut resilient = Resilient::new(Box::new(failing), CpuRenderer::new(&splats));

@@ -76,7 +76,7 @@ struct FlyArgs {
     /// Which sensors there are: ug has depth, g has not
     #[arg(long, value_name = "ug|g", default_value_t)]
     level: Level,
-    /// Surroundings that each seed is flown in: day, dusk, night
+    /// Surroundings that each seed is flown in: day, dusk, night, fog, night-fog
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day")]
     variants: Vec<Variant>,
     /// How many seeds are flown: each is another place

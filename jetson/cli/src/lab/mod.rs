@@ -62,7 +62,7 @@ pub(crate) struct LabArgs {
     /// Whom the project is for: ug, with depth, or g, without [default: ug].
     #[arg(long, value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
-    /// The project's light: day, dusk or night [default: day].
+    /// The project's light and fog: day, dusk, night, fog or night-fog [default: day].
     #[arg(long, value_name = "NAME", requires = "project")]
     pub variant: Option<Variant>,
     /// Seed of the generated scene and of the simulator's noise [default: 7].

@@ -6,6 +6,8 @@ use std::time::Instant;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use image::{ImageBuffer, Luma, Rgb};
+use vizflyt_scenes::Variant;
+use vizflyt_server::environment::air;
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage};
@@ -43,6 +45,9 @@ pub(crate) struct RenderArgs {
     /// png to look at, npy to compute with
     #[arg(long, value_enum, default_value_t)]
     format: FileFormat,
+    /// The light and the fog it is seen in: day, dusk, night, fog, night-fog
+    #[arg(long, value_name = "NAME", default_value_t)]
+    environment: Variant,
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
@@ -69,7 +74,9 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     drop(loaded);
     println!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
+    let air = air(&args.environment.environment());
     for Shot { camera, folder } in shots {
+        let camera = Camera { air, ..camera };
         let times = rasterizer.render(&[], &[camera], &mut images)?;
         let [image] = &images;
         std::fs::create_dir_all(&folder)

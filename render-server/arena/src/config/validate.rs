@@ -160,6 +160,7 @@ impl ArenaConfig {
         self.check_stages()?;
         self.check_no_fly()?;
         self.check_objects()?;
+        self.check_environment()?;
         self.check_rules()
     }
 

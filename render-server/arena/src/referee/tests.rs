@@ -4,7 +4,9 @@ use vizflyt_protocol::messages::Limits;
 
 use super::*;
 use crate::DistanceField;
-use crate::config::{BodyPart, Geofence, Goal, NoFly, Occupancy, RulesConfig, Spawn};
+use crate::config::{
+    BodyPart, EnvironmentConfig, Geofence, Goal, NoFly, Occupancy, RulesConfig, Spawn,
+};
 use crate::occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
 use crate::pose::PoseConfig;
 
@@ -28,6 +30,7 @@ pub(crate) fn arena() -> ArenaConfig {
         body: Vec::new(),
         no_fly: Vec::new(),
         occupancy: Occupancy { voxel_m: 0.1, ..Occupancy::default() },
+        environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
         vehicles: Vec::new(),
         localization: Vec::new(),

@@ -13,7 +13,9 @@ mod site;
 
 use glam::DVec3;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, Geofence, Goal, Occupancy, RulesConfig, Spawn};
+use vizflyt_arena::config::{
+    CameraConfig, EnvironmentConfig, Geofence, Goal, Occupancy, RulesConfig, Spawn,
+};
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::messages::Limits;
 
@@ -73,6 +75,7 @@ fn arena(site: &Site) -> ArenaConfig {
         no_fly: Vec::new(),
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
         vehicles: Vec::new(),
         localization: Vec::new(),

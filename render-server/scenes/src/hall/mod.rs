@@ -17,7 +17,9 @@ mod texture;
 use glam::{DVec2, DVec3};
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{Geofence, Goal, Occupancy, RulesConfig, Spawn, StageConfig};
+use vizflyt_arena::config::{
+    EnvironmentConfig, Geofence, Goal, Occupancy, RulesConfig, Spawn, StageConfig,
+};
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::Limits;
@@ -244,6 +246,7 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         no_fly: Vec::new(),
         occupancy: Occupancy::default(),
         cameras: vec![front_camera()],
+        environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
         vehicles: Vec::new(),
         localization: Vec::new(),

@@ -23,7 +23,8 @@
 //! GET /api/leaderboard        the standings of the course, JSON; GET /wall shows them large ([`leaderboard`])
 //! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
 //! ```
-//! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]).
+//! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]);
+//! `GET` and `PUT /api/environment` are its light and fog ([`environment`]).
 //! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
 //! ([`access`]); all routes are in one table ([`routes`]):
 //! ```text
@@ -37,6 +38,7 @@
 
 mod access;
 mod cameras;
+mod environment;
 mod leaderboard;
 mod login;
 pub(crate) mod messages;
@@ -59,10 +61,12 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, Result};
 use axum::Extension;
 use axum::body::Bytes;
+use axum::extract::rejection::BytesRejection;
 use axum::extract::{Query, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use tokio::net::TcpListener;
 use tracing::warn;
 use vizflyt_arena::config::StageConfig;
@@ -159,6 +163,17 @@ pub(crate) fn vehicle<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<Vehicle>
         let text = format!("there is no vehicle '{name}'; there are {}", names.join(", "));
         Box::new((StatusCode::NOT_FOUND, text).into_response())
     })
+}
+
+/// Returns what a page of ours orders in JSON, or the answer that refuses it.
+pub(crate) fn ordered<T: DeserializeOwned>(
+    headers: &HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<T, Box<Response>> {
+    origin::check(headers).map_err(|refusal| Box::new(refuse(&refusal)))?;
+    let body = body.map_err(|rejection| Box::new(rejection.into_response()))?;
+    serde_json::from_slice(&body)
+        .map_err(|error| Box::new((StatusCode::BAD_REQUEST, error.to_string()).into_response()))
 }
 
 /// What `/ws` is asked for.

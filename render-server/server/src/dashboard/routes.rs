@@ -14,7 +14,8 @@ use axum::routing::{MethodRouter, delete, get, patch, post, put};
 use super::Page;
 use super::access::{self, Takes};
 use super::{
-    cameras, file, leaderboard, login, map, pairing, scenes, shell, stats, vehicles, watch,
+    cameras, environment, file, leaderboard, login, map, pairing, scenes, shell, stats, vehicles,
+    watch,
 };
 
 /// One route.
@@ -100,6 +101,8 @@ fn table() -> Vec<Route> {
         act(Method::DELETE, "/api/vehicles/{vehicle}/team", Vehicle, leaderboard::check_out),
         read("/api/scenes", Everything, scenes::list),
         act(Method::PUT, "/api/scene", Everything, scenes::change),
+        read("/api/environment", Everything, environment::get),
+        act(Method::PUT, "/api/environment", Everything, environment::change),
         read("/api/pairing", Everything, pairing::standing),
         act(Method::POST, "/api/pairing", Everything, pairing::open),
         act(Method::DELETE, "/api/pairing", Everything, pairing::shut),

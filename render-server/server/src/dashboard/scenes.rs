@@ -13,7 +13,7 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-use super::{Page, origin, refuse};
+use super::{Page, ordered};
 
 /// What there is to choose from.
 #[derive(Debug, Serialize)]
@@ -49,16 +49,9 @@ pub(super) async fn change(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if let Err(refusal) = origin::check(&headers) {
-        return refuse(&refusal);
-    }
-    let body = match body {
-        Ok(body) => body,
-        Err(rejection) => return rejection.into_response(),
-    };
-    let Wish { name } = match serde_json::from_slice(&body) {
+    let Wish { name } = match ordered(&headers, body) {
         Ok(wish) => wish,
-        Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
+        Err(refusal) => return *refusal,
     };
     if let Some(flying) = page.hub.vehicles.iter().find(|vehicle| vehicle.under_way()) {
         let text = format!("'{}' flies; land it first", flying.name);

@@ -15,11 +15,13 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, Geofence, Occupancy, RulesConfig, Spawn};
+use vizflyt_arena::config::{
+    CameraConfig, EnvironmentConfig, Geofence, Occupancy, RulesConfig, Spawn,
+};
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
-use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use super::orient::{Up, WorldFromScene};
 
@@ -68,6 +70,7 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         body: Vec::new(),
         no_fly: Vec::new(),
         occupancy: Occupancy::default(),
+        environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
         vehicles: Vec::new(),
         localization: Vec::new(),
@@ -105,6 +108,7 @@ fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
                     world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, 0.0),
                     near_m: 0.05,
                     background: [0.0; 3],
+                    air: Air::CLEAR,
                 }
             })
             .collect();

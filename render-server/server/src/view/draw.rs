@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_rgbd::encode_jpeg;
-use vizflyt_splat::{Camera, DepthKind, Rasterizer, RgbdImage};
+use vizflyt_splat::{Air, Camera, DepthKind, Rasterizer, RgbdImage};
 
 use crate::previews::depth_colour;
 use crate::scene::WorldFromScene;
@@ -114,6 +114,7 @@ impl Request {
             world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, self.pitch_rad),
             near_m: NEAR_M,
             background: [0.0; 3],
+            air: Air::CLEAR,
         }
     }
 }

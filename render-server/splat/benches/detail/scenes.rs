@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, Splats};
+use vizflyt_splat::{Air, Camera, Splats};
 
 #[path = "city.rs"]
 pub(crate) mod city;
@@ -16,6 +16,7 @@ pub(crate) fn look(from: DVec3, to: DVec3) -> Camera {
         world_from_cam: Pose::new(from, DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z))),
         near_m: 0.05,
         background: [0.5, 0.6, 0.8],
+        air: Air::CLEAR,
     }
 }
 

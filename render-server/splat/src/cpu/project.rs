@@ -17,6 +17,7 @@ use super::cull::{View, Visible};
 use super::lens::{self, Model};
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
 use super::simd::{Kernel, Simd};
+use crate::Air;
 use crate::harmonics::{C0, C1, C2, C3};
 use crate::limits::BLUR_PX2;
 
@@ -235,9 +236,13 @@ fn vector<S: Simd, const LENS: bool>(
     }
 
     let inverse_c = s.splat(1.0) / c;
-    let inverse_length = s.splat(1.0) / s.sqrt(dot(s, d, d));
+    let distance = s.sqrt(dot(s, d, d));
+    let inverse_length = s.splat(1.0) / distance;
     let direction = [d[0] * inverse_length, d[1] * inverse_length, d[2] * inverse_length];
-    let rgb = colour(s, &sh[first..], direction);
+    let mut rgb = colour(s, &sh[first..], direction);
+    if let Some(air) = &view.air {
+        rgb = through(s, air, rgb, distance);
+    }
     let fields = [
         mean_x,
         mean_y,
@@ -408,6 +413,21 @@ fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
     }
     let zero = s.splat(0.0);
     [s.max(rgb[0], zero), s.max(rgb[1], zero), s.max(rgb[2], zero)]
+}
+
+/// Returns colours seen from a distance [m]; the vector form of [`Air::seen`].
+#[inline(always)]
+fn through<S: Simd>(s: S, air: &Air, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
+    // Within the range of `exp2`; a millionth of a millionth is left there.
+    let lost = distance * s.splat(-air.fog_per_m * std::f32::consts::LOG2_E);
+    let left = s.exp2(s.max(lost, s.splat(-40.0)));
+    let mut seen = rgb;
+    for channel in 0..3 {
+        let fog = s.splat(air.fog[channel]);
+        let lit = rgb[channel] * s.splat(air.light[channel]);
+        seen[channel] = s.mul_add(lit - fog, left, fog);
+    }
+    seen
 }
 
 /// Adds coefficient `k` times its basis function.

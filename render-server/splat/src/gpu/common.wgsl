@@ -32,7 +32,12 @@ struct View {
     lens: vec4<f32>,
     /// Its fifth; the greatest slope it images; near plane [m].
     more: vec4<f32>,
+    /// What is seen of it through the air.
     background: vec4<f32>,
+    /// Factor of every colour; log2 of what fog takes per metre.
+    light: vec4<f32>,
+    /// Colour of fog.
+    fog: vec4<f32>,
     /// Width, height [px], tiles across, first tile.
     size: vec4<u32>,
     /// Lens model, 1 if the part is there, first pixel, id.

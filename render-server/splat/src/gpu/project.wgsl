@@ -229,12 +229,16 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     }
     // Above 0, so that dividing by it is no trap where a splat covers everything evenly.
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
-    let direction = d / sqrt(dot(d, d));
-    let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, direction);
+    let distance = sqrt(dot(d, d));
+    let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, d / distance);
+    // As `Air::seen`.
+    let light = views[view].light;
+    let fog = views[view].fog.xyz;
+    let seen = mix(fog, rgb * light.xyz, exp2(-light.w * distance));
     let tag = camera << 16u | views[view].flags.w;
     shapes[slot] = vec4(mean, b / c, falloff.x);
     extents[slot] = vec4(falloff.y, level, bitcast<f32>(tag), b * extent.x / a);
-    colours[slot] = vec4(rgb, z);
+    colours[slot] = vec4(seen, z);
     return bitcast<u32>(z);
 }
 

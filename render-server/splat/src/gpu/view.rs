@@ -5,8 +5,8 @@ use vizflyt_protocol::geometry::{Cam, Distortion, Frame, Intrinsics, Pose};
 use zerocopy::{Immutable, IntoBytes};
 
 use super::TILE_PX;
-use crate::Camera;
 use crate::limits::BLUR_PX2;
+use crate::{Air, Camera};
 
 /// `Tick` of `common.wgsl`.
 #[derive(Clone, Copy, Debug, Default, IntoBytes, Immutable)]
@@ -32,13 +32,15 @@ pub(super) struct View {
     lens: [f32; 4],
     more: [f32; 4],
     background: [f32; 4],
+    light: [f32; 4],
+    fog: [f32; 4],
     size: [u32; 4],
     flags: [u32; 4],
     planes: [[f32; 4]; 5],
     weights: [[f32; 4]; 2],
 }
 
-const _: () = assert!(size_of::<Tick>() == 32 && size_of::<View>() == 272);
+const _: () = assert!(size_of::<Tick>() == 32 && size_of::<View>() == 304);
 
 /// Where an image lies among the images of its tick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -100,7 +102,8 @@ impl View {
         // Infinite for a pinhole, which the shader does not ask.
         let reach = lens.reach.min(f64::from(f32::MAX)) as f32;
         let (planes, weights) = planes(camera, lens, &rotation);
-        let [r, g, b] = camera.background;
+        let [r, g, b] = camera.air.background(camera.background);
+        let Air { light, fog, fog_per_m } = camera.air;
         Self {
             rows: [row(0), row(1), row(2)],
             focal: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(|v| v as f32),
@@ -108,6 +111,8 @@ impl View {
             lens: [c[0], c[1], c[2], c[3]],
             more: [c[4], reach, camera.near_m, 0.0],
             background: [r, g, b, 0.0],
+            light: [light[0], light[1], light[2], fog_per_m * std::f32::consts::LOG2_E],
+            fog: [fog[0], fog[1], fog[2], 0.0],
             size: [k.width_px, k.height_px, k.width_px.div_ceil(TILE_PX), place.first_tile],
             flags: [u32::from(model), 1, place.first_pixel, u32::from(id)],
             planes,

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Camera, Splats};
+use vizflyt_splat::{Air, Camera, Splats};
 
 /// Knuth's MMIX generator; its upper 24 bits, from `low` to `high`.
 pub(crate) fn random(state: &mut u64, low: f32, high: f32) -> f32 {
@@ -61,6 +61,7 @@ pub(crate) fn camera(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
         world_from_cam: Pose::new(DVec3::new(0.05, -0.02, -0.1), DQuat::from_rotation_z(0.1)),
         near_m: 0.05,
         background: [0.2, 0.4, 0.6],
+        air: Air::CLEAR,
     }
 }
 
@@ -95,5 +96,6 @@ pub(crate) fn oracle_camera(path: &Path) -> Camera {
         world_from_cam: Pose::new(-(rotation * translation), DQuat::from_mat3(&rotation)),
         near_m: 0.01,
         background: c.bg,
+        air: Air::CLEAR,
     }
 }

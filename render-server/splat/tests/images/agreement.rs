@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_splat::{
-    Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats, render_reference,
+    Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats, render_reference,
 };
 
 use crate::compare;
@@ -47,6 +47,14 @@ pub(crate) fn distortion() -> impl Strategy<Value = Distortion> {
     ]
 }
 
+/// Clear air, or light and fog from haze to soup.
+pub(crate) fn air() -> impl Strategy<Value = Air> {
+    let colour = || prop::array::uniform3(0.0..1.0f32);
+    let some = (colour(), prop_oneof![Just(0.0), 0.001..20.0f32], colour())
+        .prop_map(|(light, fog_per_m, fog)| Air { light, fog_per_m, fog });
+    prop_oneof![Just(Air::CLEAR), some]
+}
+
 pub(crate) fn camera() -> impl Strategy<Value = Camera> {
     (
         1..70u32,
@@ -57,9 +65,20 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
         prop::array::uniform4(-1.0..1.0f64),
         prop::array::uniform3(0.0..1.0f32),
         distortion(),
+        air(),
     )
         .prop_map(
-            |(width_px, height_px, (fov_deg, ratio), centre, position, q, background, lens)| {
+            |(
+                width_px,
+                height_px,
+                (fov_deg, ratio),
+                centre,
+                position,
+                q,
+                background,
+                lens,
+                air,
+            )| {
                 let k = Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians());
                 let q = DQuat::from_array(q);
                 let rotation = if q.length() > 1e-2 { q.normalize() } else { DQuat::IDENTITY };
@@ -74,6 +93,7 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
                     world_from_cam: Pose::new(DVec3::from(position), rotation),
                     near_m: 0.01,
                     background,
+                    air,
                 }
             },
         )
@@ -146,6 +166,7 @@ fn wall() -> (Splats, Camera) {
         world_from_cam: Pose::IDENTITY,
         near_m: 0.01,
         background: [0.0; 3],
+        air: Air::CLEAR,
     };
     (splats, camera)
 }

@@ -4,8 +4,8 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{
-    Camera, CpuRenderer, Placement, Rasterizer, RenderError, RgbdImage, RigidObject, Scene, Splats,
-    render_reference,
+    Air, Camera, CpuRenderer, Placement, Rasterizer, RenderError, RgbdImage, RigidObject, Scene,
+    Splats, render_reference,
 };
 
 use crate::agreement::{assert_agrees, camera, splats};
@@ -76,6 +76,7 @@ fn ahead() -> Camera {
         world_from_cam: Pose::IDENTITY,
         near_m: 0.05,
         background: [0.0; 3],
+        air: Air::CLEAR,
     }
 }
 

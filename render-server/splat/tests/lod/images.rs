@@ -3,7 +3,7 @@
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{
-    Camera, CpuRenderer, Detail, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
+    Air, Camera, CpuRenderer, Detail, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
 
 use crate::city::city;
@@ -18,6 +18,7 @@ fn look(from: DVec3, to: DVec3) -> Camera {
         world_from_cam: Pose::new(from, DQuat::from_mat3(&rotation)),
         near_m: 0.05,
         background: [0.5, 0.6, 0.8],
+        air: Air::CLEAR,
     }
 }
 

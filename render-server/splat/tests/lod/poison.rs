@@ -2,7 +2,7 @@
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Camera, CpuRenderer, Detail, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Air, Camera, CpuRenderer, Detail, Rasterizer, RgbdImage, Splats};
 
 use crate::city::Random;
 use crate::likeness::Likeness;
@@ -36,6 +36,7 @@ fn cameras() -> Vec<Camera> {
             world_from_cam: Pose::new(DVec3::new(0.0, 0.0, -distance_m), DQuat::IDENTITY),
             near_m: 0.05,
             background: [0.2, 0.4, 0.6],
+            air: Air::CLEAR,
         })
         .into()
 }

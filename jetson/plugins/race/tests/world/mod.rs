@@ -15,7 +15,7 @@ use vizflyt_sdk::protocol::geometry::Object;
 use vizflyt_sdk::{
     Autonomy, ImageStamps, ObservationBuffer, Pose, Setpoint, Vehicle, Volume, World, YawTarget,
 };
-use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
+use vizflyt_splat::{Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
 use vehicle::Quadrotor;
 
@@ -49,7 +49,7 @@ pub(crate) fn fly(
     mut watch: impl FnMut(f64, &Race, DVec3, &RgbdImage),
 ) -> Outcome {
     let project = Project::named(project).expect("a project of the course");
-    let mut generated = project.generate(seed, Level::Ug, Variant::Day);
+    let mut generated = project.generate(seed, Level::Ug, Variant::DAY);
     let movers = MovingObjects::new(&generated.arena, seed);
     generated.truth.retain(is_near);
     let scene = Scene { splats: &generated.splats, objects: &generated.objects };
@@ -85,6 +85,7 @@ pub(crate) fn fly(
                 world_from_cam: quad.world_from_body() * front.body_from_cam,
                 near_m: 0.05,
                 background: [0.0; 3],
+                air: Air::CLEAR,
             };
             let placements = movers.placements(ns(now_s));
             renderer

@@ -1,4 +1,4 @@
-// Who looks at the page, and what they may order: login, start, land, reset, scene. Every request
+// Who looks at the page, and what they may order: login, start, land, reset, scene, light and fog. Every request
 // that changes something goes through `order`, which shows the token that belongs to the cookie.
 
 const make = (tag, props = {}, ...children) => {
@@ -174,4 +174,54 @@ $("scenes").addEventListener("click", async ({ currentTarget }) => {
 });
 known.then(async ({ role }) => {
   if (role === "instructor") $("scenes").hidden = (await askScenes()).scenes.length < 2;
+});
+
+// ---- light and fog -----------------------------------------------------------------------
+const light = make("select", { id: "environment-choice" });
+const sight = make("input", { id: "environment-sight", type: "number", min: 0, max: 1000, step: 0.5 });
+const airSaid = make("p", { className: "said" });
+airSaid.setAttribute("role", "status");
+let air = {};
+const airForm = make(
+  "form",
+  {},
+  make("label", { htmlFor: light.id, textContent: "what the cameras see the scene in, from the next image on" }),
+  light,
+  make("label", { htmlFor: sight.id, textContent: "how far one sees [m]; 0 is clear air" }),
+  sight,
+  airSaid,
+  make("p", { className: "choices" },
+    make("button", { type: "submit", className: "ghost worded", textContent: "change" }),
+    make("button", { type: "button", className: "ghost worded", textContent: "close", onclick: () => airs.close() })),
+);
+const airs = panel("light and fog", airForm);
+const OWN = "own";
+
+function showAir(told) {
+  air = told;
+  const names = told.name ? told.names : [...told.names, OWN];
+  light.replaceChildren(...names.map((name) => new Option(name, name, false, name === (told.name ?? OWN))));
+  sight.value = told.fog_visibility_m;
+}
+async function changeAir(wish) {
+  try {
+    const answer = await order("PUT", "/api/environment", wish);
+    airSaid.textContent = answer.ok ? "changed" : await answer.text();
+    if (answer.ok) showAir(await answer.json());
+  } catch {
+    airSaid.textContent = "the server cannot be reached";
+  }
+}
+// A name takes effect at once; the sight with the button.
+light.addEventListener("change", () => light.value !== OWN && changeAir({ name: light.value }));
+airForm.addEventListener("submit", (event) => {
+  event.preventDefault();
+  changeAir({ light: air.light, fog: air.fog, fog_visibility_m: Number(sight.value) });
+});
+$("environment").addEventListener("click", async ({ currentTarget }) => {
+  const button = currentTarget, answer = await fetch("/api/environment");
+  airSaid.textContent = answer.ok ? "" : await answer.text();
+  if (answer.ok) showAir(await answer.json());
+  airs.open_from(button);
+  light.focus();
 });

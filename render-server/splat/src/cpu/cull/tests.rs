@@ -64,8 +64,13 @@ fn no_block_is_culled_that_holds_a_splat_in_view() {
                 DVec3::new(turn.cos(), 0.3 * turn, (2.0 * turn).sin()),
                 DQuat::from_rotation_y(0.8 * turn) * DQuat::from_rotation_x(0.5 * turn),
             );
-            let camera =
-                Camera { intrinsics, world_from_cam: pose, near_m: 0.05, background: [0.0; 3] };
+            let camera = Camera {
+                intrinsics,
+                world_from_cam: pose,
+                near_m: 0.05,
+                background: [0.0; 3],
+                air: Air::CLEAR,
+            };
             let view = View::new(&camera, &kept.of(&camera), &pose);
             let mut visible = Vec::new();
             cull(0, &part, &view, 0.0, &mut visible);

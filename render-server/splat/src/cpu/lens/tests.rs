@@ -2,8 +2,8 @@ use glam::DVec2;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 
 use super::{Lenses, Model, atan, distort};
-use crate::Camera;
 use crate::cpu::simd::{InstructionSet, Kernel, Simd};
+use crate::{Air, Camera};
 
 fn every_set<K: Kernel + Clone>(kernel: &K) {
     for set in InstructionSet::available() {
@@ -107,6 +107,7 @@ fn lenses_are_found_again_and_the_oldest_is_forgotten() {
         world_from_cam: Pose::IDENTITY,
         near_m: 0.05,
         background: [0.0; 3],
+        air: Air::CLEAR,
     };
     let mut lenses = Lenses::default();
     for round in 0..3 {

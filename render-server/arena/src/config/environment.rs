@@ -1,0 +1,130 @@
+//! `[environment]`: the light on the scene and the air in it, for the cameras alone.
+
+use serde::{Deserialize, Serialize};
+
+use super::ArenaConfig;
+use super::validate::{ConfigError, check_number};
+
+/// `[environment]`: what lies between the scene, as it was captured, and the images of it. All of it
+/// may be left out: then nothing does. Obstacles, course, depth and ids do not depend on it.
+///
+/// ```
+/// use vizflyt_arena::config::EnvironmentConfig;
+/// let fog = EnvironmentConfig::named("fog").unwrap();
+/// // What is as far away as one can see has lost 98 % of its contrast.
+/// let left = (-fog.fog_per_m() * fog.fog_visibility_m).exp();
+/// assert!((left - 0.02).abs() < 1e-9);
+/// assert_eq!(fog.name(), Some("fog"));
+/// assert_eq!(EnvironmentConfig::named("hail"), None);
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EnvironmentConfig {
+    /// Every colour of the scene is multiplied by it: red, green, blue; 0 to 4.
+    pub light: [f64; 3],
+    /// How far one sees: at this distance 2 % of the contrast are left (the meteorological optical
+    /// range of Koschmieder's law); 0 is clear air, else 0.5 to 1000. [m]
+    pub fog_visibility_m: f64,
+    /// What fog looks like where it hides everything: red, green, blue; 0 to 1.
+    pub fog: [f64; 3],
+}
+
+impl Default for EnvironmentConfig {
+    fn default() -> Self {
+        Self { light: [1.0; 3], fog_visibility_m: 0.0, fog: FOG }
+    }
+}
+
+/// Grey, a little blue.
+const FOG: [f64; 3] = [0.70, 0.73, 0.76];
+
+impl EnvironmentConfig {
+    /// The environments that have a name, which pages and command lines offer.
+    ///
+    /// Light is a factor of display values: a value of 0.5 stands for a fifth of the light, 0.22 for a
+    /// thirtieth. One sees 12 m in the fog, in rooms of 11 m: the far wall is a shadow.
+    pub const NAMED: [(&'static str, Self); 5] = [
+        ("day", Self { light: [1.0; 3], fog_visibility_m: 0.0, fog: FOG }),
+        ("dusk", Self { light: [0.62, 0.48, 0.42], fog_visibility_m: 0.0, fog: FOG }),
+        ("night", Self { light: [0.20, 0.23, 0.34], fog_visibility_m: 0.0, fog: FOG }),
+        ("fog", Self { light: [1.0; 3], fog_visibility_m: 12.0, fog: FOG }),
+        (
+            "night-fog",
+            Self {
+                light: [0.20, 0.23, 0.34],
+                fog_visibility_m: 12.0,
+                fog: [FOG[0] * 0.20, FOG[1] * 0.23, FOG[2] * 0.34],
+            },
+        ),
+    ];
+
+    /// Returns the environment of a name.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::NAMED.into_iter().find(|(known, _)| *known == name).map(|(_, named)| named)
+    }
+
+    /// Returns the name of this environment, if it has one.
+    pub fn name(&self) -> Option<&'static str> {
+        Self::NAMED.into_iter().find(|(_, named)| named == self).map(|(name, _)| name)
+    }
+
+    /// Returns the extinction of the air: `exp(-it * d)` of the light is left at distance `d`. [1/m]
+    pub fn fog_per_m(&self) -> f64 {
+        let contrast = 0.02_f64;
+        if self.fog_visibility_m > 0.0 { -contrast.ln() / self.fog_visibility_m } else { 0.0 }
+    }
+
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`ConfigError::Invalid`], which names the key.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        for light in self.light {
+            check_number("environment.light", light, "", 0.0..=4.0)?;
+        }
+        for fog in self.fog {
+            check_number("environment.fog", fog, "", 0.0..=1.0)?;
+        }
+        if self.fog_visibility_m == 0.0 {
+            return Ok(());
+        }
+        let key = "environment.fog_visibility_m";
+        check_number(key, self.fog_visibility_m, "m, or 0 for clear air", 0.5..=1000.0)
+    }
+
+    pub(super) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+impl ArenaConfig {
+    pub(super) fn check_environment(&self) -> Result<(), ConfigError> {
+        self.environment.check()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn named_ones_are_valid_and_found_again() {
+        for (name, named) in EnvironmentConfig::NAMED {
+            named.check().unwrap();
+            assert_eq!(named.name(), Some(name));
+        }
+        assert!(EnvironmentConfig::named("day").unwrap().is_default());
+    }
+
+    #[test]
+    fn numbers_that_cannot_work_are_named() {
+        let check = |text: &str| {
+            let environment: EnvironmentConfig = toml::from_str(text).unwrap();
+            environment.check().unwrap_err().to_string()
+        };
+        assert!(check("light = [1, -1, 1]").contains("environment.light"));
+        assert!(check("fog = [0.5, 0.5, 1.5]").contains("environment.fog"));
+        assert!(check("fog_visibility_m = 0.1").contains("environment.fog_visibility_m"));
+        assert!(check("fog_visibility_m = nan").contains("environment.fog_visibility_m"));
+    }
+}

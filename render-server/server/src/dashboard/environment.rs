@@ -1,0 +1,74 @@
+//! Light and fog from the page: `GET /api/environment` tells those of this moment and those that have
+//! a name, `PUT /api/environment` changes them, also in flight. For the instructor alone
+//! ([`super::routes`]).
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::extract::rejection::BytesRejection;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use serde_json::{Map, Value};
+use vizflyt_arena::config::EnvironmentConfig;
+
+use super::{Page, ordered};
+
+/// What there is, and what is.
+#[derive(Debug, Serialize)]
+struct Told {
+    /// The name of the one of this moment, if it has one.
+    name: Option<&'static str>,
+    #[serde(flatten)]
+    now: EnvironmentConfig,
+    names: Vec<&'static str>,
+}
+
+/// Tells the environment.
+pub(super) async fn get(State(page): State<Arc<Page>>) -> Response {
+    Json(told(page.hub.environment.now())).into_response()
+}
+
+/// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
+pub(super) async fn change(
+    State(page): State<Arc<Page>>,
+    headers: HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Response {
+    let wish = match ordered::<Map<String, Value>>(&headers, body) {
+        Ok(wish) => wish,
+        Err(refusal) => return *refusal,
+    };
+    let environment = match parse(wish) {
+        Ok(environment) => environment,
+        Err(why) => return (StatusCode::BAD_REQUEST, why).into_response(),
+    };
+    match page.hub.environment.change(environment) {
+        Ok(true) => {
+            let name = environment.name().unwrap_or("the page's own");
+            page.hub.note(&format!("light and fog are changed to: {name}"));
+        }
+        // The same again is no news.
+        Ok(false) => {}
+        Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
+    }
+    Json(told(environment)).into_response()
+}
+
+fn parse(wish: Map<String, Value>) -> Result<EnvironmentConfig, String> {
+    let Some(name) = wish.get("name").filter(|_| wish.len() == 1) else {
+        return serde_json::from_value(Value::Object(wish)).map_err(|error| error.to_string());
+    };
+    let named = name.as_str().and_then(EnvironmentConfig::named);
+    named.ok_or_else(|| {
+        let names = EnvironmentConfig::NAMED.map(|(name, _)| name).join(", ");
+        format!("no environment is called {name}; there are {names}")
+    })
+}
+
+fn told(now: EnvironmentConfig) -> Told {
+    let names = EnvironmentConfig::NAMED.into_iter().map(|(name, _)| name).collect();
+    Told { name: now.name(), now, names }
+}
