@@ -97,6 +97,14 @@ const isPainted = (page, id) =>
     return seen.size > 20;
   }, id);
 
+/** How bright the colour camera's picture is, 0 to 255. */
+const brightness = (page) =>
+  page.evaluate(() => {
+    const canvas = document.getElementById("colour");
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    return data.reduce((sum, value, k) => sum + (k % 4 < 3 ? value : 0), 0) / (data.length * 0.75);
+  });
+
 /** A flight: it waits for its start, is watched on three screens, and is stopped by the keyboard. */
 async function flight(browser) {
   const demo = start("demo", "--headless", "--wait", "--scene", "race", "--log", scratch, "--report", `${scratch}/report.json`);
@@ -114,6 +122,17 @@ async function flight(browser) {
   await page.locator("#theme").click();
   await shot(page, "laptop-other-theme");
   await page.locator("#theme").click();
+  // Another light is seen with the next images.
+  await isPainted(page, "colour");
+  const day = await brightness(page);
+  await page.locator("#environment").click();
+  await page.locator("#environment-choice").selectOption("night");
+  for (let k = 0; (await brightness(page)) > 0.6 * day; k += 1) {
+    assert.ok(k < 100, "no night on the picture");
+    await page.waitForTimeout(100);
+  }
+  await page.locator("#environment-choice").selectOption("day");
+  await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
   for (const size of ["phone", "projector", "laptop"]) {
     const [width, height] = SIZES[size];
     await page.setViewportSize({ width, height });
