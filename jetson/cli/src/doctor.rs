@@ -9,8 +9,9 @@ use std::process::ExitCode;
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::Geofence;
-use vizflyt_runtime::airframe::{Difference, Room, Version, compare, parse_params, shipped};
+use vizflyt_runtime::airframe::{
+    ArenaFence, Difference, Room, Version, Visit, compare, parse_params, shipped,
+};
 use vizflyt_runtime::link::same;
 
 use crate::terminal::tell;
@@ -84,7 +85,8 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let system = visit.link().system().unwrap_or(0);
     tell(format!("vehicle  system {system}, {firmware}, {} parameters", has.len()));
     let wanted = args.wanted(version)?;
-    let room = args.room()?;
+    let arena = args.arena()?;
+    let room = args.room(arena.as_ref());
     let found = compare(version, &wanted, room, |name| has.get(name).copied());
     for difference in &found {
         tell(line(difference));
@@ -97,8 +99,9 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         found.len() - wrong.len()
     ));
     if !args.apply {
-        if !wrong.is_empty() {
-            tell("`--apply` writes the right values");
+        if !wrong.is_empty() || arena.is_some() {
+            let also = if arena.is_some() { ", and the arena's polygons" } else { "" };
+            tell(format!("`--apply` writes the right values{also}"));
         }
         return Ok(status(dangers));
     }
@@ -117,6 +120,9 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
             }
         }
     }
+    if let Some(arena) = &arena {
+        failed += usize::from(!upload_fence(&mut visit, arena)?);
+    }
     if !values.is_empty() {
         tell("restart the autopilot, then look again: some parameters appear only then");
     }
@@ -124,21 +130,30 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
 }
 
 impl VehicleArgs {
-    fn room(&self) -> Result<Room> {
-        let Some(path) = &self.arena else {
-            return Ok(Room { ceiling_m: self.ceiling, radius_m: self.radius });
-        };
+    fn arena(&self) -> Result<Option<ArenaConfig>> {
+        let Some(path) = &self.arena else { return Ok(None) };
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("the arena {} cannot be read", path.display()))?;
-        let arena = ArenaConfig::parse(&text).with_context(|| path.display().to_string())?;
-        let room = room_of(&arena);
-        if let Room { ceiling_m: Some(ceiling_m), radius_m: Some(radius_m) } = room {
+        Ok(Some(ArenaConfig::parse(&text).with_context(|| path.display().to_string())?))
+    }
+
+    fn room(&self, arena: Option<&ArenaConfig>) -> Room {
+        let given = Room { ceiling_m: self.ceiling, floor_m: None, radius_m: self.radius };
+        let Some(arena) = arena else { return given };
+        let room = Room::of(&arena.info(), arena.spawn.position_m).unwrap_or(given);
+        if let Room {
+            ceiling_m: Some(ceiling_m),
+            floor_m: Some(floor_m),
+            radius_m: Some(radius_m),
+        } = room
+        {
             tell(format!(
-                "arena    {}: a fence that ends {ceiling_m:.2} m over the start, {radius_m:.2} m around it",
+                "arena    {}: a fence from {floor_m:.2} m to {ceiling_m:.2} m over the start, {radius_m:.2} m \
+                 around it, and polygons",
                 arena.name
             ));
         }
-        Ok(room)
+        room
     }
 
     fn wanted(&self, version: Version) -> Result<BTreeMap<String, f64>> {
@@ -151,14 +166,19 @@ impl VehicleArgs {
     }
 }
 
-/// Returns the cylinder about the start that holds the arena's fence: the autopilot's own fence acts
-/// where the guard's did not, never before it.
-fn room_of(arena: &ArenaConfig) -> Room {
-    let start = arena.spawn.position_m;
-    let Geofence { min_m, max_m } = arena.geofence;
-    let top_m = arena.limits.max_altitude_m.map_or(max_m.z, |most_m| most_m.min(max_m.z));
-    let furthest = (start - min_m).max(max_m - start).truncate();
-    Room { ceiling_m: Some(top_m - start.z), radius_m: Some(furthest.length()) }
+/// Has the autopilot keep the arena's polygons; returns whether it does.
+fn upload_fence(visit: &mut Visit, arena: &ArenaConfig) -> Result<bool> {
+    let info = arena.info();
+    let fence = ArenaFence::of(&info);
+    if let Some(gap) = fence.gap(&info) {
+        tell(format!("note     {gap}"));
+    }
+    let kept = visit.upload_fence(fence.polygons)?;
+    match &kept {
+        Ok(polygons) => tell(format!("written  fence of {polygons} polygons")),
+        Err(why) => tell(format!("FAILED   fence of polygons: {why}")),
+    }
+    Ok(kept.is_ok())
 }
 
 fn status(wrong: usize) -> ExitCode {
@@ -173,34 +193,5 @@ fn line(difference: &Difference) -> String {
         }
         (Some(has), None) => format!("differs  {name} is {has}, right is {right}"),
         (None, _) => format!("absent   {name}, right is {right}"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_autopilot_s_fence_holds_the_arena_s() {
-        let text = r#"
-            name = "room"
-            scene = "scene.ply"
-            body_radius_m = 0.12
-            takeoff_height_m = 1.2
-            spawn = { position_m = [1.0, 0.0, 0.1] }
-            geofence = { min_m = [0.0, -3.0, -0.5], max_m = [5.0, 2.0, 3.6] }
-            limits = { max_speed_mps = 3.0, max_acceleration_mps2 = 6.0, max_altitude_m = 2.6 }
-            [[cameras]]
-            name = "front"
-            width_px = 320
-            height_px = 240
-            horizontal_fov_deg = 90.0
-            position_m = [0.06, 0, 0.02]
-        "#;
-        let arena = ArenaConfig::parse(text).unwrap();
-        // The furthest corner is 4 m east and 3 m south.
-        let Room { ceiling_m, radius_m } = room_of(&arena);
-        assert!((ceiling_m.unwrap() - 2.5).abs() < 1e-9, "{ceiling_m:?}");
-        assert!((radius_m.unwrap() - 5.0).abs() < 1e-9, "{radius_m:?}");
     }
 }

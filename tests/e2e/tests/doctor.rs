@@ -59,6 +59,39 @@ fn dangers_are_named_and_mended() {
 }
 
 #[test]
+fn the_arena_becomes_the_autopilots_fence() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("room");
+    let made = Command::new(vizflyt())
+        .args(["scene", "generate", "room", "-o", scene.to_str().unwrap()])
+        .output();
+    assert!(made.unwrap().status.success());
+    let path = scene.join("arena.toml");
+    let mut arena = std::fs::read_to_string(&path).unwrap();
+    let boxes = [("pillar", "-0.5", "3.65"), ("table", "0.0", "0.9")];
+    for (name, bottom, top) in boxes {
+        arena += &format!(
+            "\n[[no_fly]]\nname = \"{name}\"\nmin_m = [6.0, 1.0, {bottom}]\nmax_m = [7.0, 1.5, {top}]\n"
+        );
+    }
+    std::fs::write(&path, arena).unwrap();
+    let (_simulator, address) = simulator(&["FENCE_TYPE=3"]);
+    let arena = ["--arena", path.to_str().unwrap()];
+    let (_, text) = doctor(&address, &arena);
+    assert!(text.contains("DANGER   FENCE_TYPE is 3, right is 15"), "{text}");
+    let (output, text) = doctor(&address, &[&arena[..], &["--apply"]].concat());
+    assert!(output.status.success(), "{text}");
+    for expected in [
+        "written  FENCE_TYPE = 15",
+        "written  FENCE_ALT_MIN = 0.1",
+        "written  fence of 2 polygons",
+        "does not know the no-fly boxes about (6.5, 1.2)",
+    ] {
+        assert!(text.contains(expected), "no '{expected}' in:\n{text}");
+    }
+}
+
+#[test]
 fn nobody_there_is_said_in_words() {
     let (output, text) = doctor("udpin:127.0.0.1:0", &[]);
     assert_eq!(output.status.code(), Some(1));

@@ -2,20 +2,23 @@
 //! setpoints, parameters. Whatever comes, it arms only for a take-off, sends whole packets of its own,
 //! and always knows when it is due.
 #![no_main]
+use glam::DVec2;
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{
-    GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, MavlinkVersion, Message, StreamDecoder,
-    encode,
+    FenceSide, GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, MavlinkVersion, Message,
+    StreamDecoder, encode,
 };
 use vizflyt_protocol::messages::{PoseSample, YawTarget};
 use vizflyt_protocol::time::{HostTime, ServerTime};
-use vizflyt_runtime::link::{COMPONENT_ID, Goal, Link, SYSTEM_ID};
+use vizflyt_runtime::link::{COMPONENT_ID, FencePolygon, Goal, Link, SYSTEM_ID};
 
 /// What an autopilot, another companion or a ground station may say.
-const MESSAGES: [u32; 20] =
-    [0, 1, 22, 27, 30, 32, 49, 77, 84, 105, 109, 111, 148, 193, 230, 253, 256, 20, 23, 76];
+const MESSAGES: [u32; 23] = [
+    0, 1, 22, 27, 30, 32, 49, 77, 84, 105, 109, 111, 148, 193, 230, 253, 256, 20, 23, 76, 40, 47,
+    51,
+];
 const GOALS: [Goal; 4] = [Goal::Prepare, Goal::TakeOff(1.0), Goal::Fly, Goal::Land];
 /// As long as no silence is 292 years. [s]
 const LATEST_S: f64 = 1e8;
@@ -61,7 +64,13 @@ impl Machine {
                 self.link
                     .setpoint(self.now, &GuidedSetpoint { motion: GuidedMotion::Velocity(p), yaw });
             }
-            6 => self.link.read_params(self.now),
+            6 if *value < 128 => self.link.read_params(self.now),
+            6 => {
+                let corner = |byte: &u8| DVec2::new(f64::from(*byte), f64::from(*value));
+                let corners_m: Vec<_> = argument.iter().map(corner).collect();
+                let side = if *value % 2 == 0 { FenceSide::Inside } else { FenceSide::Outside };
+                self.link.set_fence(self.now, vec![FencePolygon { side, corners_m }]);
+            }
             _ => self.link.write_param(self.now, "FS_GCS_ENABLE", f64::from(*value)),
         }
         rest

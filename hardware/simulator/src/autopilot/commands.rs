@@ -34,6 +34,9 @@ struct Command {
 impl Autopilot {
     pub(super) fn handle_packet(&mut self, now: AutopilotTime, packet: &Packet) {
         let sender = (packet.header.system_id as u8, packet.header.component_id);
+        if self.handle_mission(now, sender, &packet.message) {
+            return;
+        }
         match &packet.message {
             MavMessage::HEARTBEAT(_)
                 if f64::from(sender.0) == self.params.value(Param::GcsSystemId) =>
@@ -123,7 +126,7 @@ impl Autopilot {
         }
     }
 
-    fn is_for_us(&self, system: u8, component: u8) -> bool {
+    pub(super) fn is_for_us(&self, system: u8, component: u8) -> bool {
         (system == 0 || system == self.system_id())
             && (component == 0 || component == AUTOPILOT_COMPONENT)
     }

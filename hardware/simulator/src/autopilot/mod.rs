@@ -5,6 +5,7 @@
 //! - [`Autopilot::handle_sensors`], 400 Hz: estimate -> mode -> control -> motors ([`flight`]).
 //! - [`Autopilot::handle_input`]: bytes of the link -> signed by the key, if one was given
 //!   ([`signing`]) -> messages -> commands ([`commands`]).
+//!   The fence's polygons come by the mission protocol ([`mission`]).
 //! - [`Autopilot::handle_timeout`]: heartbeats, streams, failsafes ([`telemetry`], [`failsafe`]).
 //! - [`Autopilot::poll_transmit`]: bytes for the link.
 //!
@@ -20,6 +21,7 @@ mod arming;
 mod commands;
 mod failsafe;
 mod flight;
+mod mission;
 mod params;
 mod setpoints;
 mod signing;
@@ -102,6 +104,8 @@ pub struct Autopilot {
     sample: SensorSample,
     flight: flight::FlightState,
     failsafe: failsafe::Failsafe,
+    /// The fence's, as uploaded.
+    polygons: mission::Polygons,
     streams: Streams,
     decoders: [StreamDecoder; MAX_LINKS],
     outbox: VecDeque<MavMessage>,
@@ -138,6 +142,7 @@ impl Default for Autopilot {
             sample: SensorSample::default(),
             flight: flight::FlightState::default(),
             failsafe: failsafe::Failsafe::default(),
+            polygons: mission::Polygons::default(),
             streams: Streams::default(),
             decoders: Default::default(),
             outbox: VecDeque::new(),
@@ -168,10 +173,11 @@ impl Autopilot {
         Ok(autopilot)
     }
 
-    /// Makes an autopilot that boots with the parameters and the key this one has stored.
+    /// Makes an autopilot that boots with the parameters, the fence and the key this one has stored.
     pub fn rebooted(&self) -> Self {
         let signing = self.signing.as_ref().map(|signing| signing.rebooted(self.now));
-        Self { params: self.params.clone(), radio: self.radio, signing, ..Self::default() }
+        let (params, polygons) = (self.params.clone(), self.polygons.stored());
+        Self { params, polygons, radio: self.radio, signing, ..Self::default() }
     }
 
     /// Whether somebody has asked for a reboot.
@@ -216,6 +222,7 @@ impl Autopilot {
     pub fn handle_timeout(&mut self, now: AutopilotTime) {
         self.now = now;
         self.check_failsafes(now);
+        self.tend_upload(now);
         self.stream(now);
     }
 

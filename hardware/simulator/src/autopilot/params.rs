@@ -133,7 +133,7 @@ params! {
     AhrsOriginAlt = "AHRS_ORIGIN_ALT", 0.0, -1000.0..10000.0, MAV_PARAM_TYPE_REAL32;
     /// The autopilot's own fence, around home.
     FenceEnable = "FENCE_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
-    /// Sides: 1 ceiling, 2 circle, 4 polygons (not simulated), 8 floor.
+    /// Sides: 1 ceiling, 2 circle, 4 polygons, 8 floor.
     FenceType = "FENCE_TYPE", 7.0, 0.0..15.0, MAV_PARAM_TYPE_INT8;
     /// A breach: 0 is only reported, 1 RTL, 2 LAND, 4 BRAKE.
     FenceAction = "FENCE_ACTION", 1.0, 0.0..5.0, MAV_PARAM_TYPE_INT8;
@@ -143,7 +143,7 @@ params! {
     FenceAltMin = "FENCE_ALT_MIN", -10.0, -100.0..100.0, MAV_PARAM_TYPE_REAL32;
     /// Radius around home. [m]
     FenceRadius = "FENCE_RADIUS", 300.0, 0.5..10000.0, MAV_PARAM_TYPE_REAL32;
-    /// RTL stays this far under the ceiling. [m]
+    /// RTL stays this far under the ceiling; the floor counts once the vehicle was this far over it. [m]
     FenceMargin = "FENCE_MARGIN", 2.0, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
     /// Battery monitor: 4 measures voltage and current (lab).
     BattMonitor = "BATT_MONITOR", 4.0, 0.0..30.0, MAV_PARAM_TYPE_INT8;

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::names::{Known, Version, known};
+use super::room::Room;
 use super::rules::RULES;
 use crate::link::same;
 
@@ -17,28 +18,6 @@ pub struct Difference {
     pub right: f64,
     /// What is dangerous about what it has.
     pub danger: Option<String>,
-}
-
-/// The room, where it differs from the one that the files were written for.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Room {
-    /// Height at which the fence ends. [m]
-    pub ceiling_m: Option<f64>,
-    /// Distance from the take-off point at which it ends. [m]
-    pub radius_m: Option<f64>,
-}
-
-impl Room {
-    /// Puts the room's measures in the place of the file's.
-    fn fit(self, version: Version, name: &str, right: f64) -> f64 {
-        let measure = match name {
-            "FENCE_ALT_MAX" => self.ceiling_m,
-            "FENCE_RADIUS" => self.radius_m,
-            _ => None,
-        };
-        let fitted = measure.zip(known(version, name));
-        fitted.map_or(right, |(newest, known)| known.value_in(version, newest))
-    }
 }
 
 /// Returns the differences of what an autopilot `has` from what is `wanted`, the dangerous ones first.
@@ -136,6 +115,8 @@ mod tests {
         check(&[("RTL_ALT_M", 15.0), ("FENCE_ALT_MAX", 3.0)], "below FENCE_ALT_MAX");
         check(&[("EK3_SRC1_POSXY", 3.0), ("GPS1_TYPE", 0.0)], "needs a GPS");
         check(&[("FENCE_ENABLE", 1.0), ("FENCE_TYPE", 2.0)], "no ceiling");
+        let heights = [("FENCE_ALT_MAX", 2.5), ("FENCE_ALT_MIN", 2.0), ("FENCE_MARGIN", 0.3)];
+        check(&heights, "apart");
     }
 
     /// The published lab's parameters, which would climb into the net.
@@ -168,11 +149,12 @@ mod tests {
     #[test]
     fn the_room_goes_before_the_file() {
         let version = Version::V48;
-        let room = Room { ceiling_m: Some(2.5), radius_m: Some(3.0) };
+        let room = Room { ceiling_m: Some(2.5), floor_m: Some(0.2), radius_m: Some(3.0) };
         let has = wanted(version);
         let found = compare(version, &wanted(version), room, |name| has.get(name).copied());
         let fence: Vec<_> = found.iter().map(|f| (f.name.as_str(), f.right)).collect();
-        assert_eq!(fence, [("FENCE_ALT_MAX", 2.5), ("FENCE_RADIUS", 3.0)]);
+        let right = [("FENCE_ALT_MAX", 2.5), ("FENCE_RADIUS", 3.0), ("FENCE_ALT_MIN", 0.2)];
+        assert_eq!(fence, right);
         assert!(found[0].danger.as_ref().unwrap().contains("outside the room"), "{found:?}");
         let nothing = compare(version, &wanted(version), Room::default(), |_| None);
         assert!(nothing.iter().all(|f| f.has.is_none() && f.danger.is_none()));

@@ -4,17 +4,20 @@
 //! ```text
 //! hardware/airframe/*.param ── file ──▶ wanted ─┐
 //! autopilot ── visit ──▶ firmware, values ──────┴─ compare ──▶ differences ──▶ a person; --apply
+//! arena ── room ──▶ heights and circle into `wanted`; polygons of the fence, uploaded
 //! ```
 
 mod compare;
 mod file;
 mod names;
+mod room;
 mod rules;
 mod visit;
 
-pub use compare::{Difference, Room, compare};
+pub use compare::{Difference, compare};
 pub use file::{ParamFileError, parse_params};
 pub use names::{Known, Version, known};
+pub use room::{ArenaFence, Room};
 pub use rules::{RULES, Rule, contradictions};
 pub use visit::{Visit, VisitError};
 

@@ -151,6 +151,7 @@ const TABLE: &[Known] = &[
     whole("FENCE_TYPE", 0.0, 15.0),
     whole("FENCE_ACTION", 0.0, 5.0),
     real("FENCE_ALT_MAX", 1.0, 1000.0),
+    real("FENCE_ALT_MIN", -100.0, 100.0),
     real("FENCE_RADIUS", 1.0, 10_000.0),
     real("FENCE_MARGIN", 0.1, 10.0),
     // Battery.

@@ -80,6 +80,14 @@ pub const RULES: &[Rule] = &[
         },
     },
     Rule {
+        name: "FENCE_TYPE",
+        danger: |value| {
+            (value as i32 & POLYGONS == 0).then_some(
+                "the fence is round: it holds neither the room's walls nor its no-fly boxes",
+            )
+        },
+    },
+    Rule {
         name: "FENCE_ALT_MAX",
         danger: |value| (value > 10.0).then_some("the fence ends far above any room's ceiling"),
     },
@@ -133,6 +141,9 @@ pub const RULES: &[Rule] = &[
     Rule { name: "EK3_SRC1_VELZ", danger: not_external },
     Rule { name: "EK3_SRC1_YAW", danger: not_external },
 ];
+
+/// Bit of FENCE_TYPE: polygons to stay in and out of.
+const POLYGONS: i32 = 4;
 
 fn battery_action(value: f64) -> Option<&'static str> {
     match value as i32 {
@@ -218,6 +229,11 @@ pub fn contradictions(values: &Values) -> Vec<String> {
     check(
         both(get("FENCE_MARGIN"), get("FENCE_RADIUS"), |margin, radius| margin >= radius),
         "FENCE_MARGIN must be below FENCE_RADIUS",
+    );
+    let height = get("FENCE_ALT_MAX").zip(get("FENCE_ALT_MIN")).map(|(most, least)| most - least);
+    check(
+        both(height, get("FENCE_MARGIN"), |height, margin| height <= 2.0 * margin),
+        "FENCE_ALT_MAX and FENCE_ALT_MIN must be more than twice FENCE_MARGIN apart",
     );
     check(
         both(get("RTL_ALT_M"), get("FENCE_ALT_MAX"), |rtl, fence| rtl >= fence),

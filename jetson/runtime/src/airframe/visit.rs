@@ -9,7 +9,9 @@ use vizflyt_sdk::host_now;
 
 use super::names::Version;
 use crate::link::port::{MavlinkAddress, Port};
-use crate::link::{Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent};
+use crate::link::{
+    FenceEvent, FencePolygon, Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent,
+};
 
 /// Why a visit came to nothing.
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +66,8 @@ const VERSION_S: f64 = 4.0;
 const LIST_S: f64 = 90.0;
 /// A value is asked for five times.
 const WRITE_S: f64 = 5.0;
+/// The origin comes within some seconds of a start, and a fence is offered for eight.
+const FENCE_S: f64 = 20.0;
 /// A message is with the autopilot by then, over any link. [s]
 const TAKES_S: f64 = 1.0;
 
@@ -163,6 +167,28 @@ impl Visit {
             written.push((name.clone(), has.flatten()));
         }
         Ok(written)
+    }
+
+    /// Has the autopilot keep these polygons as its own fence; returns how many it keeps, or why it does
+    /// not.
+    ///
+    /// # Errors
+    /// [`VisitError::Armed`].
+    pub fn upload_fence(
+        &mut self,
+        polygons: Vec<FencePolygon>,
+    ) -> Result<Result<usize, String>, VisitError> {
+        if self.link.state().armed {
+            return Err(VisitError::Armed);
+        }
+        self.link.set_fence(host_now(), polygons);
+        let done = self.until(FENCE_S, |event, _| match event {
+            Some(LinkEvent::Fence(FenceEvent::Kept(polygons))) => Some(Ok(*polygons)),
+            Some(LinkEvent::Fence(FenceEvent::NotKept(why))) => Some(Err(why.clone())),
+            _ => None,
+        });
+        let silent = "it has no origin yet; start it in its localization, and try again";
+        Ok(done.unwrap_or_else(|| Err(silent.to_owned())))
     }
 
     /// Hands the key for signing over, or takes signing back.

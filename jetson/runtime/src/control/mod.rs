@@ -31,6 +31,7 @@ use vizflyt_protocol::messages::{
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle, host_now};
 
+use crate::airframe::ArenaFence;
 use crate::console::Screen;
 use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
 use crate::guard::Fix;
@@ -310,6 +311,11 @@ impl Loop {
                 self.control.settings.tighten(&mut arena);
                 tracing::info!("server: arena {}", arena.name);
                 self.flight.handle(now, Input::Arena(arena.clone()));
+                let fence = ArenaFence::of(&arena);
+                if let Some(gap) = fence.gap(&arena) {
+                    self.tell_event(now, EventKind::Note, &gap);
+                }
+                self.link.set_fence(now, fence.polygons);
                 if self.plugin.is_none() && self.flight.outcome().is_none() {
                     self.start_plugin(now, arena);
                 }

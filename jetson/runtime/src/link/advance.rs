@@ -6,9 +6,10 @@
 use glam::DVec3;
 use vizflyt_protocol::geometry::yaw_of;
 use vizflyt_protocol::mavlink::dialect::{
-    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
-    MavState, MavType, PARAM_REQUEST_LIST_DATA, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
-    SET_GPS_GLOBAL_ORIGIN_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, MISSION_COUNT_DATA, MavAutopilot, MavCmd, MavMessage,
+    MavMissionType, MavModeFlag, MavSeverity, MavState, MavType, PARAM_REQUEST_LIST_DATA,
+    PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, SET_GPS_GLOBAL_ORIGIN_DATA, STATUSTEXT_DATA,
+    TIMESYNC_DATA,
 };
 use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, GuidedSetpoint, guided_to_mavlink};
 use vizflyt_protocol::messages::YawTarget;
@@ -19,7 +20,7 @@ use super::companions::ANNOUNCES;
 use super::dialect::Rise;
 use super::params::Request;
 use super::rates::Verdict;
-use super::{Goal, Link, LinkEvent, Rising, Target};
+use super::{FenceEvent, Goal, Link, LinkEvent, Rising, Target};
 
 /// Any place will do indoors: it only ties the local frame to the globe. ArduCopter's own
 /// test field. [1e-7 degrees, 1e-7 degrees, mm]
@@ -42,6 +43,7 @@ impl Link {
             self.given_up(now, command, &why);
         }
         self.advance_params(now, target);
+        self.advance_fence(now, target);
         let Some(command) = self.wanted(now, target) else { return };
         let endless = self.goal == Goal::Land && !command.is_chore();
         let patience = if endless { Patience::Endless } else { Patience::Bounded };
@@ -149,6 +151,35 @@ impl Link {
         }
     }
 
+    /// Offers the fence's polygons. Not to a vehicle that flies: what it flies within is not to change.
+    fn advance_fence(&mut self, now: HostTime, target: Target) {
+        if !self.dialect.keeps_polygons() {
+            if self.fence.give_up() {
+                let why = "it has no place on the globe when it flies by external navigation";
+                self.events.push_back(LinkEvent::Fence(FenceEvent::NotKept(why.to_owned())));
+            }
+            return;
+        }
+        // Parameters first: a serial link carries one conversation at a time.
+        if self.state.armed || self.params.is_busy() {
+            return;
+        }
+        match self.fence.poll(now) {
+            Some(Ok(count)) => {
+                let message = MISSION_COUNT_DATA {
+                    count,
+                    target_system: target.system,
+                    target_component: target.component,
+                    mission_type: MavMissionType::MAV_MISSION_TYPE_FENCE,
+                    ..Default::default()
+                };
+                self.send(now, &MavMessage::MISSION_COUNT(message));
+            }
+            Some(Err(event)) => self.events.push_back(LinkEvent::Fence(event)),
+            None => {}
+        }
+    }
+
     pub(super) fn every_second(&mut self, now: HostTime) {
         // Heartbeats also tell a bridge or an autopilot that waits where we are.
         self.send_heartbeat(now);
@@ -164,7 +195,7 @@ impl Link {
         };
         self.note_clock_request(request.ts1);
         self.send(now, &MavMessage::TIMESYNC(request));
-        if self.dialect.needs_origin() && !self.origin_set {
+        if self.dialect.needs_origin() && self.origin.is_none() {
             self.send(
                 now,
                 &MavMessage::SET_GPS_GLOBAL_ORIGIN(SET_GPS_GLOBAL_ORIGIN_DATA {

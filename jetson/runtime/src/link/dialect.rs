@@ -32,6 +32,8 @@ pub(super) trait Dialect: Debug + Send + Sync {
     fn rise(&self) -> Rise;
     /// Whether it needs SET_GPS_GLOBAL_ORIGIN before it has a position.
     fn needs_origin(&self) -> bool;
+    /// Whether it keeps polygons as a fence of its own when it flies by external navigation.
+    fn keeps_polygons(&self) -> bool;
     /// What to do if its estimator has no position.
     fn navigation_advice(&self) -> &'static str;
     /// Name of the parameter for external navigation's latency in milliseconds.
@@ -84,6 +86,10 @@ impl Dialect for ArduCopter {
         true
     }
 
+    fn keeps_polygons(&self) -> bool {
+        true
+    }
+
     fn navigation_advice(&self) -> &'static str {
         "external navigation needs VISO_TYPE=1 and EK3_SRC1_* = 6"
     }
@@ -104,6 +110,7 @@ impl Dialect for ArduCopter {
             "BATT_FS_LOW_ACT",
             "BATT_FS_CRT_ACT",
             "FENCE_ENABLE",
+            "FENCE_TYPE",
             "FENCE_ACTION",
         ]
     }
@@ -185,6 +192,11 @@ impl Dialect for Px4 {
     }
 
     fn needs_origin(&self) -> bool {
+        false
+    }
+
+    /// Its fence is checked against the global position, which external navigation does not give.
+    fn keeps_polygons(&self) -> bool {
         false
     }
 

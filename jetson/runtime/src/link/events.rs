@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use vizflyt_protocol::mavlink::SigningFault;
 
-use super::{Delay, Firmware, ParamEvent, Rate};
+use super::{Delay, FenceEvent, Firmware, ParamEvent, Rate};
 
 /// Something that happened on the link.
 #[derive(Clone, Debug, PartialEq)]
@@ -43,6 +43,8 @@ pub enum LinkEvent {
     Delay(Delay),
     /// Packets are refused for their signature.
     NotSigned(SigningFault),
+    /// What became of the fence's polygons.
+    Fence(FenceEvent),
     /// What became of reading or writing parameters.
     Param(ParamEvent),
 }
@@ -62,6 +64,10 @@ impl LinkEvent {
             )),
             Self::NotSigned(fault) => Some(format!(
                 "packets on the link are refused: {fault}; see `vizflyt vehicle sign`"
+            )),
+            Self::Fence(FenceEvent::NotKept(why)) => Some(format!(
+                "the autopilot's own fence is not the arena's: {why}; it flies within what its FENCE_* \
+                 say, and guard and referee keep the rest"
             )),
             _ => None,
         }

@@ -18,6 +18,7 @@ mod commands;
 mod companions;
 mod dialect;
 mod events;
+mod fence;
 mod navigation;
 mod params;
 pub mod port;
@@ -39,7 +40,7 @@ use vizflyt_protocol::mavlink::dialect::{
     EkfStatusFlags, MavCmd, MavMessage, MavSysStatusSensor, SETUP_SIGNING_DATA,
 };
 use vizflyt_protocol::mavlink::{
-    GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
+    GlobalPoint, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
     vision_to_mavlink,
 };
 use vizflyt_protocol::messages::{PoseSample, VehicleState};
@@ -50,6 +51,7 @@ use commands::{Command, Commands};
 use companions::Companions;
 use dialect::Dialect;
 pub use events::{LinkEvent, advice};
+pub use fence::{FenceEvent, FencePolygon};
 use navigation::Feed;
 pub use navigation::{Delay, VISION_HZ};
 use params::Params;
@@ -222,7 +224,9 @@ pub struct Link {
     /// Stamps of our newest clock requests. [ns]
     clock_asked: VecDeque<i64>,
     boot_ms: u32,
-    origin_set: bool,
+    /// Of the autopilot's local frame, as it says.
+    origin: Option<GlobalPoint>,
+    fence: fence::Upload,
     ekf: EkfStatusFlags,
     prearm: Prearm,
     took_off: bool,
@@ -273,7 +277,8 @@ impl Link {
             clock: OffsetFilter::default(),
             clock_asked: VecDeque::new(),
             boot_ms: 0,
-            origin_set: false,
+            origin: None,
+            fence: fence::Upload::default(),
             ekf: EkfStatusFlags::empty(),
             prearm: Prearm::default(),
             took_off: false,
@@ -368,6 +373,16 @@ impl Link {
         self.advance(now);
     }
 
+    /// Has the autopilot keep these polygons as its own fence, from the next time that it is on the
+    /// ground; [`LinkEvent::Fence`] tells what it made of them. Repeating the same changes nothing.
+    pub fn set_fence(&mut self, now: HostTime, polygons: Vec<FencePolygon>) {
+        self.fence.want(polygons);
+        if let Some(origin) = self.origin {
+            self.fence.set_origin(origin);
+        }
+        self.advance(now);
+    }
+
     /// Tells the autopilot the key for signing, or with `None` to sign no more; returns whether there
     /// is an autopilot to tell. It does not answer. Only a wire that nobody listens to may carry this.
     pub fn setup_signing(&mut self, now: HostTime, signing: Option<&LinkSigning>) -> bool {
@@ -399,7 +414,7 @@ impl Link {
     /// Returns when [`Self::handle_timeout`] is due next.
     pub fn poll_timeout(&self) -> Option<HostTime> {
         let rising = self.rising.map(|rising| rising.due_at);
-        let due = [self.commands.due_at(), self.params.due_at(), rising];
+        let due = [self.commands.due_at(), self.params.due_at(), self.fence.due_at(), rising];
         Some(due.into_iter().flatten().fold(self.beat_at, Ord::min))
     }
 
@@ -452,6 +467,11 @@ impl Link {
     /// Whether parameters are being read or written.
     pub fn is_busy_with_params(&self) -> bool {
         self.params.is_busy()
+    }
+
+    /// Whether the fence's polygons are on their way to the autopilot.
+    pub fn is_busy_with_fence(&self) -> bool {
+        self.fence.is_under_way()
     }
 
     /// Returns the streams asked for, and how often they come.

@@ -1,5 +1,8 @@
 //! What the autopilot, and others on its network, say.
 
+// Why: MISSION_REQUEST is superseded on paper, and what ArduCopter sends.
+#![allow(deprecated)]
+
 use std::collections::VecDeque;
 
 use glam::DVec3;
@@ -8,8 +11,9 @@ use vizflyt_protocol::mavlink::dialect::{
     MavModeFlag, MavSysStatusSensor, STATUSTEXT_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
 use vizflyt_protocol::mavlink::{
-    CopterMode, Message, Packet, attitude_from_mavlink, highres_imu_from_mavlink,
-    local_position_from_mavlink, raw_imu_from_mavlink,
+    CopterMode, GlobalPoint, Message, Packet, attitude_from_mavlink, fence_corner_to_mavlink,
+    fence_request_from_mavlink, highres_imu_from_mavlink, local_position_from_mavlink,
+    raw_imu_from_mavlink,
 };
 use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{AutopilotTime, HostTime, OffsetFilter};
@@ -85,7 +89,20 @@ impl Link {
             MavMessage::ESTIMATOR_STATUS(message) => {
                 self.ekf = EkfStatusFlags::from_bits_truncate(message.flags.bits());
             }
-            MavMessage::GPS_GLOBAL_ORIGIN(_) => self.origin_set = true,
+            MavMessage::GPS_GLOBAL_ORIGIN(message) => {
+                let (latitude_e7, longitude_e7) = (message.latitude, message.longitude);
+                let origin = GlobalPoint { latitude_e7, longitude_e7 };
+                self.origin = Some(origin);
+                self.fence.set_origin(origin);
+            }
+            request @ (MavMessage::MISSION_REQUEST(_) | MavMessage::MISSION_REQUEST_INT(_)) => {
+                self.handle_fence_request(now, from, request);
+            }
+            MavMessage::MISSION_ACK(message) => {
+                if let Some(event) = self.fence.acknowledged(now, message) {
+                    self.events.push_back(LinkEvent::Fence(event));
+                }
+            }
             MavMessage::TIMESYNC(message) => self.handle_timesync(now, message),
             MavMessage::STATUSTEXT(message) => self.handle_text(now, message),
             MavMessage::COMMAND_ACK(message) => self.handle_ack(now, message),
@@ -139,7 +156,8 @@ impl Link {
 
     /// Drops what a restarted autopilot does not know any more.
     fn forget(&mut self) {
-        self.origin_set = false;
+        self.origin = None;
+        self.fence.restart();
         self.ekf = EkfStatusFlags::empty();
         self.prearm = Prearm::default();
         self.took_off = false;
@@ -169,6 +187,14 @@ impl Link {
             self.params.read(self.dialect.watched());
         }
         self.boot_ms = boot_ms;
+    }
+
+    fn handle_fence_request(&mut self, now: HostTime, from: Target, request: &MavMessage) {
+        let Some(seq) = fence_request_from_mavlink(request) else { return };
+        if let Some(corner) = self.fence.asked(now, seq) {
+            let item = fence_corner_to_mavlink(&corner, seq, (from.system, from.component));
+            self.send(now, &MavMessage::MISSION_ITEM_INT(item));
+        }
     }
 
     fn handle_imu(&mut self, now: HostTime, boot_us: u64, (accel, gyro): (DVec3, DVec3)) {

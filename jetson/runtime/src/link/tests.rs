@@ -3,6 +3,7 @@
 // Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
 #![allow(deprecated)]
 
+mod fence;
 mod imu;
 mod px4;
 mod refusals;
@@ -551,7 +552,10 @@ fn telemetry_is_read_at_every_chunk_size() {
         for part in bytes.chunks(chunk) {
             link.handle_input(HostTime::ZERO, part);
         }
-        assert!(link.state().armed && link.state().mode == 4 && link.origin_set, "chunk {chunk}");
+        assert!(
+            link.state().armed && link.state().mode == 4 && link.origin.is_some(),
+            "chunk {chunk}"
+        );
         assert!((link.state().p_world_m - DVec3::ONE).length() < 1e-6);
         let events: Vec<_> = std::iter::from_fn(|| link.poll_event()).collect();
         assert_eq!(events.len(), 4, "{events:?}");

@@ -48,6 +48,9 @@ impl Link {
         if let Some(missing) = self.navigation_missing() {
             return Some(missing);
         }
+        if self.fence.is_under_way() {
+            return Some("the autopilot is being told the arena's fence".into());
+        }
         match self.prearm.ok {
             Some(true) => None,
             Some(false) => Some(self.prearm_words(now).into()),
@@ -57,7 +60,7 @@ impl Link {
 
     /// Returns why the autopilot does not know where it is.
     fn navigation_missing(&self) -> Option<Cow<'static, str>> {
-        if self.dialect.needs_origin() && !self.origin_set {
+        if self.dialect.needs_origin() && self.origin.is_none() {
             return Some("the autopilot has not confirmed its origin yet".into());
         }
         // PX4 calls a position that external navigation gives relative.
@@ -123,7 +126,7 @@ impl Link {
             Command::TakeOff(height_m) if !(height_m > 0.0) => {
                 Some(format!("{height_m} m is no height; set takeoff_height_m of the arena").into())
             }
-            Command::TakeOff(_) if self.dialect.needs_origin() && !self.origin_set => Some(
+            Command::TakeOff(_) if self.dialect.needs_origin() && self.origin.is_none() => Some(
                 "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the way to the \
                  autopilot, or set AHRS_OPTIONS=16 and AHRS_ORIGIN_*"
                     .into(),

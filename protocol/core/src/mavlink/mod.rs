@@ -5,6 +5,7 @@
 //! simulator and the bridge agree on one version of it.
 
 mod command;
+mod fence;
 mod frames;
 mod setpoint;
 mod signing;
@@ -15,6 +16,10 @@ pub use ::mavlink::dialects::ardupilotmega as dialect;
 pub use ::mavlink::{MavHeader, MavlinkVersion, Message, MessageData};
 
 pub use command::{CopterMode, command_name, result_name};
+pub use fence::{
+    FenceCorner, FenceSide, GlobalPoint, fence_corner_from_mavlink, fence_corner_to_mavlink,
+    fence_request_from_mavlink, mission_result_name,
+};
 pub use frames::{
     body_from_frd, frd_from_body, ned_from_world, ned_rotation_from_world, world_from_ned,
     world_rotation_from_ned, yaw_ned_from_world, yaw_world_from_ned,

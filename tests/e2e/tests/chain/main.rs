@@ -120,22 +120,8 @@ fn without_the_runtime_the_autopilot_lands_it() {
 fn without_a_guard_the_autopilot_keeps_its_own_fence() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
-    // Somebody else's program, which knows of no fence, takes over on the same link.
     flight.kill_runtime();
-    let started = Instant::now();
-    let mut sequence = 0;
-    while !is_landing(&flight) {
-        assert!(started.elapsed() < PATIENCE, "it flies on: {:?}", flight.now());
-        let motion = GuidedMotion::Velocity(DVec3::X);
-        let setpoint = GuidedSetpoint { motion, yaw: YawTarget::Angle(0.0) };
-        let target = guided_to_mavlink(&setpoint, (1, 1), 0);
-        tell(&flight, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(target), &mut sequence);
-        if sequence % 20 == 1 {
-            tell(&flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
-        }
-        // The setpoints' own rate, not a wait for something.
-        std::thread::sleep(Duration::from_millis(25));
-    }
+    fly_on(&flight);
     let reached_m = flight.now().p_m.x - START_X_M;
     println!(
         "without a guard: the autopilot's fence of {FENCE_RADIUS_M} m acts at {reached_m:.2} m"
@@ -144,13 +130,62 @@ fn without_a_guard_the_autopilot_keeps_its_own_fence() {
     ends_inside(&mut flight, "no guard", COAST_M);
 }
 
+/// Flies on until the autopilot lands: somebody else's program, which knows of no fence, has taken
+/// over on the same link.
+fn fly_on(flight: &Flight) {
+    let started = Instant::now();
+    let mut sequence = 0;
+    while !is_landing(flight) {
+        assert!(started.elapsed() < PATIENCE, "it flies on: {:?}", flight.now());
+        let motion = GuidedMotion::Velocity(DVec3::X);
+        let setpoint = GuidedSetpoint { motion, yaw: YawTarget::Angle(0.0) };
+        let target = guided_to_mavlink(&setpoint, (1, 1), 0);
+        tell(flight, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(target), &mut sequence);
+        if sequence % 20 == 1 {
+            tell(flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
+        }
+        // The setpoints' own rate, not a wait for something.
+        std::thread::sleep(Duration::from_millis(25));
+    }
+}
+
+/// Puts a pillar across the room that only `arena.toml` knows.
+fn forbid(folder: &Path) {
+    let path = folder.join("arena.toml");
+    let mut text = std::fs::read_to_string(&path).expect("the arena reads");
+    text += &format!(
+        "\n[[no_fly]]\nname = \"pillar\"\nmin_m = [{NO_FLY_X_M}, -2.0, -0.5]\nmax_m = [3.0, 2.0, 3.65]\n"
+    );
+    std::fs::write(&path, text).expect("the arena is written");
+}
+
+#[test]
+fn with_neither_server_nor_guard_the_autopilot_lands_at_a_no_fly_box() {
+    let mut lab = Lab::open_in(1, forbid);
+    // Its circle and its ceiling would not notice; the runtime has told it of the box.
+    let mut flight = outward_with(&lab, &["--param=FENCE_TYPE=4"]);
+    lab.kill_server();
+    flight.kill_runtime();
+    fly_on(&flight);
+    let reached_m = flight.now().p_m.x;
+    println!("a no-fly box from {NO_FLY_X_M} m: the autopilot's fence acts at {reached_m:.2} m");
+    assert!(reached_m > NO_FLY_X_M - 0.4, "at {reached_m} m something else landed it");
+    wait("the landing", || flight.now().p_m.z < 0.05);
+    let (track, _) = flight.so_far();
+    let furthest_m = track.iter().map(|sight| sight.p_m.x).fold(0.0, f64::max);
+    assert!(furthest_m < NO_FLY_X_M + COAST_M, "it was at {furthest_m} m");
+}
+
 /// Returns a flight that flies at the fence, as the plugin asks.
 fn outward(lab: &Lab) -> Flight {
     let fence = format!("--param=FENCE_RADIUS={FENCE_RADIUS_M}");
+    outward_with(lab, &[&fence, "--param=FENCE_TYPE=3"])
+}
+
+/// As [`outward`], with the autopilot's own fence of this kind.
+fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
     let vehicle = [
-        &*fence,
         "--param=FENCE_ENABLE=1",
-        "--param=FENCE_TYPE=3",
         "--param=FENCE_ACTION=2",
         "--param=FENCE_ALT_MAX=3.2",
         "--param=FENCE_MARGIN=0.3",
@@ -159,6 +194,7 @@ fn outward(lab: &Lab) -> Flight {
         "--param=FS_OPTIONS=8",
         "--param=GUID_TIMEOUT=0.5",
     ];
+    let vehicle = [fence, &vehicle].concat();
     let plan = Plan { how: "forward", vehicle: &vehicle, ..Plan::default() };
     let mut flight = lab.fly(0, plan);
     flight.until("\"phase\":\"flying\"");
@@ -200,5 +236,7 @@ fn wait(what: &str, done: impl Fn() -> bool) {
 /// Where the lab's vehicles start, and the side of the room's fence that they fly at. [m, world]
 const START_X_M: f64 = 0.9;
 const FENCE_X_M: f64 = 2.6;
+/// Where a box begins that is not to be flown in. [m, world]
+const NO_FLY_X_M: f64 = 2.4;
 /// The autopilot's own fence around the start: the corner of the arena's that they fly at. [m]
 const FENCE_RADIUS_M: f64 = 1.7;

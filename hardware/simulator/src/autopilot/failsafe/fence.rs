@@ -1,15 +1,21 @@
-//! The autopilot's own fence: a cylinder around home with a ceiling and a floor.
+//! The autopilot's own fence: a cylinder around home with a ceiling and a floor, and polygons
+//! (AC_Fence.cpp).
+//!
+//! The floor is there from when the vehicle has risen FENCE_MARGIN over it until it lands, so that
+//! standing on the ground is no breach.
 
 use glam::DVec3;
+use vizflyt_protocol::mavlink::{CopterMode, GlobalPoint};
 use vizflyt_protocol::time::AutopilotTime;
 
 use super::super::dialect::{self, FenceBreach, MavMessage, MavSeverity};
-use super::super::{Autopilot, Param};
+use super::super::{Autopilot, Param, Return};
 use super::Action;
 
 /// Bits of FENCE_TYPE.
 const CEILING: u8 = 1;
 const CIRCLE: u8 = 2;
+const POLYGONS: u8 = 4;
 const FLOOR: u8 = 8;
 /// Beyond the fence by this much more, LAND whatever the action. [m]
 const GIVE_UP_M: f64 = 100.0;
@@ -19,17 +25,23 @@ const GIVE_UP_M: f64 = 100.0;
 pub(in super::super) struct Breaches {
     ceiling: bool,
     circle: bool,
+    polygon: bool,
     floor: bool,
     beyond_m: f64,
 }
 
 impl Breaches {
     pub(in super::super) fn any(self) -> bool {
-        self.ceiling || self.circle || self.floor
+        self.ceiling || self.circle || self.polygon || self.floor
     }
 
     fn names(self) -> String {
-        let all = [(self.ceiling, "Max Alt"), (self.circle, "Circle"), (self.floor, "Min Alt")];
+        let all = [
+            (self.ceiling, "Max Alt"),
+            (self.circle, "Circle"),
+            (self.polygon, "Polygon"),
+            (self.floor, "Min Alt"),
+        ];
         all.iter().filter(|(on, _)| *on).map(|(_, name)| *name).collect::<Vec<_>>().join(", ")
     }
 }
@@ -38,6 +50,8 @@ impl Breaches {
 #[derive(Clone, Copy, Debug, Default)]
 pub(in super::super) struct Fence {
     breached: Breaches,
+    /// The floor counts.
+    floor: bool,
     count: u16,
     at: Option<AutopilotTime>,
 }
@@ -48,17 +62,26 @@ impl Autopilot {
     }
 
     fn breaches_at(&self, p_world_m: DVec3) -> Breaches {
-        let Some(home) = self.home else { return Breaches::default() };
+        // Before the first arming, home is wherever it stands.
+        let home = self.home.unwrap_or(p_world_m);
         let value = |param| self.params.value(param);
         let sides = value(Param::FenceType) as u8;
         let from_home = p_world_m - home;
         let above_m = from_home.z - value(Param::FenceAltMax);
         let outside_m = from_home.truncate().length() - value(Param::FenceRadius);
         let below_m = value(Param::FenceAltMin) - from_home.z;
+        let origin = self
+            .origin
+            .map(|(latitude_e7, longitude_e7, _)| GlobalPoint { latitude_e7, longitude_e7 });
         Breaches {
             ceiling: sides & CEILING != 0 && above_m > 0.0,
             circle: sides & CIRCLE != 0 && outside_m > 0.0,
-            floor: sides & FLOOR != 0 && below_m > 0.0 && !self.landed,
+            // Without an origin a polygon is nowhere.
+            polygon: sides & POLYGONS != 0
+                && origin.is_some_and(|origin| {
+                    self.polygons.are_breached_at(origin, p_world_m.truncate())
+                }),
+            floor: sides & FLOOR != 0 && below_m > 0.0 && self.failsafe.fence.floor,
             beyond_m: above_m.max(outside_m),
         }
     }
@@ -85,7 +108,23 @@ impl Autopilot {
         }
     }
 
+    /// Lets the floor count from when the vehicle is well over it until it lands.
+    fn check_floor(&mut self) {
+        let value = |param| self.params.value(param);
+        let comes_down = match self.mode {
+            CopterMode::Land => true,
+            CopterMode::Rtl => self.returning == Return::Land,
+            _ => false,
+        };
+        let is_down = !self.armed || self.landed || comes_down;
+        let z_m = self.estimator.estimate().p_world_m.z;
+        let height_m = self.home.map_or(0.0, |home| z_m - home.z);
+        let is_over = height_m >= value(Param::FenceAltMin) + value(Param::FenceMargin);
+        self.failsafe.fence.floor = !is_down && (self.failsafe.fence.floor || is_over);
+    }
+
     pub(super) fn check_fence(&mut self, now: AutopilotTime) {
+        self.check_floor();
         if !self.is_fenced() || !self.armed || self.landed {
             self.failsafe.fence.breached = Breaches::default();
             return;
@@ -121,7 +160,7 @@ impl Autopilot {
             breach_status: u8::from(fence.breached.any()),
             breach_type: if fence.breached.ceiling {
                 FenceBreach::FENCE_BREACH_MAXALT
-            } else if fence.breached.circle {
+            } else if fence.breached.circle || fence.breached.polygon {
                 FenceBreach::FENCE_BREACH_BOUNDARY
             } else if fence.breached.floor {
                 FenceBreach::FENCE_BREACH_MINALT

@@ -1,4 +1,5 @@
 mod failsafes;
+mod fence;
 mod pitfalls;
 mod signed;
 

@@ -1,0 +1,220 @@
+//! The arena's polygons on their way to the autopilot.
+
+use glam::DVec2;
+use vizflyt_protocol::mavlink::dialect::{
+    GPS_GLOBAL_ORIGIN_DATA, MISSION_ACK_DATA, MISSION_ITEM_INT_DATA, MISSION_REQUEST_DATA,
+    MISSION_REQUEST_INT_DATA, MavCmd, MavMissionResult, MavMissionType,
+};
+use vizflyt_protocol::mavlink::{FenceSide, GlobalPoint};
+
+use super::*;
+
+const ACCEPTED: MavMissionResult = MavMissionResult::MAV_MISSION_ACCEPTED;
+const DENIED: MavMissionResult = MavMissionResult::MAV_MISSION_DENIED;
+
+/// A square of 4 m to stay in, and a triangle to stay out of.
+fn fence() -> Vec<FencePolygon> {
+    let at = |corners: &[(f64, f64)]| corners.iter().map(|&p| DVec2::from(p)).collect();
+    let square = at(&[(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)]);
+    let triangle = at(&[(1.0, 0.0), (1.5, 0.0), (1.0, 0.5)]);
+    vec![
+        FencePolygon { side: FenceSide::Inside, corners_m: square },
+        FencePolygon { side: FenceSide::Outside, corners_m: triangle },
+    ]
+}
+
+impl Script {
+    /// One that has been told the fence.
+    fn fenced() -> Self {
+        let mut script = Self::ready();
+        script.link.set_fence(script.now, fence());
+        // The parameters that it watches are asked for first; nobody answers.
+        while script.offers() == 0 {
+            script.run(0.1);
+        }
+        script
+    }
+
+    fn offers(&self) -> usize {
+        self.count(|m| matches!(m, MavMessage::MISSION_COUNT(m) if m.count == 7))
+    }
+
+    fn ask(&mut self, seq: u16) -> Option<MISSION_ITEM_INT_DATA> {
+        let mission_type = MavMissionType::MAV_MISSION_TYPE_FENCE;
+        let (target_system, target_component) = (255, 191);
+        self.say(&if self.kind == MavAutopilot::MAV_AUTOPILOT_PX4 || seq.is_multiple_of(2) {
+            MavMessage::MISSION_REQUEST_INT(MISSION_REQUEST_INT_DATA {
+                seq,
+                target_system,
+                target_component,
+                mission_type,
+            })
+        } else {
+            MavMessage::MISSION_REQUEST(MISSION_REQUEST_DATA {
+                seq,
+                target_system,
+                target_component,
+                mission_type,
+            })
+        });
+        match self.sent.last() {
+            Some(MavMessage::MISSION_ITEM_INT(item)) if item.seq == seq => Some(item.clone()),
+            _ => None,
+        }
+    }
+
+    fn acknowledge(&mut self, result: MavMissionResult) {
+        self.say(&MavMessage::MISSION_ACK(MISSION_ACK_DATA {
+            target_system: 255,
+            target_component: 191,
+            mavtype: result,
+            mission_type: MavMissionType::MAV_MISSION_TYPE_FENCE,
+            ..Default::default()
+        }));
+    }
+
+    fn fence_events(&self) -> Vec<&FenceEvent> {
+        let mut events = Vec::new();
+        for event in &self.events {
+            if let LinkEvent::Fence(event) = event {
+                events.push(event);
+            }
+        }
+        events
+    }
+}
+
+#[test]
+fn each_corner_goes_where_the_autopilot_s_origin_puts_it() {
+    let mut script = Script::new();
+    script.link.set_fence(script.now, fence());
+    script.heartbeat();
+    script.run(3.0);
+    assert_eq!(script.offers(), 0, "no origin, no place on the globe");
+    let origin = GlobalPoint { latitude_e7: 480_000_000, longitude_e7: 110_000_000 };
+    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA {
+        latitude: origin.latitude_e7,
+        longitude: origin.longitude_e7,
+        ..Default::default()
+    }));
+    script.run(6.0);
+    assert!(script.offers() > 0);
+    let mut corners_m = Vec::new();
+    for seq in 0..7 {
+        let item = script.ask(seq).expect("the corner");
+        let place = GlobalPoint { latitude_e7: item.x, longitude_e7: item.y };
+        corners_m.push(place.from_origin_m(origin));
+        let (command, corners) = if seq < 4 {
+            (MavCmd::MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 4.0)
+        } else {
+            (MavCmd::MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION, 3.0)
+        };
+        assert_eq!((item.command, item.param1), (command, corners));
+    }
+    assert!(script.ask(7).is_none() && script.ask(u16::MAX).is_none());
+    for (corner_m, right_m) in corners_m.iter().zip(fence().iter().flat_map(|p| &p.corners_m)) {
+        assert!((*corner_m - *right_m).length() < 0.01, "{corner_m} is not {right_m}");
+    }
+    assert!(script.link.is_busy_with_fence());
+    script.acknowledge(ACCEPTED);
+    assert_eq!(script.fence_events(), [&FenceEvent::Kept(2)]);
+    // Repeating the same, and a repeated origin, change nothing.
+    let offers = script.offers();
+    script.link.set_fence(script.now, fence());
+    script.run(5.0);
+    assert!(script.offers() == offers && !script.link.is_busy_with_fence());
+}
+
+#[test]
+fn arming_waits_for_it_and_an_armed_vehicle_is_left_alone() {
+    let mut script = Script::fenced();
+    script.run(4.0);
+    assert!(script.missing().contains("told the arena's fence"), "{}", script.missing());
+    for seq in 0..7 {
+        script.ask(seq);
+    }
+    script.acknowledge(ACCEPTED);
+    assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
+
+    script.armed = true;
+    script.heartbeat();
+    let offers = script.offers();
+    let mut other = fence();
+    other.pop();
+    script.link.set_fence(script.now, other);
+    script.run(3.0);
+    assert_eq!(script.count(|m| matches!(m, MavMessage::MISSION_COUNT(_))), offers);
+    script.armed = false;
+    script.run(3.0);
+    assert!(script.count(|m| matches!(m, MavMessage::MISSION_COUNT(m) if m.count == 4)) > 0);
+}
+
+#[test]
+fn what_is_lost_is_offered_again_and_silence_ends_it() {
+    let mut script = Script::fenced();
+    script.run(3.5);
+    assert_eq!(script.offers(), 3);
+    // One that stops in the middle is begun anew.
+    script.ask(0);
+    script.run(2.0);
+    assert_eq!(script.offers(), 4);
+    // An answer that belongs to no whole upload is none.
+    script.acknowledge(ACCEPTED);
+    script.acknowledge(MavMissionResult::MAV_MISSION_INVALID_SEQUENCE);
+    assert_eq!(script.fence_events(), [] as [&FenceEvent; 0]);
+    script.run(10.0);
+    assert_eq!(script.offers(), 5);
+    let [FenceEvent::NotKept(why)] = script.fence_events()[..] else {
+        panic!("{:?}", script.fence_events())
+    };
+    assert_eq!(why, "it does not answer");
+    // The flight goes on without: guard and referee are there.
+    assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
+    let warnings: Vec<_> = script.events.iter().filter_map(LinkEvent::warning).collect();
+    let told = "own fence is not the arena's: it does not answer";
+    assert!(warnings.iter().any(|warning| warning.contains(told)), "{warnings:?}");
+}
+
+#[test]
+fn a_refusal_is_told_in_words_and_a_busy_autopilot_asked_again() {
+    let mut script = Script::fenced();
+    script.run(1.0);
+    script.acknowledge(DENIED);
+    let offers = script.offers();
+    script.run(2.0);
+    assert_eq!(script.offers(), offers + 1);
+    script.acknowledge(MavMissionResult::MAV_MISSION_NO_SPACE);
+    let no_room = FenceEvent::NotKept("it has no room for as many corners".into());
+    assert_eq!(script.fence_events(), [&no_room]);
+    script.run(5.0);
+    assert_eq!(script.offers(), offers + 1);
+}
+
+#[test]
+fn a_restarted_autopilot_is_told_again() {
+    let mut script = Script::fenced();
+    for seq in 0..7 {
+        script.ask(seq);
+    }
+    script.acknowledge(ACCEPTED);
+    let offers = script.offers();
+    script.run_silently(3.5);
+    script.heartbeat();
+    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.run(5.0);
+    assert!(script.offers() > offers);
+}
+
+#[test]
+fn px4_is_not_asked() {
+    let mut script = Script::new();
+    script.kind = MavAutopilot::MAV_AUTOPILOT_PX4;
+    script.link.set_fence(script.now, fence());
+    script.heartbeat();
+    script.run(2.0);
+    assert_eq!(script.offers(), 0);
+    let [FenceEvent::NotKept(why)] = script.fence_events()[..] else {
+        panic!("{:?}", script.fence_events())
+    };
+    assert!(why.contains("no place on the globe"), "{why}");
+}
