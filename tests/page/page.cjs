@@ -1,6 +1,6 @@
 // The page in a real, headless Chromium, against the real program. See `run`.
 //
-//   node page.cjs VIZFLYT [SHOTS]
+//   node page.cjs VIZFLYT [SHOTS [TEST]]
 
 const assert = require("node:assert/strict");
 const { spawn, spawnSync } = require("node:child_process");
@@ -9,7 +9,7 @@ const os = require("node:os");
 const path = require("node:path");
 const { chromium } = require("playwright-core");
 
-const [vizflyt, shots] = process.argv.slice(2);
+const [vizflyt, shots, only] = process.argv.slice(2);
 /** Bounds a test that fails; a passing one waits for what it waits for. [ms] */
 const PATIENCE = 120_000;
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
@@ -159,6 +159,64 @@ async function flight(browser) {
   assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
 }
 
+/** A flight that flies straight into a wall: its crash card comes by itself, and is looked at by keyboard alone. */
+async function crash(browser) {
+  const plugin = path.join(path.dirname(vizflyt), "examples", "misbehave");
+  assert.ok(fs.existsSync(plugin), `no ${plugin}: cargo build --release --examples`);
+  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--plugin", plugin, "--log", scratch);
+  const [, url] = await demo.line(/page\s+(http:\S+)/);
+  const page = await open(browser, url);
+  await until(page, "phase-text", /ready to start/);
+  assert.ok(await page.locator("#crash").isHidden(), "nothing has crashed yet");
+  await page.locator("#start").click();
+  await until(page, "outcome-title", /Collision/);
+  const card = page.getByRole("region", { name: "Collision" });
+  await card.waitFor();
+  const region = page.locator("#crash");
+  assert.ok((await region.locator(".cause").innerText()).length > 20, "a probable cause");
+  assert.match(await text(page, "crash-when"), /s after take-off, \d of \d stages/);
+  const { cause, images, samples } = await page.evaluate(async () => {
+    const [{ name }] = await (await fetch("/api/vehicles")).json();
+    return (await fetch(`/api/vehicles/${name}/crash`)).json();
+  });
+  assert.equal(await region.locator(".cause").innerText(), cause);
+  const count = images[0].before_s.length;
+  assert.ok(count >= 5 && images[0].before_s[0] > 1, `${count} images`);
+  assert.ok(samples.length > 100 && samples.at(-1).clearance_m < 0.05, JSON.stringify(samples.at(-1)));
+  for (const name of ["clearance and speed before the end", "the place from above"])
+    assert.ok(await region.getByRole("img", { name }).isVisible(), name);
+  // It plays by itself until someone stops it; then image by image.
+  const seen = () => page.evaluate(() => document.querySelector("#crash img").naturalWidth);
+  await page.waitForFunction(() => document.querySelector("#crash img").naturalWidth > 100);
+  await region.getByRole("button", { name: "pause" }).focus();
+  await page.keyboard.press("Enter");
+  await region.getByRole("button", { name: "play" }).waitFor();
+  const slider = region.getByRole("slider", { name: "time of the image" });
+  await slider.focus();
+  await page.keyboard.press("End");
+  assert.match(await slider.getAttribute("aria-valuetext"), /^0\.\d s before the end$/);
+  const last = await region.locator("img").first().getAttribute("src");
+  await page.keyboard.press("ArrowLeft");
+  assert.notEqual(await region.locator("img").first().getAttribute("src"), last);
+  await region.getByRole("button", { name: "show depth" }).press("Enter");
+  await region.getByRole("img", { name: /^depth image of front, / }).waitFor();
+  await page.waitForFunction(() => document.querySelector("#crash img").naturalWidth > 100);
+  assert.ok((await seen()) > 100);
+  await region.getByRole("button", { name: "show colour" }).press("Enter");
+  for (const size of ["laptop", "phone", "projector"]) {
+    const [width, height] = SIZES[size];
+    await page.setViewportSize({ width, height });
+    await checkAccess(page, size);
+    if (size === "phone") await region.scrollIntoViewIfNeeded();
+    await shot(page, `${size}-crash`);
+  }
+  await page.locator("#theme").click();
+  await shot(page, "projector-crash-other-theme");
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  assert.equal(await demo.ended, 1, "a collision is no success");
+}
+
 /** A lab whose page takes a login: wrong, right, cameras, scene, pairing, out again. */
 async function lab(browser) {
   const scenes = path.join(scratch, "scenes"), keys = path.join(scratch, "keys");
@@ -265,7 +323,8 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  for (const test of [lab, flight]) {
+  const wanted = [lab, flight, crash].filter(({ name }) => !only || name === only);
+  for (const test of wanted) {
     const began = Date.now();
     try {
       await test(browser);

@@ -10,13 +10,15 @@
 //! - [`body`], [`collision`], [`fence`], [`course`]: one rule each;
 //! - [`check`]: whether a course can be flown at all;
 //! - [`referee`]: all of it for one vehicle, as one state machine;
-//! - [`verdict`]: what a flight was worth, by all that happened in it.
+//! - [`verdict`]: what a flight was worth, by all that happened in it;
+//! - [`crash`]: why one failed, in words and drawings.
 
 pub mod body;
 pub mod check;
 pub mod collision;
 pub mod config;
 pub mod course;
+pub mod crash;
 pub mod distance;
 pub mod fence;
 pub mod grid;

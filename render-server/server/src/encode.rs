@@ -67,7 +67,7 @@ pub fn run(hub: &Arc<Hub>, ticks: &Ticks, options: EncodeOptions) {
                 }
             }
         }
-        ticks.pass_on(tick, hub.outlet.viewers() > 0);
+        ticks.pass_on(tick, hub.wants_previews());
     }
 }
 

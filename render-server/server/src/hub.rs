@@ -105,6 +105,12 @@ impl Hub {
         }
     }
 
+    /// Whether previews are made: a page looks at them, or a flight is under way, whose crash card
+    /// they may be on.
+    pub fn wants_previews(&self) -> bool {
+        self.outlet.viewers() > 0 || self.vehicles.iter().any(|vehicle| vehicle.under_way())
+    }
+
     /// Returns the report over the whole run.
     pub fn report(&self) -> Report {
         self.stats.report(&self.vehicles, *lock(&self.source), &lock(&self.renderer))

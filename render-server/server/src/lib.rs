@@ -15,6 +15,7 @@ pub mod args;
 mod berth;
 pub mod cameras;
 pub mod clock;
+pub mod crash;
 pub mod dashboard;
 pub mod door;
 pub mod drawn;

@@ -1,7 +1,8 @@
 //! The preview thread: small pictures of what was drawn, for the pages.
 //!
 //! Takes the ticks that the encode thread is done with ([`crate::drawn`]), each newest-wins, of
-//! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera. Per image of
+//! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera; of those that fly
+//! and nobody watches, [`UNWATCHED_HZ`], for the card of a crash ([`crate::crash`]). Per image of
 //! 640x480, on this thread of its own: 3 ms, most of it the two JPEGs of at most [`MOST_WIDTH_PX`].
 
 use std::sync::Arc;
@@ -9,15 +10,16 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use tracing::warn;
+use vizflyt_arena::crash::ahead_m;
 use vizflyt_protocol::messages::MAX_CAMERAS;
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{DepthKind, RgbdImage};
 
 use crate::drawn::Ticks;
-use crate::hub::{Hub, MAX_VEHICLES};
+use crate::hub::{Hub, MAX_VEHICLES, lock};
 
 /// Two small pictures for the page.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Preview {
     /// JPEG of the colour image.
     pub colour: Vec<u8>,
@@ -25,6 +27,8 @@ pub struct Preview {
     pub depth: Vec<u8>,
     /// JPEG of which object is seen where, coloured by [`id_colour`]; empty where none was seen yet.
     pub ids: Vec<u8>,
+    /// What is ahead: [`vizflyt_arena::crash::ahead_m`]. [m, cam]
+    pub ahead_m: Option<f64>,
 }
 
 /// Makes previews until the server stops.
@@ -34,18 +38,27 @@ pub fn run(hub: &Arc<Hub>, ticks: &Ticks) {
     while !hub.stop.is_set() {
         let Some(tick) = ticks.take_spent(PATIENCE) else { continue };
         let watched = hub.outlet.watched();
-        for slot in tick.slots.iter().filter(|slot| slot.fresh && watched[slot.vehicle]) {
+        for slot in tick.slots.iter().filter(|slot| slot.fresh) {
+            let vehicle = &hub.vehicles[slot.vehicle];
+            let rate_hz = if watched[slot.vehicle] {
+                PREVIEW_HZ
+            } else if vehicle.under_way() {
+                UNWATCHED_HZ
+            } else {
+                continue;
+            };
             let turn = &mut turns[slot.vehicle][slot.camera];
             // A tick that no one took can overtake the one that is being encoded.
-            if slot.seq <= turn.seq || !turn.comes(Instant::now()) {
+            if slot.seq <= turn.seq || !turn.comes(Instant::now(), rate_hz) {
                 continue;
             }
             turn.seq = slot.seq;
-            let vehicle = &hub.vehicles[slot.vehicle];
             match stage.preview(&slot.image) {
                 Ok(preview) => {
+                    let preview = Arc::new(preview);
+                    lock(&vehicle.shots).add(slot.camera, slot.shown, preview.clone());
                     if let Some(place) = vehicle.previews.get(slot.camera) {
-                        place.send_replace(Some(Arc::new(preview)));
+                        place.send_replace(Some(preview));
                     }
                 }
                 Err(error) => warn!("{}: camera {}: {error:#}", vehicle.name, slot.camera),
@@ -64,11 +77,11 @@ struct Turn {
 
 impl Turn {
     /// Whether the camera's turn has come, at `now`; if so, notes when it comes again.
-    fn comes(&mut self, now: Instant) -> bool {
+    fn comes(&mut self, now: Instant, rate_hz: u32) -> bool {
         let comes = now >= self.due;
         if comes {
             // From when it was due, so that the mean rate is kept; from now, after a rest.
-            self.due = (self.due + Duration::from_secs(1) / PREVIEW_HZ).max(now);
+            self.due = (self.due + Duration::from_secs(1) / rate_hz).max(now);
         }
         comes
     }
@@ -80,6 +93,7 @@ struct Stage {
     depth_mm: Vec<u16>,
     coloured: Vec<u8>,
     small: Vec<u8>,
+    nearest: Vec<u16>,
     /// Whether an object has been seen: a scene without any needs no picture of them.
     has_objects: bool,
     palette: Vec<[u8; 3]>,
@@ -92,6 +106,7 @@ impl Stage {
             depth_mm: Vec::new(),
             coloured: Vec::new(),
             small: Vec::new(),
+            nearest: Vec::new(),
             has_objects: false,
             palette: (0..PALETTE_SIZE).map(|k| depth_colour(palette_depth_mm(k))).collect(),
         }
@@ -100,6 +115,7 @@ impl Stage {
     fn preview(&mut self, image: &RgbdImage) -> Result<Preview> {
         image.write_rgb8(&mut self.rgb);
         image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
+        let ahead_m = ahead_m(&self.depth_mm, image.width_px as usize, &mut self.nearest);
         self.coloured.clear();
         for &mm in &self.depth_mm {
             self.coloured.extend_from_slice(&self.palette[palette_index(mm)]);
@@ -116,7 +132,7 @@ impl Stage {
             }
             ids = jpeg(&self.coloured, size, &mut self.small)?;
         }
-        Ok(Preview { colour, depth, ids })
+        Ok(Preview { colour, depth, ids, ahead_m })
     }
 }
 
@@ -215,6 +231,8 @@ const NEAR_MM: f32 = 300.0;
 const FAR_MM: f32 = 20_000.0;
 /// Smooth enough to watch; half of the cost of a stream at 30 Hz. [Hz]
 pub const PREVIEW_HZ: u32 = 15;
+/// Ten images of a crash; 1.5 % of a core a camera. [Hz]
+const UNWATCHED_HZ: u32 = 5;
 const PREVIEW_QUALITY: u8 = 80;
 /// Wider than the page shows a camera. [px]
 const MOST_WIDTH_PX: u32 = 480;
@@ -301,8 +319,8 @@ mod tests {
         let start = Instant::now();
         let mut turn = Turn { due: start, seq: 0 };
         let at = |ms: u64| start + Duration::from_millis(ms);
-        let turns = (0..1000).filter(|&ms| turn.comes(at(ms))).count();
+        let turns = (0..1000).filter(|&ms| turn.comes(at(ms), PREVIEW_HZ)).count();
         assert!(turns.abs_diff(PREVIEW_HZ as usize) <= 1, "{turns}");
-        assert!(turn.comes(at(5000)));
+        assert!(turn.comes(at(5000), PREVIEW_HZ));
     }
 }

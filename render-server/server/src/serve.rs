@@ -35,7 +35,7 @@ use crate::stats::Report;
 use crate::stop::Stop;
 use crate::transport;
 use crate::vehicle::Vehicle;
-use crate::{clock, dashboard, encode, previews, tick};
+use crate::{clock, crash, dashboard, encode, previews, tick};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -240,6 +240,7 @@ async fn run(
     }
     let mut recorders = tokio::task::JoinSet::new();
     for (vehicle, (_, arena)) in hub.vehicles.iter().zip(&twin.flying) {
+        recorders.spawn(crash::follow(vehicle.clone(), arena.clone(), twin.field.clone()));
         if let Some(board) = &hub.leaderboard {
             let (board, vehicle) = (board.clone(), vehicle.clone());
             recorders.spawn(record(board, vehicle, arena.clone(), args.official_attempts));
@@ -333,6 +334,8 @@ struct Twin {
     referees: Vec<Referee>,
     moving: Moving,
     map: Map,
+    /// What stands still.
+    field: Arc<DistanceField>,
 }
 
 fn prepare(args: &ServeArgs) -> Result<Twin> {
@@ -342,9 +345,9 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
         .iter()
         .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
         .collect();
-    let obstacles = Arc::new(scene::bake(&splats, &arena));
-    let map = draw_map(&splats, &arena, &obstacles);
-    let obstacles = scene::obstacles(&arena, &objects, obstacles, args.seed);
+    let field = Arc::new(scene::bake(&splats, &arena));
+    let map = draw_map(&splats, &arena, &field);
+    let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };
     objects.extend(vehicle_models(together));
     let renderer = choose(Drawn { splats: &splats, objects: &objects }, args.renderer)?;
@@ -356,7 +359,7 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
     let referees =
         flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone()).counting_from(epoch));
     let referees = referees.collect();
-    Ok(Twin { arena, renderer, flying, referees, moving, map })
+    Ok(Twin { arena, renderer, flying, referees, moving, map, field })
 }
 
 fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map {

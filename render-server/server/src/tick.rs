@@ -105,10 +105,16 @@ pub fn poses(
                     lock(&vehicle.trail).add(&sample);
                     let referee = &referees[index];
                     // What ends the flight belongs to it.
-                    if judging || referee.is_judging() {
+                    let ends = judging && !referee.is_judging();
+                    if ends || referee.is_judging() {
                         let clearance_m = referee.clearance_m(sample.world_from_body.translation_m);
                         let least_m = referee.least_clearance_m();
-                        lock(&vehicle.samples).add(&sample, clearance_m, least_m);
+                        let mut samples = lock(&vehicle.samples);
+                        if ends {
+                            samples.end(&sample, clearance_m, least_m);
+                        } else {
+                            samples.add(&sample, clearance_m, least_m);
+                        }
                     }
                 }
                 // Two frames of one burst may bear the same stamp: no fault of anyone's.
@@ -327,7 +333,7 @@ pub fn draw(
                 for slot in tick.slots.iter().filter(|slot| slot.fresh && slot.counted) {
                     hub.vehicles[slot.vehicle].images.cameras[slot.camera].drew();
                 }
-                let skipped = ticks.publish(tick, hub.outlet.viewers() > 0);
+                let skipped = ticks.publish(tick, hub.wants_previews());
                 hub.stats.ticks.fetch_add(1, Ordering::Relaxed);
                 hub.stats.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
             }

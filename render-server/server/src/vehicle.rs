@@ -19,7 +19,9 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::watch;
+use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::pose::PoseQuality;
+use vizflyt_arena::verdict::{Verdict, judge};
 use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, ImuReading, MAX_CAMERAS, Name,
     PoseSample, Telemetry, Timing, bounded,
@@ -29,6 +31,7 @@ use vizflyt_protocol::time::ServerTime;
 use crate::accounts::{Ledger, Tally};
 use crate::cameras::{CameraSet, Cameras};
 use crate::clock;
+use crate::crash::{Card, Shots};
 use crate::drivers::SourceCounters;
 use crate::events::{EventLog, Origin};
 use crate::hub::lock;
@@ -60,6 +63,10 @@ pub struct Vehicle {
     pub timing: watch::Sender<Option<Timing>>,
     /// The newest previews, by camera.
     pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
+    /// The previews of the last seconds.
+    pub shots: Mutex<Shots>,
+    /// What its last failed flight looked like at its end.
+    pub crash: watch::Sender<Option<Arc<Card>>>,
     /// Where the vehicle was.
     pub trail: Mutex<Trail>,
     /// Where the present flight was, for its verdict.
@@ -131,6 +138,8 @@ impl Vehicle {
             telemetry: watch::Sender::new(None),
             timing: watch::Sender::new(None),
             previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
+            shots: Mutex::new(Shots::of(count)),
+            crash: watch::Sender::new(None),
             trail: Mutex::default(),
             samples: Mutex::default(),
             checked_in: Mutex::default(),
@@ -261,6 +270,30 @@ impl Vehicle {
     /// Returns how the present flight goes.
     pub fn flight(&self) -> Flight {
         lock(&self.flight).clone()
+    }
+
+    /// Returns what happened in the present flight, in order; of a very long story the end.
+    pub fn events_of_flight(&self) -> Vec<Event> {
+        let mut cursor = self.first_event();
+        let entries = self.events.read(&mut cursor).unwrap_or_else(|lagged| {
+            cursor = lagged.oldest;
+            self.events.read(&mut cursor).unwrap_or_default()
+        });
+        entries.into_iter().map(|entry| entry.event).collect()
+    }
+
+    /// Judges the present flight by all that happened so far.
+    pub fn verdict(&self, arena: &ArenaConfig) -> Verdict {
+        let events = self.events_of_flight();
+        let samples = lock(&self.samples);
+        let mut verdict = judge(arena, &events, samples.kept());
+        // Samples are 20 ms apart; what lay between them was swept.
+        if let (Some(sampled_m), Some(swept_m)) =
+            (verdict.min_clearance_m, samples.least_clearance_m())
+        {
+            verdict.min_clearance_m = Some(sampled_m.min(swept_m));
+        }
+        verdict
     }
 
     /// Logs something this server noticed; it goes to the runtime, the page and standard output.

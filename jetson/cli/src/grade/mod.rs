@@ -4,13 +4,12 @@
 //! ```text
 //! project, level, variant, seed -> course  place in memory: splats, arena, distance field
 //!                               -> trial   one flight in lock-step, a plugin process of its own
-//!                               -> cause   what a failure probably was
+//!                               -> vizflyt_arena::crash  what a failure probably was
 //! flights                       -> document  figures, hash, signature -> report/, junit, JSON
 //! parts of a grade              -> merge     the whole
 //! ```
 //! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
 
-mod cause;
 mod course;
 mod document;
 mod junit;
@@ -33,6 +32,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use ed25519_dalek::SigningKey;
+use vizflyt_arena::crash::probable_cause;
 use vizflyt_runtime::supervisor::PluginLimits;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{Level, Project};
@@ -312,7 +312,7 @@ fn run_of(place: &Place, delays: &Delays, seed: u64, variant: Variant, flown: &F
         variant: variant.to_string(),
         outcome: verdict.outcome,
         reason: verdict.reason.clone(),
-        cause: cause::probable_cause(&place.arena, &place.field, delays, flown),
+        cause: probable_cause(&place.arena, &place.field, &flown.record(delays)),
         stages_passed: verdict.stages_passed,
         stages: verdict.stages.clone(),
         seconds: verdict.seconds,

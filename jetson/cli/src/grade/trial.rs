@@ -19,6 +19,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use glam::DVec3;
 use sha2::{Digest, Sha256};
+use vizflyt_arena::crash::{Asked, Flight as Record, Seen, ahead_m};
 use vizflyt_arena::pose::Measured;
 use vizflyt_arena::verdict::{Sample, Verdict, judge};
 use vizflyt_arena::{ArenaConfig, Referee};
@@ -78,17 +79,6 @@ pub(crate) struct Shot {
     pub size_px: (u32, u32),
 }
 
-/// An answer of the plugin, for the report.
-#[derive(Clone, Debug)]
-pub(crate) struct Asked {
-    /// When the plugin was given the image.
-    pub stamp: ServerTime,
-    /// What it asked for.
-    pub setpoint: Option<Setpoint>,
-    /// Least depth in the middle of the first camera's image; `None` without a return. [m]
-    pub ahead_m: Option<f64>,
-}
-
 /// What a flight leaves behind.
 #[derive(Clone, Debug)]
 pub(crate) struct Flown {
@@ -102,6 +92,8 @@ pub(crate) struct Flown {
     pub samples: Vec<Sample>,
     /// What the plugin asked for.
     pub asked: Vec<Asked>,
+    /// What was ahead in the images that it answered.
+    pub seen: Vec<Seen>,
     /// The newest images until the flight was decided.
     pub shots: VecDeque<Shot>,
     /// The last lines that the plugin printed.
@@ -110,6 +102,21 @@ pub(crate) struct Flown {
     pub images: u64,
     /// Virtual time. [s]
     pub virtual_s: f64,
+}
+
+impl Flown {
+    /// Returns what its probable cause is told from.
+    pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
+        Record {
+            verdict: &self.verdict,
+            events: &self.events,
+            samples: &self.samples,
+            asked: Some(&self.asked),
+            seen: &self.seen,
+            last_line: self.lines.back().map(String::as_str),
+            delay_s: (delays.image_ns + delays.answer_ns) as f64 * 1e-9,
+        }
+    }
 }
 
 /// Where the clocks start: far enough from zero that nothing is before it. [ns]
@@ -200,6 +207,8 @@ struct Flight<'a> {
     events: Vec<Event>,
     samples: Vec<Sample>,
     asked: Vec<Asked>,
+    seen: Vec<Seen>,
+    scratch: Vec<u16>,
     shots: VecDeque<Shot>,
     lines: VecDeque<String>,
     answered: u64,
@@ -248,6 +257,8 @@ impl<'a> Flight<'a> {
             events: Vec::new(),
             samples: Vec::new(),
             asked: Vec::new(),
+            seen: Vec::new(),
+            scratch: Vec::new(),
             shots: VecDeque::new(),
             lines: VecDeque::new(),
             answered: 0,
@@ -396,8 +407,7 @@ impl<'a> Flight<'a> {
             image.write_rgb8(&mut picture.rgb);
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
             let k = &self.cameras[index].intrinsics;
-            let size = (k.width_px as usize, k.height_px as usize);
-            picture.ahead_m = least_ahead_m(&picture.depth_mm, size);
+            picture.ahead_m = ahead_m(&picture.depth_mm, k.width_px as usize, &mut self.scratch);
             if !self.arena.cameras[index].depth {
                 // As in flight: what the course withholds is "no return" everywhere.
                 picture.depth_mm.fill(0);
@@ -481,7 +491,8 @@ impl<'a> Flight<'a> {
         let k = self.cameras.first().map(|camera| camera.intrinsics);
         let ahead_m = front.and_then(|picture| picture.ahead_m);
         let (stamp, setpoint) = (self.server_now(), setpoint.cloned());
-        self.asked.push(Asked { stamp, setpoint, ahead_m });
+        self.asked.push(Asked { stamp, setpoint });
+        self.seen.push(Seen { stamp, ahead_m });
         let (Some(picture), Some(k)) = (front, k) else { return };
         let is_due = self.shots.back().is_none_or(|shot| {
             pending.shown.seconds_since(shot.stamp) >= SHOT_PERIOD_S - 0.5 * 2.5e-3
@@ -545,26 +556,13 @@ impl<'a> Flight<'a> {
             events: self.events,
             samples: self.samples,
             asked: self.asked,
+            seen: self.seen,
             shots: self.shots,
             lines: self.lines,
             images: self.answered,
             virtual_s,
         }
     }
-}
-
-/// Returns the tenth percentile of the depths in the middle ninth of an image: what is ahead, single
-/// pixels aside. [m, cam]
-fn least_ahead_m(depth_mm: &[u16], (width, height): (usize, usize)) -> Option<f64> {
-    let rows = depth_mm.chunks_exact(width).skip(height / 3).take(height / 3);
-    let middle = rows.flat_map(|row| &row[width / 3..2 * width / 3]);
-    let mut returns: Vec<u16> = middle.copied().filter(|&mm| mm > 0).collect();
-    if returns.is_empty() {
-        return None;
-    }
-    let nth = returns.len() / 10;
-    let (_, &mut mm, _) = returns.select_nth_unstable(nth);
-    Some(f64::from(mm) / 1000.0)
 }
 
 /// Hears what the plugin prints.

@@ -101,6 +101,8 @@ pub(super) struct State {
     flight_s: Option<f64>,
     landed: bool,
     outcome: Option<OutcomeLine>,
+    /// Number of the newest crash card.
+    crash: Option<u64>,
     /// What moves, where it is now.
     objects: Vec<ObjectLine>,
 }
@@ -262,6 +264,7 @@ pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
         outcome: flight
             .outcome
             .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
+        crash: vehicle.crash.borrow().as_ref().map(|card| card.id),
         objects: objects(&hub.moving, now),
     }))
 }

@@ -15,6 +15,8 @@
 //! POST /api/vehicles/V/land           ends its flight: it brakes, then lands
 //! POST /api/vehicles/V/reset          on the ground: course, clock, path and figures begin anew
 //! GET /api/vehicles/V/cameras         its cameras of this moment, JSON
+//! GET /api/vehicles/V/crash           what its last failed flight looked like at its end, JSON ([`crash`])
+//! GET /api/vehicles/V/crash/ID/CAMERA/KIND/N   an image of that, JPEG; KIND is colour or depth
 //! PUT /api/vehicles/V/cameras/NAME    a whole camera, by the keys of `[[cameras]]`; from the next
 //!                                     tick on
 //! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
@@ -38,6 +40,7 @@
 
 mod access;
 mod cameras;
+mod crash;
 mod environment;
 mod leaderboard;
 mod login;

@@ -14,8 +14,8 @@ use axum::routing::{MethodRouter, delete, get, patch, post, put};
 use super::Page;
 use super::access::{self, Takes};
 use super::{
-    cameras, environment, file, leaderboard, login, map, pairing, scenes, shell, stats, vehicles,
-    watch,
+    cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, shell, stats,
+    vehicles, watch,
 };
 
 /// One route.
@@ -59,6 +59,7 @@ const FILES: &[(&str, &str, &str)] = &[
     ("/three.core.min.js", "text/javascript; charset=utf-8", THREE_CORE),
     ("/cameras.js", "text/javascript; charset=utf-8", CAMERAS),
     ("/waterfall.js", "text/javascript; charset=utf-8", WATERFALL),
+    ("/crash.js", "text/javascript; charset=utf-8", CRASH),
     ("/pairing.js", "text/javascript; charset=utf-8", PAIRING),
     ("/leaderboard.js", "text/javascript; charset=utf-8", LEADERBOARD),
     ("/standings.js", "text/javascript; charset=utf-8", STANDINGS),
@@ -92,6 +93,8 @@ fn table() -> Vec<Route> {
         act(Method::POST, "/api/vehicles/{vehicle}/land", Vehicle, vehicles::land),
         act(Method::POST, "/api/vehicles/{vehicle}/reset", Everything, vehicles::reset),
         read("/api/vehicles/{vehicle}/cameras", Vehicle, cameras::list),
+        read("/api/vehicles/{vehicle}/crash", Vehicle, crash::show),
+        read("/api/vehicles/{vehicle}/crash/{id}/{camera}/{kind}/{number}", Vehicle, crash::image),
         act(Method::PUT, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::put),
         act(Method::PATCH, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::patch),
         read("/api/leaderboard", Key, leaderboard::show),
@@ -174,6 +177,7 @@ pub(super) const CONTROLS: &str = include_str!("page/controls.js");
 const THREE: &str = include_str!("page/three/three.module.min.js");
 const THREE_CORE: &str = include_str!("page/three/three.core.min.js");
 pub(super) const CAMERAS: &str = include_str!("page/cameras.js");
+pub(super) const CRASH: &str = include_str!("page/crash.js");
 pub(super) const PAIRING: &str = include_str!("page/pairing.js");
 pub(super) const MAP: &str = include_str!("page/map.js");
 pub(super) const WATERFALL: &str = include_str!("page/waterfall.js");

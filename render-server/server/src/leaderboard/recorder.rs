@@ -10,8 +10,7 @@ use std::time::Duration;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::verdict::{Outcome, Verdict, judge};
-use vizflyt_protocol::messages::Event;
+use vizflyt_arena::verdict::{Outcome, Verdict};
 
 use super::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
 use crate::hub::lock;
@@ -81,7 +80,7 @@ impl Recorder {
         let Some(run) = &mut self.run else { return Ok(()) };
         let landed = flight.landed.is_some();
         if landed || (flight.outcome.is_some() && !run.decided) {
-            let verdict = verdict(&self.vehicle, &self.arena);
+            let verdict = self.vehicle.verdict(&self.arena);
             self.board.end(&run.id, &end(&verdict, &self.arena)).await?;
             run.decided = true;
             if landed {
@@ -109,24 +108,6 @@ impl Recorder {
             begun => begun,
         }
     }
-}
-
-/// Judges the present flight by all that happened so far.
-fn verdict(vehicle: &Vehicle, arena: &ArenaConfig) -> Verdict {
-    let mut cursor = vehicle.first_event();
-    let entries = vehicle.events.read(&mut cursor).unwrap_or_else(|lagged| {
-        cursor = lagged.oldest;
-        vehicle.events.read(&mut cursor).unwrap_or_default()
-    });
-    let events: Vec<Event> = entries.into_iter().map(|entry| entry.event).collect();
-    let samples = lock(&vehicle.samples);
-    let mut verdict = judge(arena, &events, samples.kept());
-    // Samples are 20 ms apart; what lay between them was swept.
-    if let (Some(sampled_m), Some(swept_m)) = (verdict.min_clearance_m, samples.least_clearance_m())
-    {
-        verdict.min_clearance_m = Some(sampled_m.min(swept_m));
-    }
-    verdict
 }
 
 fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {

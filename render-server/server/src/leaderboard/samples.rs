@@ -22,11 +22,17 @@ impl Samples {
     /// Adds where the vehicle is, if the last is long enough ago; with its clearance there, and the least of the
     /// flight so far, swept. [m]
     pub fn add(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
-        self.least_clearance_m = least_clearance_m;
         let last = self.kept.last().map(|sample| sample.stamp);
         if last.is_some_and(|last| pose.stamp.seconds_since(last) < self.apart_s) {
+            self.least_clearance_m = least_clearance_m;
             return;
         }
+        self.end(pose, clearance_m, least_clearance_m);
+    }
+
+    /// Adds where the vehicle is at the end of its flight, however short ago the last was.
+    pub fn end(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
+        self.least_clearance_m = least_clearance_m;
         if self.kept.len() >= MOST {
             // An hour in the air keeps its shape at half the rate.
             let mut keep = false;
@@ -82,5 +88,12 @@ mod tests {
         assert!(kept.is_sorted_by(|a, b| a.stamp < b.stamp));
         assert!(kept[0].p_world_m.x < 100.0 && kept[kept.len() - 1].p_world_m.x > 199_900.0);
         assert_eq!(samples.least_clearance_m(), Some(0.5));
+        // The moment of the end is kept, though the last was a millisecond before.
+        let (count, last) = (kept.len(), kept[kept.len() - 1].stamp.plus_seconds(0.001));
+        let end = PoseSample::still(last, Pose::new(glam::DVec3::X, glam::DQuat::IDENTITY));
+        samples.add(&end, -0.01, -0.01);
+        assert_eq!(samples.kept().len(), count);
+        samples.end(&end, -0.01, -0.01);
+        assert_eq!(samples.kept().last().map(|sample| sample.clearance_m), Some(-0.01));
     }
 }

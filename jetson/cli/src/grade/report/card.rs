@@ -6,13 +6,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use jpeg_encoder::{ColorType, Encoder};
+use vizflyt_arena::crash::{end_of, plot, since};
 use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::messages::EventKind;
 
-use super::super::cause::{end_of, since};
 use super::super::document::Run;
 use super::super::trial::Flown;
-use super::{escape, plot};
+use super::escape;
 
 /// Folder of the images, in the report's.
 const IMAGES: &str = "images";
@@ -43,7 +43,7 @@ pub(crate) fn write(
         run.stages_passed,
         run.stages.len()
     );
-    let at = end_of(flown);
+    let at = end_of(&flown.events, &flown.samples);
     if let Some(at) = at {
         card += &strip(folder, run, flown, |stamp| at.seconds_since(stamp))?;
         let last = since(&flown.samples, at, PLOTTED_S);

@@ -2,7 +2,6 @@
 //! flights, and a crash card for each that did not finish.
 
 pub(crate) mod card;
-mod plot;
 
 use std::fmt::Write;
 use std::fs;

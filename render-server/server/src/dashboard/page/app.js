@@ -3,6 +3,7 @@
 
 import { CameraForm } from "/cameras.js";
 import { ask, showOrders } from "/controls.js";
+import { showCrash } from "/crash.js";
 import { showLeaderboard } from "/leaderboard.js";
 import { TopView } from "/map.js";
 
@@ -427,6 +428,7 @@ function hearState(state) {
     const ended = state.landed ? "; the vehicle has landed" : "";
     banner(TONES[kind] || "warn", TITLES[kind] ?? kind, state.outcome.text + ended);
   }
+  showCrash(api(), state.crash);
   // Whoever looks from across the room sees it, too.
   document.body.dataset.outcome = state.outcome ? TONES[kindOf(state.outcome.kind)] || "warn" : "";
   // When the vehicle changes, a flight is decided, and when it has landed: the standings may be others.

@@ -1,26 +1,17 @@
 //! Drawings of a crash card: clearance and speed over time, and the place from above, as SVG.
+//!
+//! Colours are the page's: classes `axis`, `scale`, `zero`, `way`, `speed`, `solid`, `gate`, `end`.
 
 use std::fmt::Write;
 
 use glam::{DVec2, DVec3};
-use vizflyt_arena::verdict::Sample;
-use vizflyt_arena::{ArenaConfig, ObstacleSlice};
 use vizflyt_protocol::time::ServerTime;
 
-/// Of a drawing. [user units]
-const WIDTH: f64 = 420.0;
-const HEIGHT: f64 = 220.0;
-/// Around a plot, for its words. [user units]
-const MARGIN: f64 = 34.0;
-/// Every so many samples are drawn: 40 a second.
-const EVERY: usize = 5;
-/// The top view shows so much around the last part of the way. [m]
-const AROUND_M: f64 = 2.5;
-/// It shows so much at least. [m]
-const LEAST_VIEW_M: f64 = 6.0;
+use crate::verdict::Sample;
+use crate::{ArenaConfig, ObstacleSlice};
 
 /// Draws clearance and speed over the time before `at`, which is 0.
-pub(super) fn clearance(samples: &[Sample], at: ServerTime) -> String {
+pub fn clearance(samples: &[Sample], at: ServerTime) -> String {
     let seconds = samples.first().map_or(1.0, |first| at.seconds_since(first.stamp)).max(0.1);
     let most = |of: fn(&Sample) -> f64| samples.iter().map(of).fold(0.5, f64::max);
     let most_m = most(|sample| sample.clearance_m.min(2.0));
@@ -53,7 +44,7 @@ pub(super) fn clearance(samples: &[Sample], at: ServerTime) -> String {
 }
 
 /// Draws the place from above around the last part of the way.
-pub(super) fn top_view(
+pub fn top_view(
     arena: &ArenaConfig,
     slice: &ObstacleSlice,
     samples: &[Sample],
@@ -116,7 +107,7 @@ pub(super) fn top_view(
     format!(
         "<svg viewBox=\"0 0 {WIDTH} {height:.0}\" role=\"img\" aria-label=\"the place from above\">\
          <path class=\"solid\" d=\"{solid}\"/>{gates}<path class=\"way\" d=\"{path}\"/>{end}\
-         <path class=\"axis\" style=\"stroke:var(--faint)\" d=\"M10 {bar_y:.1}h{metre:.1}\"/>\
+         <path class=\"scale\" d=\"M10 {bar_y:.1}h{metre:.1}\"/>\
          <text x=\"10\" y=\"{text_y:.1}\">1 m</text></svg>",
         text_y = bar_y - 5.0,
     )
@@ -134,9 +125,10 @@ fn window(arena: &ArenaConfig, samples: &[Sample]) -> (DVec2, DVec2) {
 
 /// Returns the path through samples, thinned; its ends are there.
 fn line(samples: &[Sample], place: impl Fn(&Sample) -> (f64, f64)) -> String {
+    let every = samples.len().div_ceil(MOST_POINTS).max(1);
     let mut path = String::new();
     for (index, sample) in samples.iter().enumerate() {
-        if index % EVERY == 0 || index + 1 == samples.len() {
+        if index % every == 0 || index + 1 == samples.len() {
             let (x, y) = place(sample);
             let command = if path.is_empty() { 'M' } else { 'L' };
             let _ = write!(path, "{command}{x:.1} {y:.1}");
@@ -144,3 +136,15 @@ fn line(samples: &[Sample], place: impl Fn(&Sample) -> (f64, f64)) -> String {
     }
     path
 }
+
+/// Of a drawing. [user units]
+const WIDTH: f64 = 420.0;
+const HEIGHT: f64 = 220.0;
+/// Around a plot, for its words. [user units]
+const MARGIN: f64 = 34.0;
+/// Points of a path at most: finer than a pixel for any flight that is looked at, and 16 KB.
+const MOST_POINTS: usize = 1200;
+/// The top view shows so much around the last part of the way. [m]
+const AROUND_M: f64 = 2.5;
+/// It shows so much at least. [m]
+const LEAST_VIEW_M: f64 = 6.0;

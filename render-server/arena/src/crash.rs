@@ -1,0 +1,95 @@
+//! What a flight that failed tells afterwards: its probable cause in words, and drawings of its end.
+//! Pure; the autograder's report and the page's crash card say and draw the same.
+//!
+//! ```text
+//! verdict, events, samples, answers --> probable_cause --> a sentence
+//! samples, obstacles at its height  --> plot           --> SVG
+//! ```
+
+mod cause;
+pub mod plot;
+#[cfg(test)]
+mod tests;
+
+pub use cause::probable_cause;
+
+use vizflyt_protocol::messages::{Event, EventKind, Setpoint};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::verdict::{Sample, Verdict};
+
+/// An answer of the plugin.
+#[derive(Clone, Debug)]
+pub struct Asked {
+    /// When the plugin was given the image.
+    pub stamp: ServerTime,
+    /// What it asked for.
+    pub setpoint: Option<Setpoint>,
+}
+
+/// What was ahead in an image of the first camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// When the image was new.
+    pub stamp: ServerTime,
+    /// By [`ahead_m`]. [m, cam]
+    pub ahead_m: Option<f64>,
+}
+
+/// A flight that is over, as far as it was written down.
+#[derive(Clone, Copy, Debug)]
+pub struct Flight<'a> {
+    /// What it was worth.
+    pub verdict: &'a Verdict,
+    /// All that happened, in order.
+    pub events: &'a [Event],
+    /// Where it was, in order.
+    pub samples: &'a [Sample],
+    /// What the plugin answered, in order; `None` where nobody wrote it down, as in a lab.
+    pub asked: Option<&'a [Asked]>,
+    /// What was ahead, in order.
+    pub seen: &'a [Seen],
+    /// The last line that the plugin printed.
+    pub last_line: Option<&'a str>,
+    /// From when an image is drawn until its answer counts. [s]
+    pub delay_s: f64,
+}
+
+/// Returns when a flight was decided: by the event that ended it, else by its last sample.
+pub fn end_of(events: &[Event], samples: &[Sample]) -> Option<ServerTime> {
+    let decided = events.iter().find(|event| {
+        matches!(
+            event.kind,
+            EventKind::Collision { .. }
+                | EventKind::Geofence { .. }
+                | EventKind::Finished { .. }
+                | EventKind::TimeLimit
+                | EventKind::EmergencyStop
+                | EventKind::PluginFailed
+        )
+    });
+    decided.map(|event| event.stamp).or_else(|| samples.last().map(|sample| sample.stamp))
+}
+
+/// Returns the samples of the last `seconds` until `at`.
+pub fn since(samples: &[Sample], at: ServerTime, seconds: f64) -> &[Sample] {
+    let begin = samples.partition_point(|sample| at.seconds_since(sample.stamp) > seconds);
+    let end = samples.partition_point(|sample| sample.stamp <= at);
+    samples.get(begin..end).unwrap_or_default()
+}
+
+/// Returns the tenth percentile of the depths in the middle ninth of an image `width_px` wide: what is
+/// ahead, single pixels aside; `None` where nothing is. Zero depths are none. [m, cam]
+pub fn ahead_m(depth_mm: &[u16], width_px: usize, scratch: &mut Vec<u16>) -> Option<f64> {
+    let height = depth_mm.len().checked_div(width_px)?;
+    let rows = depth_mm.chunks_exact(width_px).skip(height / 3).take(height / 3);
+    let middle = rows.flat_map(|row| &row[width_px / 3..2 * width_px / 3]);
+    scratch.clear();
+    scratch.extend(middle.filter(|&&mm| mm > 0));
+    let nth = scratch.len() / 10;
+    if scratch.is_empty() {
+        return None;
+    }
+    let (_, &mut mm, _) = scratch.select_nth_unstable(nth);
+    Some(f64::from(mm) / 1000.0)
+}

@@ -1,0 +1,285 @@
+//! Each rule that names a probable cause, by a flight that it is made for; and what is drawn of one.
+
+use glam::{DVec3, Quat, Vec3};
+use vizflyt_protocol::messages::{Axes, Event, EventKind, Setpoint, YawTarget, bounded};
+use vizflyt_protocol::time::ServerTime;
+
+use super::*;
+use crate::config::{CameraConfig, StageConfig};
+use crate::referee::tests::arena;
+use crate::verdict::judge;
+use crate::{ArenaConfig, BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
+
+/// The end of every flight here, since its start. [s]
+const END_S: f64 = 12.0;
+
+fn at(s: f64) -> ServerTime {
+    ServerTime::ZERO.plus_seconds(1.0 + s)
+}
+
+/// The room of the referee's tests with a camera ahead, and a wall across it at x = 4.
+fn room() -> (ArenaConfig, DistanceField) {
+    let mut config = arena();
+    config.cameras = vec![CameraConfig::ahead("front", [320, 240], 90.0, DVec3::ZERO)];
+    config.stages = vec![StageConfig {
+        name: "window".into(),
+        center_m: DVec3::new(2.0, 0.0, 1.0),
+        normal: DVec3::X,
+        width_m: 1.0,
+        height_m: 0.8,
+        ..StageConfig::default()
+    }];
+    let cell = |y: usize, z: usize| Ellipsoid {
+        center_m: Vec3::new(4.0, y as f32 * 0.05 - 3.0, z as f32 * 0.05),
+        scales_m: Vec3::splat(0.05),
+        rotation: Quat::IDENTITY,
+        opacity: 0.95,
+    };
+    let wall = (0..120).flat_map(|y| (0..80).map(move |z| cell(y, z)));
+    let field = DistanceField::of(OccupancyGrid::bake(wall, &BakeSpec::of(&config)));
+    (config, field)
+}
+
+/// How a flight went.
+#[derive(Clone)]
+struct Case {
+    /// Where it ended. [m, world]
+    end_m: DVec3,
+    v_mps: DVec3,
+    /// At the end, against the motion. [m/s^2]
+    braking_mps2: f64,
+    /// At the end. [rad]
+    yaw_rad: f64,
+    turn_radps: f64,
+    event: Option<(EventKind, &'static str)>,
+    /// Seconds before the end at which images were answered; `None` where nobody wrote it down.
+    asked_before_s: Option<Vec<f64>>,
+    setpoint: Option<Setpoint>,
+    ahead_m: Option<f64>,
+    last_line: Option<&'static str>,
+}
+
+fn towards(v_mps: DVec3) -> Setpoint {
+    Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw: YawTarget::Keep }
+}
+
+/// It hit the wall head on at 2 m/s, its plugin awake and the room behind it clear.
+fn head_on() -> Case {
+    let kind = EventKind::Collision { p_world_m: DVec3::ZERO, clearance_m: -0.01 };
+    Case {
+        end_m: DVec3::new(3.8, 0.0, 1.0),
+        v_mps: DVec3::X * 2.0,
+        braking_mps2: 0.0,
+        yaw_rad: 0.0,
+        turn_radps: 0.0,
+        event: Some((kind, "touched an obstacle")),
+        asked_before_s: Some(vec![1.1, 0.1, 0.03]),
+        setpoint: Some(Setpoint::Hold),
+        ahead_m: Some(20.0),
+        last_line: None,
+    }
+}
+
+/// Returns what the flight is said to have failed of.
+fn cause_of(case: &Case) -> Option<String> {
+    let (arena, field) = room();
+    let sample = |tick: u32| {
+        let before_s = END_S - f64::from(tick) / 50.0;
+        Sample {
+            stamp: at(END_S - before_s),
+            p_world_m: case.end_m - case.v_mps * before_s,
+            v_world_mps: case.v_mps + case.v_mps.normalize_or_zero() * case.braking_mps2 * before_s,
+            yaw_rad: case.yaw_rad - case.turn_radps * before_s,
+            clearance_m: 0.2 * before_s,
+        }
+    };
+    let samples: Vec<Sample> = (0..=600).map(sample).collect();
+    let ended = case.event.clone().map(|(kind, text)| Event {
+        stamp: at(END_S),
+        kind,
+        text: bounded(text),
+    });
+    let events: Vec<Event> = ended.into_iter().collect();
+    let verdict = judge(&arena, &events, &samples);
+    let answer = |&s: &f64| Asked { stamp: at(END_S - s), setpoint: case.setpoint.clone() };
+    let asked: Option<Vec<Asked>> =
+        case.asked_before_s.as_ref().map(|times| times.iter().map(answer).collect());
+    let seen = [Seen { stamp: at(END_S - 1.05), ahead_m: case.ahead_m }];
+    let flight = Flight {
+        verdict: &verdict,
+        events: &events,
+        samples: &samples,
+        asked: asked.as_deref(),
+        seen: &seen,
+        last_line: case.last_line,
+        delay_s: 0.04,
+    };
+    probable_cause(&arena, &field, &flight)
+}
+
+#[track_caller]
+fn check(case: &Case, expected: &str) {
+    let cause = cause_of(case).unwrap_or_default();
+    assert!(cause.contains(expected), "not {expected:?}: {cause:?}");
+}
+
+#[test]
+fn a_collision_is_named_by_the_first_rule_that_holds() {
+    let case = head_on();
+    check(&case, "it did not brake: it flew on at 2.0 m/s");
+    check(
+        &Case { braking_mps2: 3.0, ..case.clone() },
+        "it braked too late: at 2.0 m/s it needs 0.33 m",
+    );
+    let flew_on = Some(towards(DVec3::X * 1.5));
+    check(
+        &Case { setpoint: flew_on, ..case.clone() },
+        "flew on: 1.5 m/s was asked for 0.03 s before",
+    );
+    check(
+        &Case { ahead_m: Some(2.1), ..case.clone() },
+        "too fast for its depth horizon: at 2.0 m/s",
+    );
+    // Fast enough sideways along the wall that it only grazed it.
+    let graze = DVec3::new(0.3, 2.0, 0.0);
+    check(&Case { v_mps: graze, ..case.clone() }, "passed too close: a graze at 2.0 m/s");
+    check(
+        &Case { turn_radps: 1.0, ..case.clone() },
+        "hit while turning: 57 degrees a second to the left",
+    );
+    check(
+        &Case { turn_radps: -1.0, ..case.clone() },
+        "to the right, at 2.0 m/s; an image is 40 ms old",
+    );
+    // The camera sees 45 degrees to each side.
+    let aside = Case { yaw_rad: -1.0, ..case.clone() };
+    check(&aside, "could not see: the obstacle was 57 degrees to the left");
+    check(&Case { turn_radps: 1.0, ..aside }, "outside the camera's view while it turned");
+    let asleep = Case { asked_before_s: Some(vec![3.0, 0.9]), ..case.clone() };
+    check(&asleep, "the newest setpoint was 0.9 s old at the contact");
+    check(
+        &Case { asked_before_s: Some(vec![]), ..case.clone() },
+        "not one setpoint had come before",
+    );
+    let (kind, _) = case.event.clone().unwrap();
+    let door = Some((kind.clone(), "touched 'door' at 1.0 m"));
+    check(&Case { event: door, ..case.clone() }, "it met 'door', which moves, at 2.0 m/s");
+    let floor = Some((kind, "touched the floor"));
+    let fell = Case { event: floor, v_mps: DVec3::Z * -2.5, ..case };
+    check(&fell, "came down onto the floor at 2.5 m/s");
+}
+
+#[test]
+fn without_its_answers_a_collision_is_not_laid_on_them() {
+    // In a lab nobody has written down what the plugin asked for.
+    let live = Case { asked_before_s: None, ..head_on() };
+    check(&live, "it did not brake");
+    check(&Case { ahead_m: Some(2.1), ..live.clone() }, "too fast for its depth horizon");
+    let nothing_seen = Case { ahead_m: None, ..live };
+    check(&nothing_seen, "it did not brake");
+}
+
+#[test]
+fn other_ends_have_their_own_causes() {
+    let case = Case { event: None, ..head_on() };
+    let fence = EventKind::Geofence { p_world_m: DVec3::ZERO, margin_m: 0.1 };
+    let outside = Case {
+        end_m: DVec3::new(1.0, 2.8, 1.0),
+        v_mps: DVec3::Y * 3.0,
+        event: Some((fence, "beyond the fence")),
+        ..case.clone()
+    };
+    check(&outside, "at the north face of the geofence with 3.0 m/s, 0.20 m from it");
+    let above = Case { end_m: DVec3::new(1.0, 0.0, 3.9), v_mps: DVec3::Z, ..outside };
+    check(&above, "at the upper face of the geofence with 1.0 m/s, 0.10 m from it");
+
+    let time = Some((EventKind::TimeLimit, "the course's time is over"));
+    let stuck = Case { v_mps: DVec3::ZERO, event: time.clone(), ..case.clone() };
+    check(&stuck, "stuck before window: it moved 0.0 m in its last 10 s");
+    let astray = Case { v_mps: DVec3::Y * 0.5, event: time, ..case.clone() };
+    check(&astray, "astray before window: 6 m in 12 s, 0.5 m/s");
+
+    let stop = Some((EventKind::EmergencyStop, "emergency stop pressed"));
+    check(&Case { event: stop, ..case.clone() }, "stopped by hand: emergency stop pressed");
+    check(&case, "it gave up: not over when its record ends");
+    let finished = Some((EventKind::Finished { seconds: 12.0 }, "at the goal"));
+    assert_eq!(cause_of(&Case { event: finished, ..case.clone() }), None);
+
+    // It never rose from the floor.
+    let ground = Case { end_m: DVec3::ZERO, v_mps: DVec3::ZERO, ..case };
+    check(&ground, "not the plugin: the vehicle never took off");
+    check(&Case { asked_before_s: Some(vec![]), ..ground }, "no image was ever answered");
+}
+
+#[test]
+fn a_plugin_that_failed_is_quoted() {
+    let failed =
+        |text: &'static str| Case { event: Some((EventKind::PluginFailed, text)), ..head_on() };
+    let said = Case { last_line: Some("no such model"), ..failed("ended with exit status 3") };
+    check(&said, "ended with exit status 3; the last it printed: no such model");
+    check(&failed("ended with exit status 3"), "ended with exit status 3");
+    check(
+        &failed("has not answered image 7"),
+        "it answers images, but for 0.0 s without a setpoint",
+    );
+    let silent = "2.0 s without a setpoint";
+    check(&Case { setpoint: None, ..failed(silent) }, "but never with a setpoint");
+    let hung = Case { asked_before_s: Some(vec![3.0]), ..failed("has not answered image 7") };
+    check(&hung, "does `on_image` wait for something, or loop?");
+    check(&failed("its setpoints are refused: NaN"), "no numbers to fly by");
+    // What it said is not said twice.
+    let once = Case { last_line: Some("exit status 3"), ..failed("ended with exit status 3") };
+    assert_eq!(cause_of(&once).as_deref(), Some("ended with exit status 3"));
+}
+
+#[test]
+fn what_was_ahead_is_the_nearest_of_the_middle_but_single_pixels() {
+    let (width, height) = (30, 30);
+    let mut depth = vec![9000_u16; width * height];
+    let mut scratch = Vec::new();
+    assert_eq!(ahead_m(&depth, width, &mut scratch), Some(9.0));
+    // A few pixels are noise, a tenth is an obstacle; at the border nothing counts.
+    depth[15 * width + 15] = 500;
+    depth[0] = 100;
+    assert_eq!(ahead_m(&depth, width, &mut scratch), Some(9.0));
+    depth[14 * width + 10..][..10].fill(1500);
+    depth[15 * width + 10..][..10].fill(1500);
+    assert_eq!(ahead_m(&depth, width, &mut scratch), Some(1.5));
+    depth.fill(0);
+    assert_eq!(ahead_m(&depth, width, &mut scratch), None);
+    assert_eq!(ahead_m(&[], 0, &mut scratch), None);
+    assert_eq!(ahead_m(&[1], 30, &mut scratch), None);
+}
+
+#[test]
+fn drawings_hold_every_part_and_only_finite_numbers() {
+    let (arena, field) = room();
+    let sample = |tick: u32| Sample {
+        stamp: at(f64::from(tick) / 200.0),
+        p_world_m: DVec3::new(f64::from(tick) / 100.0, 0.0, 1.0),
+        v_world_mps: DVec3::X * 2.0,
+        yaw_rad: 0.1,
+        clearance_m: 1.0,
+    };
+    let samples: Vec<Sample> = (0..6000).map(sample).collect();
+    let end = samples[5999].stamp;
+    let last = since(&samples, end, 4.0);
+    assert_eq!(last.len(), 801);
+    let slice = field.obstacle_slice(1.0);
+    let top = plot::top_view(&arena, &slice, last, &samples);
+    let course = plot::clearance(last, end);
+    for class in ["class=\"solid\"", "class=\"gate\"", "class=\"way\"", "class=\"end\""] {
+        assert!(top.contains(class), "{class}");
+    }
+    assert!(course.contains("class=\"speed\"") && course.contains("4.0 s before"), "{course}");
+    // Bounded, however long the flight was; styles are the page's, which allows none in place.
+    assert!(top.len() < 60_000, "{}", top.len());
+    for text in
+        [&top, &course, &plot::clearance(&[], end), &plot::top_view(&arena, &slice, &[], &[])]
+    {
+        assert!(
+            !text.contains("NaN") && !text.contains("inf") && !text.contains("style="),
+            "{text}"
+        );
+    }
+}

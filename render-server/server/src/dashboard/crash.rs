@@ -1,0 +1,62 @@
+//! The crash card over HTTP: read by whoever may see the vehicle.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::{Path, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+
+use super::{Page, picture, vehicle};
+
+/// `GET /api/vehicles/V/crash`: the newest card.
+pub(super) async fn show(State(page): State<Arc<Page>>, Path(name): Path<String>) -> Response {
+    let vehicle = match vehicle(&page, &name) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
+    let card = vehicle.crash.borrow().clone();
+    match card {
+        Some(card) => Json(&*card).into_response(),
+        None => {
+            let text = format!("no flight of '{name}' has failed since the server started");
+            (StatusCode::NOT_FOUND, text).into_response()
+        }
+    }
+}
+
+/// Which picture of a moment.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Kind {
+    Colour,
+    Depth,
+}
+
+/// `GET /api/vehicles/V/crash/ID/CAMERA/KIND/N`: an image of a card, as long as it is the newest.
+pub(super) async fn image(
+    State(page): State<Arc<Page>>,
+    Path((name, id, camera, kind, number)): Path<(String, u64, usize, Kind, usize)>,
+) -> Response {
+    let vehicle = match vehicle(&page, &name) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
+    let card = vehicle.crash.borrow().clone();
+    let card = card.filter(|card| card.id == id);
+    let preview = card.as_ref().and_then(|card| card.image(camera, number));
+    match preview.map(|preview| (preview, kind)) {
+        Some((preview, Kind::Colour)) => jpeg(&preview.colour),
+        Some((preview, Kind::Depth)) => jpeg(&preview.depth),
+        None => {
+            (StatusCode::NOT_FOUND, "there is no such image, or another flight has failed since")
+                .into_response()
+        }
+    }
+}
+
+fn jpeg(bytes: &[u8]) -> Response {
+    picture("image/jpeg", Bytes::copy_from_slice(bytes))
+}
