@@ -4,6 +4,12 @@
 mod arena;
 mod bench;
 mod bridge;
+#[cfg(feature = "crazyflie")]
+mod crazyflie;
+// What of it needs no radio is tested in every build.
+#[cfg(all(test, not(feature = "crazyflie")))]
+#[path = "crazyflie/estimate.rs"]
+mod crazyflie_estimate;
 mod demo;
 mod doctor;
 mod fly;
@@ -62,6 +68,8 @@ enum Command {
     Password(password::PasswordArgs),
     /// Finds what is wrong before it flies: the autopilot's parameters, the localization's axes.
     Doctor(doctor::DoctorArgs),
+    #[cfg(feature = "crazyflie")]
+    Crazyflie(crazyflie::CrazyflieArgs),
     /// What is set up on the vehicle once: the key for MAVLink signing.
     Vehicle(vehicle::VehicleArgs),
     /// Teams, runs and standings of the lab's flights.
@@ -118,6 +126,8 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Grade(args) => grade::run(&args),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
+        #[cfg(feature = "crazyflie")]
+        Command::Crazyflie(args) => crazyflie::run(&args),
         Command::Password(args) => password::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Vehicle(args) => vehicle::run(&args),

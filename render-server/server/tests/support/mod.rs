@@ -146,6 +146,11 @@ impl Server {
         }
     }
 
+    /// Returns its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Returns the server's keys folder.
     pub fn keys(&self) -> KeysFolder {
         KeysFolder::open(Some(&self.keys.path().join("keys"))).unwrap()

@@ -1,0 +1,191 @@
+//! Twenty open pages beside four runtimes with two cameras each: no event is lost, memory stays, and
+//! the runtimes keep their images.
+//!
+//! ```text
+//! VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test viewers -- --nocapture
+//! ```
+//! runs it for ten minutes and prints rates and memory; without it, for a few seconds. Rates are
+//! compared in one run, without pages, with them, and without again; no test hangs on them.
+
+mod support;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use quinn::TransportConfig;
+use support::{Client, Emitter, Server, Socket, send_json, write_arena};
+use vizflyt_protocol::messages::ToRuntime;
+
+const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
+const VIEWERS: usize = 20;
+/// A page that is not read is closed by the server after this long; nothing here comes near it.
+const MOST_MEMORY_GROWTH_MB: f64 = 24.0;
+
+/// What one vehicle's runtime has got.
+#[derive(Debug, Default)]
+struct Got {
+    images: [AtomicU64; 2],
+    cameras_changed: AtomicU64,
+}
+
+#[test]
+fn twenty_pages_cost_four_runtimes_no_event() {
+    let seconds = std::env::var("VIZFLYT_STRESS_S").ok().map_or(4, |s| s.parse().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let second = "name = \"down\"\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
+                  position_m = [0, 0, 0]\ntilt_deg = -30.0\nrate_hz = 15.0\n";
+    let vehicles: String =
+        VEHICLES.iter().map(|name| format!("[[vehicles]]\nname = \"{name}\"\n")).collect();
+    let more = format!("rate_hz = 15.0\n[[cameras]]\n{second}{vehicles}");
+    let server = Server::start(&write_arena(folder.path(), &more), &["--apart"]);
+    let _emitters = VEHICLES.map(|name| Emitter::along(server.vicon, name, |_| 0.0));
+
+    let runtimes = tokio::runtime::Runtime::new().unwrap();
+    let got: Vec<Arc<Got>> = VEHICLES.iter().map(|_| Arc::default()).collect();
+    for (name, got) in VEHICLES.iter().zip(&got) {
+        let client = runtimes.block_on(async {
+            let mut quiet = TransportConfig::default();
+            quiet.keep_alive_interval(Some(Duration::from_secs(1)));
+            Client::welcomed_to(&server, name, quiet).await.0
+        });
+        runtimes.spawn(images(client.connection.clone(), got.clone()));
+        runtimes.spawn(messages(client, got.clone()));
+    }
+
+    let rate = |phase: &str, seconds: u64, during: &mut dyn FnMut()| {
+        let count = || -> Vec<u64> {
+            let counters = got.iter().flat_map(|got| &got.images);
+            counters.map(|images| images.load(Ordering::Relaxed)).collect()
+        };
+        let (before, start) = (count(), Instant::now());
+        while start.elapsed() < Duration::from_secs(seconds) {
+            std::thread::sleep(Duration::from_millis(500));
+            during();
+        }
+        let passed_s = start.elapsed().as_secs_f64();
+        let hz: Vec<f64> =
+            count().iter().zip(before).map(|(now, then)| (now - then) as f64 / passed_s).collect();
+        let (sum, least) = (hz.iter().sum::<f64>(), hz.iter().copied().fold(f64::MAX, f64::min));
+        println!("{phase:<16} {sum:6.1} images/s of 8 cameras, the slowest {least:.2} Hz");
+        assert!(least > 0.0, "{phase}: a camera stands still");
+        sum
+    };
+    // The first seconds fill caches and open streams.
+    rate("start", 2, &mut || {});
+    let before = rate("no page", (seconds / 4).max(2), &mut || {});
+
+    let done = Arc::new(AtomicBool::new(false));
+    let pages: Vec<_> = (0..VIEWERS).map(|k| Page::open(&server, VEHICLES[k % 4], &done)).collect();
+    let start_mb = rss_mb(&server);
+    let mut changes = 0;
+    let watched = rate("20 pages", seconds, &mut || {
+        // What each runtime and each page must hear of.
+        changes += 1;
+        for name in VEHICLES {
+            let tilt = format!("{{\"tilt_deg\": {}}}", changes % 2);
+            let path = format!("PATCH /api/vehicles/{name}/cameras/front");
+            let (status, said) = send_json(server.http, &path, None, &tilt);
+            assert_eq!(status, 200, "{said}");
+        }
+    });
+    let end_mb = rss_mb(&server);
+    std::thread::sleep(Duration::from_secs(1));
+    done.store(true, Ordering::Relaxed);
+    let (mut pictures, mut states) = (0, 0);
+    for page in pages {
+        let seen = page.join().unwrap();
+        assert_eq!(seen.changes, changes, "events of a page");
+        assert!(seen.pictures > 0 && seen.states > 0, "{seen:?}");
+        (pictures, states) = (pictures + seen.pictures, states + seen.states);
+    }
+    for (name, got) in VEHICLES.iter().zip(&got) {
+        assert_eq!(got.cameras_changed.load(Ordering::Relaxed), changes, "events of {name}");
+    }
+    let after = rate("no page again", (seconds / 4).max(2), &mut || {});
+    let alone = (before + after) / 2.0;
+    println!(
+        "with 20 pages the runtimes get {:.3} of their images; a page {:.1} pictures and {:.1} states \
+         a second; {changes} events to each, none lost; server {start_mb:.1} -> {end_mb:.1} MB",
+        watched / alone,
+        pictures as f64 / VIEWERS as f64 / seconds as f64,
+        states as f64 / VIEWERS as f64 / seconds as f64,
+    );
+    assert!(end_mb - start_mb < MOST_MEMORY_GROWTH_MB, "{start_mb} -> {end_mb} MB");
+}
+
+/// Counts a runtime's images.
+async fn images(connection: quinn::Connection, got: Arc<Got>) {
+    while let Ok(mut stream) = connection.accept_uni().await {
+        let Ok(bytes) = stream.read_to_end(1 << 22).await else { continue };
+        let (header, _) = vizflyt_protocol::packet::ImageHeader::parse(&bytes).unwrap();
+        got.images[usize::from(header.camera)].fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// Counts what a runtime must be told.
+async fn messages(mut client: Client, got: Arc<Got>) {
+    loop {
+        client.until(|message| matches!(message, ToRuntime::Camera { .. }).then_some(())).await;
+        got.cameras_changed.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// What one page was shown.
+#[derive(Debug, Default)]
+struct Seen {
+    changes: u64,
+    pictures: u64,
+    states: u64,
+}
+
+struct Page;
+
+impl Page {
+    fn open(server: &Server, vehicle: &str, done: &Arc<AtomicBool>) -> JoinHandle<Seen> {
+        let origin = format!("http://{}", server.http);
+        let path = format!("/ws?vehicle={vehicle}");
+        let mut socket = Socket::open_at(server.http, &origin, &path).unwrap();
+        // From here on no event may be missing.
+        let history = socket.message("events");
+        let mut next = 1 + history["events"].as_array().unwrap().iter().fold(0, index_of);
+        let done = done.clone();
+        std::thread::spawn(move || {
+            let mut seen = Seen::default();
+            while !done.load(Ordering::Relaxed) {
+                let (opcode, payload) = socket.next();
+                if opcode == 2 {
+                    seen.pictures += 1;
+                    continue;
+                }
+                let message: serde_json::Value = serde_json::from_slice(&payload).unwrap();
+                match message["type"].as_str() {
+                    Some("state") => seen.states += 1,
+                    Some("events") => {
+                        for event in message["events"].as_array().unwrap() {
+                            let index = index_of(0, event);
+                            assert!(index >= next, "event {index} comes twice or late");
+                            next = index + 1;
+                            let text = event["text"].as_str().unwrap_or_default();
+                            seen.changes += u64::from(text.starts_with("camera front is now"));
+                        }
+                    }
+                    _ => {}
+                }
+            }
+            seen
+        })
+    }
+}
+
+fn index_of(most: u64, event: &serde_json::Value) -> u64 {
+    most.max(event["index"].as_u64().unwrap())
+}
+
+/// Returns the server's resident memory. [MB]
+fn rss_mb(server: &Server) -> f64 {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.id())).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<f64>().unwrap() / 1024.0
+}
