@@ -97,13 +97,29 @@ pub struct SimulatedCamera {
     sensor: Sensor,
     /// Counts the intervals since the clock's zero.
     next: Option<u64>,
+    behind: Option<Behind>,
+}
+
+/// Draws what is behind the tags for a camera that stands somewhere, an image of its own size.
+pub struct Behind(pub Box<dyn FnMut(&Pose<World, Cam>) -> Gray + Send>);
+
+impl std::fmt::Debug for Behind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Behind")
+    }
 }
 
 impl SimulatedCamera {
     /// Makes a camera.
     pub fn new(camera: TagCamera, sensor: Sensor) -> Self {
         let renderer = Renderer::new(camera.intrinsics);
-        Self { camera, renderer, sensor, next: None }
+        Self { camera, renderer, sensor, next: None, behind: None }
+    }
+
+    /// Makes a camera that sees a place behind the tags instead of a cluttered wall.
+    #[must_use]
+    pub fn before(camera: TagCamera, sensor: Sensor, behind: Behind) -> Self {
+        Self { behind: Some(behind), ..Self::new(camera, sensor) }
     }
 
     /// Returns the camera.
@@ -165,7 +181,10 @@ impl SimulatedCamera {
             Mounting::Body(body_from_cam) => ends.map(|pose| pose * body_from_cam),
             Mounting::Unknown => return None,
         };
+        let middle = world_from_cam[0].interpolate(&world_from_cam[1], 0.5);
+        let background = self.behind.as_mut().map(|behind| (behind.0)(&middle));
         let image = self.renderer.render(&Shot {
+            background: background.as_ref(),
             light: self.sensor.light,
             blur_px: self.sensor.blur_px,
             noise: self.sensor.noise,

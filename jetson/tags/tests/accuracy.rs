@@ -1,9 +1,11 @@
 //! Is the vehicle located as well as the lab needs, against known truth? Images are drawn with distortion,
-//! blur of optics and motion, noise, uneven light.
+//! blur of optics and motion, noise, uneven light; before a plain wall, and in the hall as the splat renderer
+//! draws it.
 
 mod flights;
+mod hall;
 
-use flights::{Figures, Path, fly, lemniscate, pose_on, spiral, square};
+use flights::{Figures, Path, fly, lemniscate, locate, pose_on, spiral, square};
 use glam::{DVec2, DVec3};
 use vizflyt_tags::simulated::{Sensor, belly_camera, cube, mat, webcams};
 
@@ -43,6 +45,26 @@ fn two_webcams_locate_the_cube_along_square_spiral_and_lemniscate() {
     assert!((0.05..1.5).contains(&squared), "{squared}");
     // After the first, images are not searched as a whole.
     assert!(looked_at < 0.05 * sets as f64, "{looked_at} of {sets}");
+}
+
+/// The room of the lab full of pictures, windows, edges, drawn through the cameras' own lenses.
+#[test]
+fn the_hall_behind_the_tags_changes_nothing() {
+    let figures =
+        locate(hall::seen_by(webcams(2)), &[cube()], 4.0, |t_s| pose_on(lemniscate, 2.0, t_s));
+    tell("in the hall", &figures);
+    assert!(figures.rms_mm() <= 15.0 && figures.p99_mm() <= 50.0);
+    assert!(figures.rms_deg() <= 1.0);
+    assert!(figures.availability_percent() >= 99.0);
+
+    let mat = mat(DVec2::new(2.5, -1.8), DVec2::new(8.5, 1.8));
+    let over = |s_m: f64| lemniscate(s_m) * DVec3::new(1.0, 1.0, 0.0) + DVec3::Z;
+    let figures =
+        locate(hall::seen_by(vec![belly_camera()]), &[mat], 1.5, |t_s| pose_on(over, 1.0, t_s));
+    tell("over the mat in the hall", &figures);
+    assert!(figures.rms_mm() <= 8.0, "{} mm", figures.rms_mm());
+    assert!(figures.rms_deg() <= 1.0);
+    assert!(figures.availability_percent() >= 99.0);
 }
 
 #[test]

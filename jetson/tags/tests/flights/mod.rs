@@ -109,16 +109,23 @@ pub(crate) fn fly(
     pose_at: impl Fn(f64) -> Pose<World, Body>,
 ) -> Figures {
     let count = cameras.len();
-    let mut locator = Locator::new(cameras.clone(), layouts, LocateSettings::default())
-        .expect("the lab is sound");
-    let mut simulated: Vec<SimulatedCamera> = cameras
-        .into_iter()
-        .enumerate()
-        .map(|(i, camera)| {
-            let phase = if together { 0.0 } else { i as f64 / count as f64 };
-            SimulatedCamera::new(camera, Sensor { phase, ..sensor })
-        })
-        .collect();
+    let simulated = cameras.into_iter().enumerate().map(|(i, camera)| {
+        let phase = if together { 0.0 } else { i as f64 / count as f64 };
+        SimulatedCamera::new(camera, Sensor { phase, ..sensor })
+    });
+    locate(simulated.collect(), layouts, seconds, pose_at)
+}
+
+/// Flies before cameras and locates.
+pub(crate) fn locate(
+    mut simulated: Vec<SimulatedCamera>,
+    layouts: &[TagLayout],
+    seconds: f64,
+    pose_at: impl Fn(f64) -> Pose<World, Body>,
+) -> Figures {
+    let cameras = simulated.iter().map(|camera| camera.camera().clone()).collect();
+    let mut locator =
+        Locator::new(cameras, layouts, LocateSettings::default()).expect("the lab is sound");
     let mut figures = Figures::default();
     let mut truth = Truth::default();
     let start = HostTime::from_ns(5_000_000_000);

@@ -1,0 +1,55 @@
+//! The lab's hall behind the tags: generated splats, drawn by the renderer of the images.
+
+use std::sync::{Arc, Mutex};
+
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+use vizflyt_scenes::{SceneKind, generate};
+use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage};
+use vizflyt_tags::camera::TagCamera;
+use vizflyt_tags::image::Gray;
+use vizflyt_tags::simulated::{Behind, Sensor, SimulatedCamera};
+
+/// Returns the cameras in the hall, spread over the interval as free webcams are.
+pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
+    let hall = Arc::new(Mutex::new(CpuRenderer::new(&generate(SceneKind::Room, 7).splats)));
+    let count = cameras.len() as f64;
+    let seen = cameras.into_iter().enumerate().map(|(i, camera)| {
+        let sensor = Sensor { phase: i as f64 / count, ..Sensor::default() };
+        let behind = drawn(hall.clone(), camera.intrinsics);
+        SimulatedCamera::before(camera, sensor, behind)
+    });
+    seen.collect()
+}
+
+/// Draws for one lens; again only where the camera has moved.
+fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
+    let mut last: Option<(Pose<World, Cam>, Gray)> = None;
+    Behind(Box::new(move |world_from_cam: &Pose<World, Cam>| {
+        if let Some((at, image)) = &last
+            && at == world_from_cam
+        {
+            return image.clone();
+        }
+        let camera = Camera {
+            intrinsics,
+            world_from_cam: *world_from_cam,
+            near_m: 0.05,
+            background: [0.0; 3],
+            air: Air::CLEAR,
+        };
+        let mut images = [RgbdImage::default()];
+        hall.lock()
+            .expect("no test panics here")
+            .render(&[], &[camera], &mut images)
+            .expect("drawn");
+        let mut rgb = Vec::new();
+        images[0].write_rgb8(&mut rgb);
+        let grey =
+            |c: &[u8]| (u32::from(c[0]) * 77 + u32::from(c[1]) * 150 + u32::from(c[2]) * 29) >> 8;
+        let pixels = rgb.chunks_exact(3).map(|c| grey(c) as u8).collect();
+        let image =
+            Gray::new(images[0].width_px, images[0].height_px, pixels).expect("of this size");
+        last = Some((*world_from_cam, image.clone()));
+        image
+    }))
+}
