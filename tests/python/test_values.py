@@ -154,3 +154,23 @@ def test_an_arena_for_tests_is_made_by_hand():
     assert (info.goal_m == [1, 2, 3]).all() and info.limits.max_speed_mps == 2
     assert info.geofence.signed_distance_m([0, 0, 0]) < 0 and info.cameras == []
     assert vizflyt.ArenaInfo().goal_m is None
+    table = vizflyt.Volume.aabb([0, 0, 0], [1, 1, 1])
+    info = vizflyt.ArenaInfo(no_fly=[table], floor_z_m=0.25, setpoints=["position"], attitude_rate=True)
+    assert info.no_fly == [table] and info.floor_z_m == 0.25
+    assert info.setpoints == ["position", "attitude_rate"] and info.attitude_rate
+    assert "velocity" in vizflyt.ArenaInfo().setpoints and not vizflyt.ArenaInfo().attitude_rate
+    with pytest.raises(ValueError, match="'speed' is no kind of setpoint|\"speed\" is no kind of setpoint"):
+        vizflyt.ArenaInfo(setpoints=["speed"])
+    with pytest.raises(ValueError, match="at most 8 no-fly boxes"):
+        vizflyt.ArenaInfo(no_fly=[table] * 9)
+
+
+def test_the_course_s_map_is_every_obstacle(monkeypatch):
+    monkeypatch.delenv("VIZFLYT_MAP", raising=False)
+    assert vizflyt.course_map() is None
+    monkeypatch.setenv("VIZFLYT_MAP", '[{"sphere": {"center_m": [1, 2, 3], "radius_m": 0.5}}]')
+    (ball,) = vizflyt.course_map()
+    assert ball.signed_distance_m([1, 2, 4]) == pytest.approx(0.5)
+    monkeypatch.setenv("VIZFLYT_MAP", "[1]")
+    with pytest.raises(ValueError, match="map.json"):
+        vizflyt.course_map()

@@ -5,8 +5,11 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, PoseAges, bounded};
-use vizflyt_sdk::{ArenaInfo as SdkArenaInfo, CameraInfo as SdkCameraInfo, Limits as SdkLimits};
+use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_NO_FLY, PoseAges, bounded};
+use vizflyt_sdk::{
+    ArenaInfo as SdkArenaInfo, CameraInfo as SdkCameraInfo, Limits as SdkLimits, SetpointKind,
+    SetpointKinds,
+};
 use vizflyt_sdk::{Body, Cam};
 
 use crate::arguments::{array3, vector};
@@ -116,14 +119,16 @@ pub(crate) struct ArenaInfo(pub(crate) SdkArenaInfo);
 impl ArenaInfo {
     #[new]
     #[pyo3(signature = (
-        *, name = "test", geofence = None, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
+        *, name = "test", geofence = None, no_fly = Vec::new(), floor_z_m = 0.0, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
         goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, ground_truth = true,
-        attitude_rate = false, cameras = Vec::new()
+        attitude_rate = false, setpoints = None, cameras = Vec::new()
     ))]
     #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
     fn make(
         name: &str,
         geofence: Option<Volume>,
+        no_fly: Vec<Volume>,
+        floor_z_m: f64,
         limits: Option<Limits>,
         body_radius_m: f64,
         takeoff_height_m: f64,
@@ -132,8 +137,22 @@ impl ArenaInfo {
         time_limit_s: f64,
         ground_truth: bool,
         attitude_rate: bool,
+        setpoints: Option<Vec<String>>,
         cameras: Vec<CameraInfo>,
     ) -> PyResult<Self> {
+        if no_fly.len() > MAX_NO_FLY {
+            return Err(PyValueError::new_err(format!(
+                "an arena has at most {MAX_NO_FLY} no-fly boxes, not {}",
+                no_fly.len()
+            )));
+        }
+        let mut kinds = match setpoints {
+            Some(names) => names.iter().map(|name| kind(name)).collect::<PyResult<_>>()?,
+            None => SetpointKinds::USUAL,
+        };
+        if attitude_rate {
+            kinds = kinds.with(SetpointKind::AttitudeRate);
+        }
         if cameras.len() > MAX_CAMERAS {
             return Err(PyValueError::new_err(format!(
                 "a vehicle has at most {MAX_CAMERAS} cameras, not {}",
@@ -145,8 +164,8 @@ impl ArenaInfo {
         Ok(Self(SdkArenaInfo {
             name: bounded(name),
             geofence: geofence.map_or(everywhere, |volume| volume.0),
-            no_fly: [].into_iter().collect(),
-            floor_z_m: 0.0,
+            no_fly: no_fly.into_iter().map(|volume| volume.0).collect(),
+            floor_z_m,
             limits: limits.map_or(usual, |limits| limits.0),
             body_radius_m,
             takeoff_height_m,
@@ -155,7 +174,7 @@ impl ArenaInfo {
             time_limit_s,
             ground_truth,
             pose_ages: PoseAges::default(),
-            attitude_rate,
+            setpoints: kinds,
             cameras: cameras.into_iter().map(|camera| camera.0).collect(),
         }))
     }
@@ -170,6 +189,18 @@ impl ArenaInfo {
     #[getter]
     fn geofence(&self) -> Volume {
         Volume(self.0.geofence)
+    }
+
+    /// Keep-out volumes of the body's surface. [world]
+    #[getter]
+    fn no_fly(&self) -> Vec<Volume> {
+        self.0.no_fly.iter().copied().map(Volume).collect()
+    }
+
+    /// Height of the floor. [m, world]
+    #[getter]
+    fn floor_z_m(&self) -> f64 {
+        self.0.floor_z_m
     }
 
     /// Limits of motion.
@@ -217,7 +248,14 @@ impl ArenaInfo {
     /// Whether the plugin may ask for `Setpoint.attitude_rate`.
     #[getter]
     fn attitude_rate(&self) -> bool {
-        self.0.attitude_rate
+        self.0.setpoints.contains(SetpointKind::AttitudeRate)
+    }
+
+    /// Kinds of setpoint that the plugin may ask for, of 'position', 'velocity', 'acceleration',
+    /// 'offset', 'attitude_rate' and 'trajectory'; hold, land and take_off it always may.
+    #[getter]
+    fn setpoints(&self) -> Vec<&'static str> {
+        self.0.setpoints.iter().map(SetpointKind::name).collect()
     }
 
     /// The vehicle's cameras.
@@ -234,4 +272,23 @@ impl ArenaInfo {
             self.0.goal_m.map(|goal_m| goal_m.to_array())
         )
     }
+}
+
+/// Returns every obstacle of the course, where its map is known; None where it is not. [world]
+///
+/// # Errors
+/// `ValueError` for a map that cannot be read.
+#[pyfunction]
+pub(crate) fn course_map() -> PyResult<Option<Vec<Volume>>> {
+    let map = vizflyt_sdk::map().map_err(|error| PyValueError::new_err(error.to_string()))?;
+    Ok(map.map(|volumes| volumes.into_iter().map(Volume).collect()))
+}
+
+/// Returns the kind of setpoint of a name.
+fn kind(name: &str) -> PyResult<SetpointKind> {
+    let known = SetpointKind::ALL.into_iter().find(|kind| kind.name() == name);
+    known.ok_or_else(|| {
+        let all = SetpointKinds::ALL;
+        PyValueError::new_err(format!("{name:?} is no kind of setpoint; there are: {all}"))
+    })
 }

@@ -22,7 +22,7 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _vizflyt {
     #[pymodule_export]
-    use crate::arena::{ArenaInfo, CameraInfo, Limits};
+    use crate::arena::{ArenaInfo, CameraInfo, Limits, course_map};
     #[pymodule_export]
     use crate::buffer::ObservationBuffer;
     #[pymodule_export]

@@ -46,6 +46,9 @@ pub struct FlyArgs {
     /// The vehicle's name in the localization system [default: vizflyt]
     #[arg(long)]
     pub vehicle: Option<String>,
+    /// The map of a course whose map is known (map.json), for the plugin
+    #[arg(long, value_name = "FILE")]
+    pub map: Option<PathBuf>,
     /// Folder for flight logs (MCAP)
     #[arg(long, value_name = "DIR", default_value = "flights")]
     pub log: PathBuf,

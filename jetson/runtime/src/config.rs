@@ -168,6 +168,7 @@ impl PluginConfig {
             network: self.network,
             user: self.user.clone(),
             write: self.write.clone(),
+            map: None,
             hide: Vec::new(),
         }
     }

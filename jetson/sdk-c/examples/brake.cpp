@@ -18,7 +18,9 @@ void on_start(void *user, const VizflytArena *arena) {
     self->max_speed_mps = std::min(1.0, arena->max_speed_mps);
     for (unsigned i = 0; i < arena->camera_count; ++i)
         if (std::strcmp(arena->cameras[i], "front") == 0) self->camera = i;
-    std::printf("flying in %s\n", arena->name);
+    std::printf("flying in %s: floor at %g m, %u no-fly boxes, a map of %u, velocities %s\n",
+                arena->name, arena->floor_z_m, arena->no_fly_count, arena->map_count,
+                arena->setpoints & (1u << VIZFLYT_VELOCITY) ? "allowed" : "refused");
     std::fflush(stdout);
 }
 

@@ -33,6 +33,7 @@ extern "C" {
 #define VIZFLYT_MAX_IMU 64
 #define VIZFLYT_MAX_WAYPOINTS 32
 #define VIZFLYT_MAX_PIECES 8
+#define VIZFLYT_MAX_NO_FLY 8
 
 /* ---- an observation, as it lies in shared memory; valid during on_image ---- */
 
@@ -144,6 +145,23 @@ typedef struct VizflytSetpoint {
 
 /* ---- the plugin ---- */
 
+enum {
+    VIZFLYT_SPHERE = 0,    /* a: centre, radius_m */
+    VIZFLYT_CAPSULE = 1,   /* a, b: ends of the axis, radius_m */
+    VIZFLYT_BOX = 2,       /* a: centre, b: half of each side, rotation_xyzw: of the box into the world */
+    VIZFLYT_HALF_SPACE = 3 /* a: normal, radius_m: offset; all points with normal . p <= offset */
+};
+
+/* A solid in the world. [m] */
+typedef struct VizflytVolume {
+    uint32_t kind;
+    uint32_t reserved;
+    double a[3];
+    double b[3];
+    double radius_m;
+    double rotation_xyzw[4];
+} VizflytVolume;
+
 typedef struct VizflytArena {
     uint32_t camera_count;
     uint32_t has_goal;
@@ -154,6 +172,15 @@ typedef struct VizflytArena {
     uint32_t attitude_rate; /* 1: VIZFLYT_ATTITUDE_RATE is allowed */
     char name[33];
     char cameras[VIZFLYT_MAX_CAMERAS][33]; /* their names, by index */
+    /* Kinds of setpoint that the course allows: 1 << VIZFLYT_POSITION and so on; trajectories of both
+     * kinds are 1 << VIZFLYT_WAYPOINTS. To hold, land and take off is always allowed. */
+    uint32_t setpoints;
+    double floor_z_m;         /* height of the floor, world */
+    VizflytVolume geofence;   /* keep the body's surface in it */
+    uint32_t no_fly_count;
+    uint32_t map_count;       /* 0: the map is not known */
+    VizflytVolume no_fly[VIZFLYT_MAX_NO_FLY]; /* keep the body's surface out of them */
+    const VizflytVolume *map; /* every obstacle, where the map is known; valid during on_start */
 } VizflytArena;
 
 /* All are called from the thread of vizflyt_run, one at a time. None may let an exception out, nor

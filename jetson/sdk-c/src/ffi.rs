@@ -3,12 +3,12 @@
 use std::ffi::{CString, c_char, c_int, c_void};
 use std::process::ExitCode;
 
-use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_PIECES, MAX_WAYPOINTS};
+use vizflyt_sdk::glam::{DQuat, DVec3};
+use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_NO_FLY, MAX_PIECES, MAX_WAYPOINTS};
 use vizflyt_sdk::protocol::packet::ObservationHeader;
 use vizflyt_sdk::{
-    ArenaInfo, Autonomy, Axes, Event, Observation, Path, PathYaw, Piece, Setpoint, Trajectory,
-    Waypoint, YawTarget,
+    ArenaInfo, Autonomy, Axes, Event, Observation, Path, PathYaw, Piece, Setpoint, SetpointKind,
+    Trajectory, Volume, Waypoint, YawTarget,
 };
 
 /// A point to pass.
@@ -59,6 +59,39 @@ pub struct VizflytSetpoint {
     pub pieces: *const VizflytPiece,
 }
 
+/// A solid.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct VizflytVolume {
+    /// `VIZFLYT_SPHERE` and so on.
+    pub kind: u32,
+    /// Zero.
+    pub reserved: u32,
+    /// By kind. [m, world]
+    pub a: [f64; 3],
+    /// By kind.
+    pub b: [f64; 3],
+    /// Of a sphere and a capsule; the offset of a half space. [m]
+    pub radius_m: f64,
+    /// Of a box into the world.
+    pub rotation_xyzw: [f64; 4],
+}
+
+impl From<&Volume> for VizflytVolume {
+    fn from(volume: &Volume) -> Self {
+        let zero = DVec3::ZERO;
+        let level = DQuat::IDENTITY;
+        let (kind, a, b, radius_m, rotation) = match *volume {
+            Volume::Sphere { center_m, radius_m } => (0, center_m, zero, radius_m, level),
+            Volume::Capsule { a_m, b_m, radius_m } => (1, a_m, b_m, radius_m, level),
+            Volume::Cuboid { center_m, half_m, rotation } => (2, center_m, half_m, 0.0, rotation),
+            Volume::HalfSpace { normal, offset_m } => (3, normal, zero, offset_m, level),
+        };
+        let rotation_xyzw = rotation.to_array();
+        Self { kind, reserved: 0, a: a.to_array(), b: b.to_array(), radius_m, rotation_xyzw }
+    }
+}
+
 /// What a plugin is told at the start.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
@@ -81,6 +114,20 @@ pub struct VizflytArena {
     pub name: [u8; 33],
     /// The cameras' names, each ending in 0.
     pub cameras: [[u8; 33]; MAX_CAMERAS],
+    /// Kinds of setpoint that may be asked for: bit `VIZFLYT_POSITION` and so on.
+    pub setpoints: u32,
+    /// Height of the floor. [m, world]
+    pub floor_z_m: f64,
+    /// Keep-in volume of the body's surface.
+    pub geofence: VizflytVolume,
+    /// Keep-out volumes there are.
+    pub no_fly_count: u32,
+    /// Of the map; 0 where it is not known.
+    pub map_count: u32,
+    /// Keep-out volumes of the body's surface.
+    pub no_fly: [VizflytVolume; MAX_NO_FLY],
+    /// Every obstacle, where the course's map is known.
+    pub map: *const VizflytVolume,
 }
 
 /// A plugin's callbacks.
@@ -123,6 +170,18 @@ pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
 
 const NOT_ATTACHED: c_int = 2;
 
+/// Returns the number of a kind of setpoint in `vizflyt.h`; both kinds of trajectory have the first's.
+fn number(kind: SetpointKind) -> u32 {
+    match kind {
+        SetpointKind::Position => 2,
+        SetpointKind::Velocity => 3,
+        SetpointKind::Acceleration => 4,
+        SetpointKind::Offset => 5,
+        SetpointKind::AttitudeRate => 6,
+        SetpointKind::Trajectory => 8,
+    }
+}
+
 struct CPlugin(VizflytPlugin);
 
 impl Autonomy for CPlugin {
@@ -132,6 +191,17 @@ impl Autonomy for CPlugin {
         for (name, camera) in cameras.iter_mut().zip(&info.cameras) {
             *name = zero_ended(&camera.name);
         }
+        let map: Vec<VizflytVolume> = match vizflyt_sdk::map() {
+            Ok(map) => map.iter().flatten().map(VizflytVolume::from).collect(),
+            Err(error) => {
+                eprintln!("{error}");
+                Vec::new()
+            }
+        };
+        let mut no_fly = [VizflytVolume::from(&info.geofence); MAX_NO_FLY];
+        for (slot, volume) in no_fly.iter_mut().zip(&info.no_fly) {
+            *slot = volume.into();
+        }
         let arena = VizflytArena {
             camera_count: info.cameras.len() as u32,
             has_goal: info.goal_m.is_some().into(),
@@ -139,9 +209,16 @@ impl Autonomy for CPlugin {
             max_speed_mps: info.limits.max_speed_mps,
             max_acceleration_mps2: info.limits.max_acceleration_mps2,
             ground_truth: info.ground_truth.into(),
-            attitude_rate: info.attitude_rate.into(),
+            attitude_rate: info.setpoints.contains(SetpointKind::AttitudeRate).into(),
             name: zero_ended(&info.name),
             cameras,
+            setpoints: info.setpoints.iter().fold(0, |bits, kind| bits | 1 << number(kind)),
+            floor_z_m: info.floor_z_m,
+            geofence: (&info.geofence).into(),
+            no_fly_count: info.no_fly.len() as u32,
+            map_count: map.len() as u32,
+            no_fly,
+            map: if map.is_empty() { std::ptr::null() } else { map.as_ptr() },
         };
         // SAFETY: the callback keeps to `vizflyt.h`; `arena` outlives the call.
         unsafe { on_start(self.0.user, &raw const arena) }

@@ -51,8 +51,8 @@ fn arena() -> ArenaInfo {
     ArenaInfo {
         name: bounded("hall"),
         geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
+        no_fly: [Volume::aabb(DVec3::ZERO, DVec3::ONE)].into_iter().collect(),
+        floor_z_m: 0.25,
         limits: Limits::new(3.0, 4.0),
         body_radius_m: 0.1,
         takeoff_height_m: 1.0,
@@ -61,7 +61,7 @@ fn arena() -> ArenaInfo {
         time_limit_s: 0.0,
         ground_truth: false,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         // The plugin looks for its camera by name.
         cameras: ["rear", "front"]
             .map(|name| CameraInfo {
@@ -93,6 +93,10 @@ impl Rig {
         let ipc = RuntimeEnd::create(&service, ObservationWriter::len_for(&arena().cameras));
         let child = Command::new(program)
             .arg(format!("{SERVICE_OPTION}={service}"))
+            .env(
+                vizflyt_sdk::MAP_VARIABLE,
+                r#"[{"sphere": {"center_m": [1, 2, 3], "radius_m": 0.5}}]"#,
+            )
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
@@ -151,5 +155,8 @@ fn a_cpp_plugin_attaches_sees_and_answers() {
     let mut said = String::new();
     std::io::Read::read_to_string(rig.child.stdout.as_mut().unwrap(), &mut said).unwrap();
     assert!(rig.child.wait().unwrap().success());
-    assert_eq!(said, "flying in hall\nstopped after 3 images\n");
+    assert_eq!(
+        said,
+        "flying in hall: floor at 0.25 m, 1 no-fly boxes, a map of 1, velocities allowed\nstopped after 3 images\n"
+    );
 }

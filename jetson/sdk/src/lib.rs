@@ -30,6 +30,7 @@
 mod autonomy;
 mod clock;
 pub mod ipc;
+mod map;
 #[cfg(feature = "opencv")]
 mod mat;
 mod memory;
@@ -44,12 +45,13 @@ pub use vizflyt_protocol as protocol;
 pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 pub use vizflyt_protocol::messages::{
     ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Path, PathYaw, Piece,
-    Setpoint, Trajectory, Waypoint, YawTarget,
+    Setpoint, SetpointKind, SetpointKinds, Trajectory, Waypoint, YawTarget,
 };
 pub use vizflyt_protocol::time::HostTime;
 
 pub use autonomy::Autonomy;
 pub use clock::host_now;
+pub use map::{MapError, VARIABLE as MAP_VARIABLE, map, parse_map};
 pub use memory::{
     ImageStamps, ObservationBuffer, ObservationTooLarge, ObservationWriter, PlanesMut,
 };

@@ -10,7 +10,9 @@ use std::path::{Path, PathBuf};
 use glam::{DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Body, Pose, Volume, World};
-use vizflyt_protocol::messages::{ArenaInfo, Limits, MAX_CAMERAS, MAX_NO_FLY, PoseAges, bounded};
+use vizflyt_protocol::messages::{
+    ArenaInfo, Limits, MAX_CAMERAS, MAX_NO_FLY, PoseAges, SetpointKind, SetpointKinds, bounded,
+};
 
 use crate::pose::PoseConfig;
 
@@ -245,6 +247,12 @@ impl ArenaConfig {
         Pose::new(self.spawn.position_m, DQuat::from_rotation_z(yaw_rad))
     }
 
+    /// Returns what plugins may ask for.
+    pub fn setpoints(&self) -> SetpointKinds {
+        let allowed = self.rules.setpoints.unwrap_or(SetpointKinds::USUAL);
+        if self.attitude_rate { allowed.with(SetpointKind::AttitudeRate) } else { allowed }
+    }
+
     /// Returns what the runtime must know. Of a validated config nothing is cut.
     pub fn info(&self) -> ArenaInfo {
         ArenaInfo {
@@ -263,7 +271,7 @@ impl ArenaConfig {
                 hold_after_s: self.pose.hold_after_s,
                 land_after_s: self.pose.land_after_s,
             },
-            attitude_rate: self.attitude_rate,
+            setpoints: self.setpoints(),
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
         }
     }

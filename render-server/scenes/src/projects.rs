@@ -13,7 +13,7 @@ use core::str::FromStr;
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{CameraConfig, RulesConfig};
-use vizflyt_protocol::messages::Limits;
+use vizflyt_protocol::messages::{Limits, SetpointKinds};
 
 use crate::hall::{self, Layout};
 use crate::variant::Variant;
@@ -124,6 +124,9 @@ struct Levels {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Suite {
+    /// What plugins may ask for, if not what `[rules]` says.
+    #[serde(default)]
+    setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
 }
 
@@ -198,7 +201,10 @@ impl Project {
             time_limit_s: plan.time_limit_s,
             ground_truth: plan.ground_truth,
             limits: plan.limits,
-            rules: plan.rules,
+            rules: RulesConfig {
+                setpoints: suite.setpoints.or(plan.rules.setpoints),
+                ..plan.rules
+            },
             cameras: suite.cameras.clone(),
             environment: variant.environment(),
             goal: arena.goal.filter(|_| plan.finish == Finish::Goal),
@@ -220,7 +226,25 @@ const FILES: [(&str, &str); 5] = [
 
 #[cfg(test)]
 mod tests {
+    use vizflyt_protocol::messages::SetpointKind;
+
     use super::*;
+
+    #[test]
+    fn the_known_map_is_flown_by_points_and_by_graduates_by_velocities() {
+        let project = Project::all().find(|project| project.name() == "p2").unwrap();
+        let allows = |level, kind| {
+            let arena = project.generate(3, level, Variant::DAY).arena;
+            arena.info().setpoints.contains(kind)
+        };
+        for level in Level::ALL {
+            assert!(
+                allows(level, SetpointKind::Position) && allows(level, SetpointKind::Trajectory)
+            );
+            assert_eq!(allows(level, SetpointKind::Velocity), level == Level::G);
+            assert!(!allows(level, SetpointKind::AttitudeRate));
+        }
+    }
 
     #[test]
     fn every_project_makes_a_valid_arena() {

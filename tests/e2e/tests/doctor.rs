@@ -70,8 +70,8 @@ fn the_arena_becomes_the_autopilots_fence() {
     let mut arena = std::fs::read_to_string(&path).unwrap();
     let boxes = [("pillar", "-0.5", "3.65"), ("table", "0.0", "0.9")];
     for (name, bottom, top) in boxes {
-        arena += &format!(
-            "\n[[no_fly]]\nname = \"{name}\"\nmin_m = [6.0, 1.0, {bottom}]\nmax_m = [7.0, 1.5, {top}]\n"
+        arena = format!(
+            "{arena}\n[[no_fly]]\nname = \"{name}\"\nmin_m = [6.0, 1.0, {bottom}]\nmax_m = [7.0, 1.5, {top}]\n"
         );
     }
     std::fs::write(&path, arena).unwrap();

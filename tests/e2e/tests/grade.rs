@@ -103,6 +103,30 @@ fn two_runs_give_the_same_grade_whatever_runs_beside_them_and_parts_make_the_who
     rig.refused(&["verify", &whole], "was changed after it was signed");
 }
 
+#[test]
+fn the_race_is_flown_from_images_and_refused_without_depth() {
+    let rig = Rig::new();
+    let race = ["race", "--project=p5", "--seeds=1", "--json"];
+    let grade = rig.grade(&race);
+    let run = &grade["runs"][0];
+    assert_eq!(run["outcome"], "finished", "{run}");
+    assert_eq!(run["stages_passed"], 4, "{run}");
+    // Colour alone: it says so before it takes off, and what would do.
+    let grade = rig.grade(&[&race[..], &["--level=g"]].concat());
+    let run = &grade["runs"][0];
+    assert_eq!(run["outcome"], "plugin_failed", "{run}");
+    let cause = run["cause"].as_str().unwrap_or_default();
+    assert!(cause.contains("race needs depth") && cause.contains("--level ug"), "{run}");
+}
+
+#[test]
+fn the_known_map_is_flown_by_points() {
+    let rig = Rig::new();
+    // The example asks for velocities where it may, and for points here.
+    let grade = rig.grade(&["avoid", "--project=p2", "--seeds=1", "--image-rate=15", "--json"]);
+    assert_eq!(grade["runs"][0]["outcome"], "finished", "{grade}");
+}
+
 /// Writes a plugin that is a shell script, and returns its path.
 fn script(rig: &Rig, name: &str, text: &str) -> String {
     use std::os::unix::fs::PermissionsExt;

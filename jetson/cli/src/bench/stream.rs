@@ -399,7 +399,7 @@ fn arena() -> ArenaInfo {
         time_limit_s: 0.0,
         ground_truth: true,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
         cameras: [].into_iter().collect(),
     }
 }

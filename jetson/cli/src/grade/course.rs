@@ -25,6 +25,8 @@ pub(crate) struct Place {
     pub field: Arc<DistanceField>,
     /// That, and what moves; its clock is 0 at the start of a flight.
     pub obstacles: Obstacles,
+    /// The map that plugins may know, as JSON, where it is known.
+    pub map: Option<String>,
     /// SHA-256 of what cameras see.
     pub scene_sha256: String,
     /// SHA-256 of the rules: the project's file and the arena's.
@@ -51,6 +53,8 @@ impl Place {
         hash.update([0]);
         hash.update(rules);
         let field = Arc::new(baked.field);
+        let truth = Some(&generated.truth).filter(|_| generated.map_is_known);
+        let map = truth.map(serde_json::to_string).transpose().context("the map has no text")?;
         let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
         Ok(Self {
             scene_sha256: hash_of(&generated.splats, &generated.objects),
@@ -58,6 +62,7 @@ impl Place {
             arena: generated.arena,
             splats: generated.splats,
             objects: generated.objects,
+            map,
             field,
             obstacles,
         })

@@ -218,6 +218,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<Done>> {
         let named = || format!("seed {seed}, {variant}");
         let place = Place::make(&project, args.level, variant, seed).with_context(named)?;
+        let limits = PluginLimits { map: place.map.clone(), ..limits.clone() };
         let (place, command, limits) = (&place, &command[..], &limits);
         let trial = Trial { place, seed, command, limits, answer_within, delays, stop };
         let Some(flown) = trial.fly().with_context(named)? else { return Ok(None) };

@@ -257,6 +257,9 @@ impl Show {
             format!("--log={}", flight.log.display()).into(),
             self.log_level.clone(),
         ]);
+        if let Some(map) = &stage.map {
+            fly.push(format!("--map={}", map.display()).into());
+        }
         if !flight.plugin_arguments.is_empty() {
             fly.push("--".into());
             fly.extend(flight.plugin_arguments.iter().cloned());

@@ -17,6 +17,8 @@ pub(crate) struct Stage {
     pub arena: PathBuf,
     /// True geometry, where the scene was generated.
     pub truth: Option<PathBuf>,
+    /// The map that plugins may know, where it is known.
+    pub map: Option<PathBuf>,
     /// Where the vehicle stands: `x,y,z,yaw_deg`. [m, world; deg]
     pub spawn: String,
     /// Corners of the fence. [m, world]
@@ -60,6 +62,7 @@ impl Stage {
         Ok(Self {
             arena: path.to_owned(),
             truth: None,
+            map: None,
             spawn: spawn(&arena),
             fence_m: fence_m(&arena),
             folder: None,
@@ -77,7 +80,8 @@ impl Stage {
         let config =
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
-        Ok(Self { arena, truth, spawn: spawn(&config), fence_m: fence_m(&config), folder })
+        let map = Some(arena.with_file_name("map.json")).filter(|path| path.exists());
+        Ok(Self { arena, truth, map, spawn: spawn(&config), fence_m: fence_m(&config), folder })
     }
 }
 

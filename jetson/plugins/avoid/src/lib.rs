@@ -21,7 +21,7 @@ pub mod steer;
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, Body, CameraImage, Event, EventKind, HostTime, Observation, Pose,
-    Setpoint, Vehicle, World, YawTarget,
+    Setpoint, SetpointKind, Vehicle, World, YawTarget,
 };
 
 use field::{Field, Surroundings};
@@ -141,10 +141,13 @@ impl Avoid {
 
         let climb_mps = (CLIMB_PER_S * (goal_m.z - p_m.z)).clamp(-CLIMB_MPS, CLIMB_MPS);
         let look = if wanted_mps.length() > LOOK_MPS { wanted_mps } else { to_goal_m };
-        Some(Setpoint::velocity(
-            self.setpoint_mps.extend(climb_mps),
-            YawTarget::Angle(look.to_angle()),
-        ))
+        let v_mps = self.setpoint_mps.extend(climb_mps);
+        let yaw = YawTarget::Angle(look.to_angle());
+        if arena.setpoints.contains(SetpointKind::Velocity) {
+            return Some(Setpoint::velocity(v_mps, yaw));
+        }
+        // A course of points: one as far ahead as the guard flies to at this speed.
+        Some(Setpoint::Position { p_world_m: p_m + v_mps / POINT_PER_S, yaw })
     }
 }
 
@@ -183,6 +186,8 @@ const BLIND_S: f64 = 0.3;
 /// Height is corrected with a time constant of 0.7 s, no faster than 1 m/s.
 const CLIMB_PER_S: f64 = 1.5;
 const CLIMB_MPS: f64 = 1.0;
+/// The guard flies to a point with its distance times this, at most. [1/s]
+const POINT_PER_S: f64 = 0.8;
 /// Slower than this the direction of travel means nothing, and the nose turns to the goal. [m/s]
 const LOOK_MPS: f64 = 0.3;
 

@@ -23,7 +23,7 @@ fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
         time_limit_s: 0.0,
         ground_truth: true,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         cameras: [front].into_iter().collect(),
     }
 }

@@ -58,6 +58,9 @@ pub struct Race {
     searching_s: Option<f64>,
     /// Asked for last. [m/s, home]
     setpoint_mps: DVec3,
+    /// Whether depth has ever come with an image, and how many images came without before.
+    has_depth: bool,
+    without_depth: u32,
     /// Number of the image seen last.
     seen: Option<u64>,
     last_s: Option<f64>,
@@ -77,6 +80,9 @@ impl Autonomy for Race {
         }
         // Another camera's image has come: this one has been answered.
         if self.seen.replace(camera.seq) == Some(camera.seq) {
+            return None;
+        }
+        if !self.has_depth(&camera) {
             return None;
         }
         Some(self.decide(&vehicle, &camera))
@@ -119,6 +125,21 @@ impl Race {
     /// Returns how the hand turns, once that is known.
     pub fn hand(&self) -> Option<&hand::Motion> {
         self.hand.motion()
+    }
+
+    /// Whether images come with depth; until one has, nothing is answered and the vehicle stays on the
+    /// ground.
+    ///
+    /// # Panics
+    /// If none has for a second: it cannot fly here, and the runtime tells the person this sentence.
+    fn has_depth(&mut self, camera: &CameraImage<'_>) -> bool {
+        self.has_depth |= camera.depth_mm.iter().any(|&depth_mm| depth_mm > 0);
+        self.without_depth += u32::from(!self.has_depth);
+        assert!(
+            self.has_depth || self.without_depth < PATIENCE,
+            "race needs depth, and this course's level gives colour alone (g); fly it with --level ug"
+        );
+        self.has_depth
     }
 
     fn decide(&mut self, vehicle: &Vehicle, camera: &CameraImage<'_>) -> Setpoint {
@@ -238,6 +259,9 @@ impl Race {
     }
 }
 
+/// So many images without any depth, and there is none: a second of them. A camera that is covered
+/// shows none for a while.
+const PATIENCE: u32 = 30;
 /// Images farther apart than this are a gap, not a step. [s]
 const MAX_DT_S: f64 = 0.1;
 /// Ahead and sideways together. [m/s]

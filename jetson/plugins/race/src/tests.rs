@@ -26,13 +26,18 @@ fn arena() -> ArenaInfo {
         time_limit_s: 0.0,
         ground_truth: false,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         cameras: [front].into_iter().collect(),
     }
 }
 
 /// One observation with a floor 1 m below and a wall 6.4 m ahead.
 fn see(plugin: &mut Race, ms: u64, attitude: DQuat) -> Option<Setpoint> {
+    see_at(plugin, ms, attitude, 32_000.0)
+}
+
+/// As [`see`], the floor and the wall by so much nearer or farther; 0 is no depth at all.
+fn see_at(plugin: &mut Race, ms: u64, attitude: DQuat, far_mm: f64) -> Option<Setpoint> {
     let arena = arena();
     let mut buffer = ObservationBuffer::new(&arena.cameras);
     let stamp = HostTime::from_ns(ms * 1_000_000);
@@ -48,7 +53,7 @@ fn see(plugin: &mut Race, ms: u64, attitude: DQuat) -> Option<Setpoint> {
         planes.rgb.fill(120);
         for (at, depth_mm) in planes.depth_mm.iter_mut().enumerate() {
             let slope = (at / 64) as f64 + 0.5 - 24.0;
-            *depth_mm = (32_000.0 / slope.max(5.0)) as u16;
+            *depth_mm = (far_mm / slope.max(5.0)) as u16;
         }
     });
     plugin.on_image(&buffer.observation())
@@ -71,6 +76,25 @@ fn with_nothing_to_fly_through_it_stays_and_looks_about() {
     let most = looks_rad.iter().fold(0.0_f64, |most, look| most.max(*look));
     let least = looks_rad.iter().fold(0.0_f64, |least, look| least.min(*look));
     assert!(most > 0.8 && least < -0.8, "it looks from {least} to {most} rad");
+}
+
+#[test]
+fn without_depth_it_says_so_and_stays_on_the_ground() {
+    let mut plugin = Race::default();
+    plugin.on_start(&arena());
+    for step in 0..u64::from(PATIENCE) - 1 {
+        assert_eq!(see_at(&mut plugin, 1000 + 40 * step, DQuat::IDENTITY, 0.0), None);
+    }
+    let mut other = plugin.clone();
+    let ends = std::panic::catch_unwind(move || see_at(&mut other, 9000, DQuat::IDENTITY, 0.0));
+    let sentence = ends.unwrap_err();
+    let sentence = sentence.downcast_ref::<&str>().expect("a sentence");
+    assert!(sentence.contains("colour alone (g)") && sentence.contains("--level ug"), "{sentence}");
+    // A camera that is uncovered in time flies; later it may be covered for as long as it is.
+    assert!(see(&mut plugin, 9000, DQuat::IDENTITY).is_some());
+    for step in 0..u64::from(2 * PATIENCE) {
+        assert!(see_at(&mut plugin, 9040 + 40 * step, DQuat::IDENTITY, 0.0).is_some());
+    }
 }
 
 #[test]

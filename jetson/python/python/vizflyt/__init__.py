@@ -42,6 +42,7 @@ from ._vizflyt import (
     Vehicle,
     Volume,
     __version__,
+    course_map,
 )
 
 __all__ = [
@@ -63,5 +64,6 @@ __all__ = [
     "Vehicle",
     "Volume",
     "__version__",
+    "course_map",
     "run",
 ]

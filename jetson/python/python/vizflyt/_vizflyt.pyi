@@ -25,6 +25,8 @@ class ArenaInfo:
         *,
         name: str = "test",
         geofence: Volume | None = None,
+        no_fly: Sequence[Volume] = ...,
+        floor_z_m: float = 0.0,
         limits: Limits | None = None,
         body_radius_m: float = 0.12,
         takeoff_height_m: float = 1.0,
@@ -33,6 +35,7 @@ class ArenaInfo:
         time_limit_s: float = 0.0,
         ground_truth: bool = True,
         attitude_rate: bool = False,
+        setpoints: Sequence[str] | None = None,
         cameras: Sequence[CameraInfo] = ...,
     ) -> ArenaInfo: ...
     @property
@@ -42,6 +45,14 @@ class ArenaInfo:
     @property
     def geofence(self) -> Volume:
         """Keep-in volume of the body's surface. [world]"""
+
+    @property
+    def no_fly(self) -> list[Volume]:
+        """Keep-out volumes of the body's surface. [world]"""
+
+    @property
+    def floor_z_m(self) -> float:
+        """Height of the floor. [m, world]"""
 
     @property
     def limits(self) -> Limits:
@@ -73,6 +84,12 @@ class ArenaInfo:
     @property
     def attitude_rate(self) -> bool:
         """Whether the plugin may ask for `Setpoint.attitude_rate`."""
+
+    @property
+    def setpoints(self) -> list[str]:
+        """Kinds of setpoint that the plugin may ask for, of 'position', 'velocity', 'acceleration',
+        'offset', 'attitude_rate' and 'trajectory'; hold, land and take_off it always may."""
+
     @property
     def cameras(self) -> list[CameraInfo]:
         """The vehicle's cameras."""
@@ -553,6 +570,9 @@ class Intrinsics:
         """Returns where a point (3,) [m, cam] lies in the image: shape (2,) [px]; of points (N, 3), shape (N, 2).
         NaN for what lies behind the camera or out of the lens's reach.
         """
+
+def course_map() -> list[Volume] | None:
+    """Returns every obstacle of the course, where its map is known; None where it is not. [world]"""
 
 @final
 class Volume:

@@ -51,7 +51,7 @@ pub(crate) fn arena() -> ArenaInfo {
         time_limit_s: 30.0,
         ground_truth: true,
         pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
-        attitude_rate: false,
+        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
         cameras: heapless::Vec::new(),
     }
 }

@@ -20,7 +20,8 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Volume, wrap_pi, yaw_of};
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Axes, InvalidSetpoint, Limits, Path, PoseAges, PoseSample, Setpoint, YawTarget,
+    ArenaInfo, Axes, InvalidSetpoint, Limits, Path, PoseAges, PoseSample, Setpoint, SetpointKind,
+    SetpointKinds, YawTarget,
 };
 use vizflyt_protocol::time::HostTime;
 
@@ -167,7 +168,7 @@ pub struct Guard {
     resolved: Resolved,
     /// Where the vehicle was when the plugin took over. [m, world]
     take_off_z_m: f64,
-    attitude_rate_allowed: bool,
+    allowed: SetpointKinds,
     pose_ages: PoseAges,
     /// When the newest setpoint came, or the plugin took over.
     asked_at: HostTime,
@@ -196,7 +197,7 @@ impl Guard {
             asked: None,
             resolved: Resolved::Nothing,
             take_off_z_m: fix.p_world_m.z,
-            attitude_rate_allowed: arena.attitude_rate,
+            allowed: arena.setpoints,
             pose_ages: arena.pose_ages,
             asked_at: now,
             ticked_at: now,
@@ -215,8 +216,9 @@ impl Guard {
     pub fn ask(&mut self, now: HostTime, setpoint: Setpoint) -> Result<(), InvalidSetpoint> {
         setpoint.check()?;
         let setpoint = bounded(setpoint);
-        if matches!(setpoint, Setpoint::AttitudeRate { .. }) && !self.attitude_rate_allowed {
-            return Err(InvalidSetpoint::AttitudeRate);
+        let allowed = self.allowed;
+        if let Some(asked) = SetpointKind::of(&setpoint).filter(|&kind| !allowed.contains(kind)) {
+            return Err(InvalidSetpoint::NotAllowed { asked, allowed });
         }
         let goes_on = match (&setpoint, &self.resolved, &self.asked) {
             (Setpoint::Trajectory(new), Resolved::Path(follower), _) => {

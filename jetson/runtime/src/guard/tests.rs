@@ -22,7 +22,7 @@ fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> Ar
         time_limit_s: 0.0,
         ground_truth: true,
         pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
-        attitude_rate: true,
+        setpoints: SetpointKinds::ALL,
         cameras: heapless::Vec::new(),
     }
 }
@@ -535,9 +535,11 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
         thrust,
     };
     let mut strict = arena(room(), 3.0, 4.0);
-    strict.attitude_rate = false;
+    strict.setpoints = SetpointKinds::USUAL;
     let mut forbidden = Guard::new(&strict, &at_rest(0), time(0));
-    assert_eq!(forbidden.ask(time(1), rates(0.0, 1.0)), Err(InvalidSetpoint::AttitudeRate));
+    let allowed = SetpointKinds::USUAL;
+    let refused = InvalidSetpoint::NotAllowed { asked: SetpointKind::AttitudeRate, allowed };
+    assert_eq!(forbidden.ask(time(1), rates(0.0, 1.0)), Err(refused));
 
     // Nose down for 0.2 s at 1 rad/s, then level rates: it accelerates ahead by g tan(0.2).
     let mut guard = guard();
@@ -553,6 +555,22 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
             let ahead = DQuat::from_rotation_z(0.3) * DVec3::X;
             assert!((a - ahead * GRAVITY_MPS2 * 0.2_f64.tan()).length() < 1e-6, "{a}");
         }
+    }
+}
+
+#[test]
+fn only_what_the_course_allows_is_flown() {
+    let mut course = arena(room(), 3.0, 4.0);
+    course.setpoints = [SetpointKind::Position].into_iter().collect();
+    let mut guard = Guard::new(&course, &at_rest(0), time(0));
+    let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
+    assert_eq!(guard.ask(time(1), position), Ok(()));
+    let refused = guard.ask(time(2), Setpoint::velocity(DVec3::X, YawTarget::Keep)).unwrap_err();
+    let text = "this course does not allow velocity; it allows position";
+    assert_eq!(refused.to_string(), text);
+    // It does not count against the deadline either: what was asked before stays in force.
+    for always in [Setpoint::Hold, Setpoint::TakeOff, Setpoint::Land] {
+        assert_eq!(guard.ask(time(3), always), Ok(()));
     }
 }
 

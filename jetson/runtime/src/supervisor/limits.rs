@@ -40,6 +40,8 @@ pub struct PluginLimits {
     pub user: Option<String>,
     /// Folders it may write in, beside its own, the working folder and `/tmp`.
     pub write: Vec<PathBuf>,
+    /// The map that it is handed, as JSON, where the course's map is known.
+    pub map: Option<String>,
     /// Files and folders that it may not read, where the kernel has Landlock: what a grade must keep from
     /// it.
     pub hide: Vec<PathBuf>,
@@ -62,6 +64,7 @@ impl Default for PluginLimits {
             network: false,
             user: None,
             write: Vec::new(),
+            map: None,
             hide: Vec::new(),
         }
     }
@@ -70,7 +73,29 @@ impl Default for PluginLimits {
 /// Less than this, no interpreter starts. [MB]
 pub const LEAST_MEMORY_MB: u64 = 64;
 
+/// Linux takes environment variables of 128 KiB: some thousand obstacles.
+const MOST_MAP: usize = 120 * 1024;
+
 impl PluginLimits {
+    /// Hands the plugin a map, if it is one.
+    ///
+    /// # Errors
+    /// What is wrong with it.
+    pub fn hand_map(&mut self, text: &str) -> Result<(), String> {
+        let volumes = vizflyt_sdk::parse_map(text).map_err(|error| error.to_string())?;
+        let text = text.trim().to_owned();
+        if text.len() > MOST_MAP {
+            return Err(format!(
+                "the map of {} obstacles has {} kB, more than the {} kB that a plugin can be handed",
+                volumes.len(),
+                text.len() / 1024,
+                MOST_MAP / 1024
+            ));
+        }
+        self.map = Some(text);
+        Ok(())
+    }
+
     /// Checks that the limits leave a plugin room to live.
     ///
     /// # Errors
@@ -116,6 +141,13 @@ mod tests {
             let why = limits.check().unwrap_err();
             assert!(why.contains(named), "{why}");
         };
+        let mut mapped = fair.clone();
+        assert!(mapped.hand_map("{}").unwrap_err().contains("map.json"));
+        let volume = r#"{"sphere": {"center_m": [1, 2, 3], "radius_m": 0.5}}"#;
+        let large = format!("[{}]", vec![volume; 3000].join(","));
+        assert!(mapped.hand_map(&large).unwrap_err().contains("3000 obstacles"));
+        assert_eq!(mapped.hand_map(&format!("[{volume}]\n")), Ok(()));
+        assert_eq!(mapped.map, Some(format!("[{volume}]")));
         check(PluginLimits { memory_mb: 1, ..fair.clone() }, "plugin.memory_mb = 1");
         check(PluginLimits { cpus: f64::NAN, ..fair.clone() }, "plugin.cpus = NaN");
         check(PluginLimits { processes: 1, ..fair.clone() }, "plugin.processes = 1");

@@ -103,6 +103,11 @@ impl Supervisor {
             // So that Ctrl-C at the terminal reaches the runtime first, and grandchildren can be
             // ended with the plugin.
             .process_group(0);
+        // Not one that this process was handed itself.
+        process.env_remove(vizflyt_sdk::MAP_VARIABLE);
+        if let Some(map) = &confinement.limits.map {
+            process.env(vizflyt_sdk::MAP_VARIABLE, map);
+        }
         confinement.apply(&mut process, &bounds);
         let mut child = process.spawn()?;
         for note in notes {

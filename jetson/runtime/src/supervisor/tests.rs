@@ -53,6 +53,19 @@ fn to_the_end_with(limits: &PluginLimits, command: &[&str]) -> (Vec<(Stream, Str
     (lines, sentence)
 }
 
+#[test]
+fn a_plugin_is_handed_its_own_map_and_no_other() {
+    let look = |limits: &PluginLimits| {
+        let (lines, _) = to_the_end_with(limits, &["sh", "-c", "echo \"map: $VIZFLYT_MAP\""]);
+        lines.into_iter().map(|(_, line)| line).collect::<Vec<_>>()
+    };
+    let text = r#"[{"sphere":{"center_m":[1,2,3],"radius_m":0.5}}]"#;
+    let mut limits = PluginLimits::default();
+    assert_eq!(look(&limits), ["map: "]);
+    limits.hand_map(text).unwrap();
+    assert_eq!(look(&limits), [format!("map: {text}")]);
+}
+
 fn check_sentence(script: &str, expected: &str) {
     let (_, sentence) = to_the_end(&["sh", "-c", script]);
     assert!(sentence.starts_with(expected), "{script}: {sentence}");
@@ -289,7 +302,7 @@ fn arena() -> ArenaInfo {
         time_limit_s: 0.0,
         ground_truth: true,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
         cameras: cameras().into_iter().collect(),
     }
 }

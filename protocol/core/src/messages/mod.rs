@@ -18,6 +18,7 @@
 //! [`FromPlugin`]) use the same encoding over shared-memory queues.
 
 mod event;
+mod kinds;
 mod pairing;
 mod plugin;
 mod session;
@@ -27,6 +28,7 @@ mod timing;
 mod trajectory;
 
 pub use event::{Event, EventKind};
+pub use kinds::{SetpointKind, SetpointKinds};
 pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{

@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-use super::{Event, MAX_CAMERAS, MAX_NO_FLY, Name, Telemetry, Text, Timing};
+use super::{Event, MAX_CAMERAS, MAX_NO_FLY, Name, SetpointKinds, Telemetry, Text, Timing};
 use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
 use crate::time::{HostTime, ServerTime};
 
@@ -303,8 +303,8 @@ pub struct ArenaInfo {
     pub ground_truth: bool,
     /// When the guard holds, and when it lands, for want of a pose.
     pub pose_ages: PoseAges,
-    /// Whether plugins may ask for [`Setpoint::AttitudeRate`](super::Setpoint::AttitudeRate).
-    pub attitude_rate: bool,
+    /// What plugins may ask for; the guard refuses the rest.
+    pub setpoints: SetpointKinds,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
 }

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use super::Trajectory;
+use super::{SetpointKind, SetpointKinds, Trajectory};
 
 /// The axes in which a vector of a setpoint is given.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -88,7 +88,7 @@ pub enum Setpoint {
         yaw: YawTarget,
     },
     /// Turn at body rates under a thrust. Only where the course allows it
-    /// ([`ArenaInfo::attitude_rate`](super::ArenaInfo::attitude_rate)).
+    /// ([`ArenaInfo::setpoints`](super::ArenaInfo::setpoints)).
     ///
     /// The guard flies it: it keeps the attitude that the rates lead to, bounds its tilt, and asks
     /// the autopilot for the motion that this attitude and thrust mean, within the same limits and
@@ -121,9 +121,14 @@ pub enum InvalidSetpoint {
     /// A piece's duration.
     #[error("a trajectory's piece lasts {0} s; it must last longer than 0")]
     Duration(f64),
-    /// The course does not allow attitude rates.
-    #[error("this course does not allow attitude rates; set attitude_rate = true in arena.toml")]
-    AttitudeRate,
+    /// The course does not allow its kind.
+    #[error("this course does not allow {}; it allows {allowed}", asked.name())]
+    NotAllowed {
+        /// What was asked for.
+        asked: SetpointKind,
+        /// What may be.
+        allowed: SetpointKinds,
+    },
 }
 
 impl Setpoint {

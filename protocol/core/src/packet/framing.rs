@@ -125,7 +125,7 @@ mod tests {
             time_limit_s: 99.0,
             ground_truth: true,
             pose_ages: PoseAges::default(),
-            attitude_rate: true,
+            setpoints: crate::messages::SetpointKinds::ALL,
             cameras: core::iter::repeat_n(camera, MAX_CAMERAS).collect(),
         }
     }

@@ -1,7 +1,8 @@
-//! `[rules]`: what a flight is fined for, beside what ends it.
+//! `[rules]`: what a flight is fined for, beside what ends it, and what a plugin may ask for.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::SetpointKinds;
 
 use super::validate::{ConfigError, check_number, check_position, invalid};
 use super::{ArenaConfig, Geofence};
@@ -20,6 +21,9 @@ pub struct RulesConfig {
     pub near_miss_m: f64,
     /// For each near miss: of one, until it is over. [s]
     pub near_miss_s: f64,
+    /// Kinds of setpoint that plugins may ask for; without it all but attitude rates.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub setpoints: Option<SetpointKinds>,
 }
 
 impl RulesConfig {
@@ -38,6 +42,7 @@ impl RulesConfig {
     ///     false_start_s: 5.0,
     ///     near_miss_m: 0.1,
     ///     near_miss_s: 2.0,
+    ///     setpoints: None,
     /// };
     /// let clearances_m = [0.5, 0.09, 0.08, 0.5, 0.05];
     /// assert_eq!(rules.penalty_s(Some(DVec3::splat(0.5)), clearances_m), 4.0);
@@ -74,6 +79,10 @@ impl ArenaConfig {
             check_number(key, value, "s", 0.0..=86400.0)?;
         }
         check_number("rules.near_miss_m", rules.near_miss_m, "m (0 is none)", 0.0..=2.0)?;
+        if rules.setpoints == Some(SetpointKinds::NONE) {
+            let advice = "name one kind or more, or leave it out".to_owned();
+            return Err(invalid("rules.setpoints", "[]", advice));
+        }
         let Some(start) = &rules.start_box else { return Ok(()) };
         check_position("rules.start_box.min_m", start.min_m)?;
         check_position("rules.start_box.max_m", start.max_m)?;

@@ -39,6 +39,21 @@ width_m = 1.0
 height_m = 1.0
 "#;
 
+#[test]
+fn rules_say_what_plugins_may_ask_for() {
+    let with = |more: &str| ArenaConfig::parse(&format!("{more}\n{FOREST}"));
+    let usual = with("").unwrap();
+    assert_eq!(usual.info().setpoints, SetpointKinds::USUAL);
+    let positions = with("rules = { setpoints = [\"position\"] }\nattitude_rate = true").unwrap();
+    let kinds = [SetpointKind::Position, SetpointKind::AttitudeRate];
+    assert_eq!(positions.info().setpoints, kinds.into_iter().collect());
+    assert_eq!(ArenaConfig::parse(&positions.to_toml().unwrap()).unwrap(), positions);
+    let none = with("rules = { setpoints = [] }").unwrap_err().to_string();
+    assert!(none.contains("rules.setpoints") && none.contains("name one kind"), "{none}");
+    let unknown = with("rules = { setpoints = [\"speed\"] }").unwrap_err().to_string();
+    assert!(unknown.contains("`velocity`"), "{unknown}");
+}
+
 /// Parses the forest with one line replaced and expects a message that holds each of `parts`.
 #[track_caller]
 fn check_refused(from: &str, to: &str, parts: &[&str]) {

@@ -22,7 +22,7 @@ pub(crate) fn named(index: usize, name: &str) -> Vehicle {
         time_limit_s: 0.0,
         ground_truth: true,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
         cameras: [].into_iter().collect(),
     };
     let cameras = Cameras::new(Vec::new());

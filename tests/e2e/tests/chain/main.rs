@@ -152,9 +152,9 @@ fn fly_on(flight: &Flight) {
 /// Puts a pillar across the room that only `arena.toml` knows.
 fn forbid(folder: &Path) {
     let path = folder.join("arena.toml");
-    let mut text = std::fs::read_to_string(&path).expect("the arena reads");
-    text += &format!(
-        "\n[[no_fly]]\nname = \"pillar\"\nmin_m = [{NO_FLY_X_M}, -2.0, -0.5]\nmax_m = [3.0, 2.0, 3.65]\n"
+    let text = std::fs::read_to_string(&path).expect("the arena reads");
+    let text = format!(
+        "{text}\n[[no_fly]]\nname = \"pillar\"\nmin_m = [{NO_FLY_X_M}, -2.0, -0.5]\nmax_m = [3.0, 2.0, 3.65]\n"
     );
     std::fs::write(&path, text).expect("the arena is written");
 }

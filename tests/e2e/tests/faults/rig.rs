@@ -175,7 +175,7 @@ impl Server {
             time_limit_s: 0.0,
             ground_truth: true,
             pose_ages: PoseAges::default(),
-            attitude_rate: false,
+            setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
             cameras: [].into_iter().collect(),
         };
         let camera = CameraConfig {

@@ -103,7 +103,7 @@ pub(crate) fn arena() -> ArenaInfo {
         time_limit_s: 60.0,
         ground_truth: true,
         pose_ages: PoseAges::default(),
-        attitude_rate: false,
+        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         cameras: [small_camera()].into_iter().collect(),
     }
 }

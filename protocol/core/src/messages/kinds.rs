@@ -1,0 +1,190 @@
+//! Which kinds of setpoint a course allows.
+
+use core::fmt;
+
+use serde::de::{Deserializer, SeqAccess, Visitor};
+use serde::ser::{SerializeSeq, Serializer};
+use serde::{Deserialize, Serialize};
+
+use super::Setpoint;
+
+/// A kind of setpoint. To hold, to land and to go back to the height of take-off are always allowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SetpointKind {
+    /// A point in the world.
+    Position,
+    /// A velocity.
+    Velocity,
+    /// An acceleration.
+    Acceleration,
+    /// A point from where the vehicle is.
+    Offset,
+    /// Body rates under a thrust.
+    AttitudeRate,
+    /// Waypoints or polynomials.
+    Trajectory,
+}
+
+impl SetpointKind {
+    /// Every one.
+    pub const ALL: [Self; 6] = [
+        Self::Position,
+        Self::Velocity,
+        Self::Acceleration,
+        Self::Offset,
+        Self::AttitudeRate,
+        Self::Trajectory,
+    ];
+
+    /// Returns the kind of a setpoint; `None` of one that is always allowed.
+    pub fn of(setpoint: &Setpoint) -> Option<Self> {
+        match setpoint {
+            Setpoint::Hold | Setpoint::Land | Setpoint::TakeOff => None,
+            Setpoint::Position { .. } => Some(Self::Position),
+            Setpoint::Velocity { .. } => Some(Self::Velocity),
+            Setpoint::Acceleration { .. } => Some(Self::Acceleration),
+            Setpoint::Offset { .. } => Some(Self::Offset),
+            Setpoint::AttitudeRate { .. } => Some(Self::AttitudeRate),
+            Setpoint::Trajectory(_) => Some(Self::Trajectory),
+        }
+    }
+
+    /// Returns its name, as `arena.toml` has it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Position => "position",
+            Self::Velocity => "velocity",
+            Self::Acceleration => "acceleration",
+            Self::Offset => "offset",
+            Self::AttitudeRate => "attitude_rate",
+            Self::Trajectory => "trajectory",
+        }
+    }
+}
+
+/// A set of kinds of setpoint; in files a list of their names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SetpointKinds(u8);
+
+impl SetpointKinds {
+    /// None but those that are always allowed.
+    pub const NONE: Self = Self(0);
+    /// All but attitude rates: what a course allows that says nothing.
+    pub const USUAL: Self = Self(0b10_1111);
+    /// Every one.
+    pub const ALL: Self = Self(0b11_1111);
+
+    /// Returns the set with another kind in it.
+    ///
+    /// ```
+    /// use vizflyt_protocol::messages::{SetpointKind, SetpointKinds};
+    /// assert_eq!(SetpointKinds::USUAL.with(SetpointKind::AttitudeRate), SetpointKinds::ALL);
+    /// assert!(!SetpointKinds::USUAL.contains(SetpointKind::AttitudeRate));
+    /// ```
+    #[must_use]
+    pub const fn with(self, kind: SetpointKind) -> Self {
+        Self(self.0 | 1 << kind as u8)
+    }
+
+    /// Whether a kind is in it.
+    pub const fn contains(self, kind: SetpointKind) -> bool {
+        self.0 & 1 << kind as u8 != 0
+    }
+
+    /// Whether a setpoint may be asked for.
+    pub fn allow(self, setpoint: &Setpoint) -> bool {
+        SetpointKind::of(setpoint).is_none_or(|kind| self.contains(kind))
+    }
+
+    /// Returns those in it.
+    pub fn iter(self) -> impl Iterator<Item = SetpointKind> {
+        SetpointKind::ALL.into_iter().filter(move |&kind| self.contains(kind))
+    }
+}
+
+impl FromIterator<SetpointKind> for SetpointKinds {
+    fn from_iter<I: IntoIterator<Item = SetpointKind>>(kinds: I) -> Self {
+        kinds.into_iter().fold(Self::NONE, Self::with)
+    }
+}
+
+/// The names, with commas.
+impl fmt::Display for SetpointKinds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, kind) in self.iter().enumerate() {
+            write!(f, "{}{}", if index == 0 { "" } else { ", " }, kind.name())?;
+        }
+        if *self == Self::NONE { f.write_str("none") } else { Ok(()) }
+    }
+}
+
+impl Serialize for SetpointKinds {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut list = serializer.serialize_seq(Some(self.iter().count()))?;
+        for kind in self.iter() {
+            list.serialize_element(&kind)?;
+        }
+        list.end()
+    }
+}
+
+impl<'de> Deserialize<'de> for SetpointKinds {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct List;
+
+        impl<'de> Visitor<'de> for List {
+            type Value = SetpointKinds;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a list of kinds of setpoint")
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Self::Value, A::Error> {
+                let mut kinds = SetpointKinds::NONE;
+                while let Some(kind) = list.next_element()? {
+                    kinds = kinds.with(kind);
+                }
+                Ok(kinds)
+            }
+        }
+
+        deserializer.deserialize_seq(List)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use proptest::prelude::*;
+
+    use std::string::ToString;
+
+    use super::*;
+
+    #[test]
+    fn the_names_are_those_of_files() {
+        let kinds: SetpointKinds = serde_json::from_str(r#"["velocity", "position"]"#).unwrap();
+        assert_eq!(kinds, [SetpointKind::Position, SetpointKind::Velocity].into_iter().collect());
+        assert_eq!(kinds.to_string(), "position, velocity");
+        assert_eq!(SetpointKinds::NONE.to_string(), "none");
+        let error = serde_json::from_str::<SetpointKinds>(r#"["speed"]"#).unwrap_err();
+        assert!(error.to_string().contains("`velocity`"), "{error}");
+        for kind in SetpointKind::ALL {
+            let text = serde_json::to_string(&kind).unwrap();
+            assert_eq!(text.trim_matches('"'), kind.name());
+        }
+        assert!(SetpointKinds::NONE.allow(&Setpoint::Land));
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_sent_arrives(bits in 0_u8..0b100_0000) {
+            let kinds = SetpointKinds(bits);
+            let mut buffer = [0; 16];
+            let bytes = postcard::to_slice(&kinds, &mut buffer).unwrap();
+            prop_assert_eq!(postcard::from_bytes::<SetpointKinds>(bytes), Ok(kinds));
+        }
+    }
+}
