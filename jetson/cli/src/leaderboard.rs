@@ -1,14 +1,17 @@
-//! `vizflyt leaderboard`: teams, runs and standings of the lab's flights, from the database that `vizflyt serve` writes.
+//! `vizflyt leaderboard`: teams, runs and standings of the lab's flights, from the database that `vizflyt serve`
+//! writes; and signed grades, which are added here.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use vizflyt_server::leaderboard::{
-    Attempt, Database, Leaderboard, Place, Run, standings, write_csv,
+    Attempt, Database, GradeBoard, GradeEntry, Leaderboard, Place, Run, grade_boards, standings,
+    write_csv,
 };
 
+use crate::grade::{self, Grade};
 use crate::terminal::tell;
 
 /// Shows who flew what how well, keeps the teams, and exports the runs.
@@ -17,6 +20,7 @@ use crate::terminal::tell;
   vizflyt leaderboard                                who leads on each course
   vizflyt leaderboard team add wasps                 prints the token by which the team checks in
   vizflyt leaderboard export --course race runs.csv
+  vizflyt leaderboard add grade.json --team wasps    a grade of `vizflyt grade`, if it is as it was signed
   vizflyt leaderboard --database postgres://user:password@db.example.edu/vizflyt")]
 pub(crate) struct LeaderboardArgs {
     /// A file, or postgres://USER:PASSWORD@HOST/NAME
@@ -38,11 +42,29 @@ enum LeaderboardCommand {
     },
     /// Writes the runs as CSV.
     Export(ExportArgs),
+    /// Adds a signed grade of `vizflyt grade`; once, and only as it was signed.
+    Add(AddArgs),
+}
+
+#[derive(Args, Debug)]
+struct AddArgs {
+    /// The grade: the whole, as `vizflyt grade -o` or `vizflyt grade merge -o` wrote it
+    #[arg(value_name = "GRADE.json")]
+    file: PathBuf,
+    /// Whose it is
+    #[arg(long, value_name = "NAME")]
+    team: String,
+    /// Whose signature counts: a public key or a file with one [default: this computer's own]
+    #[arg(long, value_name = "KEY")]
+    key: Option<String>,
+    /// Folder of this computer's own key [default: ~/.config/vizflyt]
+    #[arg(long, value_name = "DIR")]
+    keys: Option<PathBuf>,
 }
 
 #[derive(Args, Debug, Default)]
 struct ShowArgs {
-    /// Only this course: the arena's name
+    /// Only this course: the arena's name, or of grades the project's
     #[arg(long)]
     course: Option<String>,
     /// One JSON object instead of tables
@@ -93,11 +115,20 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
             "there is no home folder to keep the leaderboard in; name a file with --database",
         )?),
     };
+    if let Some(LeaderboardCommand::Add(add)) = &args.command {
+        // What does not count opens no database.
+        let grade = grade::verified(&add.file, add.key.as_deref(), add.keys.as_deref())?;
+        let entry = entry(&grade, &add.team)?;
+        let board = Leaderboard::open(&database).await?;
+        return self::add(&board, &entry, &grade.to_text()?).await;
+    }
     let board = Leaderboard::open(&database).await?;
     let shown = ShowArgs::default();
     match args.command.as_ref().unwrap_or(&LeaderboardCommand::Show(shown)) {
         LeaderboardCommand::Show(show) => self::show(&board, show).await,
         LeaderboardCommand::Team { command } => team(&board, command).await,
+        // Dealt with above.
+        LeaderboardCommand::Add(_) => Ok(()),
         LeaderboardCommand::Export(export) => {
             let runs = board.runs(export.course.as_deref()).await?;
             match &export.out {
@@ -140,9 +171,76 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
     Ok(())
 }
 
+/// Returns what the leaderboard keeps of a grade.
+fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
+    if let Some(shard) = grade.shard {
+        let (index, count) = (shard.index, shard.count);
+        anyhow::bail!(
+            "this is part {index} of {count} of a grade; `vizflyt grade merge` makes the whole"
+        );
+    }
+    ensure!(!grade.runs.is_empty(), "this grade has no flights");
+    let (subject, summary) = (&grade.subject, &grade.summary);
+    let last_seed = subject.first_seed.saturating_add(subject.seeds.saturating_sub(1));
+    let delays = subject.delays;
+    Ok(GradeEntry {
+        team: team.to_owned(),
+        hash: grade.hash.clone(),
+        plugin_sha256: subject.plugin_sha256.clone(),
+        project: subject.project.clone(),
+        level: subject.level.clone(),
+        conditions: format!(
+            "{}, seeds {} to {last_seed}, {:.1}+{:.1} ms late, every {:.1} ms",
+            subject.variants.join(" "),
+            subject.first_seed,
+            delays.image,
+            delays.answer,
+            delays.image_period
+        ),
+        flights: summary.runs as u32,
+        finished: summary.finished as u32,
+        stages: grade.runs.iter().map(|run| run.stages.len()).max().unwrap_or(0) as u32,
+        mean_stages_passed: summary.mean_stages_passed,
+        median_s: grade.median_finish_s(),
+        score: summary.score.value,
+    })
+}
+
+async fn add(board: &Leaderboard, entry: &GradeEntry, document: &str) -> Result<()> {
+    board.add_grade(entry, document).await?;
+    tell(format!("the grade {} of team '{}' is added", entry.hash, entry.team));
+    let boards = grade_boards(&board.grades().await?);
+    let own = boards.iter().filter(|board| {
+        (&board.project, &board.level, &board.conditions)
+            == (&entry.project, &entry.level, &entry.conditions)
+    });
+    own.for_each(show_grades);
+    Ok(())
+}
+
+fn show_grades(board: &GradeBoard) {
+    tell(format!("{} {}, graded: {}", board.project, board.level, board.conditions));
+    for place in &board.places {
+        let best = &place.best;
+        let median = best.median_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.2} s"));
+        tell(format!(
+            "{:>4}  {:<24} {:>5.2} of {:<2} stages  {:>3} of {:<3} finished  {median:>10}  {:>3} grades",
+            place.rank,
+            best.team,
+            best.mean_stages_passed,
+            best.stages,
+            best.finished,
+            best.flights,
+            place.grades
+        ));
+    }
+}
+
 async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
     let runs = board.runs(args.course.as_deref()).await?;
     let mut courses = board.courses().await?;
+    let mut graded = grade_boards(&board.grades().await?);
+    graded.retain(|board| args.course.as_ref().is_none_or(|only| *only == board.project));
     courses.retain(|course| args.course.as_ref().is_none_or(|only| only == course));
     if args.json {
         let boards: Vec<_> = courses
@@ -155,10 +253,10 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
                 })
             })
             .collect();
-        tell(serde_json::json!({ "courses": boards, "runs": runs }));
+        tell(serde_json::json!({ "courses": boards, "graded": graded, "runs": runs }));
         return Ok(());
     }
-    if courses.is_empty() {
+    if courses.is_empty() && graded.is_empty() {
         tell(match &args.course {
             Some(course) => format!("nobody has flown '{course}' yet"),
             None => format!("nobody has flown yet; runs are kept in {}", board.database()),
@@ -181,6 +279,7 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
             of_course.len()
         ));
     }
+    graded.iter().for_each(show_grades);
     Ok(())
 }
 

@@ -84,7 +84,11 @@ fn two_runs_give_the_same_grade_whatever_runs_beside_them_and_parts_make_the_who
     });
     rig.refused(&["merge", &parts[0]], "missing: 2");
     let whole = rig.at("whole.json");
-    rig.good(&["merge", &parts[1], &parts[0], "-o", &whole]);
+    let report = rig.at("merged");
+    rig.good(&["merge", &parts[1], &parts[0], "-o", &whole, "--report", &report]);
+    let page = fs::read_to_string(Path::new(&report).join("index.html")).unwrap();
+    assert!(page.contains("2 of 2") && !page.contains("class=\"card\""), "all finished: no card");
+    rig.good(&["verify", Path::new(&report).join("grade.json").to_str().unwrap()]);
     let merged: Value = serde_json::from_str(&fs::read_to_string(&whole).unwrap()).unwrap();
     assert_eq!(merged, one);
 
@@ -96,11 +100,63 @@ fn two_runs_give_the_same_grade_whatever_runs_beside_them_and_parts_make_the_who
     let other = Command::new(vizflyt()).args(["grade", "key", &keys]).output().unwrap();
     let other = String::from_utf8(other.stdout).unwrap();
     rig.refused(&["verify", &whole, "--key", other.trim()], "is signed with the key");
+    on_the_leaderboard(&rig, &whole, &parts[0]);
     let text = fs::read_to_string(&whole).unwrap();
     let forged = text.replacen("\"seed\": 2", "\"seed\": 3", 1);
     assert_ne!(forged, text);
     fs::write(&whole, forged).unwrap();
     rig.refused(&["verify", &whole], "was changed after it was signed");
+    let error = leaderboard(&rig, &["add", &whole, "--team=wasps", &keys_of(&rig)]).unwrap_err();
+    assert!(error.contains("was changed after it was signed"), "{error}");
+}
+
+fn keys_of(rig: &Rig) -> String {
+    format!("--keys={}", rig.at("keys"))
+}
+
+/// Runs `vizflyt leaderboard` on a database of the rig's; returns what it says, or what it refuses with.
+fn leaderboard(rig: &Rig, args: &[&str]) -> Result<String, String> {
+    let database = format!("--database={}", rig.at("board.sqlite"));
+    let output = Command::new(vizflyt()).args(["leaderboard", &database]).args(args).output();
+    let output = output.unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    if output.status.success() { Ok(text(output.stdout)) } else { Err(text(output.stderr)) }
+}
+
+/// A whole grade is added once, by whom the instructor names, and stands.
+fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
+    let keys = keys_of(rig);
+    let add = |file: &str, team: &str| leaderboard(rig, &["add", file, team, &keys]);
+    let refused = |file: &str, team: &str, expected: &str| {
+        let error = add(file, team).unwrap_err();
+        assert!(error.contains(expected) && !error.contains("panicked"), "{error}");
+    };
+    refused(whole, "--team=wasps", "there is no team 'wasps'");
+    for team in ["wasps", "bees"] {
+        leaderboard(rig, &["team", "add", team]).unwrap();
+    }
+    refused(part, "--team=wasps", "part 1 of 2 of a grade; `vizflyt grade merge`");
+    let others = format!("--keys={}", rig.at("others"));
+    let error = leaderboard(rig, &["add", whole, "--team=wasps", &others]).unwrap_err();
+    assert!(error.contains("is signed with the key"), "{error}");
+    let said = add(whole, "--team=wasps").unwrap();
+    assert!(
+        said.contains("of team 'wasps' is added") && said.contains("2 of 2   finished"),
+        "{said}"
+    );
+    refused(whole, "--team=wasps", "already: team 'wasps' has added it");
+    refused(whole, "--team=bees", "already: team 'wasps' has added it");
+    let shown: Value =
+        serde_json::from_str(&leaderboard(rig, &["show", "--json"]).unwrap()).unwrap();
+    let board = &shown["graded"][0];
+    assert_eq!((&board["project"], &board["level"]), (&"forest".into(), &"ug".into()));
+    assert!(board["conditions"].as_str().unwrap().starts_with("day, seeds 1 to 2, "), "{board}");
+    let place = &board["places"][0];
+    assert_eq!(
+        (&place["rank"], &place["team"], &place["finished"]),
+        (&1.into(), &"wasps".into(), &2.into())
+    );
+    assert!(place["median_s"].as_f64().unwrap() > 5.0, "{place}");
 }
 
 #[test]

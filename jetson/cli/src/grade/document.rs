@@ -14,6 +14,11 @@ use super::statistics::{Interval, mean_interval, share_interval};
 /// What the first field holds; another layout is another number.
 pub(crate) const FORMAT: &str = "vizflyt-grade-1";
 
+/// Seeds that are flown at most, and parts of a grade.
+pub(crate) const MOST_SEEDS: u64 = 100_000;
+/// Variants that there are at most, in this version and those to come.
+const MOST_VARIANTS: usize = 64;
+
 /// A grade.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -168,6 +173,11 @@ impl Subject {
 }
 
 impl Shard {
+    /// Whether there is such a part.
+    fn is_one(index: u64, count: u64) -> bool {
+        1 <= index && index <= count && count <= MOST_SEEDS
+    }
+
     /// Whether the flight at this place of the order belongs to it.
     pub(crate) fn holds(self, place: usize) -> bool {
         place as u64 % self.count == self.index - 1
@@ -180,7 +190,7 @@ impl std::str::FromStr for Shard {
     fn from_str(text: &str) -> Result<Self, String> {
         let parts = text.split_once('/').and_then(|(index, count)| {
             let (index, count) = (index.parse().ok()?, count.parse().ok()?);
-            (1 <= index && index <= count).then_some(Self { index, count })
+            Self::is_one(index, count).then_some(Self { index, count })
         });
         parts.ok_or_else(|| format!("{text:?} is no part; give 1/4 to 4/4 for four parts"))
     }
@@ -246,6 +256,16 @@ impl Grade {
         Ok(())
     }
 
+    /// Returns the median time of the flights that finished, penalties included. [s]
+    pub(crate) fn median_finish_s(&self) -> Option<f64> {
+        let finished = self.runs.iter().filter(|run| run.outcome == Outcome::Finished);
+        let mut times: Vec<f64> = finished.map(|run| run.seconds + run.penalty_s).collect();
+        times.sort_by(f64::total_cmp);
+        let upper = *times.get(times.len() / 2)?;
+        let lower = times[(times.len() - 1) / 2];
+        Some(millionth((lower + upper) / 2.0))
+    }
+
     /// Reads a grade from a file.
     ///
     /// # Errors
@@ -257,8 +277,22 @@ impl Grade {
     }
 
     /// Reads a grade from its text.
+    ///
+    /// # Errors
+    /// Text that is no grade, or one of more flights or parts than are ever flown: what it says is
+    /// counted through, also before its signature holds.
     pub(crate) fn parse(text: &str) -> Result<Self> {
-        Ok(serde_json::from_str(text)?)
+        let grade: Self = serde_json::from_str(text)?;
+        let Subject { seeds, variants, .. } = &grade.subject;
+        ensure!(
+            *seeds <= MOST_SEEDS && variants.len() <= MOST_VARIANTS,
+            "{seeds} seeds in {} variants: at most {MOST_SEEDS} and {MOST_VARIANTS}",
+            variants.len()
+        );
+        if let Some(Shard { index, count }) = grade.shard {
+            ensure!(Shard::is_one(index, count), "{index}/{count} is no part");
+        }
+        Ok(grade)
     }
 
     /// Returns the text for files and people.
@@ -499,9 +533,40 @@ pub(crate) mod tests {
         for place in 0..flights.len() {
             assert_eq!(shards.iter().filter(|shard| shard.holds(place)).count(), 1);
         }
-        for wrong in ["0/3", "4/3", "1/0", "1", "a/b", "-1/2"] {
+        for wrong in ["1/100001", "0/3", "4/3", "1/0", "1", "a/b", "-1/2"] {
             assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn the_median_is_of_the_flights_that_finished() {
+        let of = |outcomes: &[Outcome]| {
+            let runs = outcomes.iter().zip(1..).map(|(&outcome, seed)| run(seed, outcome));
+            Grade::new(subject(), None, runs.collect()).median_finish_s()
+        };
+        // Seed n takes 10.5 s and n tenths, penalty included.
+        let (done, hit) = (Outcome::Finished, Outcome::Collided);
+        assert_eq!(of(&[hit, hit]), None);
+        assert_eq!(of(&[hit, done]), Some(10.7));
+        assert_eq!(of(&[done, done, hit, done]), Some(10.7));
+        assert_eq!(of(&[done, done]), Some(10.65));
+    }
+
+    #[test]
+    fn numbers_that_would_be_counted_for_ever_make_no_grade() {
+        let parsed = |change: &dyn Fn(&mut Grade)| {
+            let mut grade = grade();
+            change(&mut grade);
+            Grade::parse(&grade.to_text().unwrap())
+        };
+        assert!(parsed(&|_| ()).is_ok());
+        for wrong in [Shard { index: 1, count: u64::MAX }, Shard { index: 0, count: 0 }] {
+            let error = parsed(&|grade| grade.shard = Some(wrong)).unwrap_err().to_string();
+            assert!(error.ends_with("is no part"), "{error}");
+        }
+        let error = parsed(&|grade| grade.subject.seeds = u64::MAX).unwrap_err().to_string();
+        assert!(error.contains("at most 100000"), "{error}");
+        assert!(parsed(&|grade| grade.subject.variants = vec!["day".into(); 65]).is_err());
     }
 
     #[test]

@@ -39,7 +39,8 @@ use vizflyt_scenes::projects::{Level, Project};
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::Place;
-use self::document::{DelaysMs, Grade, Run, Shard, Subject, hex};
+pub(crate) use self::document::Grade;
+use self::document::{DelaysMs, MOST_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
 use self::trial::{Delays, Flown, Trial};
 use crate::fly::plugin::Plugin;
@@ -53,7 +54,7 @@ use crate::terminal::{stop_flag, tell};
   vizflyt grade avoid --project forest --variants day,night       in other light, too
   vizflyt grade ./first --project p5 --level g --json > me.json   the signed grade, for programs
   vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        an eighth of the flights, on a cluster
-  vizflyt grade merge *.json -o whole.json                        all eighths make the whole
+  vizflyt grade merge *.json -o whole.json --report out           all eighths make the whole
   vizflyt grade verify whole.json                                 is it as it was signed?
 
 The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
@@ -151,6 +152,9 @@ enum GradeCommand {
         /// Whose signature counts: a public key or a file with one [default: this computer's own]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
+        /// Writes a report of the whole there: index.html, grade.json; images are in the parts' reports
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
         #[command(flatten)]
         result: ResultArgs,
     },
@@ -167,25 +171,31 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
     match &args.command {
         None => grade(&args.fly),
         Some(GradeCommand::Verify { file, key, keys }) => {
-            let grade = Grade::read(file)?;
-            let key = keys::verifying_key(key.as_deref(), keys.as_deref())?;
-            grade.verify(&key).with_context(|| format!("{} does not count", file.display()))?;
+            let grade = verified(file, key.as_deref(), keys.as_deref())?;
             tell(format!(
                 "{}: as signed with {}; score {:.1}, {} of {} finished",
                 file.display(),
-                hex(&key.to_bytes()),
+                grade.signature.as_ref().map_or("", |signed| &signed.key),
                 grade.summary.score.value,
                 grade.summary.finished,
                 grade.summary.runs
             ));
             Ok(ExitCode::SUCCESS)
         }
-        Some(GradeCommand::Merge { files, key, result }) => {
+        Some(GradeCommand::Merge { files, key, report, result }) => {
             let read = |path: &PathBuf| Ok((path.display().to_string(), Grade::read(path)?));
             let parts = files.iter().map(read).collect::<Result<Vec<_>>>()?;
             let key = keys::verifying_key(key.as_deref(), result.keys.as_deref())?;
             let grade = signed(merge::merge(&parts, &key)?, result)?;
+            if let Some(folder) = report {
+                let failed = grade.runs.iter().filter(|run| run.cause.is_some());
+                let cards: Vec<String> = failed.map(report::card::without_images).collect();
+                report::write(folder, &grade, &cards)?;
+            }
             hand_over(&grade, result)?;
+            if let (Some(folder), false) = (report, result.json) {
+                tell(format!("report      {}", folder.join("index.html").display()));
+            }
             Ok(ExitCode::SUCCESS)
         }
         Some(GradeCommand::Key { keys }) => {
@@ -193,6 +203,18 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
     }
+}
+
+/// Returns the grade of a file if it is as it was signed with a key: as given, in hexadecimal or in a
+/// file; else this computer's own.
+///
+/// # Errors
+/// What does not hold, in a sentence.
+pub(crate) fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> Result<Grade> {
+    let grade = Grade::read(file)?;
+    let key = keys::verifying_key(key, keys)?;
+    grade.verify(&key).with_context(|| format!("{} does not count", file.display()))?;
+    Ok(grade)
 }
 
 /// Flies, judges, reports.
@@ -272,7 +294,11 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     ensure!(within(image_rate, 1.0, 200.0), "--image-rate {image_rate}: give 1 to 200 Hz");
     ensure!(within(image_delay, 0.0, 200.0), "--image-delay {image_delay}: give 0 to 200 ms");
     ensure!(within(answer_delay, 0.0, 1000.0), "--answer-delay {answer_delay}: give 0 to 1000 ms");
-    ensure!(args.seeds >= 1 && args.seeds <= 100_000, "--seeds {}: give 1 to 100000", args.seeds);
+    ensure!(
+        (1..=MOST_SEEDS).contains(&args.seeds),
+        "--seeds {}: give 1 to {MOST_SEEDS}",
+        args.seeds
+    );
     Ok(Delays {
         image_period_ns: (1e9 / image_rate) as i64,
         image_ns: (image_delay * 1e6) as i64,

@@ -14,7 +14,9 @@ use vizflyt_protocol::messages::FlightPhase;
 
 use super::{Page, origin, refuse, vehicle};
 use crate::hub::lock;
-use crate::leaderboard::{Attempt, LeaderboardError, Place, Run, standings};
+use crate::leaderboard::{
+    Attempt, GradeBoard, LeaderboardError, Place, Run, grade_boards, standings,
+};
 use crate::vehicle::CheckIn;
 
 /// What the page and the wall show.
@@ -26,6 +28,8 @@ struct Board {
     official: Vec<Place>,
     /// By practice runs.
     practice: Vec<Place>,
+    /// By signed grades, of all projects.
+    graded: Vec<GradeBoard>,
     /// The newest runs, newest first.
     newest: Vec<Run>,
     /// Who flies, or is about to.
@@ -51,6 +55,10 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
         Ok(runs) => runs,
         Err(error) => return failed(&error),
     };
+    let grades = match board.grades().await {
+        Ok(grades) => grades,
+        Err(error) => return failed(&error),
+    };
     let now = crate::clock::now();
     let flyer = |vehicle: &Arc<crate::vehicle::Vehicle>| {
         let (by, flight) = (lock(&vehicle.checked_in).clone(), vehicle.flight());
@@ -66,6 +74,7 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
     let answer = Board {
         official: standings(&runs, &course, Attempt::Official),
         practice: standings(&runs, &course, Attempt::Practice),
+        graded: grade_boards(&grades),
         vehicles: page.hub.vehicles.iter().map(flyer).collect(),
         newest: runs.into_iter().take(NEWEST).collect(),
         course,

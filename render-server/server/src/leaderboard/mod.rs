@@ -3,13 +3,16 @@
 //! ```text
 //! recorder (a task for each vehicle) -> begin, heard, end -> runs
 //! `vizflyt leaderboard team add`     -> teams, their tokens
+//! `vizflyt leaderboard add`          -> grades, their signatures verified
 //! runs -> standings (pure) -> page, wall view, command line;  runs -> CSV
+//! grades -> grade_boards (pure) -> page, command line
 //! ```
 //! SQLite in a file by default, `PostgreSQL` by URL for a department; one set of queries for both. A run is
 //! a row from its take-off on: a server killed in flight loses that run's end, which is then
 //! [`RunState::CutOff`], and nothing else.
 
 mod export;
+pub(crate) mod grades;
 mod place;
 mod recorder;
 mod samples;
@@ -19,6 +22,7 @@ mod store;
 pub(crate) mod tests;
 
 pub use export::write_csv;
+pub use grades::{GradeBoard, GradeEntry, GradePlace, grade_boards};
 pub use place::{Database, UnknownDatabase};
 pub(crate) use recorder::record;
 pub use samples::Samples;

@@ -13,7 +13,7 @@ use super::{Attempt, Database, NewRun, Run, RunEnd, RunState, Team};
 /// The open database.
 #[derive(Clone, Debug)]
 pub struct Leaderboard {
-    pool: AnyPool,
+    pub(super) pool: AnyPool,
     database: Database,
 }
 
@@ -52,6 +52,14 @@ pub enum LeaderboardError {
         course: String,
         /// As many it may fly.
         most: u32,
+    },
+    /// The same grade is there.
+    #[error("the grade {hash} is on the leaderboard already: team '{team}' has added it")]
+    Added {
+        /// Over all flights.
+        hash: String,
+        /// Who has added it.
+        team: String,
     },
     /// No randomness for a token.
     #[error("cannot draw a token: {0}")]
@@ -97,7 +105,7 @@ impl Leaderboard {
         }
         first.close().await.map_err(open)?;
         let pool = options.connect(&database.url()).await.map_err(open)?;
-        migrations()
+        migrations(&MIGRATIONS)
             .run(&pool)
             .await
             .map_err(|error| LeaderboardError::Migrate(database.clone(), error))?;
@@ -332,7 +340,7 @@ impl Leaderboard {
         Ok(())
     }
 
-    async fn no_team(&self, name: &str) -> LeaderboardError {
+    pub(super) async fn no_team(&self, name: &str) -> LeaderboardError {
         match self.teams().await {
             Ok(teams) => {
                 let names: BTreeSet<String> = teams.into_iter().map(|team| team.name).collect();
@@ -348,7 +356,7 @@ impl Leaderboard {
         }
     }
 
-    fn failed(&self, error: sqlx::Error) -> LeaderboardError {
+    pub(super) fn failed(&self, error: sqlx::Error) -> LeaderboardError {
         LeaderboardError::Query(self.database.clone(), error)
     }
 }
@@ -382,24 +390,27 @@ fn run(row: &AnyRow) -> Result<Run, sqlx::Error> {
     })
 }
 
-/// The tables' versions: a file each, never changed once released.
-fn migrations() -> Migrator {
-    let teams_and_runs = include_str!("migrations/0001_teams_and_runs.sql");
-    Migrator::with_migrations(vec![Migration::new(
-        1,
-        "teams and runs".into(),
-        MigrationType::Simple,
-        teams_and_runs.into_sql_str(),
-        false,
-    )])
+/// Returns what brings the tables to the last of these versions.
+pub(super) fn migrations(versions: &[(&'static str, &'static str)]) -> Migrator {
+    let migration = |(index, &(name, sql)): (usize, &(&'static str, &'static str))| {
+        let version = index as i64 + 1;
+        Migration::new(version, name.into(), MigrationType::Simple, sql.into_sql_str(), false)
+    };
+    Migrator::with_migrations(versions.iter().enumerate().map(migration).collect())
 }
+
+/// The tables' versions: a file each, never changed once released.
+pub(super) const MIGRATIONS: [(&str, &str); 2] = [
+    ("teams and runs", include_str!("migrations/0001_teams_and_runs.sql")),
+    ("grades", include_str!("migrations/0002_grades.sql")),
+];
 
 /// Returns a token's hash; a token has 128 bits of its own, so nobody gains by a slow one.
 fn hash(token: &str) -> String {
     Fingerprint::of(token.as_bytes()).to_string()
 }
 
-fn unix_ms() -> i64 {
+pub(super) fn unix_ms() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
 }
 

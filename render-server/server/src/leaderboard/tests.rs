@@ -1,5 +1,6 @@
 //! The database on a file, and on a `PostgreSQL` server where `VIZFLYT_TEST_POSTGRES` names one.
 
+use super::grades::tests::grade;
 use super::*;
 
 /// An official run that has ended.
@@ -90,10 +91,52 @@ async fn behaves(board: &Leaderboard) {
     assert_eq!((runs.len(), cut_off), (3, 2));
     board.end(&practice, &end(1)).await.unwrap();
 
+    grades_behave(board).await;
+
     board.retire_team("wasps").await.unwrap();
     assert_eq!(board.team_of(&token).await.unwrap(), None);
-    assert!(board.teams().await.unwrap()[0].retired);
+    let teams = board.teams().await.unwrap();
+    let retired: Vec<_> = teams.iter().filter(|team| team.retired).map(|team| &team.name).collect();
+    assert_eq!(retired, ["wasps"]);
     assert!(board.retire_team("bees").await.is_err());
+}
+
+/// The same for grades, with the team 'wasps' there.
+async fn grades_behave(board: &Leaderboard) {
+    let own = grade("wasps", 4.25, 7, 31.5);
+    board.add_grade(&own, "{}").await.unwrap();
+    // The same grade, also under another team's name, and the same flights by another plugin.
+    board.add_team("hornets").await.unwrap();
+    let taken = GradeEntry { team: "hornets".into(), ..own.clone() };
+    for again in [&own, &taken] {
+        let error = board.add_grade(again, "{}").await.unwrap_err().to_string();
+        assert!(error.contains("already: team 'wasps' has added it"), "{error}");
+    }
+    let other = GradeEntry { plugin_sha256: "another".into(), median_s: None, ..taken };
+    board.add_grade(&other, "{}").await.unwrap();
+    let stranger = grade("bees", 1.0, 0, 0.0);
+    let error = board.add_grade(&stranger, "{}").await.unwrap_err().to_string();
+    assert!(error.starts_with("there is no team 'bees'; the teams are: hornets, wasps"), "{error}");
+    assert_eq!(board.grades().await.unwrap(), [own, other]);
+}
+
+/// A database of before there were grades keeps its teams and runs and takes grades.
+#[tokio::test]
+async fn a_database_of_the_first_version_is_updated() {
+    use sqlx::Connection;
+    let folder = tempfile::tempdir().unwrap();
+    let database = Database::File(folder.path().join("runs.sqlite"));
+    sqlx::any::install_default_drivers();
+    let mut first = sqlx::AnyConnection::connect(&database.url()).await.unwrap();
+    store::migrations(&store::MIGRATIONS[..1]).run(&mut first).await.unwrap();
+    sqlx::query("INSERT INTO teams (name, token_hash, created_unix_ms) VALUES ('wasps', 'x', 1)")
+        .execute(&mut first)
+        .await
+        .unwrap();
+    first.close().await.unwrap();
+    let board = Leaderboard::open(&database).await.unwrap();
+    assert_eq!(board.teams().await.unwrap()[0].name, "wasps");
+    grades_behave(&board).await;
 }
 
 #[tokio::test]

@@ -31,18 +31,7 @@ pub(crate) fn write(
     run: &Run,
     flown: &Flown,
 ) -> Result<String> {
-    let Run { seed, variant, outcome, .. } = run;
-    let mut card = format!(
-        "<section class=\"card\" id=\"{variant}-{seed}\"><h3>Seed {seed}, {variant}: \
-         <span class=\"outcome {outcome}\">{}</span></h3><p class=\"cause\">{}</p>\
-         <p class=\"faint\">{}; {:.1} s after take-off, {} of {} stages</p>",
-        outcome.name().replace('_', " "),
-        escape(run.cause.as_deref().unwrap_or_default()),
-        escape(&run.reason),
-        run.seconds,
-        run.stages_passed,
-        run.stages.len()
-    );
+    let mut card = head(run);
     let at = end_of(&flown.events, &flown.samples);
     if let Some(at) = at {
         card += &strip(folder, run, flown, |stamp| at.seconds_since(stamp))?;
@@ -76,6 +65,32 @@ pub(crate) fn write(
         );
     }
     Ok(card + "</section>\n")
+}
+
+/// Returns the card of a failed flight that another computer has flown, of which only the grade is here.
+pub(crate) fn without_images(run: &Run) -> String {
+    head(run)
+        + "<p class=\"faint\">Merged from parts: its images, clearance and place are in the report of \
+           the part that flew it, if that was given <code>--report</code>; or fly this seed again.</p>\
+           </section>\n"
+}
+
+/// Returns what begins a card: which flight, how it ended, and why.
+fn head(run: &Run) -> String {
+    let Run { seed, variant, outcome, .. } = run;
+    // A part's text is another's: its variant is no name of ours until it is looked at.
+    let variant = escape(variant);
+    format!(
+        "<section class=\"card\" id=\"{variant}-{seed}\"><h3>Seed {seed}, {variant}: \
+         <span class=\"outcome {outcome}\">{}</span></h3><p class=\"cause\">{}</p>\
+         <p class=\"faint\">{}; {:.1} s after take-off, {} of {} stages</p>",
+        outcome.name().replace('_', " "),
+        escape(run.cause.as_deref().unwrap_or_default()),
+        escape(&run.reason),
+        run.seconds,
+        run.stages_passed,
+        run.stages.len()
+    )
 }
 
 /// Writes the last images; returns them side by side.
@@ -112,4 +127,25 @@ fn strip(
         );
     }
     Ok(strip + "</div>")
+}
+
+#[cfg(test)]
+mod tests {
+    use vizflyt_arena::verdict::Outcome;
+
+    use super::super::super::document::tests::run;
+    use super::*;
+
+    #[test]
+    fn a_card_without_images_says_so_and_holds_no_markup_of_a_plugin() {
+        let mut failed = run(3, Outcome::Collided);
+        failed.reason = "said <script>".to_owned();
+        let card = without_images(&failed);
+        assert!(card.starts_with("<section class=\"card\" id=\"day-3\">"), "{card}");
+        assert!(card.contains("too fast") && card.contains("said &lt;script&gt;"), "{card}");
+        assert!(
+            card.contains("report of the part that flew it") && !card.contains("<img"),
+            "{card}"
+        );
+    }
 }

@@ -90,7 +90,8 @@ fn table(runs: &[Run]) -> String {
                     <th class=\"text\">Why</th></tr></thead><tbody>\n"
         .to_owned();
     for run in runs {
-        let Run { seed, variant, outcome, .. } = run;
+        let Run { seed, outcome, .. } = run;
+        let variant = escape(&run.variant);
         let mut stages = String::new();
         for stage in &run.stages {
             let (class, when) = match stage.passed_s {

@@ -1,6 +1,6 @@
 // The leaderboard's panel on the page: standings, who has checked in, and checking in.
 import { order } from "/controls.js";
-import { ask, fill } from "/standings.js";
+import { ask, fill, fillGrades } from "/standings.js";
 
 const $ = (id) => document.getElementById(id);
 let vehicle = null;
@@ -11,6 +11,7 @@ async function show() {
   if (!board) return;
   fill($("official"), board.official);
   fill($("practice"), board.practice);
+  fillGrades($("graded"), board.graded);
   const now = board.vehicles.find((flyer) => flyer.vehicle === vehicle);
   $("checked-in").textContent = now?.team ? `${now.team} flies: ${now.attempt}` : "nobody has checked in: flights have no place in the standings";
   $("check-out").hidden = !now?.team;

@@ -26,6 +26,25 @@ export function fill(body, places) {
   body.replaceChildren(...rows);
 }
 
+/** Fills a node with the standings of signed grades: a table for each course and conditions. */
+export function fillGrades(node, boards) {
+  const parts = boards.flatMap(({ project, level, conditions, places }) => {
+    const rows = places.map(({ rank, team, mean_stages_passed, stages, finished, flights, median_s }) => {
+      const row = document.createElement("tr");
+      if (rank === 1) row.className = "first";
+      const time = median_s == null ? "–" : `${median_s.toFixed(2)} s`;
+      row.append(cell(rank), cell(team), cell(`${mean_stages_passed.toFixed(2)}/${stages}`), cell(`${finished} of ${flights}`), cell(time));
+      return row;
+    });
+    const title = Object.assign(document.createElement("h3"), { textContent: `graded: ${project} ${level}, ${conditions}` });
+    const table = document.createElement("table"), body = document.createElement("tbody");
+    body.append(...rows);
+    table.append(body);
+    return [title, table];
+  });
+  node.replaceChildren(...parts);
+}
+
 /** Who flies now, in a sentence; empty if nobody. */
 export function flying(vehicles) {
   return vehicles
