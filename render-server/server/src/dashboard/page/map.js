@@ -95,8 +95,13 @@ export class TopView {
     const [lo, hi] = bounds(this.arena);
     const pad = Math.min(34, w * 0.05);
     const [dx, dy] = [Math.max(0.1, hi[0] - lo[0]), Math.max(0.1, hi[1] - lo[1])];
-    this.scale = Math.min((w - 2 * pad) / dx, (h - 2 * pad - 14) / dy);
-    this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, (h - 10) / 2 + ((lo[1] + hi[1]) / 2) * this.scale];
+    // Below the stage lights and above what is written at the bottom, where there is room for that.
+    const lights = this.canvas.parentElement.querySelector("#stages");
+    const top = Math.min(lights && !lights.hidden ? lights.offsetTop + lights.offsetHeight + 8 : pad, h * 0.35);
+    const bottom = Math.min(pad + 14, h * 0.25);
+    this.scale = Math.min((w - 2 * pad) / dx, (h - top - bottom) / dy);
+    const middle = (top + h - bottom) / 2;
+    this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, middle + ((lo[1] + hi[1]) / 2) * this.scale];
   }
 
   at(p) {
