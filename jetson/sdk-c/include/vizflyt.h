@@ -17,7 +17,7 @@
  *
  * Frames: world is x east, y north, z up; body is x forward, y left, z up; camera is x right, y down,
  * z forward. Rotations are unit quaternions in the order x, y, z, w. SI units; angles in radians;
- * times in nanoseconds of CLOCK_MONOTONIC. Protocol version 4, little-endian. */
+ * times in nanoseconds of CLOCK_MONOTONIC. Little-endian. */
 #ifndef VIZFLYT_H
 #define VIZFLYT_H
 
@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define VIZFLYT_PROTOCOL_VERSION 5
+#define VIZFLYT_PROTOCOL_VERSION 6
 #define VIZFLYT_MAX_CAMERAS 8
 #define VIZFLYT_MAX_IMU 64
 #define VIZFLYT_MAX_WAYPOINTS 32

@@ -2,10 +2,22 @@
 //! Wi-Fi, with time going on and things breaking.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::mavlink::dialect::MavMessage;
+use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, MavlinkVersion, Message, encode};
 use vizflyt_simulator::autopilot::Radio;
 use vizflyt_simulator::simulation::{MAX_LINKS, Simulation, SimulationConfig};
 use vizflyt_simulator::wifi::WifiConfig;
+
+/// The mission protocol: MISSION_COUNT, ITEM_INT, ACK, REQUEST_INT, REQUEST_LIST, CLEAR_ALL.
+const MISSION: [u32; 6] = [44, 73, 47, 51, 43, 45];
+
+/// Says a whole message of the mission protocol with this payload.
+fn say(simulation: &mut Simulation, which: u8, payload: &[u8]) {
+    let id = MISSION[usize::from(which) % MISSION.len()];
+    let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, payload) else { return };
+    let header = MavHeader { system_id: 255, component_id: 191, sequence: which };
+    simulation.handle_mavlink(0, encode(header, &message, &mut [0; MAX_PACKET]));
+}
 
 fuzz_target!(|input: (bool, bool, Vec<(u8, &[u8])>)| {
     let (over_wifi, radio, steps) = input;
@@ -24,6 +36,7 @@ fuzz_target!(|input: (bool, bool, Vec<(u8, &[u8])>)| {
             251 => simulation.set_radio(Radio::Lost),
             252 => simulation.set_radio(Radio::Heard),
             253 => simulation.break_motor(packet.len() % 4, 0.5),
+            240..=249 => say(&mut simulation, what - 240, packet),
             link => simulation.handle_mavlink(usize::from(link) % MAX_LINKS, packet),
         }
         for _ in 0..5 {
