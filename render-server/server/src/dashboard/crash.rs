@@ -18,13 +18,11 @@ pub(super) async fn show(State(page): State<Arc<Page>>, Path(name): Path<String>
         Err(none) => return *none,
     };
     let card = vehicle.crash.borrow().clone();
-    match card {
-        Some(card) => Json(&*card).into_response(),
-        None => {
-            let text = format!("no flight of '{name}' has failed since the server started");
-            (StatusCode::NOT_FOUND, text).into_response()
-        }
-    }
+    let Some(card) = card else {
+        let text = format!("no flight of '{name}' has failed since the server started");
+        return (StatusCode::NOT_FOUND, text).into_response();
+    };
+    Json(&*card).into_response()
 }
 
 /// Which picture of a moment.
