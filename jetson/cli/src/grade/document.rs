@@ -263,7 +263,7 @@ impl Grade {
         times.sort_by(f64::total_cmp);
         let upper = *times.get(times.len() / 2)?;
         let lower = times[(times.len() - 1) / 2];
-        Some(millionth((lower + upper) / 2.0))
+        Some(millionth(f64::midpoint(lower, upper)))
     }
 
     /// Reads a grade from a file.
