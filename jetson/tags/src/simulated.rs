@@ -101,7 +101,16 @@ pub struct SimulatedCamera {
 }
 
 /// Draws what is behind the tags for a camera that stands somewhere, an image of its own size.
-pub struct Behind(pub Box<dyn FnMut(&Pose<World, Cam>) -> Gray + Send>);
+pub struct Behind(Box<Draw>);
+
+type Draw = dyn FnMut(&Pose<World, Cam>) -> Gray + Send;
+
+impl Behind {
+    /// Draws by calling this.
+    pub fn new(draw: impl FnMut(&Pose<World, Cam>) -> Gray + Send + 'static) -> Self {
+        Self(Box::new(draw))
+    }
+}
 
 impl std::fmt::Debug for Behind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

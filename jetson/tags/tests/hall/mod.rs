@@ -24,7 +24,7 @@ pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
 /// Draws for one lens; again only where the camera has moved.
 fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
     let mut last: Option<(Pose<World, Cam>, Gray)> = None;
-    Behind(Box::new(move |world_from_cam: &Pose<World, Cam>| {
+    Behind::new(move |world_from_cam: &Pose<World, Cam>| {
         if let Some((at, image)) = &last
             && at == world_from_cam
         {
@@ -51,5 +51,5 @@ fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
             Gray::new(images[0].width_px, images[0].height_px, pixels).expect("of this size");
         last = Some((*world_from_cam, image.clone()));
         image
-    }))
+    })
 }
