@@ -130,14 +130,20 @@ fn light_and_fog_are_told_and_changed_by_our_own_page_only() {
         assert_eq!(status, 200, "{body}");
         serde_json::from_str::<serde_json::Value>(body).unwrap()
     };
+    let mut socket = Socket::open(server.http, &format!("http://{}", server.http)).ok().unwrap();
     let told = environment();
     assert_eq!((&told["name"], &told["light"][2]), (&serde_json::Value::Null, &0.5.into()));
     assert_eq!(told["names"][3], "fog");
     let put = |body: &str, origin| send_json(server.http, "PUT /api/environment", origin, body);
     let (status, answer) = put(r#"{"name": "fog"}"#, None);
     assert!(status == 200 && answer.contains("\"name\":\"fog\""), "{answer}");
-    let text = server.line(|line| line["event"]["text"].as_str().map(str::to_owned));
-    assert_eq!(text, "light and fog are changed to: fog");
+    let told = (0..MANY).find_map(|_| {
+        let events = socket.message("events");
+        let mut texts =
+            events["events"].as_array()?.iter().filter_map(|event| event["text"].as_str());
+        texts.next_back().map(str::to_owned)
+    });
+    assert_eq!(told.as_deref(), Some("light and fog are changed to: fog"));
     assert_eq!(environment()["fog_visibility_m"], 12.0);
     assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
     for (body, expected) in [

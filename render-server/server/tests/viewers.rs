@@ -32,12 +32,11 @@ struct Got {
 
 #[test]
 fn twenty_pages_cost_four_runtimes_no_event() {
-    let seconds = std::env::var("VIZFLYT_STRESS_S").ok().map_or(4, |s| s.parse().unwrap());
+    let seconds = std::env::var("VIZFLYT_STRESS_S").map_or(4, |s| s.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let second = "name = \"down\"\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
                   position_m = [0, 0, 0]\ntilt_deg = -30.0\nrate_hz = 15.0\n";
-    let vehicles: String =
-        VEHICLES.iter().map(|name| format!("[[vehicles]]\nname = \"{name}\"\n")).collect();
+    let vehicles = VEHICLES.map(|name| format!("[[vehicles]]\nname = \"{name}\"\n")).concat();
     let more = format!("rate_hz = 15.0\n[[cameras]]\n{second}{vehicles}");
     let server = Server::start(&write_arena(folder.path(), &more), &["--apart"]);
     let _emitters = VEHICLES.map(|name| Emitter::along(server.vicon, name, |_| 0.0));
@@ -104,7 +103,7 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         assert_eq!(got.cameras_changed.load(Ordering::Relaxed), changes, "events of {name}");
     }
     let after = rate("no page again", (seconds / 4).max(2), &mut || {});
-    let alone = (before + after) / 2.0;
+    let alone = f64::midpoint(before, after);
     println!(
         "with 20 pages the runtimes get {:.3} of their images; a page {:.1} pictures and {:.1} states \
          a second; {changes} events to each, none lost; server {start_mb:.1} -> {end_mb:.1} MB",

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use glam::{Quat, Vec3};
 use sha2::{Digest, Sha256};
+use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Obstacles};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{Level, Project};
@@ -47,7 +48,11 @@ impl Place {
         let generated = project.generate(seed, level, variant);
         // Not kept for later: on disk it would be a map for the next plugin.
         let baked = bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, &|_| ());
-        let rules = generated.arena.to_toml().context("the arena cannot be written down")?;
+        // Light and fog belong to what cameras see.
+        let environment = generated.arena.environment;
+        let rules =
+            ArenaConfig { environment: EnvironmentConfig::default(), ..generated.arena.clone() };
+        let rules = rules.to_toml().context("the arena cannot be written down")?;
         let mut hash = Sha256::new();
         hash.update(project.text());
         hash.update([0]);
@@ -57,7 +62,7 @@ impl Place {
         let map = truth.map(serde_json::to_string).transpose().context("the map has no text")?;
         let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
         Ok(Self {
-            scene_sha256: hash_of(&generated.splats, &generated.objects),
+            scene_sha256: hash_of(&generated.splats, &generated.objects, &environment),
             rules_sha256: hex(&hash.finalize()),
             arena: generated.arena,
             splats: generated.splats,
@@ -69,11 +74,15 @@ impl Place {
     }
 }
 
-fn hash_of(splats: &Splats, objects: &[RigidObject]) -> String {
+fn hash_of(splats: &Splats, objects: &[RigidObject], environment: &EnvironmentConfig) -> String {
     let mut hash = Sha256::new();
     take_all(&mut hash, splats);
     for object in objects {
         take_all(&mut hash, &object.splats);
+    }
+    let EnvironmentConfig { light, fog_visibility_m, fog } = environment;
+    for number in light.iter().chain(fog).chain([fog_visibility_m]) {
+        hash.update(number.to_le_bytes());
     }
     hex(&hash.finalize())
 }
