@@ -5,8 +5,10 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_arena::collision::sweep;
-use vizflyt_arena::config::BodyPart;
+use vizflyt_arena::config::{BodyPart, MotionConfig, ObjectConfig};
 use vizflyt_arena::grid::Grid;
+use vizflyt_arena::objects::MovingObjects;
+use vizflyt_arena::obstacles::{Obstacles, Visit};
 use vizflyt_arena::{BakeSpec, BodyShape, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_protocol::geometry::Pose;
 
@@ -30,6 +32,31 @@ fn forest(splats: usize) -> Vec<Ellipsoid> {
             }
         })
         .collect()
+}
+
+/// The hand of the clock: a bar of 1.2 m that turns in 4 s about x, at the origin's height of flight.
+fn clock_hand() -> (DistanceField, MovingObjects) {
+    let grid = Grid::covering(DVec3::new(-0.3, -0.3, -0.9), DVec3::new(0.3, 0.3, 0.9), 0.02);
+    let bar = (0..600).map(|i| Ellipsoid {
+        center_m: Vec3::new(
+            (i % 3) as f32 * 0.02 - 0.02,
+            (i / 3 % 5) as f32 * 0.02 - 0.04,
+            (i / 15) as f32 * 0.03 - 0.6,
+        ),
+        scales_m: Vec3::splat(0.012),
+        rotation: Quat::IDENTITY,
+        opacity: 0.95,
+    });
+    let hand = ObjectConfig {
+        name: "hand".into(),
+        scene: "hand.ply".into(),
+        position_m: DVec3::new(0.0, 0.0, 1.2),
+        yaw_deg: 0.0,
+        phase_s: Some(0.0),
+        motion: MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 },
+    };
+    let field = DistanceField::of(OccupancyGrid::bake_object(bar, grid, 0.3));
+    (field, MovingObjects::of(&[hand], 7))
 }
 
 fn spec() -> BakeSpec {
@@ -66,6 +93,27 @@ fn rules(criterion: &mut Criterion) {
     };
     let hub = BodyPart { from_m: DVec3::ZERO, to_m: None, radius_m: 0.05 };
     let frame = BodyShape::of_parts(&[arm(0.09), arm(-0.09), hub]);
+    let (hand, objects) = clock_hand();
+    let empty = DistanceField::of(OccupancyGrid::bake(std::iter::empty(), &spec()));
+    let turning = Obstacles::new(empty.into(), vec![hand.into()], objects);
+    for (name, body) in [("sphere", BodyShape::sphere(0.12)), ("two arms and a hub", frame.clone())]
+    {
+        let mut tick = 0;
+        criterion.bench_function(&format!("swept tick beside a turning hand, {name}"), |bencher| {
+            bencher.iter(|| {
+                // Past the hand's face, 0.2 to 0.8 m before it, as a vehicle waits for its turn.
+                tick = (tick + 1) % 800;
+                let visit = |tick: i64| {
+                    let before_m = 0.5 + 0.3 * (tick as f64 * 0.01).sin();
+                    let at_m = DVec3::new(-before_m, 0.1, 1.2);
+                    let world_from_body =
+                        Pose::new(at_m, DQuat::from_rotation_z(tick as f64 * 1e-3));
+                    Visit { since_epoch_ns: tick * 5_000_000, world_from_body }
+                };
+                turning.sweep(&body, &visit(tick), &visit(tick + 1))
+            });
+        });
+    }
     for (name, body) in [("sphere", BodyShape::sphere(0.12)), ("two arms and a hub", frame)] {
         criterion.bench_function(&format!("swept tick, {name}, 6 m/s at 200 Hz"), |bencher| {
             bencher.iter(|| {

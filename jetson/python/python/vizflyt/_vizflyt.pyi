@@ -572,7 +572,11 @@ class Intrinsics:
         """
 
 def course_map() -> list[Volume] | None:
-    """Returns every obstacle of the course, where its map is known; None where it is not. [world]"""
+    """Returns every obstacle of the course, where its map is known; None where it is not. [world]
+
+    # Errors
+    `ValueError` for a map that cannot be read.
+    """
 
 @final
 class Volume:

@@ -10,6 +10,7 @@
 
 use super::device::Device;
 use super::sort;
+use super::view::View;
 use crate::blocks::BLOCK;
 
 /// How much there must be room for.
@@ -33,7 +34,7 @@ impl Room {
         // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
         let slots = (binding_bytes / 16).min(65_535 * 256);
         Self {
-            views: binding_bytes / 272,
+            views: binding_bytes / size_of::<View>() as u64,
             // Ranks, and a number per workgroup.
             camera_blocks: (binding_bytes / 4 * 255 / 256).min(65_535 * 256),
             regions: slots / BLOCK as u64,
@@ -124,7 +125,7 @@ impl Buffers {
         Self {
             room,
             tick: device.uniform("tick", &[0; 32]),
-            views: storage("views", room.views * 68),
+            views: storage("views", room.views * (size_of::<View>() / 4) as u64),
             regions: storage("regions", room.camera_blocks + room.camera_blocks.div_ceil(256)),
             sizes: source("sizes", SIZES_BYTES / 4),
             dispatches: device.buffer("dispatches", 64, indirect),
