@@ -488,11 +488,17 @@ pub fn send_json(
     );
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(stream, "{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n{body}").unwrap();
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).unwrap();
-    let body = answer.split_once("\r\n\r\n").expect("a body").1.to_owned();
-    (status(&answer), body)
+    // A server that refuses a long body answers before it has read it all, and closes: sending then
+    // fails, and so may reading on once the answer is here. Only the answer counts.
+    let request = format!("{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n{body}");
+    let sent = stream.write_all(request.as_bytes());
+    let mut answer = Vec::new();
+    let read = stream.read_to_end(&mut answer);
+    let answer = String::from_utf8(answer).unwrap();
+    let Some((_, body)) = answer.split_once("\r\n\r\n") else {
+        panic!("no answer: {sent:?}, {read:?}");
+    };
+    (status(&answer), body.to_owned())
 }
 
 fn status(answer: &str) -> u16 {
