@@ -3,9 +3,11 @@
 use std::fs;
 
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::messages::{Arrivals, ClockState, Intervals, StageTimes, Stages};
+use vizflyt_protocol::messages::{
+    Arrivals, ClockState, Intervals, OutcomeKind, StageTimes, Stages,
+};
 
-use crate::flight::{Outcome, OutcomeKind};
+use crate::flight::Outcome;
 use crate::stats::ImageTimes;
 
 /// The report. Field names carry their units.

@@ -12,52 +12,11 @@
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::messages::{Event, EventKind, FlightPhase};
+use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, OutcomeKind};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::config::ArenaConfig;
 use crate::referee::AIRBORNE_M;
-
-/// How a flight ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Outcome {
-    /// The course was flown to its end.
-    Finished,
-    /// The body touched an obstacle, or the floor too fast.
-    Collided,
-    /// It left the geofence, or could not have stopped inside.
-    Geofence,
-    /// The course's time was over.
-    Timeout,
-    /// It was landed before the end, by the plugin or by a person.
-    Landed,
-    /// The plugin crashed, hung or gave up.
-    PluginFailed,
-    /// It never took off, or something else than the plugin failed.
-    Error,
-}
-
-impl Outcome {
-    /// Returns the name as it stands in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Finished => "finished",
-            Self::Collided => "collided",
-            Self::Geofence => "geofence",
-            Self::Timeout => "timeout",
-            Self::Landed => "landed",
-            Self::PluginFailed => "plugin_failed",
-            Self::Error => "error",
-        }
-    }
-}
-
-impl core::fmt::Display for Outcome {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.pad(self.name())
-    }
-}
 
 /// Where the vehicle was at one moment of a flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -87,7 +46,7 @@ pub struct StageVerdict {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Verdict {
     /// How it ended.
-    pub outcome: Outcome,
+    pub outcome: OutcomeKind,
     /// Why, in one sentence.
     pub reason: String,
     /// How many stages were passed.
@@ -111,7 +70,8 @@ pub struct Verdict {
 /// Judges a flight in `arena` by all that happened, each in order of time.
 ///
 /// ```
-/// use vizflyt_arena::verdict::{Outcome, judge};
+/// use vizflyt_arena::verdict::judge;
+/// use vizflyt_protocol::messages::OutcomeKind;
 /// # let arena = vizflyt_arena::ArenaConfig::parse(r#"
 /// # name = "room"
 /// # scene = "scene.ply"
@@ -129,7 +89,7 @@ pub struct Verdict {
 /// # "#).unwrap();
 /// // Nothing happened at all: the vehicle never took off.
 /// let verdict = judge(&arena, &[], &[]);
-/// assert_eq!((verdict.outcome, verdict.score), (Outcome::Error, 0.0));
+/// assert_eq!((verdict.outcome, verdict.score), (OutcomeKind::Error, 0.0));
 /// ```
 pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdict {
     let airborne_m = arena.spawn.position_m.z + AIRBORNE_M;
@@ -140,7 +100,7 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
     let (outcome, reason) = match (end, took_off) {
         (Some((outcome, event)), _) => (outcome, event.text.as_str().to_owned()),
         (None, Some(_)) => landed(events),
-        (None, None) => (Outcome::Error, "the vehicle never took off".to_owned()),
+        (None, None) => (OutcomeKind::Error, "the vehicle never took off".to_owned()),
     };
     let last = samples.last().map(|sample| sample.stamp);
     let landing = || events.iter().find(|event| is_landing(event)).map(|event| event.stamp);
@@ -166,7 +126,7 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
     // Without a goal the last stage is the finish.
     let has_goal = arena.goal.is_some();
     let parts = stages.len() + usize::from(has_goal);
-    let passed = stages_passed + usize::from(has_goal && outcome == Outcome::Finished);
+    let passed = stages_passed + usize::from(has_goal && outcome == OutcomeKind::Finished);
     Verdict {
         outcome,
         reason,
@@ -182,7 +142,7 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
 }
 
 /// Returns how a flight ended that only its landing ended, and why.
-fn landed(events: &[Event]) -> (Outcome, String) {
+fn landed(events: &[Event]) -> (OutcomeKind, String) {
     let landing = events.iter().position(is_landing);
     let before = &events[..landing.unwrap_or(events.len())];
     let lost = before.iter().rev().find_map(|event| match event.kind {
@@ -192,24 +152,24 @@ fn landed(events: &[Event]) -> (Outcome, String) {
     });
     match (lost.flatten(), landing) {
         // That the pose is lost is no choice of the plugin's.
-        (Some(lost), _) => (Outcome::Error, lost.text.as_str().to_owned()),
+        (Some(lost), _) => (OutcomeKind::Error, lost.text.as_str().to_owned()),
         (None, Some(landing)) => {
             let text = events[landing].text.as_str();
-            (Outcome::Landed, text.strip_prefix("landing: ").unwrap_or(text).to_owned())
+            (OutcomeKind::Landed, text.strip_prefix("landing: ").unwrap_or(text).to_owned())
         }
-        (None, None) => (Outcome::Landed, "not over when its record ends".to_owned()),
+        (None, None) => (OutcomeKind::Landed, "not over when its record ends".to_owned()),
     }
 }
 
 /// Returns the outcome of a flight that this event ends.
-fn ending(event: &Event) -> Option<Outcome> {
+fn ending(event: &Event) -> Option<OutcomeKind> {
     match event.kind {
-        EventKind::Collision { .. } => Some(Outcome::Collided),
-        EventKind::Geofence { .. } => Some(Outcome::Geofence),
-        EventKind::Finished { .. } => Some(Outcome::Finished),
-        EventKind::TimeLimit => Some(Outcome::Timeout),
-        EventKind::EmergencyStop => Some(Outcome::Landed),
-        EventKind::PluginFailed => Some(Outcome::PluginFailed),
+        EventKind::Collision { .. } => Some(OutcomeKind::Collided),
+        EventKind::Geofence { .. } => Some(OutcomeKind::Geofence),
+        EventKind::Finished { .. } => Some(OutcomeKind::Finished),
+        EventKind::TimeLimit => Some(OutcomeKind::Timeout),
+        EventKind::EmergencyStop => Some(OutcomeKind::Landed),
+        EventKind::PluginFailed => Some(OutcomeKind::PluginFailed),
         _ => None,
     }
 }
@@ -273,7 +233,7 @@ mod tests {
         let hit = EventKind::Collision { p_world_m, clearance_m: -0.01 };
         let events = [stage(2.0, 0), event(3.4, hit), event(3.5, EventKind::PluginFailed)];
         let verdict = judge(&course(), &events, &samples(6));
-        assert_eq!((verdict.outcome, verdict.reason.as_str()), (Outcome::Collided, "why"));
+        assert_eq!((verdict.outcome, verdict.reason.as_str()), (OutcomeKind::Collided, "why"));
         // Off the ground 0.4 s after the first sample; what came after the contact does not count.
         assert!((verdict.seconds - 3.0).abs() < 1e-6, "{}", verdict.seconds);
         assert_eq!((verdict.stages_passed, verdict.score), (1, 25.0));
@@ -289,34 +249,34 @@ mod tests {
         let mut events = vec![stage(2.0, 0), stage(3.0, 1), stage(4.0, 2)];
         events.push(event(5.0, finished));
         let verdict = judge(&course(), &events, &samples(6));
-        assert_eq!((verdict.outcome, verdict.stages_passed), (Outcome::Finished, 3));
+        assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Finished, 3));
         assert_eq!(verdict.score, 100.0);
         // A stage after the end is none.
         let late = [event(3.0, EventKind::TimeLimit), stage(3.5, 0)];
         let verdict = judge(&course(), &late, &samples(6));
-        assert_eq!((verdict.outcome, verdict.stages_passed), (Outcome::Timeout, 0));
+        assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Timeout, 0));
     }
 
     #[test]
     fn landing_early_ends_the_time() {
         let landing = event(2.4, EventKind::Phase(FlightPhase::Landing));
         let verdict = judge(&course(), std::slice::from_ref(&landing), &samples(6));
-        assert_eq!(verdict.outcome, Outcome::Landed);
+        assert_eq!(verdict.outcome, OutcomeKind::Landed);
         assert!((verdict.seconds - 2.0).abs() < 1e-6);
         // For want of a pose it is nobody's choice; one that came back does not count.
         let lost = event(2.0, EventKind::PoseLost { age_s: 0.2 });
         let back = event(2.1, EventKind::PoseRegained);
         let blind = judge(&course(), &[lost.clone(), landing.clone()], &samples(6));
-        assert_eq!(blind.outcome, Outcome::Error);
+        assert_eq!(blind.outcome, OutcomeKind::Error);
         let seen = judge(&course(), &[lost, back, landing], &samples(6));
-        assert_eq!(seen.outcome, Outcome::Landed);
+        assert_eq!(seen.outcome, OutcomeKind::Landed);
     }
 
     #[test]
     fn on_the_ground_there_is_nothing_to_judge() {
         let verdict = judge(&course(), &[], &samples(0));
-        assert_eq!((verdict.outcome, verdict.min_clearance_m), (Outcome::Error, None));
+        assert_eq!((verdict.outcome, verdict.min_clearance_m), (OutcomeKind::Error, None));
         let failed = judge(&course(), &[event(0.0, EventKind::PluginFailed)], &[]);
-        assert_eq!((failed.outcome, failed.seconds), (Outcome::PluginFailed, 0.0));
+        assert_eq!((failed.outcome, failed.seconds), (OutcomeKind::PluginFailed, 0.0));
     }
 }

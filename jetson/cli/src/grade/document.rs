@@ -7,7 +7,8 @@ use anyhow::{Context, Result, bail, ensure};
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use vizflyt_arena::verdict::{Outcome, StageVerdict};
+use vizflyt_arena::verdict::StageVerdict;
+use vizflyt_protocol::messages::OutcomeKind;
 
 use super::statistics::{Interval, mean_interval, share_interval};
 
@@ -100,7 +101,7 @@ pub(crate) struct Run {
     /// The surroundings.
     pub variant: String,
     /// How it ended.
-    pub outcome: Outcome,
+    pub outcome: OutcomeKind,
     /// Why, in one sentence.
     pub reason: String,
     /// What it probably was, in words; absent if it finished.
@@ -258,7 +259,7 @@ impl Grade {
 
     /// Returns the median time of the flights that finished, penalties included. [s]
     pub(crate) fn median_finish_s(&self) -> Option<f64> {
-        let finished = self.runs.iter().filter(|run| run.outcome == Outcome::Finished);
+        let finished = self.runs.iter().filter(|run| run.outcome == OutcomeKind::Finished);
         let mut times: Vec<f64> = finished.map(|run| run.seconds + run.penalty_s).collect();
         times.sort_by(f64::total_cmp);
         let upper = *times.get(times.len() / 2)?;
@@ -323,7 +324,7 @@ impl Run {
 impl Summary {
     fn of(runs: &[Run]) -> Self {
         let finished: Vec<&Run> =
-            runs.iter().filter(|run| run.outcome == Outcome::Finished).collect();
+            runs.iter().filter(|run| run.outcome == OutcomeKind::Finished).collect();
         let scores: Vec<f64> = runs.iter().map(|run| run.score).collect();
         let stages: usize = runs.iter().map(|run| run.stages_passed).sum();
         let times = finished.iter().map(|run| run.seconds + run.penalty_s);
@@ -408,18 +409,18 @@ pub(crate) mod tests {
         }
     }
 
-    pub(crate) fn run(seed: u64, outcome: Outcome) -> Run {
+    pub(crate) fn run(seed: u64, outcome: OutcomeKind) -> Run {
         Run {
             seed,
             variant: "day".into(),
             outcome,
             reason: "reached the goal".into(),
-            cause: (outcome != Outcome::Finished).then(|| "too fast".to_owned()),
+            cause: (outcome != OutcomeKind::Finished).then(|| "too fast".to_owned()),
             stages_passed: 1,
             stages: vec![StageVerdict { name: "window".into(), passed_s: Some(3.25) }],
             seconds: 10.0 + 0.1 * seed as f64,
             penalty_s: 0.5,
-            score: if outcome == Outcome::Finished { 100.0 } else { 50.0 },
+            score: if outcome == OutcomeKind::Finished { 100.0 } else { 50.0 },
             min_clearance_m: Some(0.31),
             max_speed_mps: 2.9,
             path_m: 21.7,
@@ -435,7 +436,7 @@ pub(crate) mod tests {
     }
 
     pub(crate) fn grade() -> Grade {
-        let runs = vec![run(3, Outcome::Finished), run(1, Outcome::Collided)];
+        let runs = vec![run(3, OutcomeKind::Finished), run(1, OutcomeKind::Collided)];
         let shard = Some(Shard { index: 1, count: 2 });
         let mut grade = Grade::new(subject(), shard, runs);
         grade.sign(&key()).unwrap();
@@ -540,12 +541,12 @@ pub(crate) mod tests {
 
     #[test]
     fn the_median_is_of_the_flights_that_finished() {
-        let of = |outcomes: &[Outcome]| {
+        let of = |outcomes: &[OutcomeKind]| {
             let runs = outcomes.iter().zip(1..).map(|(&outcome, seed)| run(seed, outcome));
             Grade::new(subject(), None, runs.collect()).median_finish_s()
         };
         // Seed n takes 10.5 s and n tenths, penalty included.
-        let (done, hit) = (Outcome::Finished, Outcome::Collided);
+        let (done, hit) = (OutcomeKind::Finished, OutcomeKind::Collided);
         assert_eq!(of(&[hit, hit]), None);
         assert_eq!(of(&[hit, done]), Some(10.7));
         assert_eq!(of(&[done, done, hit, done]), Some(10.7));

@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use vizflyt_arena::verdict::Outcome;
+use vizflyt_protocol::messages::OutcomeKind;
 
 use super::document::Grade;
 use super::report::escape;
@@ -32,7 +32,7 @@ fn text(grade: &Grade) -> String {
             run.seed,
             run.seconds
         );
-        if run.outcome == Outcome::Finished {
+        if run.outcome == OutcomeKind::Finished {
             text += "/>\n";
         } else {
             let cause = run.cause.as_deref().unwrap_or(&run.reason);

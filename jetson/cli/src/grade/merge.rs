@@ -46,10 +46,10 @@ mod tests {
     use super::super::document::tests::{key, run, subject};
     use super::super::document::{Shard, Subject};
     use super::*;
-    use vizflyt_arena::verdict::Outcome;
+    use vizflyt_protocol::messages::OutcomeKind;
 
     fn part(subject: &Subject, index: u64, count: u64, seeds: &[u64]) -> (String, Grade) {
-        let runs = seeds.iter().map(|&seed| run(seed, Outcome::Finished)).collect();
+        let runs = seeds.iter().map(|&seed| run(seed, OutcomeKind::Finished)).collect();
         let mut grade = Grade::new(subject.clone(), Some(Shard { index, count }), runs);
         grade.sign(&key()).unwrap();
         (format!("part-{index}.json"), grade)
@@ -65,7 +65,7 @@ mod tests {
         let subject = subject();
         let parts = [part(&subject, 2, 2, &[2, 4]), part(&subject, 1, 2, &[3, 1])];
         let merged = merge(&parts, &key().verifying_key()).unwrap();
-        let whole = (1..=4).map(|seed| run(seed, Outcome::Finished)).collect();
+        let whole = (1..=4).map(|seed| run(seed, OutcomeKind::Finished)).collect();
         assert_eq!(merged, Grade::new(subject, None, whole));
     }
 

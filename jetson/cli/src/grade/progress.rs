@@ -4,7 +4,7 @@ use std::io::{IsTerminal, Write};
 use std::time::Instant;
 
 use super::document::Run;
-use vizflyt_arena::verdict::Outcome;
+use vizflyt_protocol::messages::OutcomeKind;
 
 /// Of the bar. [characters]
 const BAR: usize = 24;
@@ -35,12 +35,12 @@ impl Progress {
     /// Takes note of a flight.
     pub(super) fn flown(&mut self, run: &Run, virtual_s: f64) {
         self.done += 1;
-        self.finished += usize::from(run.outcome == Outcome::Finished);
+        self.finished += usize::from(run.outcome == OutcomeKind::Finished);
         self.virtual_s += virtual_s;
         let mut out = std::io::stderr().lock();
         // Nobody may be reading any more; the grade goes on.
         let _ = if self.is_terminal {
-            if run.outcome != Outcome::Finished {
+            if run.outcome != OutcomeKind::Finished {
                 let _ = writeln!(out, "\r\x1b[K{}", line(run));
             }
             write!(out, "\r\x1b[K{}", self.bar())

@@ -23,7 +23,8 @@ use std::collections::VecDeque;
 
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Setpoint,
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, OutcomeKind, PoseAges,
+    Setpoint,
 };
 use vizflyt_protocol::time::HostTime;
 
@@ -31,7 +32,7 @@ use crate::guard::{
     Fix, Guard, HoldReason, LandReason, Passed, RESTART_WITHIN_S, SETPOINT_HOLD_S, Stance,
 };
 use crate::link::{Goal, Link, LinkEvent};
-pub use outcome::{Outcome, OutcomeKind};
+pub use outcome::Outcome;
 
 /// What a person may set.
 #[derive(Clone, Copy, Debug, PartialEq)]

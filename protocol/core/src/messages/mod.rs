@@ -36,7 +36,7 @@ pub use session::{
     Limits, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ToRuntime, ToServer, Welcome,
 };
 pub use setpoint::{Axes, InvalidSetpoint, Setpoint, YawTarget};
-pub use telemetry::{FlightPhase, ImageStats, Telemetry, VehicleState};
+pub use telemetry::{FlightPhase, ImageStats, OutcomeKind, Telemetry, VehicleState};
 pub use timing::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Stages, Timing,
     Waterfall,

@@ -26,6 +26,48 @@ pub enum FlightPhase {
     Waiting,
 }
 
+/// How a flight ended, as runtime, grades and leaderboard say it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OutcomeKind {
+    /// The course was flown to its end.
+    Finished,
+    /// The body touched an obstacle of the twin, or the floor too fast.
+    Collided,
+    /// It left the geofence, or could not have stopped inside.
+    Geofence,
+    /// The course's time was over.
+    Timeout,
+    /// It was landed before the end: by the plugin, by a person, or as the time that a person asked
+    /// for was over.
+    Landed,
+    /// The plugin crashed, hung or gave up.
+    PluginFailed,
+    /// It never took off, or something else failed: link, localization, server.
+    Error,
+}
+
+impl OutcomeKind {
+    /// Returns the name as it stands in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Finished => "finished",
+            Self::Collided => "collided",
+            Self::Geofence => "geofence",
+            Self::Timeout => "timeout",
+            Self::Landed => "landed",
+            Self::PluginFailed => "plugin_failed",
+            Self::Error => "error",
+        }
+    }
+}
+
+impl core::fmt::Display for OutcomeKind {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.pad(self.name())
+    }
+}
+
 /// What the autopilot says of the vehicle, in our frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct VehicleState {

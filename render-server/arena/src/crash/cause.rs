@@ -3,11 +3,10 @@
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::wrap_pi;
-use vizflyt_protocol::messages::{EventKind, Setpoint};
+use vizflyt_protocol::messages::{EventKind, OutcomeKind, Setpoint};
 
 use super::{Flight, end_of, since};
 use crate::config::CameraConfig;
-use crate::verdict::Outcome;
 use crate::{ArenaConfig, DistanceField};
 
 /// Returns what a flight that did not finish probably failed of; `None` if it finished.
@@ -18,17 +17,17 @@ pub fn probable_cause(
 ) -> Option<String> {
     let reason = &flight.verdict.reason;
     match flight.verdict.outcome {
-        Outcome::Finished => None,
-        Outcome::Collided => Some(of_collision(arena, field, flight)),
-        Outcome::Geofence => Some(of_fence(arena, flight)),
-        Outcome::Timeout => Some(of_timeout(flight)),
-        Outcome::Landed if is_stopped(flight) => Some(format!("stopped by hand: {reason}")),
-        Outcome::Landed => Some(format!("it gave up: {reason}")),
-        Outcome::PluginFailed => Some(of_plugin(flight)),
-        Outcome::Error if flight.asked.is_some_and(<[_]>::is_empty) => {
+        OutcomeKind::Finished => None,
+        OutcomeKind::Collided => Some(of_collision(arena, field, flight)),
+        OutcomeKind::Geofence => Some(of_fence(arena, flight)),
+        OutcomeKind::Timeout => Some(of_timeout(flight)),
+        OutcomeKind::Landed if is_stopped(flight) => Some(format!("stopped by hand: {reason}")),
+        OutcomeKind::Landed => Some(format!("it gave up: {reason}")),
+        OutcomeKind::PluginFailed => Some(of_plugin(flight)),
+        OutcomeKind::Error if flight.asked.is_some_and(<[_]>::is_empty) => {
             Some("no image was ever answered: is `on_image` there, and does it return?".to_owned())
         }
-        Outcome::Error => Some(format!("not the plugin: {reason}")),
+        OutcomeKind::Error => Some(format!("not the plugin: {reason}")),
     }
 }
 

@@ -10,7 +10,8 @@ use std::time::Duration;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::verdict::{Outcome, Verdict};
+use vizflyt_arena::verdict::Verdict;
+use vizflyt_protocol::messages::OutcomeKind;
 
 use super::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
 use crate::hub::lock;
@@ -113,7 +114,7 @@ impl Recorder {
 fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {
     // The goal is the course's last stage for whoever reads a leaderboard.
     let goal = u32::from(arena.goal.is_some());
-    let reached = if verdict.outcome == Outcome::Finished { goal } else { 0 };
+    let reached = if verdict.outcome == OutcomeKind::Finished { goal } else { 0 };
     RunEnd {
         outcome: verdict.outcome.name().to_owned(),
         stages_passed: verdict.stages_passed as u32 + reached,

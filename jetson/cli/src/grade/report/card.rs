@@ -131,14 +131,14 @@ fn strip(
 
 #[cfg(test)]
 mod tests {
-    use vizflyt_arena::verdict::Outcome;
+    use vizflyt_protocol::messages::OutcomeKind;
 
     use super::super::super::document::tests::run;
     use super::*;
 
     #[test]
     fn a_card_without_images_says_so_and_holds_no_markup_of_a_plugin() {
-        let mut failed = run(3, Outcome::Collided);
+        let mut failed = run(3, OutcomeKind::Collided);
         failed.reason = "said <script>".to_owned();
         let card = without_images(&failed);
         assert!(card.starts_with("<section class=\"card\" id=\"day-3\">"), "{card}");

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use vizflyt_arena::verdict::Outcome;
+use vizflyt_protocol::messages::OutcomeKind;
 
 use super::document::{Grade, Run};
 use super::statistics::Interval;
@@ -85,7 +85,7 @@ fn figures(grade: &Grade) -> String {
 
 fn table(runs: &[Run]) -> String {
     let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Seed</th>\
-                    <th class=\"text\">Variant</th><th class=\"text\">Outcome</th><th>Stages</th>\
+                    <th class=\"text\">Variant</th><th class=\"text\">OutcomeKind</th><th>Stages</th>\
                     <th>Time</th><th>Clearance</th><th>Speed</th><th>Score</th>\
                     <th class=\"text\">Why</th></tr></thead><tbody>\n"
         .to_owned();
@@ -109,7 +109,7 @@ fn table(runs: &[Run]) -> String {
             stages += "-";
         }
         let seed = match outcome {
-            Outcome::Finished => seed.to_string(),
+            OutcomeKind::Finished => seed.to_string(),
             _ => format!("<a href=\"#{variant}-{seed}\">{seed}</a>"),
         };
         let clearance =
@@ -214,6 +214,6 @@ mod tests {
         }
         let read = Grade::read(&folder.path().join("grade.json")).unwrap();
         assert_eq!(read, grade());
-        assert!(table(&[run(5, Outcome::Finished)]).contains("<td class=\"text\">5</td>"));
+        assert!(table(&[run(5, OutcomeKind::Finished)]).contains("<td class=\"text\">5</td>"));
     }
 }
