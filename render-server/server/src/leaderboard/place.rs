@@ -55,6 +55,8 @@ impl FromStr for Database {
         match text.split_once("://") {
             Some(("postgres" | "postgresql", _)) => Ok(Self::Postgres(text.to_owned())),
             Some((scheme, _)) => Err(UnknownDatabase(scheme.to_owned())),
+            // A file of that name would hardly be meant.
+            None if text.starts_with("sqlite:") => Err(UnknownDatabase("sqlite:".to_owned())),
             None if text.is_empty() => Err(UnknownDatabase(String::new())),
             None => Ok(Self::File(PathBuf::from(text))),
         }
@@ -103,6 +105,8 @@ mod tests {
         assert!(!format!("{server:?}").contains("cret"));
         let error = "mysql://x".parse::<Database>().unwrap_err().to_string();
         assert!(error.contains("'mysql' is no database"), "{error}");
-        assert!("".parse::<Database>().is_err());
+        for none in ["", "sqlite:runs.sqlite", "sqlite:///runs.sqlite"] {
+            assert!(none.parse::<Database>().is_err(), "{none}");
+        }
     }
 }

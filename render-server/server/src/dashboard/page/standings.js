@@ -37,7 +37,10 @@ export function fillGrades(node, boards) {
       return row;
     });
     const title = Object.assign(document.createElement("h3"), { textContent: `graded: ${project} ${level}, ${conditions}` });
-    const table = document.createElement("table"), body = document.createElement("tbody");
+    const table = document.createElement("table"), heads = document.createElement("tr"), body = document.createElement("tbody");
+    const head = (textContent) => Object.assign(document.createElement("th"), { textContent, scope: "col" });
+    heads.append(...["place", "team", "stages", "finished", "time"].map(head));
+    table.createTHead().append(heads);
     body.append(...rows);
     table.append(body);
     return [title, table];

@@ -1,5 +1,5 @@
 // The wall view: the standings, large, and who flies; asks every second, shows and can do nothing else.
-import { ask, fill, flying } from "/standings.js";
+import { ask, fill, fillGrades, flying } from "/standings.js";
 
 const $ = (id) => document.getElementById(id);
 const light = matchMedia("(prefers-color-scheme: light)");
@@ -16,6 +16,8 @@ async function show() {
       document.title = `${board.course} – VizFlyt leaderboard`;
       fill($("official"), board.official);
       fill($("practice"), board.practice);
+      fillGrades($("graded"), board.graded);
+      $("graded-panel").hidden = !board.graded.length;
       $("flying").textContent = flying(board.vehicles);
     }
   } catch {
