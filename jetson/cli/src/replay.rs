@@ -13,7 +13,7 @@ use clap::Args;
 use serde_json::json;
 use vizflyt_runtime::log::read::{LogReader, RecordedFlight, RecordedPoses};
 use vizflyt_runtime::replay::{Differs, FlownPlugin, Plan, ReplayOptions, ReplayReport, replay};
-use vizflyt_runtime::supervisor::Stream;
+use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
 use crate::fly::plugin::Plugin;
 use crate::plugins;
@@ -39,9 +39,12 @@ pub(crate) struct ReplayArgs {
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT", requires = "plugin")]
     plugin_arguments: Vec<OsString>,
+    /// The map that the flight's plugin was handed (map.json), if it was
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// Sends the flight's poses there at its pace, as packets that `vizflyt serve --pose json` reads, and
     /// nothing else
-    #[arg(long, value_name = "HOST:PORT", conflicts_with_all = ["plugin", "all", "answers", "report"])]
+    #[arg(long, value_name = "HOST:PORT", conflicts_with_all = ["plugin", "map", "all", "answers", "report"])]
     poses_to: Option<SocketAddr>,
     /// The name of the vehicle in those packets
     #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "poses_to")]
@@ -81,8 +84,14 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     };
     let mut command = Plugin::find(&plugin)?.command()?;
     command.extend(arguments);
+    // Confined as in flight: what it could not do there it cannot do here.
+    let mut limits = PluginLimits::default();
+    if let Some(path) = &args.map {
+        limits.hand_map_file(path)?;
+    }
     let options = ReplayOptions {
         command,
+        limits,
         is_realtime: args.realtime,
         all: args.all,
         answer_within: Duration::try_from_secs_f64(args.within)

@@ -56,10 +56,7 @@ pub fn fly_command(
     keep_going_when_files_are_full();
     let mut plugin_limits = args.jetson.plugin.limits();
     if let Some(path) = &args.map {
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("the map {} cannot be read", path.display()))?;
-        let handed = plugin_limits.hand_map(&text).map_err(anyhow::Error::msg);
-        handed.with_context(|| path.display().to_string())?;
+        plugin_limits.hand_map_file(path)?;
     }
     let server = args.server.address()?;
     let (fingerprint, identity) = args.server.known()?;

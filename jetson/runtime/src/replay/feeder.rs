@@ -9,7 +9,7 @@ use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_rgbd::{Decoder, peek};
 use zerocopy::FromBytes;
 
-use super::{ReplayError, sleep_until};
+use super::{ReplayError, ReplayOptions, sleep_until};
 use crate::lockstep::{PluginProcess, ProcessError};
 use crate::log::Observation;
 use crate::supervisor::{PluginLimits, Stream};
@@ -35,6 +35,7 @@ pub(super) enum Answered {
 /// Feeds one plugin process after the other, as the flight had them.
 pub(super) struct Feeder<'a> {
     command: &'a [OsString],
+    limits: &'a PluginLimits,
     answer_within: Duration,
     process: Option<PluginProcess>,
     decoders: HashMap<u32, Decoder>,
@@ -44,8 +45,10 @@ pub(super) struct Feeder<'a> {
 type Failed = String;
 
 impl<'a> Feeder<'a> {
-    pub(super) fn new(command: &'a [OsString], answer_within: Duration) -> Self {
-        Self { command, answer_within, process: None, decoders: HashMap::new() }
+    pub(super) fn new(options: &'a ReplayOptions) -> Self {
+        let ReplayOptions { command, limits, answer_within, .. } = options;
+        let answer_within = *answer_within;
+        Self { command, limits, answer_within, process: None, decoders: HashMap::new() }
     }
 
     /// Sends a message; a start begins a process, and ends the one before.
@@ -57,9 +60,7 @@ impl<'a> Feeder<'a> {
         match message {
             ToPlugin::Start(_) => {
                 self.stop(line);
-                // Confined as in flight: what it could not do there it cannot do here.
-                let limits = PluginLimits::default();
-                let process = PluginProcess::start(self.command, &limits, self.answer_within)?;
+                let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
                 apart(self.process.insert(process).begin(message, line))
             }
             // Ours comes at the end of the log.

@@ -38,7 +38,7 @@ use self::plan::Feed;
 pub use self::plan::{FlownPlugin, Plan};
 use crate::lockstep::ProcessError;
 use crate::log::read::{LogError, LogReader, Recorded, RecordedFlight};
-use crate::supervisor::Stream;
+use crate::supervisor::{PluginLimits, Stream};
 
 /// Why a log cannot be replayed.
 #[derive(Debug, thiserror::Error)]
@@ -76,6 +76,8 @@ pub enum ReplayError {
 pub struct ReplayOptions {
     /// The command that starts the plugin, before the runtime's own argument.
     pub command: Vec<OsString>,
+    /// What it may take, and the map that it is handed: as in flight.
+    pub limits: PluginLimits,
     /// At the flight's pace instead of as fast as possible.
     pub is_realtime: bool,
     /// Images that the plugin skipped in flight, too.
@@ -188,7 +190,7 @@ fn run(
     answers: &mut impl Write,
 ) -> Result<Option<String>, ReplayError> {
     let mut flight = RecordedFlight::new(LogReader::open(log)?, true);
-    let mut feeder = Feeder::new(&options.command, options.answer_within);
+    let mut feeder = Feeder::new(options);
     let mut pace: Option<(HostTime, Instant)> = None;
     while let Some(recorded) = flight.next()? {
         let Recorded::Observation(observation) = recorded else { continue };

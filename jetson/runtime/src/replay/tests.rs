@@ -227,6 +227,7 @@ fn misbehave(how: &str) -> Vec<OsString> {
 fn replay_to(log: &Path, command: Vec<OsString>, answers: &str) -> (ReplayReport, Vec<String>) {
     let options = ReplayOptions {
         command,
+        limits: PluginLimits::default(),
         is_realtime: false,
         all: false,
         answer_within: Duration::from_secs(5),

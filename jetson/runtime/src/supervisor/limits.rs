@@ -1,9 +1,10 @@
 //! What a plugin may use, and what happens when it ends: the settings, from `[plugin]` in
 //! `jetson.toml`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
+use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
 /// When a plugin that ended is started again.
@@ -94,6 +95,17 @@ impl PluginLimits {
         }
         self.map = Some(text);
         Ok(())
+    }
+
+    /// As [`Self::hand_map`], of a file.
+    ///
+    /// # Errors
+    /// What is wrong with it, and its name.
+    pub fn hand_map_file(&mut self, path: &Path) -> anyhow::Result<()> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("the map {} cannot be read", path.display()))?;
+        let handed = self.hand_map(&text).map_err(anyhow::Error::msg);
+        handed.with_context(|| path.display().to_string())
     }
 
     /// Checks that the limits leave a plugin room to live.
