@@ -60,7 +60,7 @@ impl Rig {
     }
 }
 
-/// An array as numpy saves it, of f32.
+/// An array as numpy saves it, of f32 or u16.
 struct Array {
     shape: Vec<usize>,
     values: Vec<f32>,
@@ -70,18 +70,21 @@ fn array(bytes: &[u8]) -> Option<Array> {
     assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
     let head = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
     let text = String::from_utf8_lossy(&bytes[10..head]);
-    if !text.contains("'<f4'") {
-        return None;
-    }
     let shape = text.split("'shape': (").nth(1)?.split(')').next()?;
     let shape = shape.split(',').filter_map(|side| side.trim().parse().ok()).collect();
-    let values = bytes[head..].chunks_exact(4);
-    let values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    let body = &bytes[head..];
+    let values = if text.contains("'<f4'") {
+        body.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+    } else if text.contains("'<u2'") {
+        body.chunks_exact(2).map(|b| f32::from(u16::from_le_bytes([b[0], b[1]]))).collect()
+    } else {
+        return None;
+    };
     Some(Array { shape, values })
 }
 
 fn saved(folder: &str, name: &str) -> Array {
-    array(&fs::read(Path::new(folder).join(name)).unwrap()).expect("f32")
+    array(&fs::read(Path::new(folder).join(name)).unwrap()).expect("f32 or u16")
 }
 
 /// Width, height, bits per channel and colour type of a PNG (its IHDR).
@@ -161,6 +164,27 @@ fn pictures_are_written_as_png_and_as_arrays() {
     assert!(alpha.values[middle] > 0.9, "something is ahead");
     let (a, b) = (expected.values[middle], median.values[middle]);
     assert!(a > 0.5 && (a / b - 1.0).abs() < 0.2, "expected {a} m, median {b} m");
+}
+
+/// A door that slides: its pixels are known by their ids, and are elsewhere a second later.
+#[test]
+fn what_moves_is_drawn_where_its_clock_says() {
+    let rig = Rig::new();
+    let (scene, camera) = (rig.at("moving"), rig.at("cam.json"));
+    good(&["scene", "generate", "moving", "-o", &scene]);
+    let door = |at: &str| {
+        let out = rig.at(at);
+        let fixed = ["scene", "render", &scene, "--camera", &camera, "--format", "npy"];
+        let said = good(&[&fixed[..], &["--at", at, "--out", &out]].concat());
+        assert!(said.contains("door, pendulum, second drone at"), "{said}");
+        let ids = saved(&out, "ids.npy").values;
+        (0..ids.len()).filter(|&k| ids[k] == 1.0).map(|k| k % 160).collect::<Vec<_>>()
+    };
+    let middle = |columns: &[usize]| columns.iter().sum::<usize>() as f64 / columns.len() as f64;
+    let (first, again, later) = (door("0"), door("0"), door("1"));
+    assert!(first.len() > 500 && first == again, "{} pixels", first.len());
+    assert!((middle(&first) - middle(&later)).abs() > 5.0, "{} {}", middle(&first), middle(&later));
+    refused(&["scene", "render", &scene, "--camera", &camera, "--at", "soon"], &["'soon' is no"]);
 }
 
 #[test]
@@ -315,7 +339,7 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     let error: Value = serde_json::from_slice(&socket.receive()).unwrap();
     assert!(error["error"].as_str().unwrap().contains("unknown field `what`"), "{error}");
     let ask = json!({"p_m": welcome["start_m"], "yaw_rad": 0.3, "pitch_rad": -0.1, "fov_deg": 80,
-                     "width_px": 200, "height_px": 100, "depth": false});
+                     "width_px": 200, "height_px": 100, "depth": false, "at_s": 2.5});
     socket.send(&ask.to_string());
     let told: Value = serde_json::from_slice(&socket.receive()).unwrap();
     assert!(told["visible"].as_u64().unwrap() > 100, "{told}");
@@ -328,6 +352,8 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
         &rig.at("race"),
         "--camera",
         &rig.at("copied.json"),
+        "--at",
+        "2.5",
         "--out",
         &rig.at("copied"),
     ]);

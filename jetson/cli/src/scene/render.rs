@@ -9,8 +9,8 @@ use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_scenes::Variant;
 use vizflyt_server::environment::air;
 use vizflyt_server::render::{RendererKind, choose};
-use vizflyt_server::scene::load_as_it_is;
-use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage};
+use vizflyt_server::scene::{load_as_it_is, load_objects};
+use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
 use super::npy;
@@ -32,7 +32,8 @@ Files:
 
 Examples:
   vizflyt scene render room.ply --camera cam.json --out pictures
-  vizflyt scene render forest/arena.toml --camera a.json --camera b.json --format npy --out poses")]
+  vizflyt scene render forest/arena.toml --camera a.json --camera b.json --format npy --out poses
+  vizflyt scene render race/arena.toml --camera cam.json --at 2.5")]
 pub(crate) struct RenderArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
@@ -48,6 +49,12 @@ pub(crate) struct RenderArgs {
     /// The light and the fog it is seen in: day, dusk, night, fog, night-fog
     #[arg(long, value_name = "NAME", default_value_t)]
     environment: Variant,
+    /// The instant at which what moves is drawn, since the arena's clock began
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
+    at: f64,
+    /// What the arena leaves to chance: where in their motion its objects begin
+    #[arg(long, default_value_t = 7)]
+    seed: u64,
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
@@ -67,17 +74,24 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     // Cameras first: a mistake in one is told before the scene is loaded.
     let shots = shots(args)?;
     let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let (objects, moving) = load_objects(&args.scene, args.seed)?;
     let start = Instant::now();
-    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer)?;
+    let twin = Scene { splats: &loaded.splats, objects: &objects };
+    let Chosen { mut rasterizer, reason } = choose(twin, args.renderer)?;
     println!("scene       {}: {} splats", scene.display(), loaded.splats.len());
+    if !moving.is_empty() {
+        let names: Vec<_> = moving.names().collect();
+        println!("objects     {} at {} s", names.join(", "), args.at);
+    }
     println!("renderer    {} ({reason})", rasterizer.name());
-    drop(loaded);
+    drop((loaded, objects));
+    let placements = moving.placements((args.at * 1e9).round() as i64);
     println!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
     let air = air(&args.environment.environment());
     for Shot { camera, folder } in shots {
         let camera = Camera { air, ..camera };
-        let times = rasterizer.render(&[], &[camera], &mut images)?;
+        let times = rasterizer.render(&placements, &[camera], &mut images)?;
         let [image] = &images;
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;
@@ -96,6 +110,13 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// Within what a clock of nanoseconds can say.
+fn seconds(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is no number of seconds"))?;
+    let good = value.is_finite() && value.abs() <= 1e9;
+    good.then_some(value).ok_or_else(|| format!("{value} s is beyond any flight"))
 }
 
 struct Shot {

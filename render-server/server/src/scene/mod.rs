@@ -26,6 +26,7 @@ use anyhow::{Context, Result, bail};
 use tracing::{info, warn};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::LocalizationConfig;
+use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::format::{self, Loaded, Progress};
 use vizflyt_splat::{RigidObject, Splats};
 
@@ -65,6 +66,18 @@ pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
     };
     let loaded = read(&scene)?;
     Ok((scene, loaded))
+}
+
+/// Reads what moves in an arena, with those phases that its file leaves to the seed; of a bare scene,
+/// nothing.
+pub fn load_objects(path: &Path, seed: u64) -> Result<(Vec<RigidObject>, MovingObjects)> {
+    match named(path)? {
+        Named::Arena(path) => {
+            let (arena, _) = parse_arena(&path)?;
+            Ok((read_objects(&arena, &path)?, MovingObjects::new(&arena, seed)))
+        }
+        Named::Scene(_) => Ok((Vec::new(), MovingObjects::default())),
+    }
 }
 
 /// Returns where an arena's poses come from, as its file says; a bare scene says nothing.
@@ -121,8 +134,12 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
 fn with_arena(path: &Path) -> Result<Scene> {
     let (arena, scene) = parse_arena(path)?;
     let world_from_scene = WorldFromScene::IDENTITY;
-    let objects = objects::read_all(&arena, path, |path| Ok(read(path)?.splats))?;
+    let objects = read_objects(&arena, path)?;
     Ok(Scene { splats: read(&scene)?.splats, arena, objects, world_from_scene })
+}
+
+fn read_objects(arena: &ArenaConfig, arena_toml: &Path) -> Result<Vec<RigidObject>> {
+    objects::read_all(arena, arena_toml, |path| Ok(read(path)?.splats))
 }
 
 fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {

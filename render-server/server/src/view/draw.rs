@@ -3,6 +3,7 @@
 use anyhow::{Context, Result};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
+use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Air, Camera, DepthKind, Rasterizer, RgbdImage};
@@ -28,6 +29,9 @@ pub(super) struct Request {
     height_px: u32,
     /// Shows depth instead of colour.
     depth: bool,
+    /// On the clock of what moves. [s]
+    #[serde(default)]
+    at_s: f64,
 }
 
 /// What is said of a picture before it comes.
@@ -63,6 +67,7 @@ pub(super) struct Drawn {
 /// Renderer and scratch memory.
 pub(super) struct Engine {
     rasterizer: Box<dyn Rasterizer>,
+    moving: MovingObjects,
     world_from_scene: WorldFromScene,
     image: [RgbdImage; 1],
     rgb: Vec<u8>,
@@ -70,14 +75,20 @@ pub(super) struct Engine {
 }
 
 impl Engine {
-    pub(super) fn new(rasterizer: Box<dyn Rasterizer>, world_from_scene: WorldFromScene) -> Self {
+    pub(super) fn new(
+        rasterizer: Box<dyn Rasterizer>,
+        moving: MovingObjects,
+        world_from_scene: WorldFromScene,
+    ) -> Self {
         let (image, rgb, depth_mm) = ([RgbdImage::default()], Vec::new(), Vec::new());
-        Self { rasterizer, world_from_scene, image, rgb, depth_mm }
+        Self { rasterizer, moving, world_from_scene, image, rgb, depth_mm }
     }
 
     pub(super) fn draw(&mut self, request: &Request) -> Result<Drawn> {
         let camera = request.camera();
-        let times = self.rasterizer.render(&[], &[camera], &mut self.image)?;
+        // What no clock can say stands where it began.
+        let placements = self.moving.placements((request.at_s * 1e9) as i64);
+        let times = self.rasterizer.render(&placements, &[camera], &mut self.image)?;
         let [image] = &self.image;
         if request.depth {
             image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
@@ -156,7 +167,8 @@ const QUALITY: u8 = 85;
 mod tests {
     use super::*;
     use glam::{Quat, Vec3};
-    use vizflyt_splat::{CpuRenderer, Splats};
+    use vizflyt_arena::config::{MotionConfig, ObjectConfig};
+    use vizflyt_splat::{CpuRenderer, RigidObject, Scene, Splats};
 
     fn ball() -> Splats {
         Splats {
@@ -178,13 +190,48 @@ mod tests {
             width_px: 64,
             height_px: 48,
             depth: false,
+            at_s: 0.0,
         }
+    }
+
+    fn still(splats: &Splats) -> Engine {
+        let renderer = Box::new(CpuRenderer::new(splats));
+        Engine::new(renderer, MovingObjects::default(), WorldFromScene::IDENTITY)
+    }
+
+    #[test]
+    fn what_moves_is_where_its_clock_says() {
+        let door = ObjectConfig {
+            name: "door".into(),
+            scene: "door.ply".into(),
+            position_m: DVec3::new(0.0, 0.5, 0.0),
+            yaw_deg: 0.0,
+            phase_s: Some(0.0),
+            motion: MotionConfig::Path {
+                points_m: vec![DVec3::ZERO, DVec3::Y * 5.0],
+                speed_mps: 1.0,
+                closed: false,
+            },
+        };
+        // The ball is the object; the room is empty.
+        let objects = [RigidObject { id: 1, splats: ball() }];
+        let empty = Splats::default();
+        let scene = Scene { splats: &empty, objects: &objects };
+        let renderer = Box::new(CpuRenderer::new(scene));
+        let moving = MovingObjects::of(&[door], 0);
+        let mut engine = Engine::new(renderer, moving, WorldFromScene::IDENTITY);
+        let mut middle_m = |p_y_m: f64, at_s: f64| {
+            let looking = Request { p_m: [0.0, p_y_m, 1.0], at_s, ..request() };
+            engine.draw(&looking).unwrap().told.middle_m
+        };
+        assert_eq!((middle_m(1.0, 0.0), middle_m(1.0, 4.0)), (Some(3.0), None));
+        assert_eq!((middle_m(5.0, 0.0), middle_m(5.0, 4.0)), (None, Some(3.0)));
     }
 
     #[test]
     fn the_page_sees_what_is_ahead_and_how_far() {
         let splats = ball();
-        let mut engine = Engine::new(Box::new(CpuRenderer::new(&splats)), WorldFromScene::IDENTITY);
+        let mut engine = still(&splats);
         let drawn = engine.draw(&request()).unwrap();
         assert_eq!((drawn.told.visible, drawn.told.middle_m), (1, Some(3.0)));
         assert_eq!(drawn.jpeg[..2], [0xff, 0xd8]);

@@ -27,6 +27,7 @@ use clap::Args;
 use serde::Serialize;
 use tokio::time::timeout;
 use tracing::debug;
+use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
 use self::draw::{Drawn, Engine, Request};
@@ -40,8 +41,8 @@ use crate::stop::Stop;
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "On the page: W A S D to fly, E and Q up and down, drag to look around, wheel \
-for the speed; on a touch screen one finger looks, two fly. `copy camera` gives the camera as a \
-CAM.json for `vizflyt scene render`.
+for the speed; on a touch screen one finger looks, two fly. `play` lets the clock of what moves \
+run, where something does. `copy camera` gives the camera as a CAM.json for `vizflyt scene render`.
 
 Examples:
   vizflyt scene view room.ply
@@ -67,6 +68,10 @@ pub struct ViewArgs {
     /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
     #[arg(long, value_name = "METRES", value_parser = crate::args::scale)]
     pub scale: Option<f64>,
+
+    /// What the arena leaves to chance: where in their motion its objects begin
+    #[arg(long, default_value_t = 7)]
+    pub seed: u64,
 
     /// Only prints the address
     #[arg(long)]
@@ -110,6 +115,8 @@ struct Welcome {
     yaw_rad: f64,
     /// The arena's fence. [m, world]
     fence_m: [[f64; 3]; 2],
+    /// How many objects move in it.
+    objects: usize,
 }
 
 async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
@@ -133,9 +140,11 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
 }
 
 fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, splats, world_from_scene, .. } =
+    let Scene { arena, splats, objects, world_from_scene } =
         scene::load(&args.scene, args.up, args.scale)?;
-    let Chosen { rasterizer, reason } = choose(&splats, args.renderer)?;
+    let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
+    let Chosen { rasterizer, reason } = choose(twin, args.renderer)?;
+    let moving = MovingObjects::new(&arena, args.seed);
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;
     let welcome = Welcome {
@@ -145,8 +154,9 @@ fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
         start_m: start_m.to_array(),
         yaw_rad: arena.spawn.yaw_deg.to_radians(),
         fence_m: [arena.geofence.min_m.to_array(), arena.geofence.max_m.to_array()],
+        objects: moving.len(),
     };
-    Ok((Engine::new(rasterizer, world_from_scene), welcome))
+    Ok((Engine::new(rasterizer, moving, world_from_scene), welcome))
 }
 
 fn router(view: Arc<View>) -> Router {

@@ -4,8 +4,9 @@
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture");
 const context = canvas.getContext("2d");
-const eye = { p: [0, 0, 1], yaw: 0, pitch: 0, fov: 75, depth: false };
+const eye = { p: [0, 0, 1], yaw: 0, pitch: 0, fov: 75, depth: false, at_s: 0 };
 const keys = new Set();
+let playing = false; // The clock of what moves runs.
 let start = null, told = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
@@ -32,6 +33,7 @@ function hear(message) {
     document.title = `${message.name} · VizFlyt`;
     $("name").textContent = message.name;
     $("facts").textContent = `${message.splats.toLocaleString("en")} splats · ${message.renderer.name} (${message.renderer.reason})`;
+    $("clock").hidden = !message.objects;
     if (!start) {
       start = { p: message.start_m, yaw: message.yaw_rad };
       home();
@@ -76,7 +78,7 @@ function ask() {
   const side = (length) => Math.max(16, Math.round(length * ratio() * wanted));
   socket.send(JSON.stringify({
     p_m: eye.p, yaw_rad: eye.yaw, pitch_rad: eye.pitch, fov_deg: eye.fov,
-    width_px: side(innerWidth), height_px: side(innerHeight), depth: eye.depth,
+    width_px: side(innerWidth), height_px: side(innerHeight), depth: eye.depth, at_s: eye.at_s,
   }));
   [waiting, stale, shownShare] = [true, false, wanted];
 }
@@ -105,6 +107,12 @@ function look(left, up) {
   changed();
 }
 
+function passTime(dt_s) {
+  eye.at_s += dt_s;
+  $("time").textContent = `${eye.at_s.toFixed(1)} s`;
+  changed();
+}
+
 function home() {
   [eye.p, eye.yaw, eye.pitch] = [[...start.p], start.yaw, 0];
   changed(false);
@@ -119,6 +127,7 @@ function turn(now) {
   const up = axis(["KeyE", "Space"], ["KeyQ"]);
   const step = speed_mps * dt_s * (keys.has("ShiftLeft") || keys.has("ShiftRight") ? 4 : 1);
   if (ahead || left || up) move(ahead * step, left * step, up * step);
+  if (playing) passTime(dt_s);
   ask();
   requestAnimationFrame(turn);
 }
@@ -181,6 +190,10 @@ function shows(depth) {
 }
 $("colour").onclick = () => shows(false);
 $("depth").onclick = () => shows(true);
+$("play").onclick = () => {
+  playing = !playing;
+  $("play").setAttribute("aria-pressed", playing);
+};
 $("home").onclick = () => start && home();
 $("fov").oninput = ({ target }) => {
   eye.fov = +target.value;
@@ -192,7 +205,8 @@ $("copy").onclick = async () => {
   const text = JSON.stringify(told.camera);
   try {
     await navigator.clipboard.writeText(text);
-    say("copied; save it as cam.json, then: vizflyt scene render SCENE --camera cam.json");
+    const at = $("clock").hidden ? "" : ` --at ${eye.at_s.toFixed(2)}`;
+    say(`copied; save it as cam.json, then: vizflyt scene render SCENE --camera cam.json${at}`);
   } catch {
     say(text, true);
   }
