@@ -1,0 +1,280 @@
+//! Images from hand-made arrivals to the memory that a plugin reads.
+
+use super::*;
+use crate::stream::Ticket;
+use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::messages::{Name, bounded};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, peek, slice_len};
+use vizflyt_sdk::Observation;
+use vizflyt_sdk::glam::{DQuat, DVec3};
+use vizflyt_sdk::ipc::{PluginEnd, unique_service};
+
+fn camera(name: &str) -> CameraInfo {
+    CameraInfo {
+        name: bounded(name),
+        intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
+        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
+    }
+}
+
+struct TestImage {
+    header: ImageHeader,
+    payload: Vec<u8>,
+    pose: HostTime,
+    session: u64,
+}
+
+fn image(camera: u8, tick: u64, depth_mm: u16) -> TestImage {
+    sized_image(camera, tick, depth_mm, [32, 24])
+}
+
+fn sized_image(camera: u8, tick: u64, depth_mm: u16, [width, height]: [u32; 2]) -> TestImage {
+    let k = Intrinsics::from_horizontal_fov(width, height, 1.5);
+    let pixels = k.pixels();
+    let (rgb, depth_mm) = (vec![90; pixels * 3], vec![depth_mm; pixels]);
+    let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
+    let mut payload = Vec::new();
+    Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
+    // Mounted as far ahead as the tick says.
+    let mount = Pose::new(DVec3::X * tick as f64, DQuat::IDENTITY);
+    let world_from_body = Pose::IDENTITY;
+    TestImage {
+        header: ImageHeader::new(tick, camera, ServerTime::ZERO, &k, &mount, &world_from_body),
+        payload,
+        pose: HostTime::from_ns(1000 * tick),
+        session: 1,
+    }
+}
+
+/// Name, tick, depth. [m]
+type Seen = (String, u64, f32);
+
+struct Rig {
+    publisher: ImagePublisher,
+    plugin: PluginEnd,
+    names: Vec<Name>,
+    mailbox: Mailbox,
+}
+
+impl Rig {
+    fn new(names: &[&str]) -> Self {
+        let cameras: Vec<_> = names.iter().map(|name| camera(name)).collect();
+        let service = unique_service();
+        let len = ObservationWriter::len_for(&cameras);
+        let ipc = Arc::new(RuntimeEnd::create(&service, len).unwrap());
+        let plugin = PluginEnd::open(&service).unwrap();
+        let names = cameras.iter().map(|camera| camera.name.clone()).collect();
+        let publisher = ImagePublisher::new(ipc, cameras, Arc::default());
+        Self { publisher, plugin, names, mailbox: Mailbox::default() }
+    }
+
+    /// An image begins to arrive.
+    fn open(&self, image: &TestImage) -> Option<Ticket> {
+        let TestImage { header, pose, session, .. } = *image;
+        self.mailbox.open(&Arrival { session, header, pose, first: pose })
+    }
+
+    /// Pieces of an image arrive; a slice that was cut counts as one.
+    fn push(&self, ticket: Ticket, image: &TestImage, pieces: std::ops::Range<usize>) {
+        let mut all = Vec::new();
+        let head_len = peek(&image.payload).unwrap().header_len;
+        let (head, mut rest) = image.payload.split_at(head_len.min(image.payload.len()));
+        all.push(head.to_vec());
+        while let Some(len) = slice_len(rest) {
+            let (slice, after) = rest.split_at(rest.len().min(len as usize));
+            all.push(slice.to_vec());
+            rest = after;
+        }
+        let end = pieces.end.min(all.len());
+        for piece in &mut all[pieces.start..end] {
+            self.mailbox.push(ticket, piece);
+        }
+    }
+
+    fn end(&self, ticket: Ticket, image: &TestImage) {
+        let trailer = ImageTrailer::new(0, ServerTime::ZERO, ServerTime::ZERO);
+        let received = image.pose.plus_ns(500);
+        self.mailbox.end(ticket, Some(Whole { trailer, received }));
+    }
+
+    /// Gives it an image; returns what was told and (tick, metres) of each camera the plugin
+    /// sees.
+    fn take(&mut self, image: &TestImage) -> Option<(Published, Vec<Seen>)> {
+        let ticket = self.open(image)?;
+        self.push(ticket, image, 0..99);
+        self.end(ticket, image);
+        self.step()
+    }
+
+    /// Does all there is to do; returns what was told and what the plugin sees.
+    fn step(&mut self) -> Option<(Published, Vec<Seen>)> {
+        let mut told = None;
+        let tell = &mut |published| told = Some(published);
+        while self.publisher.step(&self.mailbox, Duration::ZERO, tell).unwrap() {}
+        let sample = self.plugin.observation().unwrap();
+        assert_eq!(told.is_some(), sample.is_some(), "told and published are the same");
+        let sample = sample?;
+        let observation = Observation::from_bytes(sample.bytes(), &self.names).unwrap();
+        let seen = observation
+            .cameras()
+            .map(|c| {
+                (c.name.to_owned(), c.seq, c.depth_m(c.width_px - 1, c.height_px - 1).unwrap())
+            })
+            .collect();
+        assert_eq!(observation.seq(), told.as_ref().unwrap().seq);
+        for camera in observation.cameras() {
+            let (k, x_m) = (camera.intrinsics, camera.body_from_cam.translation_m.x);
+            assert_eq!((k.width_px, k.height_px), (camera.width_px, camera.height_px));
+            assert_eq!(x_m, camera.seq as f64, "the mounting is that of the image");
+        }
+        Some((told.unwrap(), seen))
+    }
+}
+
+#[test]
+fn an_image_is_decoded_into_the_plugins_memory() {
+    let mut rig = Rig::new(&["front"]);
+    let (published, seen) = rig.take(&image(0, 5, 1250)).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 5, 1.25)]);
+    assert_eq!((published.seq, published.pose.as_ns()), (1, 5000));
+    assert!(published.ready > published.received);
+    assert!(rig.take(&image(0, 4, 9)).is_none(), "stale");
+    assert_eq!(rig.take(&image(0, 6, 2000)).unwrap().0.seq, 2);
+    let restarted = TestImage { pose: HostTime::from_ns(99_000), session: 2, ..image(0, 1, 2000) };
+    assert_eq!(rig.take(&restarted).unwrap().0.seq, 3, "a server that counts anew");
+}
+
+#[test]
+fn cameras_of_a_tick_come_together_and_a_missing_one_is_not_waited_for() {
+    let mut rig = Rig::new(&["front", "rear"]);
+    assert!(rig.take(&image(0, 1, 1000)).is_none());
+    let (_, seen) = rig.take(&image(1, 1, 2000)).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 1, 2.0)]);
+    // The rear image of tick 2 is lost.
+    assert!(rig.take(&image(0, 2, 1100)).is_none());
+    let (_, seen) = rig.take(&image(1, 3, 2200)).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 2, 1.1)]);
+    let (_, seen) = rig.take(&image(0, 3, 1200)).unwrap();
+    assert_eq!(seen.len(), 2);
+}
+
+#[test]
+fn a_camera_that_changes_its_size_loses_no_image() {
+    let mut rig = Rig::new(&["front"]);
+    let mut at = 0;
+    // Up, beyond what the memory was made for, down again, and up by many steps.
+    for size in [[32, 24], [640, 480], [8, 8], [32, 24], [1280, 720], [1, 1], [1920, 1080]] {
+        at += 1;
+        let depth_mm = 1000 + at as u16;
+        let (published, seen) = rig.take(&sized_image(0, at, depth_mm, size)).unwrap();
+        assert_eq!(published.seq, at, "no observation is skipped");
+        assert_eq!(seen, [("front".to_owned(), at, f32::from(depth_mm) / 1000.0)]);
+    }
+    assert_eq!(rig.publisher.rejected, 0);
+}
+
+#[test]
+fn one_of_two_cameras_grows_between_the_images_of_a_tick() {
+    let mut rig = Rig::new(&["front", "rear"]);
+    assert!(rig.take(&image(0, 1, 1000)).is_none());
+    let (_, seen) = rig.take(&sized_image(1, 1, 2000, [400, 300])).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 1, 2.0)]);
+    // And both in the next.
+    assert!(rig.take(&sized_image(1, 2, 2100, [64, 48])).is_none());
+    let (_, seen) = rig.take(&sized_image(0, 2, 1100, [500, 10])).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 2, 1.1), ("rear".to_owned(), 2, 2.1)]);
+}
+
+#[test]
+fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
+    let mut rig = Rig::new(&["front", "rear"]);
+    let together = |mut image: TestImage, cameras: u32| {
+        image.header.together = cameras.into();
+        image
+    };
+    // The front camera alone, at once.
+    assert_eq!(rig.take(&together(image(0, 1, 1000), 0b01)).unwrap().1.len(), 1);
+    // Both; the rear one drawn a tick before, as it may be when the encoder was busy.
+    assert!(rig.take(&together(image(0, 3, 1100), 0b11)).is_none());
+    let (_, seen) = rig.take(&together(image(1, 2, 2000), 0b11)).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 3, 1.1), ("rear".to_owned(), 2, 2.0)]);
+    assert_eq!(rig.publisher.rejected, 0);
+}
+
+#[test]
+fn images_that_are_nonsense_are_dropped() {
+    let mut rig = Rig::new(&["front"]);
+    assert!(rig.take(&image(3, 1, 1000)).is_none(), "there is no camera 3");
+    let mut cut = image(0, 2, 1000);
+    cut.payload.truncate(cut.payload.len() / 2);
+    assert!(rig.take(&cut).is_none());
+    let mut other_size = image(0, 3, 1000);
+    other_size.header.width_px = 64.into();
+    assert!(rig.take(&other_size).is_none());
+    assert!(rig.take(&image(0, 4, 1000)).is_some());
+    assert_eq!(rig.publisher.rejected, 3);
+}
+
+#[test]
+fn an_image_is_decoded_as_it_arrives_and_seen_when_it_is_whole() {
+    let mut rig = Rig::new(&["front"]);
+    let image = image(0, 1, 1500);
+    let ticket = rig.open(&image).unwrap();
+    rig.push(ticket, &image, 0..2);
+    assert!(rig.step().is_none());
+    assert_eq!(rig.publisher.lanes[0].decoded, 2, "the first slice is decoded already");
+    rig.push(ticket, &image, 2..99);
+    assert!(rig.step().is_none(), "not before it says that it is whole");
+    rig.end(ticket, &image);
+    assert_eq!(rig.step().unwrap().1, [("front".to_owned(), 1, 1.5)]);
+}
+
+#[test]
+fn an_image_that_is_cut_off_leaves_nothing_behind() {
+    let mut rig = Rig::new(&["front", "rear"]);
+    assert!(rig.take(&image(1, 1, 2000)).is_none());
+    let (cut, next) = (image(0, 1, 1000), image(0, 2, 1100));
+    let ticket = rig.open(&cut).unwrap();
+    rig.push(ticket, &cut, 0..2);
+    assert!(rig.step().is_none());
+    rig.mailbox.end(ticket, None);
+    assert!(rig.step().is_none());
+    // The next tick publishes the rear image alone; the front's half is not seen.
+    let (_, seen) = rig.take(&next).unwrap();
+    assert_eq!(seen, [("rear".to_owned(), 1, 2.0)]);
+    let (_, seen) = rig.take(&image(1, 2, 2100)).unwrap();
+    assert_eq!(seen, [("front".to_owned(), 2, 1.1), ("rear".to_owned(), 2, 2.1)]);
+    assert_eq!(rig.publisher.rejected, 0);
+}
+
+#[test]
+fn a_camera_whose_image_stalls_holds_up_no_other_and_its_image_comes_along_later() {
+    let mut rig = Rig::new(&["front", "rear"]);
+    let stalled = image(0, 1, 1000);
+    let ticket = rig.open(&stalled).unwrap();
+    rig.push(ticket, &stalled, 0..2);
+    assert!(rig.take(&image(1, 1, 2000)).is_none());
+    // The rear camera's next image has come whole: what is there is published.
+    let (_, seen) = rig.take(&image(1, 2, 2100)).unwrap();
+    assert_eq!(seen, [("rear".to_owned(), 1, 2.0)]);
+    // The rest of the front's was sent again: all of it is in the next observation.
+    rig.push(ticket, &stalled, 2..99);
+    rig.end(ticket, &stalled);
+    let (_, seen) = rig.step().unwrap();
+    assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 2, 2.1)]);
+    assert_eq!(rig.publisher.rejected, 0);
+}
+
+#[test]
+fn one_that_gives_way_to_a_newer_one_is_not_mixed_with_it() {
+    let mut rig = Rig::new(&["front"]);
+    let (old, new) = (sized_image(0, 1, 1000, [64, 96]), sized_image(0, 2, 1100, [64, 96]));
+    let ticket = rig.open(&old).unwrap();
+    rig.push(ticket, &old, 0..3);
+    assert!(rig.step().is_none());
+    assert_eq!(rig.take(&new).unwrap().1, [("front".to_owned(), 2, 1.1)]);
+    assert_eq!(rig.mailbox.replaced(), 1);
+    assert!(!rig.mailbox.push(ticket, &mut vec![0]), "its receiver learns it");
+}
