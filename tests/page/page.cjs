@@ -316,6 +316,68 @@ async function lab(browser) {
   assert.equal(await server.ended, 0);
 }
 
+/** Runs a command of the program to its end; returns what it printed. */
+function command(...args) {
+  const { status, stdout, stderr } = spawnSync(vizflyt, args, { encoding: "utf8" });
+  assert.equal(status, 0, `vizflyt ${args.join(" ")}: ${stderr}`);
+  return stdout;
+}
+
+/** A team checks in on the page and flies; page and wall show its run, and then its signed grade, by themselves. */
+async function leaderboard(browser) {
+  const at = (name) => path.join(scratch, `board-${name}`);
+  const database = at("runs.sqlite"), free = "127.0.0.1:0";
+  command("scene", "generate", "race", "-o", at("race"));
+  const [token] = command("leaderboard", "--database", database, "team", "add", "wasps").match(/^[0-9a-f]{32}$/m);
+  const server = start("serve", at("race"), "--leaderboard", database, "--keys", at("server"), "--pair", "team:vizflyt",
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+  const [ready] = await server.line(/^.*"ready":"server".*$/);
+  const { http, quic, vicon, spawn: stand } = JSON.parse(ready);
+  const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
+  command("pair", quic, "--code", code, "--keys", at("jetson"));
+
+  const page = await open(browser, http), wall = await open(browser, `${http}/wall`);
+  const firstRow = (page, id) => page.locator(`#${id} tr`).first().innerText();
+  const shows = (page, id, pattern) =>
+    page.waitForFunction(([id, source]) => new RegExp(source).test(document.querySelector(`#${id} tr`)?.innerText), [id, pattern.source]);
+  await shows(wall, "official", /nobody yet/);
+  await page.locator("#leaderboard summary").click();
+  await page.locator("#team-form [name=token]").fill("no token of any team");
+  await page.locator("#team-form [name=attempt]").selectOption("official");
+  await page.locator("#team-form button").click();
+  await until(page, "team-said", /no team/);
+  await page.locator("#team-form [name=token]").fill(token);
+  await page.locator("#team-form button").click();
+  await until(page, "checked-in", /wasps flies: official/);
+
+  const vehicle = start("sim", "--vicon", vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
+  const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
+  const fly = start("fly", "race", "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
+    "--seconds", "3", "--log", at("flights"), "--json");
+  await until(wall, "flying", /wasps, official: \d/);
+  assert.equal(await fly.ended, 0);
+  // Neither page is loaded again.
+  for (const screen of [wall, page]) await shows(screen, "official", /^1\s+wasps\s+0\/\d\s/);
+  assert.match(await firstRow(wall, "practice"), /nobody yet/);
+  assert.ok(await wall.locator("#graded-panel").isHidden(), "nobody has a grade yet");
+
+  command("grade", "race", "--project", "p4", "--seeds", "1", "-o", at("grade.json"), "--keys", at("grader"));
+  command("leaderboard", "--database", database, "add", at("grade.json"), "--team", "wasps");
+  await wall.locator("#graded-panel").waitFor();
+  assert.match(await text(wall, "graded"), /graded: p4 ug, day[\s\S]*wasps/);
+  const over = await wall.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  assert.ok(over <= 0, `wall: ${over} px too wide`);
+  await shot(page, "laptop-leaderboard");
+  await shot(wall, "wall");
+  for (const screen of [page, wall]) {
+    assert.deepEqual(screen.faults, []);
+    await screen.context().close();
+  }
+  vehicle.child.kill();
+  server.child.stdin.end();
+  assert.equal(await server.ended, 0);
+}
+
 async function main() {
   if (shots) fs.mkdirSync(shots, { recursive: true });
   const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
@@ -323,7 +385,7 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  const wanted = [lab, flight, crash].filter(({ name }) => !only || name === only);
+  const wanted = [lab, flight, crash, leaderboard].filter(({ name }) => !only || name === only);
   for (const test of wanted) {
     const began = Date.now();
     try {

@@ -126,8 +126,10 @@ async fn images(connection: quinn::Connection, got: Arc<Got>) {
 /// Counts what a runtime must be told.
 async fn messages(mut client: Client, got: Arc<Got>) {
     loop {
-        client.until(|message| matches!(message, ToRuntime::Camera { .. }).then_some(())).await;
-        got.cameras_changed.fetch_add(1, Ordering::Relaxed);
+        // Without pages nothing is said for minutes.
+        if let ToRuntime::Camera { .. } = client.next_ever().await {
+            got.cameras_changed.fetch_add(1, Ordering::Relaxed);
+        }
     }
 }
 

@@ -405,19 +405,20 @@ impl Client {
 
     /// Returns the next message of the control stream.
     pub async fn next(&mut self) -> ToRuntime {
-        tokio::time::timeout(PATIENCE, async {
-            loop {
-                if let Some(message) = self.deframer.next::<ToRuntime>() {
-                    return message.unwrap();
-                }
-                // One byte at a time never overruns the deframer.
-                let mut byte = [0; 1];
-                self.recv.read_exact(&mut byte).await.expect("the control stream goes on");
-                self.deframer.push(&byte);
+        tokio::time::timeout(PATIENCE, self.next_ever()).await.expect("a message")
+    }
+
+    /// As [`Self::next`], however long it takes.
+    pub async fn next_ever(&mut self) -> ToRuntime {
+        loop {
+            if let Some(message) = self.deframer.next::<ToRuntime>() {
+                return message.unwrap();
             }
-        })
-        .await
-        .expect("a message")
+            // One byte at a time never overruns the deframer.
+            let mut byte = [0; 1];
+            self.recv.read_exact(&mut byte).await.expect("the control stream goes on");
+            self.deframer.push(&byte);
+        }
     }
 
     /// Returns the first message for which `wanted` yields something.
