@@ -20,8 +20,8 @@ use vizflyt_protocol::messages::ToRuntime;
 
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
 const VIEWERS: usize = 20;
-/// A page that is not read is closed by the server after this long; nothing here comes near it.
-const MOST_MEMORY_GROWTH_MB: f64 = 24.0;
+/// From a quarter of the watched time to its end.
+const MOST_MEMORY_GROWTH_MB: f64 = 12.0;
 
 /// What one vehicle's runtime has got.
 #[derive(Debug, Default)]
@@ -77,9 +77,9 @@ fn twenty_pages_cost_four_runtimes_no_event() {
 
     let done = Arc::new(AtomicBool::new(false));
     let pages: Vec<_> = (0..VIEWERS).map(|k| Page::open(&server, VEHICLES[k % 4], &done)).collect();
-    let start_mb = rss_mb(&server);
-    let mut changes = 0;
+    let (mut memory_mb, mut changes) = (vec![rss_mb(&server)], 0);
     let watched = rate("20 pages", seconds, &mut || {
+        memory_mb.push(rss_mb(&server));
         // What each runtime and each page must hear of.
         changes += 1;
         for name in VEHICLES {
@@ -89,7 +89,6 @@ fn twenty_pages_cost_four_runtimes_no_event() {
             assert_eq!(status, 200, "{said}");
         }
     });
-    let end_mb = rss_mb(&server);
     std::thread::sleep(Duration::from_secs(1));
     done.store(true, Ordering::Relaxed);
     let (mut pictures, mut states) = (0, 0);
@@ -104,14 +103,18 @@ fn twenty_pages_cost_four_runtimes_no_event() {
     }
     let after = rate("no page again", (seconds / 4).max(2), &mut || {});
     let alone = f64::midpoint(before, after);
+    // The crash cards' images fill their room in the first seconds.
+    let [start_mb, filled_mb, end_mb] =
+        [0, memory_mb.len() / 4, memory_mb.len() - 1].map(|n| memory_mb[n]);
     println!(
         "with 20 pages the runtimes get {:.3} of their images; a page {:.1} pictures and {:.1} states \
-         a second; {changes} events to each, none lost; server {start_mb:.1} -> {end_mb:.1} MB",
+         a second; {changes} events to each, none lost; server {start_mb:.1} MB at first, {filled_mb:.1} after a quarter, {end_mb:.1} at the \
+         end",
         watched / alone,
         pictures as f64 / VIEWERS as f64 / seconds as f64,
         states as f64 / VIEWERS as f64 / seconds as f64,
     );
-    assert!(end_mb - start_mb < MOST_MEMORY_GROWTH_MB, "{start_mb} -> {end_mb} MB");
+    assert!(end_mb - filled_mb < MOST_MEMORY_GROWTH_MB, "{filled_mb} -> {end_mb} MB");
 }
 
 /// Counts a runtime's images.

@@ -98,39 +98,74 @@ impl Hand {
         let longest_m = self.sightings.iter().map(|sighting| sighting.half_m).fold(0.0, f64::max);
         let whole = |sighting: &&Sighting| sighting.half_m > WHOLE * longest_m;
         let pivot_m = pivot_m(self.sightings.iter().filter(whole))?;
-        // Angles about the pivot, unwrapped, over the last seconds; then a straight line.
+        // From the pivot to its middle: cut off aslant, its own line is a few degrees off.
+        let angles: Vec<(f64, f64)> = self
+            .sightings
+            .iter()
+            .filter(whole)
+            .map(|sighting| (sighting.at_s, (sighting.middle_m - pivot_m).to_angle()))
+            .collect();
+        let omega_radps = while_in_sight_radps(&angles)?;
+        // Unseen it may have turned by any angle: that speed says by how many whole turns.
         let newest_s = self.sightings.back()?.at_s;
-        let (mut n, mut t, mut tt, mut a, mut ta) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        let mut last_rad: Option<f64> = None;
-        let mut length_m = 0.0_f64;
-        for sighting in self.sightings.iter().filter(whole) {
-            let from_pivot_m = sighting.middle_m - pivot_m;
-            length_m = length_m.max(from_pivot_m.length() + sighting.half_m);
-            // From the pivot to its middle: cut off aslant, its own line is a few degrees off.
-            let angle_rad = from_pivot_m.to_angle();
-            let unwrapped_rad =
-                last_rad.map_or(angle_rad, |last_rad| last_rad + wrap_pi(angle_rad - last_rad));
-            last_rad = Some(unwrapped_rad);
-            let since_s = sighting.at_s - newest_s;
-            n += 1.0;
-            t += since_s;
-            tt += since_s * since_s;
-            a += unwrapped_rad;
-            ta += since_s * unwrapped_rad;
-        }
-        let spread = n * tt - t * t;
-        if !(spread > 1e-9) {
-            return None;
-        }
-        let omega_radps = (n * ta - t * a) / spread;
-        let angle_rad = (a - omega_radps * t) / n;
+        let (mut last_s, mut last_rad) = *angles.first()?;
+        let line = Line::through(angles.iter().map(|&(at_s, angle_rad)| {
+            let foretold_rad = last_rad + omega_radps * (at_s - last_s);
+            (last_s, last_rad) = (at_s, foretold_rad + wrap_pi(angle_rad - foretold_rad));
+            (at_s - newest_s, last_rad)
+        }))?;
+        let tip_m = |sighting: &Sighting| (sighting.middle_m - pivot_m).length() + sighting.half_m;
+        let length_m = self.sightings.iter().filter(whole).map(tip_m).fold(0.0, f64::max);
         Some(Motion {
             pivot_m,
-            angle_rad: wrap_pi(angle_rad),
+            angle_rad: wrap_pi(line.at_zero),
             at_s: newest_s,
-            omega_radps,
+            omega_radps: line.slope,
             length_m,
         })
+    }
+}
+
+/// Returns the speed of turning over those stretches in which the hand was always seen; `None` if
+/// they are too short. [(s, rad)] -> [rad/s]
+fn while_in_sight_radps(angles: &[(f64, f64)]) -> Option<f64> {
+    let (mut squares, mut products) = (0.0, 0.0);
+    for stretch in angles.chunk_by(|before, after| after.0 - before.0 < OUT_OF_SIGHT_S) {
+        let (first_s, first_rad) = stretch[0];
+        let turned = |&(at_s, angle_rad): &(f64, f64)| {
+            // Less than half a turn, above the window's lower edge.
+            (at_s - first_s, wrap_pi(angle_rad - first_rad))
+        };
+        let count = stretch.len() as f64;
+        let (t, a) =
+            stretch.iter().map(turned).fold((0.0, 0.0), |(t, a), (dt, da)| (t + dt, a + da));
+        for (dt, da) in stretch.iter().map(turned) {
+            squares += (dt - t / count).powi(2);
+            products += (dt - t / count) * (da - a / count);
+        }
+    }
+    (squares > 1e-3).then(|| products / squares)
+}
+
+/// A straight line, by least squares.
+struct Line {
+    at_zero: f64,
+    slope: f64,
+}
+
+impl Line {
+    fn through(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
+        let (mut n, mut x, mut xx, mut y, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for (at, value) in points {
+            n += 1.0;
+            x += at;
+            xx += at * at;
+            y += value;
+            xy += at * value;
+        }
+        let spread = n * xx - x * x;
+        let slope = (n * xy - x * y) / spread;
+        (spread > 1e-9).then(|| Self { at_zero: (y - slope * x) / n, slope })
     }
 }
 
@@ -176,6 +211,8 @@ fn sighting(at_s: f64, points_m: &[DVec2]) -> Option<Sighting> {
 
 /// Two turns at 60 degrees a second, and slower ones in part. [s]
 const REMEMBERED_S: f64 = 8.0;
+/// Not seen for so long, it was out of sight. [s]
+const OUT_OF_SIGHT_S: f64 = 0.5;
 /// Watched for so long without a hand, there is none: a turn at 40 degrees a second. [s]
 const NO_HAND_S: f64 = 9.0;
 /// Half a hand's width, and the error of its predicted place. [m]

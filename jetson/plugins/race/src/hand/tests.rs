@@ -62,3 +62,23 @@ fn what_is_not_known_yet_is_not_clear() {
     none.update(NO_HAND_S + 1.0, &[]);
     assert!(none.is_clear(DVec2::ZERO, 0.2, 0.0, 1.0));
 }
+
+/// The hand is out of sight for more than half a turn: which way it came back is told by its speed.
+#[test]
+fn a_turn_out_of_sight_is_counted() {
+    for omega_radps in [TAU / 7.6, -TAU / 5.9] {
+        let (mut hand, angle_at) = (Hand::default(), |at_s: f64| 0.3 + omega_radps * at_s);
+        for step in 0..220 {
+            let at_s = f64::from(step) * 0.05;
+            let along = DVec2::from_angle(angle_at(at_s));
+            let points_m: Vec<DVec2> = (0..48)
+                .flat_map(|n| [-0.03, 0.0, 0.03].map(|across| (f64::from(n) * 0.02, across)))
+                .map(|(out, across)| along * out + along.perp() * across)
+                .filter(|p_m| p_m.y > 0.3)
+                .collect();
+            hand.update(at_s, &points_m);
+        }
+        let motion = hand.motion().expect("it turns");
+        assert!((motion.omega_radps / omega_radps - 1.0).abs() < 0.03, "{motion:?}");
+    }
+}
