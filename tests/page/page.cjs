@@ -362,7 +362,7 @@ async function leaderboard(browser) {
   assert.ok(await wall.locator("#graded-panel").isHidden(), "nobody has a grade yet");
 
   command("grade", "race", "--project", "p4", "--seeds", "1", "-o", at("grade.json"), "--keys", at("grader"));
-  command("leaderboard", "--database", database, "add", at("grade.json"), "--team", "wasps");
+  command("leaderboard", "--database", database, "add", at("grade.json"), "--team", "wasps", "--keys", at("grader"));
   await wall.locator("#graded-panel").waitFor();
   assert.match(await text(wall, "graded"), /graded: p4 ug, day[\s\S]*wasps/);
   const over = await wall.evaluate(() => document.documentElement.scrollWidth - innerWidth);
