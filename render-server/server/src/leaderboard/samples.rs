@@ -42,6 +42,8 @@ impl Samples {
             });
             self.apart_s *= 2.0;
         }
+        // All at once: growing would copy megabytes between two poses. What is not used yet is no memory.
+        self.kept.reserve_exact(MOST - self.kept.len());
         self.kept.push(Sample {
             stamp: pose.stamp,
             p_world_m: pose.world_from_body.translation_m,
