@@ -374,10 +374,12 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     })
 }
 
-/// Returns `N` bytes from hexadecimal; `None` if it is anything else.
+/// Returns `N` bytes from hexadecimal as [`hex`] writes it, in small letters: there is one text for
+/// each signature, and none beside it counts; `None` if it is anything else.
 pub(crate) fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     let digits = text.as_bytes();
-    if digits.len() != 2 * N || !digits.iter().all(u8::is_ascii_hexdigit) {
+    let is_digit = |digit: &u8| matches!(digit, b'0'..=b'9' | b'a'..=b'f');
+    if digits.len() != 2 * N || !digits.iter().all(is_digit) {
         return None;
     }
     let mut bytes = [0; N];
@@ -573,7 +575,7 @@ pub(crate) mod tests {
     #[test]
     fn hexadecimal_comes_back_and_nonsense_does_not() {
         assert_eq!(from_hex::<2>(&hex(&[0xab, 0x01])), Some([0xab, 0x01]));
-        for text in ["", "abc", "abcg", "+bcd", "äb"] {
+        for text in ["", "abc", "abcg", "+bcd", "äb", "AB01"] {
             assert_eq!(from_hex::<2>(text), None, "{text}");
         }
     }

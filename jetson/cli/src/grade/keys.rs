@@ -57,7 +57,8 @@ pub(crate) fn verifying_key(given: Option<&str>, keys: Option<&Path>) -> Result<
     } else {
         given.to_owned()
     };
-    let bytes = from_hex::<32>(text.trim());
+    // As a person may have copied it.
+    let bytes = from_hex::<32>(&text.trim().to_ascii_lowercase());
     let bytes = bytes.with_context(|| format!("--key {given}: not 64 hexadecimal digits"))?;
     let key = VerifyingKey::from_bytes(&bytes).ok();
     key.with_context(|| format!("--key {given}: that is no key"))

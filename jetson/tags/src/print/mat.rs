@@ -118,19 +118,28 @@ impl Mat {
         }
         let [width, height] = count.map(|n| f64::from(n) * self.pitch_mm);
         sheet.crop_marks([left, low, width, height]);
-        let rows: Vec<String> = (first[1]..first[1] + count[1])
-            .map(|row| {
-                let [from, to] = [first[0], first[0] + count[0] - 1].map(|c| self.id(c, row));
-                if from == to { from.to_string() } else { format!("{from}-{to}") }
-            })
-            .collect();
-        let text = format!(
-            "{} {}; cut along the marks, join edge to edge; this edge is north",
-            self.family,
-            rows.join(", ")
-        );
+        let text = self.caption(first, count);
         let top = (low + height + 1.5).min(self.paper.size_mm()[1] - 4.0);
         sheet.text([left + 8.0, top], 2.4, &text);
+    }
+
+    /// Returns what stands at a sheet's upper edge, short enough to stay between the marks.
+    fn caption(&self, first: [u32; 2], count: [u32; 2]) -> String {
+        let row =
+            |row: u32| [first[0], first[0] + count[0] - 1].map(|c| self.id(c, first[1] + row));
+        let [[from, to], [last_from, last]] = [row(0), row(count[1] - 1)];
+        let ids = if count[0] == self.columns || count[1] == 1 {
+            // Rows that follow on one another.
+            format!("{from} to {last}")
+        } else {
+            format!("{from} to {to}, ..., {last_from} to {last}")
+        };
+        let join = if count == [self.columns, self.rows] {
+            ""
+        } else {
+            " cut along the marks, join edge to edge;"
+        };
+        format!("{} {ids};{join} this edge is north", self.family)
     }
 
     fn id(&self, column: u32, row: u32) -> u32 {

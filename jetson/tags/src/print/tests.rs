@@ -79,6 +79,12 @@ fn a_mat_over_several_sheets_has_every_tag_once_at_its_place() {
         .map(|sheet| sheet.shapes.iter().filter(|s| matches!(s, Shape::Boxes(_))).count() - 1)
         .sum();
     assert_eq!(drawn, 12);
+    let says = |sheet: &Sheet, part: &str| {
+        sheet.shapes.iter().any(|s| matches!(s, Shape::Text { text, .. } if text.contains(part)))
+    };
+    assert!(says(&printed.sheets[0], "tag36h11 100 to 101, ..., 103 to 104; cut along the marks"));
+    let whole = Mat { columns: 2, rows: 2, ..mat() }.print().unwrap();
+    assert!(says(&whole.sheets[0], "tag36h11 100 to 103; this edge is north"));
 }
 
 #[test]
@@ -117,7 +123,11 @@ fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
                     Shape::Line { from, to, .. } => {
                         assert!(inside(from[0], from[1]) && inside(to[0], to[1]));
                     }
-                    Shape::Text { at, .. } => assert!(inside(at[0], at[1])),
+                    // Letters of Helvetica are half as wide as high, on average.
+                    Shape::Text { at, size, text } => {
+                        let end = at[0] + text.len() as f64 * size * 0.55;
+                        assert!(inside(at[0], at[1]) && inside(end, at[1]), "{text}");
+                    }
                 }
             }
         }
