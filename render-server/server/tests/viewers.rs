@@ -103,7 +103,8 @@ fn twenty_pages_cost_four_runtimes_no_event() {
     }
     let after = rate("no page again", (seconds / 4).max(2), &mut || {});
     let alone = f64::midpoint(before, after);
-    // The crash cards' images fill their room in the first seconds.
+    // Previews for crash cards fill their room in the first seconds, what is kept of the flights in
+    // minutes; a leak shows in the second half as in the first.
     let tenths: Vec<f64> = (0..=10).map(|n| memory_mb[n * (memory_mb.len() - 1) / 10]).collect();
     println!(
         "with 20 pages the runtimes get {:.3} of their images; a page {:.1} pictures and {:.1} states \

@@ -85,7 +85,7 @@ fn figures(grade: &Grade) -> String {
 
 fn table(runs: &[Run]) -> String {
     let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Seed</th>\
-                    <th class=\"text\">Variant</th><th class=\"text\">OutcomeKind</th><th>Stages</th>\
+                    <th class=\"text\">Variant</th><th class=\"text\">Outcome</th><th>Stages</th>\
                     <th>Time</th><th>Clearance</th><th>Speed</th><th>Score</th>\
                     <th class=\"text\">Why</th></tr></thead><tbody>\n"
         .to_owned();
@@ -214,6 +214,9 @@ mod tests {
         }
         let read = Grade::read(&folder.path().join("grade.json")).unwrap();
         assert_eq!(read, grade());
-        assert!(table(&[run(5, OutcomeKind::Finished)]).contains("<td class=\"text\">5</td>"));
+        let flown = table(&[run(5, OutcomeKind::Finished)]);
+        for part in ["<td class=\"text\">5</td>", "<th class=\"text\">Outcome</th>"] {
+            assert!(flown.contains(part), "no {part}: {flown}");
+        }
     }
 }
