@@ -225,9 +225,18 @@ fn misbehave(how: &str) -> Vec<OsString> {
 }
 
 fn replay_to(log: &Path, command: Vec<OsString>, answers: &str) -> (ReplayReport, Vec<String>) {
+    replay_with(log, command, PluginLimits::default(), answers)
+}
+
+fn replay_with(
+    log: &Path,
+    command: Vec<OsString>,
+    limits: PluginLimits,
+    answers: &str,
+) -> (ReplayReport, Vec<String>) {
     let options = ReplayOptions {
         command,
-        limits: PluginLimits::default(),
+        limits,
         is_realtime: false,
         all: false,
         answer_within: Duration::from_secs(5),
@@ -237,6 +246,27 @@ fn replay_to(log: &Path, command: Vec<OsString>, answers: &str) -> (ReplayReport
     let line = &mut |_: Stream, text: &str| lines.push(text.to_owned());
     let report = replay(log, plan(log).unwrap(), &options, line).unwrap();
     (report, lines)
+}
+
+#[test]
+fn a_map_is_handed_again() {
+    let flight = Flight::new();
+    flight.start(5);
+    flight.image(1, 10);
+    flight.answer(1, 12, None);
+    let (path, folder) = flight.close();
+    let map = folder.path().join("map.json");
+    let text = r#"[{"sphere":{"center_m":[1,2,3],"radius_m":0.5}}]"#;
+    fs::write(&map, text).unwrap();
+    let mut limits = PluginLimits::default();
+    limits.hand_map_file(&map).unwrap();
+    let look = ["sh", "-c", "echo \"map: $VIZFLYT_MAP\""].map(OsString::from).to_vec();
+    let (_, lines) = replay_with(&path, look.clone(), limits, "with");
+    assert!(lines.contains(&format!("map: {text}")), "{lines:?}");
+    let (_, lines) = replay_to(&path, look, "without");
+    assert!(lines.contains(&"map: ".to_owned()), "{lines:?}");
+    let error = PluginLimits::default().hand_map_file(&path).unwrap_err().to_string();
+    assert!(error.contains(&*path.to_string_lossy()), "{error}");
 }
 
 #[test]
