@@ -6,8 +6,8 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
-use vizflyt_server::leaderboard::{
-    Attempt, Database, GradeBoard, GradeEntry, Leaderboard, Place, Run, grade_boards, standings,
+use vizflyt_server::flights::leaderboard::{
+    Attempt, Database, GradeBoard, GradeEntry, Leaderboard, Run, Standing, grade_boards, standings,
     write_csv,
 };
 
@@ -283,7 +283,7 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
     Ok(())
 }
 
-fn line(place: &Place) -> String {
+fn line(place: &Standing) -> String {
     let seconds = place.seconds.map_or_else(|| "-".to_owned(), |seconds| format!("{seconds:.2} s"));
     format!(
         "{:>4}  {:<24} {:>2} of {:<2} stages  {seconds:>10}  {:>3} runs",

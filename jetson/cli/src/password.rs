@@ -37,7 +37,7 @@ pub(crate) fn run(args: &PasswordArgs) -> Result<ExitCode> {
     } else {
         line()?
     };
-    vizflyt_server::dashboard::set_password(&folder, &password)?;
+    vizflyt_server::web::set_password(&folder, &password)?;
     tell("the password is set: log in on the page, at the bottom");
     Ok(ExitCode::SUCCESS)
 }

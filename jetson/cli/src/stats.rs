@@ -14,8 +14,8 @@ use vizflyt_arena::pose::{PoseQuality, Rejects};
 use vizflyt_protocol::messages::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Timing,
 };
-use vizflyt_server::accounts::Account;
-use vizflyt_server::stats::{Answer, Connection};
+use vizflyt_server::stats::{Connection, VehicleStats};
+use vizflyt_server::stream::delivery::Delivery;
 
 /// Where images get their age, stage by stage, and why images were skipped.
 #[derive(Args, Clone, Debug)]
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &StatsArgs) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     loop {
-        let text = if args.json { ask(args)? } else { of_answer(&parse(&ask(args)?)?)? };
+        let text = if args.json { ask(args)? } else { of_vehicle(&parse(&ask(args)?)?)? };
         if args.watch && std::io::stdout().is_terminal() {
             // Home, and clear what follows.
             print("\x1b[H\x1b[J");
@@ -98,7 +98,7 @@ fn ask(args: &StatsArgs) -> Result<String> {
     }
 }
 
-fn parse(json: &str) -> Result<Answer> {
+fn parse(json: &str) -> Result<VehicleStats> {
     serde_json::from_str(json).context("the server's answer is not understood: another version?")
 }
 
@@ -135,7 +135,7 @@ fn get(url: &str, path: &str) -> Result<(u16, String)> {
 }
 
 /// Returns the figures of a running vehicle for a person.
-fn of_answer(answer: &Answer) -> Result<String> {
+fn of_vehicle(answer: &VehicleStats) -> Result<String> {
     let Some(runtime) = &answer.runtime else {
         bail!(
             "no runtime flies '{}': there are no figures; start one with `vizflyt fly`, or read a \
@@ -298,8 +298,8 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
     out
 }
 
-fn of_account(camera: &str, account: &Account) -> String {
-    let Account { drawn, delivered, under_way, skipped } = account;
+fn of_account(camera: &str, account: &Delivery) -> String {
+    let Delivery { drawn, delivered, under_way, skipped } = account;
     let mut out = format!(
         "  {camera:<9} {drawn} drawn, {delivered} delivered, {} skipped, {under_way} under way\n",
         skipped.sum()
@@ -366,7 +366,7 @@ const MOST_BYTES: u64 = 1 << 20;
 mod tests {
     use super::*;
     use vizflyt_protocol::messages::{Stages, Waterfall};
-    use vizflyt_server::accounts::Skipped;
+    use vizflyt_server::stream::delivery::Skipped;
 
     fn times(p50: f32) -> StageTimes {
         StageTimes { p50, p90: p50 * 1.5, p99: p50 * 2.0, max: p50 * 3.0 }
@@ -419,7 +419,7 @@ mod tests {
     #[test]
     fn an_account_names_its_reasons() {
         let skipped = Skipped { no_room: 3, overrun: 2, ..Skipped::default() };
-        let text = of_account("front", &Account { drawn: 9, delivered: 4, under_way: 0, skipped });
+        let text = of_account("front", &Delivery { drawn: 9, delivered: 4, under_way: 0, skipped });
         assert!(text.contains("9 drawn, 4 delivered, 5 skipped, 0 under way"), "{text}");
         assert!(text.contains("3 no_room") && text.contains("2 overrun"), "{text}");
         assert!(!text.contains("stale"), "{text}");
@@ -439,9 +439,9 @@ mod tests {
         let pose = serde_json::to_string(&vizflyt_arena::pose::PoseQuality::default());
         let json = json.replace("SERVER", &server.unwrap()).replace("POSE", &pose.unwrap());
         let mut answer = parse(&json).unwrap();
-        let error = of_answer(&answer).unwrap_err();
+        let error = of_vehicle(&answer).unwrap_err();
         assert!(error.to_string().contains("no runtime flies 'wasp'"), "{error}");
         answer.runtime = Some("runtime 0.1 at 127.0.0.1:9".to_owned());
-        assert!(of_answer(&answer).unwrap().contains("has not reported yet"));
+        assert!(of_vehicle(&answer).unwrap().contains("has not reported yet"));
     }
 }

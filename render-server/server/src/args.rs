@@ -8,12 +8,12 @@ use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::messages::{Grant, MAX_GRANTED, bounded};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
-use crate::dashboard::Login;
-use crate::leaderboard::{Database, UnknownDatabase};
-use crate::pace::Adapt;
+use crate::flights::leaderboard::{Database, UnknownDatabase};
 use crate::render::RendererKind;
 use crate::scene::Up;
-use crate::transport::Congestion;
+use crate::stream::rate_control::Adaptation;
+use crate::stream::transport::Congestion;
+use crate::web::Login;
 
 /// Draws what the vehicle's cameras would see in the twin, and referees the flight.
 ///
@@ -83,7 +83,7 @@ pub struct ServeArgs {
     /// What may be lowered when a runtime's link is too slow for its images: quality before rate, rate
     /// before size
     #[arg(long, value_enum, default_value_t)]
-    pub adapt: Adapt,
+    pub adapt: Adaptation,
 
     /// Bare scene only: the scene's axis that points up
     #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
@@ -271,8 +271,8 @@ mod tests {
         let args =
             parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
         assert_eq!((args.up, args.scale), (Up::NegY, Some(0.2)));
-        assert_eq!((args.congestion, args.adapt), (Congestion::Bbr, Adapt::Auto));
-        assert_eq!(parse("a.toml --adapt none").unwrap().adapt, Adapt::None);
+        assert_eq!((args.congestion, args.adapt), (Congestion::Bbr, Adaptation::Auto));
+        assert_eq!(parse("a.toml --adapt none").unwrap().adapt, Adaptation::None);
         assert_eq!(args.encode_options(), EncodeOptions::default());
         let args = parse("a.toml --color 420 --depth small --depth-error 0.002").unwrap();
         let options = args.encode_options();

@@ -1,33 +1,33 @@
 //! What the threads and tasks of the server share.
 //!
 //! ```text
-//! vehicles   each with its newest pose, cameras, events, seat: see [`crate::vehicle`]
-//! outlet     who wants images of which vehicle, and the way out to them
+//! vehicles   each with its newest pose, cameras, events, lease: see [`crate::flights::vehicle`]
+//! subscriptions     who wants images of which vehicle, and the way out to them
 //! stats      what was measured, of all vehicles together
 //! ```
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use serde::Serialize;
-pub use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::pose::Predict;
 
-use crate::drivers::SourceCounters;
-use crate::environment::Environment;
-use crate::leaderboard::Leaderboard;
-use crate::moving::Moving;
-use crate::outlet::Outlet;
-use crate::pace::Adapt;
+use crate::flights::leaderboard::Leaderboard;
+use crate::flights::vehicle::Vehicle;
+use crate::lock::lock;
+use crate::poses::drivers::SourceCounters;
+use crate::render::dynamic_objects::DynamicObjects;
+use crate::render::environment::Environment;
 use crate::stats::{Report, Stats};
 use crate::stop::Stop;
-use crate::vehicle::Vehicle;
+use crate::stream::rate_control::Adaptation;
+use crate::stream::subscriptions::Subscriptions;
 
 /// Shared state of all vehicles in one arena.
 #[derive(Debug)]
 pub struct Hub {
     /// Drawn by lot at the start: a runtime tells by it that the server was restarted.
     pub boot: u64,
-    /// The vehicles served, each at its index; at least one, at most [`MAX_VEHICLES`].
+    /// The vehicles served, each at its index; at least one, at most [`MAX_VEHICLES`](vizflyt_arena::config::MAX_VEHICLES).
     pub vehicles: Vec<Arc<Vehicle>>,
     /// Which renderer draws, and why; it may give way to another in flight.
     pub renderer: Mutex<RendererInfo>,
@@ -36,15 +36,15 @@ pub struct Hub {
     /// What was measured.
     pub stats: Stats,
     /// Who wants images.
-    pub outlet: Outlet,
+    pub subscriptions: Subscriptions,
     /// What may be lowered toward a runtime whose link is too slow.
-    pub adapt: Adapt,
+    pub adapt: Adaptation,
     /// For which moment images are drawn.
     pub predict: Predict,
     /// The light and the fog that images show.
     pub environment: Environment,
     /// What moves in the twin.
-    pub moving: Moving,
+    pub dynamic_objects: DynamicObjects,
     /// Where flights are written down; `None` if they are not.
     pub leaderboard: Option<Leaderboard>,
     /// What the sources of poses are called, by their index.
@@ -72,11 +72,11 @@ impl Hub {
             renderer: Mutex::new(renderer),
             stop,
             stats: Stats::default(),
-            outlet: Outlet::new(&cameras),
-            adapt: Adapt::default(),
+            subscriptions: Subscriptions::new(&cameras),
+            adapt: Adaptation::default(),
             predict: Predict::default(),
             environment: Environment::default(),
-            moving: Moving::default(),
+            dynamic_objects: DynamicObjects::default(),
             leaderboard: None,
             source_names: Vec::new(),
             source: Mutex::default(),
@@ -108,7 +108,7 @@ impl Hub {
     /// Whether previews are made: a page looks at them, or a flight is under way, whose crash card
     /// they may be on.
     pub fn wants_previews(&self) -> bool {
-        self.outlet.viewers() > 0 || self.vehicles.iter().any(|vehicle| vehicle.under_way())
+        self.subscriptions.viewers() > 0 || self.vehicles.iter().any(|vehicle| vehicle.under_way())
     }
 
     /// Returns the report over the whole run.
@@ -124,11 +124,6 @@ fn lot() -> u64 {
     RandomState::new().hash_one(std::process::id()) | 1
 }
 
-/// Locks, also where a thread has panicked: every value kept here is valid at any time.
-pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -136,7 +131,8 @@ mod tests {
     #[test]
     fn a_vehicle_that_is_not_here_is_refused_with_the_names_of_those_that_are() {
         let vehicles = ["wasp", "bee"].iter().enumerate();
-        let vehicles = vehicles.map(|(index, name)| crate::vehicle::tests::named(index, name));
+        let vehicles =
+            vehicles.map(|(index, name)| crate::flights::vehicle::tests::named(index, name));
         let hub = Hub::new(vehicles.collect(), RendererInfo::default(), Stop::default());
         assert_eq!(hub.vehicle("bee").map(|vehicle| vehicle.index), Ok(1));
         assert_eq!(

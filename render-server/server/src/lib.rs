@@ -1,49 +1,34 @@
 //! The render server: poses in, RGB-D out; referee's events, page, report.
 //!
 //! ```text
-//! drivers (Vicon UDP) -> tick::poses (arena: gate, referee) -> vehicle: newest pose, events
-//!                        tick::draw  (renderer)             -> mailbox: newest drawn tick
-//!                        encode      (room in the outlet?)  -> outlet -> transport (QUIC)
-//!                                                           -> previews -> dashboard (WebSocket)
+//! poses   drivers -> pose thread (arena: gate, referee)  -> newest pose, events
+//! render  render thread (renderer)                       -> newest rendered tick
+//! stream  encode (a free slot?) -> subscriptions -> transport (QUIC)
+//! web     previews -> page (WebSocket)
+//! flights control leases, events, crash cards, leaderboard
 //! ```
 //! Four threads (poses, render, encode, previews) and a tokio runtime for sockets meet in [`hub::Hub`],
-//! which holds a [`vehicle::Vehicle`] each.
+//! which holds a [`flights::vehicle::Vehicle`] each.
 //! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
 
-pub mod accounts;
 pub mod args;
-mod berth;
-pub mod cameras;
+pub mod authorization;
 pub mod clock;
-pub mod crash;
-pub mod dashboard;
-pub mod door;
-pub mod drawn;
-pub mod drivers;
-pub mod encode;
-pub mod environment;
-pub mod events;
+pub mod flights;
 pub mod hub;
-pub mod leaderboard;
-mod limits;
+pub mod lock;
 pub mod mailbox;
-pub mod map;
-pub mod moving;
-pub mod outlet;
-pub mod pace;
-pub mod previews;
+pub mod poses;
+mod rate_limit;
 pub mod render;
 pub mod scene;
 mod serve;
-pub mod slices;
 pub mod stats;
 pub mod stop;
-pub mod tick;
-pub mod transport;
-pub mod vehicle;
-mod view;
+pub mod stream;
+pub mod web;
 
 pub use args::ServeArgs;
 pub use scene::default_arena;
 pub use serve::serve;
-pub use view::{ViewArgs, view};
+pub use web::{ViewArgs, view};

@@ -16,26 +16,27 @@ use vizflyt_splat::{Chosen, Rasterizer, Scene as Drawn, Splats};
 use vizflyt_trust::KeysFolder;
 
 use crate::args::{Kept, ServeArgs};
-use crate::cameras::Cameras;
-use crate::dashboard::messages::Rates;
-use crate::dashboard::{Access, Logins, Page, PageKeys};
-use crate::door::Door;
-use crate::drawn::Ticks;
-use crate::drivers::{self, Opened, PoseSource};
-use crate::environment::Environment;
-use crate::events::Origin;
-use crate::hub::{Hub, RendererInfo, lock};
-use crate::leaderboard::{Database, Leaderboard, record};
+use crate::authorization::Authorizer;
+use crate::flights::events::Origin;
+use crate::flights::leaderboard::{Database, Leaderboard, record};
+use crate::flights::vehicle::Vehicle;
+use crate::hub::{Hub, RendererInfo};
+use crate::lock::lock;
 use crate::mailbox::Mailbox;
-use crate::map::{self, Map, Obstacles};
-use crate::moving::{Moving, vehicle_models};
+use crate::poses::drivers::{self, Opened, PoseSource};
+use crate::render::cameras::Cameras;
 use crate::render::choose;
+use crate::render::dynamic_objects::{DynamicObjects, vehicle_models};
+use crate::render::environment::Environment;
+use crate::render::rendered::RenderQueue;
 use crate::scene::{self, Scene, Scenes};
 use crate::stats::Report;
 use crate::stop::Stop;
-use crate::transport;
-use crate::vehicle::Vehicle;
-use crate::{clock, crash, dashboard, encode, previews, tick};
+use crate::stream::transport;
+use crate::web::messages::Rates;
+use crate::web::top_view::{self, Obstacles, TopView};
+use crate::web::{Access, Logins, Page, PageKeys};
+use crate::{clock, flights, poses, render, stream, web};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -143,12 +144,12 @@ async fn run(
     stop: &Stop,
 ) -> Result<()> {
     // Sockets first: a taken port is told before the scene is loaded.
-    let door = Arc::new(Door::open(KeysFolder::open(args.keys.as_deref())?)?);
+    let authorizer = Arc::new(Authorizer::open(KeysFolder::open(args.keys.as_deref())?)?);
     let mut tries = if again { BIND_TRIES } else { 0 };
     let (endpoint, listener, sources) = loop {
         let bound = async {
-            let endpoint = transport::bind(args.quic, &door.identity, args.congestion)?;
-            let listener = dashboard::bind(args.http).await?;
+            let endpoint = transport::bind(args.quic, &authorizer.identity, args.congestion)?;
+            let listener = web::bind(args.http).await?;
             let sources = drivers::open(&args.localization(scene::localization(&args.arena)?))?;
             anyhow::Ok((endpoint, listener, sources))
         };
@@ -173,20 +174,20 @@ async fn run(
 
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading));
-    let twin = tokio::select! {
-        twin = load => twin.context("loading the scene failed")??,
+    let scene = tokio::select! {
+        scene = load => scene.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
-    let Chosen { rasterizer, reason } = twin.renderer;
+    let Chosen { rasterizer, reason } = scene.renderer;
     let renderer = RendererInfo { name: rasterizer.name().into_owned(), reason };
-    let vehicles = twin.flying.iter().enumerate().map(|(index, (name, arena))| {
+    let vehicles = scene.flying.iter().enumerate().map(|(index, (name, arena))| {
         Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()))
     });
     let mut hub = Hub::new(vehicles.collect(), renderer, stop.clone());
     hub.adapt = args.adapt;
-    hub.predict = twin.arena.pose.predict;
-    hub.environment = Environment::new(twin.arena.environment);
-    hub.moving = twin.moving;
+    hub.predict = scene.arena.pose.predict;
+    hub.environment = Environment::new(scene.arena.environment);
+    hub.dynamic_objects = scene.moving;
     hub.leaderboard = open_leaderboard(args).await;
     hub.source_names =
         sources.iter().map(|source| format!("{} {}", source.driver(), source.address())).collect();
@@ -194,10 +195,10 @@ async fn run(
     let renderer = lock(&hub.renderer).clone();
     let names: Vec<_> = hub.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
     let threads =
-        start_threads(args, &hub, rasterizer, twin.referees, drivers::track(sources, &names)?)?;
+        start_threads(args, &hub, rasterizer, scene.referees, drivers::track(sources, &names)?)?;
 
-    let fingerprint = door.identity.fingerprint().to_string();
-    let vehicles = hub.vehicles.iter().zip(&twin.flying);
+    let fingerprint = authorizer.identity.fingerprint().to_string();
+    let vehicles = hub.vehicles.iter().zip(&scene.flying);
     let vehicles: Vec<_> =
         vehicles.map(|(vehicle, (_, arena))| ReadyVehicle::of(vehicle, arena)).collect();
     announce(
@@ -209,54 +210,58 @@ async fn run(
             vicon,
             pose,
             fingerprint: &fingerprint,
-            paired: door.paired().clients.len(),
+            paired: authorizer.paired().clients.len(),
             spawn: vehicles.first().map_or([0.0; 4], |vehicle| vehicle.spawn),
             vehicles,
-            arena: &twin.arena.name,
+            arena: &scene.arena.name,
             renderer: &renderer.name,
             renderer_reason: &renderer.reason,
         },
     );
 
-    let access = Arc::new(Access::new(&door.folder, &names, args.login, logins.clone())?);
+    let access = Arc::new(Access::new(&authorizer.folder, &names, args.login, logins.clone())?);
     if args.print_page_keys || !args.http.ip().is_loopback() {
         print_page_keys(access.keys(), &http, &names, args.json);
     }
     let page = Page {
         hub: hub.clone(),
-        map: twin.map,
-        stages: twin.arena.stages,
+        top_view: scene.top_view,
+        stages: scene.arena.stages,
         boot: clock::now(),
         rates: Rates::of(hub.vehicles.len()),
         access,
-        door: door.clone(),
+        authorizer: authorizer.clone(),
         quic_port: quic.port(),
         scenes: scenes.clone(),
         team_tries: Mutex::default(),
     };
-    let page = tokio::spawn(dashboard::serve(page, listener));
+    let page = tokio::spawn(web::serve(page, listener));
     if let Some(grant) = args.pair.take() {
-        open_pairing(&door, &grant, quic.port(), args.json)?;
+        open_pairing(&authorizer, &grant, quic.port(), args.json)?;
     }
     let mut recorders = tokio::task::JoinSet::new();
-    for (vehicle, (_, arena)) in hub.vehicles.iter().zip(&twin.flying) {
-        recorders.spawn(crash::follow(vehicle.clone(), arena.clone(), twin.field.clone()));
+    for (vehicle, (_, arena)) in hub.vehicles.iter().zip(&scene.flying) {
+        recorders.spawn(flights::crash::follow(
+            vehicle.clone(),
+            arena.clone(),
+            scene.field.clone(),
+        ));
         if let Some(board) = &hub.leaderboard {
             let (board, vehicle) = (board.clone(), vehicle.clone());
             recorders.spawn(record(board, vehicle, arena.clone(), args.official_attempts));
         }
     }
     let rights = tokio::spawn({
-        let door = door.clone();
-        async move { door.follow().await }
+        let authorizer = authorizer.clone();
+        async move { authorizer.follow().await }
     });
     let mut printers = tokio::task::JoinSet::new();
     for vehicle in &hub.vehicles {
         let alone = hub.vehicles.len() == 1;
         printers.spawn(print_events(vehicle.clone(), alone, args.json));
     }
-    transport::serve(hub.clone(), endpoint, door, args.congestion).await;
-    hub.outlet.shut();
+    transport::serve(hub.clone(), endpoint, authorizer, args.congestion).await;
+    hub.subscriptions.shut();
     rights.abort();
     page.abort();
     printers.shutdown().await;
@@ -299,8 +304,8 @@ fn print_page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool) {
 }
 
 /// Opens the pairing that `--pair` asks for, and prints its code and what comes of it.
-fn open_pairing(door: &Arc<Door>, grant: &Grant, port: u16, json: bool) -> Result<()> {
-    let window = door.open_pairing(grant.clone()).map_err(anyhow::Error::msg)?;
+fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bool) -> Result<()> {
+    let window = authorizer.open_pairing(grant.clone()).map_err(anyhow::Error::msg)?;
     if json {
         line(&serde_json::json!({ "pairing": { "code": window.code.to_string() } }));
     } else {
@@ -310,7 +315,7 @@ fn open_pairing(door: &Arc<Door>, grant: &Grant, port: u16, json: bool) -> Resul
             window.left.as_secs()
         ));
     }
-    let mut news = door.pairing_news();
+    let mut news = authorizer.pairing_news();
     news.mark_unchanged();
     tokio::spawn(async move {
         while news.changed().await.is_ok() {
@@ -326,19 +331,19 @@ fn open_pairing(door: &Arc<Door>, grant: &Grant, port: u16, json: bool) -> Resul
 }
 
 /// Everything made from the scene.
-struct Twin {
+struct LoadedScene {
     arena: ArenaConfig,
     renderer: Chosen,
     /// Each vehicle's name, and the arena as it has it.
     flying: Vec<(String, ArenaConfig)>,
     referees: Vec<Referee>,
-    moving: Moving,
-    map: Map,
+    moving: DynamicObjects,
+    top_view: TopView,
     /// What stands still.
     field: Arc<DistanceField>,
 }
 
-fn prepare(args: &ServeArgs) -> Result<Twin> {
+fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, args.up, args.scale)?;
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
@@ -346,7 +351,7 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
         .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
         .collect();
     let field = Arc::new(scene::bake(&splats, &arena));
-    let map = draw_map(&splats, &arena, &field);
+    let top_view = render_top_view(&splats, &arena, &field);
     let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };
     objects.extend(vehicle_models(together));
@@ -355,25 +360,25 @@ fn prepare(args: &ServeArgs) -> Result<Twin> {
     drop(splats);
     // Pictures and referees count what moves from the same instant.
     let epoch = clock::now();
-    let moving = Moving::new(epoch, obstacles.objects.clone(), &objects, together);
+    let moving = DynamicObjects::new(epoch, obstacles.objects.clone(), &objects, together);
     let referees =
         flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone()).counting_from(epoch));
     let referees = referees.collect();
-    Ok(Twin { arena, renderer, flying, referees, moving, map, field })
+    Ok(LoadedScene { arena, renderer, flying, referees, moving, top_view, field })
 }
 
-fn draw_map(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Map {
+fn render_top_view(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> TopView {
     let (min, max) = (arena.geofence.min_m.truncate(), arena.geofence.max_m.truncate());
     let flight_m = arena.spawn.position_m.z + arena.takeoff_height_m;
     let obstacles = Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| {
         field.obstacle_distance_m(p.extend(flight_m)) < 0.0
     });
-    let jpeg = map::picture(splats, min, max, flight_m + MAP_HEADROOM_M);
+    let jpeg = top_view::picture(splats, min, max, flight_m + MAP_HEADROOM_M);
     let (low, high) = (arena.geofence.min_m, arena.geofence.max_m);
-    let shell = map::shell(low, high, arena.occupancy.voxel_m, |p, within_m| {
+    let shell = top_view::shell(low, high, arena.occupancy.voxel_m, |p, within_m| {
         field.obstacle_distance_m(p) < within_m
     });
-    Map {
+    TopView {
         shell,
         jpeg: jpeg.unwrap_or_default(),
         min_m: min.to_array(),
@@ -390,7 +395,7 @@ fn start_threads(
     mut source: Box<dyn PoseSource>,
 ) -> Result<Vec<JoinHandle<()>>> {
     let newest = Arc::new(Mailbox::default());
-    let ticks = Arc::new(Ticks::default());
+    let ticks = Arc::new(RenderQueue::default());
     let start = |name: &str, run: Box<dyn FnOnce() + Send>| {
         std::thread::Builder::new()
             .name(name.to_owned())
@@ -404,16 +409,21 @@ fn start_threads(
     Ok(vec![
         start(
             "pose",
-            Box::new(move || tick::poses(&pose_hub, &mut *source, &mut referees, &pose_newest)),
+            Box::new(move || {
+                poses::thread::run(&pose_hub, &mut *source, &mut referees, &pose_newest);
+            }),
         )?,
         start(
             "render",
             Box::new(move || {
-                tick::draw(&draw_hub, &mut *renderer, &newest, &draw_ticks, max_rate);
+                render::thread::run(&draw_hub, &mut *renderer, &newest, &draw_ticks, max_rate);
             }),
         )?,
-        start("encode", Box::new(move || encode::run(&encode_hub, &encode_ticks, options)))?,
-        start("previews", Box::new(move || previews::run(&previews_hub, &ticks)))?,
+        start(
+            "encode",
+            Box::new(move || stream::encode::run(&encode_hub, &encode_ticks, options)),
+        )?,
+        start("previews", Box::new(move || web::previews::run(&previews_hub, &ticks)))?,
     ])
 }
 

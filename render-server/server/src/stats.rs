@@ -1,9 +1,9 @@
 //! What the server measures of itself: time per stage, counts, peak memory.
 //!
 //! Stages bear the names of the tracing spans: `pose render encode send`. Each thread adds to its
-//! own [`Span`]; the page reads the recent past, the report the whole run. These are the times that
+//! own [`StageDurations`]; the page reads the recent past, the report the whole run. These are the times that
 //! the server *works*; what a stage adds to an image's age the runtime reports
-//! ([`vizflyt_protocol::messages::Timing`]), and [`Answer`] has both.
+//! ([`vizflyt_protocol::messages::Timing`]), and [`VehicleStats`] has both.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,32 +15,33 @@ use vizflyt_protocol::histogram::Histogram;
 use vizflyt_protocol::messages::{StageTimes, Timing};
 use vizflyt_protocol::time::ServerTime;
 
-use crate::accounts::Account;
 use crate::clock;
-use crate::drivers::SourceCounters;
-use crate::hub::{Hub, RendererInfo, lock};
-use crate::vehicle::{ImageCounters, Vehicle};
+use crate::flights::vehicle::{ImageCounters, Vehicle};
+use crate::hub::{Hub, RendererInfo};
+use crate::lock::lock;
+use crate::poses::drivers::SourceCounters;
+use crate::stream::delivery::Delivery;
 
 /// Everything measured; shared by all threads.
 #[derive(Debug, Default)]
 pub struct Stats {
     /// Arrival of a pose to the end of gate and referee.
-    pub pose: Span,
+    pub pose: StageDurations,
     /// Drawing all cameras of a tick.
-    pub render: Span,
+    pub render: StageDurations,
     /// Quantising and encoding one camera's image.
-    pub encode: Span,
+    pub encode: StageDurations,
     /// Handing an image to the transport until the runtime has acknowledged all of it.
-    pub send: Span,
-    /// Ticks drawn.
+    pub send: StageDurations,
+    /// Ticks rendered.
     pub ticks: AtomicU64,
-    /// Ticks drawn that no one took before the next.
+    /// Ticks rendered that no one took before the next.
     pub ticks_skipped: AtomicU64,
 }
 
 /// Durations of one stage.
 #[derive(Debug)]
-pub struct Span(Mutex<Samples>);
+pub struct StageDurations(Mutex<Samples>);
 
 #[derive(Debug)]
 struct Samples {
@@ -50,13 +51,13 @@ struct Samples {
     overall: Box<Histogram>,
 }
 
-impl Default for Span {
+impl Default for StageDurations {
     fn default() -> Self {
         Self(Mutex::new(Samples { recent: [0.0; RECENT], next: 0, overall: Box::default() }))
     }
 }
 
-impl Span {
+impl StageDurations {
     /// Adds a duration. [ms]
     pub fn add_ms(&self, ms: f64) {
         let mut samples = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -113,7 +114,7 @@ impl Rate {
 
 /// Everything known of one vehicle's images, as `GET /api/stats` tells it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Answer {
+pub struct VehicleStats {
     /// Whose.
     pub vehicle: String,
     /// The runtime that flies it, and where it is; absent if there is none.
@@ -123,7 +124,7 @@ pub struct Answer {
     /// Where images get their age, by the runtime's newest report.
     pub timing: Option<Timing>,
     /// What became of them in this flight, by camera.
-    pub images: Vec<CameraAccount>,
+    pub images: Vec<CameraDelivery>,
     /// How the connection fares.
     pub connection: Option<Connection>,
     /// How good the localization is.
@@ -145,12 +146,12 @@ pub struct ServerStages {
 
 /// The account of one camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct CameraAccount {
+pub struct CameraDelivery {
     /// Its name.
     pub camera: String,
     /// What became of its images.
     #[serde(flatten)]
-    pub account: Account,
+    pub account: Delivery,
 }
 
 /// How a runtime's connection fares, from its start.
@@ -196,7 +197,7 @@ impl Connection {
     }
 }
 
-impl Answer {
+impl VehicleStats {
     /// Returns the figures of `vehicle` at this moment.
     pub fn of(hub: &Hub, vehicle: &Vehicle) -> Self {
         let runtime = vehicle.runtime();
@@ -236,10 +237,10 @@ pub struct Report {
     /// What the server's own stages took. [ms]
     pub stages: ServerStages,
     /// What became of the images of the last flight, by vehicle and camera.
-    pub images: BTreeMap<String, Vec<CameraAccount>>,
-    /// Ticks drawn.
+    pub images: BTreeMap<String, Vec<CameraDelivery>>,
+    /// Ticks rendered.
     pub ticks: u64,
-    /// Ticks drawn that no one took before the next.
+    /// Ticks rendered that no one took before the next.
     pub ticks_skipped: u64,
     /// Images that a runtime acknowledged.
     pub images_sent: u64,
@@ -321,7 +322,7 @@ mod tests {
 
     #[test]
     fn percentiles_are_those_of_the_samples() {
-        let span = Span::default();
+        let span = StageDurations::default();
         assert_eq!(span.recent(), StageTimes::default());
         assert_eq!(span.overall(), StageTimes::default());
         for value in 1..=200 {

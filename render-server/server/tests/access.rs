@@ -8,7 +8,7 @@ use std::net::{SocketAddr, TcpStream};
 
 use serde_json::Value;
 use support::{PATIENCE, Server, write_arena};
-use vizflyt_server::dashboard::Takes as Said;
+use vizflyt_server::web::Takes as Said;
 
 /// The server, and the cookies of those who were given a key.
 struct Lab {
@@ -246,7 +246,7 @@ fn every_route_knows_a_stranger_a_team_and_the_instructor() {
 /// said above what it takes.
 #[test]
 fn every_route_of_the_server_is_walked() {
-    for (method, path, takes) in vizflyt_server::dashboard::routes() {
+    for (method, path, takes) in vizflyt_server::web::routes() {
         let is_it = |asked: &str| {
             let (m, p) = asked.split_once(' ').unwrap();
             let parts: Vec<_> = p.split('?').next().unwrap().split('/').collect();
@@ -317,7 +317,7 @@ fn the_password_opens_a_session_that_ends_with_it() {
     assert_eq!((status, cookie.as_str()), (409, ""), "{answer}");
     assert!(answer.contains("vizflyt password"));
     assert_eq!(standing(address, "")["password"], false);
-    vizflyt_server::dashboard::set_password(&folder, "correct horse battery").unwrap();
+    vizflyt_server::web::set_password(&folder, "correct horse battery").unwrap();
     assert_eq!(standing(address, "")["password"], true);
     let (status, cookie, answer) = log_in(address, "correct horse");
     assert!(status == 401 && cookie.is_empty() && answer.contains("not the password"), "{answer}");
@@ -336,7 +336,7 @@ fn the_password_opens_a_session_that_ends_with_it() {
     let cookie = log_in(address, "correct horse battery").1;
     let cookie = cookie.split(';').next().unwrap().to_owned();
     assert_eq!(lab.status("GET /api/pairing", &cookie), 200);
-    vizflyt_server::dashboard::set_password(&folder, "another one altogether").unwrap();
+    vizflyt_server::web::set_password(&folder, "another one altogether").unwrap();
     assert_eq!(lab.status("GET /api/pairing", &cookie), 401);
     assert_eq!(log_in(address, "correct horse battery").0, 401);
     assert_eq!(log_in(address, "another one altogether").0, 200);

@@ -12,14 +12,14 @@ use vizflyt_arena::{ArenaConfig, MovingObjects};
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::cameras::Cameras;
-use vizflyt_server::drawn::Ticks;
+use vizflyt_server::flights::vehicle::Vehicle;
 use vizflyt_server::hub::{Hub, RendererInfo};
 use vizflyt_server::mailbox::Mailbox;
-use vizflyt_server::moving::Moving;
+use vizflyt_server::poses::thread::{Localized, NewestPoses};
+use vizflyt_server::render::cameras::Cameras;
+use vizflyt_server::render::dynamic_objects::DynamicObjects;
+use vizflyt_server::render::rendered::RenderQueue;
 use vizflyt_server::stop::Stop;
-use vizflyt_server::tick::{self, Localized, Poses};
-use vizflyt_server::vehicle::Vehicle;
 use vizflyt_splat::{Camera, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload};
 
 struct Counting;
@@ -61,8 +61,8 @@ spawn = { position_m = [0, 0, 0] }
 geofence = { min_m = [-5, -5, -0.5], max_m = [5, 5, 4] }
 limits = { max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }
 [[objects]]
-name = "door"
-scene = "door.ply"
+name = "authorizer"
+scene = "authorizer.ply"
 position_m = [1, 0, 0]
 motion = { kind = "oscillation", slide_m = [0, 1, 0], period_s = 3.0 }
 [[cameras]]
@@ -84,8 +84,8 @@ rate_hz = 300.0
 /// brings the next poses, encodes some ticks, and makes previews.
 struct Everyone {
     hub: Arc<Hub>,
-    newest: Arc<Mailbox<Poses>>,
-    ticks: Arc<Ticks>,
+    newest: Arc<Mailbox<NewestPoses>>,
+    ticks: Arc<RenderQueue>,
     calls: u64,
     images: usize,
     /// Allocations of this thread up to the end of the warm-up.
@@ -93,11 +93,11 @@ struct Everyone {
 }
 
 impl Everyone {
-    fn poses(at: u64) -> Poses {
+    fn poses(at: u64) -> NewestPoses {
         let stamp = ServerTime::from_ns(at);
         let still = Pose::new(DVec3::Z, DQuat::IDENTITY);
         let sample = Localized::still(PoseSample::still(stamp, still));
-        let mut poses = Poses::default();
+        let mut poses = NewestPoses::default();
         // Now and then one vehicle is not seen.
         poses[0] = Some(sample);
         poses[1] = (!at.is_multiple_of(7)).then_some(sample);
@@ -119,7 +119,7 @@ impl Rasterizer for Everyone {
         for (camera, image) in cameras.iter().zip(images) {
             image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
-        // The door, and of the two vehicles the other one, if it has been seen.
+        // The authorizer, and of the two vehicles the other one, if it has been seen.
         assert!(placements.len() == 3 && placements[0].is_some());
         assert!(placements[1..].contains(&None));
         self.calls += 1;
@@ -159,12 +159,12 @@ fn drawing_allocates_nothing_once_it_is_warm() {
     let vehicles = vec![vehicle(0, "wasp"), vehicle(1, "bee")];
     let mut hub = Hub::new(vehicles, RendererInfo::default(), Stop::default());
     let objects = MovingObjects::new(&arena, 0);
-    hub.moving = Moving::new(ServerTime::ZERO, objects, &[], 2);
+    hub.dynamic_objects = DynamicObjects::new(ServerTime::ZERO, objects, &[], 2);
     let hub = Arc::new(hub);
-    hub.outlet.viewer_came(0);
-    hub.outlet.viewer_came(1);
-    vizflyt_server::hub::lock(&hub.renderer).name = "nothing".to_owned();
-    let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(Ticks::default()));
+    hub.subscriptions.viewer_came(0);
+    hub.subscriptions.viewer_came(1);
+    vizflyt_server::lock::lock(&hub.renderer).name = "nothing".to_owned();
+    let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(RenderQueue::default()));
     newest.put(Everyone::poses(1));
     let mut everyone = Everyone {
         hub: hub.clone(),
@@ -174,7 +174,7 @@ fn drawing_allocates_nothing_once_it_is_warm() {
         images: 0,
         warm: 0,
     };
-    tick::draw(&hub, &mut everyone, &newest, &ticks, 1000.0);
+    vizflyt_server::render::thread::run(&hub, &mut everyone, &newest, &ticks, 1000.0);
     let allocated = ALLOCATIONS.with(Cell::get) - everyone.warm;
     assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);
     // Leaving the function frees, which is not counted.

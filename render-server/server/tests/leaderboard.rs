@@ -6,7 +6,7 @@ use quinn::TransportConfig;
 use serde_json::Value;
 use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{FlightPhase, Telemetry, ToServer};
-use vizflyt_server::leaderboard::{Attempt, Database, Leaderboard, Run, RunState};
+use vizflyt_server::flights::leaderboard::{Attempt, Database, Leaderboard, Run, RunState};
 
 /// Looks at the board until it is as wanted: what is told over QUIC is written down by another task.
 async fn until(board: &Leaderboard, wanted: impl Fn(&[Run]) -> bool) -> Vec<Run> {
@@ -98,9 +98,9 @@ fn the_instructor_names_teams_and_nobody_flies_for_a_stranger() {
     let option = format!("--leaderboard={}", folder.path().join("runs.sqlite").display());
     let server = Server::start(&write_arena(folder.path(), ""), &[&option]);
     let own = format!("http://{}", server.http);
-    let seat =
+    let lease =
         |body: &str| send_json(server.http, "POST /api/vehicles/vizflyt/team", Some(&own), body);
-    let (status, text) = seat(r#"{"team": "bees"}"#);
+    let (status, text) = lease(r#"{"team": "bees"}"#);
     assert!(status == 404 && text.contains("vizflyt leaderboard team add NAME"), "{text}");
     for _ in 0..20 {
         put(&server, r#"{"token": "guess"}"#);

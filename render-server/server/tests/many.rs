@@ -1,4 +1,4 @@
-//! Several vehicles on one server, each with its own client over real QUIC.
+//! MultiSource vehicles on one server, each with its own client over real QUIC.
 
 mod support;
 

@@ -12,10 +12,10 @@ use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::Purpose;
 use vizflyt_rgbd::{ColorMode, EncodeOptions};
-use vizflyt_server::cameras::Cameras;
-use vizflyt_server::drawn::DrawnImage;
-use vizflyt_server::outlet::{Outlet, Part, Places};
-use vizflyt_server::slices::Packer;
+use vizflyt_server::render::cameras::Cameras;
+use vizflyt_server::render::rendered::RenderedImage;
+use vizflyt_server::stream::encode::slices::SliceEncoder;
+use vizflyt_server::stream::subscriptions::{Part, Slots, Subscriptions};
 
 struct Counting;
 
@@ -56,18 +56,18 @@ fn now<T>(future: impl Future<Output = T>) -> T {
 }
 
 /// Takes an image as the transport would, and lets go of it; returns its bytes of bitstream.
-fn take(outlet: &Outlet, id: u64, places: &Places) -> usize {
-    let berth = &places[0][0];
-    now(berth.image());
+fn take(subscriptions: &Subscriptions, id: u64, places: &Slots) -> usize {
+    let image = &places[0][0];
+    now(image.image());
     let mut len = 0;
     loop {
-        match now(berth.part()) {
+        match now(image.part()) {
             Part::Bytes(bytes) => len += bytes.len(),
             Part::End { .. } => break,
             Part::Cut => panic!("cut off"),
         }
     }
-    outlet.landed(0, 0, id, 0, berth);
+    subscriptions.landed(0, 0, id, 0, image);
     len
 }
 
@@ -76,19 +76,19 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
     let camera = "name = 'front'\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
                   position_m = [0, 0, 0]";
     let camera: CameraConfig = toml::from_str(camera).unwrap();
-    let mut slot = DrawnImage {
+    let mut slot = RenderedImage {
         fresh: true,
         world_from_body: Some(Pose::new(DVec3::Z, glam::DQuat::IDENTITY)),
         set: Some(Cameras::new(vec![camera]).newest()),
-        ..DrawnImage::default()
+        ..RenderedImage::default()
     };
     slot.image.resize(320, 240);
     slot.image.alpha.fill(1.0);
-    let outlet = Outlet::new(&[1]);
-    let runtime = outlet.open(0, 1, Purpose::Fly, 2);
-    let watcher = outlet.open(0, 2, Purpose::Watch, 2);
+    let subscriptions = Subscriptions::new(&[1]);
+    let runtime = subscriptions.open(0, 1, Purpose::Fly, 2);
+    let watcher = subscriptions.open(0, 2, Purpose::Watch, 2);
     let options = EncodeOptions { color_mode: ColorMode::Lossless, ..EncodeOptions::default() };
-    let mut packer = Packer::new(options);
+    let mut encoder = SliceEncoder::new(options);
     let mut turn = |round: usize| {
         for (n, value) in slot.image.rgb.iter_mut().enumerate() {
             *value = ((n * 31 + round) % 200) as f32 / 255.0;
@@ -98,8 +98,8 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
         }
         slot.seq += 1;
         let before = ALLOCATIONS.get();
-        assert!(packer.send(&outlet, &slot, 1).unwrap().is_some());
-        let sent = [take(&outlet, 1, &runtime), take(&outlet, 2, &watcher)];
+        assert!(encoder.send(&subscriptions, &slot, 1).unwrap().is_some());
+        let sent = [take(&subscriptions, 1, &runtime), take(&subscriptions, 2, &watcher)];
         let allocations = ALLOCATIONS.get() - before;
         assert!(sent[0] > 50_000 && sent[0] == sent[1], "{sent:?}");
         allocations

@@ -337,7 +337,7 @@ async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
     let (header, payload) = watcher.image().await;
     assert_eq!(peek(&payload).unwrap().width, header.width_px.get());
     watcher.pose().await;
-    // What it says does not count, and it takes nobody's seat.
+    // What it says does not count, and it takes nobody's lease.
     let landed = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
     watcher.say(&ToServer::Telemetry(landed)).await;
     let (runtime, _) = Client::welcomed(&server, usual()).await;

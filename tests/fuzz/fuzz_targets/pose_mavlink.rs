@@ -6,8 +6,8 @@ use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::mavlink::dialect::MavMessage;
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, MavlinkVersion, Message, encode};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::drivers::mavlink::MavlinkStream;
-use vizflyt_server::drivers::udp::PoseStream;
+use vizflyt_server::poses::drivers::mavlink::MavlinkStream;
+use vizflyt_server::poses::drivers::udp::PoseStream;
 
 const IDS: [u32; 5] = [0, 30, 31, 32, 331];
 

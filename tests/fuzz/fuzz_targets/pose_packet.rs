@@ -3,8 +3,8 @@
 use libfuzzer_sys::fuzz_target;
 use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::drivers::json::JsonStream;
-use vizflyt_server::drivers::udp::PoseStream;
+use vizflyt_server::poses::drivers::json::JsonStream;
+use vizflyt_server::poses::drivers::udp::PoseStream;
 
 fuzz_target!(|packets: Vec<&[u8]>| {
     let config = LocalizationConfig::parse("json,up=y,units=mm,nose=-y").unwrap();

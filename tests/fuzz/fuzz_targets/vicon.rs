@@ -3,8 +3,8 @@
 use libfuzzer_sys::fuzz_target;
 use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::drivers::udp::PoseStream;
-use vizflyt_server::drivers::vicon::ViconStream;
+use vizflyt_server::poses::drivers::udp::PoseStream;
+use vizflyt_server::poses::drivers::vicon::ViconStream;
 
 fuzz_target!(|packets: Vec<&[u8]>| {
     let mut source =

@@ -8,9 +8,9 @@ use glam::DVec3;
 use serde::Serialize;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
-use vizflyt_server::pace::LEVELS;
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::{Up, load, load_as_it_is};
+use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Air, Camera, Chosen, DepthKind, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};

@@ -29,16 +29,16 @@ use vizflyt_runtime::images::ImagePublisher;
 use vizflyt_runtime::stream::{self, Mailbox, Outbox, ServerClock, Shared, Step, StreamSettings};
 use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
 use vizflyt_sdk::{Observation, ObservationWriter};
-use vizflyt_server::cameras::Cameras;
+use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
-use vizflyt_server::door::Door;
-use vizflyt_server::drawn::DrawnImage;
+use vizflyt_server::flights::vehicle::Vehicle;
 use vizflyt_server::hub::{Hub, RendererInfo};
-use vizflyt_server::outlet::Broadcast;
-use vizflyt_server::slices::Packer;
+use vizflyt_server::render::cameras::Cameras;
+use vizflyt_server::render::rendered::RenderedImage;
 use vizflyt_server::stop::Stop;
-use vizflyt_server::transport::{self, Congestion};
-use vizflyt_server::vehicle::Vehicle;
+use vizflyt_server::stream::encode::slices::SliceEncoder;
+use vizflyt_server::stream::subscriptions::Broadcast;
+use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_splat::RgbdImage;
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
@@ -173,9 +173,9 @@ impl Bench {
             let now = clock::now();
             let mut header = ImageHeader::new(seq, 0, now, &k, &identity.0, &identity.1);
             header.render_end_ns = now.as_ns().into();
-            link.hub.outlet.begin((0, 0), header, 0, true, &mut broadcast);
+            link.hub.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
             broadcast.push(payload);
-            link.hub.outlet.end(&mut broadcast, Some(clock::now()));
+            link.hub.subscriptions.end(&mut broadcast, Some(clock::now()));
             Ok(())
         })?;
         let ms = plugin.end()?;
@@ -234,19 +234,19 @@ impl Bench {
         let decoding = thread::spawn(move || {
             publisher.run(&mailbox, || stop.load(Ordering::Relaxed), |_| {});
         });
-        let mut packer = Packer::new(EncodeOptions::default());
-        let mut slot = DrawnImage {
+        let mut encoder = SliceEncoder::new(EncodeOptions::default());
+        let mut slot = RenderedImage {
             fresh: true,
             set: Some(set),
             world_from_body: Some(Pose::IDENTITY),
             image: picture(self.size),
-            ..DrawnImage::default()
+            ..RenderedImage::default()
         };
         self.tick(|seq| {
             let now = clock::now();
             handed[seq as usize % RING].store(now.as_ns(), Ordering::Relaxed);
             (slot.seq, slot.pose, slot.render_end) = (seq, now, now);
-            packer.send(&link.hub.outlet, &slot, 1)?;
+            encoder.send(&link.hub.subscriptions, &slot, 1)?;
             Ok(())
         })?;
         let counters = &link.hub.vehicles[0].images;
@@ -344,7 +344,7 @@ impl Link {
             vehicles: Vec::new(),
         };
         Paired::add(&folder, client)?;
-        let door = Arc::new(Door::open(folder)?);
+        let authorizer = Arc::new(Authorizer::open(folder)?);
 
         let camera: CameraConfig = serde_json::from_value(serde_json::json!({
             "name": "front", "width_px": width_px, "height_px": height_px,
@@ -358,22 +358,23 @@ impl Link {
         {
             let _inside = tokio.enter();
             let congestion = Congestion::Auto;
-            let endpoint = transport::bind(([127, 0, 0, 1], 0).into(), &door.identity, congestion)?;
+            let endpoint =
+                transport::bind(([127, 0, 0, 1], 0).into(), &authorizer.identity, congestion)?;
             let settings = StreamSettings {
                 server: endpoint.local_addr()?,
-                fingerprint: door.identity.fingerprint(),
+                fingerprint: authorizer.identity.fingerprint(),
                 identity,
                 vehicle: bounded("bench"),
                 purpose: Purpose::Fly,
                 program: bounded("vizflyt bench"),
             };
-            tokio.spawn(transport::serve(hub.clone(), endpoint, door, congestion));
+            tokio.spawn(transport::serve(hub.clone(), endpoint, authorizer, congestion));
             let outbox = Arc::new(Outbox::default());
             tokio.spawn(stream::run(settings, shared.clone(), outbox, |_| true));
         }
         let deadline = Instant::now() + CONNECTED_WITHIN;
         let connected = || {
-            let room = hub.outlet.wait_for_room(PATIENCE).fly[0][0];
+            let room = hub.subscriptions.wait_for_room(PATIENCE).fly[0][0];
             // Images that come before the clocks are related cannot be placed in time.
             room && shared.clock.state(vizflyt_sdk::host_now()).is_some()
         };

@@ -66,13 +66,13 @@ mod tests {
         let q = [0.0, 0.0, 0.6, 0.8];
         let record = [1500.0, -250.0, 1020.0, f64::from(packed(q))];
         let text = pose_packet("bee", 7, 1234, record).to_string();
-        let mut stream = vizflyt_server::drivers::json::JsonStream::new(
+        let mut stream = vizflyt_server::poses::drivers::json::JsonStream::new(
             &vizflyt_arena::config::LocalizationConfig::new(vizflyt_arena::config::Driver::Json),
             0,
             &["bee"],
         );
         let now = vizflyt_protocol::time::ServerTime::from_ns(5_000_000_000);
-        let poses = vizflyt_server::drivers::udp::PoseStream::handle_packet(
+        let poses = vizflyt_server::poses::drivers::udp::PoseStream::handle_packet(
             &mut stream,
             now,
             text.as_bytes(),

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use clap::Args;
 use vizflyt_arena::config::{Driver, LocalizationConfig};
-use vizflyt_server::{drivers, scene};
+use vizflyt_server::{poses::drivers, scene};
 
 use self::check::{Check, Step, Verdict};
 use self::words::pose_in_words;

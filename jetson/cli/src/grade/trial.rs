@@ -383,7 +383,7 @@ impl<'a> Flight<'a> {
         let seen = self.now.plus_ns(self.trial.delays.image_ns);
         let shown = motion.reach(ServerTime::from_ns(seen.as_ns()));
         let world_from_body = motion.at(shown);
-        let air = vizflyt_server::environment::air(&self.arena.environment);
+        let air = vizflyt_server::render::environment::air(&self.arena.environment);
         let cameras: Vec<Camera> = due
             .iter()
             .map(|&index| Camera {

@@ -63,7 +63,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
 
 fn view(args: vizflyt_server::ViewArgs) -> Result<()> {
     let quiet = args.no_browser;
-    vizflyt_server::view(args, |url, renderer| {
+    vizflyt_server::web::view(args, |url, renderer| {
         tell(format!("renderer    {} ({})", renderer.name, renderer.reason));
         tell(format!("page        {url}"));
         if !quiet {

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_scenes::Variant;
-use vizflyt_server::environment::air;
+use vizflyt_server::render::environment::air;
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::{load_as_it_is, load_objects};
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};

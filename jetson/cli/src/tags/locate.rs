@@ -413,7 +413,8 @@ mod tests {
             rms_px: 0.2,
         };
         let text = packet("wasp", 7, "server", &located, 4.0).to_string();
-        let read = vizflyt_server::drivers::json::PosePacket::parse(text.as_bytes()).unwrap();
+        let read =
+            vizflyt_server::poses::drivers::json::PosePacket::parse(text.as_bytes()).unwrap();
         assert_eq!((&*read.object, read.seq, read.stamp_ns), ("wasp", Some(7), Some(81_250_000)));
         assert_eq!(read.position_m, [1.0, -2.0, 0.5]);
         assert_eq!(read.rotation_xyzw, located.world_from_body.rotation.to_array());

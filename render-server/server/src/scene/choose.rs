@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use crate::hub::lock;
+use crate::lock::lock;
 
 /// The scenes to choose from, and the one chosen.
 #[derive(Debug)]

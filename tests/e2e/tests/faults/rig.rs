@@ -23,16 +23,16 @@ use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::stream::{
     Mailbox, Outbox, ServerClock, Shared, Step, StreamEvent, StreamSettings, run_over,
 };
-use vizflyt_server::cameras::Cameras;
+use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
-use vizflyt_server::door::Door;
-use vizflyt_server::events::Origin;
+use vizflyt_server::flights::events::Origin;
+use vizflyt_server::flights::vehicle::Vehicle;
 use vizflyt_server::hub::{Hub, RendererInfo};
-use vizflyt_server::outlet::Broadcast;
-use vizflyt_server::pace::{self, Adapt};
+use vizflyt_server::render::cameras::Cameras;
 use vizflyt_server::stop::Stop;
-use vizflyt_server::transport::{self, Congestion};
-use vizflyt_server::vehicle::Vehicle;
+use vizflyt_server::stream::rate_control::{self, Adaptation};
+use vizflyt_server::stream::subscriptions::Broadcast;
+use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
 use crate::network::{Chance, Network, Socket};
@@ -50,34 +50,46 @@ pub(crate) const SERVER: &str = "10.0.0.1:4433";
 pub(crate) struct Source {
     /// Images a second. [Hz]
     pub(crate) rate_hz: u32,
-    /// Encoded images, [`IMAGES`] of each level of the pace, one after the other, again and again.
+    /// Encoded images, [`IMAGES`] of each level of rate control, one after the other, again and again.
     pub(crate) payloads: Arc<Vec<Bytes>>,
     /// Their size. [px]
     pub(crate) size_px: [u32; 2],
     /// Time between events of the server.
     pub(crate) event_every: Duration,
     /// What may be lowered on a slow link.
-    pub(crate) adapt: Adapt,
+    pub(crate) adapt: Adaptation,
 }
 
 impl Source {
     /// Returns images of 640x480 at 60 Hz, 120 KB each.
     pub(crate) fn vga() -> Self {
         let (size_px, event_every) = ([640, 480], Duration::from_millis(300));
-        Self { rate_hz: 60, payloads: payloads(size_px), size_px, event_every, adapt: Adapt::None }
+        Self {
+            rate_hz: 60,
+            payloads: payloads(size_px),
+            size_px,
+            event_every,
+            adapt: Adaptation::None,
+        }
     }
 
     /// Returns images of 160x120 at 100 Hz, 8 KB each, and few events: the log of those grows, to a
     /// bound.
     pub(crate) fn small() -> Self {
         let (size_px, event_every) = ([160, 120], Duration::from_secs(100));
-        Self { rate_hz: 100, payloads: payloads(size_px), size_px, event_every, adapt: Adapt::None }
+        Self {
+            rate_hz: 100,
+            payloads: payloads(size_px),
+            size_px,
+            event_every,
+            adapt: Adaptation::None,
+        }
     }
 }
 
-/// Returns the width of images at a level of the pace: its share of the bytes is one of columns.
+/// Returns the width of images at a level of rate control: its share of the bytes is one of columns.
 fn columns(width: u32, level: usize) -> u32 {
-    (f64::from(width) * pace::level(level).share) as u32
+    (f64::from(width) * rate_control::level(level).share) as u32
 }
 
 fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
@@ -94,7 +106,7 @@ fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
         Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
         Bytes::from(payload)
     };
-    Arc::new((0..pace::LEVELS.len() * IMAGES).map(payload).collect())
+    Arc::new((0..rate_control::LEVELS.len() * IMAGES).map(payload).collect())
 }
 
 /// What came of it all.
@@ -148,8 +160,8 @@ impl Keys {
         Self { folder, runtime, _root: root }
     }
 
-    fn door(&self) -> Arc<Door> {
-        Arc::new(Door::open(self.folder.clone()).unwrap())
+    fn authorizer(&self) -> Arc<Authorizer> {
+        Arc::new(Authorizer::open(self.folder.clone()).unwrap())
     }
 }
 
@@ -195,17 +207,17 @@ impl Server {
         hub.adapt = source.adapt;
         let hub = Arc::new(hub);
         let socket = network.socket(SERVER.parse().unwrap());
-        let door = keys.door();
-        let config = transport::server_config(&door.identity, congestion).unwrap();
+        let authorizer = keys.authorizer();
+        let config = transport::server_config(&authorizer.identity, congestion).unwrap();
         let endpoint = Endpoint::new_with_abstract_socket(
-            seeded(transport::endpoint_config(&door.identity).unwrap(), 1),
+            seeded(transport::endpoint_config(&authorizer.identity).unwrap(), 1),
             Some(config),
             socket.clone(),
             Arc::new(TokioRuntime),
         )
         .unwrap();
         let tasks = vec![
-            tokio::spawn(transport::serve(hub.clone(), endpoint, door, congestion)),
+            tokio::spawn(transport::serve(hub.clone(), endpoint, authorizer, congestion)),
             tokio::spawn(draw(hub.clone(), source.clone(), notes.clone())),
             tokio::spawn(localize(hub.clone())),
             tokio::spawn(happen(hub.clone(), source.clone(), notes.clone())),
@@ -255,21 +267,21 @@ async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
             seq += 1;
             let now = clock::now();
             lock(&notes).drawn.push(now);
-            hub.vehicles[0].images.cameras[0].drew();
+            hub.vehicles[0].images.cameras[0].count_rendered();
             if seq % u64::from(hub.vehicles[0].level().keep_one_in) == 0 {
                 newest = Some((seq, now));
             }
         }
-        let room = hub.outlet.wait_for_room(Duration::ZERO).fly[0][0];
+        let room = hub.subscriptions.wait_for_room(Duration::ZERO).fly[0][0];
         if room && let Some((seq, pose)) = newest.take() {
             let level = hub.vehicles[0].level.load(Ordering::Relaxed);
             let [width, height] = source.size_px;
             let k = Intrinsics::from_horizontal_fov(columns(width, level), height, 1.5);
             let identity = (Pose::IDENTITY, Pose::IDENTITY);
             let header = ImageHeader::new(seq, 0, pose, &k, &identity.0, &identity.1);
-            hub.outlet.begin((0, 0), header, 0, true, &mut broadcast);
+            hub.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
             broadcast.push(&source.payloads[level * IMAGES + seq as usize % IMAGES]);
-            hub.outlet.end(&mut broadcast, Some(clock::now()));
+            hub.subscriptions.end(&mut broadcast, Some(clock::now()));
         }
         tokio::select! {
             biased;
@@ -336,7 +348,7 @@ impl Runtime {
         let outbox = Arc::new(Outbox::default());
         let settings = StreamSettings {
             server: SERVER.parse().unwrap(),
-            fingerprint: keys.door().identity.fingerprint(),
+            fingerprint: keys.authorizer().identity.fingerprint(),
             identity: keys.runtime.clone(),
             vehicle: bounded("vizflyt"),
             purpose: Purpose::Fly,

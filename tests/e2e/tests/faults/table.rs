@@ -8,8 +8,8 @@ use std::time::Duration;
 use tokio::time::{Instant, sleep_until};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::clock;
-use vizflyt_server::pace::Adapt;
-use vizflyt_server::transport::Congestion;
+use vizflyt_server::stream::rate_control::Adaptation;
+use vizflyt_server::stream::transport::Congestion;
 
 use crate::memory;
 use crate::network::{Impairment, Network};
@@ -324,11 +324,11 @@ pub(crate) fn cases() -> Vec<Case> {
         }
     }
     for (mbit, adapt, what) in [
-        (50, Adapt::None, "50 Mbit/s, as is"),
-        (50, Adapt::Quality, "50 Mbit/s, lower quality"),
-        (20, Adapt::Quality, "20 Mbit/s, lower quality"),
-        (20, Adapt::All, "20 Mbit/s, lower all"),
-        (5, Adapt::All, "5 Mbit/s, lower all"),
+        (50, Adaptation::None, "50 Mbit/s, as is"),
+        (50, Adaptation::Quality, "50 Mbit/s, lower quality"),
+        (20, Adaptation::Quality, "20 Mbit/s, lower quality"),
+        (20, Adaptation::All, "20 Mbit/s, lower all"),
+        (5, Adaptation::All, "5 Mbit/s, lower all"),
     ] {
         let path = Impairment { bandwidth_bps: mbit * 1_000_000, queue: 256 << 10, ..near() };
         let source = Source { adapt, ..source.clone() };

@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail};
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
-use vizflyt_server::drivers::json::PosePacket;
+use vizflyt_server::poses::drivers::json::PosePacket;
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::capture::{self, Exposure, ImageSource};
 use vizflyt_tags::image::Gray;

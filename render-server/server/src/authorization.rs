@@ -1,0 +1,224 @@
+//! Who may come in: this server's identity, and the rights of those paired with it.
+//!
+//! `paired.toml` is read again whenever it changes, so that removing an entry ends that client's
+//! right and its connection. A file that cannot be read leaves the former rights as they are: a
+//! slip of the hand must not drop vehicles out of the air.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::{info, warn};
+use vizflyt_protocol::messages::{FromApplicant, Grant, PairingShare};
+use vizflyt_trust::pairing::{Admitted, Attempt, Binding, Code, Desk, Refusal, WindowState};
+use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
+
+use crate::lock::lock;
+
+/// What every way into the server asks.
+#[derive(Debug)]
+pub struct Authorizer {
+    /// Who this server is.
+    pub identity: Identity,
+    /// Where everything is kept.
+    pub folder: KeysFolder,
+    paired: watch::Sender<Arc<Paired>>,
+    desk: Mutex<Desk>,
+    /// What came of the newest attempt to pair.
+    pairing_news: watch::Sender<String>,
+}
+
+impl Authorizer {
+    /// Opens the keys folder; makes this server's identity at its first start.
+    ///
+    /// # Errors
+    /// Keys or a `paired.toml` that cannot be used.
+    pub fn open(folder: KeysFolder) -> Result<Self, KeyError> {
+        let identity = Identity::keep(&folder, Owner::Server)?;
+        let paired = watch::Sender::new(Arc::new(Paired::read(&folder)?));
+        let (desk, pairing_news) = (Mutex::default(), watch::Sender::default());
+        Ok(Self { identity, folder, paired, desk, pairing_news })
+    }
+
+    /// Returns who is paired.
+    pub fn paired(&self) -> Arc<Paired> {
+        self.paired.borrow().clone()
+    }
+
+    /// Returns the paired client of a fingerprint.
+    pub fn client(&self, fingerprint: Fingerprint) -> Option<Client> {
+        self.paired.borrow().client(fingerprint).cloned()
+    }
+
+    /// Completes when a client may no longer use a vehicle.
+    pub async fn right_ends(&self, fingerprint: Fingerprint, vehicle: &str) {
+        let mut paired = self.paired.subscribe();
+        let lost = |paired: &Arc<Paired>| {
+            !paired.client(fingerprint).is_some_and(|client| client.may_use(vehicle))
+        };
+        // An error means that the sender is gone; `self` holds it.
+        let _ = paired.wait_for(lost).await;
+    }
+
+    /// Opens a pairing window with a fresh code.
+    ///
+    /// # Errors
+    /// A window that is open already; no random numbers.
+    pub fn open_pairing(&self, grant: Grant) -> Result<WindowState, String> {
+        let code = Code::random()?;
+        let now = Instant::now();
+        let mut desk = lock(&self.desk);
+        if !desk.open(now, code, grant) {
+            return Err("a pairing is open already; use its code, or close it".to_owned());
+        }
+        self.pairing_news.send_replace("waiting for the code".to_owned());
+        desk.state(now).ok_or_else(|| "the pairing closed at once".to_owned())
+    }
+
+    /// Returns the open pairing window.
+    pub fn pairing(&self) -> Option<WindowState> {
+        lock(&self.desk).state(Instant::now())
+    }
+
+    /// Closes the pairing window.
+    pub fn shut_pairing(&self) {
+        lock(&self.desk).shut();
+        self.pairing_news.send_replace("closed".to_owned());
+    }
+
+    /// Returns what comes of attempts to pair, newest wins.
+    pub fn pairing_news(&self) -> watch::Receiver<String> {
+        self.pairing_news.subscribe()
+    }
+
+    /// Returns what came of the newest attempt to pair.
+    pub fn newest_pairing_news(&self) -> String {
+        self.pairing_news.borrow().clone()
+    }
+
+    /// Takes the first message of a client that wants to be paired.
+    ///
+    /// # Errors
+    /// The reason to refuse.
+    pub fn begin_pairing(
+        &self,
+        message: &FromApplicant,
+        binding: &Binding,
+    ) -> Result<(Attempt, PairingShare), Refusal> {
+        lock(&self.desk).begin(Instant::now(), message, binding)
+    }
+
+    /// Takes its proof; if that is right, it is paired from now on.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn confirm_pairing(
+        &self,
+        attempt: Attempt,
+        message: &FromApplicant,
+        from: SocketAddr,
+    ) -> Result<Admitted, String> {
+        let admitted = lock(&self.desk).confirm(Instant::now(), attempt, message);
+        let admitted = admitted.map_err(|refusal| {
+            self.pairing_news.send_replace(format!("{from}: {refusal}"));
+            refusal.to_string()
+        })?;
+        match Paired::add(&self.folder, admitted.client.clone()) {
+            Ok(paired) => {
+                self.paired.send_replace(Arc::new(paired));
+                self.pairing_news.send_replace(format!("'{}' is paired", admitted.client.name));
+                Ok(admitted)
+            }
+            Err(error) => {
+                warn!("{error}");
+                self.pairing_news.send_replace(error.to_string());
+                Err("the server could not keep the pairing; its log says why".to_owned())
+            }
+        }
+    }
+
+    /// Follows `paired.toml`, for ever.
+    pub async fn follow(&self) {
+        let mut tick = interval(LOOK_EVERY);
+        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut taken = self.folder.stamp(Paired::FILE);
+        let mut seen = taken;
+        loop {
+            tick.tick().await;
+            let found = self.folder.stamp(Paired::FILE);
+            // Two looks alike: an editor that empties the file before it fills it is not believed.
+            if found == seen && found != taken {
+                taken = found;
+                self.reread();
+            }
+            seen = found;
+        }
+    }
+
+    fn reread(&self) {
+        match Paired::read(&self.folder) {
+            Ok(paired) => {
+                let changed = self.paired.send_if_modified(|known| {
+                    let changes = **known != paired;
+                    *known = Arc::new(paired);
+                    changes
+                });
+                if changed {
+                    info!("paired.toml has changed: {} paired", self.paired().clients.len());
+                }
+            }
+            Err(error) => warn!("{error}; the former rights stay until this is mended"),
+        }
+    }
+}
+
+/// Removing an entry counts after two of these.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vizflyt_trust::Role;
+
+    fn client(name: &str, vehicle: &str) -> Client {
+        Client {
+            name: name.to_owned(),
+            fingerprint: Fingerprint::of(name.as_bytes()),
+            role: Role::Team,
+            vehicles: vec![vehicle.to_owned()],
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_right_ends_with_its_entry_but_not_with_a_slip_of_the_hand() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
+        Paired::add(&folder, client("ants", "ant")).unwrap();
+        let authorizer = Arc::new(Authorizer::open(folder.clone()).unwrap());
+        let following = tokio::spawn({
+            let authorizer = authorizer.clone();
+            async move { authorizer.follow().await }
+        });
+        let print = Fingerprint::of(b"ants");
+        let ending = tokio::spawn({
+            let authorizer = authorizer.clone();
+            async move { authorizer.right_ends(print, "ant").await }
+        });
+        // A vehicle that is not its own: no right to begin with.
+        authorizer.right_ends(print, "bee").await;
+
+        let good = folder.read(Paired::FILE).unwrap().unwrap();
+        folder.write(Paired::FILE, "[[client]").unwrap();
+        tokio::time::sleep(8 * LOOK_EVERY).await;
+        assert!(!ending.is_finished() && authorizer.client(print).is_some());
+        folder.write(Paired::FILE, &good.replace("\"ant\"", "\"ant\", \"bee\"")).unwrap();
+        tokio::time::sleep(8 * LOOK_EVERY).await;
+        assert!(!ending.is_finished() && authorizer.client(print).unwrap().may_use("bee"));
+        folder.write(Paired::FILE, "").unwrap();
+        ending.await.unwrap();
+        assert_eq!(authorizer.client(print), None);
+        following.abort();
+    }
+}

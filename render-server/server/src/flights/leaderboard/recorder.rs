@@ -1,0 +1,131 @@
+//! Writes one vehicle's flights down: a run from its take-off, its verdict when it is decided, once more when
+//! the vehicle has landed.
+//!
+//! The verdict is the autograder's ([`vizflyt_arena::verdict`]): a lab flight and a graded one are judged by the
+//! same code.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::warn;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_arena::verdict::Verdict;
+use vizflyt_protocol::messages::OutcomeKind;
+
+use super::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
+use crate::flights::vehicle::Vehicle;
+use crate::lock::lock;
+
+/// Follows a vehicle's flights until the task is dropped.
+/// A team's official runs beyond `most_official` are practice.
+pub(crate) async fn record(
+    board: Leaderboard,
+    vehicle: Arc<Vehicle>,
+    arena: ArenaConfig,
+    most_official: Option<u32>,
+) {
+    let mut telemetry = vehicle.telemetry.subscribe();
+    let mut log = vehicle.events.subscribe();
+    let mut beat = interval(HEARD_EVERY);
+    beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut recorder =
+        Recorder { board, vehicle: vehicle.clone(), arena, most_official, run: None, last: None };
+    loop {
+        let is_beat = tokio::select! {
+            _ = telemetry.changed() => { telemetry.mark_unchanged(); false }
+            _ = log.changed() => { log.mark_unchanged(); false }
+            _ = beat.tick() => true,
+        };
+        if let Err(error) = recorder.follow(is_beat).await {
+            // A flight is worth more than its record: said, and tried again at the next change.
+            warn!("{error}");
+            if is_beat {
+                vehicle.note(&format!("this flight is not written down: {error}"));
+            }
+        }
+    }
+}
+
+struct Recorder {
+    board: Leaderboard,
+    vehicle: Arc<Vehicle>,
+    arena: ArenaConfig,
+    most_official: Option<u32>,
+    run: Option<Running>,
+    /// Number of the flight that was written down last.
+    last: Option<u64>,
+}
+
+/// The run under way.
+struct Running {
+    id: String,
+    /// Number of its flight.
+    flight: u64,
+    /// Told once when decided, once when landed.
+    decided: bool,
+}
+
+impl Recorder {
+    async fn follow(&mut self, is_beat: bool) -> Result<(), LeaderboardError> {
+        let (number, flight) = (self.vehicle.flights(), self.vehicle.flight());
+        // Another runtime has sat down: the flight before is over, whatever became of it.
+        if self.run.as_ref().is_some_and(|run| run.flight != number) {
+            self.run = None;
+        }
+        if self.run.is_none() && flight.took_off.is_some() && self.last != Some(number) {
+            let id = self.begin().await?;
+            self.last = Some(number);
+            self.run = Some(Running { id, flight: number, decided: false });
+        }
+        let Some(run) = &mut self.run else { return Ok(()) };
+        let landed = flight.landed.is_some();
+        if landed || (flight.outcome.is_some() && !run.decided) {
+            let verdict = self.vehicle.verdict(&self.arena);
+            self.board.end(&run.id, &end(&verdict, &self.arena)).await?;
+            run.decided = true;
+            if landed {
+                self.run = None;
+            }
+        } else if is_beat && !run.decided {
+            self.board.heard(&run.id).await?;
+        }
+        Ok(())
+    }
+
+    async fn begin(&self) -> Result<String, LeaderboardError> {
+        let checked_in = lock(&self.vehicle.checked_in).clone();
+        let new = NewRun {
+            team: checked_in.as_ref().map(|by| by.team.clone()),
+            course: self.arena.name.clone(),
+            vehicle: self.vehicle.name.as_str().to_owned(),
+            attempt: checked_in.map_or(Attempt::Practice, |by| by.attempt),
+        };
+        match self.board.begin(&new, self.most_official).await {
+            Err(error @ LeaderboardError::Spent { .. }) => {
+                self.vehicle.note(&format!("{error}: this flight is practice"));
+                self.board.begin(&NewRun { attempt: Attempt::Practice, ..new }, None).await
+            }
+            begun => begun,
+        }
+    }
+}
+
+fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {
+    // The goal is the course's last stage for whoever reads a leaderboard.
+    let goal = u32::from(arena.goal.is_some());
+    let reached = if verdict.outcome == OutcomeKind::Finished { goal } else { 0 };
+    RunEnd {
+        outcome: verdict.outcome.name().to_owned(),
+        stages_passed: verdict.stages_passed as u32 + reached,
+        stages: verdict.stages.len() as u32 + goal,
+        seconds: Some(verdict.seconds),
+        penalty_s: verdict.penalty_s,
+        min_clearance_m: verdict.min_clearance_m,
+        // Why: a verdict has string keys and finite or absent numbers.
+        verdict: serde_json::to_string(verdict).unwrap_or_default(),
+    }
+}
+
+/// How often a run says that it is still flown.
+const HEARD_EVERY: Duration = Duration::from_secs(10);

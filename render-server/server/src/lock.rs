@@ -1,0 +1,8 @@
+//! Locking that survives a panic elsewhere.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Locks, also where a thread has panicked: every value kept here is valid at any time.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

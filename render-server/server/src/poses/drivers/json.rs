@@ -1,0 +1,271 @@
+//! VizFlyt's own pose packet: one JSON object a datagram, from any program. Sans-IO.
+//!
+//! ```json
+//! {"vizflyt_pose": 1, "object": "vizflyt", "seq": 12, "stamp_ns": 123456789, "clock": "sender",
+//!  "position_m": [1.0, 2.0, 0.5], "rotation_xyzw": [0, 0, 0, 1],
+//!  "position_sigma_m": [0.002, 0.002, 0.004], "rotation_sigma_rad": [0.01, 0.01, 0.01]}
+//! ```
+//! `seq`, `stamp_ns`, `clock` and the sigmas may be left out. Stamps are of this computer's
+//! CLOCK_MONOTONIC (`"clock": "server"`), or of any clock of the sender's (`"sender"`, also if
+//! nothing is said), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
+//! rhythm; without either, a pose is as old as its arrival. `quality` is what `vizflyt tags locate` saw:
+//! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. What else the object
+//! holds is ignored.
+
+use std::borrow::Cow;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
+use glam::{DQuat, DVec3};
+use serde::Deserialize;
+use vizflyt_arena::config::LocalizationConfig;
+use vizflyt_arena::pose::PoseSigma;
+use vizflyt_protocol::time::ServerTime;
+
+use super::sender_clock::SenderClock;
+use super::udp::{PoseStream, Silence};
+use super::vehicle_names::VehicleNames;
+use super::{Measurement, SourceCounters, TagsSeen};
+
+/// A packet, as it is written.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct PosePacket<'a> {
+    /// Version: 1.
+    vizflyt_pose: u32,
+    /// Name of the object.
+    #[serde(borrow)]
+    pub object: Cow<'a, str>,
+    /// Counts packets of this object.
+    #[serde(default)]
+    pub seq: Option<u64>,
+    /// When the pose was true. [ns, clock]
+    #[serde(default)]
+    pub stamp_ns: Option<u64>,
+    /// Whose clock that is.
+    #[serde(default)]
+    pub clock: StampClock,
+    /// Where the object is. [m, world]
+    pub position_m: [f64; 3],
+    /// Rotation of its axes into the world's.
+    pub rotation_xyzw: [f64; 4],
+    /// Standard deviation of the position. [m, world]
+    #[serde(default)]
+    pub position_sigma_m: Option<[f64; 3]>,
+    /// Standard deviation of the rotation. [rad, body]
+    #[serde(default)]
+    pub rotation_sigma_rad: Option<[f64; 3]>,
+    /// What the pose rests on, if that is tags.
+    #[serde(default, deserialize_with = "tags_if_any")]
+    pub quality: Option<TagsSeen>,
+}
+
+/// Reads what `vizflyt tags locate` says; what another program means by `quality` is its own affair.
+fn tags_if_any<'de, D: serde::Deserializer<'de>>(
+    deserializer: D,
+) -> Result<Option<TagsSeen>, D::Error> {
+    let value = serde_json::Value::deserialize(deserializer)?;
+    Ok(TagsSeen::deserialize(value).ok())
+}
+
+/// Whose clock a stamp is of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StampClock {
+    /// CLOCK_MONOTONIC of the render server's computer.
+    Server,
+    /// Another.
+    #[default]
+    Sender,
+}
+
+/// Why bytes are no packet.
+#[derive(Debug, thiserror::Error)]
+pub enum JsonError {
+    /// It is no such JSON object.
+    #[error("packet of {length} bytes is no pose packet: {error}")]
+    Json {
+        /// Its length.
+        length: usize,
+        /// What the reader says.
+        error: serde_json::Error,
+    },
+    /// A version this parser does not know.
+    #[error("vizflyt_pose is {0}, this server knows 1")]
+    Version(u32),
+    /// Numbers that are no position.
+    #[error("position_m {0:?} is absurdly large")]
+    Position([f64; 3]),
+    /// A quaternion that is no rotation.
+    #[error("rotation_xyzw {0:?} is not of unit length")]
+    Rotation([f64; 4]),
+    /// Sigmas that are none.
+    #[error("{key} {value:?}: give positive numbers")]
+    Sigma {
+        /// Which.
+        key: &'static str,
+        /// What it says.
+        value: [f64; 3],
+    },
+}
+
+impl<'a> PosePacket<'a> {
+    /// Reads a packet and checks its numbers.
+    pub fn parse(bytes: &'a [u8]) -> Result<Self, JsonError> {
+        let packet: Self = serde_json::from_slice(bytes)
+            .map_err(|error| JsonError::Json { length: bytes.len(), error })?;
+        if packet.vizflyt_pose != 1 {
+            return Err(JsonError::Version(packet.vizflyt_pose));
+        }
+        // JSON has no NaN, but numbers that overflow.
+        if !packet.position_m.iter().all(|value| value.abs() <= MOST) {
+            return Err(JsonError::Position(packet.position_m));
+        }
+        let length = DQuat::from_array(packet.rotation_xyzw).length();
+        // Three digits are enough to write a quaternion by.
+        if !((length - 1.0).abs() <= 0.01) {
+            return Err(JsonError::Rotation(packet.rotation_xyzw));
+        }
+        for (key, value) in [
+            ("position_sigma_m", packet.position_sigma_m),
+            ("rotation_sigma_rad", packet.rotation_sigma_rad),
+        ] {
+            if let Some(value) = value
+                && !value.iter().all(|sigma| *sigma > 0.0 && *sigma <= MOST)
+            {
+                return Err(JsonError::Sigma { key, value });
+            }
+        }
+        Ok(packet)
+    }
+}
+
+/// Selects our vehicles from the packets.
+#[derive(Debug)]
+pub struct JsonStream {
+    roster: VehicleNames,
+    /// Of each vehicle: its packets may come from different programs.
+    clocks: Vec<SenderClock>,
+    /// What the newest pose of each vehicle rests on.
+    tags: Vec<Option<TagsSeen>>,
+    warned_of_clock: bool,
+}
+
+impl JsonStream {
+    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
+        let roster = VehicleNames::new(config, source, vehicles);
+        let clocks = vec![SenderClock::default(); roster.len()];
+        let tags = vec![None; roster.len()];
+        Self { roster, clocks, tags, warned_of_clock: false }
+    }
+
+    fn stamp(&mut self, vehicle: usize, packet: &PosePacket<'_>, now: ServerTime) -> ServerTime {
+        match (packet.stamp_ns, packet.clock) {
+            (Some(stamp_ns), StampClock::Server) => {
+                let stamp = ServerTime::from_ns(stamp_ns);
+                let age_s = now.seconds_since(stamp);
+                if (-FUTURE_S..=OLDEST_S).contains(&age_s) {
+                    return stamp.min(now);
+                }
+                if !std::mem::replace(&mut self.warned_of_clock, true) {
+                    self.roster.warn(format!(
+                        "json: '{}' is stamped {age_s:.3} s before it came; `\"clock\": \"server\"` \
+                         means CLOCK_MONOTONIC of this very computer: leave `clock` out if the sender \
+                         runs elsewhere; till then poses are stamped as they come",
+                        packet.object
+                    ));
+                }
+                now
+            }
+            (Some(stamp_ns), StampClock::Sender) => {
+                let clock = &mut self.clocks[vehicle];
+                let stamp = clock.map_in_order(stamp_ns, now);
+                if let Some(jump_s) = clock.take_jump_s() {
+                    self.roster.warn(format!(
+                        "json: the clock that stamps '{}' has jumped by {jump_s:.3} s; use a \
+                         monotonic one (in Python time.monotonic_ns())",
+                        packet.object
+                    ));
+                }
+                stamp
+            }
+            (None, _) => match packet.seq {
+                Some(seq) => self.roster.stamp(vehicle, seq as u32, now),
+                None => now,
+            },
+        }
+    }
+}
+
+impl PoseStream for JsonStream {
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.handle_packet_from(now, NOBODY, bytes)
+    }
+
+    fn handle_packet_from(
+        &mut self,
+        now: ServerTime,
+        from: SocketAddr,
+        bytes: &[u8],
+    ) -> &[Measurement] {
+        self.roster.begin();
+        let packet = match PosePacket::parse(bytes) {
+            Ok(packet) => packet,
+            Err(error) => {
+                let advice = "docs/guides/localization.md shows a packet";
+                self.roster.bad(&error, advice);
+                return &[];
+            }
+        };
+        let Some(vehicle) = self.roster.find(packet.object.as_bytes()) else {
+            let advice = "correct `object` in the sender, or start the server with --vehicle";
+            self.roster.others(std::iter::once(&*packet.object), advice);
+            return &[];
+        };
+        if packet.seq.is_some_and(|seq| !self.roster.is_next(vehicle, seq as u32, now)) {
+            return &[];
+        }
+        let stamp = self.stamp(vehicle, &packet, now);
+        let sigma = packet
+            .position_sigma_m
+            .zip(packet.rotation_sigma_rad)
+            .map(|(p, r)| PoseSigma { position_m: p.into(), rotation_rad: r.into() });
+        self.tags[vehicle] = packet.quality.map(|seen| {
+            // A port, and not an address, as anyone on the network can send a packet: the page's link leads to
+            // the sender itself.
+            let view = seen.view_port.map(|port| SocketAddr::new(from.ip(), port));
+            TagsSeen { view, ..seen }
+        });
+        let rotation = DQuat::from_array(packet.rotation_xyzw).normalize();
+        let pose = (DVec3::from(packet.position_m), rotation);
+        self.roster.measure(vehicle, (stamp, now), pose, sigma);
+        self.roster.measured()
+    }
+
+    fn next_warning(&mut self) -> Option<String> {
+        self.roster.next_warning()
+    }
+
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        let tags = self.tags.get(vehicle).copied().flatten();
+        SourceCounters { tags, ..self.roster.counters(vehicle) }
+    }
+
+    fn silence(&self) -> Silence {
+        Silence {
+            at_first: "start the program that sends pose packets, to this address",
+            later: "does the program that sends pose packets still run?",
+        }
+    }
+}
+
+/// Who sends where nobody said.
+const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
+/// No lab is a thousand kilometres wide, not in millimetres either.
+const MOST: f64 = 1e9;
+/// Two readings of one clock, rounded. [s]
+const FUTURE_S: f64 = 0.001;
+/// A pose that took longer is another clock's. [s]
+const OLDEST_S: f64 = 2.0;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,297 @@
+//! An autopilot's own estimate, over MAVLink: what it makes of UWB, optical flow or a camera of its
+//! own. Sans-IO.
+//!
+//! Either ODOMETRY (331) alone, or LOCAL_POSITION_NED (32) for the position, each with the newest
+//! ATTITUDE_QUATERNION (31) or ATTITUDE (30) turned on to its instant by its own rates. Whoever
+//! streams is asked for 32 and 31 at 50 Hz. Stamps are the autopilot's time since boot, which
+//! [`super::sender_clock`] relates to ours. A vehicle's object is the number of its system; a vehicle
+//! alone takes whichever comes.
+
+use std::net::SocketAddr;
+
+use glam::{DQuat, DVec3};
+use vizflyt_arena::config::{LocalizationConfig, MAX_VEHICLES};
+use vizflyt_arena::pose::PoseSigma;
+use vizflyt_protocol::mavlink::dialect::{
+    ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, MavCmd, MavFrame, MavMessage, ODOMETRY_DATA,
+};
+use vizflyt_protocol::mavlink::{
+    MAX_PACKET, MavHeader, Packet, StreamDecoder, attitude_from_mavlink, body_from_frd, encode,
+    local_position_from_mavlink, world_from_ned, world_rotation_from_ned,
+};
+use vizflyt_protocol::time::ServerTime;
+
+use super::sender_clock::SenderClock;
+use super::udp::{PoseStream, Silence};
+use super::vehicle_names::VehicleNames;
+use super::{Measurement, SourceCounters};
+
+/// Selects our vehicles' autopilots.
+pub struct MavlinkStream {
+    roster: VehicleNames,
+    decoder: StreamDecoder,
+    /// Packets of one datagram, until they are looked at.
+    packets: Vec<Packet>,
+    systems: Vec<System>,
+    asks: u8,
+}
+
+/// One vehicle's autopilot.
+#[derive(Clone, Debug, Default)]
+struct System {
+    clock: SenderClock,
+    attitude: Option<Attitude>,
+    /// Who it is, and where it is.
+    from: Option<(MavHeader, SocketAddr)>,
+    asked: Option<ServerTime>,
+    /// ODOMETRY comes: the other messages say the same, less well.
+    has_odometry: bool,
+    /// The newest stamp used. [ns, autopilot]
+    last_ns: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Attitude {
+    boot_ms: u32,
+    world_from_body: DQuat,
+    omega_body_radps: DVec3,
+}
+
+impl MavlinkStream {
+    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
+        let roster = VehicleNames::new(config, source, vehicles);
+        let systems = vec![System::default(); roster.len().min(MAX_VEHICLES)];
+        let decoder = StreamDecoder::default();
+        Self { roster, decoder, packets: Vec::new(), systems, asks: 0 }
+    }
+
+    fn vehicle_of(&self, header: MavHeader) -> Option<usize> {
+        let named = self.roster.find(header.system_id.to_string().as_bytes());
+        named.or((self.roster.len() == 1).then_some(0))
+    }
+
+    fn handle(&mut self, now: ServerTime, from: Option<SocketAddr>, packet: &Packet) {
+        let relevant = matches!(
+            packet.message,
+            MavMessage::ODOMETRY(_)
+                | MavMessage::LOCAL_POSITION_NED(_)
+                | MavMessage::ATTITUDE_QUATERNION(_)
+                | MavMessage::ATTITUDE(_)
+                | MavMessage::HEARTBEAT(_)
+        );
+        // Ground stations and companions of the same system have other component numbers.
+        if !relevant || packet.header.component_id != AUTOPILOT {
+            return;
+        }
+        let Some(vehicle) = self.vehicle_of(packet.header) else {
+            let name = packet.header.system_id.to_string();
+            let advice =
+                "set `objects` to the autopilots' system numbers: objects = { bee = \"2\" }";
+            return self.roster.others(std::iter::once(name.as_str()), advice);
+        };
+        let system = &mut self.systems[vehicle];
+        if let Some(from) = from {
+            system.from = Some((packet.header, from));
+        }
+        match &packet.message {
+            MavMessage::ATTITUDE_QUATERNION(message) => {
+                system.attitude = attitude_of(message).or(system.attitude);
+            }
+            MavMessage::ATTITUDE(message) => {
+                let (world_from_body, omega_body_radps) = attitude_from_mavlink(message);
+                let boot_ms = message.time_boot_ms;
+                // The quaternion is the better of the two where both come.
+                let newer =
+                    system.attitude.is_none_or(|old| boot_ms.wrapping_sub(old.boot_ms) > 100);
+                if newer && world_from_body.is_normalized() && omega_body_radps.is_finite() {
+                    system.attitude = Some(Attitude { boot_ms, world_from_body, omega_body_radps });
+                }
+            }
+            MavMessage::LOCAL_POSITION_NED(message) if !system.has_odometry => {
+                let (p_world_m, _) = local_position_from_mavlink(message);
+                let Some(attitude) = system.attitude else { return };
+                let dt_ms = message.time_boot_ms.wrapping_sub(attitude.boot_ms).cast_signed();
+                // An attitude of another moment is none.
+                if dt_ms.abs() > OLDEST_ATTITUDE_MS {
+                    return;
+                }
+                let turned = attitude.omega_body_radps * (f64::from(dt_ms) * 1e-3);
+                let rotation = attitude.world_from_body * DQuat::from_scaled_axis(turned);
+                let stamp_ns = u64::from(message.time_boot_ms) * 1_000_000;
+                self.measure(vehicle, now, stamp_ns, (p_world_m, rotation), None);
+            }
+            MavMessage::ODOMETRY(message) => self.handle_odometry(vehicle, now, message),
+            _ => {}
+        }
+    }
+
+    fn handle_odometry(&mut self, vehicle: usize, now: ServerTime, message: &ODOMETRY_DATA) {
+        if message.frame_id != MavFrame::MAV_FRAME_LOCAL_NED {
+            let error = format!("ODOMETRY is in {:?}", message.frame_id);
+            return self.roster.bad(&error, "only MAV_FRAME_LOCAL_NED is known");
+        }
+        self.systems[vehicle].has_odometry = true;
+        let [w, x, y, z] = message.q.map(f64::from);
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        let p = DVec3::new(message.x.into(), message.y.into(), message.z.into());
+        if !((rotation.length() - 1.0).abs() <= 0.01) {
+            let error = format!("ODOMETRY's rotation {rotation} is not of unit length");
+            return self.roster.bad(&error, "does the autopilot know its attitude yet?");
+        }
+        // The diagonal of an upper triangle; NaN in its first place means unknown.
+        let variance = |[a, b, c]: [usize; 3]| {
+            let at = |index: usize| f64::from(message.pose_covariance[index]);
+            DVec3::new(at(a), at(b), at(c))
+        };
+        let (p2, r2) = (variance([0, 6, 11]), variance([15, 18, 20]));
+        let known = p2.cmpgt(DVec3::ZERO).all() && r2.cmpgt(DVec3::ZERO).all();
+        let sigma = (known && p2.is_finite() && r2.is_finite()).then(|| PoseSigma {
+            position_m: DVec3::new(p2.y, p2.x, p2.z).map(f64::sqrt),
+            rotation_rad: r2.map(f64::sqrt),
+        });
+        let rotation = world_rotation_from_ned(rotation.normalize());
+        let stamp_ns = message.time_usec.saturating_mul(1000);
+        self.measure(vehicle, now, stamp_ns, (world_from_ned(p), rotation), sigma);
+    }
+
+    fn measure(
+        &mut self,
+        vehicle: usize,
+        now: ServerTime,
+        stamp_ns: u64,
+        (p_m, rotation): (DVec3, DQuat),
+        sigma: Option<PoseSigma>,
+    ) {
+        if !(p_m.abs().cmple(DVec3::splat(MOST)).all() && rotation.is_normalized()) {
+            let error = format!("position {p_m} with rotation {rotation} is no pose");
+            return self.roster.bad(&error, "has the autopilot an estimate yet?");
+        }
+        let system = &mut self.systems[vehicle];
+        // A routed link may bring a packet twice.
+        if stamp_ns == system.last_ns
+            || self.roster.measured().iter().any(|measured| measured.vehicle == vehicle)
+        {
+            return;
+        }
+        system.last_ns = stamp_ns;
+        let stamp = system.clock.map_in_order(stamp_ns, now);
+        if let Some(jump_s) = system.clock.take_jump_s() {
+            self.roster.warn(format!(
+                "mavlink: the autopilot's clock has jumped by {jump_s:.3} s; has it rebooted?"
+            ));
+        }
+        self.roster.measure(vehicle, (stamp, now), (p_m, rotation), sigma);
+    }
+
+    fn handle_bytes(
+        &mut self,
+        now: ServerTime,
+        from: Option<SocketAddr>,
+        bytes: &[u8],
+    ) -> &[Measurement] {
+        self.roster.begin();
+        let mut packets = std::mem::take(&mut self.packets);
+        let before = self.decoder.stats();
+        self.decoder.push(bytes, |packet| packets.push(packet));
+        let after = self.decoder.stats();
+        if after.packets + after.unknown == before.packets + before.unknown {
+            self.roster.bad(
+                &format!("{} bytes hold no MAVLink packet", bytes.len()),
+                "is something else sent to this port?",
+            );
+        }
+        for packet in packets.drain(..) {
+            self.handle(now, from, &packet);
+        }
+        self.packets = packets;
+        self.roster.measured()
+    }
+}
+
+fn attitude_of(message: &ATTITUDE_QUATERNION_DATA) -> Option<Attitude> {
+    let q = [message.q2, message.q3, message.q4, message.q1].map(f64::from);
+    let rotation = DQuat::from_array(q);
+    let rates = [message.rollspeed, message.pitchspeed, message.yawspeed].map(f64::from);
+    let rates = DVec3::from(rates);
+    ((rotation.length() - 1.0).abs() <= 0.01 && rates.is_finite()).then(|| Attitude {
+        boot_ms: message.time_boot_ms,
+        world_from_body: world_rotation_from_ned(rotation.normalize()),
+        omega_body_radps: body_from_frd(rates),
+    })
+}
+
+impl PoseStream for MavlinkStream {
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.handle_bytes(now, None, bytes)
+    }
+
+    fn handle_packet_from(
+        &mut self,
+        now: ServerTime,
+        from: SocketAddr,
+        bytes: &[u8],
+    ) -> &[Measurement] {
+        self.handle_bytes(now, Some(from), bytes)
+    }
+
+    fn poll_transmit(&mut self, now: ServerTime) -> Option<(SocketAddr, Vec<u8>)> {
+        let due = |system: &&mut System| {
+            system.from.is_some()
+                && system.asked.is_none_or(|at| now.seconds_since(at) > ASK_EVERY_S)
+        };
+        // One message at a time: the position first, the attitude on the next call.
+        let attitude = self.asks % 2 == 1;
+        let system = self.systems.iter_mut().find(due)?;
+        let (autopilot, to) = system.from?;
+        if attitude {
+            system.asked = Some(now);
+        }
+        self.asks = self.asks.wrapping_add(1);
+        let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+            target_system: autopilot.system_id as u8,
+            target_component: autopilot.component_id,
+            command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+            param1: if attitude { 31.0 } else { 32.0 },
+            param2: INTERVAL_US,
+            ..COMMAND_LONG_DATA::default()
+        });
+        let header =
+            MavHeader { system_id: OUR_SYSTEM, component_id: OUR_COMPONENT, sequence: self.asks };
+        Some((to, encode(header, &message, &mut [0; MAX_PACKET]).to_vec()))
+    }
+
+    fn next_warning(&mut self) -> Option<String> {
+        self.roster.next_warning()
+    }
+
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        self.roster.counters(vehicle)
+    }
+
+    fn silence(&self) -> Silence {
+        Silence {
+            at_first: "send the autopilot's MAVLink here, for example with the bridge or \
+                       mavlink-router",
+            later: "is the autopilot's link there?",
+        }
+    }
+}
+
+/// MAV_COMP_ID_AUTOPILOT1.
+const AUTOPILOT: u8 = 1;
+/// Ours: no ground station, so that nobody takes us for one.
+const OUR_SYSTEM: u32 = 246;
+/// MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
+const OUR_COMPONENT: u8 = 197;
+/// 50 Hz. [us]
+const INTERVAL_US: f32 = 20_000.0;
+/// A request may be lost, and a rebooted autopilot has forgotten it. [s]
+const ASK_EVERY_S: f64 = 5.0;
+/// Attitudes turn on evenly for so long. [ms]
+const OLDEST_ATTITUDE_MS: i32 = 100;
+/// No room is wider. [m]
+const MOST: f64 = 1e6;
+
+#[cfg(test)]
+mod tests;

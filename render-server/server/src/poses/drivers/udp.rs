@@ -1,0 +1,239 @@
+//! The socket of a stream that comes over UDP: arrival stamps, and what silence means.
+
+use std::collections::VecDeque;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use socket2::{Domain, Protocol, Socket, Type};
+use vizflyt_arena::config::Driver;
+use vizflyt_protocol::time::ServerTime;
+
+use super::{Measurement, PoseSource, SourceCounters};
+use crate::clock;
+
+/// What is behind the socket: bytes in, poses out. Sans-IO.
+pub trait PoseStream: Send {
+    /// Takes one datagram that arrived at `now`; returns the poses of our vehicles that are in it
+    /// and newer than the last, at most one of each.
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement];
+
+    /// As [`Self::handle_packet`], for streams that answer their sender.
+    fn handle_packet_from(
+        &mut self,
+        now: ServerTime,
+        _from: SocketAddr,
+        bytes: &[u8],
+    ) -> &[Measurement] {
+        self.handle_packet(now, bytes)
+    }
+
+    /// Returns what is to be sent by now, and where to. Asked after each packet, and ten times a
+    /// second.
+    fn poll_transmit(&mut self, _now: ServerTime) -> Option<(SocketAddr, Vec<u8>)> {
+        None
+    }
+
+    /// Returns what a person should know by now, once per occurrence.
+    fn next_warning(&mut self) -> Option<String>;
+
+    /// Returns the counters of a vehicle.
+    fn counters(&self, vehicle: usize) -> SourceCounters;
+
+    /// Returns what to do about silence.
+    fn silence(&self) -> Silence;
+}
+
+/// What a person can do about a stream that is silent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Silence {
+    /// When nothing has ever come.
+    pub at_first: &'static str,
+    /// When it has stopped.
+    pub later: &'static str,
+}
+
+/// A bound socket without a stream yet.
+#[derive(Debug)]
+pub struct UdpPort {
+    driver: Driver,
+    socket: UdpSocket,
+    address: SocketAddr,
+}
+
+impl UdpPort {
+    /// Binds `address`.
+    pub fn bind(driver: Driver, address: SocketAddr) -> Result<Self> {
+        let open = || -> std::io::Result<UdpSocket> {
+            let kind = Domain::for_address(address);
+            let socket = Socket::new(kind, Type::DGRAM, Some(Protocol::UDP))?;
+            // A second of a stream, so that a busy computer loses no frame.
+            socket.set_recv_buffer_size(RECEIVE_BUFFER)?;
+            socket.bind(&address.into())?;
+            Ok(socket.into())
+        };
+        let port_0 = match driver {
+            Driver::Vicon => "--vicon 127.0.0.1:0".to_owned(),
+            other => format!("--pose {other}:127.0.0.1:0"),
+        };
+        let socket = open().with_context(|| {
+            format!("{driver}: cannot listen on {address}; is another server running? try {port_0}")
+        })?;
+        let address = socket.local_addr()?;
+        Ok(Self { driver, socket, address })
+    }
+
+    /// Joins a multicast group on our address `interface`, or wherever the system's routes lead.
+    /// Others on this computer may listen too.
+    pub fn join(driver: Driver, group: Ipv4Addr, port: u16, interface: Ipv4Addr) -> Result<Self> {
+        let open = || -> std::io::Result<UdpSocket> {
+            let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+            socket.set_recv_buffer_size(RECEIVE_BUFFER)?;
+            socket.set_reuse_address(true)?;
+            socket.bind(&SocketAddr::from((Ipv4Addr::UNSPECIFIED, port)).into())?;
+            let socket: UdpSocket = socket.into();
+            socket.join_multicast_v4(&group, &interface)?;
+            Ok(socket)
+        };
+        let socket = open().with_context(|| {
+            format!(
+                "{driver}: cannot join the multicast group {group}:{port} on {interface}; set \
+                 `interface` to this computer's address in the motion capture's network"
+            )
+        })?;
+        let address = (IpAddr::V4(group), socket.local_addr()?.port()).into();
+        Ok(Self { driver, socket, address })
+    }
+
+    /// Returns where the stream must be sent.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Gives what comes to a stream.
+    pub fn with<S: PoseStream>(self, stream: S) -> UdpPoses<S> {
+        UdpPoses {
+            port: self,
+            from: None,
+            stream,
+            buffer: vec![0; 65536].into_boxed_slice(),
+            heard: clock::now(),
+            silence_warned: false,
+            warnings: VecDeque::new(),
+        }
+    }
+}
+
+/// Receives a stream of poses.
+#[derive(Debug)]
+pub struct UdpPoses<S> {
+    port: UdpPort,
+    from: Option<SocketAddr>,
+    stream: S,
+    buffer: Box<[u8]>,
+    /// When anything last arrived; the start, before anything did.
+    heard: ServerTime,
+    silence_warned: bool,
+    warnings: VecDeque<String>,
+}
+
+impl<S: PoseStream> UdpPoses<S> {
+    fn send(&mut self, now: ServerTime) {
+        while let Some((to, bytes)) = self.stream.poll_transmit(now) {
+            // Lost like any datagram; it is asked again.
+            let _ = self.port.socket.send_to(&bytes, to);
+        }
+    }
+
+    fn notice_silence(&mut self, now: ServerTime) {
+        let silence_s = now.seconds_since(self.heard);
+        let allowed_s = if self.from.is_some() { SILENCE_S } else { FIRST_SILENCE_S };
+        if self.silence_warned || !(silence_s > allowed_s) {
+            return;
+        }
+        self.silence_warned = true;
+        let (driver, ms) = (self.port.driver, (silence_s * 1e3).round());
+        let Silence { at_first, later } = self.stream.silence();
+        self.warnings.push_back(match self.from {
+            Some(from) => format!("{driver}: no sample for {ms} ms from {from}; {later}"),
+            None => {
+                format!(
+                    "{driver}: nothing has come to {} for {ms} ms; {at_first}",
+                    self.port.address
+                )
+            }
+        });
+    }
+}
+
+impl<S: PoseStream> PoseSource for UdpPoses<S> {
+    fn receive(&mut self, timeout: Duration) -> &[Measurement] {
+        // A zero time-out would mean "for ever" to the socket.
+        let timeout = timeout.max(Duration::from_millis(1));
+        if self.port.socket.set_read_timeout(Some(timeout)).is_err() {
+            return &[];
+        }
+        self.send(clock::now());
+        let received = self.port.socket.recv_from(&mut self.buffer[..]);
+        let now = clock::now();
+        // Errors are the time-out, or an ICMP complaint about something else: both mean no pose.
+        let Ok((length, from)) = received else {
+            self.notice_silence(now);
+            return &[];
+        };
+        self.heard = now;
+        self.from = Some(from);
+        self.silence_warned = false;
+        self.stream.handle_packet_from(now, from, &self.buffer[..length])
+    }
+
+    fn next_warning(&mut self) -> Option<String> {
+        self.warnings.pop_front().or_else(|| self.stream.next_warning())
+    }
+
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        self.stream.counters(vehicle)
+    }
+}
+
+/// 1 MiB holds 3 s of 1024-byte packets at 300 Hz.
+const RECEIVE_BUFFER: usize = 1 << 20;
+/// A hundred frames at 200 Hz. [s]
+const SILENCE_S: f64 = 0.5;
+/// The simulator, or a person at Tracker, takes a while to start. [s]
+const FIRST_SILENCE_S: f64 = 5.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::poses::drivers::vicon::ViconStream;
+    use vizflyt_arena::config::LocalizationConfig;
+
+    #[test]
+    fn a_stream_over_a_real_socket_is_read_and_its_end_noticed() {
+        let port = UdpPort::bind(Driver::Vicon, "127.0.0.1:0".parse().unwrap()).unwrap();
+        let to = port.address();
+        let config = LocalizationConfig::new(Driver::Vicon);
+        let mut source = port.with(ViconStream::new(&config, 0, &["v"]));
+        let sender = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let mut bytes = vec![1, 0, 0, 0, 1, 0, 72, 0];
+        bytes.extend_from_slice(b"v");
+        bytes.resize(8 + 24, 0);
+        for value in [1000.0f64, 0.0, 0.0, 0.0, 0.0, 0.0] {
+            bytes.extend_from_slice(&value.to_le_bytes());
+        }
+        sender.send_to(&bytes, to).unwrap();
+        let pose = source.receive(Duration::from_secs(30))[0];
+        assert_eq!(pose.world_from_body.translation_m.x, 1.0);
+        assert_eq!(source.next_warning(), None);
+        // As if the last packet had come a second ago.
+        source.notice_silence(pose.arrival.plus_seconds(1.0));
+        let from = sender.local_addr().unwrap();
+        assert_eq!(
+            source.next_warning().unwrap(),
+            format!("vicon: no sample for 1000 ms from {from}; set Tracker to Live, then retry")
+        );
+        source.notice_silence(pose.arrival.plus_seconds(2.0));
+        assert_eq!(source.next_warning(), None, "said once");
+    }
+}

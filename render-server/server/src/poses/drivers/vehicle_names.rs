@@ -1,0 +1,243 @@
+//! What every stream needs beside its parser: which object is which vehicle, counters, the way into
+//! the world frame, and what a person should be told. Sans-IO.
+
+use std::collections::VecDeque;
+use std::fmt::Display;
+
+use glam::{DMat3, DQuat, DVec3};
+use vizflyt_arena::config::{Alignment, Driver, LocalizationConfig, MAX_VEHICLES};
+use vizflyt_arena::pose::PoseSigma;
+use vizflyt_protocol::time::ServerTime;
+
+use super::frame_clock::FrameClock;
+use super::{Measurement, SourceCounters};
+
+/// The vehicles of one stream.
+#[derive(Debug)]
+pub(super) struct VehicleNames {
+    driver: Driver,
+    source: u8,
+    alignment: Alignment,
+    objects: Vec<Object>,
+    bad_packets: u64,
+    /// What the newest packet yielded.
+    measured: Vec<Measurement>,
+    warned_of_others: bool,
+    warned_of_bad: bool,
+    warned_of_far: bool,
+    warnings: VecDeque<String>,
+}
+
+/// One vehicle's object. Tracker counts all objects' frames together, but several simulators that
+/// send to one server each count their own.
+#[derive(Debug)]
+struct Object {
+    name: String,
+    clock: FrameClock,
+    last_frame: Option<u32>,
+    /// Since when that frame has been repeated.
+    stuck_since: Option<ServerTime>,
+    warned_of_stuck: bool,
+    counters: SourceCounters,
+}
+
+impl VehicleNames {
+    /// Makes a roster of the vehicles named, the first at index 0, and so on; at most
+    /// [`MAX_VEHICLES`]. Its measurements are of `source`.
+    pub(super) fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
+        let object = |vehicle: &&str| Object {
+            name: config.object_of(vehicle).to_owned(),
+            clock: FrameClock::default(),
+            last_frame: None,
+            stuck_since: None,
+            warned_of_stuck: false,
+            counters: SourceCounters::default(),
+        };
+        Self {
+            driver: config.driver,
+            source,
+            alignment: config.alignment(),
+            objects: vehicles.iter().take(MAX_VEHICLES).map(object).collect(),
+            bad_packets: 0,
+            measured: Vec::with_capacity(MAX_VEHICLES),
+            warned_of_others: false,
+            warned_of_bad: false,
+            warned_of_far: false,
+            warnings: VecDeque::new(),
+        }
+    }
+
+    /// Returns whose object has this name.
+    pub(super) fn find(&self, name: &[u8]) -> Option<usize> {
+        self.objects.iter().position(|object| object.name.as_bytes() == name)
+    }
+
+    /// Returns how many vehicles there are.
+    pub(super) fn len(&self) -> usize {
+        self.objects.len()
+    }
+
+    /// Begins a packet.
+    pub(super) fn begin(&mut self) {
+        self.measured.clear();
+    }
+
+    /// Returns what the packet yielded.
+    pub(super) fn measured(&self) -> &[Measurement] {
+        &self.measured
+    }
+
+    /// Takes the number of a vehicle's next frame; returns whether it is newer than the last, and
+    /// counts.
+    pub(super) fn is_next(&mut self, vehicle: usize, frame: u32, now: ServerTime) -> bool {
+        let object = &mut self.objects[vehicle];
+        if let Some(last) = object.last_frame {
+            let ahead = frame.wrapping_sub(last).cast_signed();
+            // A counter that falls back by more than any reordering is a source restarted.
+            if ahead <= 0 && ahead > -RESTART_FRAMES {
+                object.counters.stale_packets += 1;
+                if ahead == 0 {
+                    self.notice_stuck(vehicle, frame, now);
+                }
+                return false;
+            }
+            if (2..RESTART_FRAMES).contains(&ahead) {
+                object.counters.lost_frames += (ahead - 1) as u64;
+            }
+        }
+        object.last_frame = Some(frame);
+        (object.stuck_since, object.warned_of_stuck) = (None, false);
+        true
+    }
+
+    /// The very same frame again and again: the source is paused, or shows a still.
+    fn notice_stuck(&mut self, vehicle: usize, frame: u32, now: ServerTime) {
+        let object = &mut self.objects[vehicle];
+        let since = *object.stuck_since.get_or_insert(now);
+        if now.seconds_since(since) > STUCK_S
+            && !std::mem::replace(&mut object.warned_of_stuck, true)
+        {
+            let (driver, name) = (self.driver, &object.name);
+            self.warnings.push_back(format!(
+                "{driver}: '{name}' streams frame {frame} again and again; the source is paused or \
+                 plays nothing: set it to live"
+            ));
+        }
+    }
+
+    /// Returns when a frame without a time was measured.
+    pub(super) fn stamp(&mut self, vehicle: usize, frame: u32, arrival: ServerTime) -> ServerTime {
+        self.objects[vehicle].clock.stamp(frame, arrival)
+    }
+
+    /// Counts a frame in which the vehicle was not seen.
+    pub(super) fn occluded(&mut self, vehicle: usize) {
+        self.objects[vehicle].counters.occluded += 1;
+    }
+
+    /// Adds a pose as it was streamed: position and rotation of the object, the position's sigma
+    /// along the stream's axes and the rotation's about the object's.
+    pub(super) fn measure(
+        &mut self,
+        vehicle: usize,
+        (stamp, arrival): (ServerTime, ServerTime),
+        (p_stream, stream_from_object): (DVec3, DQuat),
+        sigma: Option<PoseSigma>,
+    ) {
+        let alignment = &self.alignment;
+        let world_from_body = alignment.world_from_body(p_stream, stream_from_object);
+        let far_m = world_from_body.translation_m.abs().max_element();
+        self.notice_far(vehicle, far_m);
+        let alignment = &self.alignment;
+        let sigma = sigma.map(|sigma| {
+            let turn = DMat3::from_rotation_z(alignment.offset.yaw_deg.to_radians());
+            let body = DMat3::from_quat(alignment.nose.object_from_body().conjugate());
+            PoseSigma {
+                position_m: spread(
+                    turn * alignment.axes.matrix(),
+                    sigma.position_m * alignment.unit_m,
+                ),
+                rotation_rad: spread(body * alignment.axes.matrix(), sigma.rotation_rad),
+            }
+        });
+        self.objects[vehicle].counters.poses += 1;
+        let source = self.source;
+        self.measured.push(Measurement { vehicle, source, stamp, arrival, world_from_body, sigma });
+    }
+
+    fn notice_far(&mut self, vehicle: usize, far_m: f64) {
+        if far_m > FAR_M && !std::mem::replace(&mut self.warned_of_far, true) {
+            let (driver, name) = (self.driver, &self.objects[vehicle].name);
+            self.warnings.push_back(format!(
+                "{driver}: '{name}' is {far_m:.0} m from the origin; no room is that large: are these \
+                 millimetres? set `units` (vizflyt doctor localization finds which)"
+            ));
+        }
+    }
+
+    /// Counts a packet that does not parse; the first one is told, with what to ask oneself.
+    pub(super) fn bad(&mut self, why: &dyn Display, advice: &str) {
+        self.bad_packets += 1;
+        if !std::mem::replace(&mut self.warned_of_bad, true) {
+            let driver = self.driver;
+            self.warnings.push_back(format!(
+                "{driver}: {why}; {advice} (further bad packets are only counted)"
+            ));
+        }
+    }
+
+    /// Notes that only objects stream that are nobody's; told once, unless ours has been seen.
+    pub(super) fn others<'a>(&mut self, names: impl Iterator<Item = &'a str>, advice: &str) {
+        if self.warned_of_others || self.objects.iter().any(|object| object.counters.poses > 0) {
+            return;
+        }
+        self.warned_of_others = true;
+        let quoted = |name: &str| format!("'{name}'");
+        let others: Vec<_> = names.take(MOST_NAMES).map(quoted).collect();
+        let ours: Vec<_> = self.objects.iter().map(|object| quoted(&object.name)).collect();
+        let (driver, others, ours) = (self.driver, others.join(", "), ours.join(", "));
+        self.warnings.push_back(format!(
+            "{driver}: object {others} streams, but {ours} was asked for; {advice}"
+        ));
+    }
+
+    /// Tells a person something.
+    pub(super) fn warn(&mut self, text: String) {
+        // What nobody reads must not pile up.
+        if self.warnings.len() < MOST_WARNINGS {
+            self.warnings.push_back(text);
+        }
+    }
+
+    /// Returns the next thing a person should know, each once.
+    pub(super) fn next_warning(&mut self) -> Option<String> {
+        self.warnings.pop_front()
+    }
+
+    /// Returns the counters of a vehicle.
+    pub(super) fn counters(&self, vehicle: usize) -> SourceCounters {
+        let own = self.objects.get(vehicle).map_or_else(SourceCounters::default, |o| o.counters);
+        SourceCounters { bad_packets: self.bad_packets, ..own }
+    }
+}
+
+/// Returns the standard deviations along other axes of what has these along its own, uncorrelated.
+fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
+    let squared = sigma * sigma;
+    let row = |index: usize| {
+        let row = axes.row(index);
+        (row * row).dot(squared).sqrt()
+    };
+    DVec3::new(row(0), row(1), row(2))
+}
+
+/// Ten seconds at 200 Hz: beyond any reordering on a LAN.
+const RESTART_FRAMES: i32 = 2000;
+/// Names in a warning.
+pub(super) const MOST_NAMES: usize = 8;
+/// Things to tell that may wait.
+const MOST_WARNINGS: usize = 16;
+/// No lab is wider. [m]
+const FAR_M: f64 = 100.0;
+/// A repeated frame for so long is no hiccup. [s]
+const STUCK_S: f64 = 1.0;

@@ -1,0 +1,199 @@
+//! Vicon Tracker's UDP object stream: bytes in, the poses of the named objects out. Sans-IO.
+//!
+//! Layout (Tracker 3 user guide, "UDP object stream"; little-endian, packed):
+//! ```text
+//! u32 frame, u8 items, then per item:
+//!   u8 id, u16 size, then `size` bytes; for id 0 (object) size is 72:
+//!     char[24] name (NUL-padded), f64 x, y, z [mm], f64 rx, ry, rz [rad]
+//! ```
+//! Tracker pads packets to a block size: bytes after the last item are ignored. Items with
+//! another id are skipped by their size.
+//!
+//! Rotation: unless the setting `euler` says otherwise, turns about the fixed x, then the fixed y,
+//! then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on
+//! site.
+//!
+//! Stamps: the stream carries a frame counter but no time, and Tracker's clock is not ours. So a
+//! pose is stamped with its arrival on CLOCK_MONOTONIC, less the jitter that the frame counter
+//! reveals ([`super::frame_clock`]). The constant part of Tracker's own delay (a few ms) stays in.
+
+use glam::DVec3;
+use vizflyt_arena::config::{Euler, LocalizationConfig, MAX_VEHICLES};
+use vizflyt_protocol::time::ServerTime;
+
+use super::udp::{PoseStream, Silence};
+use super::vehicle_names::{MOST_NAMES, VehicleNames};
+use super::{Measurement, SourceCounters};
+
+/// One object of a packet.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViconObject<'a> {
+    /// Name, without the padding; Tracker writes ASCII, but any byte may come.
+    pub name: &'a [u8],
+    /// Where it is, in the stream's unit (Tracker's is the millimetre).
+    pub p_stream: DVec3,
+    /// Angles about x, y and z, or `None` if Tracker did not see the object (it then sends zeros).
+    /// [rad]
+    pub angles_rad: Option<DVec3>,
+}
+
+/// Why bytes are no packet of the stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ViconError {
+    /// Fewer bytes than the packet's head.
+    #[error("packet of {0} bytes is shorter than its head of 5")]
+    Short(usize),
+    /// An item runs past the end.
+    #[error("item {item} needs {need} bytes at offset {offset}, {have} are left")]
+    Cut {
+        /// Index of the item.
+        item: u8,
+        /// Where it begins.
+        offset: usize,
+        /// What it needs.
+        need: usize,
+        /// What is left.
+        have: usize,
+    },
+    /// An object of a size this parser does not know.
+    #[error("item {item} is an object of {size} bytes instead of 72")]
+    Size {
+        /// Index of the item.
+        item: u8,
+        /// Its stated size.
+        size: u16,
+    },
+    /// A coordinate or an angle is not a sensible number.
+    #[error("item {item} has a coordinate or angle that is not finite or absurdly large")]
+    NotFinite {
+        /// Index of the item.
+        item: u8,
+    },
+}
+
+/// Returns the frame number and gives every object of a packet to `visit`, in order.
+pub fn parse<'a>(
+    bytes: &'a [u8],
+    mut visit: impl FnMut(ViconObject<'a>),
+) -> Result<u32, ViconError> {
+    let Some((head, _)) = bytes.split_first_chunk::<HEAD>() else {
+        return Err(ViconError::Short(bytes.len()));
+    };
+    let frame = u32::from_le_bytes([head[0], head[1], head[2], head[3]]);
+    let mut offset = HEAD;
+    for item in 0..head[4] {
+        let rest = &bytes[offset..];
+        let cut = |need| ViconError::Cut { item, offset, need, have: rest.len() };
+        let (item_head, body) = rest.split_first_chunk::<ITEM_HEAD>().ok_or(cut(ITEM_HEAD))?;
+        let size = u16::from_le_bytes([item_head[1], item_head[2]]);
+        let need = ITEM_HEAD + usize::from(size);
+        let body = body.get(..usize::from(size)).ok_or(cut(need))?;
+        offset += need;
+        if item_head[0] == OBJECT_ID {
+            let body: &[u8; OBJECT_SIZE] =
+                body.try_into().map_err(|_| ViconError::Size { item, size })?;
+            visit(object(body).ok_or(ViconError::NotFinite { item })?);
+        }
+    }
+    Ok(frame)
+}
+
+fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
+    let (name, numbers) = body.split_at(NAME_SIZE);
+    let name = &name[..name.iter().position(|&byte| byte == 0).unwrap_or(NAME_SIZE)];
+    let mut values = [0.0f64; 6];
+    for (value, bytes) in values.iter_mut().zip(numbers.chunks_exact(8)) {
+        *value = f64::from_le_bytes(bytes.try_into().ok()?);
+        if !(value.abs() <= MOST) {
+            return None;
+        }
+    }
+    let [x, y, z, rx, ry, rz] = values;
+    let seen = values != [0.0; 6];
+    Some(ViconObject {
+        name,
+        p_stream: DVec3::new(x, y, z),
+        angles_rad: seen.then_some(DVec3::new(rx, ry, rz)),
+    })
+}
+
+/// Selects our vehicles from the stream, keeps the counters, and notices what is wrong.
+#[derive(Debug)]
+pub struct ViconStream {
+    roster: VehicleNames,
+    euler: Euler,
+}
+
+impl ViconStream {
+    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on;
+    /// at most [`MAX_VEHICLES`].
+    pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
+        let roster = VehicleNames::new(config, source, vehicles);
+        Self { roster, euler: config.euler.unwrap_or_default() }
+    }
+}
+
+impl PoseStream for ViconStream {
+    fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
+        self.roster.begin();
+        let mut found = [None; MAX_VEHICLES];
+        let mut others = heapless::Vec::<_, MOST_NAMES>::new();
+        let parsed = parse(bytes, |object| match self.roster.find(object.name) {
+            Some(vehicle) => found[vehicle] = Some(object),
+            None => drop(others.push(object.name)),
+        });
+        let frame = match parsed {
+            Ok(frame) => frame,
+            Err(error) => {
+                let advice =
+                    "is something other than Tracker's UDP object stream sent to this port?";
+                self.roster.bad(&error, advice);
+                return &[];
+            }
+        };
+        if found.iter().all(Option::is_none) && !others.is_empty() {
+            let names = others.iter().filter_map(|name| std::str::from_utf8(name).ok());
+            self.roster.others(names, "rename the object in Tracker, or set `objects`");
+        }
+        for (vehicle, object) in found.into_iter().enumerate() {
+            let Some(object) = object else { continue };
+            if !self.roster.is_next(vehicle, frame, now) {
+                continue;
+            }
+            let Some(angles_rad) = object.angles_rad else {
+                self.roster.occluded(vehicle);
+                continue;
+            };
+            let stamp = self.roster.stamp(vehicle, frame, now);
+            let pose = (object.p_stream, self.euler.rotation(angles_rad));
+            self.roster.measure(vehicle, (stamp, now), pose, None);
+        }
+        self.roster.measured()
+    }
+
+    fn next_warning(&mut self) -> Option<String> {
+        self.roster.next_warning()
+    }
+
+    fn counters(&self, vehicle: usize) -> SourceCounters {
+        self.roster.counters(vehicle)
+    }
+
+    fn silence(&self) -> Silence {
+        Silence {
+            at_first: "in Tracker enable the UDP object stream to this computer and set it to Live",
+            later: "set Tracker to Live, then retry",
+        }
+    }
+}
+
+const HEAD: usize = 5;
+const ITEM_HEAD: usize = 3;
+const OBJECT_ID: u8 = 0;
+const NAME_SIZE: usize = 24;
+const OBJECT_SIZE: usize = 72;
+/// No lab is a thousand kilometres wide [mm], and no angle has this many turns [rad].
+const MOST: f64 = 1e9;
+
+#[cfg(test)]
+mod tests;

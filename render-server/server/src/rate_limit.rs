@@ -1,0 +1,122 @@
+//! What unknown peers may cost: attempts that came to nothing (connections, logins) are counted by
+//! address, pure.
+//!
+//! Only addresses that proved to be their own are charged (a handshake was completed), so nobody
+//! can use up another's. Memory is bounded: addresses that have paid back are forgotten, and when
+//! all places are taken, the rest of the world shares one.
+
+use std::collections::HashMap;
+use std::net::{IpAddr, Ipv6Addr};
+use std::time::{Duration, Instant};
+
+/// Remembers who was turned away.
+#[derive(Debug, Default)]
+pub(crate) struct RateLimiter {
+    debts: HashMap<IpAddr, Debt>,
+    /// Of all addresses that found no place.
+    others: Option<Debt>,
+}
+
+/// A token bucket, kept as the time at which it is full again.
+#[derive(Clone, Copy, Debug)]
+struct Debt {
+    full_at: Instant,
+}
+
+impl RateLimiter {
+    /// Whether an address has attempts left.
+    pub(crate) fn may_try(&self, now: Instant, address: IpAddr) -> bool {
+        let debt = self.debts.get(&place(address)).or(self.others.as_ref());
+        debt.is_none_or(|debt| debt.owed(now) + EACH <= EACH * BURST)
+    }
+
+    /// Takes one attempt.
+    pub(crate) fn charge(&mut self, now: Instant, address: IpAddr) {
+        let place = place(address);
+        if self.debts.len() >= MOST_PLACES && !self.debts.contains_key(&place) {
+            self.debts.retain(|_, debt| debt.owed(now) > Duration::ZERO);
+        }
+        let full = self.debts.len() >= MOST_PLACES;
+        let debt = match self.debts.get_mut(&place) {
+            Some(debt) => debt,
+            None if full => self.others.get_or_insert(Debt { full_at: now }),
+            None => self.debts.entry(place).or_insert(Debt { full_at: now }),
+        };
+        debt.full_at = debt.full_at.max(now) + EACH;
+    }
+}
+
+impl Debt {
+    fn owed(self, now: Instant) -> Duration {
+        self.full_at.saturating_duration_since(now)
+    }
+}
+
+/// Whoever has an IPv6 address has a whole /64 of them (RFC 6177).
+fn place(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V6(v6) => Ipv6Addr::from_bits(v6.to_bits() >> 64 << 64).into(),
+        v4 @ IpAddr::V4(_) => v4,
+    }
+}
+
+/// Attempts at once; a person who mistypes stays below.
+const BURST: u32 = 10;
+/// One attempt comes back after this long.
+const EACH: Duration = Duration::from_secs(3);
+/// Some 100 KB.
+const MOST_PLACES: usize = 1024;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::net::Ipv4Addr;
+
+    fn ip(text: &str) -> IpAddr {
+        text.parse().unwrap()
+    }
+
+    /// Returns how many attempts `address` has at `now`, and takes them.
+    fn attempts(limiter: &mut RateLimiter, now: Instant, address: IpAddr) -> u32 {
+        let mut count = 0;
+        while limiter.may_try(now, address) {
+            limiter.charge(now, address);
+            count += 1;
+        }
+        count
+    }
+
+    #[test]
+    fn a_burst_then_one_at_a_time() {
+        let (mut limiter, start) = (RateLimiter::default(), Instant::now());
+        let stranger = ip("192.168.1.9");
+        assert_eq!(attempts(&mut limiter, start, stranger), BURST);
+        assert_eq!(attempts(&mut limiter, start, ip("::ffff:192.168.1.9")), 0, "the same address");
+        assert_eq!(attempts(&mut limiter, start, ip("192.168.1.10")), BURST, "another one");
+        assert_eq!(attempts(&mut limiter, start + EACH, stranger), 1);
+        assert_eq!(attempts(&mut limiter, start + EACH * 1000, stranger), BURST, "and no more");
+    }
+
+    #[test]
+    fn a_network_of_ipv6_is_one_place() {
+        let (mut limiter, now) = (RateLimiter::default(), Instant::now());
+        assert_eq!(attempts(&mut limiter, now, ip("2001:db8::1")), BURST);
+        assert_eq!(attempts(&mut limiter, now, ip("2001:db8::2:1")), 0);
+        assert_eq!(attempts(&mut limiter, now, ip("2001:db8:0:1::1")), BURST);
+    }
+
+    #[test]
+    fn a_million_addresses_cost_no_more_memory_than_a_thousand() {
+        let (mut limiter, start) = (RateLimiter::default(), Instant::now());
+        for bits in 0..20_000 {
+            limiter.charge(start, Ipv4Addr::from_bits(bits).into());
+        }
+        assert_eq!(limiter.debts.len(), MOST_PLACES);
+        let late = Ipv4Addr::from_bits(30_000).into();
+        assert!(!limiter.may_try(start, late), "the rest shares what is left, and that is used up");
+        // Those who were charged once are free again, and make room.
+        let later = start + EACH * 20_000;
+        assert_eq!(attempts(&mut limiter, later, late), BURST);
+        assert_eq!(limiter.debts.len(), 1);
+    }
+}

@@ -1,0 +1,78 @@
+//! The encode thread: drawn ticks in, image packets out; the ticks then go to the previews.
+//!
+//! Waits for room in the [`Subscriptions`](crate::stream::subscriptions), then takes the newest drawn tick: what was
+//! drawn meanwhile is skipped unencoded. How one image becomes bytes: [`crate::stream::encode::slices`].
+
+pub mod slices;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tracing::warn;
+use vizflyt_arena::config::MAX_VEHICLES;
+use vizflyt_protocol::messages::MAX_CAMERAS;
+use vizflyt_rgbd::EncodeOptions;
+
+use crate::hub::Hub;
+use crate::render::rendered::RenderQueue;
+use crate::stream::encode::slices::SliceEncoder;
+
+/// Encodes until the server stops.
+pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue, options: EncodeOptions) {
+    let mut encoder = SliceEncoder::new(options);
+    let mut order: Vec<usize> = Vec::new();
+    // Images of each camera so far, where the link has no room for all.
+    let mut turns = [[0u32; MAX_CAMERAS]; MAX_VEHICLES];
+    while !hub.stop.is_set() {
+        let wanted = hub.subscriptions.wait_for_room(PATIENCE);
+        if !wanted.anything() {
+            continue;
+        }
+        let Some(tick) = ticks.take(PATIENCE) else { continue };
+        // The newest tick's first: an older image joins what the runtime has begun.
+        order.clear();
+        order.extend((0..tick.slots.len()).filter(|&index| tick.slots[index].fresh));
+        order.sort_by_key(|&index| std::cmp::Reverse(tick.slots[index].seq));
+        // A slow link gets one of so many images; watchers get what the runtime gets.
+        order.retain(|&index| {
+            let slot = &tick.slots[index];
+            let turn = &mut turns[slot.vehicle][slot.camera];
+            *turn = turn.wrapping_add(1);
+            turn.is_multiple_of(hub.vehicles[slot.vehicle].level().keep_one_in)
+        });
+        let mut together = [0u32; MAX_VEHICLES];
+        for &index in &order {
+            let slot = &tick.slots[index];
+            if wanted.fly[slot.vehicle][slot.camera] {
+                together[slot.vehicle] |= 1 << slot.camera;
+            }
+        }
+        for &index in &order {
+            let slot = &tick.slots[index];
+            let (vehicle, camera) = (slot.vehicle, slot.camera);
+            if !wanted.stream[vehicle][camera] {
+                continue;
+            }
+            encoder.set_options(hub.vehicles[vehicle].level().options(&options));
+            match encoder.send(&hub.subscriptions, slot, together[vehicle]) {
+                Ok(Some((start, end))) => {
+                    hub.stats.encode.add(start, end);
+                    // What only watchers get is not the runtime's.
+                    if together[vehicle] >> camera & 1 == 1 {
+                        hub.vehicles[vehicle].images.cameras[camera].count_sent(slot.counted);
+                    }
+                }
+                Ok(None) => {}
+                Err(error) => {
+                    hub.vehicles[vehicle].images.cameras[camera].count_failed(slot.counted);
+                    let name = &hub.vehicles[vehicle].name;
+                    warn!("{name}: camera {camera}: {error:#}; image {} is skipped", slot.seq);
+                }
+            }
+        }
+        ticks.pass_on(tick, hub.wants_previews());
+    }
+}
+
+/// How long a stop may go unnoticed.
+const PATIENCE: Duration = Duration::from_millis(100);

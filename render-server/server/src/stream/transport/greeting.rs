@@ -1,0 +1,177 @@
+//! A connection from its first byte to its lease: who it is, preambles, `Hello`, and which vehicle,
+//! or why not.
+//!
+//! A client that is not paired is told how to pair, before a byte of it is read; one that is paired
+//! hears of no vehicle but those it may use.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use quinn::{Connection, ConnectionError};
+use rustls::pki_types::CertificateDer;
+use tokio::time::timeout;
+use tracing::{info, warn};
+use vizflyt_protocol::messages::{Purpose, ToRuntime, ToServer, bounded};
+use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_trust::{Client, Fingerprint};
+use zerocopy::IntoBytes;
+
+use super::control::{Ending, Incoming, Outbound, PATIENCE, gone};
+use super::{END, FOREIGN, REFUSED, UNPAIRED, session};
+use crate::authorization::Authorizer;
+use crate::flights::vehicle::{ControlLease, WatchLease};
+use crate::hub::Hub;
+
+/// Speaks with one runtime until either side ends it.
+pub(super) async fn run(
+    hub: Arc<Hub>,
+    authorizer: Arc<Authorizer>,
+    port: u16,
+    connection: Connection,
+) {
+    let address = connection.remote_address();
+    let (code, reason) = tokio::select! {
+        ending = talk(&hub, &authorizer, port, &connection) => ending,
+        () = hub.stop.wait() => (END, "the server ends".to_owned()),
+    };
+    // What the other side said on closing tells more than which of our calls failed first.
+    let reason = connection.close_reason().map_or(reason, |error| why(&error));
+    info!("{address}: session ends: {reason}");
+    // Why: RFC 9000 lets a reason be of any length, but it must fit a packet.
+    let cut: String = reason.chars().take(200).collect();
+    connection.close(code, cut.as_bytes());
+}
+
+async fn talk(
+    hub: &Arc<Hub>,
+    authorizer: &Authorizer,
+    port: u16,
+    connection: &Connection,
+) -> Ending {
+    let Some(client) = peer(connection).and_then(|fingerprint| authorizer.client(fingerprint))
+    else {
+        warn!("{}: not paired", connection.remote_address());
+        return (UNPAIRED, unpaired(connection, port));
+    };
+    let opened = timeout(PATIENCE, async {
+        let (send, mut recv) = connection.accept_bi().await.map_err(|error| gone(&error))?;
+        let mut preamble = [0; Preamble::SIZE];
+        recv.read_exact(&mut preamble).await.map_err(|error| gone(&error))?;
+        Ok::<_, Ending>((send, recv, preamble))
+    });
+    let (mut send, recv, preamble) = match opened.await {
+        Ok(Ok(opened)) => opened,
+        Ok(Err(ending)) => return ending,
+        Err(_) => return (FOREIGN, "nothing was said for 5 s".to_owned()),
+    };
+    // Ours goes out even to another version: its layout never changes, so that both can tell.
+    if let Err(error) = send.write_all(Preamble::of(Party::Server).as_bytes()).await {
+        return gone(&error);
+    }
+    if let Err(error) = Preamble::check(&preamble, Party::Server) {
+        let reason = error.to_string();
+        warn!("{}: {reason}", connection.remote_address());
+        let _ = send.finish();
+        return linger(connection, (FOREIGN, reason)).await;
+    }
+    let mut incoming = Incoming::new(recv);
+    let hello = match timeout(PATIENCE, incoming.next()).await {
+        Ok(Ok(ToServer::Hello(hello))) => hello,
+        Ok(Ok(_)) => return (FOREIGN, "the first message was not Hello".to_owned()),
+        Ok(Err(ending)) => return ending,
+        Err(_) => return (FOREIGN, "no Hello came for 5 s".to_owned()),
+    };
+    let address = connection.remote_address();
+    let lease = permit(&client, &hello.vehicle)
+        .and_then(|()| hub.vehicle(&hello.vehicle))
+        .and_then(|vehicle| match hello.purpose {
+            Purpose::Fly => {
+                vehicle.take_control(&hello, address).map(|lease| Lease::Fly(Box::new(lease)))
+            }
+            Purpose::Watch => vehicle.watch().map(Lease::Watch),
+        });
+    match lease {
+        Ok(lease) => {
+            let stay = async {
+                match &lease {
+                    Lease::Fly(lease) => {
+                        Box::pin(session::fly(hub, connection, &hello, lease, send, incoming)).await
+                    }
+                    Lease::Watch(lease) => {
+                        Box::pin(session::watch(hub, connection, &hello, lease, send, incoming))
+                            .await
+                    }
+                }
+            };
+            tokio::select! {
+                ending = stay => ending,
+                () = authorizer.right_ends(client.fingerprint, &hello.vehicle) => {
+                    (UNPAIRED, format!("'{}' may no longer use '{}'", client.name, hello.vehicle))
+                }
+            }
+        }
+        Err(reason) => {
+            warn!("{address}: refused: {reason}");
+            let mut out = Outbound::new(send);
+            let refusal = ToRuntime::Refused(bounded(&reason));
+            if let Err(ending) = out.write(&refusal).await {
+                return ending;
+            }
+            let _ = out.send.finish();
+            linger(connection, (REFUSED, reason)).await
+        }
+    }
+}
+
+/// Returns who is at the other end; TLS has made sure that it holds the key.
+pub(super) fn peer(connection: &Connection) -> Option<Fingerprint> {
+    let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
+    chain.first().map(|certificate| Fingerprint::of(certificate))
+}
+
+fn unpaired(connection: &Connection, port: u16) -> String {
+    // The address by which the client reached us, as far as the system tells.
+    let host = match connection.local_ip().map(|ip| ip.to_canonical()) {
+        Some(IpAddr::V6(ip)) => format!("[{ip}]"),
+        Some(ip) => ip.to_string(),
+        None => "HOST".to_owned(),
+    };
+    format!(
+        "this computer is not paired with the server; run `vizflyt pair {host}:{port}` and type \
+         the code from the server's page"
+    )
+}
+
+fn permit(client: &Client, vehicle: &str) -> Result<(), String> {
+    if client.may_use(vehicle) {
+        return Ok(());
+    }
+    let own: Vec<_> = client.vehicles.iter().map(|name| format!("'{name}'")).collect();
+    Err(format!("'{}' may use {} here, not '{vehicle}'", client.name, own.join(", ")))
+}
+
+/// What a client may do.
+enum Lease {
+    Fly(Box<ControlLease>),
+    Watch(WatchLease),
+}
+
+pub(super) fn why(error: &ConnectionError) -> String {
+    match error {
+        ConnectionError::ApplicationClosed(close) if close.reason.is_empty() => {
+            "closed by the runtime".to_owned()
+        }
+        ConnectionError::ApplicationClosed(close) => {
+            format!("closed by the runtime: {}", String::from_utf8_lossy(&close.reason))
+        }
+        ConnectionError::TimedOut => "nothing came for 5 s".to_owned(),
+        other => other.to_string(),
+    }
+}
+
+/// Gives the last words time to arrive: closing at once would discard them.
+pub(super) async fn linger(connection: &Connection, ending: Ending) -> Ending {
+    let _ = timeout(Duration::from_secs(2), connection.closed()).await;
+    ending
+}

@@ -1,0 +1,246 @@
+//! Images to one subscriber: a stream each, few in flight, reset past a deadline.
+//!
+//! In flight means handed to the transport and not yet acknowledged. Measured: resetting an older
+//! stream whenever a newer image is ready starves an overloaded link altogether; waiting for room
+//! with the newest image, and resetting only past [`DEADLINE`], delivers what the link carries.
+//!
+//! How each image fared tells [`crate::stream::rate_control`] what the link carries.
+//!
+//! One task per place of the subscriptions, made when the subscriber comes or its K grows: it writes an
+//! image's slices as the encoder makes them, without a copy, and none waits for another camera's.
+
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use quinn::{Connection, SendStream};
+use tokio::task::JoinSet;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use tracing::trace;
+use vizflyt_protocol::messages::{EventKind, Purpose};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_protocol::time::ServerTime;
+use zerocopy::IntoBytes;
+
+use super::{END, VarInt};
+use crate::clock;
+use crate::flights::vehicle::Vehicle;
+use crate::hub::Hub;
+use crate::lock::lock;
+use crate::stats::Rate;
+use crate::stream::rate_control::{DECIDE_EVERY, RateController, SentImage};
+use crate::stream::subscriptions::{InFlightImage, MOST_IN_FLIGHT, Part, Slots};
+
+/// The context of images to one session; closes the subscriptions when dropped.
+pub(super) struct ImageSenders {
+    context: SenderContext,
+    places: Slots,
+    allowed: u32,
+}
+
+/// What every sender knows.
+#[derive(Clone)]
+struct SenderContext {
+    hub: Arc<Hub>,
+    vehicle: Arc<Vehicle>,
+    connection: Connection,
+    id: u64,
+    /// The runtime's; a watcher far away says nothing of the flight.
+    pace: Option<Arc<Mutex<RateController>>>,
+}
+
+impl ImageSenders {
+    /// Opens the subscriptions of `vehicle` for its session `id`.
+    pub(super) fn open(
+        hub: Arc<Hub>,
+        vehicle: Arc<Vehicle>,
+        connection: Connection,
+        id: u64,
+        purpose: Purpose,
+    ) -> Self {
+        let allowed = in_flight(connection.min_rtt(), USUAL_RATE_HZ);
+        let places = hub.subscriptions.open(vehicle.index, id, purpose, allowed);
+        let adapt = hub.adapt.toward(connection.remote_address().ip());
+        let pace =
+            (purpose == Purpose::Fly).then(|| Arc::new(Mutex::new(RateController::new(adapt))));
+        vehicle.level.store(0, Ordering::Relaxed);
+        Self { context: SenderContext { hub, vehicle, connection, id, pace }, places, allowed }
+    }
+
+    /// Sends images until the connection ends.
+    pub(super) async fn run(mut self) -> (VarInt, String) {
+        let mut senders = JoinSet::new();
+        self.spawn(&mut senders, 0);
+        let rate = Rate::default();
+        let mut every_second = interval(Duration::from_secs(1));
+        every_second.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let drawn_rate = Rate::default();
+        let mut decide = interval(DECIDE_EVERY);
+        decide.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                _ = senders.join_next() => {
+                    return (END, "a sender of images has failed".to_owned());
+                }
+                _ = every_second.tick() => {
+                    let SenderContext { hub, vehicle, connection, id, .. } = &self.context;
+                    let ticks = hub.stats.ticks.load(Ordering::Relaxed);
+                    let hz = rate.of(ticks, clock::now()).max(USUAL_RATE_HZ);
+                    let allowed = in_flight(connection.min_rtt(), hz);
+                    let before = self.allowed;
+                    self.allowed = before.max(allowed);
+                    self.spawn(&mut senders, before);
+                    hub.subscriptions.allow(vehicle.index, *id, allowed);
+                }
+                _ = decide.tick() => {
+                    let drawn = self.context.vehicle.images.cameras.iter();
+                    let drawn = drawn.map(|counters| counters.counts().drawn).sum();
+                    self.context.decide(drawn_rate.of(drawn, clock::now()));
+                }
+            }
+        }
+    }
+
+    /// Starts the senders of the places from `before` to what is allowed, of every camera.
+    fn spawn(&self, senders: &mut JoinSet<()>, before: u32) {
+        for (camera, slots) in self.places.iter().enumerate() {
+            for (place, image) in slots.iter().enumerate() {
+                if (before..self.allowed).contains(&(place as u32)) {
+                    senders.spawn(send(self.context.clone(), camera, place, image.clone()));
+                }
+            }
+        }
+    }
+}
+
+impl SenderContext {
+    /// Lowers or raises how images are made; `wanted_hz` are drawn, of all cameras.
+    fn decide(&self, wanted_hz: f64) {
+        let Some(pace) = &self.pace else { return };
+        let change = lock(pace).decide(clock::now(), wanted_hz);
+        if let Some(change) = change {
+            self.vehicle.level.store(change.to, Ordering::Relaxed);
+            self.vehicle.tell(EventKind::Note, &change.text());
+        }
+    }
+}
+
+impl Drop for ImageSenders {
+    fn drop(&mut self) {
+        self.context.hub.subscriptions.close(self.context.vehicle.index, self.context.id);
+    }
+}
+
+/// Returns K: one image being acknowledged, and as many as a round trip spans.
+fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
+    let spanned = (min_rtt.as_secs_f64() * rate_hz).ceil();
+    1 + (spanned as u32).clamp(1, MOST_IN_FLIGHT - 1)
+}
+
+/// Sends the images that come to one place, for ever.
+async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<InFlightImage>) {
+    let SenderContext { hub, vehicle, connection, id, pace } = &context;
+    loop {
+        let (header, priority) = image.image().await;
+        let start = clock::now();
+        let mut sent = Sent { bytes: 0, encode_end: None };
+        let delivered = deliver(connection, &image, &header, priority, &mut sent).await;
+        let end = clock::now();
+        // Figures are the runtime's.
+        if let Some(pace) = pace {
+            if delivered {
+                hub.stats.send.add(start, end);
+                vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
+                vehicle.images.bytes.fetch_add(sent.bytes as u64, Ordering::Relaxed);
+            } else {
+                vehicle.images.late.fetch_add(1, Ordering::Relaxed);
+                vehicle.images.cameras[camera].count_late();
+            }
+            lock(pace).landed(&SentImage {
+                bytes: sent.bytes,
+                // The encoder's time is not the link's.
+                handed: sent.encode_end.unwrap_or(start),
+                ended: end,
+                delivered,
+                min_rtt: connection.min_rtt(),
+            });
+        }
+        let ms = end.seconds_since(start) * 1e3;
+        trace!(camera, delivered, ms, "send");
+        hub.subscriptions.landed(vehicle.index, camera, *id, place, &image);
+    }
+}
+
+/// How far an image has come.
+struct Sent {
+    /// Of its bitstream.
+    bytes: usize,
+    /// Once it is known.
+    encode_end: Option<ServerTime>,
+}
+
+/// Sends an image on a stream of its own; returns whether all was acknowledged in time.
+async fn deliver(
+    connection: &Connection,
+    image: &InFlightImage,
+    header: &ImageHeader,
+    priority: i32,
+    sent: &mut Sent,
+) -> bool {
+    let Ok(Ok(mut stream)) = timeout(DEADLINE, connection.open_uni()).await else {
+        return false;
+    };
+    // Fails only if the stream has ended already.
+    let _ = stream.set_priority(priority);
+    let delivered = timeout(DEADLINE, write(&mut stream, image, header, sent)).await;
+    let delivered = delivered.ok().flatten().is_some();
+    if !delivered {
+        // Fails only if it is finished and acknowledged after all.
+        let _ = stream.reset(VarInt::from_u32(0));
+    }
+    delivered
+}
+
+async fn write(
+    stream: &mut SendStream,
+    image: &InFlightImage,
+    header: &ImageHeader,
+    sent: &mut Sent,
+) -> Option<()> {
+    let send = clock::now();
+    stream.write_all(header.as_bytes()).await.ok()?;
+    let encode_end = loop {
+        match image.part().await {
+            Part::Bytes(bytes) => {
+                sent.bytes += bytes.len();
+                stream.write_chunk(bytes).await.ok()?;
+            }
+            Part::End { encode_end } => break encode_end,
+            Part::Cut => return None,
+        }
+    };
+    sent.encode_end = Some(encode_end);
+    let trailer = ImageTrailer::new(u32::try_from(sent.bytes).ok()?, encode_end, send);
+    stream.write_all(trailer.as_bytes()).await.ok()?;
+    stream.finish().ok()?;
+    // `None` inside is "acknowledged"; a code is "the other side does not want it".
+    stream.stopped().await.ok()?.is_none().then_some(())
+}
+
+/// Older than this, an image helps no pilot, and its retransmissions delay newer ones.
+const DEADLINE: Duration = Duration::from_millis(150);
+/// What a vehicle's camera is drawn at on a small machine; K never assumes less. [Hz]
+const USUAL_RATE_HZ: f64 = 60.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn k_grows_with_round_trip_and_rate() {
+        assert_eq!(in_flight(Duration::from_micros(200), 60.0), 2);
+        assert_eq!(in_flight(Duration::from_millis(20), 60.0), 3);
+        assert_eq!(in_flight(Duration::from_millis(40), 100.0), 5);
+        assert_eq!(in_flight(Duration::from_secs(9), 100.0), 8);
+    }
+}

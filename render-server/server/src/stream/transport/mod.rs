@@ -1,0 +1,325 @@
+//! QUIC to the runtime: one endpoint, one session per connection.
+//!
+//! ```text
+//! accept -> limits: who may try at all; a few handshakes at once, unproved addresses prove themselves
+//!        -> pairing, if that is what it asks for; else
+//!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
+//!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
+//!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
+//! ```
+//! Settings and figures: docs/BENCHMARKS.md.
+
+mod control;
+mod greeting;
+mod images;
+mod lan;
+mod pairing;
+mod session;
+
+pub use lan::{Lan, LanConfig};
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use quinn::congestion::{BbrConfig, ControllerFactory, CubicConfig};
+use quinn::crypto::rustls::{HandshakeData, QuicServerConfig};
+use quinn::{
+    AckFrequencyConfig, Connection, Endpoint, EndpointConfig, MtuDiscoveryConfig, ServerConfig,
+    TransportConfig, VarInt,
+};
+use quinn_proto::HashedConnectionIdGenerator;
+use ring::hmac;
+use socket2::{Domain, Protocol, Socket, Type};
+use tokio::sync::Semaphore;
+use tracing::{debug, warn};
+use vizflyt_protocol::messages::close;
+use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
+
+use crate::authorization::Authorizer;
+use crate::hub::Hub;
+use crate::lock::lock;
+use crate::rate_limit::RateLimiter;
+use crate::stream::rate_control::is_near;
+
+/// Who decides how fast to send.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Congestion {
+    /// `lan` to private and loopback addresses, `cubic` to all others.
+    #[default]
+    Auto,
+    /// A constant window that ignores loss; for a cable of our own.
+    Lan,
+    /// Fair to others (RFC 9438).
+    Cubic,
+    /// Fair to others, less bothered by loss (experimental in quinn).
+    Bbr,
+}
+
+impl Congestion {
+    /// Returns what suits a peer at `address`.
+    fn toward(self, address: IpAddr) -> Self {
+        match self {
+            Self::Auto if is_near(address) => Self::Lan,
+            Self::Auto => Self::Cubic,
+            chosen => chosen,
+        }
+    }
+
+    fn factory(self) -> Arc<dyn ControllerFactory + Send + Sync> {
+        match self {
+            Self::Auto | Self::Lan => Arc::new(LanConfig::default()),
+            Self::Cubic => Arc::new(CubicConfig::default()),
+            Self::Bbr => Arc::new(BbrConfig::default()),
+        }
+    }
+}
+
+/// Opens the endpoint. Must run within a tokio runtime.
+pub fn bind(address: SocketAddr, identity: &Identity, congestion: Congestion) -> Result<Endpoint> {
+    let open = || -> std::io::Result<std::net::UdpSocket> {
+        let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+        // The kernel may grant less (net.core.wmem_max); more than 212 KB already helps.
+        socket.set_send_buffer_size(SOCKET_BUFFER)?;
+        socket.set_recv_buffer_size(SOCKET_BUFFER)?;
+        socket.bind(&address.into())?;
+        socket.set_nonblocking(true)?;
+        Ok(socket.into())
+    };
+    let socket = open().with_context(|| {
+        format!(
+            "cannot listen on {address} (QUIC); is another server running? try --quic 0.0.0.0:0"
+        )
+    })?;
+    let config = server_config(identity, congestion)?;
+    Endpoint::new(endpoint_config(identity)?, Some(config), socket, Arc::new(quinn::TokioRuntime))
+        .context("cannot start QUIC")
+}
+
+/// Returns the settings of the endpoint itself.
+///
+/// Its secrets come of the identity, not of chance: a server that was killed and started again can
+/// answer packets of its former life with a stateless reset (RFC 9000, section 10.3), so that the
+/// runtime connects anew at once instead of after seconds of silence.
+pub fn endpoint_config(identity: &Identity) -> Result<EndpointConfig> {
+    let secret = |purpose: &[u8]| {
+        let key = hmac::Key::new(hmac::HMAC_SHA256, identity.key.secret_der());
+        hmac::sign(&key, purpose)
+    };
+    let reset = hmac::Key::new(hmac::HMAC_SHA256, secret(b"vizflyt stateless reset").as_ref());
+    let mut ids = [0; 8];
+    ids.copy_from_slice(&secret(b"vizflyt connection ids").as_ref()[..8]);
+    let ids = u64::from_le_bytes(ids);
+    let mut endpoint = EndpointConfig::new(Arc::new(reset));
+    endpoint.cid_generator(move || Box::new(HashedConnectionIdGenerator::from_key(ids)));
+    // Jumbo packets from a peer whose network carries them.
+    endpoint.max_udp_payload_size(MOST_MTU).context("cannot set the packet size")?;
+    Ok(endpoint)
+}
+
+/// Accepts runtimes until the server stops.
+pub async fn serve(
+    hub: Arc<Hub>,
+    endpoint: Endpoint,
+    authorizer: Arc<Authorizer>,
+    congestion: Congestion,
+) {
+    let mut sessions = tokio::task::JoinSet::new();
+    let port = endpoint.local_addr().map_or(0, |address| address.port());
+    let unknown_peers = Arc::new(UnknownPeers::default());
+    loop {
+        let incoming = tokio::select! {
+            incoming = endpoint.accept() => incoming,
+            _ = sessions.join_next(), if !sessions.is_empty() => continue,
+            () = hub.stop.wait() => None,
+        };
+        let Some(incoming) = incoming else { break };
+        let address = incoming.remote_address();
+        if sessions.len() >= MOST_CONNECTIONS {
+            debug!("{} connections already: refused {address}", sessions.len());
+            incoming.refuse();
+            continue;
+        }
+        let Some(handshake) = unknown_peers.handshake(address.ip()) else {
+            debug!("{address}: refused: too many attempts");
+            incoming.refuse();
+            continue;
+        };
+        // Under load an address must first show that packets reach it; that costs us no memory.
+        if handshake.under_way > RETRY_ABOVE && incoming.may_retry() {
+            if let Err(error) = incoming.retry() {
+                debug!("{address}: {error}");
+            }
+            continue;
+        }
+        let chosen = congestion.toward(address.ip());
+        let config = match server_config(&authorizer.identity, chosen) {
+            Ok(config) => Arc::new(config),
+            Err(error) => {
+                warn!("{error:#}");
+                continue;
+            }
+        };
+        let (hub, authorizer, unknown_peers) =
+            (hub.clone(), authorizer.clone(), unknown_peers.clone());
+        sessions.spawn(async move {
+            let connection = match incoming.accept_with(config) {
+                Ok(connecting) => tokio::time::timeout(HANDSHAKE_WITHIN, connecting).await,
+                Err(error) => Ok(Err(error)),
+            };
+            drop(handshake);
+            let connection = match connection {
+                Ok(Ok(connection)) => connection,
+                Ok(Err(error)) => return debug!("{address}: no connection: {error}"),
+                Err(_) => return debug!("{address}: the handshake took too long"),
+            };
+            let known =
+                greeting::peer(&connection).is_some_and(|who| authorizer.client(who).is_some());
+            let pairing = is_pairing(&connection);
+            if pairing || !known {
+                unknown_peers.charge(address.ip());
+            }
+            if pairing {
+                let Ok(_place) = unknown_peers.pairings.try_acquire() else {
+                    return connection.close(REFUSED, b"others are being paired; try again");
+                };
+                Box::pin(pairing::run(&authorizer, &connection)).await;
+            } else {
+                Box::pin(greeting::run(hub, authorizer, port, connection)).await;
+            }
+        });
+    }
+    sessions.shutdown().await;
+    endpoint.close(END, b"the server ends");
+    // Long enough for the close to reach a runtime on the LAN; nothing depends on it.
+    let _ = tokio::time::timeout(Duration::from_millis(300), endpoint.wait_idle()).await;
+}
+
+/// Whether a client has come to be paired.
+fn is_pairing(connection: &Connection) -> bool {
+    let data = connection.handshake_data().and_then(|data| data.downcast::<HandshakeData>().ok());
+    data.is_some_and(|data| data.protocol.as_deref() == Some(ALPN_PAIR))
+}
+
+/// What those cost who are not known yet.
+#[derive(Debug)]
+struct UnknownPeers {
+    limiter: Mutex<RateLimiter>,
+    handshakes: Arc<AtomicUsize>,
+    pairings: Semaphore,
+}
+
+impl Default for UnknownPeers {
+    fn default() -> Self {
+        let (limiter, handshakes) = (Mutex::default(), Arc::default());
+        Self { limiter, handshakes, pairings: Semaphore::new(MOST_PAIRINGS) }
+    }
+}
+
+/// A handshake under way; counts until it is dropped.
+struct Handshake {
+    /// How many are under way, this one too.
+    under_way: usize,
+    count: Arc<AtomicUsize>,
+}
+
+impl UnknownPeers {
+    /// Begins a handshake with `address`, if it may have one.
+    fn handshake(&self, address: IpAddr) -> Option<Handshake> {
+        let count = self.handshakes.clone();
+        let under_way = count.fetch_add(1, Ordering::Relaxed) + 1;
+        // Counted from here on, so that every way out gives the place back.
+        let handshake = Handshake { under_way, count };
+        let may_try = lock(&self.limiter).may_try(Instant::now(), address);
+        (may_try && under_way <= MOST_HANDSHAKES).then_some(handshake)
+    }
+
+    fn charge(&self, address: IpAddr) {
+        lock(&self.limiter).charge(Instant::now(), address);
+    }
+}
+
+impl Drop for Handshake {
+    fn drop(&mut self) {
+        self.count.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// Returns the settings of connections, with the certificate that runtimes pin.
+pub fn server_config(identity: &Identity, congestion: Congestion) -> Result<ServerConfig> {
+    let tls = tls::server_config(identity, &[ALPN, ALPN_PAIR])
+        .context("cannot use the server's key for TLS")?;
+    let quic = QuicServerConfig::try_from(tls).context("cannot use TLS for QUIC")?;
+    let mut config = ServerConfig::with_crypto(Arc::new(quic));
+    config.transport_config(Arc::new(transport_config(congestion)));
+    Ok(config)
+}
+
+fn transport_config(congestion: Congestion) -> TransportConfig {
+    let mut ack = AckFrequencyConfig::default();
+    ack.ack_eliciting_threshold(VarInt::from_u32(10)).max_ack_delay(Some(Duration::from_millis(2)));
+    let mut mtu = MtuDiscoveryConfig::default();
+    mtu.upper_bound(MOST_MTU - 48); // less the IPv6 and UDP headers
+    let mut config = TransportConfig::default();
+    config
+        .max_concurrent_bidi_streams(VarInt::from_u32(1)) // the control stream
+        .max_concurrent_uni_streams(VarInt::from_u32(0)) // a runtime sends no images
+        .stream_receive_window(VarInt::from_u32(256 << 10)) // telemetry is small
+        .receive_window(VarInt::from_u32(256 << 10))
+        .send_window(4 << 20) // the default of 10 MB would queue stale images
+        .datagram_receive_buffer_size(Some(POSES_WAITING)) // none: and quinn would send none
+        .datagram_send_buffer_size(POSES_WAITING)
+        .max_idle_timeout(Some(VarInt::from_u32(5_000).into()))
+        .keep_alive_interval(Some(Duration::from_secs(1)))
+        .ack_frequency_config(Some(ack))
+        .mtu_discovery_config(Some(mtu))
+        .enable_segmentation_offload(true)
+        .congestion_controller_factory(congestion.factory());
+    config
+}
+
+/// Close codes; the reason in words goes with them.
+const END: VarInt = VarInt::from_u32(0);
+const FOREIGN: VarInt = VarInt::from_u32(1);
+const REFUSED: VarInt = VarInt::from_u32(2);
+const SLOW: VarInt = VarInt::from_u32(3);
+const REPLACED: VarInt = VarInt::from_u32(4);
+const UNPAIRED: VarInt = VarInt::from_u32(close::UNPAIRED);
+/// Measured: 600 KB images from 2.7 to 1.8 ms, no packets lost in the socket.
+const SOCKET_BUFFER: usize = 4 << 20;
+/// Jumbo frames. [bytes]
+const MOST_MTU: u16 = 9000;
+/// Handshakes under way at most: each costs some 10 KB and a signature, before we know whose it is.
+const MOST_HANDSHAKES: usize = 16;
+/// Conversations about pairing at a time; a person looks at one.
+const MOST_PAIRINGS: usize = 4;
+/// Above this many under way, addresses must prove themselves first (RFC 9000, section 8.1).
+const RETRY_ABOVE: usize = 4;
+/// Far more than a network of 50 ms and some loss needs.
+const HANDSHAKE_WITHIN: Duration = Duration::from_secs(4);
+/// A few poses; when more wait for the network, the oldest go. [bytes]
+const POSES_WAITING: usize = 1024;
+/// A vehicle needs one; unknown peers must not exhaust memory.
+const MOST_CONNECTIONS: usize = 32;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(address: &str, expected: Congestion) {
+        assert_eq!(Congestion::Auto.toward(address.parse().unwrap()), expected, "{address}");
+    }
+
+    #[test]
+    fn the_lab_gets_the_lan_window_and_the_internet_a_fair_one() {
+        check("127.0.0.1", Congestion::Lan);
+        check("192.168.10.7", Congestion::Lan);
+        check("::ffff:10.0.0.1", Congestion::Lan);
+        check("fe80::1", Congestion::Lan);
+        check("8.8.8.8", Congestion::Cubic);
+        check("2001:db8::1", Congestion::Cubic);
+        assert_eq!(Congestion::Bbr.toward("127.0.0.1".parse().unwrap()), Congestion::Bbr);
+    }
+}

@@ -1,0 +1,479 @@
+//! Who may see and do what on the page. Every request passes here before its route.
+//!
+//! Loopback is the instructor's own computer and needs no login, unless `--login always` asks for
+//! one there too. Everyone else logs in with the password ([`super::login`]) and is the instructor,
+//! or shows a key, once, by opening `/enter?key=...`, and has it in a cookie from then on. Who shows
+//! a session or a key is judged by it, wherever it comes from. The instructor's key opens
+//! everything, a vehicle's key that vehicle's page and stop button. What each route takes is said
+//! where it is made ([`super::routes`]); one that nobody thought of is the instructor's.
+//!
+//! What changes something also takes the token that belongs to the cookie, which no other site's
+//! page can read; all but the stop button, which must work whatever state a page is in.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fmt::Write;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use axum::extract::{ConnectInfo, MatchedPath, Query, Request, State};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use tokio::sync::Semaphore;
+use tracing::warn;
+use vizflyt_trust::{Fingerprint, KeyError, KeysFolder, secret};
+
+use super::routes::{Rights, Rule};
+use super::sessions::{Sessions, Tokens};
+use super::{Page, login, origin, refuse};
+use crate::lock::lock;
+use crate::rate_limit::RateLimiter;
+
+/// Who looks at the page.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Viewer {
+    /// Everything.
+    Instructor,
+    /// This vehicle's page and stop button.
+    Team(String),
+}
+
+impl Viewer {
+    /// Whether this one may see a vehicle.
+    pub(crate) fn may_see(&self, vehicle: &str) -> bool {
+        match self {
+            Self::Instructor => true,
+            Self::Team(own) => own == vehicle,
+        }
+    }
+}
+
+/// The page's keys, by their hash: looking one up takes the same time whatever it is.
+#[derive(Debug, Default)]
+pub struct PageKeys {
+    viewers: HashMap<Fingerprint, Viewer>,
+    file: KeysFile,
+}
+
+/// `page-keys.toml`.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct KeysFile {
+    instructor: String,
+    #[serde(default)]
+    vehicles: BTreeMap<String, String>,
+}
+
+impl PageKeys {
+    /// Reads the keys of a folder, and makes those that are missing for `vehicles`.
+    ///
+    /// # Errors
+    /// A file that cannot be used.
+    pub fn keep(folder: &KeysFolder, vehicles: &[&str]) -> Result<Self, KeyError> {
+        let damaged = |what: String| KeyError::Damaged { path: folder.file(FILE), what };
+        let found = folder.read_secret(FILE)?;
+        let is_new = found.is_none();
+        let mut file: KeysFile = match found {
+            Some(text) => toml::from_str(&text).map_err(|error| damaged(error.to_string()))?,
+            None => KeysFile { instructor: secret().map_err(damaged)?, ..KeysFile::default() },
+        };
+        let mut is_changed = is_new;
+        for vehicle in vehicles {
+            if !file.vehicles.contains_key(*vehicle) {
+                file.vehicles.insert((*vehicle).to_owned(), secret().map_err(damaged)?);
+                is_changed = true;
+            }
+        }
+        let mut viewers = HashMap::new();
+        let team = |(name, key): (&String, &String)| (key.clone(), Viewer::Team(name.clone()));
+        let all = file.vehicles.iter().map(team);
+        for (key, viewer) in all.chain([(file.instructor.clone(), Viewer::Instructor)]) {
+            if key.len() < LEAST_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
+                let what = format!(
+                    "a key is {LEAST_KEY} letters and digits or more; remove a wrong one and start again for a new one"
+                );
+                return Err(damaged(what));
+            }
+            if viewers.insert(Fingerprint::of(key.as_bytes()), viewer).is_some() {
+                return Err(damaged("two keys are the same; remove one of them".to_owned()));
+            }
+        }
+        if is_changed {
+            let text = toml::to_string(&file).map_err(|error| damaged(error.to_string()))?;
+            folder.write(FILE, &(HEAD.to_owned() + &text))?;
+        }
+        Ok(Self { viewers, file })
+    }
+
+    /// Returns the addresses to hand out for `vehicles`: who it is for, and the address.
+    pub fn links(&self, page: &str, vehicles: &[&str]) -> Vec<(String, String)> {
+        let link = |key: &str| format!("{page}/enter?key={key}");
+        let mut links = vec![("instructor".to_owned(), link(&self.file.instructor))];
+        for name in vehicles {
+            if let Some(key) = self.file.vehicles.get(*name) {
+                links.push((format!("team of '{name}'"), link(key)));
+            }
+        }
+        links
+    }
+
+    fn viewer(&self, key: &str) -> Option<&Viewer> {
+        self.viewers.get(&Fingerprint::of(key.as_bytes()))
+    }
+}
+
+/// Where loopback must log in as well.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Login {
+    /// From other computers; who sits at this one is the instructor
+    #[default]
+    Remote,
+    /// Here too: for a computer that students use, or behind a proxy
+    Always,
+}
+
+/// All that decides who may do what.
+#[derive(Debug)]
+pub struct Access {
+    keys: PageKeys,
+    login: Login,
+    pub(super) folder: KeysFolder,
+    pub(super) logins: Arc<Logins>,
+}
+
+/// Who has logged in, and who tries to; outlives a change of scene.
+#[derive(Debug)]
+pub struct Logins {
+    pub(super) sessions: Mutex<Sessions>,
+    tokens: Tokens,
+    pub(super) limiter: Mutex<RateLimiter>,
+    /// Passwords that wait to be checked, and the one that is.
+    pub(super) queue: Semaphore,
+    pub(super) turn: Semaphore,
+}
+
+impl Logins {
+    /// Makes that of a server that nobody has logged in to yet.
+    ///
+    /// # Errors
+    /// If the system gives no random numbers.
+    pub fn new() -> Result<Arc<Self>, String> {
+        Ok(Arc::new(Self {
+            sessions: Mutex::default(),
+            tokens: Tokens::new()?,
+            limiter: Mutex::default(),
+            queue: Semaphore::new(MOST_WAITING),
+            turn: Semaphore::new(1),
+        }))
+    }
+}
+
+/// Who asks, and what it showed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Shown {
+    pub(super) viewer: Viewer,
+    /// Cookies; neither on the server's own computer.
+    pub(super) session: Option<String>,
+    pub(super) key: Option<String>,
+}
+
+impl Shown {
+    /// Returns how it is known.
+    pub(super) fn by(&self) -> &'static str {
+        match (&self.session, &self.key) {
+            (Some(_), _) => "password",
+            (None, Some(_)) => "key",
+            (None, None) => "here",
+        }
+    }
+}
+
+impl Access {
+    /// Reads the keys, and makes those that are missing for `vehicles`.
+    ///
+    /// # Errors
+    /// Keys that cannot be used ([`PageKeys::keep`]).
+    pub fn new(
+        folder: &KeysFolder,
+        vehicles: &[&str],
+        login: Login,
+        logins: Arc<Logins>,
+    ) -> Result<Self, KeyError> {
+        Ok(Self { keys: PageKeys::keep(folder, vehicles)?, login, folder: folder.clone(), logins })
+    }
+
+    /// Returns the page's keys.
+    pub fn keys(&self) -> &PageKeys {
+        &self.keys
+    }
+
+    /// Returns who asks; `None` for a stranger.
+    pub(super) fn judge(&self, from: IpAddr, headers: &HeaderMap) -> Option<Shown> {
+        if let Some(session) = cookie(headers, SESSION) {
+            let password = self.folder.stamp(login::FILE);
+            if lock(&self.logins.sessions).is_live(Instant::now(), password, session) {
+                let session = Some(session.to_owned());
+                return Some(Shown { viewer: Viewer::Instructor, session, key: None });
+            }
+        }
+        if let Some(key) = cookie(headers, KEY) {
+            let viewer = self.keys.viewer(key)?.clone();
+            return Some(Shown { viewer, session: None, key: Some(key.to_owned()) });
+        }
+        (self.login == Login::Remote && from.to_canonical().is_loopback()).then_some(Shown {
+            viewer: Viewer::Instructor,
+            session: None,
+            key: None,
+        })
+    }
+
+    /// Whether what was shown still counts: a session may have ended meanwhile.
+    pub(super) fn holds(&self, shown: &Shown) -> bool {
+        shown.session.as_ref().is_none_or(|session| {
+            let password = self.folder.stamp(login::FILE);
+            lock(&self.logins.sessions).is_live(Instant::now(), password, session)
+        })
+    }
+
+    /// Returns the token that goes with what was shown; `None` if none is needed.
+    pub(super) fn token(&self, shown: &Shown) -> Option<String> {
+        let cookie = shown.session.as_ref().or(shown.key.as_ref())?;
+        Some(self.logins.tokens.of(cookie))
+    }
+
+    /// Whether the request bears the token that goes with what was shown.
+    fn has_token(&self, shown: &Shown, headers: &HeaderMap) -> bool {
+        let Some(cookie) = shown.session.as_ref().or(shown.key.as_ref()) else { return true };
+        let token = headers.get(TOKEN).and_then(|token| token.to_str().ok());
+        token.is_some_and(|token| self.logins.tokens.fits(cookie, token))
+    }
+}
+
+/// What a route takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Takes {
+    /// Nothing: the page's own files, which hold no secret.
+    Nothing,
+    /// Any key or login.
+    Key,
+    /// The right to a vehicle: the one that the path names as `{vehicle}`, else the query.
+    Vehicle,
+    /// The right to all vehicles: the instructor's.
+    Everything,
+}
+
+/// What a request takes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Need {
+    Nothing,
+    Key,
+    /// This vehicle.
+    Vehicle(String),
+    Everything,
+}
+
+impl Need {
+    /// Returns what a request takes whose route is `path`, with `{vehicle}` where a name stands.
+    fn of(takes: Takes, path: &str, uri: &Uri) -> Self {
+        match takes {
+            Takes::Nothing => Self::Nothing,
+            Takes::Key => Self::Key,
+            Takes::Everything => Self::Everything,
+            Takes::Vehicle => {
+                let name = match path.split('/').position(|part| part == "{vehicle}") {
+                    Some(at) => uri.path().split('/').nth(at).and_then(decoded),
+                    None => asked(uri),
+                };
+                name.map_or(Self::Everything, Self::Vehicle)
+            }
+        }
+    }
+
+    fn is_met_by(&self, viewer: &Viewer) -> bool {
+        match (self, viewer) {
+            (Self::Nothing | Self::Key, _) | (_, Viewer::Instructor) => true,
+            (Self::Vehicle(name), viewer) => viewer.may_see(name),
+            (Self::Everything, Viewer::Team(_)) => false,
+        }
+    }
+}
+
+/// Lets a request through to its route, or answers it.
+pub(super) async fn guard(
+    State((page, rights)): State<(Arc<Page>, Arc<Rights>)>,
+    ConnectInfo(from): ConnectInfo<SocketAddr>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    // This connection outlived its round: the next one of the same browser meets the new round.
+    if page.hub.stop.is_set() {
+        let close = [(header::CONNECTION, "close")];
+        return (StatusCode::SERVICE_UNAVAILABLE, close, "the server ends or changes its scene")
+            .into_response();
+    }
+    let path = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
+    let method = if request.method() == Method::HEAD { &Method::GET } else { request.method() };
+    let rule = rights.of(method, path);
+    let need = Need::of(rule.takes, path, request.uri());
+    if need == Need::Nothing {
+        return next.run(request).await;
+    }
+    // Reading too: a stranger's name that resolves to us would read as loopback.
+    if let Err(refusal) = origin::check_host(request.headers()) {
+        return refuse(&refusal);
+    }
+    match page.access.judge(from.ip(), request.headers()) {
+        Some(shown) if !need.is_met_by(&shown.viewer) => {
+            (StatusCode::FORBIDDEN, "this key is for another vehicle").into_response()
+        }
+        Some(shown) if rule.token && !page.access.has_token(&shown, request.headers()) => {
+            (StatusCode::FORBIDDEN, NO_TOKEN).into_response()
+        }
+        Some(shown) => {
+            request.extensions_mut().insert(shown.viewer.clone());
+            request.extensions_mut().insert(shown);
+            next.run(request).await
+        }
+        None => (StatusCode::UNAUTHORIZED, NO_KEY).into_response(),
+    }
+}
+
+impl Rule {
+    /// What is not thought of is the instructor's.
+    pub(super) const STRICTEST: Self = Self { takes: Takes::Everything, token: true };
+}
+
+/// What `/enter` is asked with.
+#[derive(Debug, Deserialize)]
+pub(super) struct Entering {
+    #[serde(default)]
+    key: String,
+}
+
+/// Exchanges a key for a cookie. A wrong key takes the cookie away: so one can also leave.
+pub(super) async fn enter(
+    State(page): State<Arc<Page>>,
+    Query(entering): Query<Entering>,
+    headers: HeaderMap,
+) -> Response {
+    let (key, status, to) = match page.access.keys.viewer(&entering.key) {
+        Some(Viewer::Instructor) => (entering.key.as_str(), StatusCode::SEE_OTHER, "/".to_owned()),
+        Some(Viewer::Team(name)) => {
+            (entering.key.as_str(), StatusCode::SEE_OTHER, format!("/?vehicle={}", encoded(name)))
+        }
+        None => {
+            warn!("page: somebody came with a wrong key");
+            ("", StatusCode::UNAUTHORIZED, String::new())
+        }
+    };
+    let age_s = if key.is_empty() { 0 } else { COOKIE_S };
+    let cookie = cookie_line(KEY, key, Some(age_s), &headers);
+    let mut response = (status, if key.is_empty() { NO_KEY } else { "" }).into_response();
+    let headers = response.headers_mut();
+    for (name, value) in [(header::SET_COOKIE, cookie), (header::LOCATION, to)] {
+        if let Ok(value) = HeaderValue::from_str(&value)
+            && !value.is_empty()
+        {
+            headers.insert(name, value);
+        }
+    }
+    headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    response
+}
+
+/// Returns the line that sets a cookie: out of reach of scripts, and never sent along by another
+/// site's page. `Secure` where the page was opened over TLS, as behind a proxy; what a client says
+/// of that is believed, since it is its own cookie.
+pub(super) fn cookie_line(
+    name: &str,
+    value: &str,
+    age_s: Option<u32>,
+    headers: &HeaderMap,
+) -> String {
+    let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
+    let is_secure = text("origin").is_some_and(|origin| origin.starts_with("https://"))
+        || text("x-forwarded-proto") == Some("https");
+    let age = age_s.map_or_else(String::new, |age_s| format!("; Max-Age={age_s}"));
+    let secure = if is_secure { "; Secure" } else { "" };
+    format!("{name}={value}; Path=/{age}; HttpOnly; SameSite=Strict{secure}")
+}
+
+/// Returns a cookie of the request; of several of the name the first, as nothing is won by another.
+pub(super) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str> {
+    let lines = headers.get_all(header::COOKIE).iter().filter_map(|line| line.to_str().ok());
+    let mut pairs = lines.flat_map(|line| line.split(';')).filter_map(|pair| {
+        let (name, value) = pair.trim().split_once('=')?;
+        (name == wanted).then_some(value)
+    });
+    pairs.next()
+}
+
+/// Returns the one vehicle that the query names; `None` without, or with several.
+fn asked(uri: &Uri) -> Option<String> {
+    let pairs = uri.query()?.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, "")));
+    // A key that needs decoding might be read as `vehicle` by the route: not taken for granted.
+    let mut names = None;
+    for (key, value) in pairs {
+        match key {
+            "vehicle" if names.is_none() => names = Some(value),
+            key if key == "vehicle" || key.contains('%') => return None,
+            _ => {}
+        }
+    }
+    decoded(&names?.replace('+', " "))
+}
+
+/// Undoes percent-encoding (RFC 3986, section 2.1); `None` if it is none.
+fn decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.bytes();
+    while let Some(byte) = rest.next() {
+        if byte != b'%' {
+            bytes.push(byte);
+            continue;
+        }
+        let digit = |byte: Option<u8>| char::from(byte?).to_digit(16);
+        bytes.push((digit(rest.next())? * 16 + digit(rest.next())?) as u8);
+    }
+    String::from_utf8(bytes).ok()
+}
+
+fn encoded(text: &str) -> String {
+    text.bytes().fold(String::new(), |mut out, byte| {
+        if byte.is_ascii_alphanumeric() || b"-._~".contains(&byte) {
+            out.push(char::from(byte));
+        } else {
+            // Why: writing to a String cannot fail.
+            let _ = write!(out, "%{byte:02X}");
+        }
+        out
+    })
+}
+
+const FILE: &str = "page-keys.toml";
+const HEAD: &str = "\
+# Keys of the server's page: whoever has one opens it by http://SERVER/enter?key=KEY. Remove a line and start
+# the server again for a new key; all who had the old one are out.
+";
+/// The cookie of a key.
+pub(super) const KEY: &str = "vizflyt_key";
+/// The cookie of a session; it ends with the browser's.
+pub(super) const SESSION: &str = "vizflyt_session";
+/// The header that bears the token.
+const TOKEN: &str = "x-vizflyt-token";
+/// A term. [s]
+const COOKIE_S: u32 = 180 * 24 * 3600;
+const NO_KEY: &str = "this page needs a key: open the address that the instructor gave you, which ends in \
+     /enter?key=..., or log in with the instructor's password";
+const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session tells it, or reload the page";
+/// More logins at once are nobody's.
+const MOST_WAITING: usize = 8;
+/// 80 bits, should somebody write one by hand.
+const LEAST_KEY: usize = 16;
+
+#[cfg(test)]
+#[path = "access/tests.rs"]
+mod tests;

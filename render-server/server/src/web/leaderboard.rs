@@ -1,0 +1,191 @@
+//! The leaderboard over HTTP: standings for the page and the wall, and who has checked in to fly.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::Json;
+use axum::extract::{ConnectInfo, Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use tracing::warn;
+use vizflyt_protocol::messages::FlightPhase;
+
+use super::{Page, origin, refuse, vehicle};
+use crate::flights::leaderboard::{
+    Attempt, GradeBoard, LeaderboardError, Run, Standing, grade_boards, standings,
+};
+use crate::flights::vehicle::CheckIn;
+use crate::lock::lock;
+
+/// What the page and the wall show.
+#[derive(Debug, Serialize)]
+struct Board {
+    /// The arena's name.
+    course: String,
+    /// By official runs.
+    official: Vec<Standing>,
+    /// By practice runs.
+    practice: Vec<Standing>,
+    /// By signed grades, of all projects.
+    graded: Vec<GradeBoard>,
+    /// The newest runs, newest first.
+    newest: Vec<Run>,
+    /// Who flies, or is about to.
+    vehicles: Vec<Flyer>,
+}
+
+/// A vehicle, and who has checked in.
+#[derive(Debug, Serialize)]
+struct Flyer {
+    vehicle: String,
+    team: Option<String>,
+    attempt: Attempt,
+    phase: FlightPhase,
+    /// Since take-off, while it flies. [s]
+    flight_s: Option<f64>,
+}
+
+/// `GET /api/leaderboard`: the standings of the course that is flown here.
+pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
+    let Some(board) = &page.hub.leaderboard else { return none_kept() };
+    let course = page.hub.vehicles[0].arena.name.as_str().to_owned();
+    let runs = match board.runs(Some(&course)).await {
+        Ok(runs) => runs,
+        Err(error) => return failed(&error),
+    };
+    let grades = match board.grades().await {
+        Ok(grades) => grades,
+        Err(error) => return failed(&error),
+    };
+    let now = crate::clock::now();
+    let flyer = |vehicle: &Arc<crate::flights::vehicle::Vehicle>| {
+        let (by, flight) = (lock(&vehicle.checked_in).clone(), vehicle.flight());
+        let flight_s = flight.took_off.filter(|_| flight.landed.is_none());
+        Flyer {
+            vehicle: vehicle.name.as_str().to_owned(),
+            team: by.as_ref().map(|by| by.team.clone()),
+            attempt: by.map_or(Attempt::Practice, |by| by.attempt),
+            phase: vehicle.phase(),
+            flight_s: flight_s.map(|at| now.seconds_since(at)),
+        }
+    };
+    let answer = Board {
+        official: standings(&runs, &course, Attempt::Official),
+        practice: standings(&runs, &course, Attempt::Practice),
+        graded: grade_boards(&grades),
+        vehicles: page.hub.vehicles.iter().map(flyer).collect(),
+        newest: runs.into_iter().take(NEWEST).collect(),
+        course,
+    };
+    Json(answer).into_response()
+}
+
+/// Who checks in: a team by its token, or as the instructor says.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct CheckingIn {
+    token: Option<String>,
+    team: Option<String>,
+    #[serde(default)]
+    attempt: Attempt,
+}
+
+/// `PUT /api/vehicles/V/team`: a team checks in by its token, from wherever: no other page
+/// knows it.
+pub(super) async fn check_in(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    ConnectInfo(from): ConnectInfo<SocketAddr>,
+    Json(asked): Json<CheckingIn>,
+) -> Response {
+    let Some(board) = &page.hub.leaderboard else { return none_kept() };
+    let Some(token) = &asked.token else {
+        return (StatusCode::BAD_REQUEST, "give the team's token").into_response();
+    };
+    if !lock(&page.team_tries).may_try(Instant::now(), from.ip()) {
+        return (StatusCode::TOO_MANY_REQUESTS, "too many wrong tokens; wait a minute")
+            .into_response();
+    }
+    match board.team_of(token).await {
+        Ok(Some(team)) => take(&page, &name, Some(CheckIn { team, attempt: asked.attempt })),
+        Ok(None) => {
+            lock(&page.team_tries).charge(Instant::now(), from.ip());
+            warn!("page: {from} came with a wrong team token");
+            (StatusCode::UNAUTHORIZED, "no team has this token").into_response()
+        }
+        Err(error) => failed(&error),
+    }
+}
+
+/// `POST /api/vehicles/V/team`: the instructor checks a team in by its name.
+pub(super) async fn assign(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+    Json(asked): Json<CheckingIn>,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    let Some(board) = &page.hub.leaderboard else { return none_kept() };
+    let teams = match board.teams().await {
+        Ok(teams) => teams,
+        Err(error) => return failed(&error),
+    };
+    let team = asked.team.unwrap_or_default();
+    if teams.iter().any(|known| known.name == team && !known.retired) {
+        return take(&page, &name, Some(CheckIn { team, attempt: asked.attempt }));
+    }
+    let names: Vec<_> = teams.iter().filter(|team| !team.retired).map(|team| &*team.name).collect();
+    let text = match &*names {
+        [] => "there are no teams yet: vizflyt leaderboard team add NAME".to_owned(),
+        names => format!("there is no team '{team}'; there are {}", names.join(", ")),
+    };
+    (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// `DELETE /api/vehicles/V/team`: whoever has checked in leaves.
+pub(super) async fn check_out(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    take(&page, &name, None)
+}
+
+fn take(page: &Page, name: &str, by: Option<CheckIn>) -> Response {
+    let vehicle = match vehicle(page, name) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
+    // The flight under way is whose it was at its take-off.
+    let text = match &by {
+        Some(by) => format!("{} flies {} next: {}", by.team, vehicle.name, by.attempt.name()),
+        None => format!("nobody is checked in to fly {}", vehicle.name),
+    };
+    vehicle.note(&text);
+    *lock(&vehicle.checked_in) = by;
+    text.into_response()
+}
+
+fn none_kept() -> Response {
+    (StatusCode::NOT_FOUND, "no runs are kept here: vizflyt serve --leaderboard FILE")
+        .into_response()
+}
+
+fn failed(error: &LeaderboardError) -> Response {
+    warn!("page: {error}");
+    (
+        StatusCode::SERVICE_UNAVAILABLE,
+        "the leaderboard cannot be read now; the server's log says why",
+    )
+        .into_response()
+}
+
+/// Runs that the page lists.
+const NEWEST: usize = 20;

@@ -1,0 +1,293 @@
+//! What the page is told: JSON, one type per message, tagged by `type`.
+
+use std::sync::atomic::Ordering;
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+use vizflyt_arena::config::{CameraConfig, StageConfig};
+use vizflyt_arena::pose::PoseQuality;
+use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
+use vizflyt_protocol::messages::{Event, StageTimes, Telemetry};
+use vizflyt_protocol::time::ServerTime;
+
+use super::Page;
+use crate::clock;
+use crate::flights::events::{Entry, Origin};
+use crate::flights::vehicle::Vehicle;
+use crate::hub::RendererInfo;
+use crate::lock::lock;
+use crate::poses::drivers::SourceCounters;
+use crate::render::cameras::CameraSet;
+use crate::render::dynamic_objects::{DynamicObjects, ObjectBounds};
+use crate::stats::Rate;
+use crate::web::top_view::Obstacles;
+
+/// Server to page.
+#[derive(Debug, Serialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub(super) enum Message<'a> {
+    Arena(Box<Arena<'a>>),
+    /// The cameras, after one was changed.
+    Cameras {
+        cameras: Vec<CameraLine>,
+    },
+    /// (x, y, z [m, world], speed [m/s]), oldest first.
+    Trail {
+        points: &'a [[f32; 4]],
+    },
+    Events {
+        events: Vec<Line>,
+    },
+    State(Box<State>),
+}
+
+/// The room; sent once.
+#[derive(Debug, Serialize)]
+pub(super) struct Arena<'a> {
+    boot: String,
+    name: &'a str,
+    vehicle: &'a str,
+    /// All vehicles' names.
+    vehicles: Vec<&'a str>,
+    fence: &'a Volume,
+    goal_m: Option<[f64; 3]>,
+    goal_radius_m: f64,
+    body_radius_m: f64,
+    max_speed_mps: f64,
+    time_limit_s: f64,
+    cameras: Vec<CameraLine>,
+    /// Corners of the top view's picture. [m, world]
+    map_min_m: [f64; 2],
+    map_max_m: [f64; 2],
+    obstacles: &'a Obstacles,
+    stages: &'a [StageConfig],
+}
+
+/// A camera: the keys of `[[cameras]]`, and what follows from them.
+#[derive(Debug, Serialize)]
+pub(super) struct CameraLine {
+    #[serde(flatten)]
+    keys: Map<String, Value>,
+    intrinsics: Intrinsics,
+}
+
+/// One event of the feed.
+#[derive(Debug, Serialize)]
+pub(super) struct Line {
+    index: u64,
+    origin: &'static str,
+    #[serde(flatten)]
+    event: Event,
+    /// Seconds since the server started. [s]
+    at_s: f64,
+}
+
+/// The moment; twenty times a second.
+#[derive(Debug, Serialize)]
+pub(super) struct State {
+    pose: Option<PoseLine>,
+    runtime: Option<RuntimeLine>,
+    report: Option<Telemetry>,
+    render: StageTimes,
+    encode: StageTimes,
+    send: StageTimes,
+    renderer: RendererInfo,
+    render_hz: f64,
+    stream_hz: f64,
+    stream_mbit_s: f64,
+    images_late: u64,
+    source: SourceCounters,
+    source_hz: f64,
+    quality: PoseQuality,
+    flight_s: Option<f64>,
+    landed: bool,
+    outcome: Option<OutcomeLine>,
+    /// Number of the newest crash card.
+    crash: Option<u64>,
+    /// What moves, where it is now.
+    objects: Vec<ObjectLine>,
+}
+
+/// An object of the arena: a box in its own frame, and where that is.
+#[derive(Debug, Serialize)]
+struct ObjectLine {
+    name: String,
+    /// In images of ids.
+    id: u16,
+    p_world_m: [f64; 3],
+    /// Object to world.
+    q_xyzw: [f64; 4],
+    /// Least and greatest corner. [m, object]
+    min_m: [f32; 3],
+    max_m: [f32; 3],
+}
+
+#[derive(Debug, Serialize)]
+struct OutcomeLine {
+    #[serde(flatten)]
+    event: Event,
+    at_s: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct PoseLine {
+    p_world_m: [f64; 3],
+    yaw_rad: f64,
+    /// Body to world, xyzw.
+    rotation: [f64; 4],
+    v_world_mps: [f64; 3],
+    age_s: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct RuntimeLine {
+    address: String,
+    program: String,
+}
+
+/// Rates that all viewers share.
+#[derive(Debug, Default)]
+pub(crate) struct Rates {
+    ticks: Rate,
+    vehicles: Vec<VehicleRates>,
+}
+
+/// Rates of one vehicle.
+#[derive(Debug, Default)]
+struct VehicleRates {
+    images: Rate,
+    bytes: Rate,
+    poses: Rate,
+}
+
+impl Rates {
+    /// Returns those of this many vehicles.
+    pub(crate) fn of(vehicles: usize) -> Self {
+        let vehicles = std::iter::repeat_with(VehicleRates::default).take(vehicles).collect();
+        Self { ticks: Rate::default(), vehicles }
+    }
+}
+
+pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a Vehicle) -> Message<'a> {
+    let info = &vehicle.arena;
+    Message::Arena(Box::new(Arena {
+        boot: page.boot.as_ns().to_string(),
+        name: &info.name,
+        vehicle: &vehicle.name,
+        vehicles: page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect(),
+        fence: &info.geofence,
+        goal_m: info.goal_m.map(|goal| goal.to_array()),
+        goal_radius_m: info.goal_radius_m,
+        body_radius_m: info.body_radius_m,
+        max_speed_mps: info.limits.max_speed_mps,
+        time_limit_s: info.time_limit_s,
+        cameras: camera_lines(&vehicle.cameras.newest()),
+        map_min_m: page.top_view.min_m,
+        map_max_m: page.top_view.max_m,
+        obstacles: &page.top_view.obstacles,
+        stages: &page.stages,
+    }))
+}
+
+pub(super) fn cameras(set: &CameraSet) -> Message<'static> {
+    Message::Cameras { cameras: camera_lines(set) }
+}
+
+fn camera_lines(set: &CameraSet) -> Vec<CameraLine> {
+    let line = |config: &CameraConfig| CameraLine {
+        keys: camera_keys(config),
+        intrinsics: config.intrinsics(),
+    };
+    set.configs.iter().map(line).collect()
+}
+
+/// Returns a camera by the keys of `[[cameras]]`, those of default value too.
+pub(super) fn camera_keys(config: &CameraConfig) -> Map<String, Value> {
+    let mut keys = match serde_json::to_value(config) {
+        Ok(Value::Object(keys)) => keys,
+        // A camera is a map of numbers and names: there is nothing that JSON cannot hold.
+        _ => Map::new(),
+    };
+    keys.insert("near_m".to_owned(), config.near_m.into());
+    keys.insert("yaw_deg".to_owned(), config.yaw_deg.into());
+    keys.insert("roll_deg".to_owned(), config.roll_deg.into());
+    keys.insert("depth".to_owned(), config.depth.into());
+    keys
+}
+
+pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
+    let line = |entry: Entry| Line {
+        index: entry.index,
+        origin: match entry.origin {
+            Origin::Server => "server",
+            Origin::Page => "runtime",
+        },
+        at_s: since_start_s(page, entry.event.stamp),
+        event: entry.event,
+    };
+    Message::Events { events: entries.into_iter().map(line).collect() }
+}
+
+pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
+    let hub = &page.hub;
+    let rates = &page.rates.vehicles[vehicle.index];
+    let now = clock::now();
+    let flight = vehicle.flight();
+    let source = *lock(&vehicle.source);
+    let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
+    let stats = &hub.stats;
+    Message::State(Box::new(State {
+        pose: (*vehicle.pose.borrow()).map(|sample| PoseLine {
+            p_world_m: sample.world_from_body.translation_m.to_array(),
+            yaw_rad: yaw_of(sample.world_from_body.rotation),
+            rotation: sample.world_from_body.rotation.to_array(),
+            v_world_mps: sample.twist.linear_mps.to_array(),
+            age_s: now.seconds_since(sample.stamp),
+        }),
+        runtime: vehicle.runtime().map(|runtime| RuntimeLine {
+            address: runtime.address.to_string(),
+            program: runtime.program.as_str().to_owned(),
+        }),
+        report: vehicle.telemetry.borrow().clone(),
+        render: stats.render.recent(),
+        encode: stats.encode.recent(),
+        send: stats.send.recent(),
+        renderer: lock(&hub.renderer).clone(),
+        render_hz: page.rates.ticks.of(total(&stats.ticks), now),
+        stream_hz: rates.images.of(total(&vehicle.images.sent), now),
+        stream_mbit_s: rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
+        images_late: total(&vehicle.images.late),
+        source,
+        quality: lock(&vehicle.quality).clone(),
+        source_hz: rates.poses.of(source.poses, now),
+        flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
+        landed: flight.landed.is_some(),
+        outcome: flight
+            .outcome
+            .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
+        crash: vehicle.crash.borrow().as_ref().map(|card| card.id),
+        objects: objects(&hub.dynamic_objects, now),
+    }))
+}
+
+fn objects(moving: &DynamicObjects, now: ServerTime) -> Vec<ObjectLine> {
+    let since_epoch_ns = moving.since_epoch_ns(now);
+    let named = moving.objects.names().zip(&moving.bounds).enumerate();
+    let line = |(index, (name, bounds)): (usize, (&str, &ObjectBounds))| {
+        let pose = moving.objects.placement(index, since_epoch_ns);
+        ObjectLine {
+            name: name.to_owned(),
+            id: bounds.id,
+            p_world_m: pose.translation_m.to_array(),
+            q_xyzw: pose.rotation.to_array(),
+            min_m: bounds.min_m,
+            max_m: bounds.max_m,
+        }
+    };
+    named.map(line).collect()
+}
+
+/// The runtime may stamp zero before it knows our clock: that reads as the start.
+fn since_start_s(page: &Page, stamp: ServerTime) -> f64 {
+    stamp.seconds_since(page.boot).max(0.0)
+}

@@ -1,0 +1,237 @@
+//! The page: static files from the binary, one WebSocket per viewer, and the stop button.
+//!
+//! ```text
+//! GET /            the page (no framework, nothing fetched from elsewhere)
+//! GET /ws?vehicle=V   WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
+//!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
+//!                  vehicle, if none is named
+//! GET /api/map     the top view: a JPEG drawn at the start
+//! GET /api/shell   what is solid, as cells, for the view in space ([`crate::web::top_view::shell`])
+//! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
+//! POST /api/estop  EmergencyStop to the runtimes of all vehicles
+//! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
+//! POST /api/vehicles/V/estop          EmergencyStop to its runtime
+//! POST /api/vehicles/V/start          lets it take off, if it waits for that
+//! POST /api/vehicles/V/land           ends its flight: it brakes, then lands
+//! POST /api/vehicles/V/reset          on the ground: course, clock, path and figures begin anew
+//! GET /api/vehicles/V/cameras         its cameras of this moment, JSON
+//! GET /api/vehicles/V/crash           what its last failed flight looked like at its end, JSON ([`crash`])
+//! GET /api/vehicles/V/crash/ID/CAMERA/KIND/N   an image of that, JPEG; KIND is colour or depth
+//! PUT /api/vehicles/V/cameras/NAME    a whole camera, by the keys of `[[cameras]]`; from the next
+//!                                     tick on
+//! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
+//! ```
+//! ```text
+//! GET /api/leaderboard        the standings of the course, JSON; GET /wall shows them large ([`leaderboard`])
+//! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
+//! ```
+//! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]);
+//! `GET` and `PUT /api/environment` are its light and fog ([`environment`]).
+//! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
+//! ([`access`]); all routes are in one table ([`routes`]):
+//! ```text
+//! GET /enter?key=K     exchanges a key for a cookie
+//! GET /api/session     who the server takes the viewer for, and the token of whoever has a cookie
+//! POST /api/login, /api/logout     the instructor's password for a session ([`login`])
+//! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`pairing`])
+//! ```
+//! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
+//! nobody. Only pages of the same origin may watch or stop ([`origin`]).
+
+mod access;
+mod cameras;
+mod crash;
+mod environment;
+mod leaderboard;
+mod login;
+pub(crate) mod messages;
+pub(crate) mod origin;
+mod pairing;
+pub mod previews;
+mod routes;
+mod scenes;
+mod sessions;
+mod stats;
+pub mod top_view;
+mod vehicles;
+mod view;
+mod viewer;
+
+pub use access::{Access, Login, Logins, PageKeys, Takes};
+pub use login::set_password;
+pub use routes::list as routes;
+pub use view::{ViewArgs, view};
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+
+use anyhow::{Context, Result};
+use axum::Extension;
+use axum::body::Bytes;
+use axum::extract::rejection::BytesRejection;
+use axum::extract::{Query, State, WebSocketUpgrade};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use tokio::net::TcpListener;
+use tracing::warn;
+use vizflyt_arena::config::StageConfig;
+use vizflyt_protocol::time::ServerTime;
+
+use self::access::Shown;
+use crate::authorization::Authorizer;
+use crate::flights::vehicle::Vehicle;
+use crate::hub::Hub;
+use crate::rate_limit::RateLimiter;
+use crate::scene::Scenes;
+use crate::web::top_view::TopView;
+
+/// What the page's handlers share.
+#[derive(Debug)]
+pub(crate) struct Page {
+    pub(crate) hub: Arc<Hub>,
+    pub(crate) top_view: TopView,
+    /// The course's gates, for the top view.
+    pub(crate) stages: Vec<StageConfig>,
+    /// When the server started; differs from start to start, so that a page notices a new server.
+    pub(crate) boot: ServerTime,
+    pub(crate) rates: messages::Rates,
+    /// Who may see and do what.
+    pub(crate) access: Arc<Access>,
+    /// Who may connect, and pairing.
+    pub(crate) authorizer: Arc<Authorizer>,
+    /// Where runtimes connect.
+    pub(crate) quic_port: u16,
+    /// Who tried team tokens that are none.
+    pub(crate) team_tries: Mutex<RateLimiter>,
+    /// The scenes to choose from.
+    pub(crate) scenes: Arc<Scenes>,
+}
+
+/// Binds the page's address.
+pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
+    let listener = TcpListener::bind(address).await.with_context(|| {
+        format!("cannot listen on {address} (page); is the port taken? try --http 127.0.0.1:0")
+    })?;
+    if !address.ip().is_loopback() {
+        warn!(
+            "the page at {address} asks for keys, but plain HTTP lets everyone on that network read \
+             them; use --http 127.0.0.1:8080 to keep it to this computer"
+        );
+    }
+    Ok(listener)
+}
+
+/// Serves the page until the server stops.
+pub(crate) async fn serve(page: Page, listener: TcpListener) -> Result<()> {
+    let stop = page.hub.stop.clone();
+    let router = routes::router(Arc::new(page)).into_make_service_with_connect_info::<SocketAddr>();
+    // Dropped at the stop rather than drained: WebSockets would drain for ever.
+    tokio::select! {
+        served = axum::serve(listener, router) => served.context("the page's server failed"),
+        () = stop.wait() => Ok(()),
+    }
+}
+
+pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {
+    let mut response = text.into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    for (name, value) in GUARDS {
+        headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn map(State(page): State<Arc<Page>>) -> Response {
+    picture("image/jpeg", page.top_view.jpeg.clone())
+}
+
+async fn shell(State(page): State<Arc<Page>>) -> Response {
+    picture("application/octet-stream", page.top_view.shell.clone())
+}
+
+fn picture(kind: &'static str, bytes: Bytes) -> Response {
+    let mut response = bytes.into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    for (name, value) in GUARDS {
+        headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// Returns the vehicle of this name, or the answer that there is none.
+pub(crate) fn vehicle<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<Vehicle>, Box<Response>> {
+    let found = page.hub.vehicles.iter().find(|vehicle| vehicle.name == name);
+    found.ok_or_else(|| {
+        let names: Vec<_> = page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect();
+        let text = format!("there is no vehicle '{name}'; there are {}", names.join(", "));
+        Box::new((StatusCode::NOT_FOUND, text).into_response())
+    })
+}
+
+/// Returns what a page of ours orders in JSON, or the answer that refuses it.
+pub(crate) fn ordered<T: DeserializeOwned>(
+    headers: &HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<T, Box<Response>> {
+    origin::check(headers).map_err(|refusal| Box::new(refuse(&refusal)))?;
+    let body = body.map_err(|rejection| Box::new(rejection.into_response()))?;
+    serde_json::from_slice(&body)
+        .map_err(|error| Box::new((StatusCode::BAD_REQUEST, error.to_string()).into_response()))
+}
+
+/// What `/ws` is asked for.
+#[derive(Debug, Deserialize)]
+struct Watched {
+    vehicle: Option<String>,
+}
+
+async fn watch(
+    State(page): State<Arc<Page>>,
+    Query(watched): Query<Watched>,
+    Extension(shown): Extension<Shown>,
+    headers: HeaderMap,
+    upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    let named = watched.vehicle.map(|name| vehicle(&page, &name).cloned());
+    let vehicle = match named.unwrap_or_else(|| Ok(page.hub.vehicles[0].clone())) {
+        Ok(vehicle) => vehicle,
+        Err(none) => return *none,
+    };
+    match upgrade {
+        // Viewers have nothing to say: a byte limit keeps a hostile one small.
+        Ok(upgrade) => upgrade
+            .max_message_size(1024)
+            .on_upgrade(async move |socket| viewer::run(page, vehicle, shown, socket).await),
+        Err(rejection) => rejection.into_response(),
+    }
+}
+
+pub(crate) fn refuse(refusal: &origin::Refusal) -> Response {
+    warn!("page: {refusal}");
+    (StatusCode::FORBIDDEN, refusal.to_string()).into_response()
+}
+
+pub(crate) const ICON: &str = include_str!("page/icon.svg");
+
+/// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.
+const GUARDS: [(&str, &str); 5] = [
+    (
+        "content-security-policy",
+        "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; \
+         form-action 'none'",
+    ),
+    ("x-frame-options", "DENY"),
+    ("x-content-type-options", "nosniff"),
+    ("referrer-policy", "no-referrer"),
+    ("cache-control", "no-cache"),
+];
+
+#[cfg(test)]
+mod tests;

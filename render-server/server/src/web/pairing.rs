@@ -1,0 +1,103 @@
+//! Pairing from the page: `GET /api/pairing` tells how it stands, `POST` opens one, `DELETE` closes it.
+//! For the instructor alone ([`super::access`]).
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::messages::Grant;
+
+use super::{Page, origin, refuse};
+use crate::args;
+
+/// How pairing stands.
+#[derive(Debug, Serialize)]
+struct Standing {
+    /// The open pairing.
+    open: Option<Open>,
+    /// What came of the newest attempt.
+    news: String,
+    /// Where the other computer finds us.
+    port: u16,
+}
+
+#[derive(Debug, Serialize)]
+struct Open {
+    code: String,
+    /// `instructor`, or the vehicles.
+    right: String,
+    left_s: f64,
+    tries_left: u32,
+}
+
+/// What is to be opened: `instructor` or `team:VEHICLE[,VEHICLE...]`, as `--pair` has it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Wish {
+    right: String,
+}
+
+/// Tells how pairing stands.
+pub(super) async fn standing(State(page): State<Arc<Page>>) -> Response {
+    tell(&page)
+}
+
+/// Opens a pairing.
+pub(super) async fn open(
+    State(page): State<Arc<Page>>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    let wish = serde_json::from_slice::<Wish>(&body).map_err(|error| error.to_string());
+    let grant = match wish.and_then(|wish| args::grant(&wish.right)) {
+        Ok(grant) => grant,
+        Err(error) => return (StatusCode::BAD_REQUEST, error).into_response(),
+    };
+    if let Grant::Team { vehicles } = &grant
+        && let Some(Err(unknown)) =
+            vehicles.iter().map(|v| page.hub.vehicle(v)).find(Result::is_err)
+    {
+        return (StatusCode::BAD_REQUEST, unknown).into_response();
+    }
+    match page.authorizer.open_pairing(grant) {
+        Ok(_) => tell(&page),
+        Err(error) => (StatusCode::CONFLICT, error).into_response(),
+    }
+}
+
+/// Closes the pairing.
+pub(super) async fn shut(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    page.authorizer.shut_pairing();
+    tell(&page)
+}
+
+fn tell(page: &Page) -> Response {
+    let open = page.authorizer.pairing().map(|window| Open {
+        code: window.code.to_string(),
+        right: match &window.grant {
+            Grant::Instructor => "instructor".to_owned(),
+            Grant::Team { vehicles } => {
+                let names: Vec<_> = vehicles.iter().map(ToString::to_string).collect();
+                names.join(", ")
+            }
+        },
+        left_s: window.left.as_secs_f64(),
+        tries_left: window.tries_left,
+    });
+    let mut response =
+        Json(Standing { open, news: page.authorizer.newest_pairing_news(), port: page.quic_port })
+            .into_response();
+    let no_store = axum::http::HeaderValue::from_static("no-store");
+    response.headers_mut().insert(axum::http::header::CACHE_CONTROL, no_store);
+    response
+}

@@ -1,0 +1,189 @@
+//! Every route of the page in one table: it makes the router, and says what each request takes.
+//! What is not in it is the instructor's, and answered with 404 or 405.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::handler::Handler;
+use axum::http::Method;
+use axum::middleware;
+use axum::routing::{MethodRouter, delete, get, patch, post, put};
+
+use super::Page;
+use super::access::{self, Takes};
+use super::{
+    cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, shell, stats,
+    vehicles, watch,
+};
+
+/// One route.
+struct Route {
+    method: Method,
+    path: &'static str,
+    rule: Rule,
+    handler: MethodRouter<Arc<Page>>,
+}
+
+/// What a route asks of whoever calls it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Rule {
+    /// The right.
+    pub(super) takes: Takes,
+    /// The token that shows that a page of ours sent it.
+    pub(super) token: bool,
+}
+
+/// What each route takes.
+#[derive(Debug, Default)]
+pub(super) struct Rights(HashMap<(Method, &'static str), Rule>);
+
+impl Rights {
+    /// Returns what the route `path` takes; of one that is not in the table, everything.
+    pub(super) fn of(&self, method: &Method, path: &str) -> Rule {
+        let known = self.0.iter().find(|((m, p), _)| m == method && *p == path);
+        known.map_or(Rule::STRICTEST, |(_, rule)| *rule)
+    }
+}
+
+/// The page's own files: path, type, text.
+const FILES: &[(&str, &str, &str)] = &[
+    ("/", "text/html; charset=utf-8", INDEX),
+    ("/style.css", "text/css; charset=utf-8", STYLE),
+    ("/app.js", "text/javascript; charset=utf-8", APP),
+    ("/map.js", "text/javascript; charset=utf-8", MAP),
+    ("/space.js", "text/javascript; charset=utf-8", SPACE),
+    ("/controls.js", "text/javascript; charset=utf-8", CONTROLS),
+    ("/three.module.min.js", "text/javascript; charset=utf-8", THREE),
+    ("/three.core.min.js", "text/javascript; charset=utf-8", THREE_CORE),
+    ("/cameras.js", "text/javascript; charset=utf-8", CAMERAS),
+    ("/waterfall.js", "text/javascript; charset=utf-8", WATERFALL),
+    ("/crash.js", "text/javascript; charset=utf-8", CRASH),
+    ("/pairing.js", "text/javascript; charset=utf-8", PAIRING),
+    ("/leaderboard.js", "text/javascript; charset=utf-8", LEADERBOARD),
+    ("/standings.js", "text/javascript; charset=utf-8", STANDINGS),
+    ("/wall", "text/html; charset=utf-8", WALL),
+    ("/wall.css", "text/css; charset=utf-8", WALL_STYLE),
+    ("/wall.js", "text/javascript; charset=utf-8", WALL_SCRIPT),
+    ("/icon.svg", "image/svg+xml", ICON),
+];
+
+fn table() -> Vec<Route> {
+    use Takes::{Everything, Key, Nothing, Vehicle};
+    let mut routes: Vec<_> = FILES
+        .iter()
+        .map(|&(path, kind, text)| read(path, Nothing, async move || file(kind, text)))
+        .collect();
+    routes.extend([
+        read("/enter", Nothing, access::enter),
+        read("/api/session", Nothing, login::standing),
+        // Who logs in has no token yet.
+        at_once(Method::POST, "/api/login", Nothing, login::login),
+        act(Method::POST, "/api/logout", Key, login::logout),
+        read("/api/map", Key, map),
+        read("/api/shell", Key, shell),
+        read("/ws", Vehicle, watch),
+        read("/api/stats", Vehicle, stats::get),
+        read("/api/vehicles", Key, vehicles::list),
+        // The stop button waits for no token.
+        at_once(Method::POST, "/api/estop", Everything, vehicles::stop_all),
+        at_once(Method::POST, "/api/vehicles/{vehicle}/estop", Vehicle, vehicles::stop),
+        act(Method::POST, "/api/vehicles/{vehicle}/start", Everything, vehicles::start),
+        act(Method::POST, "/api/vehicles/{vehicle}/land", Vehicle, vehicles::land),
+        act(Method::POST, "/api/vehicles/{vehicle}/reset", Everything, vehicles::reset),
+        read("/api/vehicles/{vehicle}/cameras", Vehicle, cameras::list),
+        read("/api/vehicles/{vehicle}/crash", Vehicle, crash::show),
+        read("/api/vehicles/{vehicle}/crash/{id}/{camera}/{kind}/{number}", Vehicle, crash::image),
+        act(Method::PUT, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::put),
+        act(Method::PATCH, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::patch),
+        read("/api/leaderboard", Key, leaderboard::show),
+        // The team's token is all it takes, also from a script without a cookie.
+        at_once(Method::PUT, "/api/vehicles/{vehicle}/team", Nothing, leaderboard::check_in),
+        act(Method::POST, "/api/vehicles/{vehicle}/team", Everything, leaderboard::assign),
+        act(Method::DELETE, "/api/vehicles/{vehicle}/team", Vehicle, leaderboard::check_out),
+        read("/api/scenes", Everything, scenes::list),
+        act(Method::PUT, "/api/scene", Everything, scenes::change),
+        read("/api/environment", Everything, environment::get),
+        act(Method::PUT, "/api/environment", Everything, environment::change),
+        read("/api/pairing", Everything, pairing::standing),
+        act(Method::POST, "/api/pairing", Everything, pairing::open),
+        act(Method::DELETE, "/api/pairing", Everything, pairing::shut),
+    ]);
+    routes
+}
+
+/// A route that reads.
+fn read<H, T>(path: &'static str, takes: Takes, handler: H) -> Route
+where
+    H: Handler<T, Arc<Page>>,
+    T: 'static,
+{
+    at_once(Method::GET, path, takes, handler)
+}
+
+/// A route that changes something.
+fn act<H, T>(method: Method, path: &'static str, takes: Takes, handler: H) -> Route
+where
+    H: Handler<T, Arc<Page>>,
+    T: 'static,
+{
+    Route { rule: Rule { takes, token: true }, ..at_once(method, path, takes, handler) }
+}
+
+/// A route that takes no token.
+fn at_once<H, T>(method: Method, path: &'static str, takes: Takes, handler: H) -> Route
+where
+    H: Handler<T, Arc<Page>>,
+    T: 'static,
+{
+    let handler = match method {
+        Method::POST => post(handler),
+        Method::PUT => put(handler),
+        Method::PATCH => patch(handler),
+        Method::DELETE => delete(handler),
+        _ => get(handler),
+    };
+    Route { method, path, rule: Rule { takes, token: false }, handler }
+}
+
+/// Makes the router.
+pub(super) fn router(page: Arc<Page>) -> Router {
+    let (mut router, mut rights) = (Router::new(), Rights::default());
+    for Route { method, path, rule, handler } in table() {
+        rights.0.insert((method, path), rule);
+        router = router.route(path, handler);
+    }
+    router
+        // Also before routes that are not there: what exists is nobody's business.
+        .layer(middleware::from_fn_with_state((page.clone(), Arc::new(rights)), access::guard))
+        // A camera takes some hundred bytes.
+        .layer(DefaultBodyLimit::max(16 << 10))
+        .with_state(page)
+}
+
+/// Returns every route there is: its method, its path, and what it takes.
+pub fn list() -> Vec<(String, &'static str, Takes)> {
+    let line = |route: Route| (route.method.to_string(), route.path, route.rule.takes);
+    table().into_iter().map(line).collect()
+}
+
+pub(super) const INDEX: &str = include_str!("page/index.html");
+const STYLE: &str = include_str!("page/style.css");
+pub(super) const APP: &str = include_str!("page/app.js");
+pub(super) const SPACE: &str = include_str!("page/space.js");
+pub(super) const CONTROLS: &str = include_str!("page/controls.js");
+/// three.js 0.180.0, as its npm package has it (page/three/README.md).
+const THREE: &str = include_str!("page/three/three.module.min.js");
+const THREE_CORE: &str = include_str!("page/three/three.core.min.js");
+pub(super) const CAMERAS: &str = include_str!("page/cameras.js");
+pub(super) const CRASH: &str = include_str!("page/crash.js");
+pub(super) const PAIRING: &str = include_str!("page/pairing.js");
+pub(super) const MAP: &str = include_str!("page/map.js");
+pub(super) const WATERFALL: &str = include_str!("page/waterfall.js");
+const LEADERBOARD: &str = include_str!("page/leaderboard.js");
+const STANDINGS: &str = include_str!("page/standings.js");
+const WALL: &str = include_str!("page/wall.html");
+const WALL_STYLE: &str = include_str!("page/wall.css");
+const WALL_SCRIPT: &str = include_str!("page/wall.js");
+const ICON: &str = super::ICON;

@@ -1,0 +1,269 @@
+//! The top view behind the page's map: drawn once at the start.
+//!
+//! A picture of the twin seen straight down from far above (so that a perspective camera is as good
+//! as a parallel one), without what lies above the flight: crowns and ceilings would hide the
+//! trunks and the floor. Over it, what is solid at flight height, as one bit per cell. For the view
+//! in space, the surface of what is solid, as cells.
+
+use axum::body::Bytes;
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use serde::Serialize;
+use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_rgbd::encode_jpeg;
+use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+
+/// The map's picture and obstacles.
+#[derive(Clone, Debug, Default)]
+pub struct TopView {
+    /// JPEG, north up; empty if it could not be drawn.
+    pub jpeg: Bytes,
+    /// South-west corner of the picture. [m, world]
+    pub min_m: [f64; 2],
+    /// North-east corner of the picture. [m, world]
+    pub max_m: [f64; 2],
+    /// What is solid at flight height.
+    pub obstacles: Obstacles,
+    /// The surface of what is solid: [`shell`].
+    pub shell: Bytes,
+}
+
+/// A grid of solid cells.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Obstacles {
+    /// South-west corner. [m, world]
+    origin_m: [f64; 2],
+    /// Side of a cell. [m]
+    cell_m: f64,
+    /// Cells along x.
+    width: usize,
+    /// Cells along y.
+    height: usize,
+    /// Base64 of one bit per cell, least significant first, row by row from the south-west.
+    bits: String,
+}
+
+impl Obstacles {
+    /// Returns what is solid in the rectangle from `min_m` to `max_m`, on cells of `cell_m` or
+    /// coarser, so that no side has more than [`MOST_CELLS`].
+    pub fn scan(
+        min_m: DVec2,
+        max_m: DVec2,
+        cell_m: f64,
+        mut solid: impl FnMut(DVec2) -> bool,
+    ) -> Self {
+        let span = max_m - min_m;
+        let cell_m = cell_m.max(span.max_element() / MOST_CELLS as f64);
+        let cells = |length: f64| ((length / cell_m).ceil() as usize).clamp(1, MOST_CELLS);
+        let (width, height) = (cells(span.x), cells(span.y));
+        let mut bits = vec![0u8; (width * height).div_ceil(8)];
+        for y in 0..height {
+            for x in 0..width {
+                let p = min_m + (DVec2::new(x as f64, y as f64) + 0.5) * cell_m;
+                if solid(p) {
+                    let index = y * width + x;
+                    bits[index / 8] |= 1 << (index % 8);
+                }
+            }
+        }
+        Self { origin_m: min_m.to_array(), cell_m, width, height, bits: base64(&bits) }
+    }
+}
+
+/// Returns the surface of what is `solid` in a box, as cells for the page: little-endian, the box's
+/// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
+/// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MOST_SHELL`].
+///
+/// `solid` says whether anything solid is within a distance [m] of a point [m, world].
+pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64) -> bool) -> Bytes {
+    let span = (max_m - min_m).max(DVec3::splat(1e-3));
+    let mut cell_m = cell_m.max((span.element_product() / MOST_SAMPLES).cbrt());
+    cell_m = cell_m.max(span.max_element() / f64::from(u16::MAX));
+    loop {
+        let [nx, ny, nz] = (span / cell_m).ceil().to_array().map(|n| (n as usize).max(1));
+        let at = |x: usize, y: usize, z: usize| (z * ny + y) * nx + x;
+        let mut is_solid = vec![false; nx * ny * nz];
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in 0..nx {
+                    let p = min_m + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell_m;
+                    is_solid[at(x, y, z)] = solid(p, cell_m / 2.0);
+                }
+            }
+        }
+        let hidden = |x: usize, y: usize, z: usize| {
+            let inside = x > 0 && y > 0 && z > 0 && x + 1 < nx && y + 1 < ny && z + 1 < nz;
+            inside
+                && [
+                    at(x - 1, y, z),
+                    at(x + 1, y, z),
+                    at(x, y - 1, z),
+                    at(x, y + 1, z),
+                    at(x, y, z - 1),
+                    at(x, y, z + 1),
+                ]
+                .iter()
+                .all(|&neighbour| is_solid[neighbour])
+        };
+        let mut bytes = Vec::new();
+        for value in [min_m.x, min_m.y, min_m.z, cell_m] {
+            bytes.extend_from_slice(&(value as f32).to_le_bytes());
+        }
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in (0..nx).filter(|&x| is_solid[at(x, y, z)] && !hidden(x, y, z)) {
+                    for place in [x, y, z] {
+                        bytes.extend_from_slice(&(place as u16).to_le_bytes());
+                    }
+                }
+            }
+        }
+        if bytes.len() <= 16 + 6 * MOST_SHELL {
+            return bytes.into();
+        }
+        cell_m *= 1.25;
+    }
+}
+
+/// Returns the camera that looks straight down on the rectangle, north up, at `px_per_m`, and sees
+/// nothing above `ceiling_m`.
+fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Camera {
+    let (span, middle) = (max_m - min_m, (min_m + max_m) / 2.0);
+    let height_m = span.max_element() * DISTANCE;
+    let side = |metres: f64| ((metres * px_per_m).round() as u32).clamp(16, MOST_SIDE_PX);
+    let (width_px, height_px) = (side(span.x), side(span.y));
+    // At the ceiling's height one metre is `px_per_m` pixels; the camera hangs `height_m` above it.
+    let f_px = px_per_m * height_m;
+    // Columns: the camera's axes in the world: right is east, down is south, ahead is down.
+    let axes = DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z);
+    Camera {
+        intrinsics: Intrinsics {
+            width_px,
+            height_px,
+            fx_px: f_px,
+            fy_px: f_px,
+            cx_px: f64::from(width_px) / 2.0,
+            cy_px: f64::from(height_px) / 2.0,
+            distortion: Distortion::None,
+        },
+        world_from_cam: Pose::new(middle.extend(ceiling_m + height_m), DQuat::from_mat3(&axes)),
+        near_m: height_m as f32,
+        background: [0.05, 0.07, 0.09],
+        air: Air::CLEAR,
+    }
+}
+
+/// Draws the top view of the rectangle up to `ceiling_m`, with a renderer of its own for the splats
+/// below: one picture is not worth a graphics device. Returns a JPEG, or nothing if drawing fails.
+pub fn picture(splats: &Splats, min_m: DVec2, max_m: DVec2, ceiling_m: f64) -> Option<Bytes> {
+    let span = max_m - min_m;
+    let px_per_m = f64::from(WANTED_SIDE_PX) / span.max_element();
+    let camera = camera_above(min_m, max_m, ceiling_m, px_per_m);
+    let mut renderer = CpuRenderer::new(&below(splats, ceiling_m as f32));
+    let mut images = [RgbdImage::default()];
+    renderer.render(&[], &[camera], &mut images).ok()?;
+    let mut rgb = Vec::new();
+    images[0].write_rgb8(&mut rgb);
+    let mut jpeg = Vec::new();
+    encode_jpeg(&rgb, images[0].width_px, images[0].height_px, 85, &mut jpeg).ok()?;
+    Some(jpeg.into())
+}
+
+/// Returns the splats whose centre is below a height.
+fn below(splats: &Splats, ceiling_m: f32) -> Splats {
+    let kept: Vec<usize> = (0..splats.len()).filter(|&k| splats.means_m[k].z < ceiling_m).collect();
+    let per_splat = splats.sh_coefficients() * 3;
+    Splats {
+        means_m: kept.iter().map(|&k| splats.means_m[k]).collect(),
+        scales_m: kept.iter().map(|&k| splats.scales_m[k]).collect(),
+        rotations: kept.iter().map(|&k| splats.rotations[k]).collect(),
+        opacities: kept.iter().map(|&k| splats.opacities[k]).collect(),
+        // Seen straight down from afar the constant term tells the colour.
+        sh_degree: 0,
+        sh: kept.iter().flat_map(|&k| &splats.sh[k * per_splat..][..3]).copied().collect(),
+    }
+}
+
+/// Returns RFC 4648 base64 with padding.
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let word = chunk.iter().fold(0u32, |word, &byte| word << 8 | u32::from(byte))
+            << (8 * (3 - chunk.len()));
+        for digit in 0..4 {
+            if digit <= chunk.len() {
+                text.push(DIGITS[(word >> (18 - 6 * digit) & 63) as usize] as char);
+            } else {
+                text.push('=');
+            }
+        }
+    }
+    text
+}
+
+/// Hides that the picture is seen from a point: a post of 1 m leans by 1/30 of its distance.
+const DISTANCE: f64 = 30.0;
+/// A map wider than this is drawn coarser. [px]
+const WANTED_SIDE_PX: u32 = 1200;
+const MOST_SIDE_PX: u32 = 2048;
+/// Tenths of a second to look through. [cells]
+const MOST_SAMPLES: f64 = 400_000.0;
+/// What a phone draws without a jerk; 360 KB.
+const MOST_SHELL: usize = 60_000;
+/// 64 KB of bits at most.
+const MOST_CELLS: usize = 720;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_is_that_of_the_rfc() {
+        // RFC 4648 section 10.
+        let vectors = ["", "Zg==", "Zm8=", "Zm9v", "Zm9vYg==", "Zm9vYmE=", "Zm9vYmFy"];
+        for (length, expected) in vectors.iter().enumerate() {
+            assert_eq!(base64(&b"foobar"[..length]), *expected);
+        }
+    }
+
+    #[test]
+    fn obstacles_are_one_bit_per_cell_from_the_south_west() {
+        let solid = |p: DVec2| p.x > 1.0 && p.y > 0.5;
+        let found = Obstacles::scan(DVec2::ZERO, DVec2::new(2.0, 1.0), 0.5, solid);
+        assert_eq!((found.width, found.height), (4, 2));
+        // South row free; north row: the two eastern cells.
+        assert_eq!(found.bits, base64(&[0b1100_0000]));
+        let coarse = Obstacles::scan(DVec2::ZERO, DVec2::new(7200.0, 1.0), 0.1, solid);
+        assert_eq!((coarse.width, coarse.height), (MOST_CELLS, 1));
+    }
+
+    #[test]
+    fn a_shell_is_the_surface_of_what_is_solid() {
+        // A cube of 5 x 5 x 5 cells in the middle of 9 x 9 x 9: 125 less the 27 inside.
+        let cube = |p: DVec3, _| (p - 0.45).abs().max_element() < 0.25;
+        let bytes = shell(DVec3::ZERO, DVec3::splat(0.9), 0.1, cube);
+        let f32_at = |k: usize| f32::from_le_bytes(bytes[4 * k..4 * k + 4].try_into().unwrap());
+        assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
+        assert_eq!((bytes.len() - 16) / 6, 125 - 27);
+        assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
+        // A hall of walls is drawn in cells as coarse as it takes; nothing at all is an empty list.
+        let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_, _| true);
+        assert!(all.len() <= 16 + 6 * MOST_SHELL && all.len() > 1000);
+        assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_, _| false).len(), 16);
+    }
+
+    #[test]
+    fn the_camera_above_maps_the_corners_of_the_rectangle_to_those_of_the_picture() {
+        let (min, max) = (DVec2::new(-1.0, -6.0), DVec2::new(42.0, 6.0));
+        let camera = camera_above(min, max, 1.5, 20.0);
+        let k = camera.intrinsics;
+        let pixel = |x: f64, y: f64| {
+            let p_cam = camera.world_from_cam.inverse().transform_point(DVec3::new(x, y, 1.5));
+            k.project(p_cam).unwrap()
+        };
+        assert!((pixel(-1.0, 6.0) - DVec2::ZERO).length() < 1e-6);
+        let corner = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
+        assert!((pixel(42.0, -6.0) - corner).length() < 1e-6);
+        assert_eq!(camera.validate(), Ok(()));
+    }
+}

@@ -1,0 +1,134 @@
+//! The vehicles over HTTP: who they are, and the stop buttons.
+
+use std::sync::Arc;
+
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
+use serde::Serialize;
+use vizflyt_protocol::messages::FlightPhase;
+
+use super::access::Viewer;
+use super::{Page, origin, refuse, vehicle};
+use crate::flights::vehicle::Vehicle;
+
+/// A vehicle in the list.
+#[derive(Debug, Serialize)]
+pub(super) struct VehicleLine {
+    name: String,
+    phase: FlightPhase,
+    /// Which program flies it.
+    runtime: Option<String>,
+    cameras: Vec<String>,
+}
+
+impl VehicleLine {
+    pub(super) fn of(vehicle: &Arc<Vehicle>) -> Self {
+        let cameras = vehicle.cameras.newest();
+        Self {
+            name: vehicle.name.to_string(),
+            phase: vehicle.phase(),
+            runtime: vehicle.runtime().map(|runtime| runtime.program.to_string()),
+            cameras: cameras.configs.iter().map(|camera| camera.name.clone()).collect(),
+        }
+    }
+}
+
+/// Answers with all vehicles that the viewer may see.
+pub(super) async fn list(
+    State(page): State<Arc<Page>>,
+    Extension(viewer): Extension<Viewer>,
+) -> Response {
+    let seen = page.hub.vehicles.iter().filter(|vehicle| viewer.may_see(&vehicle.name));
+    Json(seen.map(VehicleLine::of).collect::<Vec<_>>()).into_response()
+}
+
+/// Stops every vehicle.
+pub(super) async fn stop_all(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    press(&page.hub.vehicles)
+}
+
+/// Stops one vehicle.
+pub(super) async fn stop(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return refuse(&refusal);
+    }
+    match vehicle(&page, &name) {
+        Ok(vehicle) => press(std::slice::from_ref(vehicle)),
+        Err(none) => *none,
+    }
+}
+
+/// Lets a vehicle take off.
+pub(super) async fn start(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::start, "it takes off")
+}
+
+/// Lands a vehicle in order.
+pub(super) async fn land(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::land, "it brakes and lands")
+}
+
+/// Begins a vehicle's run anew.
+pub(super) async fn reset(
+    page: State<Arc<Page>>,
+    name: Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    tell(&page, &name, &headers, Vehicle::reset, "the run begins anew")
+}
+
+fn tell(
+    page: &Page,
+    name: &str,
+    headers: &HeaderMap,
+    order: impl FnOnce(&Vehicle, &str) -> Result<(), String>,
+    done: &'static str,
+) -> Response {
+    if let Err(refusal) = origin::check(headers) {
+        return refuse(&refusal);
+    }
+    match vehicle(page, name) {
+        Ok(vehicle) => match order(vehicle, "the page") {
+            Ok(()) => (StatusCode::ACCEPTED, done).into_response(),
+            Err(why) => (StatusCode::CONFLICT, why).into_response(),
+        },
+        Err(none) => *none,
+    }
+}
+
+/// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
+/// flight is told.
+fn press(vehicles: &[Arc<Vehicle>]) -> Response {
+    let (obey, absent): (Vec<_>, Vec<_>) =
+        vehicles.iter().partition(|vehicle| vehicle.emergency_stop("the page"));
+    let names = |vehicles: &[&Arc<Vehicle>]| {
+        vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect::<Vec<_>>().join(", ")
+    };
+    let status = if obey.is_empty() { StatusCode::CONFLICT } else { StatusCode::ACCEPTED };
+    let text = match (&*obey, &*absent) {
+        ([_], []) => "the runtime lands the vehicle".to_owned(),
+        (obey, []) => format!("the runtimes land {}", names(obey)),
+        ([], _) => "no runtime is connected: nobody to land the vehicle".to_owned(),
+        (obey, absent) => {
+            format!("the runtimes land {}; no runtime flies {}", names(obey), names(absent))
+        }
+    };
+    (status, text).into_response()
+}

@@ -1,0 +1,272 @@
+//! One picture: where the page's camera is in, JPEG out.
+
+use anyhow::{Context, Result};
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+use vizflyt_arena::objects::MovingObjects;
+use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
+use vizflyt_rgbd::encode_jpeg;
+use vizflyt_splat::{Air, Camera, DepthKind, Rasterizer, RgbdImage};
+
+use crate::scene::WorldFromScene;
+use crate::web::previews::depth_colour;
+
+/// What a page asks for.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Request {
+    /// Where the camera is. [m, world]
+    p_m: [f64; 3],
+    /// Heading: from x, counter-clockwise. [rad, world]
+    yaw_rad: f64,
+    /// Upward tilt. [rad]
+    pitch_rad: f64,
+    /// From the left edge to the right edge. [deg]
+    fov_deg: f64,
+    /// [px]
+    width_px: u32,
+    /// [px]
+    height_px: u32,
+    /// Shows depth instead of colour.
+    depth: bool,
+    /// On the clock of what moves. [s]
+    #[serde(default)]
+    at_s: f64,
+}
+
+/// What is said of a picture before it comes.
+#[derive(Debug, Serialize)]
+pub(super) struct Told {
+    ms: f32,
+    visible: usize,
+    /// Median depth in the middle of the picture; none where nothing is hit. [m]
+    middle_m: Option<f32>,
+    camera: OracleCamera,
+}
+
+/// The camera in the frame of the scene's file, as `vizflyt scene render` reads it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct OracleCamera {
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    w: u32,
+    h: u32,
+    bg: [f32; 3],
+    w2c: [[f64; 4]; 4],
+    near_m: f64,
+}
+
+/// A picture.
+pub(super) struct Drawn {
+    pub(super) told: Told,
+    pub(super) jpeg: Vec<u8>,
+}
+
+/// Renderer and scratch memory.
+pub(super) struct Engine {
+    rasterizer: Box<dyn Rasterizer>,
+    moving: MovingObjects,
+    world_from_scene: WorldFromScene,
+    image: [RgbdImage; 1],
+    rgb: Vec<u8>,
+    depth_mm: Vec<u16>,
+}
+
+impl Engine {
+    pub(super) fn new(
+        rasterizer: Box<dyn Rasterizer>,
+        moving: MovingObjects,
+        world_from_scene: WorldFromScene,
+    ) -> Self {
+        let (image, rgb, depth_mm) = ([RgbdImage::default()], Vec::new(), Vec::new());
+        Self { rasterizer, moving, world_from_scene, image, rgb, depth_mm }
+    }
+
+    pub(super) fn draw(&mut self, request: &Request) -> Result<Drawn> {
+        let camera = request.camera();
+        // What no clock can say stands where it began.
+        let placements = self.moving.placements((request.at_s * 1e9) as i64);
+        let times = self.rasterizer.render(&placements, &[camera], &mut self.image)?;
+        let [image] = &self.image;
+        if request.depth {
+            image.write_depth_mm(DepthKind::Median, &mut self.depth_mm);
+            self.rgb.clear();
+            self.rgb.extend(self.depth_mm.iter().flat_map(|&mm| depth_colour(mm)));
+        } else {
+            image.write_rgb8(&mut self.rgb);
+        }
+        let (width, height) = (image.width_px, image.height_px);
+        let mut jpeg = Vec::new();
+        encode_jpeg(&self.rgb, width, height, QUALITY, &mut jpeg).context("no picture")?;
+        let middle = (height / 2) as usize * width as usize + (width / 2) as usize;
+        let middle_m = image.depth_median_m[middle];
+        let told = Told {
+            ms: times.total_ms,
+            visible: self.rasterizer.workload().visible,
+            middle_m: (middle_m > 0.0).then_some(middle_m),
+            camera: in_scene(&camera, &self.world_from_scene),
+        };
+        Ok(Drawn { told, jpeg })
+    }
+}
+
+impl Request {
+    /// Returns the camera, its size held to what a page can show.
+    fn camera(&self) -> Camera {
+        let [width, height] =
+            [self.width_px, self.height_px].map(|side| side.clamp(16, MOST_SIDE_PX));
+        let fov_rad = self.fov_deg.clamp(5.0, 150.0).to_radians();
+        let world_from_body: Pose<World, Body> =
+            Pose::new(self.p_m.into(), DQuat::from_rotation_z(self.yaw_rad));
+        Camera {
+            intrinsics: Intrinsics::from_horizontal_fov(width, height, fov_rad),
+            world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, self.pitch_rad),
+            near_m: NEAR_M,
+            background: [0.0; 3],
+            air: Air::CLEAR,
+        }
+    }
+}
+
+/// Returns the camera that shows the scene's file, neither turned nor scaled, as `camera` shows the
+/// twin: of `p_cam = R_cw (s R_ws p + t_ws) + t_cw` everything is divided by s.
+fn in_scene(camera: &Camera, world_from_scene: &WorldFromScene) -> OracleCamera {
+    let cam_from_world = camera.world_from_cam.inverse();
+    let rotation = DMat3::from_quat(cam_from_world.rotation * world_from_scene.rotation);
+    let t = cam_from_world.transform_point(world_from_scene.translation_m) / world_from_scene.scale;
+    let rows = rotation.transpose();
+    let row = |axes: DVec3, t: f64| [axes.x, axes.y, axes.z, t];
+    let k = &camera.intrinsics;
+    OracleCamera {
+        fx: k.fx_px,
+        fy: k.fy_px,
+        cx: k.cx_px,
+        cy: k.cy_px,
+        w: k.width_px,
+        h: k.height_px,
+        bg: camera.background,
+        w2c: [
+            row(rows.x_axis, t.x),
+            row(rows.y_axis, t.y),
+            row(rows.z_axis, t.z),
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        near_m: f64::from(camera.near_m) / world_from_scene.scale,
+    }
+}
+
+/// A hand's breadth: one flies through things here. [m]
+const NEAR_M: f32 = 0.05;
+/// Full HD on a screen that is wider than high.
+const MOST_SIDE_PX: u32 = 1920;
+const QUALITY: u8 = 85;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+    use vizflyt_arena::config::{MotionConfig, ObjectConfig};
+    use vizflyt_splat::{CpuRenderer, RigidObject, Scene, Splats};
+
+    fn ball() -> Splats {
+        Splats {
+            means_m: vec![Vec3::new(3.0, 0.5, 1.0)],
+            scales_m: vec![Vec3::splat(0.2)],
+            rotations: vec![Quat::IDENTITY],
+            opacities: vec![1.0],
+            sh_degree: 0,
+            sh: vec![1.0; 3],
+        }
+    }
+
+    fn request() -> Request {
+        Request {
+            p_m: [0.0, 0.5, 1.0],
+            yaw_rad: 0.0,
+            pitch_rad: 0.0,
+            fov_deg: 60.0,
+            width_px: 64,
+            height_px: 48,
+            depth: false,
+            at_s: 0.0,
+        }
+    }
+
+    fn still(splats: &Splats) -> Engine {
+        let renderer = Box::new(CpuRenderer::new(splats));
+        Engine::new(renderer, MovingObjects::default(), WorldFromScene::IDENTITY)
+    }
+
+    #[test]
+    fn what_moves_is_where_its_clock_says() {
+        let authorizer = ObjectConfig {
+            name: "authorizer".into(),
+            scene: "authorizer.ply".into(),
+            position_m: DVec3::new(0.0, 0.5, 0.0),
+            yaw_deg: 0.0,
+            phase_s: Some(0.0),
+            motion: MotionConfig::Path {
+                points_m: vec![DVec3::ZERO, DVec3::Y * 5.0],
+                speed_mps: 1.0,
+                closed: false,
+            },
+        };
+        // The ball is the object; the room is empty.
+        let objects = [RigidObject { id: 1, splats: ball() }];
+        let empty = Splats::default();
+        let scene = Scene { splats: &empty, objects: &objects };
+        let renderer = Box::new(CpuRenderer::new(scene));
+        let moving = MovingObjects::of(&[authorizer], 0);
+        let mut engine = Engine::new(renderer, moving, WorldFromScene::IDENTITY);
+        let mut middle_m = |p_y_m: f64, at_s: f64| {
+            let looking = Request { p_m: [0.0, p_y_m, 1.0], at_s, ..request() };
+            engine.draw(&looking).unwrap().told.middle_m
+        };
+        assert_eq!((middle_m(1.0, 0.0), middle_m(1.0, 4.0)), (Some(3.0), None));
+        assert_eq!((middle_m(5.0, 0.0), middle_m(5.0, 4.0)), (None, Some(3.0)));
+    }
+
+    #[test]
+    fn the_page_sees_what_is_ahead_and_how_far() {
+        let splats = ball();
+        let mut engine = still(&splats);
+        let drawn = engine.draw(&request()).unwrap();
+        assert_eq!((drawn.told.visible, drawn.told.middle_m), (1, Some(3.0)));
+        assert_eq!(drawn.jpeg[..2], [0xff, 0xd8]);
+        let behind = Request { yaw_rad: std::f64::consts::PI, depth: true, ..request() };
+        let drawn = engine.draw(&behind).unwrap();
+        assert_eq!((drawn.told.visible, drawn.told.middle_m), (0, None));
+        let lost = Request { p_m: [1e30, 0.0, 0.0], ..request() };
+        assert!(engine.draw(&lost).is_err());
+        let huge = Request { width_px: u32::MAX, height_px: 0, ..request() };
+        assert_eq!(huge.camera().intrinsics.pixels(), 1920 * 16);
+    }
+
+    /// A point of the file lands on the same pixel, by either way.
+    #[test]
+    fn the_copied_camera_is_in_the_files_own_frame() {
+        let world_from_scene = WorldFromScene {
+            scale: 0.25,
+            rotation: DQuat::from_rotation_x(1.1) * DQuat::from_rotation_z(0.4),
+            translation_m: DVec3::new(1.0, -2.0, 3.0),
+        };
+        let looking = Request { yaw_rad: 0.7, pitch_rad: -0.2, ..request() };
+        let camera = looking.camera();
+        let copied = in_scene(&camera, &world_from_scene);
+        let p_cam = DVec3::new(0.3, -0.2, 4.0);
+        let p_world = camera.world_from_cam.transform_point(p_cam);
+        let p_scene = world_from_scene.rotation.inverse()
+            * (p_world - world_from_scene.translation_m)
+            / world_from_scene.scale;
+        let row = |k: usize| {
+            let [x, y, z, t] = copied.w2c[k];
+            DVec3::new(x, y, z).dot(p_scene) + t
+        };
+        let found = DVec3::new(row(0), row(1), row(2));
+        // The same ray, in units of the file.
+        assert!((found * 0.25 - p_cam).length() < 1e-9, "{found}");
+        assert!((copied.near_m - 0.2).abs() < 1e-6);
+    }
+}

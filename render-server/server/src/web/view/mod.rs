@@ -1,0 +1,258 @@
+//! `vizflyt scene view`: a page with a free-flying camera in a scene.
+//!
+//! ```text
+//! GET /     the page; asks over /ws for a picture from where it is, one at a time
+//! GET /ws   in: Request (JSON); out: what was drawn (JSON), then the picture (JPEG)
+//! ```
+//! Nothing is drawn unless a page asks, and a page asks only when its camera has moved and the last
+//! picture has come: the newest wins by itself, however slow the machine. One renderer serves all
+//! viewers in turn.
+
+mod draw;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use axum::Router;
+use axum::body::Bytes;
+use axum::extract::ws::{Message, WebSocket, rejection::WebSocketUpgradeRejection};
+use axum::extract::{State, WebSocketUpgrade};
+use axum::http::HeaderMap;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use clap::Args;
+use serde::Serialize;
+use tokio::time::timeout;
+use tracing::debug;
+use vizflyt_arena::objects::MovingObjects;
+use vizflyt_splat::Chosen;
+
+use self::draw::{Drawn, Engine, Request};
+use crate::hub::RendererInfo;
+use crate::lock::lock;
+use crate::render::{RendererKind, choose};
+use crate::scene::{self, Scene, Up};
+use crate::stop::Stop;
+use crate::web::{self, origin};
+
+/// Opens a page with a free-flying camera in a scene.
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "On the page: W A S D to fly, E and Q up and down, drag to look around, wheel \
+for the speed; on a touch screen one finger looks, two fly. `play` lets the clock of what moves \
+run, where something does. `copy camera` gives the camera as a CAM.json for `vizflyt scene render`.
+
+Examples:
+  vizflyt scene view room.ply
+  vizflyt scene view forest/arena.toml --renderer cpu
+  vizflyt scene view room.ply --up z --http 0.0.0.0:8090 --no-browser"
+)]
+pub struct ViewArgs {
+    /// Scene file of any format, or an arena.toml
+    pub scene: PathBuf,
+
+    /// Where the page is served; port 0 takes a free one
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
+    pub http: SocketAddr,
+
+    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    pub renderer: RendererKind,
+
+    /// Bare scene only: the scene's axis that points up
+    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
+    pub up: Up,
+
+    /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
+    #[arg(long, value_name = "METRES", value_parser = crate::args::scale)]
+    pub scale: Option<f64>,
+
+    /// What the arena leaves to chance: where in their motion its objects begin
+    #[arg(long, default_value_t = 7)]
+    pub seed: u64,
+
+    /// Only prints the address
+    #[arg(long)]
+    pub no_browser: bool,
+}
+
+/// Serves the page until SIGINT or SIGTERM; `open` is called with its address once it answers.
+///
+/// # Errors
+/// A scene that cannot be used, an address that cannot be bound, no such renderer.
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
+pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("net")
+        .enable_all()
+        .build()
+        .context("cannot start tokio")?;
+    let result = runtime.block_on(run(&args, open));
+    // Not awaited: a picture under way must not hold up the end.
+    runtime.shutdown_background();
+    result
+}
+
+/// What the handlers share.
+struct View {
+    engine: Mutex<Engine>,
+    welcome: Welcome,
+    stop: Stop,
+}
+
+/// Said to each page first.
+#[derive(Debug, Serialize)]
+struct Welcome {
+    name: String,
+    renderer: RendererInfo,
+    splats: usize,
+    /// Where to begin. [m, world]
+    start_m: [f64; 3],
+    /// Heading to begin with. [rad, world]
+    yaw_rad: f64,
+    /// The arena's fence. [m, world]
+    fence_m: [[f64; 3]; 2],
+    /// How many objects move in it.
+    objects: usize,
+}
+
+async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+    let stop = Stop::default();
+    stop.on_signals(false)?;
+    // First: a taken port is told before the scene is loaded.
+    let listener = web::bind(args.http).await?;
+    let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
+    let loading = args.clone();
+    let load = tokio::task::spawn_blocking(move || prepare(&loading));
+    let (engine, welcome) = tokio::select! {
+        prepared = load => prepared.context("loading the scene failed")??,
+        () = stop.wait() => return Ok(()),
+    };
+    open(&url, &welcome.renderer);
+    let view = Arc::new(View { engine: Mutex::new(engine), welcome, stop: stop.clone() });
+    tokio::select! {
+        served = axum::serve(listener, router(view)) => served.context("the page's server failed"),
+        () = stop.wait() => Ok(()),
+    }
+}
+
+fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
+    let Scene { arena, splats, objects, world_from_scene } =
+        scene::load(&args.scene, args.up, args.scale)?;
+    let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
+    let Chosen { rasterizer, reason } = choose(twin, args.renderer)?;
+    let moving = MovingObjects::new(&arena, args.seed);
+    let mut start_m = arena.spawn.position_m;
+    start_m.z += arena.takeoff_height_m;
+    let welcome = Welcome {
+        name: arena.name,
+        renderer: RendererInfo { name: rasterizer.name().into_owned(), reason },
+        splats: splats.len(),
+        start_m: start_m.to_array(),
+        yaw_rad: arena.spawn.yaw_deg.to_radians(),
+        fence_m: [arena.geofence.min_m.to_array(), arena.geofence.max_m.to_array()],
+        objects: moving.len(),
+    };
+    Ok((Engine::new(rasterizer, moving, world_from_scene), welcome))
+}
+
+fn router(view: Arc<View>) -> Router {
+    use web::file;
+    Router::new()
+        .route("/", get(async || file("text/html; charset=utf-8", INDEX)))
+        .route("/view.css", get(async || file("text/css; charset=utf-8", STYLE)))
+        .route("/view.js", get(async || file("text/javascript; charset=utf-8", SCRIPT)))
+        .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
+        .route("/ws", get(watch))
+        .with_state(view)
+}
+
+async fn watch(
+    State(view): State<Arc<View>>,
+    headers: HeaderMap,
+    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+) -> Response {
+    if let Err(refusal) = origin::check(&headers) {
+        return web::refuse(&refusal);
+    }
+    match upgrade {
+        Ok(upgrade) => upgrade
+            .max_message_size(4096)
+            .on_upgrade(async move |socket| converse(view, socket).await),
+        Err(rejection) => rejection.into_response(),
+    }
+}
+
+async fn converse(view: Arc<View>, mut socket: WebSocket) {
+    tokio::select! {
+        _ = answer(&view, &mut socket) => {}
+        () = view.stop.wait() => {}
+    }
+    let _ = timeout(Duration::from_millis(200), socket.send(Message::Close(None))).await;
+}
+
+/// Returns `None` when the page is gone.
+async fn answer(view: &Arc<View>, socket: &mut WebSocket) -> Option<()> {
+    send_json(socket, &view.welcome).await?;
+    loop {
+        let request: Request = match socket.recv().await?.ok()? {
+            Message::Text(text) => match serde_json::from_str(&text) {
+                Ok(request) => request,
+                Err(error) => {
+                    send_json(socket, &serde_json::json!({"error": error.to_string()})).await?;
+                    continue;
+                }
+            },
+            Message::Close(_) => return None,
+            _ => continue,
+        };
+        let drawing = view.clone();
+        let drawn = tokio::task::spawn_blocking(move || lock(&drawing.engine).draw(&request));
+        match drawn.await.ok()? {
+            Ok(Drawn { told, jpeg }) => {
+                send_json(socket, &told).await?;
+                send(socket, Message::Binary(Bytes::from(jpeg))).await?;
+            }
+            Err(error) => {
+                debug!("view: {error:#}");
+                send_json(socket, &serde_json::json!({"error": format!("{error:#}")})).await?;
+            }
+        }
+    }
+}
+
+async fn send_json(socket: &mut WebSocket, message: &impl Serialize) -> Option<()> {
+    send(socket, Message::Text(serde_json::to_string(message).ok()?.into())).await
+}
+
+async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
+    timeout(PATIENCE, socket.send(message)).await.ok()?.ok()
+}
+
+const INDEX: &str = include_str!("page/view.html");
+const STYLE: &str = include_str!("page/view.css");
+const SCRIPT: &str = include_str!("page/view.js");
+/// A page that takes nothing for this long is gone.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_id_of_the_script_is_on_the_page() {
+        let ids: Vec<_> =
+            SCRIPT.split("$(\"").skip(1).filter_map(|part| part.split('"').next()).collect();
+        assert!(ids.len() > 8);
+        for id in ids {
+            assert!(INDEX.contains(&format!("id=\"{id}\"")), "{id}");
+        }
+        assert!(INDEX.contains("/view.css") && INDEX.contains("/view.js"));
+        // The server's policy forbids both.
+        assert!(!INDEX.contains("style=") && !INDEX.contains("onclick="));
+    }
+}
