@@ -14,8 +14,9 @@ use vizflyt_arena::pose::{PoseQuality, Rejects};
 use vizflyt_protocol::messages::{
     Arrivals, ClockState, INTERVAL_EDGES_MS, Intervals, Stage, StageTimes, Timing,
 };
-use vizflyt_server::stats::{Connection, VehicleStats};
+use vizflyt_server::stream::connection::Connection;
 use vizflyt_server::stream::delivery::Delivery;
+use vizflyt_server::web::VehicleStats;
 
 /// Where images get their age, stage by stage, and why images were skipped.
 #[derive(Args, Clone, Debug)]
@@ -435,7 +436,7 @@ mod tests {
         assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
                        "images": [], "connection": null, "pose": POSE}"#;
-        let server = serde_json::to_string(&vizflyt_server::stats::ServerStages::default());
+        let server = serde_json::to_string(&vizflyt_server::web::ServerStages::default());
         let pose = serde_json::to_string(&vizflyt_arena::pose::PoseQuality::default());
         let json = json.replace("SERVER", &server.unwrap()).replace("POSE", &pose.unwrap());
         let mut answer = parse(&json).unwrap();

@@ -5,12 +5,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use vizflyt_arena::config::{Driver, LocalizationConfig};
-use vizflyt_protocol::messages::{Grant, MAX_GRANTED, bounded};
+use vizflyt_protocol::messages::Grant;
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
+use crate::authorization::parse_grant;
 use crate::flights::leaderboard::{Database, UnknownDatabase};
 use crate::render::RendererKind;
-use crate::scene::Up;
+use crate::scene::{Up, parse_scale};
 use crate::stream::rate_control::Adaptation;
 use crate::stream::transport::Congestion;
 use crate::web::Login;
@@ -90,7 +91,7 @@ pub struct ServeArgs {
     pub up: Up,
 
     /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
-    #[arg(long, value_name = "METRES", value_parser = scale)]
+    #[arg(long, value_name = "METRES", value_parser = parse_scale)]
     pub scale: Option<f64>,
 
     /// Vehicles fly in nets of their own: in the twin they neither see nor touch each other
@@ -102,7 +103,7 @@ pub struct ServeArgs {
     pub seed: u64,
 
     /// Open a pairing at the start and print its code: `instructor`, or `team:VEHICLE`
-    #[arg(long, value_name = "ROLE", value_parser = grant)]
+    #[arg(long, value_name = "ROLE", value_parser = parse_grant)]
     pub pair: Option<Grant>,
 
     /// Print the addresses, with keys, by which other computers open the page; printed anyway if
@@ -211,34 +212,8 @@ fn depth_bound(text: &str) -> Result<DepthBound, String> {
     DepthBound::new(k_per_m).ok_or_else(|| format!("{k_per_m} is outside 0.000001 to 0.1"))
 }
 
-/// Reads `instructor` or `team:VEHICLE[,VEHICLE...]`.
-pub(crate) fn grant(text: &str) -> Result<Grant, String> {
-    if text == "instructor" {
-        return Ok(Grant::Instructor);
-    }
-    let names = text.strip_prefix("team:").ok_or("write instructor, or team:VEHICLE")?;
-    let mut vehicles = heapless::Vec::new();
-    for name in names.split(',') {
-        if name.is_empty() || name.len() > 32 || name.chars().any(char::is_control) {
-            return Err(format!("'{name}' is no vehicle's name (1 to 32 bytes of text)"));
-        }
-        if vehicles.push(bounded(name)).is_err() {
-            return Err(format!("a team has {MAX_GRANTED} vehicles at most"));
-        }
-    }
-    Ok(Grant::Team { vehicles })
-}
-
 fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
-}
-
-/// Reads metres per unit of a bare scene.
-///
-/// # Errors
-/// What is no number, or no scale that a scene has.
-pub fn scale(text: &str) -> Result<f64, String> {
-    number(text, 1e-4, 1e4)
 }
 
 fn number(text: &str, least: f64, most: f64) -> Result<f64, String> {
@@ -254,6 +229,7 @@ fn number(text: &str, least: f64, most: f64) -> Result<f64, String> {
 mod tests {
     use super::*;
     use clap::Parser;
+    use vizflyt_protocol::messages::bounded;
 
     #[derive(Parser)]
     struct Cli {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
-use vizflyt_protocol::messages::{FromApplicant, Grant, PairingShare};
+use vizflyt_protocol::messages::{FromApplicant, Grant, MAX_GRANTED, PairingShare, bounded};
 use vizflyt_trust::pairing::{Admitted, Attempt, Binding, Code, Desk, Refusal, WindowState};
 use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
 
@@ -176,6 +176,24 @@ impl Authorizer {
 
 /// Removing an entry counts after two of these.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+/// Parses `instructor` or `team:VEHICLE[,VEHICLE...]`.
+pub(crate) fn parse_grant(text: &str) -> Result<Grant, String> {
+    if text == "instructor" {
+        return Ok(Grant::Instructor);
+    }
+    let names = text.strip_prefix("team:").ok_or("write instructor, or team:VEHICLE")?;
+    let mut vehicles = heapless::Vec::new();
+    for name in names.split(',') {
+        if name.is_empty() || name.len() > 32 || name.chars().any(char::is_control) {
+            return Err(format!("'{name}' is no vehicle's name (1 to 32 bytes of text)"));
+        }
+        if vehicles.push(bounded(name)).is_err() {
+            return Err(format!("a team has {MAX_GRANTED} vehicles at most"));
+        }
+    }
+    Ok(Grant::Team { vehicles })
+}
 
 #[cfg(test)]
 mod tests {

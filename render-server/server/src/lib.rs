@@ -1,21 +1,25 @@
 //! The render server: poses in, RGB-D out; referee's events, page, report.
 //!
 //! ```text
-//! poses   drivers -> pose thread (arena: gate, referee)  -> newest pose, events
-//! render  render thread (renderer)                       -> newest rendered tick
-//! stream  encode (a free slot?) -> subscriptions -> transport (QUIC)
-//! web     previews -> page (WebSocket)
-//! flights control leases, events, crash cards, leaderboard
+//! serve  loads the scene, starts threads and tasks, prints the report
+//! web       page, previews, top view        imports stream, render, poses, flights, scene
+//! stream    encoder, subscriptions, QUIC    imports render, poses, flights
+//! render    cameras -> rendered ticks       imports poses, flights, scene
+//! poses     drivers -> referee -> motions   imports flights
+//! flights   leases, events, runs            imports none of these
+//! scene     files -> splats, obstacles      imports none of these
 //! ```
-//! Four threads (poses, render, encode, previews) and a tokio runtime for sockets meet in [`hub::Hub`],
-//! which holds a [`flights::vehicle::Vehicle`] each.
-//! Everything is latest-wins but events, which are a log. [`serve()`] runs it all.
+//! Beneath the rooms lie small files that import no room: clock, stop, lock, mailbox, timing,
+//! rate limits, authorization. `tests/arrows.rs` fails on an import that runs upwards.
+//!
+//! Four threads (poses, render, encode, previews) and a tokio runtime for sockets share the rooms'
+//! states ([`stream::Rooms`]). Everything is latest-wins but events, which are a log. [`serve()`]
+//! runs it all.
 
 pub mod args;
 pub mod authorization;
 pub mod clock;
 pub mod flights;
-pub mod hub;
 pub mod lock;
 pub mod mailbox;
 pub mod poses;
@@ -23,9 +27,9 @@ mod rate_limit;
 pub mod render;
 pub mod scene;
 mod serve;
-pub mod stats;
 pub mod stop;
 pub mod stream;
+pub mod timing;
 pub mod web;
 
 pub use args::ServeArgs;

@@ -12,14 +12,15 @@ use vizflyt_arena::{ArenaConfig, MovingObjects};
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::flights::vehicle::Vehicle;
-use vizflyt_server::hub::{Hub, RendererInfo};
 use vizflyt_server::mailbox::Mailbox;
-use vizflyt_server::poses::thread::{Localized, NewestPoses};
+use vizflyt_server::poses::newest::{Localized, NewestPoses};
+use vizflyt_server::render::Rendering;
 use vizflyt_server::render::cameras::Cameras;
 use vizflyt_server::render::dynamic_objects::DynamicObjects;
 use vizflyt_server::render::rendered::RenderQueue;
 use vizflyt_server::stop::Stop;
+use vizflyt_server::stream::Rooms;
+use vizflyt_server::stream::rate_control::Adaptation;
 use vizflyt_splat::{Camera, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload};
 
 struct Counting;
@@ -61,8 +62,8 @@ spawn = { position_m = [0, 0, 0] }
 geofence = { min_m = [-5, -5, -0.5], max_m = [5, 5, 4] }
 limits = { max_speed_mps = 6.0, max_acceleration_mps2 = 8.0 }
 [[objects]]
-name = "authorizer"
-scene = "authorizer.ply"
+name = "door"
+scene = "door.ply"
 position_m = [1, 0, 0]
 motion = { kind = "oscillation", slide_m = [0, 1, 0], period_s = 3.0 }
 [[cameras]]
@@ -83,7 +84,7 @@ rate_hz = 300.0
 /// Draws nothing, but makes images of the size; and does the other threads' part between two ticks:
 /// brings the next poses, encodes some ticks, and makes previews.
 struct Everyone {
-    hub: Arc<Hub>,
+    stop: Stop,
     newest: Arc<Mailbox<NewestPoses>>,
     ticks: Arc<RenderQueue>,
     calls: u64,
@@ -119,14 +120,14 @@ impl Rasterizer for Everyone {
         for (camera, image) in cameras.iter().zip(images) {
             image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
-        // The authorizer, and of the two vehicles the other one, if it has been seen.
+        // The door, and of the two vehicles the other one, if it has been seen.
         assert!(placements.len() == 3 && placements[0].is_some());
         assert!(placements[1..].contains(&None));
         self.calls += 1;
         self.images += cameras.len();
         match self.calls {
             WARM_UP => self.warm = ALLOCATIONS.with(Cell::get),
-            TICKS => self.hub.stop.set(),
+            TICKS => self.stop.set(),
             _ => {}
         }
         if self.calls.is_multiple_of(3)
@@ -154,27 +155,37 @@ const TICKS: u64 = 360;
 #[test]
 fn drawing_allocates_nothing_once_it_is_warm() {
     let arena = ArenaConfig::parse(ARENA).unwrap();
-    let vehicle =
-        |index, name| Vehicle::new(index, name, arena.info(), Cameras::new(arena.cameras.clone()));
-    let vehicles = vec![vehicle(0, "wasp"), vehicle(1, "bee")];
-    let mut hub = Hub::new(vehicles, RendererInfo::default(), Stop::default());
+    let vehicle = |name| (name, arena.info(), arena.cameras.clone());
+    let vehicles = vec![vehicle("wasp"), vehicle("bee")];
+    let rooms = Rooms::bare(vehicles, Adaptation::default(), Stop::default());
     let objects = MovingObjects::new(&arena, 0);
-    hub.dynamic_objects = DynamicObjects::new(ServerTime::ZERO, objects, &[], 2);
-    let hub = Arc::new(hub);
-    hub.subscriptions.viewer_came(0);
-    hub.subscriptions.viewer_came(1);
-    vizflyt_server::lock::lock(&hub.renderer).name = "nothing".to_owned();
+    let rendering = Rendering {
+        cameras: [(); 2].map(|()| Cameras::new(arena.cameras.clone())).into(),
+        dynamic_objects: DynamicObjects::new(ServerTime::ZERO, objects, &[], 2),
+        ..Rendering::default()
+    };
+    rooms.streaming.subscriptions.viewer_came(0);
+    rooms.streaming.subscriptions.viewer_came(1);
+    vizflyt_server::lock::lock(&rendering.renderer).name = "nothing".to_owned();
     let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(RenderQueue::default()));
     newest.put(Everyone::poses(1));
     let mut everyone = Everyone {
-        hub: hub.clone(),
+        stop: rooms.stop.clone(),
         newest: newest.clone(),
         ticks: ticks.clone(),
         calls: 0,
         images: 0,
         warm: 0,
     };
-    vizflyt_server::render::thread::run(&hub, &mut everyone, &newest, &ticks, 1000.0);
+    let shared = (&rendering, &*rooms.flights, &*rooms.streaming);
+    vizflyt_server::render::thread::run(
+        shared,
+        &mut everyone,
+        &newest,
+        &ticks,
+        1000.0,
+        &rooms.stop,
+    );
     let allocated = ALLOCATIONS.with(Cell::get) - everyone.warm;
     assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);
     // Leaving the function frees, which is not counted.

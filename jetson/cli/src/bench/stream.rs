@@ -31,12 +31,11 @@ use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
 use vizflyt_sdk::{Observation, ObservationWriter};
 use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
-use vizflyt_server::flights::vehicle::Vehicle;
-use vizflyt_server::hub::{Hub, RendererInfo};
-use vizflyt_server::render::cameras::Cameras;
 use vizflyt_server::render::rendered::RenderedImage;
 use vizflyt_server::stop::Stop;
+use vizflyt_server::stream::Rooms;
 use vizflyt_server::stream::encode::slices::SliceEncoder;
+use vizflyt_server::stream::rate_control::Adaptation;
 use vizflyt_server::stream::subscriptions::Broadcast;
 use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_splat::RgbdImage;
@@ -166,16 +165,16 @@ impl Bench {
         let (ipc, mailbox, stop) =
             (plugin.runtime.clone(), link.shared.mailbox.clone(), plugin.stop.clone());
         let copying = thread::spawn(move || copy(&ipc, &mailbox, &stop));
-        let k = link.hub.vehicles[0].cameras.newest().infos[0].intrinsics;
+        let k = link.rooms.rendering.cameras[0].newest().infos[0].intrinsics;
         let mut broadcast = Broadcast::default();
         self.tick(|seq| {
             let identity = (Pose::IDENTITY, Pose::IDENTITY);
             let now = clock::now();
             let mut header = ImageHeader::new(seq, 0, now, &k, &identity.0, &identity.1);
             header.render_end_ns = now.as_ns().into();
-            link.hub.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
+            link.rooms.streaming.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
             broadcast.push(payload);
-            link.hub.subscriptions.end(&mut broadcast, Some(clock::now()));
+            link.rooms.streaming.subscriptions.end(&mut broadcast, Some(clock::now()));
             Ok(())
         })?;
         let ms = plugin.end()?;
@@ -218,7 +217,7 @@ impl Bench {
 
     fn pixels(&self) -> Result<Way> {
         let link = Link::start(self.size)?;
-        let set = link.hub.vehicles[0].cameras.newest();
+        let set = link.rooms.rendering.cameras[0].newest();
         let names = vec![set.infos[0].name.clone()];
         let handed: Arc<Vec<AtomicU64>> = Arc::new((0..RING).map(|_| AtomicU64::new(0)).collect());
         let table = handed.clone();
@@ -246,10 +245,10 @@ impl Bench {
             let now = clock::now();
             handed[seq as usize % RING].store(now.as_ns(), Ordering::Relaxed);
             (slot.seq, slot.pose, slot.render_end) = (seq, now, now);
-            encoder.send(&link.hub.subscriptions, &slot, 1)?;
+            encoder.send(&link.rooms.streaming.subscriptions, &slot, 1)?;
             Ok(())
         })?;
-        let counters = &link.hub.vehicles[0].images;
+        let counters = &link.rooms.streaming.vehicles[0].images;
         let sent = counters.sent.load(Ordering::Relaxed).max(1);
         let bytes = counters.bytes.load(Ordering::Relaxed) / sent;
         let ms = plugin.end()?;
@@ -326,7 +325,7 @@ impl Plugin {
 
 /// A server and a runtime, connected.
 struct Link {
-    hub: Arc<Hub>,
+    rooms: Rooms,
     shared: Shared,
     _tokio: tokio::runtime::Runtime,
     _keys: tempfile::TempDir,
@@ -350,8 +349,8 @@ impl Link {
             "name": "front", "width_px": width_px, "height_px": height_px,
             "horizontal_fov_deg": 90.0, "position_m": [0.0, 0.0, 0.0],
         }))?;
-        let vehicle = Vehicle::new(0, "bench", arena(), Cameras::new(vec![camera]));
-        let hub = Arc::new(Hub::new(vec![vehicle], RendererInfo::default(), Stop::default()));
+        let vehicles = vec![("bench", arena(), vec![camera])];
+        let rooms = Rooms::bare(vehicles, Adaptation::default(), Stop::default());
         let tokio =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
@@ -368,13 +367,13 @@ impl Link {
                 purpose: Purpose::Fly,
                 program: bounded("vizflyt bench"),
             };
-            tokio.spawn(transport::serve(hub.clone(), endpoint, authorizer, congestion));
+            tokio.spawn(transport::serve(rooms.clone(), endpoint, authorizer, congestion));
             let outbox = Arc::new(Outbox::default());
             tokio.spawn(stream::run(settings, shared.clone(), outbox, |_| true));
         }
         let deadline = Instant::now() + CONNECTED_WITHIN;
         let connected = || {
-            let room = hub.subscriptions.wait_for_room(PATIENCE).fly[0][0];
+            let room = rooms.streaming.subscriptions.wait_for_room(PATIENCE).fly[0][0];
             // Images that come before the clocks are related cannot be placed in time.
             room && shared.clock.state(vizflyt_sdk::host_now()).is_some()
         };
@@ -382,7 +381,7 @@ impl Link {
             anyhow::ensure!(Instant::now() < deadline, "no connection over loopback for 10 s");
             thread::sleep(Duration::from_millis(10));
         }
-        Ok(Self { hub, shared, _tokio: tokio, _keys: keys })
+        Ok(Self { rooms, shared, _tokio: tokio, _keys: keys })
     }
 }
 

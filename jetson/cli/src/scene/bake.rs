@@ -30,7 +30,7 @@ pub(crate) struct BakeArgs {
     #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
     up: Up,
     /// Bare scene only: metres per unit of the scene
-    #[arg(long, value_name = "METRES", value_parser = vizflyt_server::args::scale)]
+    #[arg(long, value_name = "METRES", value_parser = vizflyt_server::scene::parse_scale)]
     scale: Option<f64>,
     /// Prints one JSON object
     #[arg(long)]

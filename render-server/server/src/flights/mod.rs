@@ -5,8 +5,96 @@
 //!      people (start, land, stop, reset), from the page
 //! out  events, to runtimes, page and standard output; runs, to the database; crash cards, to the page
 //! ```
+//! Imports none of the other rooms but the database's own files: they all report to this one.
 
+pub mod control_lease;
 pub mod crash;
+pub mod crash_card;
 pub mod events;
 pub mod leaderboard;
+pub mod recent_previews;
+mod recorder;
+pub mod samples;
+pub mod track;
 pub mod vehicle;
+
+pub(crate) use recorder::record;
+
+use std::hash::{BuildHasher, RandomState};
+use std::sync::Arc;
+
+use self::leaderboard::Leaderboard;
+use self::vehicle::VehicleFlight;
+
+/// The flights of all vehicles.
+#[derive(Debug)]
+pub struct Flights {
+    /// Random: a runtime tells by it that the server was restarted.
+    pub instance_id: u64,
+    /// One for each vehicle, at its index; at least one, at most
+    /// [`MAX_VEHICLES`](vizflyt_arena::config::MAX_VEHICLES).
+    pub vehicles: Vec<Arc<VehicleFlight>>,
+    /// The database of runs; `None` if none is kept.
+    pub leaderboard: Option<Leaderboard>,
+}
+
+impl Flights {
+    /// Returns the state of a server that has seen nothing yet.
+    pub fn new(vehicles: Vec<VehicleFlight>, leaderboard: Option<Leaderboard>) -> Self {
+        Self {
+            instance_id: random_instance_id(),
+            vehicles: vehicles.into_iter().map(Arc::new).collect(),
+            leaderboard,
+        }
+    }
+
+    /// Returns the vehicle of this name.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn vehicle(&self, name: &str) -> Result<&Arc<VehicleFlight>, String> {
+        self.vehicles.iter().find(|vehicle| vehicle.name == name).ok_or_else(|| {
+            let names: Vec<_> = self.vehicles.iter().map(|v| format!("'{}'", v.name)).collect();
+            let first = self.vehicles.first().map_or("NAME", |vehicle| &vehicle.name);
+            format!(
+                "no vehicle '{name}' here, only {}; start the runtime with --vehicle {first}",
+                names.join(", ")
+            )
+        })
+    }
+
+    /// Logs a note for the pages of all vehicles; runtimes do not receive it.
+    pub fn note(&self, text: &str) {
+        for vehicle in &self.vehicles {
+            vehicle.note(text);
+        }
+    }
+
+    /// Whether any flight is under way.
+    pub fn any_under_way(&self) -> bool {
+        self.vehicles.iter().any(|vehicle| vehicle.under_way())
+    }
+}
+
+/// Returns a number that no other run has, with negligible probability of a collision; never 0.
+fn random_instance_id() -> u64 {
+    // Keyed by the system's randomness.
+    RandomState::new().hash_one(std::process::id()) | 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_vehicle_is_refused_with_the_names_of_the_known_ones() {
+        let vehicles = ["wasp", "bee"].iter().enumerate();
+        let vehicles = vehicles.map(|(index, name)| vehicle::tests::named(index, name));
+        let flights = Flights::new(vehicles.collect(), None);
+        assert_eq!(flights.vehicle("bee").map(|vehicle| vehicle.index), Ok(1));
+        assert_eq!(
+            flights.vehicle("fly").unwrap_err(),
+            "no vehicle 'fly' here, only 'wasp', 'bee'; start the runtime with --vehicle wasp"
+        );
+    }
+}

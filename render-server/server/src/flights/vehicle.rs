@@ -1,107 +1,59 @@
-//! One vehicle: what a runtime is told of it, its cameras, its lease, and how its flight goes.
+//! One vehicle's flight: who controls it, its events, its course through the room, and its outcome.
 //!
 //! ```text
-//! pose thread ----> pose (watch), track, events ----> session, page
-//! previews -------> previews (watch) ---------------> page
-//! session --------> telemetry (watch), events ------> page, pose thread (phase of flight)
-//! page -----------> events (stop button) -----------> session
+//! pose thread -> track, samples, events --> session, page
+//! previews ----> recent previews ---------> crash card
+//! session -----> telemetry (watch), events -> page, pose thread (phase of flight)
+//! page --------> events (stop button) ----> session
 //! ```
-//! Poses, telemetry and previews are latest-wins; events are a log that every reader reads whole.
+//! Telemetry is latest-wins; events are a log that every reader reads whole.
 
-mod control_lease;
-mod track;
-
-pub use control_lease::{ControlLease, RuntimeInfo, WatchLease};
-pub use track::Track;
-
-use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::pose::PoseQuality;
 use vizflyt_arena::verdict::{Verdict, judge};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, ImuReading, MAX_CAMERAS, Name,
-    PoseSample, Telemetry, Timing, bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, Telemetry, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
+use super::control_lease::{ControlLease, Leases, RuntimeInfo, WatchLease};
+use super::crash_card::CrashCard;
+use super::events::{EventLog, Origin};
+use super::leaderboard::Attempt;
+use super::recent_previews::RecentPreviews;
+use super::samples::Samples;
+use super::track::Track;
 use crate::clock;
-use crate::flights::crash::{CrashCard, RecentPreviews};
-use crate::flights::events::{EventLog, Origin};
-use crate::flights::leaderboard::{Attempt, Samples};
 use crate::lock::lock;
-use crate::poses::drivers::SourceCounters;
-use crate::render::cameras::{CameraSet, Cameras};
-use crate::stats::{CameraDelivery, Connection};
-use crate::stream::delivery::{CameraCounters, DeliveryStats};
-use crate::stream::rate_control::{self, Level};
-use crate::web::previews::Preview;
-
-use control_lease::LeaseState;
 
 /// One vehicle in the arena.
 #[derive(Debug)]
-pub struct Vehicle {
-    /// Its place in [`Hub::vehicles`](crate::hub::Hub::vehicles).
+pub struct VehicleFlight {
+    /// Its index in the state of every room.
     pub index: usize,
     /// The object in the localization system.
     pub name: Name,
-    /// What the runtime gets to know; its cameras are those of the start, see [`Self::welcome`].
+    /// What the runtime is told of the arena; its cameras are those of the start.
     pub arena: ArenaInfo,
-    /// The cameras of this moment.
-    pub cameras: Cameras,
-    /// What happened to it.
+    /// The events of all its flights.
     pub events: EventLog,
-    /// The newest pose.
-    pub pose: watch::Sender<Option<PoseSample>>,
     /// The runtime's newest report.
     pub telemetry: watch::Sender<Option<Telemetry>>,
-    /// Where images get their age, by the runtime's newest report.
-    pub timing: watch::Sender<Option<Timing>>,
-    /// The newest previews, by camera.
-    pub previews: Vec<watch::Sender<Option<Arc<Preview>>>>,
     /// The previews of the last seconds.
-    pub shots: Mutex<RecentPreviews>,
-    /// What its last failed flight looked like at its end.
+    pub previews: Mutex<RecentPreviews>,
+    /// The crash card of its last failed flight.
     pub crash: watch::Sender<Option<Arc<CrashCard>>>,
-    /// Where the vehicle was.
+    /// Where it was in this flight, for the page.
     pub track: Mutex<Track>,
-    /// Where the present flight was, for its verdict.
+    /// Where it was in this flight, for its verdict.
     pub samples: Mutex<Samples>,
-    /// Whose its next flights are.
+    /// The team whose its next flights are.
     pub checked_in: Mutex<Option<CheckIn>>,
-    /// What the localization delivered of it.
-    pub source: Mutex<SourceCounters>,
-    /// How good it is, by the pose filter.
-    pub quality: Mutex<PoseQuality>,
-    /// What its autopilot's IMU felt that the pose thread has not taken yet, oldest first.
-    imu: Mutex<VecDeque<ImuReading>>,
-    /// From the start of drawing until the plugin is given the image, by the runtime's newest
-    /// report; 0 is not known. [ns]
-    seen_after_ns: AtomicU64,
-    /// Its images on their way.
-    pub images: ImageCounters,
-    /// How its images are made, by what its runtime's link carries: number of a [`pace::level`].
-    pub level: AtomicUsize,
-    lease: Mutex<LeaseState>,
+    leases: Leases,
     flight: Mutex<Flight>,
-    delivery: Mutex<DeliveryStats>,
-}
-
-/// What became of a vehicle's images.
-#[derive(Debug, Default)]
-pub struct ImageCounters {
-    /// Images that the runtime acknowledged.
-    pub sent: AtomicU64,
-    /// Images reset past their deadline or refused by the runtime.
-    pub late: AtomicU64,
-    /// Bytes of images acknowledged.
-    pub bytes: AtomicU64,
-    /// What became of each, by camera.
-    pub cameras: [CameraCounters; MAX_CAMERAS],
 }
 
 /// A team that flies a vehicle.
@@ -124,45 +76,41 @@ pub struct Flight {
     pub outcome: Option<Event>,
 }
 
-impl Vehicle {
-    /// Makes the state of a vehicle of which nothing has been heard yet.
-    pub fn new(index: usize, name: &str, arena: ArenaInfo, cameras: Cameras) -> Self {
-        let count = cameras.newest().configs.len();
+impl VehicleFlight {
+    /// Returns the state of a vehicle that has not flown yet.
+    pub fn new(index: usize, name: &str, arena: ArenaInfo) -> Self {
+        let cameras = arena.cameras.len();
         Self {
             index,
             name: bounded(name),
             arena,
-            cameras,
             events: EventLog::default(),
-            pose: watch::Sender::new(None),
             telemetry: watch::Sender::new(None),
-            timing: watch::Sender::new(None),
-            previews: (0..count).map(|_| watch::Sender::new(None)).collect(),
-            shots: Mutex::new(RecentPreviews::of(count)),
+            previews: Mutex::new(RecentPreviews::of(cameras)),
             crash: watch::Sender::new(None),
             track: Mutex::default(),
             samples: Mutex::default(),
             checked_in: Mutex::default(),
-            source: Mutex::default(),
-            quality: Mutex::default(),
-            imu: Mutex::new(VecDeque::with_capacity(IMU_WAITING)),
-            seen_after_ns: AtomicU64::new(0),
-            images: ImageCounters::default(),
-            level: AtomicUsize::new(0),
-            lease: Mutex::default(),
+            leases: Leases::default(),
             flight: Mutex::default(),
-            delivery: Mutex::default(),
         }
     }
 
-    /// Returns how its images are made now.
-    pub fn level(&self) -> &'static Level {
-        rate_control::level(self.level.load(Ordering::Relaxed))
+    /// Grants control to a runtime; see [`Leases::take_control`].
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn take_control(&self, hello: &Hello, address: SocketAddr) -> Result<ControlLease, String> {
+        let (now, under_way) = (clock::now(), self.under_way());
+        self.leases.take_control(&self.name, hello, address, now, under_way, || self.begin())
     }
 
-    /// Returns what a runtime is told of the arena, with the cameras `set`.
-    pub fn welcome(&self, set: &CameraSet) -> ArenaInfo {
-        ArenaInfo { cameras: set.infos.iter().cloned().collect(), ..self.arena.clone() }
+    /// Lets a watcher join.
+    ///
+    /// # Errors
+    /// The reason to refuse, for a person.
+    pub fn watch(&self) -> Result<WatchLease, String> {
+        self.leases.watch(&self.name)
     }
 
     /// Appends to the log what the server or the runtime noticed.
@@ -215,59 +163,6 @@ impl Vehicle {
         }
     }
 
-    /// Takes the runtime's report of times.
-    pub fn report_timing(&self, timing: Timing) {
-        lock(&self.delivery).report(&timing.cameras);
-        let seen = &timing.waterfall;
-        let seen_after_ms = seen.age.p50 - seen.stages.pose.p50;
-        if seen.images > 0 && seen_after_ms > 0.0 {
-            self.seen_after_ns.store((f64::from(seen_after_ms) * 1e6) as u64, Ordering::Relaxed);
-        }
-        self.timing.send_replace(Some(timing));
-    }
-
-    /// Returns how long after the start of drawing the plugin is given an image, by the runtime's
-    /// newest report. [s]
-    pub fn seen_after_s(&self) -> Option<f64> {
-        let ns = self.seen_after_ns.load(Ordering::Relaxed);
-        (ns > 0).then_some(ns as f64 * 1e-9)
-    }
-
-    /// Takes what the autopilot's IMU felt; of more than wait, the oldest go.
-    pub fn feel(&self, readings: &[ImuReading]) {
-        let mut waiting = lock(&self.imu);
-        for &reading in readings {
-            if waiting.len() == IMU_WAITING {
-                waiting.pop_front();
-            }
-            waiting.push_back(reading);
-        }
-    }
-
-    /// Returns the oldest reading of the IMU that waits.
-    pub fn next_feeling(&self) -> Option<ImuReading> {
-        lock(&self.imu).pop_front()
-    }
-
-    /// Returns what became of the images of the present flight, by camera.
-    pub fn accounts(&self) -> Vec<CameraDelivery> {
-        let delivery = lock(&self.delivery);
-        let cameras = self.arena.cameras.iter().zip(&self.images.cameras).enumerate();
-        let account =
-            |(index, (info, counters)): (usize, (&CameraInfo, &CameraCounters))| CameraDelivery {
-                camera: info.name.as_str().to_owned(),
-                account: delivery.account(index, counters),
-            };
-        cameras.map(account).collect()
-    }
-
-    /// Returns how the runtime's connection fares, if there is one.
-    pub fn connection(&self) -> Option<Connection> {
-        let state = self.lock_lease();
-        let (connection, since) = state.connection.as_ref()?;
-        Some(Connection::of(connection, *since))
-    }
-
     /// Returns how the present flight goes.
     pub fn flight(&self) -> Flight {
         lock(&self.flight).clone()
@@ -298,7 +193,7 @@ impl Vehicle {
     }
 
     /// Logs something this server noticed; it goes to the runtime, the page and standard output.
-    pub fn tell(&self, kind: EventKind, text: &str) {
+    pub fn publish(&self, kind: EventKind, text: &str) {
         let event = Event { stamp: clock::now(), kind, text: bounded(text) };
         self.log(Origin::Server, event);
     }
@@ -314,24 +209,24 @@ impl Vehicle {
         self.telemetry.borrow().as_ref().map_or(FlightPhase::Connecting, |report| report.phase)
     }
 
-    /// Returns the runtime that holds the lease.
+    /// Returns the runtime that has control.
     pub fn runtime(&self) -> Option<RuntimeInfo> {
-        self.lock_lease().taken.clone()
+        self.leases.holder()
     }
 
-    /// Returns how many flights have begun: rises when a runtime takes the lease on the ground.
+    /// Returns how many flights have begun: rises when a runtime takes control on the ground.
     pub fn flights(&self) -> u64 {
-        self.lock_lease().flights
+        self.leases.flights()
     }
 
     /// Returns the index of the present flight's first event.
     pub fn first_event(&self) -> u64 {
-        self.lock_lease().flight_start
+        self.leases.first_event()
     }
 
     /// Presses the stop button; returns whether a runtime is there to obey.
     pub fn emergency_stop(&self, by: &str) -> bool {
-        self.tell(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
+        self.publish(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
         self.runtime().is_some()
     }
 
@@ -351,7 +246,7 @@ impl Vehicle {
                 word(phase)
             ));
         }
-        self.tell(EventKind::Start, &format!("start pressed on {by}"));
+        self.publish(EventKind::Start, &format!("start pressed on {by}"));
         Ok(())
     }
 
@@ -363,7 +258,7 @@ impl Vehicle {
         if self.runtime().is_none() {
             return Err(format!("no runtime flies '{}': nobody to land it", self.name));
         }
-        self.tell(EventKind::Land, &format!("land pressed on {by}"));
+        self.publish(EventKind::Land, &format!("land pressed on {by}"));
         Ok(())
     }
 
@@ -372,36 +267,28 @@ impl Vehicle {
     /// # Errors
     /// The reason to refuse, for a person.
     pub fn reset(&self, by: &str) -> Result<(), String> {
-        let mut state = self.lock_lease();
-        if self.under_way() {
-            return Err(format!("'{}' is {}; land it first", self.name, word(self.phase())));
-        }
-        self.begin(&mut state);
-        drop(state);
+        let refuse = || {
+            self.under_way()
+                .then(|| format!("'{}' is {}; land it first", self.name, word(self.phase())))
+        };
+        self.leases.restart(refuse, || self.begin())?;
         self.note(&format!("the run was reset on {by}"));
         Ok(())
     }
 
-    /// Begins a flight.
-    fn begin(&self, state: &mut LeaseState) {
-        state.flights += 1;
-        state.flight_start = self.events.next_index();
+    /// Forgets the former flight; returns the index of the first event of the new one.
+    fn begin(&self) -> u64 {
         self.telemetry.send_replace(None);
-        self.timing.send_replace(None);
-        lock(&self.delivery).begin(&self.images.cameras);
         lock(&self.track).clear();
         *lock(&self.samples) = Samples::default();
         *lock(&self.flight) = Flight::default();
+        self.events.next_index()
     }
 
     /// Whether a flight had begun and not ended when its runtime was last heard.
     pub fn under_way(&self) -> bool {
         use FlightPhase::{Flying, Holding, Landing, TakingOff};
         matches!(self.phase(), TakingOff | Flying | Holding | Landing)
-    }
-
-    fn lock_lease(&self) -> MutexGuard<'_, LeaseState> {
-        lock(&self.lease)
     }
 }
 
@@ -419,7 +306,5 @@ fn word(phase: FlightPhase) -> &'static str {
     }
 }
 
-/// Readings of the IMU that wait for the pose thread at most: 0.6 s at 100 Hz.
-const IMU_WAITING: usize = 64;
 #[cfg(test)]
 pub(crate) mod tests;

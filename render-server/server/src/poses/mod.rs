@@ -2,9 +2,44 @@
 //!
 //! ```text
 //! in   packets of Vicon, NatNet, JSON, MAVLink; IMU readings of the autopilots
-//! out  each vehicle's newest pose, track and quality; the referee's events;
-//!      the newest motions of all vehicles, to the render thread
+//! out  each vehicle's newest pose, its quality, the drivers' counters;
+//!      to `flights`: the referee's events, track and samples
+//!      to `render`: the newest motions of all vehicles
 //! ```
+//! Imports `flights` only.
 
 pub mod drivers;
+pub mod newest;
 pub mod thread;
+mod vehicle;
+
+use std::sync::Mutex;
+
+pub use self::vehicle::VehiclePose;
+use crate::poses::drivers::SourceCounters;
+use crate::timing::StageDurations;
+
+/// The localization of all vehicles.
+#[derive(Debug)]
+pub struct Localization {
+    /// One for each vehicle, at its index.
+    pub vehicles: Vec<VehiclePose>,
+    /// What the sources of poses are called, by their index.
+    pub source_names: Vec<String>,
+    /// What the sources delivered, of all vehicles.
+    pub counters: Mutex<SourceCounters>,
+    /// From the arrival of a pose to the end of filter and referee.
+    pub durations: StageDurations,
+}
+
+impl Localization {
+    /// Returns the state of vehicles that have not been seen yet.
+    pub fn new(vehicles: usize, source_names: Vec<String>) -> Self {
+        Self {
+            vehicles: (0..vehicles).map(|_| VehiclePose::default()).collect(),
+            source_names,
+            counters: Mutex::default(),
+            durations: StageDurations::default(),
+        }
+    }
+}

@@ -12,164 +12,195 @@ use std::time::{Duration, Instant};
 
 use tracing::{trace_span, warn};
 use vizflyt_arena::Referee;
-use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::neighbours::Neighbour;
-use vizflyt_arena::pose::{Motion, Rejected};
+use vizflyt_arena::pose::Rejected;
 use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::time::ServerTime;
 
+use super::Localization;
+use super::drivers::{Measurement, PoseSource, SourceCounters};
+use super::newest::{Localized, NewestPoses, publish};
 use crate::clock;
+use crate::flights::Flights;
 use crate::flights::events::Origin;
-use crate::flights::vehicle::Vehicle;
-use crate::hub::Hub;
+use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
 use crate::mailbox::Mailbox;
-use crate::poses::drivers::{PoseSource, SourceCounters};
+use crate::stop::Stop;
 
-/// The newest poses on their way to the render thread, by vehicle.
-pub type NewestPoses = [Option<Localized>; MAX_VEHICLES];
-
-/// Where a vehicle is, and whereto it moves.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Localized {
-    /// The newest believed pose.
-    pub sample: PoseSample,
-    /// How it moves by all that was read.
-    pub motion: Motion,
+/// What the pose thread owns and whom it reports to.
+#[derive(Debug)]
+pub struct PoseThread {
+    /// Where poses, quality and counters go.
+    pub localization: Arc<Localization>,
+    /// Where events, track and samples go.
+    pub flights: Arc<Flights>,
+    /// The referee of each vehicle, at its index.
+    pub referees: Vec<Referee>,
+    /// Whether the vehicles see and touch each other.
+    pub neighbours: bool,
 }
 
-impl Localized {
-    /// Makes that of a vehicle that stands still.
-    pub fn still(sample: PoseSample) -> Self {
-        Self { sample, motion: Motion::at_rest(sample.stamp, sample.world_from_body) }
+impl PoseThread {
+    /// Takes measurements from `source` until the server stops.
+    pub fn run(mut self, source: &mut dyn PoseSource, newest: &Mailbox<NewestPoses>, stop: &Stop) {
+        let mut watches: Vec<_> =
+            self.flights.vehicles.iter().map(|vehicle| VehicleWatch::of(vehicle)).collect();
+        let mut quality_due = Instant::now() + QUALITY_EVERY;
+        while !stop.is_set() {
+            let due = self.referees.iter().filter_map(Referee::poll_timeout).min();
+            let due = due.map_or(PATIENCE, |due| {
+                Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
+            });
+            let measured = source.receive(due.min(PATIENCE));
+            self.restart_referees(&mut watches);
+            self.take_imu();
+            // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
+            // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
+            let mut judged_at = None;
+            let mut accepted = NewestPoses::default();
+            for measurement in measured {
+                let stamp = self.take(measurement, &mut accepted, &mut watches);
+                judged_at = judged_at.max(stamp);
+                self.localization.durations.add(measurement.arrival, clock::now());
+            }
+            if accepted.iter().any(Option::is_some) {
+                publish(newest, &accepted);
+            }
+            self.judge(judged_at.unwrap_or_else(clock::now));
+            self.count(source, &watches);
+            while let Some(warning) = source.next_warning() {
+                warn!("{warning}");
+                self.flights.note(&warning);
+            }
+            if Instant::now() >= quality_due {
+                quality_due = Instant::now() + QUALITY_EVERY;
+                self.publish_quality();
+            }
+        }
     }
-}
 
-/// Takes poses from `source` until the server stops; `referees` has one for each vehicle.
-pub fn run(
-    hub: &Arc<Hub>,
-    source: &mut dyn PoseSource,
-    referees: &mut [Referee],
-    newest: &Mailbox<NewestPoses>,
-) {
-    let flights = hub.vehicles.iter().map(|vehicle| vehicle.flights());
-    let mut watches: Vec<_> =
-        flights.map(|flights| VehicleWatch { flights, ..VehicleWatch::default() }).collect();
-    let mut quality_told = Instant::now();
-    while !hub.stop.is_set() {
-        let due = referees.iter().filter_map(Referee::poll_timeout).min();
-        let due = due.map_or(PATIENCE, |due| {
-            Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
-        });
-        let measured = source.receive(due.min(PATIENCE));
-        for ((vehicle, referee), watch) in hub.vehicles.iter().zip(&mut *referees).zip(&mut watches)
-        {
-            // A new runtime on the ground is a new flight: course and timer start afresh.
+    /// Restarts course and timer where a new flight has begun: a new runtime on the ground.
+    fn restart_referees(&mut self, watches: &mut [VehicleWatch]) {
+        let vehicles = self.flights.vehicles.iter().zip(&mut self.referees).zip(watches);
+        for ((vehicle, referee), watch) in vehicles {
             let flights = vehicle.flights();
             if flights != watch.flights {
                 watch.flights = flights;
                 referee.restart();
             }
         }
-        for (vehicle, referee) in hub.vehicles.iter().zip(&mut *referees) {
-            while let Some(reading) = vehicle.next_feeling() {
+    }
+
+    fn take_imu(&mut self) {
+        for (vehicle, referee) in self.localization.vehicles.iter().zip(&mut self.referees) {
+            while let Some(reading) = vehicle.pop_imu() {
                 referee.handle_imu(&reading);
             }
         }
-        // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
-        // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
-        let mut judged_at = None;
-        let mut believed = NewestPoses::default();
-        for measured in measured {
-            let index = measured.vehicle;
-            let _span = trace_span!("pose", stamp_ns = measured.stamp.as_ns()).entered();
-            let judging = referees[index].is_judging();
-            match referees[index].handle_measurement(&measured.weighed()) {
-                Ok(sample) => {
-                    judged_at = judged_at.max(Some(sample.stamp));
-                    believed[index] =
-                        referees[index].motion().map(|motion| Localized { sample, motion });
-                    introduce(hub, referees, index);
-                    let vehicle = &hub.vehicles[index];
-                    vehicle.pose.send_replace(Some(sample));
-                    lock(&vehicle.track).add(&sample);
-                    let referee = &referees[index];
-                    // What ends the flight belongs to it.
-                    let ends = judging && !referee.is_judging();
-                    if ends || referee.is_judging() {
-                        let clearance_m = referee.clearance_m(sample.world_from_body.translation_m);
-                        let least_m = referee.least_clearance_m();
-                        let mut samples = lock(&vehicle.samples);
-                        if ends {
-                            samples.end(&sample, clearance_m, least_m);
-                        } else {
-                            samples.add(&sample, clearance_m, least_m);
-                        }
-                    }
-                }
-                // Two frames of one burst may bear the same stamp: no fault of anyone's.
-                Err(Rejected::Stale) => {
-                    watches[index].rejected += 1;
-                    judged_at = judged_at.max(Some(measured.stamp));
-                }
-                Err(reason) => {
-                    let name = hub.source_names.get(usize::from(measured.source));
-                    watches[index].rejected(&hub.vehicles[index], name, reason);
-                }
+    }
+
+    /// Takes one measurement; returns its stamp, unless it was rejected for its contents.
+    fn take(
+        &mut self,
+        measurement: &Measurement,
+        accepted: &mut NewestPoses,
+        watches: &mut [VehicleWatch],
+    ) -> Option<ServerTime> {
+        let index = measurement.vehicle;
+        let _span = trace_span!("pose", stamp_ns = measurement.stamp.as_ns()).entered();
+        let referee = &mut self.referees[index];
+        let was_judging = referee.is_judging();
+        match referee.handle_measurement(&measurement.with_covariance()) {
+            Ok(sample) => {
+                accepted[index] = referee.motion().map(|motion| Localized { sample, motion });
+                self.share_neighbours(index);
+                self.localization.vehicles[index].newest.send_replace(Some(sample));
+                self.record(index, &sample, was_judging);
+                Some(sample.stamp)
             }
-            hub.stats.pose.add(measured.arrival, clock::now());
+            // Two frames of one burst may bear the same stamp: no fault of anyone's.
+            Err(Rejected::Stale) => {
+                watches[index].rejected += 1;
+                Some(measurement.stamp)
+            }
+            Err(reason) => {
+                let name = self.localization.source_names.get(usize::from(measurement.source));
+                watches[index].reject(&self.flights.vehicles[index], name, reason);
+                None
+            }
         }
-        if believed.iter().any(Option::is_some) {
-            publish(newest, &believed);
+    }
+
+    /// Adds a pose to the track and, while the referee judges, to the samples of the flight.
+    fn record(&self, index: usize, sample: &PoseSample, was_judging: bool) {
+        let (vehicle, referee) = (&self.flights.vehicles[index], &self.referees[index]);
+        lock(&vehicle.track).add(sample);
+        // What ends the flight belongs to it.
+        let ends = was_judging && !referee.is_judging();
+        if !(ends || referee.is_judging()) {
+            return;
         }
-        let judged_at = judged_at.unwrap_or_else(clock::now);
-        let mut all = SourceCounters::default();
-        for ((vehicle, referee), watch) in hub.vehicles.iter().zip(&mut *referees).zip(&watches) {
-            referee.handle_timeout(judged_at);
+        let clearance_m = referee.clearance_m(sample.world_from_body.translation_m);
+        let least_m = referee.least_clearance_m();
+        let mut samples = lock(&vehicle.samples);
+        if ends {
+            samples.end(sample, clearance_m, least_m);
+        } else {
+            samples.add(sample, clearance_m, least_m);
+        }
+    }
+
+    /// Tells the other vehicles' referees where a vehicle is.
+    fn share_neighbours(&mut self, index: usize) {
+        if !self.neighbours {
+            return;
+        }
+        let vehicle = &self.flights.vehicles[index];
+        let (name, radius_m) = (vehicle.name.clone(), vehicle.arena.body_radius_m);
+        let motion = self.referees[index].motion();
+        let neighbour = motion.map(|motion| Neighbour { name, motion, radius_m });
+        let others = self.referees.iter_mut().enumerate().filter(|(other, _)| *other != index);
+        for (_, referee) in others {
+            referee.handle_neighbour(index, neighbour.clone());
+        }
+    }
+
+    /// Lets the referees judge what the time alone decides, and logs their events.
+    fn judge(&mut self, at: ServerTime) {
+        for (vehicle, referee) in self.flights.vehicles.iter().zip(&mut self.referees) {
+            referee.handle_timeout(at);
             while let Some(event) = referee.poll_event() {
                 vehicle.log(Origin::Server, event);
             }
-            let own = source.counters(vehicle.index);
-            let own = SourceCounters { rejected: watch.rejected, ..own };
-            *lock(&vehicle.source) = own;
-            if quality_told.elapsed() > QUALITY_EVERY {
-                tell_quality(hub, vehicle, referee);
-            }
+        }
+    }
+
+    /// Publishes what the source delivered, of each vehicle and of all.
+    fn count(&self, source: &dyn PoseSource, watches: &[VehicleWatch]) {
+        let mut all = SourceCounters::default();
+        let vehicles = self.localization.vehicles.iter().zip(watches).enumerate();
+        for (index, (vehicle, watch)) in vehicles {
+            let own = SourceCounters { rejected: watch.rejected, ..source.counters(index) };
+            *lock(&vehicle.counters) = own;
             all = all.and(own);
         }
-        while let Some(warning) = source.next_warning() {
-            warn!("{warning}");
-            hub.note(&warning);
-        }
-        *lock(&hub.source) = all;
-        if quality_told.elapsed() > QUALITY_EVERY {
-            quality_told = Instant::now();
-        }
+        *lock(&self.localization.counters) = all;
     }
-}
 
-/// Tells the other vehicles' referees where a vehicle is.
-fn introduce(hub: &Hub, referees: &mut [Referee], index: usize) {
-    if hub.dynamic_objects.vehicles < 2 {
-        return;
-    }
-    let vehicle = &hub.vehicles[index];
-    let (name, radius_m) = (vehicle.name.clone(), vehicle.arena.body_radius_m);
-    let neighbour = referees[index].motion().map(|motion| Neighbour { name, motion, radius_m });
-    let others = referees.iter_mut().enumerate().filter(|(other, _)| *other != index);
-    for (_, referee) in others {
-        referee.handle_neighbour(index, neighbour.clone());
-    }
-}
-
-/// Tells the page how good a vehicle's localization is.
-fn tell_quality(hub: &Hub, vehicle: &Vehicle, referee: &Referee) {
-    let mut quality = referee.quality(clock::now());
-    for source in &mut quality.sources {
-        if let Some(name) = hub.source_names.get(usize::from(source.source)) {
-            source.name.clone_from(name);
+    /// Publishes how good each vehicle's localization is.
+    fn publish_quality(&self) {
+        for (vehicle, referee) in self.localization.vehicles.iter().zip(&self.referees) {
+            let mut quality = referee.quality(clock::now());
+            for source in &mut quality.sources {
+                let name = self.localization.source_names.get(usize::from(source.source));
+                if let Some(name) = name {
+                    source.name.clone_from(name);
+                }
+            }
+            *lock(&vehicle.quality) = quality;
         }
     }
-    *lock(&vehicle.quality) = quality;
 }
 
 /// What the pose thread remembers of one vehicle.
@@ -181,13 +212,19 @@ struct VehicleWatch {
 }
 
 impl VehicleWatch {
-    fn rejected(&mut self, vehicle: &Vehicle, source: Option<&String>, reason: Rejected) {
+    fn of(vehicle: &VehicleFlight) -> Self {
+        Self { flights: vehicle.flights(), ..Self::default() }
+    }
+
+    /// Counts a rejected measurement, and warns of it at a bounded rate.
+    fn reject(&mut self, vehicle: &VehicleFlight, source: Option<&String>, reason: Rejected) {
         self.rejected += 1;
-        // What is wrong in another way than before is news.
+        // Another kind of rejection than the last one is warned of sooner.
         let kind = std::mem::discriminant(&reason);
-        let told = self.warned.is_some_and(|(at, told)| told == kind && at.elapsed() < WARN_EVERY);
-        let quiet = self.warned.is_some_and(|(at, _)| at.elapsed() < WARN_APART);
-        if told || quiet {
+        let repeated =
+            self.warned.is_some_and(|(at, last)| last == kind && at.elapsed() < WARN_EVERY);
+        let too_soon = self.warned.is_some_and(|(at, _)| at.elapsed() < WARN_APART);
+        if repeated || too_soon {
             return;
         }
         self.warned = Some((Instant::now(), kind));
@@ -197,59 +234,11 @@ impl VehicleWatch {
     }
 }
 
-/// Puts `believed` where the render thread takes it from; what it has not taken yet of vehicles
-/// without a new pose is still their newest.
-fn publish(newest: &Mailbox<NewestPoses>, believed: &NewestPoses) {
-    newest.put_over(*believed, |poses, older| {
-        for (pose, older) in poses.iter_mut().zip(older) {
-            *pose = pose.or(*older);
-        }
-    });
-}
-
-/// Takes the poses of `newer` into `poses`, where there are any.
-pub fn merge(newer: &NewestPoses, poses: &mut NewestPoses) {
-    for (pose, newer) in poses.iter_mut().zip(newer) {
-        *pose = newer.or(*pose);
-    }
-}
-
 /// How long a stop may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
-/// A source that sends nonsense does so 200 times a second.
+/// The period of a repeated warning: a bad source sends 200 packets a second.
 const WARN_EVERY: Duration = Duration::from_secs(5);
-/// Several sources that send different nonsense take turns.
+/// The least time between two warnings: several bad sources alternate.
 const WARN_APART: Duration = Duration::from_secs(1);
-/// How often the page hears of the localization's quality.
+/// The period at which the page is told of the localization's quality.
 const QUALITY_EVERY: Duration = Duration::from_millis(100);
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use vizflyt_protocol::geometry::Pose;
-    use vizflyt_protocol::time::ServerTime;
-
-    #[test]
-    fn what_waits_for_the_render_thread_is_every_vehicles_newest() {
-        let poses = |at_ns: [Option<u64>; 3]| {
-            let mut poses = NewestPoses::default();
-            for (pose, at_ns) in poses.iter_mut().zip(at_ns) {
-                *pose = at_ns.map(|ns| {
-                    let stamp = ServerTime::from_ns(ns);
-                    Localized::still(PoseSample::still(stamp, Pose::IDENTITY))
-                });
-            }
-            poses
-        };
-        let stamps =
-            |poses: &NewestPoses| poses.map(|pose| pose.map(|pose| pose.sample.stamp.as_ns()));
-        let newest = Mailbox::default();
-        publish(&newest, &poses([Some(1), Some(2), None]));
-        publish(&newest, &poses([Some(3), None, None]));
-        publish(&newest, &poses([None, None, Some(4)]));
-        let mut taken = newest.take(Duration::ZERO).unwrap();
-        assert_eq!(stamps(&taken)[..4], [Some(3), Some(2), Some(4), None]);
-        merge(&poses([None, Some(5), None]), &mut taken);
-        assert_eq!(stamps(&taken)[..4], [Some(3), Some(5), Some(4), None]);
-    }
-}

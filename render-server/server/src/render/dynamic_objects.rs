@@ -13,7 +13,7 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::models::{QUADROTOR, boxes};
 use vizflyt_splat::{Placement, RigidObject};
 
-use crate::poses::thread::NewestPoses;
+use crate::poses::newest::NewestPoses;
 use crate::scene::bounds_m;
 
 /// The objects of the renderer's scene, in its order.
@@ -103,7 +103,7 @@ impl DynamicObjects {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::poses::thread::Localized;
+    use crate::poses::newest::Localized;
     use glam::{DQuat, DVec3};
     use vizflyt_arena::config::{MotionConfig, ObjectConfig};
     use vizflyt_protocol::messages::PoseSample;

@@ -1,15 +1,47 @@
 //! What the cameras see: newest motions in, rendered ticks out.
 //!
 //! ```text
-//! in   the newest motions of all vehicles, from the pose thread; which cameras are wanted
+//! in   the newest motions of all vehicles, from `poses`; the demand for images, from `stream`
 //! out  rendered ticks (RGB, depth, object ids), to the encode thread and then to the previews
 //! ```
+//! Imports `scene`, `poses` and `flights`; `stream` tells its wishes through [`demand::Demand`].
 
 pub mod cameras;
+pub mod demand;
 pub mod dynamic_objects;
 pub mod environment;
 pub mod rendered;
 mod renderer;
 pub mod thread;
 
-pub use renderer::{RendererKind, choose};
+use std::sync::Mutex;
+use std::sync::atomic::AtomicU64;
+
+use vizflyt_arena::pose::Predict;
+
+use self::cameras::Cameras;
+use self::dynamic_objects::DynamicObjects;
+use self::environment::Environment;
+pub use self::renderer::{RendererInfo, RendererKind, choose};
+use crate::timing::StageDurations;
+
+/// What is rendered, and how.
+#[derive(Debug, Default)]
+pub struct Rendering {
+    /// The cameras of each vehicle, at its index.
+    pub cameras: Vec<Cameras>,
+    /// Light and fog.
+    pub environment: Environment,
+    /// Moving objects, and the vehicles as the others see them.
+    pub dynamic_objects: DynamicObjects,
+    /// The instant that images show.
+    pub predict: Predict,
+    /// Which renderer renders, and why; another one may take over in flight.
+    pub renderer: Mutex<RendererInfo>,
+    /// Rendering all cameras of a tick.
+    pub durations: StageDurations,
+    /// Ticks rendered.
+    pub ticks: AtomicU64,
+    /// Ticks rendered that were replaced by the next one before anyone took them.
+    pub ticks_skipped: AtomicU64,
+}

@@ -4,7 +4,17 @@ use std::fmt;
 
 use anyhow::{Context, Result};
 use clap::ValueEnum;
+use serde::Serialize;
 use vizflyt_splat::{Backend, Chosen, Scene};
+
+/// Which renderer renders, for reports and the page.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct RendererInfo {
+    /// What it runs on: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
+    pub name: String,
+    /// Why it is this one.
+    pub reason: String,
+}
 
 /// Values of `--renderer`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]

@@ -21,13 +21,16 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::{Camera, Placement, Rasterizer, RgbdImage};
 
 use crate::clock;
-use crate::hub::{Hub, RendererInfo};
+use crate::flights::Flights;
 use crate::lock::lock;
 use crate::mailbox::Mailbox;
-use crate::poses::thread::{Localized, NewestPoses, merge};
+use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
+use crate::render::demand::Demand;
 use crate::render::environment::air;
 use crate::render::rendered::RenderQueue;
+use crate::render::{RendererInfo, Rendering};
+use crate::stop::Stop;
 
 /// Draws the newest poses until the server stops: each tick the cameras that are due of the
 /// vehicles that someone wants images of.
@@ -35,16 +38,17 @@ use crate::render::rendered::RenderQueue;
 /// # Errors
 /// None; a camera that the renderer refuses is logged once and the tick left out.
 pub fn run(
-    hub: &Arc<Hub>,
+    (rendering, flights, demand): (&Rendering, &Flights, &impl Demand),
     renderer: &mut dyn Rasterizer,
     newest: &Mailbox<NewestPoses>,
     ticks: &RenderQueue,
     max_rate_hz: f64,
+    stop: &Stop,
 ) {
     let schedule = Schedule::new(max_rate_hz, Instant::now());
-    let mut schedules = vec![schedule; hub.vehicles.len()];
+    let mut schedules = vec![schedule; rendering.cameras.len()];
     let mut sets: Vec<Arc<CameraSet>> = Vec::with_capacity(MAX_VEHICLES);
-    let mut drawn_cameras: [RenderedCameras; MAX_VEHICLES] = Default::default();
+    let mut rendered_cameras: [RenderedCameras; MAX_VEHICLES] = Default::default();
     let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS);
     // The renderer wants the images of the cameras that are due side by side.
     let mut images: Vec<RgbdImage> = Vec::new();
@@ -52,14 +56,15 @@ pub fn run(
     let (mut poses, mut known) = (NewestPoses::default(), NewestPoses::default());
     let mut placements: Vec<Placement> = Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES);
     let (mut seq, mut refused) = (0u64, false);
-    while !hub.stop.is_set() {
-        let wanted = hub.subscriptions.wait_for_interest(PATIENCE);
+    while !stop.is_set() {
+        let wanted = demand.wait_for_interest(PATIENCE);
         if !wanted.contains(&true) {
             continue;
         }
         sets.clear();
-        sets.extend(hub.vehicles.iter().zip(&mut drawn_cameras).map(|(vehicle, drawn)| {
-            drawn.follow(vehicle.cameras.newest(), vehicle.level().shrink)
+        let vehicles = rendering.cameras.iter().zip(&mut rendered_cameras).enumerate();
+        sets.extend(vehicles.map(|(vehicle, (cameras, rendered))| {
+            rendered.follow(cameras.newest(), demand.shrink(vehicle))
         }));
         let now = Instant::now();
         let ready = (0..sets.len()).filter(|&index| wanted[index] && poses[index].is_some());
@@ -80,7 +85,7 @@ pub fn run(
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
         cameras.clear();
-        let air = air(&hub.environment.now());
+        let air = air(&rendering.environment.now());
         let mut views = [View::default(); MAX_VEHICLES];
         for (vehicle, set) in sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
@@ -91,9 +96,10 @@ pub fn run(
             if due.contains(&true) {
                 poses[vehicle] = None;
             }
-            let after_s = hub.vehicles[vehicle].seen_after_s();
-            let shown = sample.map(|newest| shown(hub.predict, after_s, &newest, clock::now()));
-            let flies = hub.vehicles[vehicle].runtime().is_some();
+            let after_s = demand.seen_after_s(vehicle);
+            let shown =
+                sample.map(|newest| shown(rendering.predict, after_s, &newest, clock::now()));
+            let flies = flights.vehicles[vehicle].runtime().is_some();
             let first = cameras.len();
             for (camera, slot) in slots.by_ref().take(set.configs.len()).enumerate() {
                 slot.fresh = due[camera];
@@ -127,14 +133,14 @@ pub fn run(
         let images = &mut images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| {
-            if hub.dynamic_objects.is_empty() {
+            if rendering.dynamic_objects.is_empty() {
                 return renderer.render(&[], &cameras, images).map(|_| ());
             }
             // Each vehicle sees the moment that its images show, and not itself.
             let drawn = views.iter().enumerate().filter(|(_, view)| view.first < view.end);
             drawn.into_iter().try_for_each(|(vehicle, &View { first, end, at })| {
                 placements.clear();
-                hub.dynamic_objects.place(at, vehicle, &known, &mut placements);
+                rendering.dynamic_objects.place(at, vehicle, &known, &mut placements);
                 let images = &mut images[first..end];
                 renderer.render(&placements, &cameras[first..end], images).map(|_| ())
             })
@@ -147,16 +153,16 @@ pub fn run(
         }
         match result {
             Ok(()) => {
-                hub.stats.render.add(start, end);
+                rendering.durations.add(start, end);
                 if seq.is_multiple_of(NAME_TICKS) {
-                    note_renderer(hub, renderer);
+                    note_renderer(rendering, flights, renderer);
                 }
                 for slot in tick.slots.iter().filter(|slot| slot.fresh && slot.counted) {
-                    hub.vehicles[slot.vehicle].images.cameras[slot.camera].count_rendered();
+                    demand.count_rendered(slot.vehicle, slot.camera);
                 }
-                let skipped = ticks.publish(tick, hub.wants_previews());
-                hub.stats.ticks.fetch_add(1, Ordering::Relaxed);
-                hub.stats.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
+                let skipped = ticks.publish(tick, demand.has_viewers() || flights.any_under_way());
+                rendering.ticks.fetch_add(1, Ordering::Relaxed);
+                rendering.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
             }
             Err(error) => {
                 if !std::mem::replace(&mut refused, true) {
@@ -194,15 +200,15 @@ fn shown(
 }
 
 /// Tells when another renderer has taken over, as the processor does from a lost graphics device.
-fn note_renderer(hub: &Hub, renderer: &dyn Rasterizer) {
+fn note_renderer(rendering: &Rendering, flights: &Flights, renderer: &dyn Rasterizer) {
     let name = renderer.name();
-    let mut info = lock(&hub.renderer);
+    let mut info = lock(&rendering.renderer);
     if info.name != name {
         let text = format!("the renderer is now {name}");
         *info = RendererInfo { name: name.into_owned(), reason: "took over in flight".to_owned() };
         drop(info);
-        for vehicle in &hub.vehicles {
-            vehicle.tell(EventKind::Note, &text);
+        for vehicle in &flights.vehicles {
+            vehicle.publish(EventKind::Note, &text);
         }
     }
 }

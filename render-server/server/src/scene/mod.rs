@@ -187,6 +187,20 @@ fn read(path: &Path) -> Result<Loaded> {
 /// Shorter loads need no progress.
 const TELL_EVERY: Duration = Duration::from_secs(1);
 
+/// Parses metres per unit of a bare scene.
+///
+/// # Errors
+/// What is no number, or no scale that a scene has.
+pub fn parse_scale(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
+    let (least, most) = (1e-4, 1e4);
+    if (least..=most).contains(&value) {
+        Ok(value)
+    } else {
+        Err(format!("{value} is outside {least} to {most}"))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

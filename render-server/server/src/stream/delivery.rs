@@ -97,6 +97,16 @@ pub struct Delivery {
     pub skipped: Skipped,
 }
 
+/// What became of the images of one camera.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraDelivery {
+    /// Its name.
+    pub camera: String,
+    /// The counts.
+    #[serde(flatten)]
+    pub account: Delivery,
+}
+
 /// Images skipped, by reason, in the order of their way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skipped {

@@ -1,6 +1,6 @@
 //! Who wants images at this moment, and the vehicle out to them.
 //!
-//! A vehicle's images go to its runtime and to any number of watchers, at most [`MOST_WATCHERS`].
+//! A vehicle's images go to its runtime and to any number of watchers, at most [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS).
 //! For each camera at most K images may be in flight to each of them (handed to the transport, not
 //! yet acknowledged). The encode thread takes the newest drawn tick only when someone has room, so
 //! that what waits is always the newest, and nothing is encoded that could not leave; an image is
@@ -335,8 +335,6 @@ impl Subscriptions {
 
 /// 100 ms of round trip at 70 Hz; more would only queue.
 pub const MOST_IN_FLIGHT: u32 = 8;
-/// A class that looks on; each costs a connection and its share of the network.
-pub const MOST_WATCHERS: usize = 8;
 /// The transport gives an image up after as long. [s]
 const STALLED_S: f64 = 0.15;
 /// How late a stalled runtime is noticed at most.

@@ -308,7 +308,7 @@ pub(super) async fn guard(
     next: Next,
 ) -> Response {
     // This connection outlived its round: the next one of the same browser meets the new round.
-    if page.hub.stop.is_set() {
+    if page.rooms.stop.is_set() {
         let close = [(header::CONNECTION, "close")];
         return (StatusCode::SERVICE_UNAVAILABLE, close, "the server ends or changes its scene")
             .into_response();

@@ -20,7 +20,7 @@ pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
     };
-    let set = vehicle.cameras.newest();
+    let set = page.rooms.rendering.cameras[vehicle.index].newest();
     Json(set.configs.iter().map(messages::camera_keys).collect::<Vec<_>>()).into_response()
 }
 
@@ -62,12 +62,13 @@ fn change(
         Ok(body) => body,
         Err(rejection) => return rejection.into_response(),
     };
-    let before = vehicle.cameras.newest();
-    match apply(&vehicle.cameras, &body) {
+    let cameras = &page.rooms.rendering.cameras[vehicle.index];
+    let before = cameras.newest();
+    match apply(cameras, &body) {
         Ok(camera) => {
             // The same again is no news.
-            if !Arc::ptr_eq(&before, &vehicle.cameras.newest()) {
-                vehicle.tell(EventKind::Note, &describe(&camera));
+            if !Arc::ptr_eq(&before, &cameras.newest()) {
+                vehicle.publish(EventKind::Note, &describe(&camera));
             }
             Json(messages::camera_keys(&camera)).into_response()
         }

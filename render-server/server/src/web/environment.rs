@@ -28,7 +28,7 @@ struct Told {
 
 /// Tells the environment.
 pub(super) async fn get(State(page): State<Arc<Page>>) -> Response {
-    Json(told(page.hub.environment.now())).into_response()
+    Json(told(page.rooms.rendering.environment.now())).into_response()
 }
 
 /// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
@@ -45,10 +45,10 @@ pub(super) async fn change(
         Ok(environment) => environment,
         Err(why) => return (StatusCode::BAD_REQUEST, why).into_response(),
     };
-    match page.hub.environment.change(environment) {
+    match page.rooms.rendering.environment.change(environment) {
         Ok(true) => {
             let name = environment.name().unwrap_or("the page's own");
-            page.hub.note(&format!("light and fog are changed to: {name}"));
+            page.rooms.flights.note(&format!("light and fog are changed to: {name}"));
         }
         // The same again is no news.
         Ok(false) => {}

@@ -16,7 +16,7 @@ use super::{Page, origin, refuse, vehicle};
 use crate::flights::leaderboard::{
     Attempt, GradeBoard, LeaderboardError, Run, Standing, grade_boards, standings,
 };
-use crate::flights::vehicle::CheckIn;
+use crate::flights::vehicle::{CheckIn, VehicleFlight};
 use crate::lock::lock;
 
 /// What the page and the wall show.
@@ -49,8 +49,8 @@ struct Flyer {
 
 /// `GET /api/leaderboard`: the standings of the course that is flown here.
 pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
-    let Some(board) = &page.hub.leaderboard else { return none_kept() };
-    let course = page.hub.vehicles[0].arena.name.as_str().to_owned();
+    let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
+    let course = page.rooms.flights.vehicles[0].arena.name.as_str().to_owned();
     let runs = match board.runs(Some(&course)).await {
         Ok(runs) => runs,
         Err(error) => return failed(&error),
@@ -60,7 +60,7 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
         Err(error) => return failed(&error),
     };
     let now = crate::clock::now();
-    let flyer = |vehicle: &Arc<crate::flights::vehicle::Vehicle>| {
+    let flyer = |vehicle: &Arc<VehicleFlight>| {
         let (by, flight) = (lock(&vehicle.checked_in).clone(), vehicle.flight());
         let flight_s = flight.took_off.filter(|_| flight.landed.is_none());
         Flyer {
@@ -75,7 +75,7 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
         official: standings(&runs, &course, Attempt::Official),
         practice: standings(&runs, &course, Attempt::Practice),
         graded: grade_boards(&grades),
-        vehicles: page.hub.vehicles.iter().map(flyer).collect(),
+        vehicles: page.rooms.flights.vehicles.iter().map(flyer).collect(),
         newest: runs.into_iter().take(NEWEST).collect(),
         course,
     };
@@ -100,7 +100,7 @@ pub(super) async fn check_in(
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     Json(asked): Json<CheckingIn>,
 ) -> Response {
-    let Some(board) = &page.hub.leaderboard else { return none_kept() };
+    let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
     let Some(token) = &asked.token else {
         return (StatusCode::BAD_REQUEST, "give the team's token").into_response();
     };
@@ -129,7 +129,7 @@ pub(super) async fn assign(
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
-    let Some(board) = &page.hub.leaderboard else { return none_kept() };
+    let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
     let teams = match board.teams().await {
         Ok(teams) => teams,
         Err(error) => return failed(&error),

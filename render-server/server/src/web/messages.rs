@@ -13,13 +13,14 @@ use vizflyt_protocol::time::ServerTime;
 use super::Page;
 use crate::clock;
 use crate::flights::events::{Entry, Origin};
-use crate::flights::vehicle::Vehicle;
-use crate::hub::RendererInfo;
+use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
 use crate::poses::drivers::SourceCounters;
+use crate::render::RendererInfo;
 use crate::render::cameras::CameraSet;
 use crate::render::dynamic_objects::{DynamicObjects, ObjectBounds};
-use crate::stats::Rate;
+use crate::stream::Rooms;
+use crate::timing::RateMeter;
 use crate::web::top_view::Obstacles;
 
 /// Server to page.
@@ -148,40 +149,40 @@ struct RuntimeLine {
 /// Rates that all viewers share.
 #[derive(Debug, Default)]
 pub(crate) struct Rates {
-    ticks: Rate,
+    ticks: RateMeter,
     vehicles: Vec<VehicleRates>,
 }
 
 /// Rates of one vehicle.
 #[derive(Debug, Default)]
 struct VehicleRates {
-    images: Rate,
-    bytes: Rate,
-    poses: Rate,
+    images: RateMeter,
+    bytes: RateMeter,
+    poses: RateMeter,
 }
 
 impl Rates {
     /// Returns those of this many vehicles.
     pub(crate) fn of(vehicles: usize) -> Self {
         let vehicles = std::iter::repeat_with(VehicleRates::default).take(vehicles).collect();
-        Self { ticks: Rate::default(), vehicles }
+        Self { ticks: RateMeter::default(), vehicles }
     }
 }
 
-pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a Vehicle) -> Message<'a> {
+pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a VehicleFlight) -> Message<'a> {
     let info = &vehicle.arena;
     Message::Arena(Box::new(Arena {
         boot: page.boot.as_ns().to_string(),
         name: &info.name,
         vehicle: &vehicle.name,
-        vehicles: page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect(),
+        vehicles: page.rooms.flights.vehicles.iter().map(|vehicle| &*vehicle.name).collect(),
         fence: &info.geofence,
         goal_m: info.goal_m.map(|goal| goal.to_array()),
         goal_radius_m: info.goal_radius_m,
         body_radius_m: info.body_radius_m,
         max_speed_mps: info.limits.max_speed_mps,
         time_limit_s: info.time_limit_s,
-        cameras: camera_lines(&vehicle.cameras.newest()),
+        cameras: camera_lines(&page.rooms.rendering.cameras[vehicle.index].newest()),
         map_min_m: page.top_view.min_m,
         map_max_m: page.top_view.max_m,
         obstacles: &page.top_view.obstacles,
@@ -228,16 +229,17 @@ pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
     Message::Events { events: entries.into_iter().map(line).collect() }
 }
 
-pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
-    let hub = &page.hub;
+pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
+    let Rooms { localization, rendering, streaming, .. } = &page.rooms;
+    let (localized, stream) =
+        (&localization.vehicles[vehicle.index], &streaming.vehicles[vehicle.index]);
     let rates = &page.rates.vehicles[vehicle.index];
     let now = clock::now();
     let flight = vehicle.flight();
-    let source = *lock(&vehicle.source);
+    let source = *lock(&localized.counters);
     let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
-    let stats = &hub.stats;
     Message::State(Box::new(State {
-        pose: (*vehicle.pose.borrow()).map(|sample| PoseLine {
+        pose: (*localized.newest.borrow()).map(|sample| PoseLine {
             p_world_m: sample.world_from_body.translation_m.to_array(),
             yaw_rad: yaw_of(sample.world_from_body.rotation),
             rotation: sample.world_from_body.rotation.to_array(),
@@ -249,16 +251,16 @@ pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
             program: runtime.program.as_str().to_owned(),
         }),
         report: vehicle.telemetry.borrow().clone(),
-        render: stats.render.recent(),
-        encode: stats.encode.recent(),
-        send: stats.send.recent(),
-        renderer: lock(&hub.renderer).clone(),
-        render_hz: page.rates.ticks.of(total(&stats.ticks), now),
-        stream_hz: rates.images.of(total(&vehicle.images.sent), now),
-        stream_mbit_s: rates.bytes.of(total(&vehicle.images.bytes), now) * 8e-6,
-        images_late: total(&vehicle.images.late),
+        render: rendering.durations.recent(),
+        encode: streaming.encode_durations.recent(),
+        send: streaming.send_durations.recent(),
+        renderer: lock(&rendering.renderer).clone(),
+        render_hz: page.rates.ticks.of(page.rooms.ticks(), now),
+        stream_hz: rates.images.of(total(&stream.images.sent), now),
+        stream_mbit_s: rates.bytes.of(total(&stream.images.bytes), now) * 8e-6,
+        images_late: total(&stream.images.late),
         source,
-        quality: lock(&vehicle.quality).clone(),
+        quality: lock(&localized.quality).clone(),
         source_hz: rates.poses.of(source.poses, now),
         flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
         landed: flight.landed.is_some(),
@@ -266,7 +268,7 @@ pub(super) fn state(page: &Page, vehicle: &Vehicle) -> Message<'static> {
             .outcome
             .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
         crash: vehicle.crash.borrow().as_ref().map(|card| card.id),
-        objects: objects(&hub.dynamic_objects, now),
+        objects: objects(&rendering.dynamic_objects, now),
     }))
 }
 

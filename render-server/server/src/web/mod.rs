@@ -60,6 +60,7 @@ mod viewer;
 pub use access::{Access, Login, Logins, PageKeys, Takes};
 pub use login::set_password;
 pub use routes::list as routes;
+pub use stats::{ServerStages, VehicleStats};
 pub use view::{ViewArgs, view};
 
 use std::net::SocketAddr;
@@ -80,17 +81,19 @@ use vizflyt_arena::config::StageConfig;
 use vizflyt_protocol::time::ServerTime;
 
 use self::access::Shown;
+use self::previews::Previews;
 use crate::authorization::Authorizer;
-use crate::flights::vehicle::Vehicle;
-use crate::hub::Hub;
+use crate::flights::vehicle::VehicleFlight;
 use crate::rate_limit::RateLimiter;
 use crate::scene::Scenes;
+use crate::stream::Rooms;
 use crate::web::top_view::TopView;
 
 /// What the page's handlers share.
 #[derive(Debug)]
 pub(crate) struct Page {
-    pub(crate) hub: Arc<Hub>,
+    pub(crate) rooms: Rooms,
+    pub(crate) previews: Arc<Previews>,
     pub(crate) top_view: TopView,
     /// The course's gates, for the top view.
     pub(crate) stages: Vec<StageConfig>,
@@ -125,7 +128,7 @@ pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
 
 /// Serves the page until the server stops.
 pub(crate) async fn serve(page: Page, listener: TcpListener) -> Result<()> {
-    let stop = page.hub.stop.clone();
+    let stop = page.rooms.stop.clone();
     let router = routes::router(Arc::new(page)).into_make_service_with_connect_info::<SocketAddr>();
     // Dropped at the stop rather than drained: WebSockets would drain for ever.
     tokio::select! {
@@ -163,10 +166,14 @@ fn picture(kind: &'static str, bytes: Bytes) -> Response {
 }
 
 /// Returns the vehicle of this name, or the answer that there is none.
-pub(crate) fn vehicle<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<Vehicle>, Box<Response>> {
-    let found = page.hub.vehicles.iter().find(|vehicle| vehicle.name == name);
+pub(crate) fn vehicle<'a>(
+    page: &'a Page,
+    name: &str,
+) -> Result<&'a Arc<VehicleFlight>, Box<Response>> {
+    let found = page.rooms.flights.vehicles.iter().find(|vehicle| vehicle.name == name);
     found.ok_or_else(|| {
-        let names: Vec<_> = page.hub.vehicles.iter().map(|vehicle| &*vehicle.name).collect();
+        let names: Vec<_> =
+            page.rooms.flights.vehicles.iter().map(|vehicle| &*vehicle.name).collect();
         let text = format!("there is no vehicle '{name}'; there are {}", names.join(", "));
         Box::new((StatusCode::NOT_FOUND, text).into_response())
     })
@@ -200,7 +207,7 @@ async fn watch(
         return refuse(&refusal);
     }
     let named = watched.vehicle.map(|name| vehicle(&page, &name).cloned());
-    let vehicle = match named.unwrap_or_else(|| Ok(page.hub.vehicles[0].clone())) {
+    let vehicle = match named.unwrap_or_else(|| Ok(page.rooms.flights.vehicles[0].clone())) {
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
     };

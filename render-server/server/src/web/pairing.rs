@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Grant;
 
 use super::{Page, origin, refuse};
-use crate::args;
+use crate::authorization::parse_grant;
 
 /// How pairing stands.
 #[derive(Debug, Serialize)]
-struct Standing {
+struct PairingStatus {
     /// The open pairing.
     open: Option<Open>,
     /// What came of the newest attempt.
@@ -56,13 +56,13 @@ pub(super) async fn open(
         return refuse(&refusal);
     }
     let wish = serde_json::from_slice::<Wish>(&body).map_err(|error| error.to_string());
-    let grant = match wish.and_then(|wish| args::grant(&wish.right)) {
+    let grant = match wish.and_then(|wish| parse_grant(&wish.right)) {
         Ok(grant) => grant,
         Err(error) => return (StatusCode::BAD_REQUEST, error).into_response(),
     };
     if let Grant::Team { vehicles } = &grant
         && let Some(Err(unknown)) =
-            vehicles.iter().map(|v| page.hub.vehicle(v)).find(Result::is_err)
+            vehicles.iter().map(|v| page.rooms.flights.vehicle(v)).find(Result::is_err)
     {
         return (StatusCode::BAD_REQUEST, unknown).into_response();
     }
@@ -94,9 +94,12 @@ fn tell(page: &Page) -> Response {
         left_s: window.left.as_secs_f64(),
         tries_left: window.tries_left,
     });
-    let mut response =
-        Json(Standing { open, news: page.authorizer.newest_pairing_news(), port: page.quic_port })
-            .into_response();
+    let mut response = Json(PairingStatus {
+        open,
+        news: page.authorizer.newest_pairing_news(),
+        port: page.quic_port,
+    })
+    .into_response();
     let no_store = axum::http::HeaderValue::from_static("no-store");
     response.headers_mut().insert(axum::http::header::CACHE_CONTROL, no_store);
     response

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
+use tokio::sync::watch;
 use tracing::warn;
 use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::crash::ahead_m;
@@ -16,32 +17,51 @@ use vizflyt_protocol::messages::MAX_CAMERAS;
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{DepthKind, RgbdImage};
 
-use crate::hub::Hub;
+use crate::flights::Flights;
+use crate::flights::recent_previews::Preview;
 use crate::lock::lock;
 use crate::render::rendered::RenderQueue;
+use crate::stop::Stop;
+use crate::stream::subscriptions::Subscriptions;
 
-/// Two small pictures for the page.
-#[derive(Debug, Default)]
-pub struct Preview {
-    /// JPEG of the colour image.
-    pub colour: Vec<u8>,
-    /// JPEG of the depth image, coloured by [`depth_colour`].
-    pub depth: Vec<u8>,
-    /// JPEG of which object is seen where, coloured by [`id_colour`]; empty where none was seen yet.
-    pub ids: Vec<u8>,
-    /// What is ahead: [`vizflyt_arena::crash::ahead_m`]. [m, cam]
-    pub ahead_m: Option<f64>,
+/// The newest previews, by vehicle and camera; latest-wins.
+#[derive(Debug)]
+pub struct Previews(Vec<Vec<watch::Sender<Option<Arc<Preview>>>>>);
+
+impl Previews {
+    /// Returns those of vehicles with this many cameras each: none yet.
+    pub fn new(cameras: &[usize]) -> Self {
+        let of = |&count: &usize| (0..count).map(|_| watch::Sender::new(None)).collect();
+        Self(cameras.iter().map(of).collect())
+    }
+
+    fn publish(&self, vehicle: usize, camera: usize, preview: Arc<Preview>) {
+        if let Some(newest) = self.0.get(vehicle).and_then(|cameras| cameras.get(camera)) {
+            newest.send_replace(Some(preview));
+        }
+    }
+
+    /// Returns a receiver of each camera's newest preview.
+    pub(super) fn subscribe(&self, vehicle: usize) -> Vec<watch::Receiver<Option<Arc<Preview>>>> {
+        self.0[vehicle].iter().map(watch::Sender::subscribe).collect()
+    }
 }
 
 /// Makes previews until the server stops.
-pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue) {
+pub fn run(
+    previews: &Previews,
+    flights: &Flights,
+    subscriptions: &Subscriptions,
+    ticks: &RenderQueue,
+    stop: &Stop,
+) {
     let mut stage = Stage::new();
     let mut turns = [[Turn { due: Instant::now(), seq: 0 }; MAX_CAMERAS]; MAX_VEHICLES];
-    while !hub.stop.is_set() {
+    while !stop.is_set() {
         let Some(tick) = ticks.take_spent(PATIENCE) else { continue };
-        let watched = hub.subscriptions.watched();
+        let watched = subscriptions.watched();
         for slot in tick.slots.iter().filter(|slot| slot.fresh) {
-            let vehicle = &hub.vehicles[slot.vehicle];
+            let vehicle = &flights.vehicles[slot.vehicle];
             let rate_hz = if watched[slot.vehicle] {
                 PREVIEW_HZ
             } else if vehicle.under_way() {
@@ -58,10 +78,8 @@ pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue) {
             match stage.preview(&slot.image) {
                 Ok(preview) => {
                     let preview = Arc::new(preview);
-                    lock(&vehicle.shots).add(slot.camera, slot.shown, preview.clone());
-                    if let Some(place) = vehicle.previews.get(slot.camera) {
-                        place.send_replace(Some(preview));
-                    }
+                    lock(&vehicle.previews).add(slot.camera, slot.shown, preview.clone());
+                    previews.publish(slot.vehicle, slot.camera, preview);
                 }
                 Err(error) => warn!("{}: camera {}: {error:#}", vehicle.name, slot.camera),
             }

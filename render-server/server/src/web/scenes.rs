@@ -53,7 +53,7 @@ pub(super) async fn change(
         Ok(wish) => wish,
         Err(refusal) => return *refusal,
     };
-    if let Some(flying) = page.hub.vehicles.iter().find(|vehicle| vehicle.under_way()) {
+    if let Some(flying) = page.rooms.flights.vehicles.iter().find(|vehicle| vehicle.under_way()) {
         let text = format!("'{}' flies; land it first", flying.name);
         return (StatusCode::CONFLICT, text).into_response();
     }
@@ -63,9 +63,9 @@ pub(super) async fn change(
     let chosen = tokio::task::spawn_blocking(move || scenes.choose(&chosen)).await;
     match chosen {
         Ok(Ok(())) => {
-            page.hub.note(&format!("the scene is changed to '{name}' on the page"));
+            page.rooms.flights.note(&format!("the scene is changed to '{name}' on the page"));
             // The server ends this round of serving, and begins the next one with that scene.
-            page.hub.stop.set();
+            page.rooms.stop.set();
             (StatusCode::ACCEPTED, "the scene changes; the page comes back by itself")
                 .into_response()
         }

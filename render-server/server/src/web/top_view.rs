@@ -8,6 +8,7 @@
 use axum::body::Bytes;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
+use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
@@ -25,6 +26,29 @@ pub struct TopView {
     pub obstacles: Obstacles,
     /// The surface of what is solid: [`shell`].
     pub shell: Bytes,
+}
+
+impl TopView {
+    /// Renders the top view of a scene, at the height that is flown at.
+    pub(crate) fn render(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Self {
+        let (min, max) = (arena.geofence.min_m.truncate(), arena.geofence.max_m.truncate());
+        let flight_m = arena.spawn.position_m.z + arena.takeoff_height_m;
+        let obstacles = Obstacles::scan(min, max, arena.occupancy.voxel_m, |p: DVec2| {
+            field.obstacle_distance_m(p.extend(flight_m)) < 0.0
+        });
+        let jpeg = picture(splats, min, max, flight_m + MAP_HEADROOM_M);
+        let (low, high) = (arena.geofence.min_m, arena.geofence.max_m);
+        let shell = shell(low, high, arena.occupancy.voxel_m, |p, within_m| {
+            field.obstacle_distance_m(p) < within_m
+        });
+        Self {
+            shell,
+            jpeg: jpeg.unwrap_or_default(),
+            min_m: min.to_array(),
+            max_m: max.to_array(),
+            obstacles,
+        }
+    }
 }
 
 /// A grid of solid cells.
@@ -212,6 +236,9 @@ const MOST_SAMPLES: f64 = 400_000.0;
 const MOST_SHELL: usize = 60_000;
 /// 64 KB of bits at most.
 const MOST_CELLS: usize = 720;
+
+/// What hangs this far above the flight is still drawn on the map. [m]
+const MAP_HEADROOM_M: f64 = 0.4;
 
 #[cfg(test)]
 mod tests {

@@ -11,7 +11,7 @@ use vizflyt_protocol::messages::FlightPhase;
 
 use super::access::Viewer;
 use super::{Page, origin, refuse, vehicle};
-use crate::flights::vehicle::Vehicle;
+use crate::flights::vehicle::VehicleFlight;
 
 /// A vehicle in the list.
 #[derive(Debug, Serialize)]
@@ -24,8 +24,8 @@ pub(super) struct VehicleLine {
 }
 
 impl VehicleLine {
-    pub(super) fn of(vehicle: &Arc<Vehicle>) -> Self {
-        let cameras = vehicle.cameras.newest();
+    pub(super) fn of(page: &Page, vehicle: &VehicleFlight) -> Self {
+        let cameras = page.rooms.rendering.cameras[vehicle.index].newest();
         Self {
             name: vehicle.name.to_string(),
             phase: vehicle.phase(),
@@ -40,8 +40,8 @@ pub(super) async fn list(
     State(page): State<Arc<Page>>,
     Extension(viewer): Extension<Viewer>,
 ) -> Response {
-    let seen = page.hub.vehicles.iter().filter(|vehicle| viewer.may_see(&vehicle.name));
-    Json(seen.map(VehicleLine::of).collect::<Vec<_>>()).into_response()
+    let seen = page.rooms.flights.vehicles.iter().filter(|vehicle| viewer.may_see(&vehicle.name));
+    Json(seen.map(|vehicle| VehicleLine::of(&page, vehicle)).collect::<Vec<_>>()).into_response()
 }
 
 /// Stops every vehicle.
@@ -49,7 +49,7 @@ pub(super) async fn stop_all(State(page): State<Arc<Page>>, headers: HeaderMap) 
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
-    press(&page.hub.vehicles)
+    press(&page.rooms.flights.vehicles)
 }
 
 /// Stops one vehicle.
@@ -73,7 +73,7 @@ pub(super) async fn start(
     name: Path<String>,
     headers: HeaderMap,
 ) -> Response {
-    tell(&page, &name, &headers, Vehicle::start, "it takes off")
+    order(&page, &name, &headers, |_, vehicle| vehicle.start(BY), "it takes off")
 }
 
 /// Lands a vehicle in order.
@@ -82,7 +82,7 @@ pub(super) async fn land(
     name: Path<String>,
     headers: HeaderMap,
 ) -> Response {
-    tell(&page, &name, &headers, Vehicle::land, "it brakes and lands")
+    order(&page, &name, &headers, |_, vehicle| vehicle.land(BY), "it brakes and lands")
 }
 
 /// Begins a vehicle's run anew.
@@ -91,21 +91,26 @@ pub(super) async fn reset(
     name: Path<String>,
     headers: HeaderMap,
 ) -> Response {
-    tell(&page, &name, &headers, Vehicle::reset, "the run begins anew")
+    let reset = |page: &Page, vehicle: &VehicleFlight| {
+        vehicle.reset(BY)?;
+        page.rooms.streaming.vehicles[vehicle.index].begin_flight();
+        Ok(())
+    };
+    order(&page, &name, &headers, reset, "the run begins anew")
 }
 
-fn tell(
+fn order(
     page: &Page,
     name: &str,
     headers: &HeaderMap,
-    order: impl FnOnce(&Vehicle, &str) -> Result<(), String>,
+    give: impl FnOnce(&Page, &VehicleFlight) -> Result<(), String>,
     done: &'static str,
 ) -> Response {
     if let Err(refusal) = origin::check(headers) {
         return refuse(&refusal);
     }
     match vehicle(page, name) {
-        Ok(vehicle) => match order(vehicle, "the page") {
+        Ok(vehicle) => match give(page, vehicle) {
             Ok(()) => (StatusCode::ACCEPTED, done).into_response(),
             Err(why) => (StatusCode::CONFLICT, why).into_response(),
         },
@@ -115,10 +120,10 @@ fn tell(
 
 /// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
 /// flight is told.
-fn press(vehicles: &[Arc<Vehicle>]) -> Response {
+fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
     let (obey, absent): (Vec<_>, Vec<_>) =
-        vehicles.iter().partition(|vehicle| vehicle.emergency_stop("the page"));
-    let names = |vehicles: &[&Arc<Vehicle>]| {
+        vehicles.iter().partition(|vehicle| vehicle.emergency_stop(BY));
+    let names = |vehicles: &[&Arc<VehicleFlight>]| {
         vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect::<Vec<_>>().join(", ")
     };
     let status = if obey.is_empty() { StatusCode::CONFLICT } else { StatusCode::ACCEPTED };
@@ -132,3 +137,6 @@ fn press(vehicles: &[Arc<Vehicle>]) -> Response {
     };
     (status, text).into_response()
 }
+
+/// Who gives the orders of this file, as events name it.
+const BY: &str = "the page";

@@ -6,48 +6,47 @@ use std::time::Duration;
 use axum::body::Bytes;
 use axum::extract::ws::{Message as Frame, WebSocket};
 use serde::Serialize;
-use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::debug;
 
 use super::access::Shown;
 use super::{Page, messages};
-use crate::flights::vehicle::Vehicle;
+use crate::flights::recent_previews::Preview;
+use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
-use crate::web::previews::Preview;
 
 /// Counts a viewer for as long as it lives.
 struct Presence<'a>(&'a Page, usize);
 
 impl<'a> Presence<'a> {
-    fn new(page: &'a Page, vehicle: &Vehicle) -> Self {
-        page.hub.subscriptions.viewer_came(vehicle.index);
+    fn new(page: &'a Page, vehicle: &VehicleFlight) -> Self {
+        page.rooms.streaming.subscriptions.viewer_came(vehicle.index);
         Self(page, vehicle.index)
     }
 }
 
 impl Drop for Presence<'_> {
     fn drop(&mut self) {
-        self.0.hub.subscriptions.viewer_left(self.1);
+        self.0.rooms.streaming.subscriptions.viewer_left(self.1);
     }
 }
 
-/// Tells one viewer everything of a vehicle until it leaves, stalls, or the server stops.
+/// Sends one viewer everything of a vehicle until it leaves, stalls, or the server stops.
 pub(super) async fn run(
     page: Arc<Page>,
-    vehicle: Arc<Vehicle>,
+    vehicle: Arc<VehicleFlight>,
     shown: Shown,
     mut socket: WebSocket,
 ) {
-    if page.hub.subscriptions.viewers() >= MOST_VIEWERS {
+    if page.rooms.streaming.subscriptions.viewers() >= MOST_VIEWERS {
         debug!("page: {MOST_VIEWERS} viewers already");
         return;
     }
     let presence = Presence::new(&page, &vehicle);
     tokio::select! {
-        _ = tell(&page, &vehicle, &mut socket) => {}
+        _ = send_all(&page, &vehicle, &mut socket) => {}
         () = right_ends(&page, &shown) => {}
-        () = page.hub.stop.wait() => {}
+        () = page.rooms.stop.wait() => {}
     }
     drop(presence);
     let _ = timeout(Duration::from_millis(200), socket.send(Frame::Close(None))).await;
@@ -62,15 +61,15 @@ async fn right_ends(page: &Page, shown: &Shown) {
 }
 
 /// Returns `None` when the viewer is gone.
-async fn tell(page: &Page, vehicle: &Vehicle, socket: &mut WebSocket) -> Option<()> {
+async fn send_all(page: &Page, vehicle: &VehicleFlight, socket: &mut WebSocket) -> Option<()> {
     let mut log = vehicle.events.subscribe();
-    let mut cameras = vehicle.cameras.subscribe();
+    let mut cameras = page.rooms.rendering.cameras[vehicle.index].subscribe();
     let (entries, mut cursor) = vehicle.events.newest(HISTORY);
     send_json(socket, &messages::arena(page, vehicle)).await?;
     let points = lock(&vehicle.track).points.clone();
     send_json(socket, &messages::Message::Trail { points: &points }).await?;
     send_json(socket, &messages::events(page, entries)).await?;
-    let mut previews: Vec<_> = vehicle.previews.iter().map(watch::Sender::subscribe).collect();
+    let mut previews = page.previews.subscribe(vehicle.index);
     for preview in &mut previews {
         preview.mark_changed();
     }

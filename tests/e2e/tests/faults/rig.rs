@@ -26,10 +26,8 @@ use vizflyt_runtime::stream::{
 use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
 use vizflyt_server::flights::events::Origin;
-use vizflyt_server::flights::vehicle::Vehicle;
-use vizflyt_server::hub::{Hub, RendererInfo};
-use vizflyt_server::render::cameras::Cameras;
 use vizflyt_server::stop::Stop;
+use vizflyt_server::stream::Rooms;
 use vizflyt_server::stream::rate_control::{self, Adaptation};
 use vizflyt_server::stream::subscriptions::Broadcast;
 use vizflyt_server::stream::transport::{self, Congestion};
@@ -132,7 +130,7 @@ pub(crate) struct Notes {
 
 /// The server's process.
 pub(crate) struct Server {
-    pub(crate) hub: Arc<Hub>,
+    pub(crate) rooms: Rooms,
     socket: Arc<Socket>,
     tasks: Vec<JoinHandle<()>>,
 }
@@ -200,12 +198,8 @@ impl Server {
             )
             .unwrap()
         };
-        let cameras = Cameras::new(vec![camera]);
-        let stop = Stop::default();
-        let vehicle = Vehicle::new(0, "vizflyt", arena, cameras);
-        let mut hub = Hub::new(vec![vehicle], RendererInfo::default(), stop);
-        hub.adapt = source.adapt;
-        let hub = Arc::new(hub);
+        let vehicles = vec![("vizflyt", arena, vec![camera])];
+        let rooms = Rooms::bare(vehicles, source.adapt, Stop::default());
         let socket = network.socket(SERVER.parse().unwrap());
         let authorizer = keys.authorizer();
         let config = transport::server_config(&authorizer.identity, congestion).unwrap();
@@ -217,12 +211,12 @@ impl Server {
         )
         .unwrap();
         let tasks = vec![
-            tokio::spawn(transport::serve(hub.clone(), endpoint, authorizer, congestion)),
-            tokio::spawn(draw(hub.clone(), source.clone(), notes.clone())),
-            tokio::spawn(localize(hub.clone())),
-            tokio::spawn(happen(hub.clone(), source.clone(), notes.clone())),
+            tokio::spawn(transport::serve(rooms.clone(), endpoint, authorizer, congestion)),
+            tokio::spawn(render(rooms.clone(), source.clone(), notes.clone())),
+            tokio::spawn(localize(rooms.clone())),
+            tokio::spawn(happen(rooms.clone(), source.clone(), notes.clone())),
         ];
-        Self { hub, socket, tasks }
+        Self { rooms, socket, tasks }
     }
 
     /// Ends it as SIGKILL does: without a word.
@@ -237,7 +231,7 @@ impl Server {
     /// Notes how often each event of the runtime came.
     pub(crate) fn note_events(&self, notes: &Mutex<Notes>) {
         let mut cursor = 0;
-        let found = self.hub.vehicles[0].events.read(&mut cursor).unwrap();
+        let found = self.rooms.flights.vehicles[0].events.read(&mut cursor).unwrap();
         let mut notes = lock(notes);
         for entry in found.iter().filter(|entry| entry.origin == Origin::Page) {
             if let Some(number) = number(&entry.event) {
@@ -252,9 +246,9 @@ fn seeded(mut config: EndpointConfig, seed: u8) -> EndpointConfig {
     config
 }
 
-/// Draws and hands out images as the render and encode threads do: newest wins, none while K are
+/// Renders and hands out images as the render and encode threads do: newest wins, none while K are
 /// in flight.
-async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
+async fn render(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
     let period = Duration::from_secs(1) / source.rate_hz;
     let mut due = Instant::now();
     let (mut seq, mut newest, mut broadcast) = (0, None, Broadcast::default());
@@ -267,21 +261,21 @@ async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
             seq += 1;
             let now = clock::now();
             lock(&notes).drawn.push(now);
-            hub.vehicles[0].images.cameras[0].count_rendered();
-            if seq % u64::from(hub.vehicles[0].level().keep_one_in) == 0 {
+            rooms.streaming.vehicles[0].images.cameras[0].count_rendered();
+            if seq % u64::from(rooms.streaming.vehicles[0].level().keep_one_in) == 0 {
                 newest = Some((seq, now));
             }
         }
-        let room = hub.subscriptions.wait_for_room(Duration::ZERO).fly[0][0];
+        let room = rooms.streaming.subscriptions.wait_for_room(Duration::ZERO).fly[0][0];
         if room && let Some((seq, pose)) = newest.take() {
-            let level = hub.vehicles[0].level.load(Ordering::Relaxed);
+            let level = rooms.streaming.vehicles[0].level.load(Ordering::Relaxed);
             let [width, height] = source.size_px;
             let k = Intrinsics::from_horizontal_fov(columns(width, level), height, 1.5);
             let identity = (Pose::IDENTITY, Pose::IDENTITY);
             let header = ImageHeader::new(seq, 0, pose, &k, &identity.0, &identity.1);
-            hub.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
+            rooms.streaming.subscriptions.begin((0, 0), header, 0, true, &mut broadcast);
             broadcast.push(&source.payloads[level * IMAGES + seq as usize % IMAGES]);
-            hub.subscriptions.end(&mut broadcast, Some(clock::now()));
+            rooms.streaming.subscriptions.end(&mut broadcast, Some(clock::now()));
         }
         tokio::select! {
             biased;
@@ -292,22 +286,22 @@ async fn draw(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
 }
 
 /// Poses, 200 Hz.
-async fn localize(hub: Arc<Hub>) {
+async fn localize(rooms: Rooms) {
     let mut tick = interval(Duration::from_millis(5));
     loop {
         tick.tick().await;
         let sample = PoseSample::still(clock::now(), Pose::IDENTITY);
-        hub.vehicles[0].pose.send_replace(Some(sample));
+        rooms.localization.vehicles[0].newest.send_replace(Some(sample));
     }
 }
 
 /// Events, from when the first runtime has come: what was before a flight concerns nobody.
-async fn happen(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
+async fn happen(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
     let mut tick = interval(source.event_every);
     let mut flown = false;
     loop {
         tick.tick().await;
-        flown |= hub.vehicles[0].runtime().is_some();
+        flown |= rooms.flights.vehicles[0].runtime().is_some();
         if !flown {
             continue;
         }
@@ -316,7 +310,7 @@ async fn happen(hub: Arc<Hub>, source: Source, notes: Arc<Mutex<Notes>>) {
             notes.told_down += 1;
             notes.told_down - 1
         };
-        hub.vehicles[0].tell(EventKind::Note, &text(number));
+        rooms.flights.vehicles[0].publish(EventKind::Note, &text(number));
     }
 }
 

@@ -14,8 +14,6 @@
 mod database_url;
 mod export;
 pub(crate) mod grades;
-mod recorder;
-mod samples;
 mod standings;
 mod store;
 #[cfg(test)]
@@ -24,8 +22,6 @@ pub(crate) mod tests;
 pub use database_url::{Database, UnknownDatabase};
 pub use export::write_csv;
 pub use grades::{GradeBoard, GradeEntry, GradePlace, grade_boards};
-pub(crate) use recorder::record;
-pub use samples::Samples;
 pub use standings::{Standing, standings};
 pub use store::{Leaderboard, LeaderboardError, MOST_RUNS};
 

@@ -54,7 +54,7 @@ pub struct Measurement {
 
 impl Measurement {
     /// Returns what the pose filter is to know of it.
-    pub fn weighed(&self) -> Measured {
+    pub fn with_covariance(&self) -> Measured {
         let Self { source, stamp, arrival, world_from_body, sigma, .. } = *self;
         Measured { source, stamp, arrival, world_from_body, sigma }
     }

@@ -5,7 +5,6 @@
 
 pub mod slices;
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use tracing::warn;
@@ -13,18 +12,26 @@ use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_protocol::messages::MAX_CAMERAS;
 use vizflyt_rgbd::EncodeOptions;
 
-use crate::hub::Hub;
+use crate::flights::Flights;
 use crate::render::rendered::RenderQueue;
+use crate::stop::Stop;
+use crate::stream::Streaming;
 use crate::stream::encode::slices::SliceEncoder;
 
 /// Encodes until the server stops.
-pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue, options: EncodeOptions) {
+pub fn run(
+    streaming: &Streaming,
+    flights: &Flights,
+    ticks: &RenderQueue,
+    options: EncodeOptions,
+    stop: &Stop,
+) {
     let mut encoder = SliceEncoder::new(options);
     let mut order: Vec<usize> = Vec::new();
     // Images of each camera so far, where the link has no room for all.
     let mut turns = [[0u32; MAX_CAMERAS]; MAX_VEHICLES];
-    while !hub.stop.is_set() {
-        let wanted = hub.subscriptions.wait_for_room(PATIENCE);
+    while !stop.is_set() {
+        let wanted = streaming.subscriptions.wait_for_room(PATIENCE);
         if !wanted.anything() {
             continue;
         }
@@ -38,7 +45,7 @@ pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue, options: EncodeOptions) {
             let slot = &tick.slots[index];
             let turn = &mut turns[slot.vehicle][slot.camera];
             *turn = turn.wrapping_add(1);
-            turn.is_multiple_of(hub.vehicles[slot.vehicle].level().keep_one_in)
+            turn.is_multiple_of(streaming.vehicles[slot.vehicle].level().keep_one_in)
         });
         let mut together = [0u32; MAX_VEHICLES];
         for &index in &order {
@@ -53,24 +60,24 @@ pub fn run(hub: &Arc<Hub>, ticks: &RenderQueue, options: EncodeOptions) {
             if !wanted.stream[vehicle][camera] {
                 continue;
             }
-            encoder.set_options(hub.vehicles[vehicle].level().options(&options));
-            match encoder.send(&hub.subscriptions, slot, together[vehicle]) {
+            encoder.set_options(streaming.vehicles[vehicle].level().options(&options));
+            match encoder.send(&streaming.subscriptions, slot, together[vehicle]) {
                 Ok(Some((start, end))) => {
-                    hub.stats.encode.add(start, end);
+                    streaming.encode_durations.add(start, end);
                     // What only watchers get is not the runtime's.
                     if together[vehicle] >> camera & 1 == 1 {
-                        hub.vehicles[vehicle].images.cameras[camera].count_sent(slot.counted);
+                        streaming.vehicles[vehicle].images.cameras[camera].count_sent(slot.counted);
                     }
                 }
                 Ok(None) => {}
                 Err(error) => {
-                    hub.vehicles[vehicle].images.cameras[camera].count_failed(slot.counted);
-                    let name = &hub.vehicles[vehicle].name;
+                    streaming.vehicles[vehicle].images.cameras[camera].count_failed(slot.counted);
+                    let name = &flights.vehicles[vehicle].name;
                     warn!("{name}: camera {camera}: {error:#}; image {} is skipped", slot.seq);
                 }
             }
         }
-        ticks.pass_on(tick, hub.wants_previews());
+        ticks.pass_on(tick, streaming.subscriptions.viewers() > 0 || flights.any_under_way());
     }
 }
 

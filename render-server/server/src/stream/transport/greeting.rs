@@ -18,22 +18,23 @@ use vizflyt_trust::{Client, Fingerprint};
 use zerocopy::IntoBytes;
 
 use super::control::{Ending, Incoming, Outbound, PATIENCE, gone};
-use super::{END, FOREIGN, REFUSED, UNPAIRED, session};
+use super::session::Session;
+use super::{END, FOREIGN, REFUSED, UNPAIRED};
 use crate::authorization::Authorizer;
-use crate::flights::vehicle::{ControlLease, WatchLease};
-use crate::hub::Hub;
+use crate::flights::control_lease::{ControlLease, WatchLease};
+use crate::stream::Rooms;
 
 /// Speaks with one runtime until either side ends it.
 pub(super) async fn run(
-    hub: Arc<Hub>,
+    rooms: Rooms,
     authorizer: Arc<Authorizer>,
     port: u16,
     connection: Connection,
 ) {
     let address = connection.remote_address();
     let (code, reason) = tokio::select! {
-        ending = talk(&hub, &authorizer, port, &connection) => ending,
-        () = hub.stop.wait() => (END, "the server ends".to_owned()),
+        ending = talk(&rooms, &authorizer, port, &connection) => ending,
+        () = rooms.stop.wait() => (END, "the server ends".to_owned()),
     };
     // What the other side said on closing tells more than which of our calls failed first.
     let reason = connection.close_reason().map_or(reason, |error| why(&error));
@@ -44,7 +45,7 @@ pub(super) async fn run(
 }
 
 async fn talk(
-    hub: &Arc<Hub>,
+    rooms: &Rooms,
     authorizer: &Authorizer,
     port: u16,
     connection: &Connection,
@@ -83,25 +84,22 @@ async fn talk(
         Err(_) => return (FOREIGN, "no Hello came for 5 s".to_owned()),
     };
     let address = connection.remote_address();
-    let lease = permit(&client, &hello.vehicle)
-        .and_then(|()| hub.vehicle(&hello.vehicle))
-        .and_then(|vehicle| match hello.purpose {
-            Purpose::Fly => {
-                vehicle.take_control(&hello, address).map(|lease| Lease::Fly(Box::new(lease)))
-            }
-            Purpose::Watch => vehicle.watch().map(Lease::Watch),
+    let granted = permit(&client, &hello.vehicle)
+        .and_then(|()| rooms.flights.vehicle(&hello.vehicle))
+        .and_then(|vehicle| {
+            let lease = match hello.purpose {
+                Purpose::Fly => Lease::Fly(Box::new(vehicle.take_control(&hello, address)?)),
+                Purpose::Watch => Lease::Watch(vehicle.watch()?),
+            };
+            Ok((&**vehicle, lease))
         });
-    match lease {
-        Ok(lease) => {
+    match granted {
+        Ok((vehicle, lease)) => {
+            let session = Session { rooms, vehicle, connection, hello: &hello };
             let stay = async {
                 match &lease {
-                    Lease::Fly(lease) => {
-                        Box::pin(session::fly(hub, connection, &hello, lease, send, incoming)).await
-                    }
-                    Lease::Watch(lease) => {
-                        Box::pin(session::watch(hub, connection, &hello, lease, send, incoming))
-                            .await
-                    }
+                    Lease::Fly(lease) => Box::pin(session.fly(lease, send, incoming)).await,
+                    Lease::Watch(lease) => Box::pin(session.watch(lease, send, incoming)).await,
                 }
             };
             tokio::select! {

@@ -24,14 +24,14 @@ use zerocopy::IntoBytes;
 
 use super::{END, VarInt};
 use crate::clock;
-use crate::flights::vehicle::Vehicle;
-use crate::hub::Hub;
 use crate::lock::lock;
-use crate::stats::Rate;
+use crate::stream::Rooms;
 use crate::stream::rate_control::{DECIDE_EVERY, RateController, SentImage};
 use crate::stream::subscriptions::{InFlightImage, MOST_IN_FLIGHT, Part, Slots};
+use crate::stream::vehicle::VehicleStream;
+use crate::timing::RateMeter;
 
-/// The context of images to one session; closes the subscriptions when dropped.
+/// The senders of images to one session; ends its subscription when dropped.
 pub(super) struct ImageSenders {
     context: SenderContext,
     places: Slots,
@@ -41,40 +41,41 @@ pub(super) struct ImageSenders {
 /// What every sender knows.
 #[derive(Clone)]
 struct SenderContext {
-    hub: Arc<Hub>,
-    vehicle: Arc<Vehicle>,
+    rooms: Rooms,
+    vehicle: usize,
     connection: Connection,
     id: u64,
     /// The runtime's; a watcher far away says nothing of the flight.
-    pace: Option<Arc<Mutex<RateController>>>,
+    rate_controller: Option<Arc<Mutex<RateController>>>,
 }
 
 impl ImageSenders {
     /// Opens the subscriptions of `vehicle` for its session `id`.
     pub(super) fn open(
-        hub: Arc<Hub>,
-        vehicle: Arc<Vehicle>,
+        rooms: Rooms,
+        vehicle: usize,
         connection: Connection,
         id: u64,
         purpose: Purpose,
     ) -> Self {
         let allowed = in_flight(connection.min_rtt(), USUAL_RATE_HZ);
-        let places = hub.subscriptions.open(vehicle.index, id, purpose, allowed);
-        let adapt = hub.adapt.toward(connection.remote_address().ip());
-        let pace =
+        let places = rooms.streaming.subscriptions.open(vehicle, id, purpose, allowed);
+        let adapt = rooms.streaming.adapt.toward(connection.remote_address().ip());
+        let rate_controller =
             (purpose == Purpose::Fly).then(|| Arc::new(Mutex::new(RateController::new(adapt))));
-        vehicle.level.store(0, Ordering::Relaxed);
-        Self { context: SenderContext { hub, vehicle, connection, id, pace }, places, allowed }
+        rooms.streaming.vehicles[vehicle].level.store(0, Ordering::Relaxed);
+        let context = SenderContext { rooms, vehicle, connection, id, rate_controller };
+        Self { context, places, allowed }
     }
 
     /// Sends images until the connection ends.
     pub(super) async fn run(mut self) -> (VarInt, String) {
         let mut senders = JoinSet::new();
         self.spawn(&mut senders, 0);
-        let rate = Rate::default();
+        let rate = RateMeter::default();
         let mut every_second = interval(Duration::from_secs(1));
         every_second.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        let drawn_rate = Rate::default();
+        let rendered_rate = RateMeter::default();
         let mut decide = interval(DECIDE_EVERY);
         decide.set_missed_tick_behavior(MissedTickBehavior::Skip);
         loop {
@@ -83,19 +84,18 @@ impl ImageSenders {
                     return (END, "a sender of images has failed".to_owned());
                 }
                 _ = every_second.tick() => {
-                    let SenderContext { hub, vehicle, connection, id, .. } = &self.context;
-                    let ticks = hub.stats.ticks.load(Ordering::Relaxed);
-                    let hz = rate.of(ticks, clock::now()).max(USUAL_RATE_HZ);
+                    let SenderContext { rooms, vehicle, connection, id, .. } = &self.context;
+                    let hz = rate.of(rooms.ticks(), clock::now()).max(USUAL_RATE_HZ);
                     let allowed = in_flight(connection.min_rtt(), hz);
                     let before = self.allowed;
                     self.allowed = before.max(allowed);
                     self.spawn(&mut senders, before);
-                    hub.subscriptions.allow(vehicle.index, *id, allowed);
+                    rooms.streaming.subscriptions.allow(*vehicle, *id, allowed);
                 }
                 _ = decide.tick() => {
-                    let drawn = self.context.vehicle.images.cameras.iter();
-                    let drawn = drawn.map(|counters| counters.counts().drawn).sum();
-                    self.context.decide(drawn_rate.of(drawn, clock::now()));
+                    let cameras = self.context.stream().images.cameras.iter();
+                    let rendered = cameras.map(|counters| counters.counts().drawn).sum();
+                    self.context.decide(rendered_rate.of(rendered, clock::now()));
                 }
             }
         }
@@ -114,20 +114,25 @@ impl ImageSenders {
 }
 
 impl SenderContext {
+    fn stream(&self) -> &VehicleStream {
+        &self.rooms.streaming.vehicles[self.vehicle]
+    }
+
     /// Lowers or raises how images are made; `wanted_hz` are drawn, of all cameras.
     fn decide(&self, wanted_hz: f64) {
-        let Some(pace) = &self.pace else { return };
-        let change = lock(pace).decide(clock::now(), wanted_hz);
+        let Some(rate_controller) = &self.rate_controller else { return };
+        let change = lock(rate_controller).decide(clock::now(), wanted_hz);
         if let Some(change) = change {
-            self.vehicle.level.store(change.to, Ordering::Relaxed);
-            self.vehicle.tell(EventKind::Note, &change.text());
+            self.stream().level.store(change.to, Ordering::Relaxed);
+            self.rooms.flights.vehicles[self.vehicle].publish(EventKind::Note, &change.text());
         }
     }
 }
 
 impl Drop for ImageSenders {
     fn drop(&mut self) {
-        self.context.hub.subscriptions.close(self.context.vehicle.index, self.context.id);
+        let SenderContext { rooms, vehicle, id, .. } = &self.context;
+        rooms.streaming.subscriptions.close(*vehicle, *id);
     }
 }
 
@@ -139,7 +144,8 @@ fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
 
 /// Sends the images that come to one place, for ever.
 async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<InFlightImage>) {
-    let SenderContext { hub, vehicle, connection, id, pace } = &context;
+    let SenderContext { rooms, vehicle, connection, id, rate_controller } = &context;
+    let streaming = &rooms.streaming;
     loop {
         let (header, priority) = image.image().await;
         let start = clock::now();
@@ -147,16 +153,17 @@ async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<In
         let delivered = deliver(connection, &image, &header, priority, &mut sent).await;
         let end = clock::now();
         // Figures are the runtime's.
-        if let Some(pace) = pace {
+        if let Some(rate_controller) = rate_controller {
+            let images = &context.stream().images;
             if delivered {
-                hub.stats.send.add(start, end);
-                vehicle.images.sent.fetch_add(1, Ordering::Relaxed);
-                vehicle.images.bytes.fetch_add(sent.bytes as u64, Ordering::Relaxed);
+                streaming.send_durations.add(start, end);
+                images.sent.fetch_add(1, Ordering::Relaxed);
+                images.bytes.fetch_add(sent.bytes as u64, Ordering::Relaxed);
             } else {
-                vehicle.images.late.fetch_add(1, Ordering::Relaxed);
-                vehicle.images.cameras[camera].count_late();
+                images.late.fetch_add(1, Ordering::Relaxed);
+                images.cameras[camera].count_late();
             }
-            lock(pace).landed(&SentImage {
+            lock(rate_controller).landed(&SentImage {
                 bytes: sent.bytes,
                 // The encoder's time is not the link's.
                 handed: sent.encode_end.unwrap_or(start),
@@ -167,7 +174,7 @@ async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<In
         }
         let ms = end.seconds_since(start) * 1e3;
         trace!(camera, delivered, ms, "send");
-        hub.subscriptions.landed(vehicle.index, camera, *id, place, &image);
+        streaming.subscriptions.landed(*vehicle, camera, *id, place, &image);
     }
 }
 

@@ -39,9 +39,9 @@ use vizflyt_protocol::messages::close;
 use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 
 use crate::authorization::Authorizer;
-use crate::hub::Hub;
 use crate::lock::lock;
 use crate::rate_limit::RateLimiter;
+use crate::stream::Rooms;
 use crate::stream::rate_control::is_near;
 
 /// Who decides how fast to send.
@@ -121,7 +121,7 @@ pub fn endpoint_config(identity: &Identity) -> Result<EndpointConfig> {
 
 /// Accepts runtimes until the server stops.
 pub async fn serve(
-    hub: Arc<Hub>,
+    rooms: Rooms,
     endpoint: Endpoint,
     authorizer: Arc<Authorizer>,
     congestion: Congestion,
@@ -133,7 +133,7 @@ pub async fn serve(
         let incoming = tokio::select! {
             incoming = endpoint.accept() => incoming,
             _ = sessions.join_next(), if !sessions.is_empty() => continue,
-            () = hub.stop.wait() => None,
+            () = rooms.stop.wait() => None,
         };
         let Some(incoming) = incoming else { break };
         let address = incoming.remote_address();
@@ -162,8 +162,8 @@ pub async fn serve(
                 continue;
             }
         };
-        let (hub, authorizer, unknown_peers) =
-            (hub.clone(), authorizer.clone(), unknown_peers.clone());
+        let (rooms, authorizer, unknown_peers) =
+            (rooms.clone(), authorizer.clone(), unknown_peers.clone());
         sessions.spawn(async move {
             let connection = match incoming.accept_with(config) {
                 Ok(connecting) => tokio::time::timeout(HANDSHAKE_WITHIN, connecting).await,
@@ -187,7 +187,7 @@ pub async fn serve(
                 };
                 Box::pin(pairing::run(&authorizer, &connection)).await;
             } else {
-                Box::pin(greeting::run(hub, authorizer, port, connection)).await;
+                Box::pin(greeting::run(rooms, authorizer, port, connection)).await;
             }
         });
     }

@@ -1,106 +1,97 @@
 //! The talk with one client, from its lease to its last byte.
 
-use std::sync::Arc;
-
 use quinn::{Connection, SendStream};
 use tokio::sync::{mpsc, watch as cell};
 use tracing::{debug, info};
 use vizflyt_protocol::messages::{
-    ClockReply, ClockRequest, Datagram, HeardEvents, Hello, PoseSample, Purpose, ToRuntime,
-    ToServer, Welcome,
+    ArenaInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, PoseSample, Purpose,
+    ToRuntime, ToServer, Welcome,
 };
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::ServerTime;
 
 use super::control::{Ending, Incoming, Outbound, gone};
 use super::greeting::why;
-use super::{REPLACED, SLOW, images};
+use super::images::ImageSenders;
+use super::{REPLACED, SLOW};
 use crate::clock;
+use crate::flights::control_lease::{ControlLease, WatchLease};
 use crate::flights::events::Origin;
-use crate::flights::vehicle::{ControlLease, Vehicle, WatchLease};
-use crate::hub::Hub;
+use crate::flights::vehicle::VehicleFlight;
 use crate::render::cameras::CameraSet;
+use crate::stream::Rooms;
 
-/// Serves the runtime that took `lease` until either side ends it.
-pub(super) async fn fly(
-    hub: &Arc<Hub>,
-    connection: &Connection,
-    hello: &Hello,
-    lease: &ControlLease,
-    send: SendStream,
-    incoming: Incoming,
-) -> Ending {
-    let (address, vehicle) = (connection.remote_address(), &lease.vehicle);
-    let again = if lease.resumed { ", and resumes its flight" } else { "" };
-    info!("{address}: {} flies '{}'{again}", hello.program, hello.vehicle);
-    vehicle.note(&format!("{} at {address} connected{again}", hello.program));
-    lease.speaks_over(connection);
-    let talk = Talk {
-        hub,
-        vehicle,
-        connection,
-        first_event: lease.first_event.max(hello.heard_events.of(hub.boot)),
-        heard_events: lease.heard_events,
-    };
-    let ending = tokio::select! {
-        ending = talk.run(lease.info.id, Purpose::Fly, Some(lease), send, incoming) => ending,
-        () = lease.evicted() => {
-            (REPLACED, "a newer runtime took over after a second of silence".to_owned())
+/// A granted conversation with one client.
+pub(super) struct Session<'a> {
+    pub(super) rooms: &'a Rooms,
+    pub(super) vehicle: &'a VehicleFlight,
+    pub(super) connection: &'a Connection,
+    pub(super) hello: &'a Hello,
+}
+
+impl Session<'_> {
+    /// Serves the runtime that took control until either side ends it.
+    pub(super) async fn fly(
+        &self,
+        lease: &ControlLease,
+        send: SendStream,
+        incoming: Incoming,
+    ) -> Ending {
+        let Self { rooms, vehicle, connection, hello } = self;
+        let address = connection.remote_address();
+        let again = if lease.resumed { ", and resumes its flight" } else { "" };
+        info!("{address}: {} flies '{}'{again}", hello.program, hello.vehicle);
+        vehicle.note(&format!("{} at {address} connected{again}", hello.program));
+        let stream = &rooms.streaming.vehicles[vehicle.index];
+        if !lease.resumed {
+            stream.begin_flight();
         }
-    };
-    let reason = connection.close_reason().map_or_else(|| ending.1.clone(), |error| why(&error));
-    vehicle.note(&format!("the runtime at {address} is gone: {reason}"));
-    ending
-}
+        let _connected = stream.connect(lease.info.id, connection);
+        let ending = tokio::select! {
+            ending = self.run(lease.info.id, Some(lease), lease.first_event, send, incoming) => ending,
+            () = lease.evicted() => {
+                (REPLACED, "a newer runtime took over after a second of silence".to_owned())
+            }
+        };
+        let reason =
+            connection.close_reason().map_or_else(|| ending.1.clone(), |error| why(&error));
+        vehicle.note(&format!("the runtime at {address} is gone: {reason}"));
+        ending
+    }
 
-/// Serves a watcher until either side ends it.
-pub(super) async fn watch(
-    hub: &Arc<Hub>,
-    connection: &Connection,
-    hello: &Hello,
-    lease: &WatchLease,
-    send: SendStream,
-    incoming: Incoming,
-) -> Ending {
-    info!("{}: {} watches '{}'", connection.remote_address(), hello.program, hello.vehicle);
-    let talk = Talk {
-        hub,
-        vehicle: &lease.vehicle,
-        connection,
-        first_event: lease.first_event.max(hello.heard_events.of(hub.boot)),
-        heard_events: HeardEvents::default(),
-    };
-    Box::pin(talk.run(lease.id, Purpose::Watch, None, send, incoming)).await
-}
+    /// Serves a watcher until either side ends it.
+    pub(super) async fn watch(
+        &self,
+        lease: &WatchLease,
+        send: SendStream,
+        incoming: Incoming,
+    ) -> Ending {
+        let (address, hello) = (self.connection.remote_address(), self.hello);
+        info!("{address}: {} watches '{}'", hello.program, hello.vehicle);
+        Box::pin(self.run(lease.id, None, lease.first_event, send, incoming)).await
+    }
 
-/// A conversation with one client.
-struct Talk<'a> {
-    hub: &'a Arc<Hub>,
-    vehicle: &'a Arc<Vehicle>,
-    connection: &'a Connection,
-    first_event: u64,
-    heard_events: HeardEvents,
-}
-
-impl Talk<'_> {
     async fn run(
         &self,
         id: u64,
-        purpose: Purpose,
         lease: Option<&ControlLease>,
+        first_event: u64,
         send: SendStream,
         incoming: Incoming,
     ) -> Ending {
         // Control goes out before images.
         let _ = send.set_priority(i32::MAX);
         let (clock_sender, clock_requests) = mpsc::channel(CLOCK_QUEUE);
-        let (heard_sender, heard) = cell::channel(0);
-        let (hub, vehicle) = (self.hub.clone(), self.vehicle.clone());
-        let senders =
-            images::ImageSenders::open(hub, vehicle, self.connection.clone(), id, purpose);
+        let (received_sender, received) = cell::channel(0);
+        let purpose = if lease.is_some() { Purpose::Fly } else { Purpose::Watch };
+        let (rooms, vehicle) = (self.rooms.clone(), self.vehicle.index);
+        let senders = ImageSenders::open(rooms, vehicle, self.connection.clone(), id, purpose);
+        let heard_events = lease.map_or_else(HeardEvents::default, |lease| lease.heard_events);
+        let heard = self.hello.heard_events.of(self.rooms.flights.instance_id);
+        let cursor = first_event.max(heard);
         tokio::select! {
-            ending = self.down(send, clock_requests, heard) => ending,
-            ending = up(lease, incoming, &clock_sender, &heard_sender) => ending,
+            ending = self.send(send, heard_events, cursor, clock_requests, received) => ending,
+            ending = self.receive(lease, incoming, &clock_sender, &received_sender) => ending,
             ending = senders.run() => ending,
             error = self.connection.closed() => gone(&error),
         }
@@ -108,22 +99,25 @@ impl Talk<'_> {
 
     /// Server to client: events first, then what was heard of its own, changed cameras, clock
     /// replies, and the newest pose.
-    async fn down(
+    async fn send(
         &self,
         send: SendStream,
+        heard_events: HeardEvents,
+        mut cursor: u64,
         mut clock_requests: mpsc::Receiver<ClockRequest>,
-        mut heard: cell::Receiver<u64>,
+        mut received: cell::Receiver<u64>,
     ) -> Ending {
-        let vehicle = &**self.vehicle;
+        let (vehicle, index) = (self.vehicle, self.vehicle.index);
         let mut out = Outbound::new(send);
-        let mut poses = vehicle.pose.subscribe();
+        let mut poses = self.rooms.localization.vehicles[index].newest.subscribe();
         let mut log = vehicle.events.subscribe();
         log.mark_changed();
-        let mut cursor = self.first_event;
-        let mut cameras = vehicle.cameras.subscribe();
-        let mut told = cameras.borrow_and_update().clone();
-        let (boot, heard_events) = (self.hub.boot, self.heard_events);
-        let welcome = Welcome { boot, heard_events, arena: vehicle.welcome(&told) };
+        let mut cameras = self.rooms.rendering.cameras[index].subscribe();
+        let mut sent = cameras.borrow_and_update().clone();
+        let arena =
+            ArenaInfo { cameras: sent.infos.iter().cloned().collect(), ..vehicle.arena.clone() };
+        let boot = self.rooms.flights.instance_id;
+        let welcome = Welcome { boot, heard_events, arena };
         if let Err(ending) = out.write(&ToRuntime::Welcome(welcome)).await {
             return ending;
         }
@@ -133,16 +127,16 @@ impl Talk<'_> {
                 biased;
                 _ = log.changed() => {
                     log.mark_unchanged();
-                    tell(vehicle, &mut out, &mut cursor).await
+                    send_events(vehicle, &mut out, &mut cursor).await
                 }
-                Ok(()) = heard.changed() => {
-                    let seq = *heard.borrow_and_update();
+                Ok(()) = received.changed() => {
+                    let seq = *received.borrow_and_update();
                     out.write(&ToRuntime::Heard(seq)).await
                 }
                 _ = cameras.changed() => {
                     let newest = cameras.borrow_and_update().clone();
-                    let before = std::mem::replace(&mut told, newest);
-                    tell_cameras(&mut out, &before, &told).await
+                    let before = std::mem::replace(&mut sent, newest);
+                    send_cameras(&mut out, &before, &sent).await
                 }
                 Some(request) = clock_requests.recv() => {
                     let reply = ClockReply { sent: request.sent, answered: clock::now() };
@@ -154,7 +148,7 @@ impl Talk<'_> {
                         && pose.stamp.seconds_since(last_pose) >= POSE_EVERY_S
                     {
                         last_pose = pose.stamp;
-                        self.tell_pose(&pose);
+                        self.send_pose(&pose);
                     }
                     Ok(())
                 }
@@ -165,8 +159,48 @@ impl Talk<'_> {
         }
     }
 
+    /// Client to server; of a watcher only clock requests count.
+    async fn receive(
+        &self,
+        lease: Option<&ControlLease>,
+        mut incoming: Incoming,
+        clock_requests: &mpsc::Sender<ClockRequest>,
+        received: &cell::Sender<u64>,
+    ) -> Ending {
+        let (vehicle, index, rooms) = (self.vehicle, self.vehicle.index, self.rooms);
+        loop {
+            let message = match incoming.next().await {
+                Ok(message) => message,
+                Err(ending) => return ending,
+            };
+            if let Some(lease) = lease {
+                lease.renew(clock::now());
+            }
+            match (message, lease) {
+                // A full queue means that replies cannot leave; a late reply would mislead anyway.
+                (ToServer::Clock(request), _) => drop(clock_requests.try_send(request)),
+                (ToServer::Telemetry(report), Some(_)) => vehicle.report(report),
+                (ToServer::Timing(timing), Some(_)) => {
+                    rooms.streaming.vehicles[index].report_timing(timing);
+                }
+                (ToServer::Imu(readings), Some(_)) => {
+                    rooms.localization.vehicles[index].push_imu(&readings);
+                }
+                (ToServer::Event { seq, event }, Some(lease)) => {
+                    if lease.receive_event(seq) {
+                        vehicle.log(Origin::Page, event);
+                    }
+                    received.send_modify(|newest| *newest = seq.max(*newest));
+                }
+                (ToServer::Heard(seq), _) => debug!("events up to {seq} were received"),
+                (ToServer::Hello(_), _) => debug!("a second Hello is ignored"),
+                (_, None) => debug!("a report of a watcher is ignored"),
+            }
+        }
+    }
+
     /// Poses are datagrams: a lost one holds up nothing.
-    fn tell_pose(&self, pose: &PoseSample) {
+    fn send_pose(&self, pose: &PoseSample) {
         let mut buffer = [0; MAX_FRAMED];
         let bytes = encode_body(&Datagram::Pose(*pose), &mut buffer);
         if let Err(error) = self.connection.send_datagram(bytes::Bytes::copy_from_slice(bytes)) {
@@ -175,7 +209,11 @@ impl Talk<'_> {
     }
 }
 
-async fn tell(vehicle: &Vehicle, out: &mut Outbound, cursor: &mut u64) -> Result<(), Ending> {
+async fn send_events(
+    vehicle: &VehicleFlight,
+    out: &mut Outbound,
+    cursor: &mut u64,
+) -> Result<(), Ending> {
     let entries = vehicle.events.read(cursor).map_err(|lagged| (SLOW, lagged.to_string()))?;
     for entry in entries {
         if entry.origin == Origin::Server {
@@ -186,7 +224,7 @@ async fn tell(vehicle: &Vehicle, out: &mut Outbound, cursor: &mut u64) -> Result
     Ok(())
 }
 
-async fn tell_cameras(
+async fn send_cameras(
     out: &mut Outbound,
     before: &CameraSet,
     now: &CameraSet,
@@ -198,42 +236,6 @@ async fn tell_cameras(
         }
     }
     Ok(())
-}
-
-/// Client to server; a watcher, who has no lease, is heard asking the time only.
-async fn up(
-    lease: Option<&ControlLease>,
-    mut incoming: Incoming,
-    clock_requests: &mpsc::Sender<ClockRequest>,
-    heard: &cell::Sender<u64>,
-) -> Ending {
-    loop {
-        let message = match incoming.next().await {
-            Ok(message) => message,
-            Err(ending) => return ending,
-        };
-        if let Some(lease) = lease {
-            lease.heard(clock::now());
-        }
-        match (message, lease) {
-            // A full queue means that replies cannot leave; a late reply would mislead anyway.
-            (ToServer::Clock(request), _) => drop(clock_requests.try_send(request)),
-            (ToServer::Telemetry(report), Some(lease)) => lease.vehicle.report(report),
-            (ToServer::Timing(timing), Some(lease)) => {
-                lease.vehicle.report_timing(timing);
-            }
-            (ToServer::Imu(readings), Some(lease)) => lease.vehicle.feel(&readings),
-            (ToServer::Event { seq, event }, Some(lease)) => {
-                if lease.hear(seq) {
-                    lease.vehicle.log(Origin::Page, event);
-                }
-                heard.send_modify(|newest| *newest = seq.max(*newest));
-            }
-            (ToServer::Heard(seq), _) => debug!("events up to {seq} were heard"),
-            (ToServer::Hello(_), _) => debug!("a second Hello is ignored"),
-            (_, None) => debug!("a watcher has nothing to tell"),
-        }
-    }
 }
 
 /// At most 100 Hz, with room for the jitter of a 200 Hz source. [s]

@@ -202,8 +202,8 @@ mod tests {
     #[test]
     fn what_moves_is_where_its_clock_says() {
         let authorizer = ObjectConfig {
-            name: "authorizer".into(),
-            scene: "authorizer.ply".into(),
+            name: "door".into(),
+            scene: "door.ply".into(),
             position_m: DVec3::new(0.0, 0.5, 0.0),
             yaw_deg: 0.0,
             phase_s: Some(0.0),

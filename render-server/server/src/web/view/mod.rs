@@ -31,9 +31,8 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
 use self::draw::{Drawn, Engine, Request};
-use crate::hub::RendererInfo;
 use crate::lock::lock;
-use crate::render::{RendererKind, choose};
+use crate::render::{RendererInfo, RendererKind, choose};
 use crate::scene::{self, Scene, Up};
 use crate::stop::Stop;
 use crate::web::{self, origin};
@@ -67,7 +66,7 @@ pub struct ViewArgs {
     pub up: Up,
 
     /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
-    #[arg(long, value_name = "METRES", value_parser = crate::args::scale)]
+    #[arg(long, value_name = "METRES", value_parser = scene::parse_scale)]
     pub scale: Option<f64>,
 
     /// What the arena leaves to chance: where in their motion its objects begin

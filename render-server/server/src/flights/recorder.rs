@@ -13,15 +13,15 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::verdict::Verdict;
 use vizflyt_protocol::messages::OutcomeKind;
 
-use super::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
-use crate::flights::vehicle::Vehicle;
+use super::leaderboard::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
+use super::vehicle::VehicleFlight;
 use crate::lock::lock;
 
 /// Follows a vehicle's flights until the task is dropped.
 /// A team's official runs beyond `most_official` are practice.
 pub(crate) async fn record(
     board: Leaderboard,
-    vehicle: Arc<Vehicle>,
+    vehicle: Arc<VehicleFlight>,
     arena: ArenaConfig,
     most_official: Option<u32>,
 ) {
@@ -49,7 +49,7 @@ pub(crate) async fn record(
 
 struct Recorder {
     board: Leaderboard,
-    vehicle: Arc<Vehicle>,
+    vehicle: Arc<VehicleFlight>,
     arena: ArenaConfig,
     most_official: Option<u32>,
     run: Option<Running>,

@@ -1,0 +1,66 @@
+//! Loads the scene: renderer, referees, moving objects, top view.
+
+use std::sync::Arc;
+
+use anyhow::Result;
+use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
+use vizflyt_splat::{Chosen, Scene as RenderedScene};
+
+use crate::args::ServeArgs;
+use crate::clock;
+use crate::render::choose;
+use crate::render::dynamic_objects::{DynamicObjects, vehicle_models};
+use crate::scene::{self, Scene};
+use crate::web::top_view::TopView;
+
+/// Everything made from the scene.
+pub(super) struct LoadedScene {
+    pub(super) arena: ArenaConfig,
+    pub(super) renderer: Chosen,
+    /// Each vehicle's name, and the arena as it has it.
+    pub(super) flying: Vec<(String, ArenaConfig)>,
+    pub(super) referees: Vec<Referee>,
+    pub(super) dynamic_objects: DynamicObjects,
+    /// Whether the vehicles see and touch each other.
+    pub(super) neighbours: bool,
+    pub(super) top_view: TopView,
+    /// What stands still.
+    pub(super) field: Arc<DistanceField>,
+}
+
+/// Loads the scene and makes all that follows from it.
+///
+/// # Errors
+/// A scene or an arena that cannot be used, no such renderer.
+pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
+    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, args.up, args.scale)?;
+    let flying: Vec<_> = arena
+        .flying(&args.vehicles)?
+        .iter()
+        .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
+        .collect();
+    let field = Arc::new(scene::bake(&splats, &arena));
+    let top_view = TopView::render(&splats, &arena, &field);
+    let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
+    let together = if args.apart { 0 } else { flying.len() };
+    objects.extend(vehicle_models(together));
+    let renderer = choose(RenderedScene { splats: &splats, objects: &objects }, args.renderer)?;
+    // The renderer holds its own form of the scene; the file's form is no longer needed.
+    drop(splats);
+    // Pictures and referees count what moves from the same instant.
+    let epoch = clock::now();
+    let dynamic_objects = DynamicObjects::new(epoch, obstacles.objects.clone(), &objects, together);
+    let referees =
+        flying.iter().map(|(_, arena)| Referee::new(arena, obstacles.clone()).counting_from(epoch));
+    let (referees, neighbours) = (referees.collect(), together > 1);
+    Ok(LoadedScene {
+        arena,
+        renderer,
+        flying,
+        referees,
+        dynamic_objects,
+        neighbours,
+        top_view,
+        field,
+    })
+}

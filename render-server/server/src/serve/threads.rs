@@ -1,0 +1,74 @@
+//! Starts the four threads: pose, render, encode, previews.
+
+use std::sync::Arc;
+use std::thread::JoinHandle;
+
+use anyhow::{Context, Result};
+use vizflyt_arena::Referee;
+use vizflyt_splat::Rasterizer;
+
+use crate::args::ServeArgs;
+use crate::mailbox::Mailbox;
+use crate::poses::drivers::PoseSource;
+use crate::poses::thread::PoseThread;
+use crate::render::rendered::RenderQueue;
+use crate::stream::Rooms;
+use crate::web::previews::{self, Previews};
+use crate::{render, stream};
+
+/// What the threads share.
+pub(super) struct Threads<'a> {
+    pub(super) rooms: &'a Rooms,
+    pub(super) previews: &'a Arc<Previews>,
+    /// Whether the vehicles see and touch each other.
+    pub(super) neighbours: bool,
+}
+
+impl Threads<'_> {
+    /// Starts them; they end when the server stops.
+    pub(super) fn start(
+        &self,
+        args: &ServeArgs,
+        mut renderer: Box<dyn Rasterizer>,
+        referees: Vec<Referee>,
+        mut source: Box<dyn PoseSource>,
+    ) -> Result<Vec<JoinHandle<()>>> {
+        let newest = Arc::new(Mailbox::default());
+        let ticks = Arc::new(RenderQueue::default());
+        let pose_thread = PoseThread {
+            localization: self.rooms.localization.clone(),
+            flights: self.rooms.flights.clone(),
+            referees,
+            neighbours: self.neighbours,
+        };
+        let (published, stop) = (newest.clone(), self.rooms.stop.clone());
+        let pose = move || pose_thread.run(&mut *source, &published, &stop);
+        let (rooms, published, max_rate_hz) = (self.rooms.clone(), ticks.clone(), args.max_rate);
+        let render = move || {
+            let shared = (&*rooms.rendering, &*rooms.flights, &*rooms.streaming);
+            let stop = &rooms.stop;
+            render::thread::run(shared, &mut *renderer, &newest, &published, max_rate_hz, stop);
+        };
+        let (rooms, rendered, options) = (self.rooms.clone(), ticks.clone(), args.encode_options());
+        let encode = move || {
+            let Rooms { streaming, flights, stop, .. } = &rooms;
+            stream::encode::run(streaming, flights, &rendered, options, stop);
+        };
+        let (rooms, made) = (self.rooms.clone(), self.previews.clone());
+        let previews = move || {
+            let Rooms { streaming, flights, stop, .. } = &rooms;
+            previews::run(&made, flights, &streaming.subscriptions, &ticks, stop);
+        };
+        Ok(vec![
+            start("pose", pose)?,
+            start("render", render)?,
+            start("encode", encode)?,
+            start("previews", previews)?,
+        ])
+    }
+}
+
+fn start(name: &str, run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>> {
+    let thread = std::thread::Builder::new().name(name.to_owned());
+    thread.spawn(run).with_context(|| format!("cannot start the {name} thread"))
+}
