@@ -13,7 +13,7 @@ use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -47,14 +47,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         };
         let world_from_body: Pose<World, Body> =
             Pose::new(DVec3::new(*x, *y, *z), DQuat::from_rotation_z(yaw_deg.to_radians()));
-        let camera = Camera {
-            intrinsics: Intrinsics::from_horizontal_fov(width, height, 90f64.to_radians()),
-            world_from_cam: world_from_body
-                * body_from_forward_cam(DVec3::ZERO, pitch_deg.to_radians()),
-            near_m: 0.05,
-            background: [0.0; 3],
-            air: Air::CLEAR,
-        };
+        let camera = Camera::new(
+            Intrinsics::from_horizontal_fov(width, height, 90f64.to_radians()),
+            world_from_body * body_from_forward_cam(DVec3::ZERO, pitch_deg.to_radians()),
+            0.05,
+        );
         let mut images = [RgbdImage::default()];
         let start = Instant::now();
         renderer.render(&[], std::slice::from_ref(&camera), &mut images)?;

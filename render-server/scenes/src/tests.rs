@@ -4,7 +4,7 @@
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, Volume, World, body_from_forward_cam};
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply};
 
 use super::*;
 use crate::solids::{REACH_M, Solids};
@@ -178,13 +178,7 @@ fn compare(scene: &Generated, within: &Volume, poses: &[(DVec3, f64, f64)]) -> A
         let world_from_body: Pose<World, Body> = Pose::new(p_m, yaw);
         let world_from_cam =
             world_from_body * body_from_forward_cam(DVec3::ZERO, pitch_deg.to_radians());
-        let camera = Camera {
-            intrinsics: k,
-            world_from_cam,
-            near_m: 0.05,
-            background: [0.0; 3],
-            air: Air::CLEAR,
-        };
+        let camera = Camera::new(k, world_from_cam, 0.05);
         let mut images = [RgbdImage::default()];
         renderer.render(&[], std::slice::from_ref(&camera), &mut images).unwrap();
         let [seen] = images;

@@ -22,7 +22,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 use vizflyt_splat::gpu::{Adapter, Budget, GpuRenderer};
-use vizflyt_splat::{Air, Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply};
+use vizflyt_splat::{Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply};
 
 /// What the command line asks for.
 struct Options {
@@ -276,7 +276,7 @@ fn captured() -> Vec<Case> {
 const SIZES: [(u32, u32); 2] = [(320, 240), (640, 480)];
 
 fn camera(intrinsics: Intrinsics, world_from_cam: Pose<World, Cam>) -> Camera {
-    Camera { intrinsics, world_from_cam, near_m: 0.01, background: [0.0; 3], air: Air::CLEAR }
+    Camera::new(intrinsics, world_from_cam, 0.01)
 }
 
 /// Leaves what another renderer needs to draw the same: the scene, its cameras in the oracle's form,

@@ -20,7 +20,7 @@ use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_splat::{
-    Air, Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply, render_reference,
+    Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply, render_reference,
 };
 
 /// A scene and where it is seen from.
@@ -251,5 +251,5 @@ fn camera(
     intrinsics: Intrinsics,
     world_from_cam: Pose<vizflyt_protocol::geometry::World, vizflyt_protocol::geometry::Cam>,
 ) -> Camera {
-    Camera { intrinsics, world_from_cam, near_m: 0.01, background: [0.0; 3], air: Air::CLEAR }
+    Camera::new(intrinsics, world_from_cam, 0.01)
 }

@@ -3,7 +3,7 @@
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 
-use crate::Air;
+use crate::Atmosphere;
 use crate::limits::JACOBIAN_MARGIN;
 
 /// What is drawn, from where.
@@ -18,10 +18,20 @@ pub struct Camera {
     /// Linear RGB shown where nothing covers the pixel, in clear air and plain light.
     pub background: [f32; 3],
     /// What lies between the scene and the camera.
-    pub air: Air,
+    pub atmosphere: Atmosphere,
 }
 
 impl Camera {
+    /// Returns a camera that shows black where nothing covers the pixel, through clear air.
+    pub const fn new(
+        intrinsics: Intrinsics,
+        world_from_cam: Pose<World, Cam>,
+        near_m: f32,
+    ) -> Self {
+        let atmosphere = Atmosphere::CLEAR;
+        Self { intrinsics, world_from_cam, near_m, background: [0.0; 3], atmosphere }
+    }
+
     /// Checks that every number is one a renderer can work with.
     pub fn validate(&self) -> Result<(), InvalidCamera> {
         self.intrinsics.validate()?;
@@ -35,7 +45,7 @@ impl Camera {
         if !self.background.iter().all(|v| v.is_finite()) {
             return Err(InvalidCamera::Background(self.background));
         }
-        self.air.validate()
+        self.atmosphere.validate()
     }
 
     /// Returns least and greatest `(x / z, y / z)` at which a splat is linearised.
@@ -106,7 +116,7 @@ pub enum InvalidCamera {
     Background([f32; 3]),
     /// Light or fog is not.
     #[error("{0:?}: light and fog are finite and at least 0, at most 100")]
-    Air(Air),
+    Atmosphere(Atmosphere),
 }
 
 /// Points on each side of the image at which a lens's border is found.

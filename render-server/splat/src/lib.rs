@@ -8,7 +8,7 @@
 //! ```
 //! use glam::{Quat, Vec3};
 //! use vizflyt_protocol::geometry::{Intrinsics, Pose};
-//! use vizflyt_splat::{Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
+//! use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
 //!
 //! // One opaque grey ball of 10 cm, 2 m ahead of a camera at the origin.
 //! let splats = Splats {
@@ -19,13 +19,8 @@
 //!     sh_degree: 0,
 //!     sh: vec![0.0; 3],
 //! };
-//! let camera = Camera {
-//!     intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.2),
-//!     world_from_cam: Pose::IDENTITY,
-//!     near_m: 0.01,
-//!     background: [0.0; 3],
-//!     air: Air::CLEAR,
-//! };
+//! let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 1.2);
+//! let camera = Camera::new(intrinsics, Pose::IDENTITY, 0.01);
 //! let mut images = [RgbdImage::default()];
 //! CpuRenderer::new(&splats).render(&[], &[camera], &mut images)?;
 //! let mut depth_mm = Vec::new();
@@ -36,32 +31,32 @@
 //!
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
-mod air;
+mod atmosphere;
+mod backend;
 mod blocks;
+pub mod builtin_models;
 mod camera;
-mod choose;
 mod cpu;
+mod fallback;
 pub mod format;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 mod harmonics;
 mod image;
 mod limits;
-pub mod models;
 mod rasterizer;
 mod reference;
-mod resilient;
 mod scene;
 mod splats;
 
-pub use air::Air;
+pub use atmosphere::Atmosphere;
+pub use backend::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
 pub use camera::{Camera, InvalidCamera};
-pub use choose::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
 pub use cpu::{CpuRenderer, Detail};
+pub use fallback::FallbackRenderer;
 pub use format::ply;
 pub use image::{DepthKind, RgbdImage};
 pub use rasterizer::{PassTimes, Rasterizer, RenderError, Workload};
 pub use reference::render_reference;
-pub use resilient::Resilient;
 pub use scene::{Placement, RigidObject, Scene};
 pub use splats::Splats;

@@ -148,7 +148,7 @@ fn project(
     let numbers = splats.sh_coefficients() * 3;
     let sh = &splats.sh[i * numbers..(i + 1) * numbers];
     let rgb = harmonics::colour(sh, direction.to_array());
-    let rgb = camera.air.seen(rgb, (mean - seen.center_m).length());
+    let rgb = camera.atmosphere.seen(rgb, (mean - seen.center_m).length());
     Some(Projected {
         mean_px,
         conic: [c / determinant, -b / determinant, a / determinant],
@@ -205,7 +205,8 @@ fn blend(projected: &[Projected], camera: &Camera, image: &mut RgbdImage) {
             }
         }
     }
-    let background = DVec3::from_array(camera.air.background(camera.background).map(f64::from));
+    let background =
+        DVec3::from_array(camera.atmosphere.background(camera.background).map(f64::from));
     image.resize(k.width_px, k.height_px);
     for i in 0..pixels {
         let colour = rgb[i] + transmittance[i] * background;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
 use vizflyt_splat::{
-    Air, Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
+    Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
 
 struct Counting;
@@ -72,12 +72,12 @@ fn cameras(turn: u32) -> Vec<Camera> {
     ]
     .into_iter()
     .enumerate()
-    .map(|(i, intrinsics)| Camera {
-        intrinsics,
-        world_from_cam: Pose::new(position_m * if i == 3 { 1e4 } else { 1.0 }, rotation),
-        near_m: 0.05,
-        background: [0.0; 3],
-        air: Air::CLEAR,
+    .map(|(i, intrinsics)| {
+        Camera::new(
+            intrinsics,
+            Pose::new(position_m * if i == 3 { 1e4 } else { 1.0 }, rotation),
+            0.05,
+        )
     })
     .collect()
 }

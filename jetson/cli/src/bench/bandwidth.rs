@@ -11,7 +11,7 @@ use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::{Up, load, load_as_it_is};
 use vizflyt_server::stream::rate_control::LEVELS;
-use vizflyt_splat::{Air, Camera, Chosen, DepthKind, RgbdImage};
+use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
 
@@ -77,7 +77,7 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
                 world_from_cam: Pose::new(eye_m, heading) * body_from_forward_cam(DVec3::ZERO, 0.0),
                 near_m: 0.1,
                 background: [0.0; 3],
-                air: Air::CLEAR,
+                air: Atmosphere::CLEAR,
             }
         };
         (scene.splats, (0..8).map(view).collect())

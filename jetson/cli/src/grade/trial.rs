@@ -383,7 +383,7 @@ impl<'a> Flight<'a> {
         let seen = self.now.plus_ns(self.trial.delays.image_ns);
         let shown = motion.reach(ServerTime::from_ns(seen.as_ns()));
         let world_from_body = motion.at(shown);
-        let air = vizflyt_server::render::environment::air(&self.arena.environment);
+        let atmosphere = vizflyt_server::render::environment::atmosphere(&self.arena.environment);
         let cameras: Vec<Camera> = due
             .iter()
             .map(|&index| Camera {
@@ -391,7 +391,7 @@ impl<'a> Flight<'a> {
                 world_from_cam: world_from_body * self.cameras[index].body_from_cam,
                 near_m: self.arena.cameras[index].near_m as f32,
                 background: [0.0; 3],
-                air,
+                atmosphere,
             })
             .collect();
         let pose = newest.stamp;

@@ -16,7 +16,7 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_arena::config::LensConfig;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
-use vizflyt_splat::{Air, Camera};
+use vizflyt_splat::{Atmosphere, Camera};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -85,7 +85,7 @@ fn parse(text: &str) -> Result<Camera> {
         world_from_cam: cam_from_world.inverse(),
         near_m: file.near_m,
         background: file.bg,
-        air: Air::CLEAR,
+        air: Atmosphere::CLEAR,
     };
     camera.validate()?;
     Ok(camera)

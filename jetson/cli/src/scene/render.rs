@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_scenes::Variant;
-use vizflyt_server::render::environment::air;
+use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::{RendererKind, choose};
 use vizflyt_server::scene::{load_as_it_is, load_objects};
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
@@ -88,9 +88,9 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let placements = moving.placements((args.at * 1e9).round() as i64);
     println!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
-    let air = air(&args.environment.environment());
+    let atmosphere = atmosphere(&args.environment.environment());
     for Shot { camera, folder } in shots {
-        let camera = Camera { air, ..camera };
+        let camera = Camera { atmosphere, ..camera };
         let times = rasterizer.render(&placements, &[camera], &mut images)?;
         let [image] = &images;
         std::fs::create_dir_all(&folder)

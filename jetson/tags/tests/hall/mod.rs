@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage};
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::simulated::{Behind, Sensor, SimulatedCamera};
@@ -30,13 +30,7 @@ fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
         {
             return image.clone();
         }
-        let camera = Camera {
-            intrinsics,
-            world_from_cam: *world_from_cam,
-            near_m: 0.05,
-            background: [0.0; 3],
-            air: Air::CLEAR,
-        };
+        let camera = Camera::new(intrinsics, *world_from_cam, 0.05);
         let mut images = [RgbdImage::default()];
         hall.lock()
             .expect("no test panics here")

@@ -4,7 +4,7 @@
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_arena::config::{MotionConfig, ObjectConfig};
 use vizflyt_protocol::geometry::{Object, Pose, Volume, World};
-use vizflyt_splat::models::{QUADROTOR, boxes};
+use vizflyt_splat::builtin_models::{QUADROTOR, boxes};
 use vizflyt_splat::{RigidObject, Splats};
 
 use super::gate::Gate;
@@ -147,7 +147,7 @@ impl Mover {
         let rest = self.rest();
         let (splats, truth) = match &self.shape {
             Shape::Quadrotor => {
-                let solid = |part: &vizflyt_splat::models::Part| Volume::Cuboid {
+                let solid = |part: &vizflyt_splat::builtin_models::Part| Volume::Cuboid {
                     center_m: part.center_m.as_dvec3(),
                     half_m: part.half_m.as_dvec3(),
                     rotation: DQuat::IDENTITY,

@@ -10,7 +10,7 @@
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_splat::models::{QUADROTOR, boxes};
+use vizflyt_splat::builtin_models::{QUADROTOR, boxes};
 use vizflyt_splat::{Placement, RigidObject};
 
 use crate::poses::newest::NewestPoses;

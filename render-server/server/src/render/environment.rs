@@ -3,7 +3,7 @@
 use std::sync::Mutex;
 
 use vizflyt_arena::config::{ConfigError, EnvironmentConfig};
-use vizflyt_splat::Air;
+use vizflyt_splat::Atmosphere;
 
 use crate::lock::lock;
 
@@ -33,8 +33,8 @@ impl Environment {
 }
 
 /// Returns what a renderer takes.
-pub fn air(config: &EnvironmentConfig) -> Air {
-    Air {
+pub fn atmosphere(config: &EnvironmentConfig) -> Atmosphere {
+    Atmosphere {
         light: config.light.map(|value| value as f32),
         fog_per_m: config.fog_per_m() as f32,
         fog: config.fog.map(|value| value as f32),

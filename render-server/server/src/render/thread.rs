@@ -27,7 +27,7 @@ use crate::mailbox::Mailbox;
 use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
-use crate::render::environment::air;
+use crate::render::environment::atmosphere;
 use crate::render::rendered::RenderQueue;
 use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
@@ -85,7 +85,7 @@ pub fn run(
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
         cameras.clear();
-        let air = air(&rendering.environment.now());
+        let atmosphere = atmosphere(&rendering.environment.now());
         let mut views = [View::default(); MAX_VEHICLES];
         for (vehicle, set) in sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
@@ -114,7 +114,7 @@ pub fn run(
                     world_from_cam: world_from_body * info.body_from_cam,
                     near_m: config.near_m as f32,
                     background: BACKGROUND,
-                    air,
+                    atmosphere,
                 });
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);

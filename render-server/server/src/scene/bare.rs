@@ -21,7 +21,7 @@ use vizflyt_arena::config::{
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use super::orient::{Up, WorldFromScene};
 
@@ -108,7 +108,7 @@ fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
                     world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, 0.0),
                     near_m: 0.05,
                     background: [0.0; 3],
-                    air: Air::CLEAR,
+                    atmosphere: Atmosphere::CLEAR,
                 }
             })
             .collect();

@@ -180,7 +180,7 @@ mod tests {
     use glam::{Quat, Vec3};
     use proptest::prelude::*;
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
-    use vizflyt_splat::{Air, Camera, render_reference};
+    use vizflyt_splat::{Atmosphere, Camera, render_reference};
 
     const ALL: [Up; 6] = [Up::X, Up::NegX, Up::Y, Up::NegY, Up::Z, Up::NegZ];
 
@@ -232,7 +232,7 @@ mod tests {
                 world_from_cam: Pose::IDENTITY,
                 near_m: 0.01,
                 background: [0.0; 3],
-                air: Air::CLEAR,
+                atmosphere: Atmosphere::CLEAR,
             };
             let before = render_reference(&scene(), &[], &camera).unwrap();
             let mut moved = scene();

@@ -11,7 +11,7 @@ use serde::Serialize;
 use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
@@ -172,7 +172,7 @@ fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Ca
         world_from_cam: Pose::new(middle.extend(ceiling_m + height_m), DQuat::from_mat3(&axes)),
         near_m: height_m as f32,
         background: [0.05, 0.07, 0.09],
-        air: Air::CLEAR,
+        atmosphere: Atmosphere::CLEAR,
     }
 }
 

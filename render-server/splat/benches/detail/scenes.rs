@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, Splats};
+use vizflyt_splat::{Camera, Splats};
 
 #[path = "city.rs"]
 pub(crate) mod city;
@@ -12,11 +12,12 @@ pub(crate) fn look(from: DVec3, to: DVec3) -> Camera {
     let z = (to - from).normalize();
     let x = z.cross(DVec3::Z).normalize();
     Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(640, 480, 90f64.to_radians()),
-        world_from_cam: Pose::new(from, DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z))),
-        near_m: 0.05,
         background: [0.5, 0.6, 0.8],
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics::from_horizontal_fov(640, 480, 90f64.to_radians()),
+            Pose::new(from, DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z))),
+            0.05,
+        )
     }
 }
 

@@ -9,7 +9,7 @@ use super::detail::BRANCH;
 use super::lens::{Lens, Model};
 use super::scene::{Block, Part};
 use crate::limits::BLUR_PX2;
-use crate::{Air, Camera};
+use crate::{Atmosphere, Camera};
 
 /// A camera, as one part of the scene sees it, in the numbers the passes use; f32, but for what is
 /// computed once per image.
@@ -33,7 +33,7 @@ pub(super) struct View {
     /// What is seen of it through the air.
     pub(super) background: [f32; 3],
     /// `None` where it changes nothing.
-    pub(super) air: Option<Air>,
+    pub(super) atmosphere: Option<Atmosphere>,
     pub(super) model: Model,
     /// Means whose slope is longer are dropped; infinite without a lens.
     pub(super) reach: f32,
@@ -111,8 +111,8 @@ impl View {
             cy_px: k.cy_px as f32,
             slope_x: slope_x.map(|v| v as f32),
             slope_y: slope_y.map(|v| v as f32),
-            background: camera.air.background(camera.background),
-            air: Some(camera.air).filter(|air| !air.is_clear()),
+            background: camera.atmosphere.background(camera.background),
+            atmosphere: Some(camera.atmosphere).filter(|atmosphere| !atmosphere.is_clear()),
             model: lens.model,
             // f32's rounding, so that what lies on the reach itself is drawn.
             reach: (lens.reach * (1.0 + 1e-6)) as f32,

@@ -17,7 +17,7 @@ use super::cull::{View, Visible};
 use super::lens::{self, Model};
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
 use super::simd::{Kernel, Simd};
-use crate::Air;
+use crate::Atmosphere;
 use crate::harmonics::{C0, C1, C2, C3};
 use crate::limits::BLUR_PX2;
 
@@ -240,8 +240,8 @@ fn vector<S: Simd, const LENS: bool>(
     let inverse_length = s.splat(1.0) / distance;
     let direction = [d[0] * inverse_length, d[1] * inverse_length, d[2] * inverse_length];
     let mut rgb = colour(s, &sh[first..], direction);
-    if let Some(air) = &view.air {
-        rgb = through(s, air, rgb, distance);
+    if let Some(atmosphere) = &view.atmosphere {
+        rgb = through(s, atmosphere, rgb, distance);
     }
     let fields = [
         mean_x,
@@ -415,16 +415,16 @@ fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
     [s.max(rgb[0], zero), s.max(rgb[1], zero), s.max(rgb[2], zero)]
 }
 
-/// Returns colours seen from a distance [m]; the vector form of [`Air::seen`].
+/// Returns colours seen from a distance [m]; the vector form of [`Atmosphere::seen`].
 #[inline(always)]
-fn through<S: Simd>(s: S, air: &Air, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
+fn through<S: Simd>(s: S, atmosphere: &Atmosphere, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
     // Within the range of `exp2`; a millionth of a millionth is left there.
-    let lost = distance * s.splat(-air.fog_per_m * std::f32::consts::LOG2_E);
+    let lost = distance * s.splat(-atmosphere.fog_per_m * std::f32::consts::LOG2_E);
     let left = s.exp2(s.max(lost, s.splat(-40.0)));
     let mut seen = rgb;
     for channel in 0..3 {
-        let fog = s.splat(air.fog[channel]);
-        let lit = rgb[channel] * s.splat(air.light[channel]);
+        let fog = s.splat(atmosphere.fog[channel]);
+        let lit = rgb[channel] * s.splat(atmosphere.light[channel]);
         seen[channel] = s.mul_add(lit - fog, left, fog);
     }
     seen

@@ -231,7 +231,7 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
     let distance = sqrt(dot(d, d));
     let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, d / distance);
-    // As `Air::seen`.
+    // As `Atmosphere::seen`.
     let light = views[view].light;
     let fog = views[view].fog.xyz;
     let seen = mix(fog, rgb * light.xyz, exp2(-light.w * distance));

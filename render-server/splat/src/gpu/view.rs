@@ -6,7 +6,7 @@ use zerocopy::{Immutable, IntoBytes};
 
 use super::TILE_PX;
 use crate::limits::BLUR_PX2;
-use crate::{Air, Camera};
+use crate::{Atmosphere, Camera};
 
 /// `Tick` of `common.wgsl`.
 #[derive(Clone, Copy, Debug, Default, IntoBytes, Immutable)]
@@ -102,8 +102,8 @@ impl View {
         // Infinite for a pinhole, which the shader does not ask.
         let reach = lens.reach.min(f64::from(f32::MAX)) as f32;
         let (planes, weights) = planes(camera, lens, &rotation);
-        let [r, g, b] = camera.air.background(camera.background);
-        let Air { light, fog, fog_per_m } = camera.air;
+        let [r, g, b] = camera.atmosphere.background(camera.background);
+        let Atmosphere { light, fog, fog_per_m } = camera.atmosphere;
         Self {
             rows: [row(0), row(1), row(2)],
             focal: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(|v| v as f32),

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, RgbdImage, RigidObject, Scene, ply};
+use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, ply};
 
 use crate::{both, compare, twins};
 
@@ -75,12 +75,12 @@ fn cameras_of_all_sizes_are_drawn_at_once() {
 #[test]
 fn light_and_fog_agree() {
     let splats = twins::cloud(3000, 2, 19);
-    let dim = Air { light: [0.2, 0.3, 1.4], ..Air::CLEAR };
-    let fog = Air { fog_per_m: 0.7, fog: [0.7, 0.6, 0.5], ..dim };
-    let soup = Air { fog_per_m: 60.0, ..fog };
-    let cameras =
-        [Air::CLEAR, dim, fog, soup].map(|air| Camera { air, ..twins::camera(96, 64, 70.0) });
-    check("air", &splats, &[], &cameras);
+    let dim = Atmosphere { light: [0.2, 0.3, 1.4], ..Atmosphere::CLEAR };
+    let fog = Atmosphere { fog_per_m: 0.7, fog: [0.7, 0.6, 0.5], ..dim };
+    let soup = Atmosphere { fog_per_m: 60.0, ..fog };
+    let cameras = [Atmosphere::CLEAR, dim, fog, soup]
+        .map(|air| Camera { air, ..twins::camera(96, 64, 70.0) });
+    check("atmosphere", &splats, &[], &cameras);
 }
 
 #[test]

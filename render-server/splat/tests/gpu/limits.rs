@@ -2,7 +2,7 @@
 
 use vizflyt_splat::gpu::{Budget, GpuRenderer};
 use vizflyt_splat::{
-    Backend, Camera, CpuRenderer, NoRenderer, Rasterizer, RenderError, Resilient, RgbdImage,
+    Backend, Camera, CpuRenderer, FallbackRenderer, NoRenderer, Rasterizer, RenderError, RgbdImage,
     RigidObject, Scene, choose,
 };
 
@@ -87,9 +87,9 @@ fn what_no_device_can_hold_is_drawn_by_the_processor() {
     let small = [twins::camera(20, 20, 80.0)];
     let expected = draw(&mut CpuRenderer::new(&splats), &small);
     assert_alike("after all", &draw(&mut gpu, &small)[0], &expected[0]);
-    let mut resilient = Resilient::new(Box::new(gpu), CpuRenderer::new(&splats));
+    let mut fallback = FallbackRenderer::new(Box::new(gpu), CpuRenderer::new(&splats));
     let expected = draw(&mut CpuRenderer::new(&splats), &large);
-    assert!(draw(&mut resilient, &large) == expected);
+    assert!(draw(&mut fallback, &large) == expected);
     // Less than one block.
     let none = Budget { binding_bytes: 5000, ..Budget::default() };
     let refused = adapter().map(|adapter| GpuRenderer::new(&splats, adapter, none).map(|_| ()));
@@ -107,11 +107,11 @@ fn the_processor_takes_over_when_a_device_is_lost() {
     assert!(matches!(lost, Err(RenderError::Device(_))), "{lost:?}");
     // And stays so.
     assert!(gpu.render(&[], &camera, &mut [RgbdImage::default()]).is_err());
-    let mut resilient = Resilient::new(Box::new(gpu), CpuRenderer::new(&splats));
-    assert!(resilient.name().starts_with("gpu "), "{}", resilient.name());
-    let after = draw(&mut resilient, &camera);
+    let mut fallback = FallbackRenderer::new(Box::new(gpu), CpuRenderer::new(&splats));
+    assert!(fallback.name().starts_with("gpu "), "{}", fallback.name());
+    let after = draw(&mut fallback, &camera);
     assert_alike("before and after", &after[0], &before[0]);
-    let name = resilient.name();
+    let name = fallback.name();
     assert!(name.starts_with("cpu ") && name.contains("is lost"), "{name}");
 }
 

@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::gpu::GpuRenderer;
 use vizflyt_splat::{
-    Air, Camera, InvalidCamera, Rasterizer, RenderError, RgbdImage, RigidObject, Scene, Splats,
+    Camera, InvalidCamera, Rasterizer, RenderError, RgbdImage, RigidObject, Scene, Splats,
     render_reference,
 };
 
@@ -12,11 +12,12 @@ use crate::{compare, renderer, twins};
 
 fn looking_ahead(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians()),
-        world_from_cam: Pose::IDENTITY,
-        near_m: 0.05,
         background: [0.2, 0.4, 0.6],
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians()),
+            Pose::IDENTITY,
+            0.05,
+        )
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, Splats};
+use vizflyt_splat::{Camera, Splats};
 
 /// Knuth's MMIX generator; its upper 24 bits, from `low` to `high`.
 pub(crate) fn random(state: &mut u64, low: f32, high: f32) -> f32 {
@@ -57,11 +57,12 @@ pub(crate) fn ball(count: usize, radius_m: f32, sh_degree: u8) -> Splats {
 pub(crate) fn camera(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     let k = Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians());
     Camera {
-        intrinsics: Intrinsics { cx_px: k.cx_px + 1.3, cy_px: k.cy_px - 0.4, ..k },
-        world_from_cam: Pose::new(DVec3::new(0.05, -0.02, -0.1), DQuat::from_rotation_z(0.1)),
-        near_m: 0.05,
         background: [0.2, 0.4, 0.6],
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics { cx_px: k.cx_px + 1.3, cy_px: k.cy_px - 0.4, ..k },
+            Pose::new(DVec3::new(0.05, -0.02, -0.1), DQuat::from_rotation_z(0.1)),
+            0.05,
+        )
     }
 }
 
@@ -84,18 +85,19 @@ pub(crate) fn oracle_camera(path: &Path) -> Camera {
     let rotation = DMat3::from_cols(row(0), row(1), row(2));
     let translation = DVec3::new(c.w2c[0][3], c.w2c[1][3], c.w2c[2][3]);
     Camera {
-        intrinsics: Intrinsics {
-            width_px: c.w,
-            height_px: c.h,
-            fx_px: c.fx,
-            fy_px: c.fy,
-            cx_px: c.cx,
-            cy_px: c.cy,
-            distortion: Distortion::None,
-        },
-        world_from_cam: Pose::new(-(rotation * translation), DQuat::from_mat3(&rotation)),
-        near_m: 0.01,
         background: c.bg,
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics {
+                width_px: c.w,
+                height_px: c.h,
+                fx_px: c.fx,
+                fy_px: c.fy,
+                cx_px: c.cx,
+                cy_px: c.cy,
+                distortion: Distortion::None,
+            },
+            Pose::new(-(rotation * translation), DQuat::from_mat3(&rotation)),
+            0.01,
+        )
     }
 }

@@ -4,7 +4,7 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_splat::{
-    Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats, render_reference,
+    Atmosphere, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats, render_reference,
 };
 
 use crate::compare;
@@ -48,11 +48,11 @@ pub(crate) fn distortion() -> impl Strategy<Value = Distortion> {
 }
 
 /// Clear air, or light and fog from haze to soup.
-pub(crate) fn air() -> impl Strategy<Value = Air> {
+pub(crate) fn atmosphere() -> impl Strategy<Value = Atmosphere> {
     let colour = || prop::array::uniform3(0.0..1.0f32);
     let some = (colour(), prop_oneof![Just(0.0), 0.001..20.0f32], colour())
-        .prop_map(|(light, fog_per_m, fog)| Air { light, fog_per_m, fog });
-    prop_oneof![Just(Air::CLEAR), some]
+        .prop_map(|(light, fog_per_m, fog)| Atmosphere { light, fog_per_m, fog });
+    prop_oneof![Just(Atmosphere::CLEAR), some]
 }
 
 pub(crate) fn camera() -> impl Strategy<Value = Camera> {
@@ -65,7 +65,7 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
         prop::array::uniform4(-1.0..1.0f64),
         prop::array::uniform3(0.0..1.0f32),
         distortion(),
-        air(),
+        atmosphere(),
     )
         .prop_map(
             |(
@@ -77,7 +77,7 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
                 q,
                 background,
                 lens,
-                air,
+                atmosphere,
             )| {
                 let k = Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians());
                 let q = DQuat::from_array(q);
@@ -93,7 +93,7 @@ pub(crate) fn camera() -> impl Strategy<Value = Camera> {
                     world_from_cam: Pose::new(DVec3::from(position), rotation),
                     near_m: 0.01,
                     background,
-                    air,
+                    atmosphere,
                 }
             },
         )
@@ -161,13 +161,7 @@ fn wall() -> (Splats, Camera) {
             splats.sh.extend([x as f32 * 0.02, y as f32 * 0.02, 0.3]);
         }
     }
-    let camera = Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(160, 120, 1.0),
-        world_from_cam: Pose::IDENTITY,
-        near_m: 0.01,
-        background: [0.0; 3],
-        air: Air::CLEAR,
-    };
+    let camera = Camera::new(Intrinsics::from_horizontal_fov(160, 120, 1.0), Pose::IDENTITY, 0.01);
     (splats, camera)
 }
 

@@ -3,7 +3,7 @@
 
 use glam::{DMat2, DQuat, DVec2, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
-use vizflyt_splat::{Air, Camera, Rasterizer, RgbdImage, Scene, Splats};
+use vizflyt_splat::{Atmosphere, Camera, Rasterizer, RgbdImage, Scene, Splats};
 
 use crate::renderers;
 
@@ -133,13 +133,7 @@ fn cameras() -> Vec<(&'static str, Camera)> {
     for (name, intrinsics) in lenses {
         for (position_m, rotation) in mountings {
             let world_from_cam = Pose::new(position_m, rotation);
-            let camera = Camera {
-                intrinsics,
-                world_from_cam,
-                near_m: 0.05,
-                background: [0.0; 3],
-                air: Air::CLEAR,
-            };
+            let camera = Camera::new(intrinsics, world_from_cam, 0.05);
             cameras.push((name, camera));
         }
     }
@@ -249,13 +243,7 @@ fn dots_land_where_the_formula_says_to_the_rim_of_a_fisheye_3840_px_wide() {
         ..Intrinsics::from_horizontal_fov(3840, 2160, 1.0)
     };
     let world_from_cam = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(0.7));
-    let camera = Camera {
-        intrinsics: k,
-        world_from_cam,
-        near_m: 0.05,
-        background: [0.0; 3],
-        air: Air::CLEAR,
-    };
+    let camera = Camera::new(k, world_from_cam, 0.05);
     let dots = dots(f_px);
     for mut renderer in renderers::every(Scene::from(&dots)) {
         let worst_px = check_dots(renderer.as_mut(), &dots, &camera);
@@ -294,7 +282,7 @@ pub(crate) fn check_stereo(make: renderers::Make<'_>) {
         world_from_cam: Pose::<World, Cam>::new(DVec3::new(x_m, 0.0, 0.0), DQuat::IDENTITY),
         near_m: 0.05,
         background: [0.0; 3],
-        air: Air::CLEAR,
+        atmosphere: Atmosphere::CLEAR,
     };
     let fisheye = Intrinsics {
         distortion: Distortion::KannalaBrandt { k1: 0.1, k2: 0.0, k3: 0.0, k4: 0.0 },

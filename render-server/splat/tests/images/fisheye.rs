@@ -5,7 +5,7 @@
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use crate::compare;
 
@@ -66,13 +66,11 @@ fn brute_force(renderer: &mut dyn Rasterizer, camera: &Camera) -> RgbdImage {
 
 /// Colour and alpha of a camera against the truth. [dB]
 fn measure(name: &str, splats: &Splats, intrinsics: Intrinsics) -> [f64; 2] {
-    let camera = Camera {
+    let camera = Camera::new(
         intrinsics,
-        world_from_cam: Pose::new(DVec3::new(0.6, 0.2, -0.5), DQuat::from_rotation_y(0.5)),
-        near_m: 0.01,
-        background: [0.0; 3],
-        air: Air::CLEAR,
-    };
+        Pose::new(DVec3::new(0.6, 0.2, -0.5), DQuat::from_rotation_y(0.5)),
+        0.01,
+    );
     let mut renderer = CpuRenderer::new(splats);
     let truth = brute_force(&mut renderer, &camera);
     let mut image = [RgbdImage::default()];

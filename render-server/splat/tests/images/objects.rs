@@ -4,8 +4,8 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{
-    Air, Camera, CpuRenderer, Placement, Rasterizer, RenderError, RgbdImage, RigidObject, Scene,
-    Splats, render_reference,
+    Camera, CpuRenderer, Placement, Rasterizer, RenderError, RgbdImage, RigidObject, Scene, Splats,
+    render_reference,
 };
 
 use crate::agreement::{assert_agrees, camera, splats};
@@ -71,13 +71,7 @@ fn wall(z_m: f32, half_m: f32, colour: f32) -> Splats {
 }
 
 fn ahead() -> Camera {
-    Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.2),
-        world_from_cam: Pose::IDENTITY,
-        near_m: 0.05,
-        background: [0.0; 3],
-        air: Air::CLEAR,
-    }
+    Camera::new(Intrinsics::from_horizontal_fov(64, 48, 1.2), Pose::IDENTITY, 0.05)
 }
 
 #[test]

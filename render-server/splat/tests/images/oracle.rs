@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, RgbdImage, Scene, Splats, ply};
+use vizflyt_splat::{Atmosphere, Camera, RgbdImage, Scene, Splats, ply};
 
 use crate::renderers::{self, Make};
 use crate::{compare, npz};
@@ -49,7 +49,7 @@ fn camera(path: &Path) -> Camera {
         world_from_cam: Pose::new(-(rotation * translation), DQuat::from_mat3(&rotation)),
         near_m: 0.01,
         background: c.bg,
-        air: Air::CLEAR,
+        atmosphere: Atmosphere::CLEAR,
     }
 }
 

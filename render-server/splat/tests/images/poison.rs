@@ -5,7 +5,7 @@
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, InvalidCamera, RenderError, RgbdImage, Scene, Splats, ply};
+use vizflyt_splat::{Camera, InvalidCamera, RenderError, RgbdImage, Scene, Splats, ply};
 
 use crate::renderers::{self, Make};
 use crate::{agreement, compare};
@@ -23,11 +23,12 @@ fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
 
 fn looking_ahead(width_px: u32, height_px: u32, fov_deg: f64) -> Camera {
     Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians()),
-        world_from_cam: Pose::IDENTITY,
-        near_m: 0.05,
         background: [0.2, 0.4, 0.6],
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics::from_horizontal_fov(width_px, height_px, fov_deg.to_radians()),
+            Pose::IDENTITY,
+            0.05,
+        )
     }
 }
 

@@ -3,7 +3,7 @@
 use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{
-    Air, Camera, CpuRenderer, Detail, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
+    Camera, CpuRenderer, Detail, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
 
 use crate::city::city;
@@ -14,11 +14,12 @@ fn look(from: DVec3, to: DVec3) -> Camera {
     let x = z.cross(DVec3::Z).normalize();
     let rotation = DMat3::from_cols(x, z.cross(x), z);
     Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(320, 240, 90f64.to_radians()),
-        world_from_cam: Pose::new(from, DQuat::from_mat3(&rotation)),
-        near_m: 0.05,
         background: [0.5, 0.6, 0.8],
-        air: Air::CLEAR,
+        ..Camera::new(
+            Intrinsics::from_horizontal_fov(320, 240, 90f64.to_radians()),
+            Pose::new(from, DQuat::from_mat3(&rotation)),
+            0.05,
+        )
     }
 }
 

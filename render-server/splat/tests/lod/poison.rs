@@ -2,7 +2,7 @@
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
-use vizflyt_splat::{Air, Camera, CpuRenderer, Detail, Rasterizer, RgbdImage, Splats};
+use vizflyt_splat::{Camera, CpuRenderer, Detail, Rasterizer, RgbdImage, Splats};
 
 use crate::city::Random;
 use crate::likeness::Likeness;
@@ -32,11 +32,12 @@ fn cloud() -> Splats {
 fn cameras() -> Vec<Camera> {
     [2.0, 30.0, 200.0, 5000.0]
         .map(|distance_m| Camera {
-            intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.2),
-            world_from_cam: Pose::new(DVec3::new(0.0, 0.0, -distance_m), DQuat::IDENTITY),
-            near_m: 0.05,
             background: [0.2, 0.4, 0.6],
-            air: Air::CLEAR,
+            ..Camera::new(
+                Intrinsics::from_horizontal_fov(64, 48, 1.2),
+                Pose::new(DVec3::new(0.0, 0.0, -distance_m), DQuat::IDENTITY),
+                0.05,
+            )
         })
         .into()
 }

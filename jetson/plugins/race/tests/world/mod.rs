@@ -15,7 +15,7 @@ use vizflyt_sdk::protocol::geometry::Object;
 use vizflyt_sdk::{
     Autonomy, ImageStamps, ObservationBuffer, Pose, Setpoint, Vehicle, Volume, World, YawTarget,
 };
-use vizflyt_splat::{Air, Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
+use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
 use vehicle::Quadrotor;
 
@@ -80,13 +80,8 @@ pub(crate) fn fly(
         let now_s = tick as f64 * vehicle::DT_S;
         if tick % IMAGE_TICKS == 0 {
             let front = &arena.cameras[0];
-            let camera = Camera {
-                intrinsics: front.intrinsics,
-                world_from_cam: quad.world_from_body() * front.body_from_cam,
-                near_m: 0.05,
-                background: [0.0; 3],
-                air: Air::CLEAR,
-            };
+            let camera =
+                Camera::new(front.intrinsics, quad.world_from_body() * front.body_from_cam, 0.05);
             let placements = movers.placements(ns(now_s));
             renderer
                 .render(&placements, std::slice::from_ref(&camera), &mut images)

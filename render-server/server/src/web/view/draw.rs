@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_rgbd::encode_jpeg;
-use vizflyt_splat::{Air, Camera, DepthKind, Rasterizer, RgbdImage};
+use vizflyt_splat::{Atmosphere, Camera, DepthKind, Rasterizer, RgbdImage};
 
 use crate::scene::WorldFromScene;
 use crate::web::previews::depth_colour;
@@ -125,7 +125,7 @@ impl Request {
             world_from_cam: world_from_body * body_from_forward_cam(DVec3::ZERO, self.pitch_rad),
             near_m: NEAR_M,
             background: [0.0; 3],
-            air: Air::CLEAR,
+            atmosphere: Atmosphere::CLEAR,
         }
     }
 }

@@ -64,13 +64,7 @@ fn no_block_is_culled_that_holds_a_splat_in_view() {
                 DVec3::new(turn.cos(), 0.3 * turn, (2.0 * turn).sin()),
                 DQuat::from_rotation_y(0.8 * turn) * DQuat::from_rotation_x(0.5 * turn),
             );
-            let camera = Camera {
-                intrinsics,
-                world_from_cam: pose,
-                near_m: 0.05,
-                background: [0.0; 3],
-                air: Air::CLEAR,
-            };
+            let camera = Camera::new(intrinsics, pose, 0.05);
             let view = View::new(&camera, &kept.of(&camera), &pose);
             let mut visible = Vec::new();
             cull(0, &part, &view, 0.0, &mut visible);

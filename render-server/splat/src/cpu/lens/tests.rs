@@ -2,8 +2,8 @@ use glam::DVec2;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 
 use super::{Lenses, Model, atan, distort};
+use crate::Camera;
 use crate::cpu::simd::{InstructionSet, Kernel, Simd};
-use crate::{Air, Camera};
 
 fn every_set<K: Kernel + Clone>(kernel: &K) {
     for set in InstructionSet::available() {
@@ -102,12 +102,8 @@ fn lenses_bend_vectors_as_the_protocol_has_it() {
 
 #[test]
 fn lenses_are_found_again_and_the_oldest_is_forgotten() {
-    let camera = |i: u32| Camera {
-        intrinsics: Intrinsics::from_horizontal_fov(64 + i, 48, 1.2),
-        world_from_cam: Pose::IDENTITY,
-        near_m: 0.05,
-        background: [0.0; 3],
-        air: Air::CLEAR,
+    let camera = |i: u32| {
+        Camera::new(Intrinsics::from_horizontal_fov(64 + i, 48, 1.2), Pose::IDENTITY, 0.05)
     };
     let mut lenses = Lenses::default();
     for round in 0..3 {

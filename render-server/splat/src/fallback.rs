@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// A renderer on a device, and the processor behind it.
-pub struct Resilient {
+pub struct FallbackRenderer {
     active: Box<dyn Rasterizer>,
     /// Until it is needed.
     spare: Option<CpuRenderer>,
@@ -20,14 +20,14 @@ pub struct Resilient {
     renamed: Option<String>,
 }
 
-impl Resilient {
+impl FallbackRenderer {
     /// Puts a processor's renderer of the same scene behind `first`.
     pub fn new(first: Box<dyn Rasterizer>, spare: CpuRenderer) -> Self {
         Self { active: first, spare: Some(spare), renamed: None }
     }
 }
 
-impl Rasterizer for Resilient {
+impl Rasterizer for FallbackRenderer {
     /// Returns what draws now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
     fn name(&self) -> Cow<'_, str> {
         self.renamed.as_deref().map_or_else(|| self.active.name(), Cow::Borrowed)
@@ -63,7 +63,7 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
 
     use super::*;
-    use crate::{Air, Splats};
+    use crate::Splats;
 
     /// Draws `left` images through another renderer, then its device is gone.
     struct Failing {
@@ -107,31 +107,26 @@ mod tests {
             sh_degree: 0,
             sh: vec![0.1, 0.2, 0.3],
         };
-        let camera = Camera {
-            intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.2),
-            world_from_cam: Pose::IDENTITY,
-            near_m: 0.01,
-            background: [0.0; 3],
-            air: Air::CLEAR,
-        };
+        let camera =
+            Camera::new(Intrinsics::from_horizontal_fov(32, 24, 1.2), Pose::IDENTITY, 0.01);
         let failing = Failing { inner: CpuRenderer::new(&splats), left: 2 };
-        let mut resilient = Resilient::new(Box::new(failing), CpuRenderer::new(&splats));
+        let mut fallback = FallbackRenderer::new(Box::new(failing), CpuRenderer::new(&splats));
         let mut images = Vec::new();
         for i in 0..5 {
-            let is_lost = resilient.name() != "gpu of glass";
-            assert_eq!(is_lost, i > 2, "{}", resilient.name());
+            let is_lost = fallback.name() != "gpu of glass";
+            assert_eq!(is_lost, i > 2, "{}", fallback.name());
             let mut image = [RgbdImage::default()];
-            resilient.render(&[], &[camera], &mut image).expect("an image");
+            fallback.render(&[], &[camera], &mut image).expect("an image");
             images.extend(image);
         }
         assert!(images.iter().all(|image| *image == images[0]));
         assert!(images[0].alpha[12 * 32 + 16] > 0.8);
-        assert!(resilient.name().starts_with("cpu "), "{}", resilient.name());
-        assert!(resilient.name().ends_with("for gpu of glass is lost: it broke"));
-        assert_eq!(resilient.workload().splats, 1);
+        assert!(fallback.name().starts_with("cpu "), "{}", fallback.name());
+        assert!(fallback.name().ends_with("for gpu of glass is lost: it broke"));
+        assert_eq!(fallback.workload().splats, 1);
         // What is no device's fault stays an error.
         let bad = Camera { near_m: f32::NAN, ..camera };
-        let refused = resilient.render(&[], &[bad], &mut [RgbdImage::default()]);
+        let refused = fallback.render(&[], &[bad], &mut [RgbdImage::default()]);
         assert!(matches!(refused, Err(RenderError::Camera(_))));
     }
 }

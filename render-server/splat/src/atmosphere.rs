@@ -8,7 +8,7 @@ use crate::InvalidCamera;
 
 /// The light on a scene, and the air before the camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Air {
+pub struct Atmosphere {
     /// Every colour is multiplied by it, linear RGB; 1 is the light the scene was captured in.
     pub light: [f32; 3],
     /// How much of the light is lost on the way, 0 for clear air: `exp(-k d)` is left. [1/m]
@@ -17,7 +17,7 @@ pub struct Air {
     pub fog: [f32; 3],
 }
 
-impl Air {
+impl Atmosphere {
     /// The light of the capture and clear air: nothing is changed.
     pub const CLEAR: Self = Self { light: [1.0; 3], fog_per_m: 0.0, fog: [0.0; 3] };
 
@@ -51,12 +51,12 @@ impl Air {
         if numbers.into_iter().all(|value| (0.0..=100.0).contains(value)) {
             Ok(())
         } else {
-            Err(InvalidCamera::Air(*self))
+            Err(InvalidCamera::Atmosphere(*self))
         }
     }
 }
 
-impl Default for Air {
+impl Default for Atmosphere {
     fn default() -> Self {
         Self::CLEAR
     }

@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 #[cfg(feature = "gpu")]
 use crate::gpu;
-use crate::{CpuRenderer, Detail, Rasterizer, Resilient, Scene};
+use crate::{CpuRenderer, Detail, FallbackRenderer, Rasterizer, Scene};
 
 /// What the user asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -60,7 +60,7 @@ pub enum NoRenderer {
 }
 
 /// Returns the renderer for a scene on this machine. One on a graphics card has the processor
-/// behind it ([`crate::Resilient`]): no image is missing when its device is lost. The processor
+/// behind it ([`crate::FallbackRenderer`]): no image is missing when its device is lost. The processor
 /// draws large scenes in adaptive detail ([`Detail::suited_to`]).
 ///
 /// # Errors
@@ -74,7 +74,7 @@ pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chose
     }
     match (graphics(scene, backend == Backend::Gpu), backend) {
         (Ok((rasterizer, reason)), _) => {
-            Ok(Chosen { rasterizer: Box::new(Resilient::new(rasterizer, cpu)), reason })
+            Ok(Chosen { rasterizer: Box::new(FallbackRenderer::new(rasterizer, cpu)), reason })
         }
         (Err(why), Backend::Gpu) => Err(NoRenderer::Gpu(why)),
         (Err(reason), _) => Ok(Chosen { rasterizer: Box::new(cpu), reason }),
@@ -126,7 +126,7 @@ mod trial {
     use glam::{Quat, Vec3};
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
 
-    use crate::{Air, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
+    use crate::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
     /// Less is no rounding: right renderers differ by 75 dB and more.
     const LEAST_DB: f64 = 50.0;
@@ -147,11 +147,8 @@ mod trial {
             splats.sh.extend((0..12).map(|k| r(0.137, i + k) - 0.5));
         }
         let camera = Camera {
-            intrinsics: Intrinsics::from_horizontal_fov(100, 75, 1.3),
-            world_from_cam: Pose::IDENTITY,
-            near_m: 0.05,
             background: [0.1, 0.2, 0.3],
-            air: Air::CLEAR,
+            ..Camera::new(Intrinsics::from_horizontal_fov(100, 75, 1.3), Pose::IDENTITY, 0.05)
         };
         (splats, camera)
     }
