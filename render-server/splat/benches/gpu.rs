@@ -12,7 +12,7 @@
 //! them to gsplat.
 //!
 //! Passes are timed by the device, the call by the host: it ends with the images in the caller's
-//! memory; the processor's renderer draws the same beside it. "Pipelined" has two ticks under way ([`GpuRenderer::begin`]).
+//! memory; the processor's renderer renders the same beside it. "Pipelined" has two ticks under way ([`GpuRenderer::begin`]).
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -112,22 +112,22 @@ fn measure(case: &Case, adapter: &Adapter, options: &Options, rows: &mut Vec<Val
     for &count in options.cameras.iter().filter(|&&count| count <= case.cameras.len()) {
         let cameras = &case.cameras[..count];
         let mut images = vec![RgbdImage::default(); count];
-        let mut draw = |gpu: &mut GpuRenderer| {
+        let mut render_one = |gpu: &mut GpuRenderer| {
             gpu.render(&[], cameras, &mut images).expect("valid cameras and a device")
         };
         // Buffers grow and clocks rise.
         for _ in 0..3 {
-            draw(&mut gpu);
+            render_one(&mut gpu);
         }
         let mut times: Vec<PassTimes> = Vec::new();
         let start = Instant::now();
         while times.len() < 10 || start.elapsed() < most {
-            times.push(draw(&mut gpu));
+            times.push(render_one(&mut gpu));
         }
         let mut cpu_ms: Vec<f32> = Vec::new();
         while cpu_ms.len() < 10 {
-            let drawn = cpu.render(&[], cameras, &mut images).expect("valid cameras");
-            cpu_ms.push(drawn.total_ms);
+            let rendered = cpu.render(&[], cameras, &mut images).expect("valid cameras");
+            cpu_ms.push(rendered.total_ms);
         }
         cpu_ms.sort_by(f32::total_cmp);
         let cpu_ms = cpu_ms[cpu_ms.len() / 2];
@@ -279,7 +279,7 @@ fn camera(intrinsics: Intrinsics, world_from_cam: Pose<World, Cam>) -> Camera {
     Camera::new(intrinsics, world_from_cam, 0.01)
 }
 
-/// Leaves what another renderer needs to draw the same: the scene, its cameras in the oracle's form,
+/// Leaves what another renderer needs to render the same: the scene, its cameras in the oracle's form,
 /// and our first image as f32.
 fn leave(case: &Case, adapter: &Adapter, out: &Path) {
     let file = |extension: &str| out.join(&case.name).with_extension(extension);

@@ -36,7 +36,7 @@ impl Atmosphere {
     }
 
     /// Returns a colour seen from a distance. [m]
-    pub(crate) fn seen(&self, rgb: [f64; 3], distance_m: f64) -> [f64; 3] {
+    pub(crate) fn attenuate(&self, rgb: [f64; 3], distance_m: f64) -> [f64; 3] {
         let left = (-f64::from(self.fog_per_m) * distance_m).exp();
         [0, 1, 2].map(|channel| {
             let lit = rgb[channel] * f64::from(self.light[channel]);

@@ -9,7 +9,7 @@ use crate::{CpuRenderer, Detail, FallbackRenderer, Rasterizer, Scene};
 /// What the user asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Backend {
-    /// A graphics card if one answers and draws a test image as the processor does, else the
+    /// A graphics card if one answers and renders a test image as the processor does, else the
     /// processor. Software Vulkan is left alone.
     #[default]
     Auto,
@@ -61,7 +61,7 @@ pub enum NoRenderer {
 
 /// Returns the renderer for a scene on this machine. One on a graphics card has the processor
 /// behind it ([`crate::FallbackRenderer`]): no image is missing when its device is lost. The processor
-/// draws large scenes in adaptive detail ([`Detail::suited_to`]).
+/// renders large scenes in adaptive detail ([`Detail::suited_to`]).
 ///
 /// # Errors
 /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
@@ -81,7 +81,7 @@ pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chose
     }
 }
 
-/// Returns a renderer on the first adapter that draws the test image, and what was found; or why
+/// Returns a renderer on the first adapter that renders the test image, and what was found; or why
 /// there is none.
 #[cfg(feature = "gpu")]
 fn graphics(
@@ -97,16 +97,17 @@ fn graphics(
         }
         let kind = if *is_software { "software adapter" } else { "graphics adapter" };
         let opened = trial::scene_and_camera();
-        let drawn = gpu::GpuRenderer::new(&opened.0, &adapter, gpu::Budget::default())
+        let rendered = gpu::GpuRenderer::new(&opened.0, &adapter, gpu::Budget::default())
             .map_err(|error| error.to_string())
             .and_then(|mut renderer| {
                 let found_db = trial::check(&mut renderer, &opened.0, &opened.1)?;
                 renderer.load(scene).map_err(|error| error.to_string())?;
                 Ok((renderer, found_db))
             });
-        match drawn {
+        match rendered {
             Ok((renderer, found_db)) => {
-                found.push(format!("{kind} {name} draws as the processor does, {found_db:.0} dB"));
+                found
+                    .push(format!("{kind} {name} renders as the processor does, {found_db:.0} dB"));
                 return Ok((Box::new(renderer), found.join("; ")));
             }
             Err(why) => found.push(format!("{kind} {name} refused: {why}")),
@@ -120,7 +121,7 @@ fn graphics(_: Scene<'_>, _: bool) -> Result<(Box<dyn Rasterizer>, String), Stri
     Err("built without the feature `gpu`".to_owned())
 }
 
-/// The test image: drivers have been seen to sort wrongly, and to draw nothing.
+/// The test image: drivers have been seen to sort wrongly, and to render nothing.
 #[cfg(feature = "gpu")]
 mod trial {
     use glam::{Quat, Vec3};
@@ -153,7 +154,7 @@ mod trial {
         (splats, camera)
     }
 
-    /// Draws the test image twice, and returns how like the processor's it is; or what is wrong.
+    /// Renders the test image twice, and returns how like the processor's it is; or what is wrong.
     pub(super) fn check(
         renderer: &mut dyn Rasterizer,
         splats: &Splats,
@@ -167,14 +168,14 @@ mod trial {
             renderer.render(&[], &[*camera], image).map_err(|error| error.to_string())?;
         }
         if images[0] != images[1] {
-            return Err("draws the same test image differently each time".to_owned());
+            return Err("renders the same test image differently each time".to_owned());
         }
         let found_db = alike_db(&images[0], &expected[0]);
         // Positive, so that NaN is refused.
         if found_db >= LEAST_DB {
             Ok(found_db)
         } else {
-            Err(format!("draws the test image {found_db:.0} dB from the processor's"))
+            Err(format!("renders the test image {found_db:.0} dB from the processor's"))
         }
     }
 
@@ -200,7 +201,7 @@ mod trial {
         use super::*;
         use crate::{PassTimes, Placement, RenderError, Workload};
 
-        /// Draws as the processor, then spoils.
+        /// Renders as the processor, then spoils.
         struct Spoiling(CpuRenderer, fn(&mut RgbdImage, usize), usize);
 
         impl Rasterizer for Spoiling {
@@ -214,10 +215,10 @@ mod trial {
                 cameras: &[Camera],
                 images: &mut [RgbdImage],
             ) -> Result<PassTimes, RenderError> {
-                let drawn = self.0.render(placements, cameras, images);
+                let rendered = self.0.render(placements, cameras, images);
                 self.1(&mut images[0], self.2);
                 self.2 += 1;
-                drawn
+                rendered
             }
 
             fn workload(&self) -> Workload {

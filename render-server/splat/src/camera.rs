@@ -6,14 +6,14 @@ use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, InvalidIntrinsics,
 use crate::Atmosphere;
 use crate::limits::JACOBIAN_MARGIN;
 
-/// What is drawn, from where.
+/// What is rendered, from where.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Size, focal lengths, principal point, lens.
     pub intrinsics: Intrinsics,
     /// Where the camera is.
     pub world_from_cam: Pose<World, Cam>,
-    /// Splats nearer than this are not drawn. [m]
+    /// Splats nearer than this are not rendered. [m]
     pub near_m: f32,
     /// Linear RGB shown where nothing covers the pixel, in clear air and plain light.
     pub background: [f32; 3],
@@ -52,7 +52,7 @@ impl Camera {
     ///
     /// Where a pinhole, or a lens near to one, puts what is far outside the image, the linearisation
     /// blows up: it is taken within what the image shows, and [`JACOBIAN_MARGIN`] of half its size
-    /// on every side. A fisheye's does not blow up, since the lens draws together what the slope
+    /// on every side. A fisheye's does not blow up, since the lens pulls together what the slope
     /// spreads; and all it can image lies close to the image: taken anywhere but at the splat
     /// itself, splats at 80 degrees would swell over all of a narrower image.
     pub(crate) fn slope_bounds(&self) -> [DVec2; 2] {

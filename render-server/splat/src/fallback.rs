@@ -1,4 +1,4 @@
-//! A renderer that outlives its device: the image under way when a driver resets is drawn by the
+//! A renderer that outlives its device: the image under way when a driver resets is rendered by the
 //! processor, and so are all after it.
 //!
 //! Cost: the processor's packed copy of the scene is there from the start, 52 bytes per splat and 6
@@ -16,7 +16,7 @@ pub struct FallbackRenderer {
     active: Box<dyn Rasterizer>,
     /// Until it is needed.
     spare: Option<CpuRenderer>,
-    /// What draws now, and what was lost and why.
+    /// What renders now, and what was lost and why.
     renamed: Option<String>,
 }
 
@@ -28,7 +28,7 @@ impl FallbackRenderer {
 }
 
 impl Rasterizer for FallbackRenderer {
-    /// Returns what draws now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
+    /// Returns what renders now, and what was lost: `cpu avx2, for gpu X is lost: ...`.
     fn name(&self) -> Cow<'_, str> {
         self.renamed.as_deref().map_or_else(|| self.active.name(), Cow::Borrowed)
     }
@@ -48,7 +48,7 @@ impl Rasterizer for FallbackRenderer {
                 }
                 self.active.render(placements, cameras, images)
             }
-            drawn => drawn,
+            rendered => rendered,
         }
     }
 
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
     use crate::Splats;
 
-    /// Draws `left` images through another renderer, then its device is gone.
+    /// Renders `left` images through another renderer, then its device is gone.
     struct Failing {
         inner: CpuRenderer,
         left: usize,

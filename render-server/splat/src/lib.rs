@@ -1,7 +1,7 @@
 //! (scene, cameras) -> RGB, metric depth, alpha and object ids of 3D Gaussian splats.
 //!
 //! A twin comes from a file ([`format`]) as [`Splats`]; with the objects that move in it, it is a
-//! [`Scene`]. A [`Rasterizer`] takes the scene once and then draws any number of [`Camera`]s per
+//! [`Scene`]. A [`Rasterizer`] takes the scene once and then renders any number of [`Camera`]s per
 //! call into [`RgbdImage`]s that the caller keeps. [`render_reference`] is the plain truth every
 //! fast renderer is compared with.
 //!

@@ -12,6 +12,6 @@ pub(crate) const ALPHA_MIN: f64 = 1.0 / 255.0;
 pub(crate) const TRANSMITTANCE_MIN: f64 = 1e-4;
 /// The projection is linearised within the image widened by this share of its half size.
 pub(crate) const JACOBIAN_MARGIN: f64 = 0.3;
-/// Splats larger than this are drawn as if they had this size; a 1000 km splat already covers every
+/// Splats larger than this are rendered as if they had this size; a 1000 km splat already covers every
 /// pixel evenly, and its squares stay far from f32's limits. [m]
 pub(crate) const MAX_SCALE_M: f32 = 1e6;

@@ -4,12 +4,12 @@ use std::borrow::Cow;
 
 use crate::{Camera, InvalidCamera, Placement, RgbdImage};
 
-/// Draws a scene that it holds a packed copy of.
+/// Renders a scene that it holds a packed copy of.
 pub trait Rasterizer: Send {
     /// Returns what it runs on, for reports: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
     fn name(&self) -> Cow<'_, str>;
 
-    /// Draws one image per camera, resizing each, and returns how long the passes took.
+    /// Renders one image per camera, resizing each, and returns how long the passes took.
     /// `placements` has one entry per object of the scene.
     ///
     /// # Errors
@@ -59,7 +59,7 @@ pub struct Workload {
     pub pairs: usize,
 }
 
-/// Why nothing was drawn.
+/// Why nothing was rendered.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RenderError {
     /// The first camera that is not valid; no image is changed.
@@ -69,7 +69,7 @@ pub enum RenderError {
     #[error("object {0} is placed at {1}, which is no rotation and finite position within 1e7 m")]
     Placement(usize, String),
     /// The graphics device is gone, or cannot hold what was asked of it, and why.
-    #[error("the graphics device cannot draw this: {0}; use the processor")]
+    #[error("the graphics device cannot render this: {0}; use the processor")]
     Device(String),
 }
 

@@ -36,16 +36,17 @@ pub fn render_reference<'a>(
     )?;
     let lens = Lens::new(camera);
     let mut projected = Vec::new();
-    let mut add = |splats: &Splats, id: u16, seen: Seen| {
+    let mut add = |splats: &Splats, id: u16, camera_in_scene: CameraInScene| {
         let all = 0..splats.len();
-        projected.extend(all.filter_map(|i| project(splats, i, id, &seen, &lens, camera)));
+        projected
+            .extend(all.filter_map(|i| project(splats, i, id, &camera_in_scene, &lens, camera)));
     };
-    add(scene.splats, 0, Seen::from(&camera.world_from_cam));
+    add(scene.splats, 0, CameraInScene::from(&camera.world_from_cam));
     for (object, placement) in scene.objects.iter().zip(placements) {
         if let Some(world_from_object) = placement {
             // An object that moves is one that stands still before a camera that moves.
             let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-            add(&object.splats, object.id, Seen::from(&object_from_cam));
+            add(&object.splats, object.id, CameraInScene::from(&object_from_cam));
         }
     }
     projected.sort_by(|a, b| a.z_m.total_cmp(&b.z_m));
@@ -54,12 +55,12 @@ pub fn render_reference<'a>(
 }
 
 /// Where the camera is, from a part of the scene.
-struct Seen {
+struct CameraInScene {
     rotation: DMat3,
     center_m: DVec3,
 }
 
-impl<F: Frame> From<&Pose<F, Cam>> for Seen {
+impl<F: Frame> From<&Pose<F, Cam>> for CameraInScene {
     fn from(part_from_cam: &Pose<F, Cam>) -> Self {
         let rotation = DMat3::from_quat(part_from_cam.rotation.normalize()).transpose();
         Self { rotation, center_m: part_from_cam.translation_m }
@@ -96,13 +97,13 @@ fn project(
     splats: &Splats,
     i: usize,
     id: u16,
-    seen: &Seen,
+    camera_in_scene: &CameraInScene,
     lens: &Lens,
     camera: &Camera,
 ) -> Option<Projected> {
     let k = &camera.intrinsics;
     let mean = splats.means_m[i].as_dvec3();
-    let p_cam = seen.rotation * (mean - seen.center_m);
+    let p_cam = camera_in_scene.rotation * (mean - camera_in_scene.center_m);
     let slope = p_cam.truncate() / p_cam.z;
     // Positive, so that NaN is refused.
     if !(p_cam.z > f64::from(camera.near_m) && slope.length() <= lens.reach) {
@@ -119,7 +120,7 @@ fn project(
     let q = splats.rotations[i].as_dquat();
     let axes = DMat3::from_quat(DQuat::normalize(q)) * DMat3::from_diagonal(scale_m);
     // Rows of J W M: covariance = B B^T.
-    let in_cam = (seen.rotation * axes).transpose();
+    let in_cam = (camera_in_scene.rotation * axes).transpose();
     let pinhole_x = (in_cam.x_axis - at.x * in_cam.z_axis) / p_cam.z;
     let pinhole_y = (in_cam.y_axis - at.y * in_cam.z_axis) / p_cam.z;
     let row_x = focal.x * (bend.x_axis.x * pinhole_x + bend.y_axis.x * pinhole_y);
@@ -144,11 +145,11 @@ fn project(
     if !touches {
         return None;
     }
-    let direction = (mean - seen.center_m).normalize_or(DVec3::Z);
+    let direction = (mean - camera_in_scene.center_m).normalize_or(DVec3::Z);
     let numbers = splats.sh_coefficients() * 3;
     let sh = &splats.sh[i * numbers..(i + 1) * numbers];
     let rgb = harmonics::colour(sh, direction.to_array());
-    let rgb = camera.atmosphere.seen(rgb, (mean - seen.center_m).length());
+    let rgb = camera.atmosphere.attenuate(rgb, (mean - camera_in_scene.center_m).length());
     Some(Projected {
         mean_px,
         conic: [c / determinant, -b / determinant, a / determinant],

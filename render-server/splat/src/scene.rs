@@ -28,5 +28,5 @@ pub struct RigidObject {
     pub splats: Splats,
 }
 
-/// Where an object is while an image is drawn; `None` where it is not there at all.
+/// Where an object is while an image is rendered; `None` where it is not there at all.
 pub type Placement = Option<Pose<World, Object>>;

@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Scenes are generated: a quarter of a city at SH degree 0 and 3, and foliage all of which is near,
-//! where nothing can be merged. FILTER keeps the scenes whose name contains it. `plot` draws
+//! where nothing can be merged. FILTER keeps the scenes whose name contains it. `plot` renders
 //! `docs/render-cost.svg` instead. Beside the median stands the processor time, divided by the
 //! threads: what the median is where nothing else uses the machine.
 
@@ -97,12 +97,12 @@ struct Figures {
 
 fn measure(renderer: &mut CpuRenderer, camera: &Camera) -> Figures {
     let mut image = [RgbdImage::default()];
-    let mut draw =
+    let mut render_one =
         || renderer.render(&[], &[*camera], &mut image).expect("a valid camera").total_ms;
-    draw();
-    draw();
+    render_one();
+    render_one();
     let before_ms = processor_ms();
-    let mut ms: Vec<f32> = (0..IMAGES).map(|_| draw()).collect();
+    let mut ms: Vec<f32> = (0..IMAGES).map(|_| render_one()).collect();
     let processor_ms = (processor_ms() - before_ms) / (IMAGES * threads()) as f64;
     ms.sort_by(f32::total_cmp);
     let [image] = image;

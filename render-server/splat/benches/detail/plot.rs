@@ -37,7 +37,7 @@ pub(crate) fn draw() {
         detail,
     };
     let series = [
-        all_in_view("all in view, every splat drawn", "#d1495b", Detail::Full),
+        all_in_view("all in view, every splat rendered", "#d1495b", Detail::Full),
         all_in_view("all in view, adaptive", "#2a9d8f", Detail::ADAPTIVE),
         elsewhere("200 k in view, the rest elsewhere, every splat", "#e09f3e", Detail::Full),
         elsewhere("200 k in view, the rest elsewhere, adaptive", "#3d7ea6", Detail::ADAPTIVE),

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use super::cull::View;
+use super::cull::ObjectView;
 use super::project::{MIN_LEVEL, Projected, Splat2d};
 use super::simd::{Kernel, Simd};
 
@@ -59,7 +59,7 @@ impl Bins {
     pub(super) fn bin<S: Simd>(
         &mut self,
         simd: S,
-        view: &View,
+        view: &ObjectView,
         projected: &Projected,
         order: &[AtomicU32],
     ) {
@@ -109,7 +109,7 @@ impl Bins {
 
 /// Notes the pairs of one slice.
 struct BinSlice<'a> {
-    view: &'a View,
+    view: &'a ObjectView,
     tiles_x: usize,
     projected: &'a Projected,
     order: &'a [AtomicU32],

@@ -7,7 +7,7 @@
 //! depths and transmittance in registers, and stops when all its pixels are opaque.
 //!
 //! Transmittance carries the pixel's end in its sign: the splat that would bring a pixel to 1e-4 is
-//! not drawn, and makes it negative.
+//! not rendered, and makes it negative.
 //!
 //! Budget: some 30 vector instructions per block and splat; 12 kB of tables, all in the L1 cache.
 
@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use rayon::prelude::*;
 
 use super::bin::{Bins, TILE};
-use super::cull::{View, Visible};
+use super::cull::{ObjectView, Visible};
 use super::project::{MIN_LEVEL, Splat2d};
 use super::scene::{BLOCK, Part};
 use super::simd::{Kernel, Simd};
@@ -56,7 +56,7 @@ impl Tagged<'_> {
 /// Blends all tiles into `image`; `tiles` is kept from image to image.
 pub(super) fn blend<S: Simd>(
     simd: S,
-    view: &View,
+    view: &ObjectView,
     splats: &[Splat2d],
     bins: &Bins,
     tagged: &Tagged<'_>,
@@ -131,7 +131,7 @@ impl Scratch {
 
 /// One tile.
 struct BlendTile<'a> {
-    view: &'a View,
+    view: &'a ObjectView,
     splats: &'a [Splat2d],
     list: &'a [AtomicU32],
     tagged: &'a Tagged<'a>,
@@ -377,7 +377,7 @@ fn blend_block<S: Simd, const IDS: bool>(
         green = s.mul_add(weight, s.splat(batch.green[i]), green);
         blue = s.mul_add(weight, s.splat(batch.blue[i]), blue);
         depth = s.mul_add(weight, s.splat(batch.z_m[i]), depth);
-        // The last splat drawn while more than half of the light passed; `finish` checks that it
+        // The last splat rendered while more than half of the light passed; `finish` checks that it
         // brought the pixel to half.
         let before_half = hit & s.lt(s.splat(0.5), transmittance);
         median = s.select(before_half, s.splat(batch.z_m[i]), median);
@@ -400,7 +400,7 @@ fn blend_block<S: Simd, const IDS: bool>(
 /// Turns a block's sums into what an image holds: RGB on the background, expected depth, median
 /// depth, alpha, id.
 #[inline(always)]
-fn finish<S: Simd>(s: S, view: &View, state: &mut [f32]) {
+fn finish<S: Simd>(s: S, view: &ObjectView, state: &mut [f32]) {
     let transmittance = s.splat(0.0) - s.negative(s.load(&state[5 * S::LANES..]));
     let alpha = s.splat(1.0) - transmittance;
     for channel in 0..3 {

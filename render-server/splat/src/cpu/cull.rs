@@ -14,7 +14,7 @@ use crate::{Atmosphere, Camera};
 /// A camera, as one part of the scene sees it, in the numbers the passes use; f32, but for what is
 /// computed once per image.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct View {
+pub(super) struct ObjectView {
     pub(super) width_px: u32,
     pub(super) height_px: u32,
     /// Rows of the rotation to the camera's axes.
@@ -38,7 +38,7 @@ pub(super) struct View {
     /// Means whose slope is longer are dropped; infinite without a lens.
     pub(super) reach: f32,
     planes: [Plane; 5],
-    /// [`Sight::large`](super::lens::Sight::large).
+    /// [`ShownSlopes::large`](super::lens::ShownSlopes::large).
     large: f32,
 }
 
@@ -50,7 +50,7 @@ struct Plane {
     weight: f32,
 }
 
-impl View {
+impl ObjectView {
     /// Prepares a validated camera, and its lens, that stands at `part_from_cam`.
     pub(super) fn new<F: Frame>(
         camera: &Camera,
@@ -72,7 +72,7 @@ impl View {
             }
         };
         let ahead = Plane { normal: z.as_vec3(), offset: camera.near_m, weight: 0.0 };
-        let sight = &lens.sight;
+        let shown = &lens.shown;
         let planes = if lens.model == Model::Pinhole {
             // A splat's mean is at u = fx x/z + cx; its extent is at most
             //   sqrt(reach^2 fx^2 (1 + jx^2) / z^2 + 2 ln(255) 0.3),
@@ -90,13 +90,13 @@ impl View {
             ]
         } else {
             // Linear in the position too: x - low z + spread d >= 0; `sees` keeps what is large.
-            let [shown_x, shown_y] = bounds([sight.low, sight.high]);
+            let [shown_x, shown_y] = bounds([shown.low, shown.high]);
             [
                 ahead,
-                plane(x - z * shown_x[0], sight.spread),
-                plane(z * shown_x[1] - x, sight.spread),
-                plane(y - z * shown_y[0], sight.spread),
-                plane(z * shown_y[1] - y, sight.spread),
+                plane(x - z * shown_x[0], shown.spread),
+                plane(z * shown_x[1] - x, shown.spread),
+                plane(y - z * shown_y[0], shown.spread),
+                plane(z * shown_y[1] - y, shown.spread),
             ]
         };
         Self {
@@ -114,10 +114,10 @@ impl View {
             background: camera.atmosphere.background(camera.background),
             atmosphere: Some(camera.atmosphere).filter(|atmosphere| !atmosphere.is_clear()),
             model: lens.model,
-            // f32's rounding, so that what lies on the reach itself is drawn.
+            // f32's rounding, so that what lies on the reach itself is rendered.
             reach: (lens.reach * (1.0 + 1e-6)) as f32,
             planes,
-            large: sight.large as f32,
+            large: shown.large as f32,
         }
     }
 
@@ -154,7 +154,7 @@ pub(super) struct Visible {
 pub(super) fn cull(
     index: usize,
     part: &Part,
-    view: &View,
+    view: &ObjectView,
     max_error_px: f32,
     visible: &mut Vec<Visible>,
 ) {
@@ -170,7 +170,7 @@ pub(super) fn cull(
 struct Walk<'a> {
     index: u32,
     part: &'a Part,
-    view: &'a View,
+    view: &'a ObjectView,
     max_error_px: f32,
 }
 
@@ -193,7 +193,7 @@ impl Walk<'_> {
     }
 }
 
-impl View {
+impl ObjectView {
     /// Returns how many pixels a metre is at most where the block is nearest to the camera.
     fn px_per_m(&self, block: &Block) -> f32 {
         let forward = self.rows[2];

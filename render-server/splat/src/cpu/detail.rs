@@ -4,7 +4,7 @@
 //! blocks of level l: its 256 splats are merged from their 1024. So the levels form a tree over the
 //! Morton order, together a third more memory, and `cull` walks it from the top: a subtree out of
 //! view costs one test, and one whose merged splats are off by less than the allowed pixels is
-//! drawn by them.
+//! rendered by them.
 //!
 //! Splats to merge are found by repeated splitting: the cluster with the greatest weighted spread
 //! is cut in two across its longest axis, until there are a quarter as many clusters as splats.
@@ -22,7 +22,7 @@ use super::scene::{BLOCK, Block, GROUP, GROUP_NUMBERS, Part, column};
 use crate::Scene;
 use crate::limits::BLUR_PX2;
 
-/// How much of a scene's detail is drawn.
+/// How much of a scene's detail is rendered.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Detail {
     /// Every splat in view.
@@ -31,7 +31,7 @@ pub enum Detail {
     /// Merged splats for what is small in the image: memory and packing time grow by a third, an
     /// image costs what it shows.
     Adaptive {
-        /// How far splats may be drawn from where they are, as root mean square; nothing is merged
+        /// How far splats may be rendered from where they are, as root mean square; nothing is merged
         /// unless it is above 0. [px]
         max_error_px: f32,
     },
@@ -40,7 +40,7 @@ pub enum Detail {
 impl Detail {
     /// As coarse as stays like full detail to 37 dB and more, on generated and captured scenes.
     pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: 0.5 };
-    /// Scenes of fewer splats are drawn fast enough in full. [splats]
+    /// Scenes of fewer splats are rendered fast enough in full. [splats]
     pub const WORTHWHILE_FROM: usize = 1_000_000;
 
     /// Returns what suits a scene: every splat of a small one, adaptive detail for a large one.
@@ -177,7 +177,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
         error_m2 += m * blob.error_m2();
         *origin = blob.origin;
     }
-    // NaN and overflow become infinite: never drawn.
+    // NaN and overflow become infinite: never rendered.
     let error_m = (error_m2 / mass).sqrt() as f32;
     block.error_m = if error_m.is_finite() { block.error_m.max(error_m) } else { f32::INFINITY };
 
@@ -192,7 +192,7 @@ fn merge_blocks(from: &From<'_>, out: Out<'_>, scratch: &mut Scratch) -> Block {
         for (lane, cluster) in group.iter().enumerate() {
             let mut put = |column: usize, v: f32| geometry[column * GROUP + lane] = v;
             let blob = merged(cluster);
-            let (covariance_m2, opacity) = blob.drawn(blur_m2);
+            let (covariance_m2, opacity) = blob.rendered(blur_m2);
             let mean_m = (blob.mean_m + center_m.as_dvec3()).as_vec3();
             for k in 0..3 {
                 put(column::MEAN + k, mean_m[k]);

@@ -32,14 +32,14 @@ pub(super) struct Lens {
     /// Means whose slope is longer are dropped.
     pub(super) reach: f64,
     /// Where means are whose splats may touch the image. Of use only with a lens.
-    pub(super) sight: Sight,
+    pub(super) shown: ShownSlopes,
 }
 
 /// Bounds on the means of splats that may touch the image behind a lens. With `z` the mean's and
 /// `d` the distance at which its splat still counts:
 /// `low - spread d / z <= slope <= high + spread d / z`, unless `z < large d`.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sight {
+pub(super) struct ShownSlopes {
     pub(super) low: DVec2,
     pub(super) high: DVec2,
     pub(super) spread: f64,
@@ -72,13 +72,17 @@ impl Lens {
             }
         };
         // All that the lens shows, to begin with.
-        let whole =
-            Sight { low: DVec2::splat(-reach), high: DVec2::splat(reach), spread: 0.0, large: 0.0 };
-        let sight = match model {
-            Model::Pinhole => whole,
-            _ => MARGINS.iter().find_map(|&share| sight(k, steep, share)).unwrap_or(whole),
+        let whole = ShownSlopes {
+            low: DVec2::splat(-reach),
+            high: DVec2::splat(reach),
+            spread: 0.0,
+            large: 0.0,
         };
-        Self { of: *k, model, slopes, reach, sight }
+        let shown = match model {
+            Model::Pinhole => whole,
+            _ => MARGINS.iter().find_map(|&share| shown(k, steep, share)).unwrap_or(whole),
+        };
+        Self { of: *k, model, slopes, reach, shown }
     }
 }
 
@@ -86,9 +90,9 @@ impl Lens {
 /// that the lens still images.
 const MARGINS: [f64; 3] = [0.6, 0.3, 0.1];
 
-/// Returns the sight of a lens that spreads no angle by more than `steep`, if it images all of the
+/// Returns the shown of a lens that spreads no angle by more than `steep`, if it images all of the
 /// image and a margin of `share` of its size around.
-fn sight(k: &Intrinsics, steep: f64, share: f64) -> Option<Sight> {
+fn shown(k: &Intrinsics, steep: f64, share: f64) -> Option<ShownSlopes> {
     let focal = DVec2::new(k.fx_px, k.fy_px);
     let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
     // How far the blur alone lets the most opaque splat be seen, and a pixel for the steps between
@@ -121,13 +125,13 @@ fn sight(k: &Intrinsics, steep: f64, share: f64) -> Option<Sight> {
     // between the points.
     let spread = 1.25 * steep * std::f64::consts::SQRT_2 / least;
     let large = focal.max_element() * steep / margin_px;
-    (spread.is_finite() && large.is_finite()).then_some(Sight { low, high, spread, large })
+    (spread.is_finite() && large.is_finite()).then_some(ShownSlopes { low, high, spread, large })
 }
 
 /// Points, less one, along each side of the image at which a lens is examined.
 const POINTS: u32 = 24;
 
-/// Lenses by intrinsics: those drawn with last.
+/// Lenses by intrinsics: those rendered with last.
 #[derive(Debug, Default)]
 pub(super) struct Lenses {
     kept: Vec<Lens>,
@@ -156,19 +160,19 @@ impl Lenses {
 const KEPT: usize = 16;
 
 /// Distorted slopes and the lens's Jacobian there, which is symmetric: xx, xy, yy.
-pub(super) struct Bent<F> {
+pub(super) struct Distorted<F> {
     pub(super) slope: [F; 2],
     pub(super) jacobian: [F; 3],
 }
 
 /// Distorts a vector of slopes.
 #[inline(always)]
-pub(super) fn distort<S: Simd>(s: S, model: &Model, slope: [S::F; 2]) -> Bent<S::F> {
+pub(super) fn distort<S: Simd>(s: S, model: &Model, slope: [S::F; 2]) -> Distorted<S::F> {
     let one = s.splat(1.0);
     let [x, y] = slope;
     let rr = s.mul_add(x, x, y * y);
     match *model {
-        Model::Pinhole => Bent { slope, jacobian: [one, s.splat(0.0), one] },
+        Model::Pinhole => Distorted { slope, jacobian: [one, s.splat(0.0), one] },
         Model::BrownConrady([k1, k2, p1, p2, k3]) => {
             let (p1, p2) = (s.splat(p1), s.splat(p2));
             let radial = polynomial(s, rr, [1.0, k1, k2, k3]);
@@ -183,7 +187,7 @@ pub(super) fn distort<S: Simd>(s: S, model: &Model, slope: [S::F; 2]) -> Bent<S:
             let xx = s.mul_add(two, s.mul_add(x * x, growth, s.mul_add(three, px, py)), radial);
             let xy = two * s.mul_add(x * y, growth, s.mul_add(p1, x, p2 * y));
             let yy = s.mul_add(two, s.mul_add(y * y, growth, s.mul_add(three, py, px)), radial);
-            Bent {
+            Distorted {
                 slope: [s.mul_add(x, radial, shift_x), s.mul_add(y, radial, shift_y)],
                 jacobian: [xx, xy, yy],
             }
@@ -199,7 +203,7 @@ pub(super) fn distort<S: Simd>(s: S, model: &Model, slope: [S::F; 2]) -> Bent<S:
             let along = bend / s.mul_add(r, r, one);
             let (ux, uy) = (x * inverse_r, y * inverse_r);
             let d = along - scale;
-            Bent {
+            Distorted {
                 slope: [x * scale, y * scale],
                 jacobian: [s.mul_add(d, ux * ux, scale), d * ux * uy, s.mul_add(d, uy * uy, scale)],
             }

@@ -5,7 +5,7 @@
 //! first two moments (the merging of mixtures in tracking; for splats, Kerbl et al. 2024, "A
 //! hierarchical 3D Gaussian representation"). A weight is what a splat covers: opacity times area.
 //!
-//! Two things differ from a plain mixture. First, *the pixel blurs*: far away every splat is drawn
+//! Two things differ from a plain mixture. First, *the pixel blurs*: far away every splat is rendered
 //! at least a pixel wide ([`crate::limits::BLUR_PX2`]), however small, so what it covers depends on
 //! the distance; a merged splat is made for the distance at which its level is used, whose pixel is
 //! `blur_m2`. Second, *splats overlap*: n of them at random places in the merged splat's area hide
@@ -69,9 +69,9 @@ impl Blob {
         spread_m2 + SHAPE_SHARE * size_m2
     }
 
-    /// Returns covariance and opacity with which it is drawn, so that it covers where the pixel
+    /// Returns covariance and opacity with which it is rendered, so that it covers where the pixel
     /// blurs by `blur_m2` what its splats did. What would be more than opaque becomes larger.
-    pub(super) fn drawn(&self, blur_m2: f64) -> (DMat3, f64) {
+    pub(super) fn rendered(&self, blur_m2: f64) -> (DMat3, f64) {
         let blur_m2 = blur_m2.max(MIN_BLUR_M2);
         let depth = self.mass(blur_m2) / (area(&self.covariance_m2) + blur_m2);
         let opacity = covered(depth, f64::from(self.origin.count));
@@ -167,7 +167,7 @@ const GROWTH_SHARE: f64 = 0.5;
 /// Hundreds of splats on each other are a plateau: a Gaussian of the same area is wider where it is
 /// seen. A ball of 20,000 splats on 78 pixels covers 70 / 77 / 87 / 120 at most 0.3 / 0.5 / 0.7 / 9.
 const MAX_GROWTH: f64 = 0.5;
-/// Keeps weights apart from 0 where splats are points; far below anything that is drawn. [m^2]
+/// Keeps weights apart from 0 where splats are points; far below anything that is rendered. [m^2]
 const MIN_BLUR_M2: f64 = 1e-24;
 /// More splats than this differ from infinitely many by less than 1 %.
 const MAX_TERMS: f64 = 32.0;

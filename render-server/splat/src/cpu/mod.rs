@@ -3,7 +3,7 @@
 //! Data flow, the files in run order: `scene` packs the splats once, and `detail` adds coarser levels
 //! of them where asked for, made by `merge`. Then, per camera: `cull` lists
 //! the blocks of splats in view, `project` brings their splats onto the image plane, `sort` orders
-//! them by depth, `bin` gives each 16x16-pixel tile its list, `blend` draws the tiles. `simd` holds
+//! them by depth, `bin` gives each 16x16-pixel tile its list, `blend` renders the tiles. `simd` holds
 //! the instruction sets and all unsafe code; every pass is written once, generic over them.
 //!
 //! Budget on two cores at 3.6 GHz, 125 k splats: 9 ms at 320x240, 22 ms at 640x480.
@@ -28,7 +28,7 @@ use simd::{InstructionSet, Simd};
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, Placement, RgbdImage, Scene};
 
-/// Draws a scene with all cores of the processor.
+/// Renders a scene with all cores of the processor.
 #[derive(Debug)]
 pub struct CpuRenderer {
     instructions: InstructionSet,
@@ -43,7 +43,7 @@ pub struct CpuRenderer {
 struct Buffers {
     lenses: lens::Lenses,
     /// Per part; those that are not there see nothing, for none of their blocks is visible.
-    views: Vec<cull::View>,
+    views: Vec<cull::ObjectView>,
     visible: Vec<cull::Visible>,
     projected: project::Projected,
     sorter: sort::Sorter,
@@ -96,14 +96,14 @@ impl CpuRenderer {
         views.clear();
         visible.clear();
         let lens = lenses.of(camera);
-        let still = cull::View::new(camera, &lens, &camera.world_from_cam);
+        let still = cull::ObjectView::new(camera, &lens, &camera.world_from_cam);
         views.push(still);
         cull::cull(0, &parts[0], &still, max_error_px, visible);
         for (i, (part, placement)) in parts[1..].iter().zip(placements).enumerate() {
             views.push(still);
             if let Some(world_from_object) = placement {
                 let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-                let view = cull::View::new(camera, &lens, &object_from_cam);
+                let view = cull::ObjectView::new(camera, &lens, &object_from_cam);
                 cull::cull(i + 1, part, &view, max_error_px, visible);
                 views[i + 1] = view;
             }

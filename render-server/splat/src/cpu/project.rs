@@ -13,7 +13,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::bin::TILE;
-use super::cull::{View, Visible};
+use super::cull::{ObjectView, Visible};
 use super::lens::{self, Model};
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
 use super::simd::{Kernel, Simd};
@@ -79,7 +79,7 @@ pub(super) struct Projected {
 pub(super) fn project<S: Simd>(
     simd: S,
     parts: &[Part],
-    views: &[View],
+    views: &[ObjectView],
     visible: &[Visible],
     out: &mut Projected,
 ) {
@@ -91,7 +91,7 @@ pub(super) fn project<S: Simd>(
     }
     out.counts.resize(visible.len(), 0);
     // One camera has one lens, whichever part it sees.
-    let bent = views.first().is_some_and(|view| view.model != Model::Pinhole);
+    let distorted = views.first().is_some_and(|view| view.model != Model::Pinhole);
     out.splats
         .par_chunks_mut(BLOCK)
         .zip(out.boxes.par_chunks_mut(BLOCK))
@@ -104,7 +104,7 @@ pub(super) fn project<S: Simd>(
             let out = Region { splats, boxes, keys };
             let (part, view) = (&parts[part as usize], &views[part as usize]);
             let block = block as usize;
-            *count = if bent {
+            *count = if distorted {
                 simd.run(ProjectBlock::<true> { part, view, block, out })
             } else {
                 simd.run(ProjectBlock::<false> { part, view, block, out })
@@ -115,7 +115,7 @@ pub(super) fn project<S: Simd>(
 /// One block, seen through a lens or a pinhole; returns how many splats survived.
 struct ProjectBlock<'a, const LENS: bool> {
     part: &'a Part,
-    view: &'a View,
+    view: &'a ObjectView,
     block: usize,
     out: Region<'a>,
 }
@@ -154,7 +154,7 @@ impl<const LENS: bool> Kernel for ProjectBlock<'_, LENS> {
 #[inline(always)]
 fn vector<S: Simd, const LENS: bool>(
     s: S,
-    view: &View,
+    view: &ObjectView,
     geometry: &[f32],
     sh: &[u16],
     first: usize,
@@ -241,7 +241,7 @@ fn vector<S: Simd, const LENS: bool>(
     let direction = [d[0] * inverse_length, d[1] * inverse_length, d[2] * inverse_length];
     let mut rgb = colour(s, &sh[first..], direction);
     if let Some(atmosphere) = &view.atmosphere {
-        rgb = through(s, atmosphere, rgb, distance);
+        rgb = attenuate(s, atmosphere, rgb, distance);
     }
     let fields = [
         mean_x,
@@ -415,9 +415,9 @@ fn colour<S: Simd>(s: S, sh: &[u16], [x, y, z]: [S::F; 3]) -> [S::F; 3] {
     [s.max(rgb[0], zero), s.max(rgb[1], zero), s.max(rgb[2], zero)]
 }
 
-/// Returns colours seen from a distance [m]; the vector form of [`Atmosphere::seen`].
+/// Returns colours seen from a distance [m]; the vector form of [`Atmosphere::attenuate`].
 #[inline(always)]
-fn through<S: Simd>(s: S, atmosphere: &Atmosphere, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
+fn attenuate<S: Simd>(s: S, atmosphere: &Atmosphere, rgb: [S::F; 3], distance: S::F) -> [S::F; 3] {
     // Within the range of `exp2`; a millionth of a millionth is left there.
     let lost = distance * s.splat(-atmosphere.fog_per_m * std::f32::consts::LOG2_E);
     let left = s.exp2(s.max(lost, s.splat(-40.0)));

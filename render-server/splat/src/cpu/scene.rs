@@ -1,5 +1,5 @@
 //! The renderer's own copy of a scene: reordered, precomputed, packed for vectors. What stands
-//! still is one part, every rigid object another: a part that moves is drawn as one that stands
+//! still is one part, every rigid object another: a part that moves is rendered as one that stands
 //! still before a camera that moves.
 //!
 //! Splats stand in blocks ([`crate::blocks`]). Within a block, groups of 16 splats hold column after column

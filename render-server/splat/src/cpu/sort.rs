@@ -177,7 +177,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_slot_comes_once_and_in_order(
+        fn sorting_is_a_permutation_in_depth_order(
             regions in prop::collection::vec(prop::collection::vec(0.2..50.0f32, 0..=BLOCK), 0..60),
         ) {
             let order = sorted_slots(&regions);

@@ -1,4 +1,4 @@
-//! Between what trainers optimise (logarithms, logits, harmonics) and what a renderer draws.
+//! Between what trainers optimise (logarithms, logits, harmonics) and what a renderer renders.
 
 use glam::Vec3;
 

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::progress::Meter;
 use crate::Splats;
 
-/// Splats that a file held and that cannot be drawn, by reason; each is counted once, under the
+/// Splats that a file held and that cannot be rendered, by reason; each is counted once, under the
 /// first reason that applies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DropCounts {

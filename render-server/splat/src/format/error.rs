@@ -72,7 +72,7 @@ pub enum FormatError {
         /// What is accepted.
         limit: u64,
     },
-    /// Nothing is left to draw.
+    /// Nothing is left to render.
     #[error(
         "{format}: no splats: the file declares {declared}, {dropped} of them were dropped as invalid"
     )]

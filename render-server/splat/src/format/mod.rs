@@ -3,7 +3,7 @@
 //! [`read`] tells the format by content, then by name, and hands the bytes (mapped, not copied) to
 //! the format's own module, which checks every size against the file's length before it allocates,
 //! and decodes in parallel into a [`Loaded`]: activated, in the axes of the PLY the scene was trained
-//! to, what cannot be drawn left out and counted. [`write`] goes the other way by file name. Called
+//! to, what cannot be rendered left out and counted. [`write`] goes the other way by file name. Called
 //! once per scene by whatever loads one: server, command line, benches.
 //!
 //! | format | names | read | written | harmonics | positions |
@@ -48,11 +48,11 @@ use progress::Meter;
 pub struct Loaded {
     /// What kind of file it was.
     pub format: Format,
-    /// What can be drawn, in file order.
+    /// What can be rendered, in file order.
     pub splats: Splats,
     /// What was left out, by reason.
     pub dropped: DropCounts,
-    /// Whether the file says that the scene was trained with anti-aliasing (mip-splatting); drawn
+    /// Whether the file says that the scene was trained with anti-aliasing (mip-splatting); rendered
     /// without, its smallest splats look a little too bright.
     pub antialiased: bool,
     /// Names of what the file holds of each splat and no splat needs, in file order.

@@ -9,7 +9,7 @@ use super::{ksplat, parse, ply, read, read_with_progress, sog, splat, spz, write
 use crate::Splats;
 
 /// A writer, the order it writes in, and what it may lose.
-struct Way {
+struct FormatCase {
     name: &'static str,
     format: Format,
     encode: fn(&Splats) -> Vec<u8>,
@@ -61,8 +61,8 @@ const KSPLAT: Loss = Loss {
     harmonic: 1e-3,
 };
 
-const WAYS: [Way; 10] = [
-    Way {
+const FORMAT_CASES: [FormatCase; 10] = [
+    FormatCase {
         name: "PLY",
         format: Format::Ply,
         encode: ply::encode,
@@ -76,7 +76,7 @@ const WAYS: [Way; 10] = [
             harmonic: 0.0,
         },
     },
-    Way {
+    FormatCase {
         name: "compressed PLY",
         format: Format::CompressedPly,
         encode: ply::encode_compressed,
@@ -92,7 +92,7 @@ const WAYS: [Way; 10] = [
             harmonic: 1.0 / 64.0 * 1.01,
         },
     },
-    Way {
+    FormatCase {
         name: ".splat",
         format: Format::Splat,
         encode: splat::encode,
@@ -106,7 +106,7 @@ const WAYS: [Way; 10] = [
             harmonic: 0.0,
         },
     },
-    Way {
+    FormatCase {
         name: "SPZ 2",
         format: Format::Spz,
         encode: |splats| spz::encode(splats, 2),
@@ -114,21 +114,21 @@ const WAYS: [Way; 10] = [
         // w is what three bytes leave, so half a turn is known least.
         loss: Loss { rotation_rad: 0.3, ..SPZ },
     },
-    Way {
+    FormatCase {
         name: "SPZ 3",
         format: Format::Spz,
         encode: |splats| spz::encode(splats, 3),
         sorted: as_is,
         loss: SPZ,
     },
-    Way {
+    FormatCase {
         name: "SPZ 4",
         format: Format::Spz,
         encode: |splats| spz::encode(splats, 4),
         sorted: as_is,
         loss: SPZ,
     },
-    Way {
+    FormatCase {
         name: "SOG",
         format: Format::Sog,
         encode: |splats| sog::encode(splats).unwrap(),
@@ -144,7 +144,7 @@ const WAYS: [Way; 10] = [
             harmonic: 2.0 * 2.0 / 255.0,
         },
     },
-    Way {
+    FormatCase {
         name: ".ksplat level 0",
         format: Format::Ksplat,
         encode: |splats| ksplat::encode(splats, 0),
@@ -157,14 +157,14 @@ const WAYS: [Way; 10] = [
             ..KSPLAT
         },
     },
-    Way {
+    FormatCase {
         name: ".ksplat level 1",
         format: Format::Ksplat,
         encode: |splats| ksplat::encode(splats, 1),
         sorted: by_cube,
         loss: KSPLAT,
     },
-    Way {
+    FormatCase {
         name: ".ksplat level 2",
         format: Format::Ksplat,
         encode: |splats| ksplat::encode(splats, 2),
@@ -219,9 +219,9 @@ fn some() -> Splats {
 }
 
 /// Compares a scene with what became of it.
-fn check_close(way: &Way, before: &Splats, after: &Splats) {
-    let Way { name, loss, format, .. } = way;
-    let order = (way.sorted)(before);
+fn check_close(case: &FormatCase, before: &Splats, after: &Splats) {
+    let FormatCase { name, loss, format, .. } = case;
+    let order = (case.sorted)(before);
     assert_eq!(after.len(), before.len(), "{name}");
     assert_eq!(after.sh_degree, before.sh_degree.min(format.max_sh_degree()), "{name}");
     let (old, new) = (before.sh_coefficients() * 3, after.sh_coefficients() * 3);
@@ -266,11 +266,11 @@ proptest! {
 
     #[test]
     fn every_format_brings_a_scene_back_within_its_steps(splats in scene()) {
-        for way in &WAYS {
-            let loaded = parse(&(way.encode)(&splats), way.format).unwrap();
-            prop_assert_eq!(loaded.format, way.format);
+        for case in &FORMAT_CASES {
+            let loaded = parse(&(case.encode)(&splats), case.format).unwrap();
+            prop_assert_eq!(loaded.format, case.format);
             prop_assert_eq!(loaded.dropped.total(), 0);
-            check_close(way, &splats, &loaded.splats);
+            check_close(case, &splats, &loaded.splats);
         }
     }
 
@@ -278,11 +278,11 @@ proptest! {
     fn any_damage_is_an_error_or_a_sound_scene(
         splats in scene(), at in any::<prop::sample::Index>(), bits in 1..=255u8,
     ) {
-        for way in &WAYS {
-            let mut bytes = (way.encode)(&splats);
+        for case in &FORMAT_CASES {
+            let mut bytes = (case.encode)(&splats);
             let at = at.index(bytes.len());
             bytes[at] ^= bits;
-            if let Ok(loaded) = parse(&bytes, way.format) {
+            if let Ok(loaded) = parse(&bytes, case.format) {
                 check_sound(&loaded);
             }
         }
@@ -300,29 +300,29 @@ proptest! {
 
 #[test]
 fn a_file_cut_anywhere_is_an_error() {
-    for way in &WAYS {
-        let bytes = (way.encode)(&some());
+    for case in &FORMAT_CASES {
+        let bytes = (case.encode)(&some());
         for length in 0..bytes.len() {
             // A `.splat` cut between splats is one of fewer, and a gzip stream's last bytes are
             // its checksum and length, without which it is refused as well.
-            if way.format == Format::Splat && length % 32 == 0 && length > 0 {
+            if case.format == Format::Splat && length % 32 == 0 && length > 0 {
                 continue;
             }
-            let result = super::decode(&bytes[..length], way.format, &super::Meter::SILENT);
-            assert!(result.is_err(), "{}: {length} of {} bytes", way.name, bytes.len());
+            let result = super::decode(&bytes[..length], case.format, &super::Meter::SILENT);
+            assert!(result.is_err(), "{}: {length} of {} bytes", case.name, bytes.len());
         }
-        assert!(parse(&bytes, way.format).is_ok());
+        assert!(parse(&bytes, case.format).is_ok());
     }
 }
 
 #[test]
 fn content_decides_and_the_name_helps() {
-    for way in &WAYS {
-        let bytes = (way.encode)(&some());
-        let marked = way.format != Format::Splat;
-        assert_eq!(Format::of_content(&bytes).is_some(), marked, "{}", way.name);
+    for case in &FORMAT_CASES {
+        let bytes = (case.encode)(&some());
+        let marked = case.format != Format::Splat;
+        assert_eq!(Format::of_content(&bytes).is_some(), marked, "{}", case.name);
         if marked {
-            assert_eq!(parse(&bytes, Format::Splat).unwrap().format, way.format, "{}", way.name);
+            assert_eq!(parse(&bytes, Format::Splat).unwrap().format, case.format, "{}", case.name);
         }
     }
     for format in Format::ALL {
@@ -356,7 +356,7 @@ fn files_and_folders_are_read_by_path() {
 }
 
 #[test]
-fn what_is_no_scene_is_refused_with_what_is_supported() {
+fn unknown_files_are_refused_with_the_list_of_formats() {
     let folder = tempfile::tempdir().unwrap();
     let check = |name: &str, bytes: &[u8], parts: &[&str]| {
         let path = folder.path().join(name);
@@ -379,10 +379,10 @@ fn what_is_no_scene_is_refused_with_what_is_supported() {
 
 #[test]
 fn an_empty_scene_is_written_and_refused_by_name() {
-    for way in &WAYS {
-        let result = parse(&(way.encode)(&Splats::default()), way.format);
-        let error = result.expect_err(way.name).to_string();
-        assert!(error.contains("no splats"), "{}: {error}", way.name);
+    for case in &FORMAT_CASES {
+        let result = parse(&(case.encode)(&Splats::default()), case.format);
+        let error = result.expect_err(case.name).to_string();
+        assert!(error.contains("no splats"), "{}: {error}", case.name);
     }
 }
 
@@ -395,9 +395,9 @@ fn values_beyond_a_format_are_clamped_not_dropped() {
     splats.opacities[3] = 1.0;
     splats.sh[20] = 50.0;
     splats.sh[21] = -50.0;
-    for way in &WAYS {
-        let loaded = parse(&(way.encode)(&splats), way.format).unwrap();
-        assert_eq!((loaded.splats.len(), loaded.dropped.total()), (7, 0), "{}", way.name);
+    for case in &FORMAT_CASES {
+        let loaded = parse(&(case.encode)(&splats), case.format).unwrap();
+        assert_eq!((loaded.splats.len(), loaded.dropped.total()), (7, 0), "{}", case.name);
         check_sound(&loaded);
     }
 }
@@ -413,17 +413,17 @@ fn a_full_bucket_or_chunk_is_followed_by_another() {
         splats.opacities.push(0.5);
         splats.sh.extend((0..12).map(|k| (f + k as f32).sin() * 0.9));
     }
-    for way in &WAYS {
-        let after = parse(&(way.encode)(&splats), way.format).unwrap().splats;
+    for case in &FORMAT_CASES {
+        let after = parse(&(case.encode)(&splats), case.format).unwrap().splats;
         // Whatever the order: every splat has one near it, and positions tell them apart.
-        let most = (way.loss.mean_m)(7.0) * 2.0;
+        let most = (case.loss.mean_m)(7.0) * 2.0;
         let mut before: Vec<Vec3> = splats.means_m.clone();
         let mut after: Vec<Vec3> = after.means_m;
         let key = |m: &Vec3| (m.z.round() as i32, (m.x * 1e3 / 3.0).round() as i32);
         before.sort_by_key(key);
         after.sort_by_key(key);
         for (a, b) in before.iter().zip(&after) {
-            assert!((a - b).abs().max_element() <= most, "{}: {a} {b}", way.name);
+            assert!((a - b).abs().max_element() <= most, "{}: {a} {b}", case.name);
         }
     }
 }

@@ -67,7 +67,7 @@ impl Bin {
             counts: &b.digits,
             sizes: &b.sizes,
         };
-        let sorted = b.room.tile_digits as usize % 2;
+        let sorted = b.capacity.tile_digits as usize % 2;
         let (tick, views, sizes) = ((0, &b.tick), (1, &b.views), (2, &b.sizes));
         let (dispatches, order, counts) = ((3, &b.dispatches), (4, order), (7, &b.counts));
         let (shapes, extents) = ((5, &b.shapes), (6, &b.extents));
@@ -90,7 +90,7 @@ impl Bin {
                     (9, &b.slots[0]),
                 ],
             ),
-            digits: sort.bind(device, pairs, b.room.tile_digits * 8, [PAIRS; 2], false),
+            digits: sort.bind(device, pairs, b.capacity.tile_digits * 8, [PAIRS; 2], false),
             bound: device.bind(&self.bound, &[tick, sizes, (11, &b.tiles[sorted]), (12, &b.lists)]),
         }
     }

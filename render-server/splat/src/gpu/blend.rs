@@ -32,7 +32,7 @@ impl Blend {
                 (2, &b.shapes),
                 (3, &b.extents),
                 (4, &b.colours),
-                (5, &b.slots[b.room.tile_digits as usize % 2]),
+                (5, &b.slots[b.capacity.tile_digits as usize % 2]),
                 (6, &b.lists),
                 (7, &b.pixels),
                 (8, &b.ids),

@@ -3,19 +3,19 @@
 //! Two sizes depend on what a camera sees, and are known to the device alone: regions (256 slots,
 //! one per visible block) and pairs (of tile and splat). The device counts what it wants and uses
 //! what there is; the counts come back with the images, and where there was too little the buffers
-//! are grown and the tick is drawn again (`read.rs`).
+//! are grown and the tick is rendered again (`read.rs`).
 //!
 //! Memory: 68 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile, 16 (20 with objects)
 //! per pixel, and as much per pixel again for each of two staging buffers.
 
 use super::device::Device;
 use super::sort;
-use super::view::View;
+use super::view::GpuView;
 use crate::blocks::BLOCK;
 
 /// How much there must be room for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Room {
+pub(super) struct Capacity {
     /// Cameras times parts.
     pub(super) views: u64,
     /// Cameras times blocks.
@@ -28,13 +28,13 @@ pub(super) struct Room {
     pub(super) tile_digits: u32,
 }
 
-impl Room {
+impl Capacity {
     /// Returns the greatest that a device can give.
     pub(super) fn limit(binding_bytes: u64) -> Self {
         // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
         let slots = (binding_bytes / 16).min(65_535 * 256);
         Self {
-            views: binding_bytes / size_of::<View>() as u64,
+            views: binding_bytes / size_of::<GpuView>() as u64,
             // Ranks, and a number per workgroup.
             camera_blocks: (binding_bytes / 4 * 255 / 256).min(65_535 * 256),
             regions: slots / BLOCK as u64,
@@ -88,7 +88,7 @@ impl Room {
 /// The buffers; named as in the shaders.
 #[derive(Debug)]
 pub(super) struct Buffers {
-    pub(super) room: Room,
+    pub(super) capacity: Capacity,
     pub(super) tick: wgpu::Buffer,
     pub(super) views: wgpu::Buffer,
     pub(super) regions: wgpu::Buffer,
@@ -114,19 +114,22 @@ pub(super) struct Buffers {
 pub(super) const SIZES_BYTES: u64 = 32;
 
 impl Buffers {
-    pub(super) fn new(device: &Device, room: Room, has_ids: bool) -> Self {
+    pub(super) fn new(device: &Device, capacity: Capacity, has_ids: bool) -> Self {
         let storage = |label: &str, words: u64| device.storage(label, words * 4);
         let source = |label: &str, words: u64| {
             let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
             device.buffer(label, words * 4, usage)
         };
         let indirect = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::INDIRECT;
-        let slots = room.regions * BLOCK as u64;
+        let slots = capacity.regions * BLOCK as u64;
         Self {
-            room,
+            capacity,
             tick: device.uniform("tick", &[0; 32]),
-            views: storage("views", room.views * (size_of::<View>() / 4) as u64),
-            regions: storage("regions", room.camera_blocks + room.camera_blocks.div_ceil(256)),
+            views: storage("views", capacity.views * (size_of::<GpuView>() / 4) as u64),
+            regions: storage(
+                "regions",
+                capacity.camera_blocks + capacity.camera_blocks.div_ceil(256),
+            ),
             sizes: source("sizes", SIZES_BYTES / 4),
             dispatches: device.buffer("dispatches", 64, indirect),
             shapes: storage("shapes", slots * 4),
@@ -134,13 +137,13 @@ impl Buffers {
             colours: storage("colours", slots * 4),
             keys: [storage("keys", slots), storage("keys", slots)],
             order: [storage("order", slots), storage("order", slots)],
-            digits: device.storage("digits", sort::count_bytes(slots.max(room.pairs))),
+            digits: device.storage("digits", sort::count_bytes(slots.max(capacity.pairs))),
             counts: storage("counts", slots + slots.div_ceil(256)),
-            tiles: [storage("tiles", room.pairs), storage("tiles", room.pairs)],
-            slots: [storage("slots", room.pairs), storage("slots", room.pairs)],
-            lists: storage("lists", room.tiles * 2),
-            pixels: source("pixels", room.pixels * 4),
-            ids: source("ids", if has_ids { room.pixels } else { 0 }),
+            tiles: [storage("tiles", capacity.pairs), storage("tiles", capacity.pairs)],
+            slots: [storage("slots", capacity.pairs), storage("slots", capacity.pairs)],
+            lists: storage("lists", capacity.tiles * 2),
+            pixels: source("pixels", capacity.pixels * 4),
+            ids: source("ids", if has_ids { capacity.pixels } else { 0 }),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Which adapter draws, and the device on it.
+//! Which adapter renders, and the device on it.
 //!
 //! Devices fail: drivers reset, cards are unplugged, memory runs out. Every error ends up in one
 //! place ([`Device::fault`]), asked after each tick; nothing panics.
@@ -19,7 +19,7 @@ pub struct AdapterName {
     pub is_software: bool,
 }
 
-/// An adapter that can draw.
+/// An adapter that can render.
 #[derive(Debug)]
 pub struct Adapter {
     inner: wgpu::Adapter,
@@ -27,7 +27,7 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// Returns all adapters that can draw, the likely fastest first.
+    /// Returns all adapters that can render, the likely fastest first.
     pub fn all() -> Vec<Self> {
         // No check of indirect dispatches: their arguments are ours, and bounded by the buffers.
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {

@@ -3,11 +3,11 @@
 //! Data flow, the files in run order: `scene` packs and uploads once; `view` turns cameras and
 //! placements into numbers. Then, for all cameras of a tick in one submission: `cull` finds the
 //! blocks in view and gives each a region of slots, `project` brings their splats onto the image
-//! planes, `sort` orders them by depth, `bin` gives each 16x16-pixel tile its list, `blend` draws the
+//! planes, `sort` orders them by depth, `bin` gives each 16x16-pixel tile its list, `blend` renders the
 //! tiles, `read` brings pixels home. `device` chooses the adapter; `buffers` is what passes share.
 //!
 //! Nothing is read back in mid-frame: the device counts and dispatches on its own. What it counted
-//! comes back with the images; had it too little room, buffers grow and the tick is drawn again, so
+//! comes back with the images; had it too little room, buffers grow and the tick is rendered again, so
 //! that no image ever lacks a splat. No kernel uses subgroup operations or waits for another
 //! workgroup, and the slots of regions are in order of the scene: the same tick gives the same
 //! images, bit for bit, on any adapter that rounds alike.
@@ -36,12 +36,12 @@ use std::time::Instant;
 
 pub use device::{Adapter, AdapterName};
 
-use buffers::{Buffers, Room};
+use buffers::{Buffers, Capacity};
 use device::Device;
 use read::{Staging, Stamps};
 use scene::GpuScene;
 use sort::{Count, Pairs, Sort};
-use view::{Place, Tick, View};
+use view::{GpuView, ImageOffset, Tick};
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, Placement, RgbdImage, Scene};
@@ -49,7 +49,7 @@ use crate::{Camera, Placement, RgbdImage, Scene};
 /// Side of a tile; `TILE` in `common.wgsl`. [px]
 const TILE_PX: u32 = 16;
 /// Ticks that may be under way at once.
-const FLIGHTS: usize = 2;
+const MAX_IN_FLIGHT: usize = 2;
 /// Digits of a depth: 32 bits.
 const DEPTH_BITS: u32 = 32;
 /// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
@@ -74,7 +74,7 @@ impl Default for Budget {
     }
 }
 
-/// Draws a scene with a graphics card.
+/// Renders a scene with a graphics card.
 #[derive(Debug)]
 pub struct GpuRenderer {
     name: String,
@@ -82,13 +82,13 @@ pub struct GpuRenderer {
     passes: Passes,
     stamps: Option<Stamps>,
     scene: GpuScene,
-    limit: Room,
+    limit: Capacity,
     bound: Option<Bound>,
     spare: Vec<Staging>,
     /// Ticks under way.
-    flights: VecDeque<(Asked, wgpu::SubmissionIndex)>,
+    in_flight: VecDeque<(PendingTick, wgpu::SubmissionIndex)>,
     lenses: view::Lenses,
-    /// Cameras drawn in one submission at most; fewer once they have not fitted.
+    /// Cameras rendered in one submission at most; fewer once they have not fitted.
     together: usize,
     budget: Budget,
     workload: Workload,
@@ -115,20 +115,20 @@ struct Bound {
     blend: wgpu::BindGroup,
 }
 
-/// A tick to be drawn.
+/// A tick to be rendered.
 #[derive(Debug)]
-struct Asked {
+struct PendingTick {
     placements: Vec<Placement>,
     cameras: Vec<Camera>,
-    places: Vec<Place>,
+    places: Vec<ImageOffset>,
     /// `tiles` and `pixels` are exact.
-    wanted: Room,
+    wanted: Capacity,
     staging: Staging,
     began: Instant,
 }
 
-/// Why a tick cannot be drawn.
-enum Refused {
+/// Why a tick cannot be rendered.
+enum SubmitError {
     /// It needs larger buffers than the device has; fewer cameras at once may fit.
     TooLarge(String),
     Render(RenderError),
@@ -160,7 +160,7 @@ impl GpuRenderer {
         }
         Ok(Self {
             name: format!("gpu {}", adapter.name().name),
-            limit: Room::limit(device.binding_bytes),
+            limit: Capacity::limit(device.binding_bytes),
             workload: Workload { splats: scene.len, ..Workload::default() },
             device,
             passes,
@@ -168,14 +168,14 @@ impl GpuRenderer {
             scene,
             bound: None,
             spare: Vec::new(),
-            flights: VecDeque::new(),
+            in_flight: VecDeque::new(),
             lenses: view::Lenses::default(),
             together: usize::MAX,
             budget,
         })
     }
 
-    /// Draws another scene from now on.
+    /// Renders another scene from now on.
     ///
     /// # Errors
     /// As [`Self::new`]; this renderer is of no more use then.
@@ -183,14 +183,14 @@ impl GpuRenderer {
     /// # Panics
     /// If a tick is under way.
     pub fn load<'a>(&mut self, scene: impl Into<Scene<'a>>) -> Result<(), RenderError> {
-        assert!(self.flights.is_empty(), "finish what was begun first");
+        assert!(self.in_flight.is_empty(), "finish what was begun first");
         self.bound = None;
         self.scene = GpuScene::new(&self.device, scene.into())?;
         self.workload = Workload { splats: self.scene.len, ..Workload::default() };
-        self.check_device().map_err(Refused::into_error)
+        self.check_device().map_err(SubmitError::into_error)
     }
 
-    /// Starts to draw one image per camera and returns at once; [`Self::finish`] fetches them. Two
+    /// Starts to render one image per camera and returns at once; [`Self::finish`] fetches them. Two
     /// ticks may be under way.
     ///
     /// # Errors
@@ -205,7 +205,7 @@ impl GpuRenderer {
     ) -> Result<(), RenderError> {
         let none = vec![RgbdImage::default(); cameras.len()];
         rasterizer::validate(self.scene.ids.len() - 1, placements, cameras, &none)?;
-        self.take_off(placements, cameras).map_err(Refused::into_error)
+        self.submit_tick(placements, cameras).map_err(SubmitError::into_error)
     }
 
     /// Waits for the tick that was begun first, fills its images, and returns how long the passes
@@ -217,7 +217,7 @@ impl GpuRenderer {
     /// # Panics
     /// If no tick is under way, or there are not as many images as it has cameras.
     pub fn finish(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, RenderError> {
-        self.land(images).map_err(Refused::into_error)
+        self.finish_tick(images).map_err(SubmitError::into_error)
     }
 
     /// Destroys the device, as a driver's reset does: to test what takes over.
@@ -226,19 +226,23 @@ impl GpuRenderer {
     }
 
     /// Submits a tick.
-    fn take_off(&mut self, placements: &[Placement], cameras: &[Camera]) -> Result<(), Refused> {
-        assert!(self.flights.len() < FLIGHTS, "two ticks are under way already");
+    fn submit_tick(
+        &mut self,
+        placements: &[Placement],
+        cameras: &[Camera],
+    ) -> Result<(), SubmitError> {
+        assert!(self.in_flight.len() < MAX_IN_FLIGHT, "two ticks are under way already");
         let began = Instant::now();
         let mut places = Vec::with_capacity(cameras.len());
         let (mut tiles, mut pixels) = (0u64, 0u64);
         for camera in cameras {
             let k = &camera.intrinsics;
-            places.push(Place { first_tile: tiles as u32, first_pixel: pixels as u32 });
+            places.push(ImageOffset { first_tile: tiles as u32, first_pixel: pixels as u32 });
             let across = k.width_px.div_ceil(TILE_PX);
             tiles += u64::from(across) * u64::from(k.height_px.div_ceil(TILE_PX));
             pixels += k.pixels() as u64;
         }
-        let wanted = Room {
+        let wanted = Capacity {
             views: (cameras.len() * self.scene.ids.len()) as u64,
             camera_blocks: cameras.len() as u64 * u64::from(self.scene.block_count),
             regions: u64::from(self.budget.regions).min(self.limit.regions),
@@ -248,9 +252,9 @@ impl GpuRenderer {
             // One number more than there are tiles: that of none.
             tile_digits: sort::digits(u64::BITS - tiles.leading_zeros()),
         };
-        self.make_room(&wanted)?;
+        self.reserve(&wanted)?;
         let staging = Staging::for_pixels(self.spare.pop(), &self.device, pixels, self.has_ids());
-        let tick = Asked {
+        let tick = PendingTick {
             placements: placements.to_vec(),
             cameras: cameras.to_vec(),
             places,
@@ -259,7 +263,7 @@ impl GpuRenderer {
             began,
         };
         let submission = self.submit(&tick);
-        self.flights.push_back((tick, submission));
+        self.in_flight.push_back((tick, submission));
         Ok(())
     }
 
@@ -268,21 +272,21 @@ impl GpuRenderer {
     }
 
     /// Makes sure of buffers for what is wanted.
-    fn make_room(&mut self, wanted: &Room) -> Result<(), Refused> {
+    fn reserve(&mut self, wanted: &Capacity) -> Result<(), SubmitError> {
         if !wanted.is_within(&self.limit) || wanted.tile_digits > self.limit.tile_digits {
-            return Err(Refused::TooLarge(format!(
+            return Err(SubmitError::TooLarge(format!(
                 "a tick needs {wanted:?}, and the graphics device has {:?}",
                 self.limit
             )));
         }
-        let has = self.bound.as_ref().map(|bound| bound.buffers.room).unwrap_or_default();
+        let has = self.bound.as_ref().map(|bound| bound.buffers.capacity).unwrap_or_default();
         if self.bound.is_some() && has.holds(wanted) {
             return Ok(());
         }
         // The old buffers go first: the new ones may need their memory.
         self.bound = None;
-        let room = has.grown_to(wanted, &self.limit);
-        let buffers = Buffers::new(&self.device, room, self.has_ids());
+        let capacity = has.grown_to(wanted, &self.limit);
+        let buffers = Buffers::new(&self.device, capacity, self.has_ids());
         let (device, passes) = (&self.device, &self.passes);
         let pairs = Pairs {
             keys: [&buffers.keys[0], &buffers.keys[1]],
@@ -302,27 +306,27 @@ impl GpuRenderer {
         self.check_device()
     }
 
-    fn check_device(&self) -> Result<(), Refused> {
+    fn check_device(&self) -> Result<(), SubmitError> {
         match self.device.fault() {
-            Some(fault) => Err(Refused::Render(RenderError::Device(fault))),
+            Some(fault) => Err(SubmitError::Render(RenderError::Device(fault))),
             None => Ok(()),
         }
     }
 
     /// Writes a tick's numbers and submits its passes and copies.
-    fn submit(&mut self, asked: &Asked) -> wgpu::SubmissionIndex {
-        let tiles = asked.wanted.tiles as u32;
-        let views = self.views(asked);
+    fn submit(&mut self, pending: &PendingTick) -> wgpu::SubmissionIndex {
+        let tiles = pending.wanted.tiles as u32;
+        let views = self.views(pending);
         let bound = self.bound.as_ref().expect("buffers were made before");
         let (device, passes, buffers) = (&self.device, &self.passes, &bound.buffers);
-        let cameras = asked.cameras.len() as u32;
+        let cameras = pending.cameras.len() as u32;
         let tick = Tick {
             cameras,
             parts: self.scene.ids.len() as u32,
             blocks: self.scene.block_count,
             tiles,
-            regions: buffers.room.regions as u32,
-            pairs: buffers.room.pairs as u32,
+            regions: buffers.capacity.regions as u32,
+            pairs: buffers.capacity.pairs as u32,
             has_ids: u32::from(self.has_ids()),
             padding: 0,
         };
@@ -364,58 +368,65 @@ impl GpuRenderer {
         passes.blend.run(&mut pass, &bound.blend, tiles);
         drop(pass);
         let has_ids = self.has_ids();
-        let pixels = asked.wanted.pixels;
-        asked.staging.copy(&mut encoder, buffers, self.stamps.as_ref(), pixels, has_ids);
+        let pixels = pending.wanted.pixels;
+        pending.staging.copy(&mut encoder, buffers, self.stamps.as_ref(), pixels, has_ids);
         let submission = device.queue.submit([encoder.finish()]);
-        asked.staging.map();
+        pending.staging.map();
         submission
     }
 
     /// Returns the cameras as each part sees them.
-    fn views(&mut self, asked: &Asked) -> Vec<View> {
-        let mut views = Vec::with_capacity(asked.cameras.len() * self.scene.ids.len());
-        for (camera, &place) in asked.cameras.iter().zip(&asked.places) {
+    fn views(&mut self, pending: &PendingTick) -> Vec<GpuView> {
+        let mut views = Vec::with_capacity(pending.cameras.len() * self.scene.ids.len());
+        for (camera, &place) in pending.cameras.iter().zip(&pending.places) {
             let lens = self.lenses.of(camera);
-            views.push(View::new(camera, &lens, &camera.world_from_cam, place, self.scene.ids[0]));
-            for (placement, &id) in asked.placements.iter().zip(&self.scene.ids[1..]) {
+            views.push(GpuView::new(
+                camera,
+                &lens,
+                &camera.world_from_cam,
+                place,
+                self.scene.ids[0],
+            ));
+            for (placement, &id) in pending.placements.iter().zip(&self.scene.ids[1..]) {
                 views.push(match placement {
                     Some(world_from_object) => {
                         // An object that moves is one that stands still before a moving camera.
                         let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-                        View::new(camera, &lens, &object_from_cam, place, id)
+                        GpuView::new(camera, &lens, &object_from_cam, place, id)
                     }
-                    None => View::absent(),
+                    None => GpuView::absent(),
                 });
             }
         }
         views
     }
 
-    /// Waits for the first tick under way; draws it again where it had too little room.
-    fn land(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, Refused> {
-        let (mut asked, mut submission) = self.flights.pop_front().expect("a tick is under way");
-        assert_eq!(asked.cameras.len(), images.len(), "one image per camera");
+    /// Waits for the first tick under way; renders it again where it had too little room.
+    fn finish_tick(&mut self, images: &mut [RgbdImage]) -> Result<PassTimes, SubmitError> {
+        let (mut pending, mut submission) =
+            self.in_flight.pop_front().expect("a tick is under way");
+        assert_eq!(pending.cameras.len(), images.len(), "one image per camera");
         let has_ids = self.has_ids();
         loop {
             let mut read_ms = 0.0;
-            let read = asked.staging.read(&self.device, submission, |bytes| {
+            let read = pending.staging.read(&self.device, submission, |bytes| {
                 let start = Instant::now();
                 let (sizes, passes_ms) = read::sizes(bytes, self.stamps.as_ref());
                 if sizes.is_complete() {
-                    let pixels = asked.wanted.pixels as usize;
-                    read::images(bytes, &asked.cameras, &asked.places, pixels, has_ids, images);
+                    let pixels = pending.wanted.pixels as usize;
+                    read::images(bytes, &pending.cameras, &pending.places, pixels, has_ids, images);
                 }
                 read_ms = milliseconds(start);
                 (sizes, passes_ms)
             });
             let (sizes, [cull_ms, project_ms, sort_ms, bin_ms, blend_ms]) =
-                read.map_err(|fault| Refused::Render(RenderError::Device(fault)))?;
+                read.map_err(|fault| SubmitError::Render(RenderError::Device(fault)))?;
             if sizes.is_complete() {
-                let cameras = asked.cameras.len().max(1);
+                let cameras = pending.cameras.len().max(1);
                 self.workload.visible = sizes.visible as usize / cameras;
                 self.workload.pairs = sizes.pairs as usize / cameras;
-                let total_ms = milliseconds(asked.began);
-                self.spare.push(asked.staging);
+                let total_ms = milliseconds(pending.began);
+                self.spare.push(pending.staging);
                 return Ok(PassTimes {
                     cull_ms,
                     project_ms,
@@ -426,16 +437,16 @@ impl GpuRenderer {
                     total_ms,
                 });
             }
-            let wanted = &mut asked.wanted;
+            let wanted = &mut pending.wanted;
             wanted.regions = wanted.regions.max(u64::from(sizes.regions_wanted));
             wanted.pairs = wanted.pairs.max(u64::from(sizes.pairs_wanted));
-            self.make_room(&asked.wanted)?;
-            submission = self.submit(&asked);
+            self.reserve(&pending.wanted)?;
+            submission = self.submit(&pending);
         }
     }
 }
 
-impl Refused {
+impl SubmitError {
     fn into_error(self) -> RenderError {
         match self {
             // Another renderer must do it, as if this one were gone.
@@ -458,17 +469,17 @@ impl Rasterizer for GpuRenderer {
         images: &mut [RgbdImage],
     ) -> Result<PassTimes, RenderError> {
         rasterizer::validate(self.scene.ids.len() - 1, placements, cameras, images)?;
-        assert!(self.flights.is_empty(), "finish what was begun first");
+        assert!(self.in_flight.is_empty(), "finish what was begun first");
         let start = Instant::now();
         let mut times = PassTimes::default();
         let mut done = 0;
         while done < cameras.len() {
             let count = (cameras.len() - done).min(self.together);
             let group = done..done + count;
-            let drawn = self
-                .take_off(placements, &cameras[group.clone()])
-                .and_then(|()| self.land(&mut images[group]));
-            match drawn {
+            let rendered = self
+                .submit_tick(placements, &cameras[group.clone()])
+                .and_then(|()| self.finish_tick(&mut images[group]));
+            match rendered {
                 Ok(part) => {
                     times.cull_ms += part.cull_ms;
                     times.project_ms += part.project_ms;
@@ -478,7 +489,7 @@ impl Rasterizer for GpuRenderer {
                     times.read_ms += part.read_ms;
                     done += count;
                 }
-                Err(Refused::TooLarge(_)) if count > 1 => self.together = count.div_ceil(2),
+                Err(SubmitError::TooLarge(_)) if count > 1 => self.together = count.div_ceil(2),
                 Err(refused) => return Err(refused.into_error()),
             }
         }

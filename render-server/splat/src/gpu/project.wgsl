@@ -72,7 +72,7 @@ fn arc_tangent(r: f32) -> f32 {
     return select(angle, 1.5707964 - angle, r > 1.0);
 }
 
-struct Bent {
+struct Distorted {
     slope: vec2<f32>,
     /// How it changes with the slope, column by column.
     along_x: vec2<f32>,
@@ -80,14 +80,14 @@ struct Bent {
 }
 
 /// As `vizflyt_protocol::geometry::Distortion::distort`.
-fn distort(view: u32, slope: vec2<f32>) -> Bent {
+fn distort(view: u32, slope: vec2<f32>) -> Distorted {
     let model = views[view].flags.x;
     let k = views[view].lens;
     let rr = dot(slope, slope);
     let x = slope.x;
     let y = slope.y;
     if model == NO_LENS {
-        return Bent(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
+        return Distorted(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
     }
     if model == BROWN_CONRADY {
         let k3 = views[view].more.x;
@@ -100,7 +100,7 @@ fn distort(view: u32, slope: vec2<f32>) -> Bent {
             p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y,
         );
         let across = 2.0 * (x * y * growth + p1 * x + p2 * y);
-        return Bent(
+        return Distorted(
             slope * radial + shift,
             vec2(radial + 2.0 * (x * x * growth + p1 * y + 3.0 * p2 * x), across),
             vec2(across, radial + 2.0 * (y * y * growth + 3.0 * p1 * y + p2 * x)),
@@ -109,17 +109,17 @@ fn distort(view: u32, slope: vec2<f32>) -> Bent {
     let r = sqrt(rr);
     if r < 1e-4 {
         // What is left out is below 1e-8 of the slope.
-        return Bent(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
+        return Distorted(slope, vec2(1.0, 0.0), vec2(0.0, 1.0));
     }
     let t = arc_tangent(r);
     let tt = t * t;
-    let bent = t * (1.0 + tt * (k.x + tt * (k.y + tt * (k.z + tt * k.w))));
+    let distorted = t * (1.0 + tt * (k.x + tt * (k.y + tt * (k.z + tt * k.w))));
     let bend = 1.0 + tt * (3.0 * k.x + tt * (5.0 * k.y + tt * (7.0 * k.z + tt * 9.0 * k.w)));
-    let scale = bent / r;
+    let scale = distorted / r;
     let along = bend / (1.0 + rr);
     let u = slope / r;
     let d = along - scale;
-    return Bent(
+    return Distorted(
         slope * scale,
         vec2(scale + d * u.x * u.x, d * u.x * u.y),
         vec2(d * u.x * u.y, scale + d * u.y * u.y),
@@ -197,11 +197,11 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     if has_lens {
         at *= min(1.0, views[view].more.y / max(length(at), 1e-30));
     }
-    let bent = distort(view, at);
+    let distorted = distort(view, at);
     let pinhole_x = (views[view].row_x.xyz - at.x * views[view].row_z.xyz) * inverse_z;
     let pinhole_y = (views[view].row_y.xyz - at.y * views[view].row_z.xyz) * inverse_z;
-    let gx = views[view].focal.x * (bent.along_x.x * pinhole_x + bent.along_y.x * pinhole_y);
-    let gy = views[view].focal.y * (bent.along_x.y * pinhole_x + bent.along_y.y * pinhole_y);
+    let gx = views[view].focal.x * (distorted.along_x.x * pinhole_x + distorted.along_y.x * pinhole_y);
+    let gy = views[view].focal.y * (distorted.along_x.y * pinhole_x + distorted.along_y.y * pinhole_y);
     let axis_0 = vector(first, 3u, lane);
     let axis_1 = vector(first, 6u, lane);
     let axis_2 = vector(first, 9u, lane);
@@ -231,7 +231,7 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
     let distance = sqrt(dot(d, d));
     let rgb = colour(geometry[first + 1u], geometry[first + 2u], lane, d / distance);
-    // As `Atmosphere::seen`.
+    // As `Atmosphere::attenuate`.
     let light = views[view].light;
     let fog = views[view].fog.xyz;
     let seen = mix(fog, rgb * light.xyz, exp2(-light.w * distance));

@@ -1,7 +1,7 @@
 //! From the device's memory to the images.
 //!
 //! Each tick copies its pixels, and what the device counted, to one of two staging buffers: while
-//! one tick is read here, the next is drawn there.
+//! one tick is read here, the next is rendered there.
 //!
 //! Budget: 16 bytes per pixel over the bus (20 with ids): 4.9 MB at 640x480, 0.2 ms at 25 GB/s; then
 //! 28 bytes written per pixel, by all cores.
@@ -14,7 +14,7 @@ use zerocopy::{FromBytes, Immutable, KnownLayout};
 
 use super::buffers::{Buffers, SIZES_BYTES};
 use super::device::Device;
-use super::view::Place;
+use super::view::ImageOffset;
 use crate::blocks::BLOCK;
 use crate::{Camera, RgbdImage};
 
@@ -184,7 +184,7 @@ pub(super) fn sizes(bytes: &[u8], stamps: Option<&Stamps>) -> (Sizes, [f32; PASS
 pub(super) fn images(
     bytes: &[u8],
     cameras: &[Camera],
-    places: &[Place],
+    places: &[ImageOffset],
     pixels: usize,
     has_ids: bool,
     images: &mut [RgbdImage],

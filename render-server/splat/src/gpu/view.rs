@@ -25,7 +25,7 @@ pub(super) struct Tick {
 /// `View` of `common.wgsl`, field by field.
 #[derive(Clone, Copy, Debug, Default, IntoBytes, Immutable)]
 #[repr(C)]
-pub(super) struct View {
+pub(super) struct GpuView {
     rows: [[f32; 4]; 3],
     focal: [f32; 4],
     slopes: [f32; 4],
@@ -40,11 +40,11 @@ pub(super) struct View {
     weights: [[f32; 4]; 2],
 }
 
-const _: () = assert!(size_of::<Tick>() == 32 && size_of::<View>() == 304);
+const _: () = assert!(size_of::<Tick>() == 32 && size_of::<GpuView>() == 304);
 
 /// Where an image lies among the images of its tick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Place {
+pub(super) struct ImageOffset {
     pub(super) first_tile: u32,
     pub(super) first_pixel: u32,
 }
@@ -80,13 +80,13 @@ impl Lenses {
     }
 }
 
-impl View {
+impl GpuView {
     /// Prepares a validated camera as a part of the scene sees it that stands at `part_from_cam`.
     pub(super) fn new<F: Frame>(
         camera: &Camera,
         lens: &Lens,
         part_from_cam: &Pose<F, Cam>,
-        place: Place,
+        place: ImageOffset,
         id: u16,
     ) -> Self {
         let k = &camera.intrinsics;

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the small scenes of this folder and what the float64 numpy oracle draws of them.
+"""Makes the small scenes of this folder and what the float64 numpy oracle renders of them.
 
     python3 make_references.py ORACLE.py
 

@@ -57,7 +57,7 @@ fn generated_twins_of_every_degree_agree() {
 }
 
 #[test]
-fn cameras_of_all_sizes_are_drawn_at_once() {
+fn cameras_of_all_sizes_are_rendered_at_once() {
     let splats = twins::cloud(3000, 1, 3);
     let sizes = [(1, 1), (1, 50), (50, 1), (15, 17), (16, 16), (33, 7), (320, 240), (2, 3)];
     let cameras: Vec<Camera> = (0..)
@@ -155,7 +155,7 @@ fn captured_scenes_agree() {
 }
 
 #[test]
-fn images_do_not_depend_on_what_was_drawn_before() {
+fn images_do_not_depend_on_earlier_images() {
     let splats = twins::cloud(3000, 0, 9);
     let Some(mut gpu) = crate::renderer(&splats) else { return };
     let camera = twins::camera(100, 80, 70.0);
@@ -171,18 +171,18 @@ fn images_do_not_depend_on_what_was_drawn_before() {
         ),
         ..camera
     };
-    let mut draw = |cameras: &[Camera]| {
+    let mut render_all = |cameras: &[Camera]| {
         let mut images = vec![RgbdImage::default(); cameras.len()];
         vizflyt_splat::Rasterizer::render(&mut gpu, &[], cameras, &mut images).expect("cameras");
         images
     };
-    let first = draw(&[camera]);
-    let several = draw(&[away, small, camera, small]);
+    let first = render_all(&[camera]);
+    let several = render_all(&[away, small, camera, small]);
     // Bit for bit.
     assert!(several[2] == first[0] && several[1] == several[3]);
     assert!(several[0].alpha.iter().all(|&alpha| alpha == 0.0));
-    assert!(draw(&[small])[0] == several[1]);
-    assert!(draw(&[]).is_empty());
+    assert!(render_all(&[small])[0] == several[1]);
+    assert!(render_all(&[]).is_empty());
 }
 
 #[test]
@@ -190,12 +190,12 @@ fn two_ticks_may_be_under_way() {
     let splats = twins::cloud(3000, 0, 9);
     let Some(mut gpu) = crate::renderer(&splats) else { return };
     let cameras = [40u32, 50, 60, 70].map(|width| twins::camera(width, 45, 70.0));
-    let draw_one = |gpu: &mut vizflyt_splat::gpu::GpuRenderer, camera: Camera| {
+    let render_one = |gpu: &mut vizflyt_splat::gpu::GpuRenderer, camera: Camera| {
         let mut image = [RgbdImage::default()];
         vizflyt_splat::Rasterizer::render(gpu, &[], &[camera], &mut image).expect("a camera");
         image
     };
-    let alone = cameras.map(|camera| draw_one(&mut gpu, camera));
+    let alone = cameras.map(|camera| render_one(&mut gpu, camera));
     gpu.begin(&[], &cameras[..1]).expect("a camera");
     for i in 0..4 {
         if let Some(next) = cameras.get(i + 1) {

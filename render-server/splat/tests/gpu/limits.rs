@@ -9,7 +9,7 @@ use vizflyt_splat::{
 use crate::agreement::assert_alike;
 use crate::{adapter, renderer, twins};
 
-fn draw(renderer: &mut dyn Rasterizer, cameras: &[Camera]) -> Vec<RgbdImage> {
+fn render_all(renderer: &mut dyn Rasterizer, cameras: &[Camera]) -> Vec<RgbdImage> {
     let mut images = vec![RgbdImage::default(); cameras.len()];
     renderer.render(&[], cameras, &mut images).expect("images");
     images
@@ -24,7 +24,7 @@ fn too_little_room_is_noticed_and_made() {
     let splats = twins::cloud(3000, 0, 1);
     let cameras = [twins::camera(80, 60, 90.0), twins::camera(64, 64, 70.0)];
     let Some(mut ample) = renderer(&splats) else { return };
-    let expected = draw(&mut ample, &cameras);
+    let expected = render_all(&mut ample, &cameras);
     let work = ample.workload();
     assert!(work.pairs > 1000 && work.visible > 300, "{work:?}");
     for (regions, pairs) in [(1, 1 << 20), (4096, 1), (1, 1), (3, 1000)] {
@@ -50,13 +50,13 @@ fn scenes_are_split_into_what_a_binding_holds() {
     let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
     let cameras: Vec<Camera> = (0..6u32).map(|i| twins::camera(20 + i, 30 - i, 80.0)).collect();
     let Some(mut ample) = renderer(&splats) else { return };
-    let expected = draw(&mut ample, &cameras);
+    let expected = render_all(&mut ample, &cameras);
     let mut gpu = with_budget(&splats, tiny).expect("an adapter was there");
     // More than fits at once, again and again.
     for _ in 0..2 {
-        assert!(draw(&mut gpu, &cameras) == expected);
+        assert!(render_all(&mut gpu, &cameras) == expected);
     }
-    assert!(draw(&mut gpu, &cameras[..1])[0] == expected[0]);
+    assert!(render_all(&mut gpu, &cameras[..1])[0] == expected[0]);
     // Objects lie in other chunks than what stands still.
     let objects = [RigidObject { id: 9, splats: twins::ball(400, 0.4, 3) }];
     let small = twins::cloud(300, 1, 4);
@@ -75,7 +75,7 @@ fn scenes_are_split_into_what_a_binding_holds() {
 }
 
 #[test]
-fn what_no_device_can_hold_is_drawn_by_the_processor() {
+fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
     let splats = twins::cloud(1500, 0, 2);
     let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
     let Some(mut gpu) = with_budget(&splats, tiny) else { return };
@@ -85,11 +85,11 @@ fn what_no_device_can_hold_is_drawn_by_the_processor() {
     assert!(why.contains("pixels: 20000"), "{why}");
     // And what fits still works.
     let small = [twins::camera(20, 20, 80.0)];
-    let expected = draw(&mut CpuRenderer::new(&splats), &small);
-    assert_alike("after all", &draw(&mut gpu, &small)[0], &expected[0]);
+    let expected = render_all(&mut CpuRenderer::new(&splats), &small);
+    assert_alike("after all", &render_all(&mut gpu, &small)[0], &expected[0]);
     let mut fallback = FallbackRenderer::new(Box::new(gpu), CpuRenderer::new(&splats));
-    let expected = draw(&mut CpuRenderer::new(&splats), &large);
-    assert!(draw(&mut fallback, &large) == expected);
+    let expected = render_all(&mut CpuRenderer::new(&splats), &large);
+    assert!(render_all(&mut fallback, &large) == expected);
     // Less than one block.
     let none = Budget { binding_bytes: 5000, ..Budget::default() };
     let refused = adapter().map(|adapter| GpuRenderer::new(&splats, adapter, none).map(|_| ()));
@@ -101,7 +101,7 @@ fn the_processor_takes_over_when_a_device_is_lost() {
     let splats = twins::cloud(2000, 1, 6);
     let camera = [twins::camera(90, 70, 80.0)];
     let Some(mut gpu) = renderer(&splats) else { return };
-    let before = draw(&mut gpu, &camera);
+    let before = render_all(&mut gpu, &camera);
     gpu.lose_device();
     let lost = gpu.render(&[], &camera, &mut [RgbdImage::default()]);
     assert!(matches!(lost, Err(RenderError::Device(_))), "{lost:?}");
@@ -109,14 +109,14 @@ fn the_processor_takes_over_when_a_device_is_lost() {
     assert!(gpu.render(&[], &camera, &mut [RgbdImage::default()]).is_err());
     let mut fallback = FallbackRenderer::new(Box::new(gpu), CpuRenderer::new(&splats));
     assert!(fallback.name().starts_with("gpu "), "{}", fallback.name());
-    let after = draw(&mut fallback, &camera);
+    let after = render_all(&mut fallback, &camera);
     assert_alike("before and after", &after[0], &before[0]);
     let name = fallback.name();
     assert!(name.starts_with("cpu ") && name.contains("is lost"), "{name}");
 }
 
 #[test]
-fn a_device_lost_between_begin_and_finish_is_told() {
+fn a_device_lost_between_begin_and_finish_is_an_error() {
     let splats = twins::cloud(2000, 0, 6);
     let camera = [twins::camera(90, 70, 80.0)];
     let Some(mut gpu) = renderer(&splats) else { return };
@@ -135,11 +135,11 @@ fn a_device_lost_between_begin_and_finish_is_told() {
 fn the_choice_says_why() {
     let splats = twins::cloud(1500, 0, 8);
     let camera = [twins::camera(60, 40, 80.0)];
-    let expected = draw(&mut CpuRenderer::new(&splats), &camera);
+    let expected = render_all(&mut CpuRenderer::new(&splats), &camera);
     let check = |backend: Backend| {
         let mut chosen = choose(&splats, backend).expect("a renderer");
         println!("{backend:?}: {} because {}", chosen.rasterizer.name(), chosen.reason);
-        let image = draw(&mut *chosen.rasterizer, &camera);
+        let image = render_all(&mut *chosen.rasterizer, &camera);
         assert_alike(&format!("{backend:?}"), &image[0], &expected[0]);
         (chosen.rasterizer.name().into_owned(), chosen.reason)
     };

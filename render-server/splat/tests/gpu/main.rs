@@ -30,7 +30,7 @@ fn renderer<'a>(scene: impl Into<Scene<'a>>) -> Option<GpuRenderer> {
     Some(GpuRenderer::new(scene, adapter()?, Budget::default()).expect("a device"))
 }
 
-/// Draws with both renderers: (processor, graphics).
+/// Renders with both renderers: (processor, graphics).
 fn both<'a>(
     scene: impl Into<Scene<'a>>,
     placements: &[Placement],

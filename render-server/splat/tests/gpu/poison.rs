@@ -32,15 +32,15 @@ fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
     }
 }
 
-/// Draws scene after scene on one device.
-struct Drawer(GpuRenderer);
+/// Renders scene after scene on one device.
+struct GpuTest(GpuRenderer);
 
-impl Drawer {
+impl GpuTest {
     fn new() -> Option<Self> {
         renderer(&Splats::default()).map(Self)
     }
 
-    fn draw(&mut self, splats: &Splats, camera: &Camera) -> RgbdImage {
+    fn render_one(&mut self, splats: &Splats, camera: &Camera) -> RgbdImage {
         self.0.load(splats).expect("room");
         let mut image = [RgbdImage::default()];
         self.0.render(&[], &[*camera], &mut image).expect("a valid camera");
@@ -52,13 +52,13 @@ impl Drawer {
 
 #[test]
 fn extreme_scales_and_opacities_stay_clean_and_agree() {
-    let Some(mut drawer) = Drawer::new() else { return };
+    let Some(mut renderer) = GpuTest::new() else { return };
     for scale in [0.0, 1e-38, 1e-30, 1e-4, 1.0, 1e4, 1e30, f32::MAX] {
         for other in [scale, 0.01] {
             for opacity in [0.0, 1e-30, 1.0 / 255.0, 0.5, 1.0] {
                 let splats = one(Vec3::new(0.1, 0.0, 2.0), Vec3::new(scale, other, scale), opacity);
                 let camera = looking_ahead(32, 24, 70.0);
-                let image = drawer.draw(&splats, &camera);
+                let image = renderer.render_one(&splats, &camera);
                 let expected = render_reference(&splats, &[], &camera).expect("a valid camera");
                 let middle = 12 * 32 + 17;
                 let off = (image.alpha[middle] - expected.alpha[middle]).abs();
@@ -70,14 +70,14 @@ fn extreme_scales_and_opacities_stay_clean_and_agree() {
 
 #[test]
 fn distances_from_behind_to_far_stay_clean() {
-    let Some(mut drawer) = Drawer::new() else { return };
+    let Some(mut renderer) = GpuTest::new() else { return };
     let camera = looking_ahead(40, 30, 80.0);
     let near = camera.near_m;
     let next = |v: f32| f32::from_bits(v.to_bits() + 1);
     for z in [-1e30, -1.0, 0.0, 1e-30, near, next(near), 0.06, 1.0, 1e6, 1e30, f32::MAX] {
         for x in [0.0, 1e-3, 5.0, 1e30] {
             let splats = one(Vec3::new(x, 0.0, z), Vec3::splat(0.2), 0.9);
-            let image = drawer.draw(&splats, &camera);
+            let image = renderer.render_one(&splats, &camera);
             if z <= near {
                 assert!(image.alpha.iter().all(|&alpha| alpha == 0.0), "z {z}");
             } else if x == 0.0 && z <= 1e6 {
@@ -89,45 +89,45 @@ fn distances_from_behind_to_far_stay_clean() {
     }
     // Inside a splat: the camera sees what of it lies beyond the near plane.
     let inside = one(Vec3::new(0.0, 0.0, 0.06), Vec3::splat(3.0), 0.9);
-    assert!(drawer.draw(&inside, &camera).alpha.iter().all(|&alpha| alpha > 0.85));
+    assert!(renderer.render_one(&inside, &camera).alpha.iter().all(|&alpha| alpha > 0.85));
 }
 
 #[test]
-fn every_size_and_field_of_view_is_drawn() {
-    let Some(mut drawer) = Drawer::new() else { return };
+fn every_size_and_field_of_view_is_rendered() {
+    let Some(mut renderer) = GpuTest::new() else { return };
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     for fov_deg in [1.0, 10.0, 90.0, 150.0, 170.0] {
         for (width, height) in [(1, 1), (3, 2), (16, 16), (17, 33), (200, 1), (1, 200)] {
             let camera = looking_ahead(width, height, fov_deg);
-            let image = drawer.draw(&splats, &camera);
+            let image = renderer.render_one(&splats, &camera);
             let expected = render_reference(&splats, &[], &camera).expect("a valid camera");
             let db = compare::psnr_db(&image.alpha, &expected.alpha);
             assert!(db > 50.0, "{width}x{height}, {fov_deg} degrees: {db} dB");
         }
     }
-    let image = drawer.draw(&splats, &looking_ahead(3840, 2160, 90.0));
+    let image = renderer.render_one(&splats, &looking_ahead(3840, 2160, 90.0));
     assert!(image.alpha[1080 * 3840 + 1920] > 0.85);
 }
 
 #[test]
 fn nothing_to_see_is_the_background() {
-    let Some(mut drawer) = Drawer::new() else { return };
+    let Some(mut renderer) = GpuTest::new() else { return };
     let camera = looking_ahead(21, 10, 90.0);
     for splats in [Splats::default(), one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.001)] {
-        let image = drawer.draw(&splats, &camera);
+        let image = renderer.render_one(&splats, &camera);
         // Halves: 0.2 is off by 5e-5.
         let off = |rgb: &[f32]| {
             rgb.iter().zip([0.2, 0.4, 0.6]).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
         };
         assert!(image.rgb.chunks(3).all(|rgb| off(rgb) < 2e-4));
         assert!(image.depth_median_m.iter().all(|&z| z == 0.0));
-        assert_eq!(drawer.0.workload().splats, 0);
+        assert_eq!(renderer.0.workload().splats, 0);
     }
 }
 
 #[test]
 fn damaged_scenes_give_the_images_of_what_is_left() {
-    let Some(mut drawer) = Drawer::new() else { return };
+    let Some(mut renderer) = GpuTest::new() else { return };
     let state = &mut 5;
     for round in 0..24 {
         let mut splats = twins::cloud(300, 1, round);
@@ -147,15 +147,15 @@ fn damaged_scenes_give_the_images_of_what_is_left() {
             }
         }
         let camera = looking_ahead(48, 36, 80.0);
-        drawer.draw(&splats, &camera);
+        renderer.render_one(&splats, &camera);
         let mut cpu = vizflyt_splat::CpuRenderer::new(&splats);
         cpu.render(&[], &[camera], &mut [RgbdImage::default()]).expect("a valid camera");
-        assert_eq!(drawer.0.workload().splats, cpu.workload().splats);
+        assert_eq!(renderer.0.workload().splats, cpu.workload().splats);
     }
 }
 
 #[test]
-fn what_is_no_camera_or_placement_is_refused() {
+fn invalid_cameras_and_placements_are_refused() {
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);
     let objects = [RigidObject { id: 1, splats: splats.clone() }];
     let Some(mut gpu) = renderer(Scene { splats: &splats, objects: &objects }) else { return };

@@ -166,7 +166,7 @@ fn wall() -> (Splats, Camera) {
 }
 
 #[test]
-fn images_do_not_depend_on_what_was_drawn_before() {
+fn images_do_not_depend_on_earlier_images() {
     let (splats, camera) = wall();
     for mut renderer in CpuRenderer::every(&splats) {
         let small = Camera {

@@ -267,8 +267,8 @@ fn wall(z_m: f32) -> Splats {
     splats
 }
 
-/// Fails unless two cameras side by side, drawn in one call, see a wall shifted by exactly the
-/// disparity, and each sees what it sees when drawn alone, bit for bit.
+/// Fails unless two cameras side by side, rendered in one call, see a wall shifted by exactly the
+/// disparity, and each sees what it sees when rendered alone, bit for bit.
 pub(crate) fn check_stereo(make: renderers::Make<'_>) {
     const BASE_M: f64 = 0.065;
     const Z_M: f32 = 2.6;

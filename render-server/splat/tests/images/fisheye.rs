@@ -1,5 +1,5 @@
 //! How good is a wide lens? A Gaussian is linearised where its middle is, so what is large in
-//! angle is drawn as an ellipse that it is not. The truth here is brute force: every pixel is drawn
+//! angle is rendered as an ellipse that it is not. The truth here is brute force: every pixel is rendered
 //! alone, by a narrow pinhole camera that looks straight along its ray, where all of that hardly
 //! matters.
 
@@ -14,7 +14,7 @@ use crate::compare;
 const PATCH: u32 = 15;
 
 /// Slope up to which pixels count, 80 degrees. At 89 the lens ends for us, and what has its middle
-/// beyond is not drawn; the splats of these tests reach some degrees inwards from there.
+/// beyond is not rendered; the splats of these tests reach some degrees inwards from there.
 const RIM: f64 = 5.671;
 
 /// The slope of the ray through pixel `i`, if it counts.
@@ -23,7 +23,7 @@ fn slope(k: &Intrinsics, i: usize) -> Option<DVec2> {
     k.slope(DVec2::new(x as f64 + 0.5, y as f64 + 0.5)).filter(|slope| slope.length() < RIM)
 }
 
-/// Draws colour and alpha pixel by pixel, of those that count.
+/// Renders colour and alpha pixel by pixel, of those that count.
 fn brute_force(renderer: &mut dyn Rasterizer, camera: &Camera) -> RgbdImage {
     let k = &camera.intrinsics;
     let mut image = RgbdImage::default();
@@ -144,7 +144,7 @@ fn wide_lenses_come_near_a_pinhole_of_90_degrees() {
         ];
         for (name, intrinsics) in lenses {
             let [rgb_db, alpha_db] = measure(&format!("{size_m} m, {name}"), &splats, intrinsics);
-            // 5 dB: what overlaps is drawn in the order of z; at 80 degrees that is less the order
+            // 5 dB: what overlaps is rendered in the order of z; at 80 degrees that is less the order
             // along the ray than it is at 45. (By distance all lenses would reach 40 to 57 dB, as
             // the truth does order, nearly; alpha, which knows no order, shows the rest.)
             assert!(rgb_db > usual_db - 5.0, "{size_m} m, {name}: {rgb_db} dB, not {usual_db}");

@@ -1,4 +1,4 @@
-//! What renderers draw: against an independent oracle, against each other, and of poisoned input.
+//! What renderers produce: against an independent oracle, against each other, and of poisoned input.
 
 mod agreement;
 mod compare;

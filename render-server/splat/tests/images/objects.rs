@@ -1,4 +1,4 @@
-//! Rigid objects: drawn where they are placed, hidden by what is nearer, and named by their ids.
+//! Rigid objects: rendered where they are placed, hidden by what is nearer, and named by their ids.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -81,17 +81,17 @@ fn a_door_before_a_wall_hides_it_and_is_named() {
     let scene = Scene { splats: &still, objects: &door };
     let centre = 24 * 64 + 32;
     for mut renderer in CpuRenderer::every(scene) {
-        let mut draw = |placement: Placement| {
+        let mut render_one = |placement: Placement| {
             let mut image = [RgbdImage::default()];
             renderer.render(&[placement], &[ahead()], &mut image).unwrap();
             let [image] = image;
             (image.ids[centre], image.depth_median_m[centre], image.rgb[centre * 3])
         };
         let at = |x_m: f64, z_m: f64| Some(Pose::new(DVec3::new(x_m, 0.0, z_m), DQuat::IDENTITY));
-        let (id, depth_m, red) = draw(at(0.0, 2.0));
+        let (id, depth_m, red) = render_one(at(0.0, 2.0));
         assert!(id == 7 && (depth_m - 2.0).abs() < 0.01 && red > 0.8, "{id} {depth_m} {red}");
         for away in [None, at(3.0, 2.0), at(0.0, 5.0), at(0.0, -2.0)] {
-            let (id, depth_m, red) = draw(away);
+            let (id, depth_m, red) = render_one(away);
             assert!(id == 0 && (depth_m - 4.0).abs() < 0.02 && red < 0.3, "{id} {depth_m} {red}");
         }
     }

@@ -243,7 +243,7 @@ pub(crate) fn check_cameras_that_are_none(make: Make<'_>) {
             let message = refused.expect_err("an invalid camera").to_string();
             assert!(message.contains(part), "{}: {message:?} lacks {part:?}", renderer.name());
             assert_eq!(untouched[0], RgbdImage::default());
-            // The next is drawn.
+            // The next is rendered.
             renderer.render(&[], &[good], &mut untouched).expect("a valid camera");
         }
     };
@@ -282,13 +282,13 @@ fn extreme_scales_and_opacities_stay_clean_and_agree() {
 }
 
 #[test]
-fn what_is_not_finite_is_left_out() {
+fn splats_that_are_not_finite_are_dropped() {
     // Not of the reference, which takes what it is given.
     check_what_is_not_finite(&renderers::cpus);
 }
 
 #[test]
-fn what_files_say_at_their_worst_stays_clean() {
+fn extreme_values_in_files_leave_images_finite() {
     check_files(&renderers::cpus);
 }
 
@@ -298,7 +298,7 @@ fn distances_from_behind_to_far_stay_clean() {
 }
 
 #[test]
-fn every_size_and_field_of_view_is_drawn() {
+fn every_size_and_field_of_view_is_rendered() {
     check_sizes_and_fields_of_view(&renderers::every);
     check_the_largest_size(&renderers::cpus);
 }

@@ -23,7 +23,7 @@ fn look(from: DVec3, to: DVec3) -> Camera {
     }
 }
 
-fn draw(
+fn render_all(
     renderer: &mut CpuRenderer,
     placements: &[Placement],
     camera: &Camera,
@@ -40,17 +40,17 @@ fn a_city_from_afar_looks_the_same_for_less() {
         let splats = city(150_000, 3, sh_degree);
         let mut full = CpuRenderer::new(&splats);
         let mut adaptive = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
-        let (mut drawn, mut all) = (0, 0);
+        let (mut rendered, mut all) = (0, 0);
         for (from, to) in [
             (DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO),
             (DVec3::new(10.0, -20.0, 130.0), DVec3::new(0.0, 10.0, 0.0)),
             (DVec3::new(-58.0, -19.0, 1.6), DVec3::new(0.0, -18.0, 3.0)),
         ] {
             let camera = look(from, to);
-            let (truth, visible) = draw(&mut full, &[], &camera);
+            let (truth, visible) = render_all(&mut full, &[], &camera);
             all += visible;
-            let (image, visible) = draw(&mut adaptive, &[], &camera);
-            drawn += visible;
+            let (image, visible) = render_all(&mut adaptive, &[], &camera);
+            rendered += visible;
             let likeness = Likeness::of(&image, &truth);
             assert!(likeness.rgb_db > 40.0, "{from}: {likeness}");
             assert!(likeness.alpha_db > 36.0, "{from}: {likeness}");
@@ -58,7 +58,7 @@ fn a_city_from_afar_looks_the_same_for_less() {
             assert!(likeness.expected_off < 0.01, "{from}: {likeness}");
             assert!(likeness.holes < 1e-3, "{from}: {likeness}");
         }
-        assert!(drawn * 10 < all * 9, "drew {drawn} of {all}");
+        assert!(rendered * 10 < all * 9, "drew {rendered} of {all}");
     }
 }
 
@@ -66,11 +66,11 @@ fn a_city_from_afar_looks_the_same_for_less() {
 fn less_error_allowed_is_less_error() {
     let splats = city(60_000, 3, 0);
     let camera = look(DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO);
-    let (truth, all) = draw(&mut CpuRenderer::new(&splats), &[], &camera);
+    let (truth, all) = render_all(&mut CpuRenderer::new(&splats), &[], &camera);
     let mut before = (0.0, 0);
     for max_error_px in [4.0, 2.0, 1.0] {
         let mut renderer = CpuRenderer::with_detail(&splats, Detail::Adaptive { max_error_px });
-        let (image, visible) = draw(&mut renderer, &[], &camera);
+        let (image, visible) = render_all(&mut renderer, &[], &camera);
         let rgb_db = Likeness::of(&image, &truth).rgb_db;
         assert!(rgb_db > before.0 && visible > before.1, "{max_error_px}: {rgb_db} {visible}");
         before = (rgb_db, visible);
@@ -79,33 +79,34 @@ fn less_error_allowed_is_less_error() {
     // None allowed: none made.
     for max_error_px in [0.0, -1.0, f32::NAN] {
         let mut renderer = CpuRenderer::with_detail(&splats, Detail::Adaptive { max_error_px });
-        let (image, visible) = draw(&mut renderer, &[], &camera);
+        let (image, visible) = render_all(&mut renderer, &[], &camera);
         assert!(image == truth && visible == all, "{max_error_px}");
     }
 }
 
 #[test]
-fn what_is_near_is_drawn_in_full() {
+fn near_splats_are_rendered_in_full() {
     let splats = city(60_000, 3, 1);
     // A street's end: nothing in view is small.
     let camera = look(DVec3::new(-22.0, -20.0, 1.6), DVec3::new(-20.0, -15.0, 1.2));
     let near = Camera { intrinsics: Intrinsics::from_horizontal_fov(320, 240, 0.4), ..camera };
-    let (truth, _) = draw(&mut CpuRenderer::new(&splats), &[], &near);
-    let (image, _) = draw(&mut CpuRenderer::with_detail(&splats, Detail::ADAPTIVE), &[], &near);
+    let (truth, _) = render_all(&mut CpuRenderer::new(&splats), &[], &near);
+    let (image, _) =
+        render_all(&mut CpuRenderer::with_detail(&splats, Detail::ADAPTIVE), &[], &near);
     let likeness = Likeness::of(&image, &truth);
     assert!(likeness.rgb_db > 60.0, "{likeness}");
 }
 
 #[test]
-fn packing_and_drawing_again_give_the_same_bytes() {
+fn packing_and_rendering_again_give_the_same_bytes() {
     let splats = city(40_000, 3, 1);
     let camera = look(DVec3::new(-110.0, -90.0, 60.0), DVec3::ZERO);
     let mut renderer = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
-    let first = draw(&mut renderer, &[], &camera);
-    assert_eq!(draw(&mut renderer, &[], &camera), first);
+    let first = render_all(&mut renderer, &[], &camera);
+    assert_eq!(render_all(&mut renderer, &[], &camera), first);
     for _ in 0..2 {
         let mut again = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
-        assert_eq!(draw(&mut again, &[], &camera), first);
+        assert_eq!(render_all(&mut again, &[], &camera), first);
     }
 }
 
@@ -140,18 +141,18 @@ fn objects_have_levels_of_their_own() {
     };
     // One right before the camera, one far away.
     let placements = [at(-28.0, 0.6), at(-5.0, -2.0), at(-27.0, 0.0)];
-    let (truth, all) = draw(&mut CpuRenderer::new(scene), &placements, &camera);
+    let (truth, all) = render_all(&mut CpuRenderer::new(scene), &placements, &camera);
     let mut renderer = CpuRenderer::with_detail(scene, Detail::ADAPTIVE);
-    let (image, drawn) = draw(&mut renderer, &placements, &camera);
+    let (image, rendered) = render_all(&mut renderer, &placements, &camera);
     let likeness = Likeness::of(&image, &truth);
     assert!(likeness.rgb_db > 38.0 && likeness.median_off < 0.01, "{likeness}");
-    assert!(drawn + 10_000 < all, "{drawn} of {all}");
+    assert!(rendered + 10_000 < all, "{rendered} of {all}");
     let count = |image: &RgbdImage, id: u16| image.ids.iter().filter(|&&v| v == id).count();
     for id in [3, 4] {
         let (a, b) = (count(&image, id), count(&truth, id));
         assert!(b > 0 && a.abs_diff(b) <= 1 + b / 50, "object {id}: {a} and {b} pixels");
     }
     // Gone again.
-    let (image, _) = draw(&mut renderer, &[None, None, None], &camera);
+    let (image, _) = render_all(&mut renderer, &[None, None, None], &camera);
     assert!(image.ids.iter().all(|&id| id == 0));
 }

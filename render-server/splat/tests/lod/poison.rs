@@ -42,7 +42,7 @@ fn cameras() -> Vec<Camera> {
         .into()
 }
 
-fn draw(splats: &Splats, detail: Detail) -> Vec<RgbdImage> {
+fn render_all(splats: &Splats, detail: Detail) -> Vec<RgbdImage> {
     let cameras = cameras();
     let mut images = vec![RgbdImage::default(); cameras.len()];
     let mut renderer = CpuRenderer::with_detail(splats, detail);
@@ -50,11 +50,11 @@ fn draw(splats: &Splats, detail: Detail) -> Vec<RgbdImage> {
     images
 }
 
-/// Draws with levels; every image is clean and as like that of full detail as is asked.
+/// Renders with levels; every image is clean and as like that of full detail as is asked.
 fn check(name: &str, splats: &Splats, least_db: f64) {
-    let truth = draw(splats, Detail::Full);
+    let truth = render_all(splats, Detail::Full);
     for max_error_px in [0.35, 3.0] {
-        let images = draw(splats, Detail::Adaptive { max_error_px });
+        let images = render_all(splats, Detail::Adaptive { max_error_px });
         for (i, (image, truth)) in images.iter().zip(&truth).enumerate() {
             assert!(image.rgb.iter().all(|v| v.is_finite()), "{name}");
             assert!(image.alpha.iter().all(|v| (0.0..=1.0).contains(v)), "{name}");
@@ -147,7 +147,7 @@ fn places_far_away_stay_clean() {
 }
 
 #[test]
-fn what_is_not_finite_is_left_out() {
+fn splats_that_are_not_finite_are_dropped() {
     let mut splats = cloud();
     for (i, bad) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY].into_iter().enumerate() {
         splats.means_m[i * 10].x = bad;

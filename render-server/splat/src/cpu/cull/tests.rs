@@ -65,7 +65,7 @@ fn no_block_is_culled_that_holds_a_splat_in_view() {
                 DQuat::from_rotation_y(0.8 * turn) * DQuat::from_rotation_x(0.5 * turn),
             );
             let camera = Camera::new(intrinsics, pose, 0.05);
-            let view = View::new(&camera, &kept.of(&camera), &pose);
+            let view = ObjectView::new(&camera, &kept.of(&camera), &pose);
             let mut visible = Vec::new();
             cull(0, &part, &view, 0.0, &mut visible);
             let mut is_visible = vec![false; part.blocks.len()];

@@ -67,9 +67,11 @@ impl Kernel for Distort {
                 let slope = DVec2::from_angle(n * 2.4) * (longest * n / 3200.0);
                 (x[lane], y[lane]) = (slope.x as f32, slope.y as f32);
             }
-            let bent = distort(s, &model, [s.load(&x), s.load(&y)]);
+            let distorted = distort(s, &model, [s.load(&x), s.load(&y)]);
             let mut found = [[0f32; 16]; 5];
-            for (out, v) in found.iter_mut().zip(bent.slope.into_iter().chain(bent.jacobian)) {
+            for (out, v) in
+                found.iter_mut().zip(distorted.slope.into_iter().chain(distorted.jacobian))
+            {
                 s.store(v, out);
             }
             for lane in 0..S::LANES {

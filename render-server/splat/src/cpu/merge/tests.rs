@@ -73,18 +73,18 @@ proptest! {
     #[test]
     fn one_splat_stays_as_it_is(blob in blob(), blur_m2 in 0.0..0.1f64) {
         let merged = merge([blob].into_iter(), blur_m2);
-        let (covariance, opacity) = merged.drawn(blur_m2);
+        let (covariance, opacity) = merged.rendered(blur_m2);
         prop_assert!(close(&covariance, &blob.covariance_m2));
         prop_assert!((opacity - f64::from(blob.origin.opacity)).abs() < 1e-5);
         prop_assert_eq!(merged.error_m2(), 0.0);
     }
 
     #[test]
-    fn what_is_drawn_is_no_more_than_opaque_and_covers_no_more_than_its_splats(
+    fn merged_splats_are_at_most_opaque_and_cover_no_more_area_than_their_parts(
         blobs in prop::collection::vec(blob(), 2..40), blur_m2 in 1e-6..0.1f64,
     ) {
         let merged = merge(blobs.iter().copied(), blur_m2);
-        let (covariance, opacity) = merged.drawn(blur_m2);
+        let (covariance, opacity) = merged.rendered(blur_m2);
         prop_assert!((0.0..=1.0).contains(&opacity));
         let covers = opacity * (area(&covariance) + blur_m2);
         prop_assert!(covers <= merged.mass(blur_m2) * (1.0 + 1e-6));

@@ -71,7 +71,7 @@ pub enum PlyError {
         /// What is wrong with it.
         reason: String,
     },
-    /// Nothing is left to draw.
+    /// Nothing is left to render.
     #[error("no splats: the file declares {declared}, {dropped} of them were dropped as invalid")]
     Empty {
         /// Rows the header declares.

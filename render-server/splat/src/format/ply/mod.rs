@@ -57,7 +57,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Loaded, PlyError> {
 ///
 /// # Errors
 /// Whatever keeps the file from being a splat scene, with the byte offset or the property's name;
-/// [`PlyError::Empty`] where nothing is left to draw.
+/// [`PlyError::Empty`] where nothing is left to render.
 pub fn parse(bytes: &[u8]) -> Result<Loaded, PlyError> {
     decode(bytes, &Meter::SILENT)
 }

@@ -162,7 +162,7 @@ fn other_types_lists_and_elements_are_passed_over() {
 }
 
 #[test]
-fn what_cannot_be_drawn_is_dropped_and_counted() {
+fn unrenderable_splats_are_dropped_and_counted() {
     let rows = [
         with(0, f32::NAN),
         GOOD,
@@ -333,7 +333,7 @@ fn numbered(name: &str, count: usize) -> Vec<String> {
 }
 
 #[test]
-fn what_every_trainer_writes_is_the_same_scene() {
+fn files_of_every_trainer_decode_to_the_same_scene() {
     let names = |names: &[&str]| names.iter().map(ToString::to_string).collect::<Vec<_>>();
     let (xyz, normals) = (names(&["x", "y", "z"]), names(&["nx", "ny", "nz"]));
     let (dc, rest) = (numbered("f_dc", 3), numbered("f_rest", 9));

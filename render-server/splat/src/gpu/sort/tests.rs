@@ -19,7 +19,7 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(room: usize) -> Option<Self> {
+    fn new(capacity: usize) -> Option<Self> {
         let Some(adapter) = Adapter::all().into_iter().next() else {
             println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
             return None;
@@ -29,14 +29,14 @@ impl Bench {
             | wgpu::BufferUsages::COPY_DST
             | wgpu::BufferUsages::COPY_SRC
             | wgpu::BufferUsages::INDIRECT;
-        let bytes = room as u64 * 4;
+        let bytes = capacity as u64 * 4;
         let buffer = |bytes: u64| device.buffer("test", bytes, usage);
         let readable = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
         Some(Self {
             sort: Sort::new(&device),
             keys: [buffer(bytes), buffer(bytes)],
             values: [buffer(bytes), buffer(bytes)],
-            counts: buffer(count_bytes(room as u64)),
+            counts: buffer(count_bytes(capacity as u64)),
             sizes: buffer(32),
             dispatches: buffer(64),
             staging: device.buffer("staging", bytes * 2, readable),
