@@ -205,7 +205,7 @@ impl ServerArgs {
     pub fn known(&self) -> anyhow::Result<(Fingerprint, Identity)> {
         let at = self.address()?;
         let folder = KeysFolder::open(self.keys.as_deref())?;
-        let identity = Identity::keep(&folder, Owner::Runtime)?;
+        let identity = Identity::load_or_create(&folder, Owner::Runtime)?;
         if let Some(fingerprint) = self.fingerprint {
             return Ok((fingerprint, identity));
         }

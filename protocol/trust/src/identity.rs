@@ -49,7 +49,7 @@ impl Identity {
     /// # Errors
     /// A file that is there and cannot be used, for its permissions or its content, is an error:
     /// a new key in its place would silently part the computer from all it is paired with.
-    pub fn keep(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
+    pub fn load_or_create(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
         let name = owner.file();
         if folder.read_secret(name)?.is_none() {
             let text = Self::make().map_err(|what| damaged(folder, owner, &what))?;
@@ -64,7 +64,7 @@ impl Identity {
     ///
     /// # Errors
     /// If the system gives no random numbers.
-    pub fn fleeting() -> Result<Self, String> {
+    pub fn ephemeral() -> Result<Self, String> {
         Self::parse(&Self::make()?)
     }
 
@@ -141,18 +141,18 @@ mod tests {
     #[test]
     fn an_identity_is_made_once_and_kept() {
         let (_root, folder) = folder();
-        let first = Identity::keep(&folder, Owner::Server).unwrap();
-        let again = Identity::keep(&folder, Owner::Server).unwrap();
+        let first = Identity::load_or_create(&folder, Owner::Server).unwrap();
+        let again = Identity::load_or_create(&folder, Owner::Server).unwrap();
         assert_eq!(first.fingerprint(), again.fingerprint());
         assert_eq!(first.key, again.key);
-        let other = Identity::keep(&folder, Owner::Runtime).unwrap();
+        let other = Identity::load_or_create(&folder, Owner::Runtime).unwrap();
         assert_ne!(first.fingerprint(), other.fingerprint());
     }
 
     #[test]
     fn every_damage_is_an_error_and_leaves_the_file_alone() {
         let (_root, folder) = folder();
-        Identity::keep(&folder, Owner::Server).unwrap();
+        Identity::load_or_create(&folder, Owner::Server).unwrap();
         let good = folder.read("server.key").unwrap().unwrap();
         let other = Identity::make().unwrap();
         let swapped = {
@@ -164,7 +164,7 @@ mod tests {
         let half = &good[..good.len() / 2];
         for bad in ["", "hello", half, &swapped, &mixed] {
             folder.write("server.key", bad).unwrap();
-            let error = Identity::keep(&folder, Owner::Server).unwrap_err().to_string();
+            let error = Identity::load_or_create(&folder, Owner::Server).unwrap_err().to_string();
             assert!(error.contains("server.key") && error.contains("move it away"), "{error}");
             assert_eq!(folder.read("server.key").unwrap().as_deref(), Some(bad));
         }

@@ -7,8 +7,8 @@
 //! the code is right, and nothing recorded is of use later. The client proves first; the server
 //! counts a try before it answers.
 
-mod applicant;
-mod desk;
+mod client;
+mod server;
 #[cfg(test)]
 mod tests;
 
@@ -22,15 +22,15 @@ use vizflyt_protocol::messages::{PairingProof, PairingShare};
 
 use crate::Fingerprint;
 
-pub use applicant::{Applicant, Confirming};
-pub use desk::{Admitted, Attempt, Desk, Refusal, TRIES, VALID, WindowState};
+pub use client::{Confirming, PairingClient};
+pub use server::{Admitted, Attempt, PairingServer, Refusal, TRIES, VALID, WindowState};
 
 /// Six digits that a person reads on one screen and types on another.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Code([u8; 6]);
 
 impl Code {
-    /// Draws a code from the system's random numbers; every code is equally likely.
+    /// Returns a uniformly random code from the system's generator.
     ///
     /// # Errors
     /// If the system gives none.
@@ -40,7 +40,7 @@ impl Code {
             let mut bytes = [0; 4];
             random.fill(&mut bytes).map_err(|_| "the system gives no random numbers".to_owned())?;
             let number = u32::from_le_bytes(bytes);
-            // Why: without this the low codes would be likelier by a hair.
+            // Why: without this the low codes would be slightly likelier.
             if number < u32::MAX / CODES * CODES {
                 return Ok(Self::from_number(number % CODES));
             }
@@ -99,9 +99,9 @@ pub struct Binding {
 /// Label of [`Binding::exporter`].
 pub const EXPORTER_LABEL: &[u8] = b"EXPORTER-vizflyt-pair";
 
-/// Which side of the key agreement.
+/// Which role in the key agreement.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Side {
+enum PairingRole {
     /// The client.
     A,
     /// The server.
@@ -110,13 +110,13 @@ enum Side {
 
 type Agreement = Spake2<Ed25519Group>;
 
-fn start(side: Side, code: Code) -> (Agreement, PairingShare) {
+fn start(role: PairingRole, code: Code) -> (Agreement, PairingShare) {
     let (a, b) =
         (spake2::Identity::new(b"vizflyt client"), spake2::Identity::new(b"vizflyt server"));
     let password = Password::new(code.0);
-    let (agreement, message) = match side {
-        Side::A => Agreement::start_a(&password, &a, &b),
-        Side::B => Agreement::start_b(&password, &a, &b),
+    let (agreement, message) = match role {
+        PairingRole::A => Agreement::start_a(&password, &a, &b),
+        PairingRole::B => Agreement::start_b(&password, &a, &b),
     };
     // The crate's message is one letter for the side, then the group element.
     let share = message[1..].try_into().expect("an element of Ed25519 has 32 bytes");
@@ -138,11 +138,11 @@ struct Transcript<'a> {
 }
 
 impl Transcript<'_> {
-    /// Finishes the agreement of `side`; `None` if the other's half is no group element.
-    fn prove(&self, side: Side, agreement: Agreement) -> Option<Proofs> {
-        let (letter, theirs) = match side {
-            Side::A => (b'B', self.server_share),
-            Side::B => (b'A', self.client_share),
+    /// Finishes the agreement of `role`; `None` if the other's half is no group element.
+    fn prove(&self, role: PairingRole, agreement: Agreement) -> Option<Proofs> {
+        let (letter, theirs) = match role {
+            PairingRole::A => (b'B', self.server_share),
+            PairingRole::B => (b'A', self.client_share),
         };
         let mut message = vec![letter];
         message.extend_from_slice(theirs);

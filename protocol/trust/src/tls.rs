@@ -175,7 +175,10 @@ mod tests {
     use rustls::{ClientConnection, ServerConnection};
 
     /// Shakes hands in memory; returns whom each side saw.
-    fn shake(client: ClientConfig, server: ServerConfig) -> Result<Option<Fingerprint>, String> {
+    fn handshake(
+        client: ClientConfig,
+        server: ServerConfig,
+    ) -> Result<Option<Fingerprint>, String> {
         let mut client =
             ClientConnection::new(Arc::new(client), "vizflyt".try_into().unwrap()).unwrap();
         let mut server = ServerConnection::new(Arc::new(server)).unwrap();
@@ -199,28 +202,31 @@ mod tests {
 
     #[test]
     fn each_side_learns_who_the_other_is() {
-        let [one, two] = [(); 2].map(|()| Identity::fleeting().unwrap());
+        let [one, two] = [(); 2].map(|()| Identity::ephemeral().unwrap());
         let server = || server_config(&one, &[b"x"]).unwrap();
         let pin = Pin::to(one.fingerprint());
-        let seen = shake(pin.client_config(&two, b"x").unwrap(), server()).unwrap();
+        let seen = handshake(pin.client_config(&two, b"x").unwrap(), server()).unwrap();
         assert_eq!(seen, Some(two.fingerprint()));
         assert_eq!((pin.found(), pin.mismatch()), (Some(one.fingerprint()), None));
 
         let wrong = Pin::to(two.fingerprint());
-        let error = shake(wrong.client_config(&two, b"x").unwrap(), server()).unwrap_err();
+        let error = handshake(wrong.client_config(&two, b"x").unwrap(), server()).unwrap_err();
         assert!(error.starts_with("client:"), "{error}");
         assert_eq!(wrong.mismatch(), Some(one.fingerprint()));
         let any = Pin::none();
-        shake(any.client_config(&two, b"x").unwrap(), server()).unwrap();
+        handshake(any.client_config(&two, b"x").unwrap(), server()).unwrap();
         assert_eq!((any.found(), any.mismatch()), (Some(one.fingerprint()), None));
-        assert!(shake(any.client_config(&two, b"y").unwrap(), server()).is_err(), "another ALPN");
+        assert!(
+            handshake(any.client_config(&two, b"y").unwrap(), server()).is_err(),
+            "another ALPN"
+        );
     }
 
     /// Shows the certificate of a paired client without its key.
     #[derive(Debug)]
-    struct Thief(Arc<rustls::sign::CertifiedKey>);
+    struct StolenCertificate(Arc<rustls::sign::CertifiedKey>);
 
-    impl rustls::client::ResolvesClientCert for Thief {
+    impl rustls::client::ResolvesClientCert for StolenCertificate {
         fn resolve(
             &self,
             _: &[&[u8]],
@@ -236,7 +242,7 @@ mod tests {
 
     #[test]
     fn a_client_without_certificate_or_with_anothers_is_refused() {
-        let [one, two, three] = [(); 3].map(|()| Identity::fleeting().unwrap());
+        let [one, two, three] = [(); 3].map(|()| Identity::ephemeral().unwrap());
         let pin = Pin::to(one.fingerprint());
         let builder = || {
             ClientConfig::builder_with_provider(provider())
@@ -246,12 +252,13 @@ mod tests {
                 .with_custom_certificate_verifier(Arc::new(pin.clone()))
         };
         let server = || server_config(&one, &[]).unwrap();
-        let error = shake(builder().with_no_client_auth(), server()).unwrap_err();
+        let error = handshake(builder().with_no_client_auth(), server()).unwrap_err();
         assert!(error.contains("peer sent no certificates"), "{error}");
         let key = provider().key_provider.load_private_key(three.key.clone_key()).unwrap();
         let stolen = rustls::sign::CertifiedKey::new(vec![two.certificate.clone()], key);
-        let thief = builder().with_client_cert_resolver(Arc::new(Thief(Arc::new(stolen))));
-        let error = shake(thief, server()).unwrap_err();
+        let thief =
+            builder().with_client_cert_resolver(Arc::new(StolenCertificate(Arc::new(stolen))));
+        let error = handshake(thief, server()).unwrap_err();
         assert!(error.starts_with("server:") && error.contains("BadSignature"), "{error}");
     }
 }

@@ -11,8 +11,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
-use vizflyt_protocol::messages::{FromApplicant, Grant, MAX_GRANTED, PairingShare, bounded};
-use vizflyt_trust::pairing::{Admitted, Attempt, Binding, Code, Desk, Refusal, WindowState};
+use vizflyt_protocol::messages::{Grant, MAX_GRANTED, PairingRequest, PairingShare, bounded};
+use vizflyt_trust::pairing::{
+    Admitted, Attempt, Binding, Code, PairingServer, Refusal, WindowState,
+};
 use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
 
 use crate::lock::lock;
@@ -25,7 +27,7 @@ pub struct Authorizer {
     /// Where everything is kept.
     pub folder: KeysFolder,
     paired: watch::Sender<Arc<Paired>>,
-    desk: Mutex<Desk>,
+    desk: Mutex<PairingServer>,
     /// What came of the newest attempt to pair.
     pairing_news: watch::Sender<String>,
 }
@@ -36,7 +38,7 @@ impl Authorizer {
     /// # Errors
     /// Keys or a `paired.toml` that cannot be used.
     pub fn open(folder: KeysFolder) -> Result<Self, KeyError> {
-        let identity = Identity::keep(&folder, Owner::Server)?;
+        let identity = Identity::load_or_create(&folder, Owner::Server)?;
         let paired = watch::Sender::new(Arc::new(Paired::read(&folder)?));
         let (desk, pairing_news) = (Mutex::default(), watch::Sender::default());
         Ok(Self { identity, folder, paired, desk, pairing_news })
@@ -104,7 +106,7 @@ impl Authorizer {
     /// The reason to refuse.
     pub fn begin_pairing(
         &self,
-        message: &FromApplicant,
+        message: &PairingRequest,
         binding: &Binding,
     ) -> Result<(Attempt, PairingShare), Refusal> {
         lock(&self.desk).begin(Instant::now(), message, binding)
@@ -117,7 +119,7 @@ impl Authorizer {
     pub fn confirm_pairing(
         &self,
         attempt: Attempt,
-        message: &FromApplicant,
+        message: &PairingRequest,
         from: SocketAddr,
     ) -> Result<Admitted, String> {
         let admitted = lock(&self.desk).confirm(Instant::now(), attempt, message);

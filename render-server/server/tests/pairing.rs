@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use quinn::{ClientConfig, Connection, Endpoint, ServerConfig, TransportConfig};
 use support::{Client, PATIENCE, Server, connect_as, write_arena};
-use vizflyt_protocol::messages::{FromApplicant, Grant, ToApplicant, ToRuntime};
+use vizflyt_protocol::messages::{Grant, PairingReply, PairingRequest, ToRuntime};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{Party, Preamble};
-use vizflyt_trust::pairing::{Applicant, Binding, Code, EXPORTER_LABEL};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
+use vizflyt_trust::pairing::{Binding, Code, EXPORTER_LABEL, PairingClient};
 use vizflyt_trust::tls::{self, Pin};
 use vizflyt_trust::{ALPN_PAIR, Fingerprint, Identity, Paired};
 use zerocopy::IntoBytes;
@@ -46,14 +46,14 @@ async fn pair(
     connection.export_keying_material(&mut exporter, EXPORTER_LABEL, &[]).unwrap();
     let binding = Binding { client: identity.fingerprint(), server, exporter };
     let (mut send, mut recv) = connection.open_bi().await.unwrap();
-    send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.unwrap();
+    send.write_all(Preamble::of(PeerRole::Runtime).as_bytes()).await.unwrap();
     let mut theirs = [0; Preamble::SIZE];
     recv.read_exact(&mut theirs).await.unwrap();
-    assert_eq!(Preamble::check(&theirs, Party::Runtime), Ok(Party::Server));
+    assert_eq!(Preamble::check(&theirs, PeerRole::Runtime), Ok(PeerRole::Server));
     let mut deframer = Deframer::default();
     let mut read = async || {
         loop {
-            if let Some(message) = deframer.next::<ToApplicant>() {
+            if let Some(message) = deframer.next::<PairingReply>() {
                 return message.unwrap();
             }
             let mut byte = [0; 1];
@@ -61,25 +61,25 @@ async fn pair(
             deframer.push(&byte);
         }
     };
-    let (applicant, begin) = Applicant::begin(code, "jetson", binding);
-    let mut say = async |message: &FromApplicant| {
+    let (client, begin) = PairingClient::begin(code, "jetson", binding);
+    let mut say = async |message: &PairingRequest| {
         send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
     };
     say(&begin).await;
     let share = match read().await {
-        ToApplicant::Share { share } => share,
-        ToApplicant::Refused(why) => return Err(why.as_str().to_owned()),
-        other @ ToApplicant::Paired { .. } => panic!("{other:?}"),
+        PairingReply::Share { share } => share,
+        PairingReply::Refused(why) => return Err(why.as_str().to_owned()),
+        other @ PairingReply::Paired { .. } => panic!("{other:?}"),
     };
-    let (confirming, confirm) = applicant.confirm(&share).unwrap();
+    let (confirming, confirm) = client.confirm(&share).unwrap();
     say(&confirm).await;
     match read().await {
-        ToApplicant::Paired { proof, grant } => {
+        PairingReply::Paired { proof, grant } => {
             assert!(confirming.is_proof(&proof), "the server knows the code");
             Ok(grant)
         }
-        ToApplicant::Refused(why) => Err(why.as_str().to_owned()),
-        other @ ToApplicant::Share { .. } => panic!("{other:?}"),
+        PairingReply::Refused(why) => Err(why.as_str().to_owned()),
+        other @ PairingReply::Share { .. } => panic!("{other:?}"),
     }
 }
 
@@ -92,7 +92,7 @@ fn other_than(code: Code) -> Code {
 async fn the_right_code_pairs_once_and_for_good() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
-    let [jetson, late] = [(); 2].map(|()| Identity::fleeting().unwrap());
+    let [jetson, late] = [(); 2].map(|()| Identity::ephemeral().unwrap());
     let refused = pair(server.quic, &jetson, other_than(code)).await.unwrap_err();
     assert_eq!(refused, "wrong code, 2 of 3 tries left");
     let Grant::Team { vehicles } = pair(server.quic, &jetson, code).await.unwrap() else {
@@ -114,7 +114,7 @@ async fn the_right_code_pairs_once_and_for_good() {
 async fn three_wrong_codes_end_it() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
-    let jetson = Identity::fleeting().unwrap();
+    let jetson = Identity::ephemeral().unwrap();
     for expected in ["2 of 3", "1 of 3", "for the last time"] {
         let refused = pair(server.quic, &jetson, other_than(code)).await.unwrap_err();
         assert!(refused.contains(expected), "{refused}");
@@ -129,7 +129,7 @@ async fn three_wrong_codes_end_it() {
 async fn a_man_in_the_middle_gains_nothing_from_the_right_code() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
-    let [jetson, middle] = [(); 2].map(|()| Identity::fleeting().unwrap());
+    let [jetson, middle] = [(); 2].map(|()| Identity::ephemeral().unwrap());
     let tls = tls::server_config(&middle, &[ALPN_PAIR]).unwrap();
     let quic = quinn::crypto::rustls::QuicServerConfig::try_from(tls).unwrap();
     let config = ServerConfig::with_crypto(Arc::new(quic));
@@ -164,7 +164,7 @@ async fn a_man_in_the_middle_gains_nothing_from_the_right_code() {
 async fn strangers_run_out_of_attempts() {
     let folder = tempfile::tempdir().unwrap();
     let (server, _) = start(folder.path());
-    let stranger = Identity::fleeting().unwrap();
+    let stranger = Identity::ephemeral().unwrap();
     let mut refused = None;
     // Far more than one address has, however slow this machine.
     for _ in 0..500 {

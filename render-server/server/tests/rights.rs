@@ -31,7 +31,7 @@ async fn a_stranger_hears_how_to_pair_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
-    let stranger = Identity::fleeting().unwrap();
+    let stranger = Identity::ephemeral().unwrap();
     let (_endpoint, connection) = connect_as(&server, &stranger, usual()).await.unwrap();
     // It says nothing, and would not listen: it is refused for who it is.
     let (code, reason) = closed(&connection).await;
@@ -52,7 +52,7 @@ async fn a_stranger_hears_how_to_pair_and_nothing_else() {
 #[tokio::test]
 async fn a_team_flies_its_own_vehicle_and_no_other() {
     let folder = tempfile::tempdir().unwrap();
-    let [own, other] = [(); 2].map(|()| Identity::fleeting().unwrap());
+    let [own, other] = [(); 2].map(|()| Identity::ephemeral().unwrap());
     let paired = [client(&own, Role::Team, &["vizflyt"]), client(&other, Role::Team, &["wasp"])];
     let server = Server::start_paired(&write_arena(folder.path(), ""), &[], &paired);
     let _emitter = Emitter::start(server.vicon, "vizflyt");

@@ -3,7 +3,7 @@
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin, ToRuntime, ToServer};
 use vizflyt_protocol::packet::framing::{Deframer, FramingError, decode_body};
-use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
 
 fn drain<M: serde::de::DeserializeOwned>(mut bytes: &[u8]) {
     let mut deframer = Deframer::default();
@@ -20,7 +20,7 @@ fn drain<M: serde::de::DeserializeOwned>(mut bytes: &[u8]) {
 
 fuzz_target!(|bytes: &[u8]| {
     if let Some(preamble) = bytes.first_chunk::<{ Preamble::SIZE }>() {
-        let _ = Preamble::check(preamble, Party::Server);
+        let _ = Preamble::check(preamble, PeerRole::Server);
     }
     drain::<ToServer>(bytes);
     drain::<ToRuntime>(bytes);

@@ -3,9 +3,9 @@
 use std::time::Instant;
 
 use libfuzzer_sys::fuzz_target;
-use vizflyt_protocol::messages::{FromApplicant, Grant, ToApplicant};
+use vizflyt_protocol::messages::{Grant, PairingReply, PairingRequest};
 use vizflyt_protocol::packet::framing::{Deframer, FramingError};
-use vizflyt_trust::pairing::{Applicant, Binding, Code, Desk};
+use vizflyt_trust::pairing::{Binding, Code, PairingClient, PairingServer};
 use vizflyt_trust::{Fingerprint, Paired, Servers};
 
 fn messages<M: serde::de::DeserializeOwned>(mut bytes: &[u8]) -> Vec<M> {
@@ -28,29 +28,29 @@ fuzz_target!(|bytes: &[u8]| {
     let binding = Binding { client: print, server: print, exporter: [0; 32] };
     let code: Code = "123456".parse().unwrap();
     let now = Instant::now();
-    let mut desk = Desk::default();
-    desk.open(now, code, Grant::Instructor);
+    let mut server = PairingServer::default();
+    server.open(now, code, Grant::Instructor);
     let mut attempt = None;
-    for message in messages::<FromApplicant>(bytes) {
+    for message in messages::<PairingRequest>(bytes) {
         match attempt.take() {
             // The code is in the code above, but a proof is a hash over a fresh half of ours.
-            Some(begun) => assert!(desk.confirm(now, begun, &message).is_err()),
-            None => attempt = desk.begin(now, &message, &binding).ok().map(|(begun, _)| begun),
+            Some(begun) => assert!(server.confirm(now, begun, &message).is_err()),
+            None => attempt = server.begin(now, &message, &binding).ok().map(|(begun, _)| begun),
         }
     }
     let mut confirming = None;
-    for message in messages::<ToApplicant>(bytes) {
+    for message in messages::<PairingReply>(bytes) {
         match message {
-            ToApplicant::Share { share } => {
-                let (applicant, _) = Applicant::begin(code, "x", binding);
-                confirming = applicant.confirm(&share).map(|(confirming, _)| confirming);
+            PairingReply::Share { share } => {
+                let (client, _) = PairingClient::begin(code, "x", binding);
+                confirming = client.confirm(&share).map(|(confirming, _)| confirming);
             }
-            ToApplicant::Paired { proof, .. } => {
+            PairingReply::Paired { proof, .. } => {
                 if let Some(confirming) = confirming.take() {
                     assert!(!confirming.is_proof(&proof));
                 }
             }
-            ToApplicant::Refused(_) => {}
+            PairingReply::Refused(_) => {}
         }
     }
     if let Ok(text) = std::str::from_utf8(bytes) {

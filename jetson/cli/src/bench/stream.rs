@@ -335,7 +335,7 @@ impl Link {
     fn start([width_px, height_px]: [u32; 2]) -> Result<Self> {
         let keys = tempfile::tempdir()?;
         let folder = KeysFolder::open(Some(&keys.path().join("keys")))?;
-        let identity = Identity::keep(&folder, Owner::Runtime)?;
+        let identity = Identity::load_or_create(&folder, Owner::Runtime)?;
         let client = Client {
             name: "bench".to_owned(),
             fingerprint: identity.fingerprint(),

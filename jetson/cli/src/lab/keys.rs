@@ -22,8 +22,8 @@ impl Keys {
             .tempdir()
             .context("cannot make a folder for its keys")?;
         let folder = KeysFolder::open(Some(&scratch.path().join("keys")))?;
-        let server = Identity::keep(&folder, Owner::Server)?;
-        let runtime = Identity::keep(&folder, Owner::Runtime)?;
+        let server = Identity::load_or_create(&folder, Owner::Server)?;
+        let runtime = Identity::load_or_create(&folder, Owner::Runtime)?;
         let client = Client {
             name: "simulated lab".to_owned(),
             fingerprint: runtime.fingerprint(),

@@ -7,10 +7,10 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use quinn::{ClientConfig, Connection, ConnectionError, RecvStream, SendStream, VarInt};
 use tokio::time::timeout;
-use vizflyt_protocol::messages::{Grant, ToApplicant};
+use vizflyt_protocol::messages::{Grant, PairingReply};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{Party, Preamble};
-use vizflyt_trust::pairing::{Applicant, Binding, Code, EXPORTER_LABEL};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
+use vizflyt_trust::pairing::{Binding, Code, EXPORTER_LABEL, PairingClient};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN_PAIR, Fingerprint, Identity, KeysFolder, KnownServer, Owner, Servers};
 use zerocopy::IntoBytes;
@@ -37,7 +37,7 @@ pub fn pair(
     code: Code,
     name: &str,
 ) -> Result<NowPaired> {
-    let identity = Identity::keep(folder, Owner::Runtime)?;
+    let identity = Identity::load_or_create(folder, Owner::Runtime)?;
     let tokio = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let paired = tokio.block_on(async {
         timeout(WITHIN, connect(&identity, server, code, name))
@@ -93,31 +93,31 @@ async fn converse(
     }
     let binding = Binding { client: identity.fingerprint(), server, exporter };
     let (mut send, mut recv) = connection.open_bi().await?;
-    send.write_all(Preamble::of(Party::Runtime).as_bytes()).await?;
+    send.write_all(Preamble::of(PeerRole::Runtime).as_bytes()).await?;
     let mut preamble = [0; Preamble::SIZE];
-    let (applicant, begin) = Applicant::begin(code, name, binding);
+    let (client, begin) = PairingClient::begin(code, name, binding);
     write(&mut send, &begin).await?;
     recv.read_exact(&mut preamble).await?;
-    Preamble::check(&preamble, Party::Runtime)?;
+    Preamble::check(&preamble, PeerRole::Runtime)?;
 
     let mut deframer = Deframer::default();
     let share = match read(&mut recv, &mut deframer).await? {
-        ToApplicant::Share { share } => share,
-        ToApplicant::Refused(why) => bail!("{why}"),
-        ToApplicant::Paired { .. } => bail!(OUT_OF_TURN),
+        PairingReply::Share { share } => share,
+        PairingReply::Refused(why) => bail!("{why}"),
+        PairingReply::Paired { .. } => bail!(OUT_OF_TURN),
     };
-    let Some((confirming, confirm)) = applicant.confirm(&share) else { bail!(OUT_OF_TURN) };
+    let Some((confirming, confirm)) = client.confirm(&share) else { bail!(OUT_OF_TURN) };
     write(&mut send, &confirm).await?;
     match read(&mut recv, &mut deframer).await? {
-        ToApplicant::Paired { proof, grant } if confirming.is_proof(&proof) => {
+        PairingReply::Paired { proof, grant } if confirming.is_proof(&proof) => {
             Ok(NowPaired { server, grant })
         }
-        ToApplicant::Paired { .. } => bail!(
+        PairingReply::Paired { .. } => bail!(
             "it does not know the code it should have shown: somebody may sit in between; do not \
              use this network"
         ),
-        ToApplicant::Refused(why) => bail!("{why}"),
-        ToApplicant::Share { .. } => bail!(OUT_OF_TURN),
+        PairingReply::Refused(why) => bail!("{why}"),
+        PairingReply::Share { .. } => bail!(OUT_OF_TURN),
     }
 }
 
@@ -126,7 +126,7 @@ async fn write(send: &mut SendStream, message: &impl serde::Serialize) -> Result
     Ok(send.write_all(encode(message, &mut buffer)).await?)
 }
 
-async fn read(recv: &mut RecvStream, deframer: &mut Deframer) -> Result<ToApplicant> {
+async fn read(recv: &mut RecvStream, deframer: &mut Deframer) -> Result<PairingReply> {
     loop {
         if let Some(message) = deframer.next() {
             return Ok(message?);

@@ -9,7 +9,7 @@ use vizflyt_protocol::messages::{
     ClockRequest, Datagram, Hello, ToRuntime, ToServer, Welcome, close,
 };
 use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, decode_body, encode};
-use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
 use vizflyt_protocol::time::ServerTime;
 use zerocopy::IntoBytes;
 
@@ -69,7 +69,7 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
     tell: &T,
 ) -> Result<Infallible, SessionEnd> {
     let (mut send, mut receive) = connection.open_bi().await.map_err(lost)?;
-    send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.map_err(lost)?;
+    send.write_all(Preamble::of(PeerRole::Runtime).as_bytes()).await.map_err(lost)?;
     let hello = Hello {
         vehicle: with.settings.vehicle.clone(),
         purpose: with.settings.purpose,
@@ -132,8 +132,8 @@ async fn check_preamble(receive: &mut RecvStream) -> Result<(), SessionEnd> {
         .await
         .map_err(|_| SessionEnd::Retry("the server does not answer".into()))?
         .map_err(lost)?;
-    match Preamble::check(&preamble, Party::Runtime) {
-        Ok(Party::Server) => Ok(()),
+    match Preamble::check(&preamble, PeerRole::Runtime) {
+        Ok(PeerRole::Server) => Ok(()),
         Ok(other) => Err(SessionEnd::Final(format!("the other side is a {}", other.name()))),
         Err(error) => Err(SessionEnd::Final(error.to_string())),
     }

@@ -9,7 +9,7 @@ use vizflyt_protocol::messages::{
     Welcome, bounded,
 };
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode, encode_body};
-use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, Party, Preamble};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, PeerRole, Preamble};
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::host_now;
@@ -27,7 +27,7 @@ struct Server {
 
 impl Server {
     fn start() -> Self {
-        let identity = Identity::fleeting().unwrap();
+        let identity = Identity::ephemeral().unwrap();
         let fingerprint = identity.fingerprint();
         let tls = vizflyt_trust::tls::server_config(&identity, &[ALPN]).unwrap();
         let crypto = quinn::crypto::rustls::QuicServerConfig::try_from(tls).unwrap();
@@ -42,7 +42,7 @@ impl Server {
         let (mut send, mut receive) = connection.accept_bi().await.unwrap();
         let mut theirs = [0; Preamble::SIZE];
         receive.read_exact(&mut theirs).await.unwrap();
-        assert_eq!(Preamble::check(&theirs, Party::Server), Ok(Party::Runtime));
+        assert_eq!(Preamble::check(&theirs, PeerRole::Server), Ok(PeerRole::Runtime));
         send.write_all(preamble.as_bytes()).await.unwrap();
         Peer { connection, send, receive, deframer: Deframer::default() }
     }
@@ -55,7 +55,7 @@ impl Server {
     /// Accepts one runtime and welcomes it as the run `boot` of a server, which has heard of the
     /// runtime's events what `heard` says.
     async fn welcome_as(&self, boot: u64, heard: impl Fn(&Hello) -> u64) -> (Peer, Hello) {
-        let mut peer = self.accept(Preamble::of(Party::Server)).await;
+        let mut peer = self.accept(Preamble::of(PeerRole::Server)).await;
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
         assert_eq!((hello.vehicle.as_str(), hello.purpose), ("vizflyt", Purpose::Fly));
         let heard_events = HeardEvents { boot: hello.boot, seq: heard(&hello) };
@@ -169,7 +169,7 @@ impl Client {
         let settings = StreamSettings {
             server: server.endpoint.local_addr().unwrap(),
             fingerprint,
-            identity: Identity::fleeting().unwrap(),
+            identity: Identity::ephemeral().unwrap(),
             vehicle: bounded("vizflyt"),
             purpose: Purpose::Fly,
             program: bounded("test"),
@@ -340,7 +340,7 @@ async fn an_event_that_found_no_room_is_told_again() {
     let settings = StreamSettings {
         server: server.endpoint.local_addr().unwrap(),
         fingerprint: server.fingerprint,
-        identity: Identity::fleeting().unwrap(),
+        identity: Identity::ephemeral().unwrap(),
         vehicle: bounded("vizflyt"),
         purpose: Purpose::Fly,
         program: bounded("test"),
@@ -368,7 +368,7 @@ async fn another_version_is_refused_by_name() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut bytes = [0; Preamble::SIZE];
-    bytes.copy_from_slice(Preamble::of(Party::Server).as_bytes());
+    bytes.copy_from_slice(Preamble::of(PeerRole::Server).as_bytes());
     bytes[4] = 99;
     let preamble = zerocopy::FromBytes::read_from_bytes(&bytes).unwrap();
     let _peer = server.accept(preamble).await;
@@ -416,7 +416,7 @@ async fn after_an_outage_or_a_silence_it_connects_anew() {
 async fn a_refusal_is_tried_again() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
-    let mut peer = server.accept(Preamble::of(Party::Server)).await;
+    let mut peer = server.accept(Preamble::of(PeerRole::Server)).await;
     peer.say(&ToRuntime::Refused(bounded("another runtime flies vizflyt"))).await;
     let StreamEvent::Down(why) = client.next() else { panic!("not down") };
     assert!(why.contains("another runtime flies"), "{why}");

@@ -29,7 +29,7 @@ mod trajectory;
 
 pub use event::{Event, EventKind};
 pub use kinds::{SetpointKind, SetpointKinds};
-pub use pairing::{FromApplicant, Grant, MAX_GRANTED, PairingProof, PairingShare, ToApplicant};
+pub use pairing::{Grant, MAX_GRANTED, PairingProof, PairingReply, PairingRequest, PairingShare};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
     ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, ImuReading,

@@ -24,7 +24,7 @@ pub const MAX_GRANTED: usize = 8;
 
 /// Client to server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum FromApplicant {
+pub enum PairingRequest {
     /// Asks to be paired.
     Begin {
         /// What people shall call this computer.
@@ -42,7 +42,7 @@ pub enum FromApplicant {
 /// Server to client.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap to box it on, and it comes once.
-pub enum ToApplicant {
+pub enum PairingReply {
     /// The server's half.
     Share {
         /// It.

@@ -10,4 +10,4 @@ pub use observation::{
     CameraHeader, ImuRecord, InvalidObservation, MAX_IMU, ObservationHeader, ObservationLayout,
     PLANE_ALIGN,
 };
-pub use preamble::{Party, Preamble, PreambleError};
+pub use preamble::{PeerRole, Preamble, PreambleError};

@@ -7,7 +7,7 @@ use crate::PROTOCOL_VERSION;
 
 /// Who speaks; its name stands in error messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Party {
+pub enum PeerRole {
     /// The render server.
     Server,
     /// The runtime on the Jetson.
@@ -16,7 +16,7 @@ pub enum Party {
     Plugin,
 }
 
-impl Party {
+impl PeerRole {
     fn from_byte(byte: u8) -> Option<Self> {
         match byte {
             1 => Some(Self::Server),
@@ -44,7 +44,7 @@ impl Party {
 pub struct Preamble {
     magic: [u8; 4],
     version: U16,
-    party: u8,
+    role: u8,
     reserved: u8,
 }
 
@@ -54,11 +54,11 @@ impl Preamble {
     const MAGIC: [u8; 4] = *b"VZFL";
 
     /// Returns what `party` of this build sends.
-    pub fn of(party: Party) -> Self {
+    pub fn of(role: PeerRole) -> Self {
         Self {
             magic: Self::MAGIC,
             version: PROTOCOL_VERSION.into(),
-            party: party as u8 + 1,
+            role: role as u8 + 1,
             reserved: 0,
         }
     }
@@ -66,21 +66,21 @@ impl Preamble {
     /// Checks the other side's preamble against this build, speaking as `me`.
     ///
     /// ```
-    /// use vizflyt_protocol::packet::{Party, Preamble};
-    /// let mut bytes = *zerocopy::IntoBytes::as_bytes(&Preamble::of(Party::Server)).first_chunk::<8>().unwrap();
-    /// assert_eq!(Preamble::check(&bytes, Party::Runtime), Ok(Party::Server));
+    /// use vizflyt_protocol::packet::{PeerRole, Preamble};
+    /// let mut bytes = *zerocopy::IntoBytes::as_bytes(&Preamble::of(PeerRole::Server)).first_chunk::<8>().unwrap();
+    /// assert_eq!(Preamble::check(&bytes, PeerRole::Runtime), Ok(PeerRole::Server));
     /// bytes[4] = 99;
-    /// let error = Preamble::check(&bytes, Party::Runtime).unwrap_err();
+    /// let error = Preamble::check(&bytes, PeerRole::Runtime).unwrap_err();
     /// # extern crate std;
     /// # use std::string::ToString;
     /// assert!(error.to_string().starts_with("server speaks protocol 99, this runtime "));
     /// ```
-    pub fn check(bytes: &[u8; Self::SIZE], me: Party) -> Result<Party, PreambleError> {
+    pub fn check(bytes: &[u8; Self::SIZE], me: PeerRole) -> Result<PeerRole, PreambleError> {
         let Ok(theirs) = Self::read_from_bytes(bytes) else {
             return Err(PreambleError::NotVizflyt);
         };
-        let party = Party::from_byte(theirs.party);
-        let (Some(them), Self::MAGIC) = (party, theirs.magic) else {
+        let role = PeerRole::from_byte(theirs.role);
+        let (Some(them), Self::MAGIC) = (role, theirs.magic) else {
             return Err(PreambleError::NotVizflyt);
         };
         let version = theirs.version.get();
@@ -126,26 +126,26 @@ mod tests {
     use super::*;
     use std::string::ToString;
 
-    fn check(bytes: [u8; 8], me: Party, expected: Result<Party, &str>) {
+    fn check(bytes: [u8; 8], me: PeerRole, expected: Result<PeerRole, &str>) {
         let found = Preamble::check(&bytes, me).map_err(|error| error.to_string());
         assert_eq!(found, expected.map_err(ToString::to_string));
     }
 
     #[test]
     fn the_older_side_is_named() {
-        check(*b"VZFL\x06\x00\x01\x00", Party::Runtime, Ok(Party::Server));
+        check(*b"VZFL\x06\x00\x01\x00", PeerRole::Runtime, Ok(PeerRole::Server));
         check(
             *b"VZFL\x07\x00\x01\x00",
-            Party::Runtime,
+            PeerRole::Runtime,
             Err("server speaks protocol 7, this runtime 6: update the runtime"),
         );
         check(
             *b"VZFL\x00\x00\x02\x00",
-            Party::Server,
+            PeerRole::Server,
             Err("runtime speaks protocol 0, this server 6: update the runtime"),
         );
         let stranger = "the other side does not speak VizFlyt; check the address and port";
-        check(*b"HTTP/1.1", Party::Server, Err(stranger));
-        check(*b"VZFL\x06\x00\x09\x00", Party::Server, Err(stranger));
+        check(*b"HTTP/1.1", PeerRole::Server, Err(stranger));
+        check(*b"VZFL\x06\x00\x09\x00", PeerRole::Server, Err(stranger));
     }
 }

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use proptest::prelude::*;
-use vizflyt_protocol::messages::{FromApplicant, Grant, PairingProof, PairingShare, bounded};
+use vizflyt_protocol::messages::{Grant, PairingProof, PairingRequest, PairingShare, bounded};
 
 use super::*;
 use crate::Role;
@@ -30,13 +30,13 @@ fn binding(connection: u8) -> Binding {
 }
 
 struct Lab {
-    desk: Desk,
+    server: PairingServer,
     now: Instant,
 }
 
 /// What a client heard at the end.
 #[derive(Debug, PartialEq)]
-enum End {
+enum PairingOutcome {
     Paired(Box<Admitted>),
     Refused(Refusal),
     /// The server's proof did not hold.
@@ -45,67 +45,72 @@ enum End {
 
 impl Lab {
     fn open(text: &str) -> Self {
-        let mut lab = Self { desk: Desk::default(), now: Instant::now() };
-        assert!(lab.desk.open(lab.now, code(text), team()));
+        let mut lab = Self { server: PairingServer::default(), now: Instant::now() };
+        assert!(lab.server.open(lab.now, code(text), team()));
         lab
     }
 
     fn begin(
         &mut self,
-        message: &FromApplicant,
+        message: &PairingRequest,
         seen: &Binding,
     ) -> Result<(Attempt, PairingShare), Refusal> {
-        self.desk.begin(self.now, message, seen)
+        self.server.begin(self.now, message, seen)
     }
 
     /// Runs a client with `text` on a connection that the two ends may see differently.
-    fn pair(&mut self, text: &str, client_sees: Binding, server_sees: Binding) -> End {
-        let (applicant, message) = Applicant::begin(code(text), "jetson", client_sees);
+    fn pair(&mut self, text: &str, client_sees: Binding, server_sees: Binding) -> PairingOutcome {
+        let (client, message) = PairingClient::begin(code(text), "jetson", client_sees);
         let (attempt, share) = match self.begin(&message, &server_sees) {
             Ok(begun) => begun,
-            Err(refusal) => return End::Refused(refusal),
+            Err(refusal) => return PairingOutcome::Refused(refusal),
         };
-        let (confirming, message) = applicant.confirm(&share).unwrap();
-        match self.desk.confirm(self.now, attempt, &message) {
-            Ok(admitted) if confirming.is_proof(&admitted.proof) => End::Paired(Box::new(admitted)),
-            Ok(_) => End::Deceived,
-            Err(refusal) => End::Refused(refusal),
+        let (confirming, message) = client.confirm(&share).unwrap();
+        match self.server.confirm(self.now, attempt, &message) {
+            Ok(admitted) if confirming.is_proof(&admitted.proof) => {
+                PairingOutcome::Paired(Box::new(admitted))
+            }
+            Ok(_) => PairingOutcome::Deceived,
+            Err(refusal) => PairingOutcome::Refused(refusal),
         }
     }
 
-    fn try_code(&mut self, text: &str) -> End {
+    fn try_code(&mut self, text: &str) -> PairingOutcome {
         self.pair(text, binding(1), binding(1))
     }
 
     fn is_open(&mut self) -> bool {
-        self.desk.state(self.now).is_some()
+        self.server.state(self.now).is_some()
     }
 }
 
 #[test]
 fn the_right_code_pairs_once() {
     let mut lab = Lab::open("123456");
-    let state = lab.desk.state(lab.now).unwrap();
+    let state = lab.server.state(lab.now).unwrap();
     assert_eq!((state.left, state.tries_left, state.grant), (VALID, TRIES, team()));
-    assert!(!lab.desk.open(lab.now, code("000000"), Grant::Instructor), "one window at a time");
-    let End::Paired(admitted) = lab.try_code("123 456") else { panic!() };
+    assert!(!lab.server.open(lab.now, code("000000"), Grant::Instructor), "one window at a time");
+    let PairingOutcome::Paired(admitted) = lab.try_code("123 456") else { panic!() };
     assert_eq!(admitted.client.fingerprint, Fingerprint::of(b"client"));
     assert_eq!((admitted.client.name.as_str(), admitted.client.role), ("jetson", Role::Team));
     assert_eq!((admitted.client.vehicles, admitted.grant), (vec!["ant".to_owned()], team()));
     assert!(!lab.is_open());
-    assert_eq!(lab.try_code("123456"), End::Refused(Refusal::Closed));
+    assert_eq!(lab.try_code("123456"), PairingOutcome::Refused(Refusal::Closed));
 }
 
 #[test]
 fn three_wrong_codes_shut_the_window() {
     let mut lab = Lab::open("123456");
-    assert_eq!(lab.try_code("123457"), End::Refused(Refusal::Wrong { left: 2 }));
-    assert_eq!(lab.try_code("654321"), End::Refused(Refusal::Wrong { left: 1 }));
-    assert_eq!(lab.try_code("000000"), End::Refused(Refusal::Shut));
-    assert_eq!(lab.try_code("123456"), End::Refused(Refusal::Closed));
+    assert_eq!(lab.try_code("123457"), PairingOutcome::Refused(Refusal::Wrong { left: 2 }));
+    assert_eq!(lab.try_code("654321"), PairingOutcome::Refused(Refusal::Wrong { left: 1 }));
+    assert_eq!(lab.try_code("000000"), PairingOutcome::Refused(Refusal::Shut));
+    assert_eq!(lab.try_code("123456"), PairingOutcome::Refused(Refusal::Closed));
     let mut lab = Lab::open("123456");
     lab.try_code("123457");
-    assert!(matches!(lab.try_code("123456"), End::Paired(_)), "a slip of the finger is no harm");
+    assert!(
+        matches!(lab.try_code("123456"), PairingOutcome::Paired(_)),
+        "a slip of the finger is no harm"
+    );
 }
 
 #[test]
@@ -114,15 +119,15 @@ fn tries_in_parallel_are_no_more_tries() {
     let seen = binding(1);
     let mut begun: Vec<_> = (0..9)
         .map(|guess| {
-            let (applicant, message) = Applicant::begin(Code::from_number(guess), "jetson", seen);
-            (applicant, lab.begin(&message, &seen).unwrap())
+            let (client, message) = PairingClient::begin(Code::from_number(guess), "jetson", seen);
+            (client, lab.begin(&message, &seen).unwrap())
         })
         .collect();
     let ends: Vec<_> = begun
         .drain(..)
-        .map(|(applicant, (attempt, share))| {
-            let (_, message) = applicant.confirm(&share).unwrap();
-            lab.desk.confirm(lab.now, attempt, &message).unwrap_err()
+        .map(|(client, (attempt, share))| {
+            let (_, message) = client.confirm(&share).unwrap();
+            lab.server.confirm(lab.now, attempt, &message).unwrap_err()
         })
         .collect();
     assert_eq!(ends[..3], [Refusal::Wrong { left: 2 }, Refusal::Wrong { left: 1 }, Refusal::Shut]);
@@ -133,17 +138,17 @@ fn tries_in_parallel_are_no_more_tries() {
 fn a_code_expires_also_between_two_messages() {
     let mut lab = Lab::open("123456");
     let seen = binding(1);
-    let (applicant, message) = Applicant::begin(code("123456"), "jetson", seen);
+    let (client, message) = PairingClient::begin(code("123456"), "jetson", seen);
     let (attempt, share) = lab.begin(&message, &seen).unwrap();
-    let (_, message) = applicant.confirm(&share).unwrap();
+    let (_, message) = client.confirm(&share).unwrap();
     let opened = lab.now;
     lab.now += VALID.mul_f64(0.999);
     assert!(lab.is_open());
     lab.now = opened + VALID;
     assert!(!lab.is_open());
     // Not even through the next window, should it have the same code.
-    assert!(lab.desk.open(lab.now, code("123456"), Grant::Instructor));
-    let end = lab.desk.confirm(lab.now, attempt, &message);
+    assert!(lab.server.open(lab.now, code("123456"), Grant::Instructor));
+    let end = lab.server.confirm(lab.now, attempt, &message);
     assert_eq!(end, Err(Refusal::Closed));
 }
 
@@ -156,7 +161,7 @@ fn a_relay_between_two_connections_fails_with_the_right_code() {
     let toward_server = Binding { client: middle, ..binding(2) };
     let mut lab = Lab::open("123456");
     let end = lab.pair("123456", toward_client, toward_server);
-    assert_eq!(end, End::Refused(Refusal::Wrong { left: 2 }));
+    assert_eq!(end, PairingOutcome::Refused(Refusal::Wrong { left: 2 }));
     // Each part of the binding counts by itself.
     for other in [
         Binding { exporter: [2; 32], ..binding(1) },
@@ -165,7 +170,7 @@ fn a_relay_between_two_connections_fails_with_the_right_code() {
     ] {
         let mut lab = Lab::open("123456");
         let end = lab.pair("123456", binding(1), other);
-        assert_eq!(end, End::Refused(Refusal::Wrong { left: 2 }), "{other:?}");
+        assert_eq!(end, PairingOutcome::Refused(Refusal::Wrong { left: 2 }), "{other:?}");
     }
 }
 
@@ -173,14 +178,14 @@ fn a_relay_between_two_connections_fails_with_the_right_code() {
 #[test]
 fn a_false_server_that_guesses_wrong_convinces_nobody() {
     let seen = Binding { server: Fingerprint::of(b"middle"), ..binding(1) };
-    let (applicant, message) = Applicant::begin(code("123456"), "jetson", seen);
+    let (client, message) = PairingClient::begin(code("123456"), "jetson", seen);
     let mut false_server = Lab::open("111111");
     let (attempt, share) = false_server.begin(&message, &seen).unwrap();
-    let (confirming, message) = applicant.confirm(&share).unwrap();
-    let end = false_server.desk.confirm(false_server.now, attempt, &message);
+    let (confirming, message) = client.confirm(&share).unwrap();
+    let end = false_server.server.confirm(false_server.now, attempt, &message);
     assert_eq!(end, Err(Refusal::Wrong { left: 2 }), "his guess was wrong, and he knows only that");
     // He answers all the same, echoing the client's proof, or anything else.
-    let FromApplicant::Confirm { proof } = message else { panic!() };
+    let PairingRequest::Confirm { proof } = message else { panic!() };
     assert!(!confirming.is_proof(&proof), "the two proofs differ, so an echo is none");
 }
 
@@ -188,20 +193,20 @@ fn a_false_server_that_guesses_wrong_convinces_nobody() {
 fn what_was_recorded_is_of_no_use_later() {
     let seen = binding(1);
     let mut lab = Lab::open("123456");
-    let (applicant, begin) = Applicant::begin(code("123456"), "jetson", seen);
+    let (client, begin) = PairingClient::begin(code("123456"), "jetson", seen);
     let (attempt, share) = lab.begin(&begin, &seen).unwrap();
-    let (confirming, confirm) = applicant.confirm(&share).unwrap();
-    let admitted = lab.desk.confirm(lab.now, attempt, &confirm).unwrap();
+    let (confirming, confirm) = client.confirm(&share).unwrap();
+    let admitted = lab.server.confirm(lab.now, attempt, &confirm).unwrap();
     assert!(confirming.is_proof(&admitted.proof));
     // The same window of code, the same fingerprints, even the same exporter: the server's half is
     // new every time.
     let mut lab = Lab::open("123456");
     let (attempt, _) = lab.begin(&begin, &seen).unwrap();
-    let end = lab.desk.confirm(lab.now, attempt, &confirm);
+    let end = lab.server.confirm(lab.now, attempt, &confirm);
     assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
     // And the server's old proof says nothing to a new client.
-    let (applicant, _) = Applicant::begin(code("123456"), "jetson", seen);
-    let (confirming, _) = applicant.confirm(&share).unwrap();
+    let (client, _) = PairingClient::begin(code("123456"), "jetson", seen);
+    let (confirming, _) = client.confirm(&share).unwrap();
     assert!(!confirming.is_proof(&admitted.proof));
 }
 
@@ -209,16 +214,16 @@ fn what_was_recorded_is_of_no_use_later() {
 fn messages_out_of_order_are_refused() {
     let mut lab = Lab::open("123456");
     let seen = binding(1);
-    let confirm = FromApplicant::Confirm { proof: [0; 32] };
+    let confirm = PairingRequest::Confirm { proof: [0; 32] };
     assert_eq!(lab.begin(&confirm, &seen).err(), Some(Refusal::Foreign));
-    let (_, begin) = Applicant::begin(code("123456"), "jetson", seen);
+    let (_, begin) = PairingClient::begin(code("123456"), "jetson", seen);
     let (attempt, _) = lab.begin(&begin, &seen).unwrap();
-    assert_eq!(lab.desk.confirm(lab.now, attempt, &begin), Err(Refusal::Foreign));
+    assert_eq!(lab.server.confirm(lab.now, attempt, &begin), Err(Refusal::Foreign));
     for name in ["", "a\nb", "\u{1b}[31m"] {
-        let begin = FromApplicant::Begin { name: bounded(name), share: [7; 32] };
+        let begin = PairingRequest::Begin { name: bounded(name), share: [7; 32] };
         assert_eq!(lab.begin(&begin, &seen).err(), Some(Refusal::Name), "{name:?}");
     }
-    assert_eq!(lab.desk.state(lab.now).unwrap().tries_left, TRIES, "nothing was tried");
+    assert_eq!(lab.server.state(lab.now).unwrap().tries_left, TRIES, "nothing was tried");
 }
 
 proptest! {
@@ -230,25 +235,25 @@ proptest! {
         let (right, wrong) = (Code::from_number(right), Code::from_number(wrong));
         let seen = binding(1);
         // (the client's code, what is done to its first message, does it pair)
-        let tampered = |message: FromApplicant, kind: u8| match (message, kind) {
-            (FromApplicant::Begin { share, .. }, 1) => {
-                FromApplicant::Begin { name: bounded(&other), share }
+        let tampered = |message: PairingRequest, kind: u8| match (message, kind) {
+            (PairingRequest::Begin { share, .. }, 1) => {
+                PairingRequest::Begin { name: bounded(&other), share }
             }
-            (FromApplicant::Begin { name, mut share }, 2) => {
+            (PairingRequest::Begin { name, mut share }, 2) => {
                 share[flip / 8] ^= 1 << (flip % 8);
-                FromApplicant::Begin { name, share }
+                PairingRequest::Begin { name, share }
             }
             (message, _) => message,
         };
         for (text, kind, pairs) in [(right, 0, true), (wrong, 0, false), (right, 1, false), (right, 2, false)] {
             let mut lab = Lab::open(&right.to_string());
-            let (applicant, message) = Applicant::begin(text, "jetson", seen);
+            let (client, message) = PairingClient::begin(text, "jetson", seen);
             let Ok((attempt, share)) = lab.begin(&tampered(message, kind), &seen) else {
                 prop_assert!(kind == 2);
                 continue;
             };
-            let (_, message) = applicant.confirm(&share).unwrap();
-            prop_assert_eq!(lab.desk.confirm(lab.now, attempt, &message).is_ok(), pairs);
+            let (_, message) = client.confirm(&share).unwrap();
+            prop_assert_eq!(lab.server.confirm(lab.now, attempt, &message).is_ok(), pairs);
         }
     }
 
@@ -256,13 +261,13 @@ proptest! {
     fn arbitrary_messages_neither_pair_nor_panic(share: PairingShare, proof: PairingProof) {
         let mut lab = Lab::open("123456");
         let seen = binding(1);
-        let begin = FromApplicant::Begin { name: bounded("x"), share };
+        let begin = PairingRequest::Begin { name: bounded("x"), share };
         if let Ok((attempt, _)) = lab.begin(&begin, &seen) {
-            let end = lab.desk.confirm(lab.now, attempt, &FromApplicant::Confirm { proof });
+            let end = lab.server.confirm(lab.now, attempt, &PairingRequest::Confirm { proof });
             prop_assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
         }
-        let (applicant, _) = Applicant::begin(code("123456"), "x", seen);
-        if let Some((confirming, _)) = applicant.confirm(&share) {
+        let (client, _) = PairingClient::begin(code("123456"), "x", seen);
+        if let Some((confirming, _)) = client.confirm(&share) {
             prop_assert!(!confirming.is_proof(&proof));
         }
     }

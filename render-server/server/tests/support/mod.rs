@@ -23,7 +23,7 @@ use vizflyt_protocol::messages::{
     bounded,
 };
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, decode_body, encode};
-use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, Party, Preamble};
+use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, PeerRole, Preamble};
 use vizflyt_splat::{Splats, ply};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
@@ -99,7 +99,7 @@ impl Server {
     pub fn start_paired(arena: &Path, more: &[&str], others: &[vizflyt_trust::Client]) -> Self {
         let keys = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&keys.path().join("keys"))).unwrap();
-        let instructor = Identity::fleeting().unwrap();
+        let instructor = Identity::ephemeral().unwrap();
         let client = client(&instructor, Role::Instructor, &[]);
         for client in others.iter().cloned().chain([client]) {
             Paired::add(&folder, client).unwrap();
@@ -158,7 +158,7 @@ impl Server {
 
     /// Returns who the server is.
     pub fn fingerprint(&self) -> Fingerprint {
-        Identity::keep(&self.keys(), Owner::Server).unwrap().fingerprint()
+        Identity::load_or_create(&self.keys(), Owner::Server).unwrap().fingerprint()
     }
 
     /// Returns the next line of standard output for which `wanted` yields something.
@@ -351,10 +351,10 @@ impl Client {
     ) -> Self {
         let (endpoint, connection) = connect_as(server, identity, transport).await.unwrap();
         let (mut send, mut recv) = connection.open_bi().await.unwrap();
-        send.write_all(Preamble::of(Party::Runtime).as_bytes()).await.unwrap();
+        send.write_all(Preamble::of(PeerRole::Runtime).as_bytes()).await.unwrap();
         let mut theirs = [0; Preamble::SIZE];
         recv.read_exact(&mut theirs).await.unwrap();
-        assert_eq!(Preamble::check(&theirs, Party::Runtime), Ok(Party::Server));
+        assert_eq!(Preamble::check(&theirs, PeerRole::Runtime), Ok(PeerRole::Server));
         let mut client = Self { connection, send, recv, deframer: Deframer::default(), endpoint };
         client.say(&ToServer::Hello(hello)).await;
         client

@@ -147,7 +147,7 @@ impl Keys {
     pub(crate) fn make() -> Self {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
-        let runtime = Identity::keep(&folder, Owner::Runtime).unwrap();
+        let runtime = Identity::load_or_create(&folder, Owner::Runtime).unwrap();
         let client = Client {
             name: "team".to_owned(),
             fingerprint: runtime.fingerprint(),

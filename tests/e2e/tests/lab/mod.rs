@@ -207,11 +207,11 @@ impl Lab {
         fs::write(&arena, text).unwrap();
 
         let keys = KeysFolder::open(Some(&at("server"))).unwrap();
-        let fingerprint = Identity::keep(&keys, Owner::Server).unwrap().fingerprint();
+        let fingerprint = Identity::load_or_create(&keys, Owner::Server).unwrap().fingerprint();
         let names: Vec<String> = (0..vehicles).map(name).collect();
         for name in &names {
             let own = KeysFolder::open(Some(&at(name))).unwrap();
-            let fingerprint = Identity::keep(&own, Owner::Runtime).unwrap().fingerprint();
+            let fingerprint = Identity::load_or_create(&own, Owner::Runtime).unwrap().fingerprint();
             let vehicles = vec![name.clone()];
             let client = Client { name: name.clone(), fingerprint, role: Role::Team, vehicles };
             Paired::add(&keys, client).unwrap();

@@ -13,7 +13,7 @@ use rustls::pki_types::CertificateDer;
 use tokio::time::timeout;
 use tracing::{info, warn};
 use vizflyt_protocol::messages::{Purpose, ToRuntime, ToServer, bounded};
-use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
 use vizflyt_trust::{Client, Fingerprint};
 use zerocopy::IntoBytes;
 
@@ -67,10 +67,10 @@ async fn talk(
         Err(_) => return (FOREIGN, "nothing was said for 5 s".to_owned()),
     };
     // Ours goes out even to another version: its layout never changes, so that both can tell.
-    if let Err(error) = send.write_all(Preamble::of(Party::Server).as_bytes()).await {
+    if let Err(error) = send.write_all(Preamble::of(PeerRole::Server).as_bytes()).await {
         return gone(&error);
     }
-    if let Err(error) = Preamble::check(&preamble, Party::Server) {
+    if let Err(error) = Preamble::check(&preamble, PeerRole::Server) {
         let reason = error.to_string();
         warn!("{}: {reason}", connection.remote_address());
         let _ = send.finish();

@@ -8,9 +8,9 @@ use quinn::{Connection, RecvStream, SendStream};
 use serde::de::DeserializeOwned;
 use tokio::time::timeout;
 use tracing::{info, warn};
-use vizflyt_protocol::messages::{FromApplicant, ToApplicant, bounded};
+use vizflyt_protocol::messages::{PairingReply, PairingRequest, bounded};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
-use vizflyt_protocol::packet::{Party, Preamble};
+use vizflyt_protocol::packet::{PeerRole, Preamble};
 use vizflyt_trust::pairing::{Binding, EXPORTER_LABEL};
 use zerocopy::IntoBytes;
 
@@ -55,23 +55,23 @@ async fn converse(authorizer: &Authorizer, connection: &Connection) -> Result<St
     let mut stream = Talk { send, deframer: Box::default() };
     let mut preamble = [0; Preamble::SIZE];
     recv.read_exact(&mut preamble).await.map_err(|error| gone(&error))?;
-    let ours = Preamble::of(Party::Server);
+    let ours = Preamble::of(PeerRole::Server);
     stream.send.write_all(ours.as_bytes()).await.map_err(|error| gone(&error))?;
-    if let Err(error) = Preamble::check(&preamble, Party::Server) {
+    if let Err(error) = Preamble::check(&preamble, PeerRole::Server) {
         return Err(linger(connection, (FOREIGN, error.to_string())).await);
     }
 
-    let begin: FromApplicant = stream.read(&mut recv).await?;
+    let begin: PairingRequest = stream.read(&mut recv).await?;
     let (attempt, share) = match authorizer.begin_pairing(&begin, &binding) {
         Ok(begun) => begun,
         Err(refusal) => return Err(stream.refuse(connection, &refusal.to_string()).await),
     };
-    stream.write(&ToApplicant::Share { share }).await?;
-    let confirm: FromApplicant = stream.read(&mut recv).await?;
+    stream.write(&PairingReply::Share { share }).await?;
+    let confirm: PairingRequest = stream.read(&mut recv).await?;
     match authorizer.confirm_pairing(attempt, &confirm, connection.remote_address()) {
         Ok(admitted) => {
             let (proof, grant) = (admitted.proof, admitted.grant);
-            stream.write(&ToApplicant::Paired { proof, grant }).await?;
+            stream.write(&PairingReply::Paired { proof, grant }).await?;
             let _ = stream.send.finish();
             Ok(admitted.client.name)
         }
@@ -85,13 +85,13 @@ struct Talk {
 }
 
 impl Talk {
-    async fn write(&mut self, message: &ToApplicant) -> Result<(), Ending> {
+    async fn write(&mut self, message: &PairingReply) -> Result<(), Ending> {
         let mut buffer = [0; MAX_FRAMED];
         self.send.write_all(encode(message, &mut buffer)).await.map_err(|error| gone(&error))
     }
 
     async fn refuse(mut self, connection: &Connection, reason: &str) -> Ending {
-        if let Err(ending) = self.write(&ToApplicant::Refused(bounded(reason))).await {
+        if let Err(ending) = self.write(&PairingReply::Refused(bounded(reason))).await {
             return ending;
         }
         let _ = self.send.finish();

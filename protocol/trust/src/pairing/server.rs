@@ -4,9 +4,9 @@ use std::time::{Duration, Instant};
 
 use hmac::{Hmac, Mac};
 use sha2::Sha256;
-use vizflyt_protocol::messages::{FromApplicant, Grant, PairingProof, PairingShare};
+use vizflyt_protocol::messages::{Grant, PairingProof, PairingRequest, PairingShare};
 
-use super::{Binding, Code, Side, Transcript, is, start};
+use super::{Binding, Code, PairingRole, Transcript, is, start};
 use crate::paired::is_name;
 use crate::{Client, Fingerprint, Role};
 
@@ -17,7 +17,7 @@ pub const TRIES: u32 = 3;
 
 /// Where computers are paired.
 #[derive(Debug, Default)]
-pub struct Desk {
+pub struct PairingServer {
     window: Option<Window>,
     /// Windows opened so far.
     opened: u64,
@@ -90,7 +90,7 @@ pub struct Admitted {
     pub proof: PairingProof,
 }
 
-impl Desk {
+impl PairingServer {
     /// Opens a window; false while one is open.
     pub fn open(&mut self, now: Instant, code: Code, grant: Grant) -> bool {
         if self.at(now).is_some() {
@@ -124,18 +124,18 @@ impl Desk {
     pub fn begin(
         &mut self,
         now: Instant,
-        message: &FromApplicant,
+        message: &PairingRequest,
         binding: &Binding,
     ) -> Result<(Attempt, PairingShare), Refusal> {
-        let FromApplicant::Begin { name, share } = message else { return Err(Refusal::Foreign) };
+        let PairingRequest::Begin { name, share } = message else { return Err(Refusal::Foreign) };
         if !is_name(name) {
             return Err(Refusal::Name);
         }
         let window = self.at(now).ok_or(Refusal::Closed)?;
-        let (agreement, server_share) = start(Side::B, window.code);
+        let (agreement, server_share) = start(PairingRole::B, window.code);
         let transcript =
             Transcript { binding, name, client_share: share, server_share: &server_share };
-        let proofs = transcript.prove(Side::B, agreement).ok_or(Refusal::Foreign)?;
+        let proofs = transcript.prove(PairingRole::B, agreement).ok_or(Refusal::Foreign)?;
         let attempt = Attempt {
             window: window.number,
             name: name.as_str().to_owned(),
@@ -151,9 +151,9 @@ impl Desk {
         &mut self,
         now: Instant,
         attempt: Attempt,
-        message: &FromApplicant,
+        message: &PairingRequest,
     ) -> Result<Admitted, Refusal> {
-        let FromApplicant::Confirm { proof } = message else { return Err(Refusal::Foreign) };
+        let PairingRequest::Confirm { proof } = message else { return Err(Refusal::Foreign) };
         // The window may have shut meanwhile, and another one opened.
         let window =
             self.at(now).filter(|window| window.number == attempt.window).ok_or(Refusal::Closed)?;
