@@ -12,7 +12,7 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::detect::{Detector, DetectorSettings, Region};
 use vizflyt_tags::family::TagFamily;
-use vizflyt_tags::locate::{LocateSettings, Locator, View};
+use vizflyt_tags::locate::{LocateSettings, Locator, StampedImage};
 use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth, belly_camera, cube, mat, webcams};
 
 fn main() {
@@ -130,13 +130,14 @@ fn speed() {
         .expect("the lab is sound");
         // It is found first.
         for (stamp, image) in &images[..4] {
-            locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+            locator.handle_images(&[StampedImage { camera: 0, stamp: *stamp, image }]);
         }
         time(
             name,
             Box::new(|i| {
                 let (stamp, image) = &images[4 + i];
-                let outcome = locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+                let outcome =
+                    locator.handle_images(&[StampedImage { camera: 0, stamp: *stamp, image }]);
                 assert!(outcome.looks[0].region.is_some(), "tracked");
             }),
         );

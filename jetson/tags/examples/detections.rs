@@ -1,4 +1,4 @@
-//! Draws images of tags and writes what is found in them beside what is there, for others to find the same:
+//! Renders images of tags and writes what is found in them beside what is there, for others to find the same:
 //!
 //! `cargo run --release -p vizflyt-tags --example detections -- FOLDER`
 //!

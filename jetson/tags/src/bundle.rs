@@ -65,7 +65,7 @@ impl<A: Frame, B: Frame> From<Rigid> for Pose<A, B> {
 
 /// What may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Role {
+pub(crate) enum Parameter {
     /// Nothing.
     Fixed,
     /// One pose of many views: a tag of a mat, a camera in the room.
@@ -76,7 +76,7 @@ pub(crate) enum Role {
 
 /// A corner in an image.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Seen {
+pub(crate) struct CornerObservation {
     pub(crate) lens: usize,
     pub(crate) left: usize,
     pub(crate) right: usize,
@@ -89,8 +89,8 @@ pub(crate) struct Seen {
 pub(crate) struct Bundle {
     /// Lenses, and whether each is to be found.
     pub(crate) lenses: Vec<(Intrinsics, bool)>,
-    pub(crate) poses: Vec<(Rigid, Role)>,
-    pub(crate) seen: Vec<Seen>,
+    pub(crate) poses: Vec<(Rigid, Parameter)>,
+    pub(crate) seen: Vec<CornerObservation>,
     /// Corners further off than this hardly count. [px]
     pub(crate) loss_px: f64,
 }
@@ -107,7 +107,7 @@ pub(crate) struct Solution {
     /// Variances of what is shared: lenses, then shared poses, as they stand in the bundle.
     covariance: Symmetric,
     /// Where each pose begins in it.
-    place: Vec<Place>,
+    place: Vec<UnknownBlock>,
 }
 
 impl Solution {
@@ -123,18 +123,18 @@ impl Solution {
     /// zero for one that is fixed. [m]
     pub(crate) fn position_sigma_m(&self, pose: usize) -> DVec3 {
         match self.place[pose] {
-            Place::Shared(at) => {
+            UnknownBlock::Shared(at) => {
                 let sigma = |i: usize| self.covariance.at(at + i, at + i).max(0.0).sqrt();
                 DVec3::new(sigma(0), sigma(1), sigma(2))
             }
-            Place::Fixed | Place::View(_) => DVec3::ZERO,
+            UnknownBlock::Fixed | UnknownBlock::View(_) => DVec3::ZERO,
         }
     }
 }
 
-/// Where a pose's six unknowns are.
+/// The six unknowns of a pose in the normal equations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
+enum UnknownBlock {
     Fixed,
     Shared(usize),
     View(usize),
@@ -142,20 +142,20 @@ enum Place {
 
 impl Bundle {
     /// Adds a pose and returns its number.
-    pub(crate) fn pose(&mut self, pose: impl Into<Rigid>, role: Role) -> usize {
+    pub(crate) fn pose(&mut self, pose: impl Into<Rigid>, role: Parameter) -> usize {
         self.poses.push((pose.into(), role));
         self.poses.len() - 1
     }
 
     /// Returns how far each corner is from where it should be; `None` if that is behind the camera.
-    pub(crate) fn residual(&self, seen: &Seen) -> Option<DVec2> {
+    pub(crate) fn residual(&self, seen: &CornerObservation) -> Option<DVec2> {
         let (left, right) = (&self.poses[seen.left].0, &self.poses[seen.right].0);
         let p_cam = left.apply(right.apply(seen.point_m));
         Some(project(&self.lenses[seen.lens].0, p_cam)?.pixel - seen.pixel)
     }
 
     /// Returns a corner's depth. [m, cam]
-    pub(crate) fn depth_m(&self, seen: &Seen) -> f64 {
+    pub(crate) fn depth_m(&self, seen: &CornerObservation) -> f64 {
         self.poses[seen.left].0.apply(self.poses[seen.right].0.apply(seen.point_m)).z
     }
 
@@ -227,14 +227,14 @@ impl Bundle {
             .poses
             .iter()
             .map(|(_, role)| match role {
-                Role::Fixed => Place::Fixed,
-                Role::Shared => {
+                Parameter::Fixed => UnknownBlock::Fixed,
+                Parameter::Shared => {
                     shared += 6;
-                    Place::Shared(shared - 6)
+                    UnknownBlock::Shared(shared - 6)
                 }
-                Role::View => {
+                Parameter::View => {
                     views += 1;
-                    Place::View(views - 1)
+                    UnknownBlock::View(views - 1)
                 }
             })
             .collect();
@@ -272,9 +272,9 @@ impl Bundle {
         }
         for ((pose, _), place) in moved.poses.iter_mut().zip(&places.place) {
             match *place {
-                Place::Fixed => {}
-                Place::Shared(at) => *pose = pose.moved(&shared[at..at + 6]),
-                Place::View(view) => *pose = pose.moved(&views[view]),
+                UnknownBlock::Fixed => {}
+                UnknownBlock::Shared(at) => *pose = pose.moved(&shared[at..at + 6]),
+                UnknownBlock::View(view) => *pose = pose.moved(&views[view]),
             }
         }
         moved
@@ -316,9 +316,9 @@ impl Bundle {
                 [(seen.left, &by_left), (seen.right, &by_right)].into_iter().enumerate()
             {
                 match places.place[pose] {
-                    Place::Fixed => {}
-                    Place::Shared(at) => shared[i + 1] = (at, derivatives),
-                    Place::View(number) => view = Some((number, derivatives)),
+                    UnknownBlock::Fixed => {}
+                    UnknownBlock::Shared(at) => shared[i + 1] = (at, derivatives),
+                    UnknownBlock::View(number) => view = Some((number, derivatives)),
                 }
             }
             normal.add(&shared, view, residual, weight);
@@ -329,7 +329,7 @@ impl Bundle {
 
 struct Places {
     lens: Vec<Option<usize>>,
-    place: Vec<Place>,
+    place: Vec<UnknownBlock>,
     shared: usize,
     views: usize,
 }

@@ -26,7 +26,7 @@ use std::fmt;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
-use crate::bundle::{Bundle, Rigid, Role, Seen};
+use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid};
 use crate::camera::Calibration;
 use crate::detection::Detection;
 use homography::Plane;
@@ -43,7 +43,7 @@ pub enum LensModel {
 
 /// What became of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum ViewOutcome {
     /// It is used.
     Kept,
     /// Fewer than four of the board's tags are in it.
@@ -58,7 +58,7 @@ pub enum Verdict {
     Enough,
 }
 
-impl fmt::Display for Verdict {
+impl fmt::Display for ViewOutcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Kept => "kept",
@@ -105,7 +105,7 @@ pub struct Calibrated {
 
 /// One view of the board.
 #[derive(Clone, Debug)]
-struct View {
+struct BoardView {
     /// Corners on the board and in the image. [m, board] [px]
     corners: Vec<(DVec2, DVec2)>,
 }
@@ -115,7 +115,7 @@ struct View {
 pub struct Calibrator {
     board: Board,
     size_px: [u32; 2],
-    views: Vec<View>,
+    views: Vec<BoardView>,
     /// Corners of the image before, on the board and in it.
     last: Vec<(DVec2, DVec2)>,
 }
@@ -138,38 +138,47 @@ impl Calibrator {
 
     /// Takes the tags of an image. With `is_stream`, images follow one another closely, and one whose
     /// corners moved since the one before is not kept.
-    pub fn add(&mut self, detections: &[Detection], is_stream: bool) -> Verdict {
-        self.take(self.board.corners_of(detections), Verdict::TooFewTags, is_stream)
+    pub fn add(&mut self, detections: &[Detection], is_stream: bool) -> ViewOutcome {
+        self.take(self.board.corners_of(detections), ViewOutcome::TooFewTags, is_stream)
     }
 
     /// Takes the corners of the checkerboard in an image, as [`Checkerboard::find`] returns them; none if it is not
     /// there. `is_stream` as for [`Self::add`].
     ///
-    /// [`Checkerboard::find`]: crate::checkers::Checkerboard::find
-    pub fn add_checkers(&mut self, corners_px: Option<&[DVec2]>, is_stream: bool) -> Verdict {
-        let corners = corners_px.map_or_else(Vec::new, |corners| self.board.checkers(corners));
-        self.take(corners, Verdict::NoBoard, is_stream)
+    /// [`Checkerboard::find`]: crate::checkerboard::Checkerboard::find
+    pub fn add_checkerboard(
+        &mut self,
+        corners_px: Option<&[DVec2]>,
+        is_stream: bool,
+    ) -> ViewOutcome {
+        let corners = corners_px.map_or_else(Vec::new, |corners| self.board.checkerboard(corners));
+        self.take(corners, ViewOutcome::NoBoard, is_stream)
     }
 
     /// Takes corners on the board and in the image; `absent` says that there are too few.
-    fn take(&mut self, corners: Vec<(DVec2, DVec2)>, absent: Verdict, is_stream: bool) -> Verdict {
+    fn take(
+        &mut self,
+        corners: Vec<(DVec2, DVec2)>,
+        absent: ViewOutcome,
+        is_stream: bool,
+    ) -> ViewOutcome {
         let before = std::mem::replace(&mut self.last, corners.clone());
         if self.views.len() >= MOST_VIEWS {
-            return Verdict::Enough;
+            return ViewOutcome::Enough;
         }
         if corners.len() < self.board.least_corners() {
             return absent;
         }
         if is_stream && !is_still(&before, &corners) {
-            return Verdict::Moving;
+            return ViewOutcome::Moving;
         }
-        let view = View { corners };
+        let view = BoardView { corners };
         let novelty_px = NOVELTY * f64::from(self.size_px[0]);
         if self.views.iter().any(|known| !differs(known, &view, novelty_px)) {
-            return Verdict::KnownView;
+            return ViewOutcome::KnownView;
         }
         self.views.push(view);
-        Verdict::Kept
+        ViewOutcome::Kept
     }
 
     /// Returns where corners were seen and how the board was tilted, by a rough lens.
@@ -205,7 +214,7 @@ impl Calibrator {
             return Err(Refused { why, add: wanted });
         }
         let held_out = |i: usize| i % HELD_OUT == HELD_OUT - 1;
-        let pick = |want: bool| -> Vec<&View> {
+        let pick = |want: bool| -> Vec<&BoardView> {
             let views = self.views.iter().enumerate();
             views.filter(|(i, _)| held_out(*i) == want).map(|(_, view)| view).collect()
         };
@@ -260,20 +269,20 @@ impl Calibrator {
 
 /// Finds the poses of views, and the lens if it is free.
 fn adjust(
-    views: &[&View],
+    views: &[&BoardView],
     lens: Intrinsics,
     is_free: bool,
 ) -> Option<(Bundle, crate::bundle::Solution)> {
     // A rough lens puts corners far off; the loss must not cut them away before the lens has bent.
     let mut bundle =
         Bundle { lenses: vec![(lens, is_free)], loss_px: FIRST_LOSS_PX, ..Bundle::default() };
-    let board = bundle.pose(Rigid::IDENTITY, Role::Fixed);
+    let board = bundle.pose(Rigid::IDENTITY, Parameter::Fixed);
     for view in views {
         let Some(pose) = Plane::fit(&view.corners).and_then(|plane| plane.pose(&lens)) else {
             continue;
         };
-        let left = bundle.pose(pose, Role::View);
-        bundle.seen.extend(view.corners.iter().map(|&(on_board, pixel)| Seen {
+        let left = bundle.pose(pose, Parameter::View);
+        bundle.seen.extend(view.corners.iter().map(|&(on_board, pixel)| CornerObservation {
             lens: 0,
             left,
             right: board,
@@ -346,7 +355,7 @@ fn is_still(before: &[(DVec2, DVec2)], now: &[(DVec2, DVec2)]) -> bool {
 }
 
 /// Whether corners that both views have are this far apart, on average; or none are in both.
-fn differs(a: &View, b: &View, least_px: f64) -> bool {
+fn differs(a: &BoardView, b: &BoardView, least_px: f64) -> bool {
     let (mut sum, mut count) = (0.0, 0);
     for (on_board, pixel) in &a.corners {
         if let Some((_, other)) = b.corners.iter().find(|(point, _)| point == on_board) {

@@ -12,15 +12,15 @@
 //! - [`solve`]: the vehicle's pose from all tags in all cameras;
 //! - [`locate`]: images in, the vehicle's pose out;
 //! - [`print`]: tags on paper; [`capture`]: images from cameras, folders, videos;
-//! - [`checkers`]: a checkerboard in an image; [`calibrate`]: a camera's lens; [`survey`]: where tags and cameras really are;
-//! - [`synth`]: draws what a camera sees of tags, with known truth; [`simulated`]: the webcams of the
+//! - [`checkerboard`]: a checkerboard in an image; [`calibrate`]: a camera's lens; [`survey`]: where tags and cameras really are;
+//! - [`synth`]: renders what a camera sees of tags, with known truth; [`simulated`]: the webcams of the
 //!   simulated lab.
 
 mod bundle;
 pub mod calibrate;
 pub mod camera;
 pub mod capture;
-pub mod checkers;
+pub mod checkerboard;
 pub mod detect;
 pub mod detection;
 pub mod family;

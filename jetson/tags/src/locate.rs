@@ -29,7 +29,7 @@ use crate::detection::Detection;
 use crate::family::TagFamily;
 use crate::image::Gray;
 use crate::layout::{CORNERS, LayoutFrame, Tag, TagLayout};
-use crate::solve::{self, Sight, Sighting};
+use crate::solve::{self, Geometry, Sighting};
 use region::Expected;
 use track::Track;
 
@@ -88,7 +88,7 @@ pub enum LocateError {
 
 /// An image and when it was exposed.
 #[derive(Clone, Copy, Debug)]
-pub struct View<'a> {
+pub struct StampedImage<'a> {
     /// Index of the camera.
     pub camera: usize,
     /// Middle of the exposure.
@@ -135,7 +135,7 @@ pub enum Unlocated {
 
 /// What one camera saw.
 #[derive(Clone, Debug)]
-pub struct Look {
+pub struct CameraResult {
     /// Index of the camera.
     pub camera: usize,
     /// When.
@@ -143,14 +143,14 @@ pub struct Look {
     /// Where it was looked; the whole image if nothing.
     pub region: Option<Region>,
     /// Tags of the layouts.
-    pub seen: Vec<Seen>,
+    pub seen: Vec<TagObservation>,
     /// Tags of no layout, or of one that this camera cannot use.
     pub strangers: Vec<Detection>,
 }
 
 /// A tag of a layout in an image.
 #[derive(Clone, Copy, Debug)]
-pub struct Seen {
+pub struct TagObservation {
     /// The tag.
     pub detection: Detection,
     /// Where the pose puts its corners; absent without one. [px]
@@ -159,23 +159,23 @@ pub struct Seen {
 
 /// What came of a set of images.
 #[derive(Clone, Debug)]
-pub struct Outcome {
+pub struct LocateOutcome {
     /// The pose, or why there is none.
     pub located: Result<Located, Unlocated>,
     /// What each camera saw.
-    pub looks: Vec<Look>,
+    pub looks: Vec<CameraResult>,
 }
 
 /// Locates one vehicle.
 pub struct Locator {
-    stations: Vec<Station>,
+    stations: Vec<CameraState>,
     tags: HashMap<(TagFamily, u32), (LayoutFrame, Tag)>,
     detector: Detector,
     track: Track,
     settings: LocateSettings,
 }
 
-struct Station {
+struct CameraState {
     camera: TagCamera,
     /// What it saw last.
     kept: Option<(HostTime, Vec<Detection>)>,
@@ -225,8 +225,10 @@ impl Locator {
         families.sort_unstable();
         families.dedup();
         let detector = Detector::new(&families, settings.detector.clone());
-        let stations =
-            cameras.into_iter().map(|camera| Station { camera, kept: None, misses: 0 }).collect();
+        let stations = cameras
+            .into_iter()
+            .map(|camera| CameraState { camera, kept: None, misses: 0 })
+            .collect();
         Ok(Self { stations, tags, detector, track: Track::default(), settings })
     }
 
@@ -239,13 +241,13 @@ impl Locator {
     ///
     /// # Panics
     /// If there is no view, a camera has no such index, or an image is not of the camera's size.
-    pub fn handle_images(&mut self, views: &[View]) -> Outcome {
+    pub fn handle_images(&mut self, views: &[StampedImage]) -> LocateOutcome {
         let stamp = views.iter().map(|view| view.stamp).max().expect("there is a view");
         let mut expected = self.track.predict(stamp).map(|pose| (pose, self.track.doubt_m(stamp)));
         let mut looks = Vec::with_capacity(views.len());
         for view in views {
             looks.push(self.look(view, expected.as_ref()));
-            if expected.is_none() && looks.iter().any(|look: &Look| !look.seen.is_empty()) {
+            if expected.is_none() && looks.iter().any(|look: &CameraResult| !look.seen.is_empty()) {
                 // Found by one camera, it is looked for in the right place by the others.
                 let sightings = self.sightings(stamp);
                 let motion = self.track.motion().unwrap_or_default();
@@ -263,10 +265,14 @@ impl Locator {
                 self.expect(look, located);
             }
         }
-        Outcome { located, looks }
+        LocateOutcome { located, looks }
     }
 
-    fn look(&mut self, view: &View, expected: Option<&(Pose<World, Body>, f64)>) -> Look {
+    fn look(
+        &mut self,
+        view: &StampedImage,
+        expected: Option<&(Pose<World, Body>, f64)>,
+    ) -> CameraResult {
         let is_seen_elsewhere = self.is_seen_elsewhere(view);
         let station = &mut self.stations[view.camera];
         let k = station.camera.intrinsics;
@@ -303,13 +309,15 @@ impl Locator {
         if station.kept.as_ref().is_none_or(|(kept, _)| *kept <= view.stamp) {
             station.kept = Some((view.stamp, known.clone()));
         }
-        let seen =
-            known.into_iter().map(|detection| Seen { detection, expected_px: None }).collect();
-        Look { camera: view.camera, stamp: view.stamp, region, seen, strangers }
+        let seen = known
+            .into_iter()
+            .map(|detection| TagObservation { detection, expected_px: None })
+            .collect();
+        CameraResult { camera: view.camera, stamp: view.stamp, region, seen, strangers }
     }
 
     /// Whether a camera other than this view's saw the vehicle in its newest image, not long ago.
-    fn is_seen_elsewhere(&self, view: &View) -> bool {
+    fn is_seen_elsewhere(&self, view: &StampedImage) -> bool {
         self.stations.iter().enumerate().any(|(index, station)| {
             let newest = station.kept.as_ref().filter(|_| index != view.camera);
             newest.is_some_and(|(at, tags)| {
@@ -330,12 +338,14 @@ impl Locator {
             for tag in tags {
                 let Some((_, placed)) = self.tags.get(&(tag.family, tag.id)) else { continue };
                 let sight = match station.camera.mounting {
-                    Mounting::World(world_from_cam) => {
-                        Sight::OutsideIn { world_from_cam, body_from_tag: placed.frame_from_tag() }
-                    }
-                    Mounting::Body(body_from_cam) => {
-                        Sight::InsideOut { body_from_cam, world_from_tag: placed.frame_from_tag() }
-                    }
+                    Mounting::World(world_from_cam) => Geometry::OutsideIn {
+                        world_from_cam,
+                        body_from_tag: placed.frame_from_tag(),
+                    },
+                    Mounting::Body(body_from_cam) => Geometry::InsideOut {
+                        body_from_cam,
+                        world_from_tag: placed.frame_from_tag(),
+                    },
                     Mounting::Unknown => continue,
                 };
                 // What the motion in between may be off moves all corners together: as much is learnt from
@@ -364,7 +374,7 @@ impl Locator {
         if self.track.motion().is_some() { self.settings.most_lag_s } else { TOGETHER_S }
     }
 
-    fn locate(&mut self, stamp: HostTime, looks: &[Look]) -> Result<Located, Unlocated> {
+    fn locate(&mut self, stamp: HostTime, looks: &[CameraResult]) -> Result<Located, Unlocated> {
         if looks.iter().all(|look| look.seen.is_empty()) {
             return Err(Unlocated::NoTag);
         }
@@ -426,7 +436,7 @@ impl Locator {
     }
 
     /// Fills in where the pose puts the corners.
-    fn expect(&self, look: &mut Look, located: &Located) {
+    fn expect(&self, look: &mut CameraResult, located: &Located) {
         let camera = &self.stations[look.camera].camera;
         let lag_s = located.stamp.seconds_since(look.stamp);
         let pose = self.track.motion().unwrap_or_default().carry(&located.world_from_body, -lag_s);

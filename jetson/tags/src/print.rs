@@ -10,13 +10,13 @@
 
 // Why: paper is sold, cut and measured in millimetres; lengths of sheets and shapes end in `_mm`.
 
-mod checkers;
+mod checkerboard;
 mod cube;
 mod mat;
 mod pdf;
 mod sheet;
 
-pub use checkers::checkers;
+pub use checkerboard::checkerboard;
 pub use cube::{CUBE_FACES, Cube};
 pub use mat::Mat;
 pub use pdf::pdf;

@@ -1,7 +1,7 @@
 //! Simulated webcams: where the vehicle truly is goes in, images with the instant of their exposure come
 //! out. Sans-IO.
 //!
-//! [`Truth`] keeps the vehicle's true poses of the last second, as they arrive; [`SimulatedCamera`] draws an
+//! [`Truth`] keeps the vehicle's true poses of the last second, as they arrive; [`SimulatedCamera`] renders an
 //! image once the truth reaches past the end of its exposure. Cameras run free, each with its own phase,
 //! as webcams do.
 
@@ -97,22 +97,22 @@ pub struct SimulatedCamera {
     sensor: Sensor,
     /// Counts the intervals since the clock's zero.
     next: Option<u64>,
-    behind: Option<Behind>,
+    behind: Option<Background>,
 }
 
-/// Draws what is behind the tags for a camera that stands somewhere, an image of its own size.
-pub struct Behind(Box<Draw>);
+/// Renders what is behind the tags for a camera that stands somewhere, an image of its own size.
+pub struct Background(Box<RenderBackground>);
 
-type Draw = dyn FnMut(&Pose<World, Cam>) -> Gray + Send;
+type RenderBackground = dyn FnMut(&Pose<World, Cam>) -> Gray + Send;
 
-impl Behind {
-    /// Draws by calling this.
-    pub fn new(draw: impl FnMut(&Pose<World, Cam>) -> Gray + Send + 'static) -> Self {
-        Self(Box::new(draw))
+impl Background {
+    /// Renders by calling this.
+    pub fn new(render: impl FnMut(&Pose<World, Cam>) -> Gray + Send + 'static) -> Self {
+        Self(Box::new(render))
     }
 }
 
-impl std::fmt::Debug for Behind {
+impl std::fmt::Debug for Background {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str("Behind")
     }
@@ -127,7 +127,7 @@ impl SimulatedCamera {
 
     /// Makes a camera that sees a place behind the tags instead of a cluttered wall.
     #[must_use]
-    pub fn before(camera: TagCamera, sensor: Sensor, behind: Behind) -> Self {
+    pub fn before(camera: TagCamera, sensor: Sensor, behind: Background) -> Self {
         Self { behind: Some(behind), ..Self::new(camera, sensor) }
     }
 
@@ -160,7 +160,7 @@ impl SimulatedCamera {
         (stamp.plus_seconds(half_s) <= newest).then_some(stamp)
     }
 
-    /// Draws the image that is [due](Self::due); `None` if none is. `latest` leaves out all but the newest
+    /// Renders the image that is [due](Self::due); `None` if none is. `latest` leaves out all but the newest
     /// of several that are.
     pub fn expose(
         &mut self,

@@ -19,7 +19,7 @@ use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use crate::family::TagFamily;
 use crate::layout::Square;
-use crate::solve::{Motion, Sight, Sighting, Solved, solve};
+use crate::solve::{Geometry, Motion, Sighting, Solved, solve};
 
 /// Why nothing was surveyed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -81,7 +81,7 @@ fn camera_pose(
         .iter()
         .map(|&(world_from_tag, size_m, corners_px)| Sighting {
             camera: lens,
-            sight: Sight::InsideOut { body_from_cam: Pose::IDENTITY, world_from_tag },
+            sight: Geometry::InsideOut { body_from_cam: Pose::IDENTITY, world_from_tag },
             size_m,
             corners_px,
             sigma_px: SIGMA_PX,
@@ -103,7 +103,7 @@ fn cube_pose(seen: &[OnCube<'_>]) -> Option<Solved> {
         .iter()
         .map(|&(camera, world_from_cam, body_from_tag, size_m, corners_px)| Sighting {
             camera,
-            sight: Sight::OutsideIn { world_from_cam, body_from_tag },
+            sight: Geometry::OutsideIn { world_from_cam, body_from_tag },
             size_m,
             corners_px,
             sigma_px: SIGMA_PX,

@@ -1,4 +1,4 @@
-//! Draws what a camera sees of tags, with known truth: for tests, benchmarks and the simulated lab.
+//! Renders what a camera sees of tags, with known truth: for tests, benchmarks and the simulated lab.
 //!
 //! ```text
 //! Renderer::new(intrinsics)    slope of the ray through every pixel, once per lens
@@ -126,7 +126,7 @@ impl<'a> Shot<'a> {
     }
 }
 
-/// Draws for one lens.
+/// Renders for one lens.
 #[derive(Debug)]
 pub struct Renderer {
     intrinsics: Intrinsics,
@@ -151,12 +151,12 @@ impl Renderer {
         }
     }
 
-    /// Returns the lens it draws for.
+    /// Returns the lens it renders for.
     pub fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics
     }
 
-    /// Draws one exposure.
+    /// Renders one exposure.
     ///
     /// # Panics
     /// If a background is of another size.
@@ -174,7 +174,7 @@ impl Renderer {
         };
         let pattern = Pattern::new(SAMPLES, shot.blur_px);
         for (quad, tag) in Self::farthest_first(shot) {
-            self.draw(&mut albedo, &pattern, &quad, &tag);
+            self.render_tag(&mut albedo, &pattern, &quad, &tag);
         }
         self.expose(&albedo, shot)
     }
@@ -209,7 +209,13 @@ impl Renderer {
         quads.into_iter().map(|(_, quad, tag)| (quad, tag)).collect()
     }
 
-    fn draw(&self, albedo: &mut [f32], pattern: &Pattern, tag_from_slope: &[DMat3], tag: &Tag) {
+    fn render_tag(
+        &self,
+        albedo: &mut [f32],
+        pattern: &Pattern,
+        tag_from_slope: &[DMat3],
+        tag: &Tag,
+    ) {
         let mut kept = self.cells.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let cells = match kept.entry((tag.family, tag.id)) {
             std::collections::hash_map::Entry::Occupied(entry) => entry.into_mut(),

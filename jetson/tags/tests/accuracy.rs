@@ -1,6 +1,6 @@
-//! Is the vehicle located as well as the lab needs, against known truth? Images are drawn with distortion,
+//! Is the vehicle located as well as the lab needs, against known truth? Images are rendered with distortion,
 //! blur of optics and motion, noise, uneven light; before a plain wall, and in the hall as the splat renderer
-//! draws it.
+//! renders it.
 
 mod flights;
 mod hall;
@@ -47,7 +47,7 @@ fn two_webcams_locate_the_cube_along_square_spiral_and_lemniscate() {
     assert!(looked_at < 0.05 * sets as f64, "{looked_at} of {sets}");
 }
 
-/// The room of the lab full of pictures, windows, edges, drawn through the cameras' own lenses.
+/// The room of the lab full of pictures, windows, edges, rendered through the cameras' own lenses.
 #[test]
 fn the_hall_behind_the_tags_changes_nothing() {
     let figures =

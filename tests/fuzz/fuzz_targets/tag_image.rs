@@ -2,7 +2,7 @@
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::capture::{decode, parse_stamps};
-use vizflyt_tags::checkers::Checkerboard;
+use vizflyt_tags::checkerboard::Checkerboard;
 
 fuzz_target!(|bytes: &[u8]| {
     match decode(bytes) {

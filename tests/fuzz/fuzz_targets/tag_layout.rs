@@ -1,7 +1,7 @@
 //! A layout of tags, or a checkerboard: one sentence, or what is written and read again as it is.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_tags::checkers::Checkerboard;
+use vizflyt_tags::checkerboard::Checkerboard;
 use vizflyt_tags::layout::TagLayout;
 
 fuzz_target!(|text: &str| {

@@ -9,7 +9,7 @@ use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::detect::{Detector, DetectorSettings, Region};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::image::Gray;
-use vizflyt_tags::locate::{LocateConfig, LocateSettings, Locator, View};
+use vizflyt_tags::locate::{LocateConfig, LocateSettings, Locator, StampedImage};
 use vizflyt_tags::simulated::{cube, webcams};
 
 fuzz_target!(|data: &[u8]| {
@@ -46,7 +46,8 @@ fuzz_target!(|data: &[u8]| {
             .expect("the lab is sound");
         for ms in [1, 34, 67] {
             let stamp = HostTime::from_ns(ms * 1_000_000);
-            let outcome = locator.handle_images(&[View { camera: 0, stamp, image: &image }]);
+            let outcome =
+                locator.handle_images(&[StampedImage { camera: 0, stamp, image: &image }]);
             if let Ok(located) = outcome.located {
                 assert!(located.world_from_body.is_valid());
                 assert!(located.position_sigma_m.is_finite());

@@ -77,7 +77,7 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
                 world_from_cam: Pose::new(eye_m, heading) * body_from_forward_cam(DVec3::ZERO, 0.0),
                 near_m: 0.1,
                 background: [0.0; 3],
-                air: Atmosphere::CLEAR,
+                atmosphere: Atmosphere::CLEAR,
             }
         };
         (scene.splats, (0..8).map(view).collect())

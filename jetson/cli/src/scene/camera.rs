@@ -85,7 +85,7 @@ fn parse(text: &str) -> Result<Camera> {
         world_from_cam: cam_from_world.inverse(),
         near_m: file.near_m,
         background: file.bg,
-        air: Atmosphere::CLEAR,
+        atmosphere: Atmosphere::CLEAR,
     };
     camera.validate()?;
     Ok(camera)

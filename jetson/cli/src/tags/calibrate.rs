@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, Verdict};
+use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, ViewOutcome};
 use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::capture;
 
@@ -62,7 +62,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
         if let Some(calibrator) = session.progress() {
             let line = guide(calibrator, verdict, is_live);
             if line != said {
-                if is_live || verdict == Verdict::Kept {
+                if is_live || verdict == ViewOutcome::Kept {
                     tell(&line);
                 }
                 said = line;
@@ -106,10 +106,10 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
 }
 
 /// Returns what to do next, in one line.
-fn guide(calibrator: &Calibrator, verdict: Verdict, is_live: bool) -> String {
+fn guide(calibrator: &Calibrator, verdict: ViewOutcome, is_live: bool) -> String {
     let wanted = calibrator.wanted();
     let next = match (verdict, wanted.first()) {
-        (Verdict::Moving | Verdict::TooFewTags | Verdict::NoBoard, _) if is_live => {
+        (ViewOutcome::Moving | ViewOutcome::TooFewTags | ViewOutcome::NoBoard, _) if is_live => {
             verdict.to_string()
         }
         (_, Some(wanted)) => wanted.clone(),

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
-use vizflyt_tags::locate::{LocateSetup, Located, Locator, Outcome, Unlocated, View};
+use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, StampedImage, Unlocated};
 
 use self::sources::{Shot, Sources};
 use self::view::LiveView;
@@ -126,9 +126,13 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     while !stop.load(Ordering::Relaxed) {
         let Some(shots) = sources.next(WAIT)? else { break };
         for set in together(&shots) {
-            let views: Vec<View> = set
+            let views: Vec<StampedImage> = set
                 .iter()
-                .map(|shot| View { camera: shot.camera, stamp: shot.stamp, image: &shot.image })
+                .map(|shot| StampedImage {
+                    camera: shot.camera,
+                    stamp: shot.stamp,
+                    image: &shot.image,
+                })
                 .collect();
             let begun = Instant::now();
             let outcome = locator.handle_images(&views);
@@ -266,7 +270,7 @@ struct Figures {
 }
 
 impl Figures {
-    fn note(&mut self, outcome: &Outcome, image_ms: f64, off_m: Option<f64>) {
+    fn note(&mut self, outcome: &LocateOutcome, image_ms: f64, off_m: Option<f64>) {
         self.sets += 1;
         self.images += outcome.looks.len();
         self.image_ms.push(image_ms);

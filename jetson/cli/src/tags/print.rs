@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use clap::{Args, Subcommand, ValueEnum};
 use glam::DVec3;
 use vizflyt_tags::family::TagFamily;
-use vizflyt_tags::print::{BAR_MM, CUBE_FACES, Cube, Mat, Paper, Printed, checkers, pdf};
+use vizflyt_tags::print::{BAR_MM, CUBE_FACES, Cube, Mat, Paper, Printed, checkerboard, pdf};
 
 use super::family;
 use crate::terminal::tell;
@@ -168,7 +168,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
             ));
         }
         What::Checkers { ref output, paper, square_mm, bar_mm } => {
-            let (sheet, board) = checkers(paper.into(), square_mm, bar_mm)?;
+            let (sheet, board) = checkerboard(paper.into(), square_mm, bar_mm)?;
             let file = beside(output)?;
             write(output, &pdf("VizFlyt checkerboard", &[sheet]))?;
             write(&file, board.to_toml()?.as_bytes())?;

@@ -18,7 +18,7 @@ fn floor(noise_px: f64) -> (Bundle, Bundle) {
     let tags: Vec<usize> = (0..9)
         .map(|i| {
             let t_m = DVec3::new(f64::from(i % 3) * 0.3, f64::from(i / 3) * 0.3, 0.0);
-            let role = if i == 0 { Role::Fixed } else { Role::Shared };
+            let role = if i == 0 { Parameter::Fixed } else { Parameter::Shared };
             truth.pose(Rigid { t_m, q: DQuat::from_rotation_z(f64::from(i)) }, role)
         })
         .collect();
@@ -28,10 +28,11 @@ fn floor(noise_px: f64) -> (Bundle, Bundle) {
             t_m: DVec3::new(-0.3, 0.3, 1.2),
             q: DQuat::from_rotation_x(std::f64::consts::PI),
         };
-        let view = truth.pose(Rigid { t_m: down.t_m + shake.t_m, q: shake.q * down.q }, Role::View);
+        let view =
+            truth.pose(Rigid { t_m: down.t_m + shake.t_m, q: shake.q * down.q }, Parameter::View);
         for &tag in &tags {
             for corner in crate::layout::CORNERS {
-                let mut seen = Seen {
+                let mut seen = CornerObservation {
                     lens: 0,
                     left: view,
                     right: tag,
@@ -46,7 +47,7 @@ fn floor(noise_px: f64) -> (Bundle, Bundle) {
     }
     let mut start = truth.clone();
     for (pose, role) in &mut start.poses {
-        if *role != Role::Fixed {
+        if *role != Parameter::Fixed {
             let off = rigid(&mut random, 0.03, 0.05);
             *pose = Rigid { t_m: pose.t_m + off.t_m, q: pose.q * off.q };
         }
@@ -74,7 +75,7 @@ fn what_it_says_of_its_own_error_is_true() {
     let mut square = 0.0;
     let mut count = 0.0;
     for (i, (pose, role)) in start.poses.iter().enumerate() {
-        if *role == Role::Shared {
+        if *role == Parameter::Shared {
             let z = (pose.t_m - truth.poses[i].0.t_m) / solution.position_sigma_m(i);
             square += z.length_squared();
             count += 3.0;
@@ -99,6 +100,6 @@ fn a_misread_tag_hardly_pulls() {
 #[test]
 fn a_tag_that_nobody_sees_is_not_determined() {
     let (_, mut start) = floor(0.1);
-    start.pose(Rigid::IDENTITY, Role::Shared);
+    start.pose(Rigid::IDENTITY, Parameter::Shared);
     assert!(start.solve().is_none());
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 
 use super::Refused;
-use crate::checkers::Checkerboard;
+use crate::checkerboard::Checkerboard;
 use crate::detection::Detection;
 use crate::file::{self, FileError};
 use crate::layout::TagLayout;
@@ -16,7 +16,7 @@ pub enum Board {
     /// Tags on a plane, any of which may be seen.
     Tags(TagLayout),
     /// A checkerboard, which must be seen as a whole.
-    Checkers(Checkerboard),
+    Checkerboard(Checkerboard),
 }
 
 impl From<TagLayout> for Board {
@@ -27,7 +27,7 @@ impl From<TagLayout> for Board {
 
 impl From<Checkerboard> for Board {
     fn from(board: Checkerboard) -> Self {
-        Self::Checkers(board)
+        Self::Checkerboard(board)
     }
 }
 
@@ -40,7 +40,7 @@ impl Board {
         file::read(path, |text| {
             let table: toml::Table = toml::from_str(text)?;
             if table.contains_key("checkerboard") {
-                return Checkerboard::parse(text).map(Self::Checkers);
+                return Checkerboard::parse(text).map(Self::Checkerboard);
             }
             TagLayout::parse(text).map(Self::Tags)
         })
@@ -64,7 +64,7 @@ impl Board {
     pub(super) fn least_corners(&self) -> usize {
         match self {
             Self::Tags(_) => 4 * LEAST_TAGS,
-            Self::Checkers(board) => board.count(),
+            Self::Checkerboard(board) => board.count(),
         }
     }
 
@@ -79,8 +79,8 @@ impl Board {
     }
 
     /// Returns the corners of a checkerboard likewise.
-    pub(super) fn checkers(&self, corners_px: &[DVec2]) -> Vec<(DVec2, DVec2)> {
-        let Self::Checkers(board) = self else { return Vec::new() };
+    pub(super) fn checkerboard(&self, corners_px: &[DVec2]) -> Vec<(DVec2, DVec2)> {
+        let Self::Checkerboard(board) = self else { return Vec::new() };
         board.corners_m().into_iter().zip(corners_px.iter().copied()).collect()
     }
 }

@@ -1,6 +1,6 @@
 //! From images to a lens: detection, choice of views, and a second look at the chosen ones.
 
-use super::{Board, Calibrated, Calibrator, LensModel, Refused, Verdict};
+use super::{Board, Calibrated, Calibrator, LensModel, Refused, ViewOutcome};
 use crate::detect::{Detector, DetectorSettings};
 use crate::family::TagFamily;
 use crate::image::Gray;
@@ -31,7 +31,7 @@ impl Session {
                 families.dedup();
                 Some(Detector::new(&families, DetectorSettings::default()))
             }
-            Board::Checkers(_) => None,
+            Board::Checkerboard(_) => None,
         };
         Self { board, model, detector, calibrator: None, kept: Vec::new() }
     }
@@ -40,7 +40,7 @@ impl Session {
     ///
     /// # Errors
     /// [`Refused`] if it is of another size than those before, or the board is no board.
-    pub fn take(&mut self, image: Gray, is_stream: bool) -> Result<Verdict, Refused> {
+    pub fn take(&mut self, image: Gray, is_stream: bool) -> Result<ViewOutcome, Refused> {
         let size = [image.width_px(), image.height_px()];
         let calibrator = match &mut self.calibrator {
             Some(calibrator) => calibrator,
@@ -58,15 +58,15 @@ impl Session {
         }
         let rough = Intrinsics::from_horizontal_fov(size[0], size[1], 1.2);
         let verdict = match (&self.board, &mut self.detector) {
-            (Board::Checkers(board), _) => {
-                calibrator.add_checkers(board.find(&image).as_deref(), is_stream)
+            (Board::Checkerboard(board), _) => {
+                calibrator.add_checkerboard(board.find(&image).as_deref(), is_stream)
             }
             (Board::Tags(_), Some(detector)) => {
                 calibrator.add(&detector.search(&image, &rough, false), is_stream)
             }
-            (Board::Tags(_), None) => Verdict::TooFewTags,
+            (Board::Tags(_), None) => ViewOutcome::TooFewTags,
         };
-        if verdict == Verdict::Kept && self.detector.is_some() {
+        if verdict == ViewOutcome::Kept && self.detector.is_some() {
             self.kept.push(image);
         }
         Ok(verdict)

@@ -199,14 +199,14 @@ fn views_that_add_nothing_are_not_kept() {
     let mut calibrator = Calibrator::new(board(), [1280, 720]).unwrap();
     let at = pose(&lens, 4, 0.3, &mut random);
     let view = look(&lens, at, 0.1, &mut random);
-    assert_eq!(calibrator.add(&view[..3], false), Verdict::TooFewTags);
+    assert_eq!(calibrator.add(&view[..3], false), ViewOutcome::TooFewTags);
     // The three tags have not moved since the image before.
-    assert_eq!(calibrator.add(&view, true), Verdict::Kept);
-    assert_eq!(calibrator.add(&look(&lens, at, 0.1, &mut random), true), Verdict::KnownView);
+    assert_eq!(calibrator.add(&view, true), ViewOutcome::Kept);
+    assert_eq!(calibrator.add(&look(&lens, at, 0.1, &mut random), true), ViewOutcome::KnownView);
     let moved = pose(&lens, 0, 0.3, &mut random);
     let view = look(&lens, moved, 0.1, &mut random);
-    assert_eq!(calibrator.add(&view, true), Verdict::Moving);
-    assert_eq!(calibrator.add(&view, true), Verdict::Kept);
+    assert_eq!(calibrator.add(&view, true), ViewOutcome::Moving);
+    assert_eq!(calibrator.add(&view, true), ViewOutcome::Kept);
     assert_eq!(calibrator.views(), 2);
 }
 
@@ -219,12 +219,12 @@ fn a_board_that_is_no_plane_is_refused() {
 
 #[test]
 fn a_lens_is_found_from_images_of_a_checkerboard() {
-    use crate::checkers::tests::{BOARD, PAINTER, pose, webcam};
+    use crate::checkerboard::tests::{BOARD, PAINTER, pose, webcam};
 
     let truth = webcam();
     let mut random = Random::new(8);
     let mut session = Session::new(BOARD, LensModel::BrownConrady);
-    assert_eq!(session.take(Gray::plain(640, 480, 90), false).unwrap(), Verdict::NoBoard);
+    assert_eq!(session.take(Gray::plain(640, 480, 90), false).unwrap(), ViewOutcome::NoBoard);
     for i in 0..45 {
         // Into the corners; where the image cuts the board, it is not found.
         let at = pose(i, 0.75, DVec2::new(158.0, 126.0), &mut random);

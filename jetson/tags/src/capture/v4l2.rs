@@ -13,7 +13,7 @@ use std::time::Duration;
 use super::decode::jpeg;
 use super::{CaptureError, Exposure, ImageSource};
 use crate::image::Gray;
-use ffi::{Buffers, Fourcc, Stamped};
+use ffi::{Buffers, Fourcc, StampKind};
 
 /// A V4L2 camera that streams.
 #[derive(Debug)]
@@ -43,7 +43,7 @@ impl Camera {
     /// # Errors
     /// [`CaptureError`] if it is not there, is no camera, is in use, or has no format known here.
     pub fn open(source: &str) -> Result<Self, CaptureError> {
-        let (path, wish) = parse(source).map_err(|why| CaptureError::unfit(source, why))?;
+        let (path, request) = parse(source).map_err(|why| CaptureError::unfit(source, why))?;
         let io = |error| CaptureError::io(path, error);
         let file: File = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
         if !ffi::streams(&file).map_err(|_| {
@@ -57,7 +57,8 @@ impl Camera {
         }
         let mut layout = None;
         for kind in Fourcc::ALL {
-            let found = ffi::set_format(&file, kind, [wish.width, wish.height]).map_err(io)?;
+            let found =
+                ffi::set_format(&file, kind, [request.width, request.height]).map_err(io)?;
             if found.kind == kind {
                 layout = Some(found);
                 break;
@@ -68,14 +69,14 @@ impl Camera {
                        `| gst-launch-1.0 ...`";
             return Err(CaptureError::unfit(path, why));
         };
-        if (layout.width, layout.height) != (wish.width, wish.height) {
+        if (layout.width, layout.height) != (request.width, request.height) {
             let why = format!(
                 "it gives {}x{} where {}x{} was asked for; a calibration holds for one size",
-                layout.width, layout.height, wish.width, wish.height
+                layout.width, layout.height, request.width, request.height
             );
             return Err(CaptureError::unfit(path, why));
         }
-        let period_ns = ffi::set_rate(&file, wish.rate_hz).unwrap_or(1_000_000_000 / 30);
+        let period_ns = ffi::set_rate(&file, request.rate_hz).unwrap_or(1_000_000_000 / 30);
         let exposure_ns = ffi::exposure_ns(&file).unwrap_or(0);
         let buffers = Buffers::start(file).map_err(io)?;
         Ok(Self { name: path.to_owned(), buffers, layout, period_ns, exposure_ns })
@@ -110,37 +111,37 @@ impl ImageSource for Camera {
 
 /// What is asked of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Wish {
+struct FormatRequest {
     width: u32,
     height: u32,
     rate_hz: u32,
 }
 
 /// Reads `/dev/video0:1280x720@60`.
-fn parse(source: &str) -> Result<(&str, Wish), String> {
-    let mut wish = Wish { width: 1280, height: 720, rate_hz: 60 };
-    let Some((path, mode)) = source.split_once(':') else { return Ok((source, wish)) };
+fn parse(source: &str) -> Result<(&str, FormatRequest), String> {
+    let mut request = FormatRequest { width: 1280, height: 720, rate_hz: 60 };
+    let Some((path, mode)) = source.split_once(':') else { return Ok((source, request)) };
     let wrong = || format!("{mode:?} is no mode; write it as 1280x720 or 1280x720@60");
     let (size, rate) = mode.split_once('@').unwrap_or((mode, "60"));
     let (width, height) = size.split_once('x').ok_or_else(wrong)?;
-    wish.width = width.parse().map_err(|_| wrong())?;
-    wish.height = height.parse().map_err(|_| wrong())?;
-    wish.rate_hz = rate.parse().map_err(|_| wrong())?;
-    super::decode::check(wish.width, wish.height)?;
-    if !(1..=1000).contains(&wish.rate_hz) {
+    request.width = width.parse().map_err(|_| wrong())?;
+    request.height = height.parse().map_err(|_| wrong())?;
+    request.rate_hz = rate.parse().map_err(|_| wrong())?;
+    super::decode::check(request.width, request.height)?;
+    if !(1..=1000).contains(&request.rate_hz) {
         return Err(wrong());
     }
-    Ok((path, wish))
+    Ok((path, request))
 }
 
 /// Returns when the middle row's exposure was half over.
-fn middle_ns(stamp_ns: u64, stamped: Stamped, period_ns: u64, exposure_ns: u64) -> u64 {
+fn middle_ns(stamp_ns: u64, stamped: StampKind, period_ns: u64, exposure_ns: u64) -> u64 {
     // Rows are read one after the other, over nearly the whole period: the middle row is half of it
     // later than the first.
     let half_readout_ns = period_ns / 2;
     match stamped {
-        Stamped::ExposureBegan => stamp_ns + exposure_ns / 2 + half_readout_ns,
-        Stamped::LastByte => stamp_ns.saturating_sub(half_readout_ns + exposure_ns / 2),
+        StampKind::ExposureBegan => stamp_ns + exposure_ns / 2 + half_readout_ns,
+        StampKind::LastByte => stamp_ns.saturating_sub(half_readout_ns + exposure_ns / 2),
     }
 }
 
@@ -172,9 +173,12 @@ mod tests {
 
     #[test]
     fn modes_are_read() {
-        let wish = Wish { width: 640, height: 480, rate_hz: 120 };
-        assert_eq!(parse("/dev/video2:640x480@120"), Ok(("/dev/video2", wish)));
-        assert_eq!(parse("/dev/video2").unwrap().1, Wish { width: 1280, height: 720, rate_hz: 60 });
+        let request = FormatRequest { width: 640, height: 480, rate_hz: 120 };
+        assert_eq!(parse("/dev/video2:640x480@120"), Ok(("/dev/video2", request)));
+        assert_eq!(
+            parse("/dev/video2").unwrap().1,
+            FormatRequest { width: 1280, height: 720, rate_hz: 60 }
+        );
         for wrong in
             ["/dev/video0:640", "/dev/video0:0x480", "/dev/video0:640x480@0", "/dev/video0:axb"]
         {
@@ -199,8 +203,8 @@ mod tests {
         let ms = 1_000_000;
         // Shutter open for 4 ms, images every 16 ms, the first row's exposure begins at 100 ms: the
         // middle row is exposed from 108 to 112 ms, the last byte is read at 120 ms.
-        let began = middle_ns(100 * ms, Stamped::ExposureBegan, 16 * ms, 4 * ms);
-        let ended = middle_ns(120 * ms, Stamped::LastByte, 16 * ms, 4 * ms);
+        let began = middle_ns(100 * ms, StampKind::ExposureBegan, 16 * ms, 4 * ms);
+        let ended = middle_ns(120 * ms, StampKind::LastByte, 16 * ms, 4 * ms);
         assert_eq!((began, ended), (110 * ms, 110 * ms));
     }
 }

@@ -180,7 +180,7 @@ fn default_tilt() -> f64 {
     LocateSettings::default().most_tilt_rad.to_degrees()
 }
 
-/// The source of a camera that is drawn by the truth.
+/// The source of a camera that is rendered from the truth.
 pub const SIMULATED: &str = "simulated";
 /// As many as one computer's USB carries.
 const MOST_CAMERAS: usize = 8;

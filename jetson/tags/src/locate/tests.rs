@@ -57,7 +57,7 @@ fn one_far_face_is_open_until_it_is_decided_and_is_then_true() {
     let mut locator = locator(vec![camera.clone()], &layouts);
     let (mut open, mut located) = (0, 0);
     for (stamp, image) in images(&camera, &layouts, pose_at, 1500) {
-        match locator.handle_images(&[View { camera: 0, stamp, image: &image }]).located {
+        match locator.handle_images(&[StampedImage { camera: 0, stamp, image: &image }]).located {
             Ok(found) => {
                 located += 1;
                 let truth = pose_at(stamp.seconds_since(at(0)));
@@ -82,7 +82,7 @@ fn strangers_lead_nowhere_and_absence_is_said() {
     let pose_at = |_| Pose::new(DVec3::new(4.0, 0.0, 1.5), DQuat::IDENTITY);
     let mut locator = locator(vec![camera.clone()], &[cube()]);
     for (stamp, image) in images(&camera, &[other], pose_at, 100) {
-        let outcome = locator.handle_images(&[View { camera: 0, stamp, image: &image }]);
+        let outcome = locator.handle_images(&[StampedImage { camera: 0, stamp, image: &image }]);
         assert_eq!(outcome.located.err(), Some(Unlocated::NoTag));
         assert!(outcome.looks[0].strangers.iter().all(|tag| tag.id >= 50));
         assert!(!outcome.looks[0].strangers.is_empty());
@@ -101,7 +101,7 @@ fn it_is_found_again_elsewhere_and_old_images_are_refused() {
     let mut locator = locator(vec![camera.clone()], &[cube()]);
     let mut last = None;
     for (stamp, image) in &all {
-        let outcome = locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+        let outcome = locator.handle_images(&[StampedImage { camera: 0, stamp: *stamp, image }]);
         if let Ok(found) = outcome.located {
             let truth = pose_at(stamp.seconds_since(at(0)));
             let off_m = found.world_from_body.translation_m.distance(truth.translation_m);
@@ -117,7 +117,7 @@ fn it_is_found_again_elsewhere_and_old_images_are_refused() {
     }
     assert!(last.expect("it was found").seconds_since(at(0)) > 0.9, "found again");
     let (stamp, image) = &all[3];
-    let outcome = locator.handle_images(&[View { camera: 0, stamp: *stamp, image }]);
+    let outcome = locator.handle_images(&[StampedImage { camera: 0, stamp: *stamp, image }]);
     assert!(matches!(outcome.located, Err(Unlocated::Old | Unlocated::NoTag)));
 }
 
@@ -139,7 +139,8 @@ fn a_camera_at_whose_border_it_is_does_not_hold_up_the_one_that_sees_it() {
     let mut locator = locator(cameras, &[cube()]);
     let (mut hidden, mut found) = (0, 0);
     for (stamp, camera, image) in &all {
-        let outcome = locator.handle_images(&[View { camera: *camera, stamp: *stamp, image }]);
+        let outcome =
+            locator.handle_images(&[StampedImage { camera: *camera, stamp: *stamp, image }]);
         if stamp.seconds_since(at(0)) < 0.2 {
             continue;
         }

@@ -1,7 +1,7 @@
 //! How the vehicle moves, and which of two answers is true.
 //!
 //! Where one square is all that is seen, two poses explain it. Both are kept, each with a penalty in the
-//! units of [`crate::solve::Fit::cost`]: what its corners cost more than the other's, summed over the
+//! units of [`crate::solve::PoseFit::cost`]: what its corners cost more than the other's, summed over the
 //! images, and what it would have turned against its own motion. The false one tilts the other way with
 //! every motion, and its penalty grows; a second tag ends it at once.
 
@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
-use crate::solve::{Fit, Motion, Solved};
+use crate::solve::{Motion, PoseFit, Solved};
 
 /// What is known of the vehicle's way.
 #[derive(Debug, Default)]
@@ -56,13 +56,13 @@ impl Track {
         stamp: HostTime,
         solved: &Solved,
         most_tilt_rad: f64,
-    ) -> Option<Fit> {
+    ) -> Option<PoseFit> {
         let stale = |h: &Hypothesis| h.predict(stamp).is_none();
         if self.hypotheses.iter().all(stale) {
             self.hypotheses.clear();
         }
         let fits = [Some(solved.best), solved.other];
-        let mut next: Vec<(Hypothesis, Fit)> = Vec::with_capacity(2);
+        let mut next: Vec<(Hypothesis, PoseFit)> = Vec::with_capacity(2);
         for fit in fits.into_iter().flatten() {
             let pose = fit.world_from_body;
             let up = (pose.rotation * DVec3::Z).z.clamp(-1.0, 1.0);

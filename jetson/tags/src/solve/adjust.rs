@@ -7,12 +7,12 @@
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
 
-use super::{Motion, Sight, Sighting};
+use super::{Geometry, Motion, Sighting};
 use crate::layout::CORNERS;
 
 /// A pose and how well it explains the corners.
 #[derive(Clone, Copy, Debug)]
-pub struct Fit {
+pub struct PoseFit {
     /// The vehicle's pose.
     pub world_from_body: Pose<World, Body>,
     /// Covariance of position (three, world axes) and attitude (three, about body axes). [m, rad]
@@ -23,7 +23,7 @@ pub struct Fit {
     pub cost: f64,
 }
 
-impl Fit {
+impl PoseFit {
     /// Returns one standard deviation of each of the six unknowns. [m, world; rad, body]
     pub fn sigmas(&self) -> (DVec3, DVec3) {
         let sigma = |i: usize| self.covariance[i][i].max(0.0).sqrt();
@@ -62,7 +62,7 @@ pub(super) fn adjust(
     sightings: &[Sighting],
     motion: &Motion,
     start: Pose<World, Body>,
-) -> Option<Fit> {
+) -> Option<PoseFit> {
     let mut pose = start;
     let mut normal = Normal::at(sightings, motion, &pose)?;
     let mut damping = 1e-4;
@@ -108,7 +108,7 @@ pub(super) fn adjust(
         }
     }
     let corners = normal.corners as f64;
-    let fit = Fit {
+    let fit = PoseFit {
         world_from_body: pose,
         covariance,
         rms_px: (normal.square_sum_px2 / corners).sqrt(),
@@ -197,14 +197,14 @@ impl Normal {
 fn in_cam(sighting: &Sighting, pose: &Pose<World, Body>, p_tag: DVec3) -> (DVec3, DMat3, DMat3) {
     let rotation = DMat3::from_quat(pose.rotation);
     match &sighting.sight {
-        Sight::OutsideIn { world_from_cam, body_from_tag } => {
+        Geometry::OutsideIn { world_from_cam, body_from_tag } => {
             let p_body = body_from_tag.transform_point(p_tag);
             let cam_from_world = world_from_cam.inverse();
             let p_cam = cam_from_world.transform_point(pose.transform_point(p_body));
             let by_world = DMat3::from_quat(cam_from_world.rotation);
             (p_cam, by_world, by_world * rotation * -cross(p_body))
         }
-        Sight::InsideOut { body_from_cam, world_from_tag } => {
+        Geometry::InsideOut { body_from_cam, world_from_tag } => {
             let p_world = world_from_tag.transform_point(p_tag);
             let p_body = rotation.transpose() * (p_world - pose.translation_m);
             let cam_from_body = body_from_cam.inverse();

@@ -19,16 +19,16 @@ mod adjust;
 mod opencv;
 mod plane;
 
-pub use adjust::Fit;
+pub use adjust::PoseFit;
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use crate::layout::Square;
 
-/// How a camera and a tag hang together with the pose that is looked for.
+/// How camera and tag relate to the unknown pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Sight {
+pub enum Geometry {
     /// A camera fixed in the room sees a tag on the vehicle.
     OutsideIn {
         /// Where the camera is.
@@ -51,7 +51,7 @@ pub struct Sighting<'a> {
     /// The camera's lens.
     pub camera: &'a Intrinsics,
     /// Camera and tag.
-    pub sight: Sight,
+    pub sight: Geometry,
     /// Edge of the tag's square. [m]
     pub size_m: f64,
     /// Its corners, in the layout's order. [px]
@@ -86,10 +86,10 @@ impl Motion {
 #[derive(Clone, Copy, Debug)]
 pub struct Solved {
     /// The pose that explains the corners best.
-    pub best: Fit,
+    pub best: PoseFit,
     /// Another minimum, turned by more than a few degrees, that explains them nearly as well:
     /// corners alone do not decide.
-    pub other: Option<Fit>,
+    pub other: Option<PoseFit>,
 }
 
 /// Returns the pose from all sightings; `None` where no start leads to one.
@@ -120,7 +120,7 @@ pub fn solve(
         add(expected);
     }
     starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let mut fits: Vec<Fit> = Vec::with_capacity(2);
+    let mut fits: Vec<PoseFit> = Vec::with_capacity(2);
     let mut tried: Vec<DQuat> = Vec::with_capacity(MOST_STARTS);
     for (_, start) in starts {
         // Starts in the same valley end in the same place.
@@ -129,7 +129,7 @@ pub fn solve(
         }
         tried.push(start.rotation);
         if let Some(fit) = adjust::adjust(sightings, motion, start) {
-            let turned = |known: &Fit| {
+            let turned = |known: &PoseFit| {
                 known.world_from_body.rotation.angle_between(fit.world_from_body.rotation)
             };
             match fits.iter_mut().find(|known| turned(known) < SAME_ANSWER_RAD) {
@@ -170,12 +170,12 @@ fn square(Sighting { camera, size_m, corners_px, .. }: &Sighting) -> Vec<Pose<Ca
     plane::poses(camera, *size_m, corners_px)
 }
 
-fn world_from_body(sight: &Sight, cam_from_tag: &Pose<Cam, Square>) -> Pose<World, Body> {
+fn world_from_body(sight: &Geometry, cam_from_tag: &Pose<Cam, Square>) -> Pose<World, Body> {
     match sight {
-        Sight::OutsideIn { world_from_cam, body_from_tag } => {
+        Geometry::OutsideIn { world_from_cam, body_from_tag } => {
             *world_from_cam * *cam_from_tag * body_from_tag.inverse()
         }
-        Sight::InsideOut { body_from_cam, world_from_tag } => {
+        Geometry::InsideOut { body_from_cam, world_from_tag } => {
             *world_from_tag * cam_from_tag.inverse() * body_from_cam.inverse()
         }
     }

@@ -9,7 +9,7 @@ use opencv::core::{CV_64F, Mat, Point2d, Point3d, Vector, no_array};
 use opencv::prelude::{MatExprTraitConst, MatTraitConst};
 use vizflyt_protocol::geometry::{Body, Cam, Frame, Intrinsics, Pose, World};
 
-use super::{Sight, Sighting};
+use super::{Geometry, Sighting};
 use crate::layout::{CORNERS, Square};
 
 /// As [`super::plane::poses`], by IPPE.
@@ -42,10 +42,10 @@ pub(super) fn joint(sightings: &[Sighting]) -> Vec<(Pose<World, Body>, f64)> {
                 CORNERS.iter().zip(sighting.corners_px).map(|(corner, pixel)| {
                     let p_tag = (*corner * sighting.size_m).extend(0.0);
                     let p = match &sighting.sight {
-                        Sight::OutsideIn { body_from_tag, .. } => {
+                        Geometry::OutsideIn { body_from_tag, .. } => {
                             body_from_tag.transform_point(p_tag)
                         }
-                        Sight::InsideOut { world_from_tag, .. } => {
+                        Geometry::InsideOut { world_from_tag, .. } => {
                             world_from_tag.transform_point(p_tag)
                         }
                     };
@@ -55,11 +55,11 @@ pub(super) fn joint(sightings: &[Sighting]) -> Vec<(Pose<World, Body>, f64)> {
             .collect();
         let method = SolvePnPMethod::SOLVEPNP_SQPNP;
         match first.sight {
-            Sight::OutsideIn { world_from_cam, .. } => {
+            Geometry::OutsideIn { world_from_cam, .. } => {
                 let poses = poses::<Body>(first.camera, &points, method);
                 found.extend(poses.into_iter().map(|p| (world_from_cam * p, first.lag_s)));
             }
-            Sight::InsideOut { body_from_cam, .. } => {
+            Geometry::InsideOut { body_from_cam, .. } => {
                 let poses = poses::<World>(first.camera, &points, method);
                 let body = |p: Pose<Cam, World>| (body_from_cam * p).inverse();
                 found.extend(poses.into_iter().map(|p| (body(p), first.lag_s)));
@@ -73,12 +73,13 @@ pub(super) fn joint(sightings: &[Sighting]) -> Vec<(Pose<World, Body>, f64)> {
 fn is_one_image(a: &Sighting, b: &Sighting) -> bool {
     let same_place = match (&a.sight, &b.sight) {
         (
-            Sight::OutsideIn { world_from_cam: a, .. },
-            Sight::OutsideIn { world_from_cam: b, .. },
+            Geometry::OutsideIn { world_from_cam: a, .. },
+            Geometry::OutsideIn { world_from_cam: b, .. },
         ) => a == b,
-        (Sight::InsideOut { body_from_cam: a, .. }, Sight::InsideOut { body_from_cam: b, .. }) => {
-            a == b
-        }
+        (
+            Geometry::InsideOut { body_from_cam: a, .. },
+            Geometry::InsideOut { body_from_cam: b, .. },
+        ) => a == b,
         _ => false,
     };
     same_place && a.camera == b.camera && a.lag_s == b.lag_s
@@ -212,7 +213,7 @@ mod tests {
                     continue;
                 }
                 let Some(corners_px) = corners(&cam_from_tag, &[0.0; 8]) else { continue };
-                let sight = Sight::OutsideIn { world_from_cam, body_from_tag };
+                let sight = Geometry::OutsideIn { world_from_cam, body_from_tag };
                 sightings.push(Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.01 });
             }
             prop_assume!(sightings.len() >= 2);

@@ -32,15 +32,15 @@ fn looking(from: DVec3, at: DVec3) -> Pose<World, Cam> {
 
 fn seen<'a>(
     camera: &'a Intrinsics,
-    sight: Sight,
+    sight: Geometry,
     truth: &Pose<World, Body>,
     noise_px: impl FnMut() -> DVec2,
 ) -> Option<Sighting<'a>> {
     let cam_from_tag = match sight {
-        Sight::OutsideIn { world_from_cam, body_from_tag } => {
+        Geometry::OutsideIn { world_from_cam, body_from_tag } => {
             world_from_cam.inverse() * *truth * body_from_tag
         }
-        Sight::InsideOut { body_from_cam, world_from_tag } => {
+        Geometry::InsideOut { body_from_cam, world_from_tag } => {
             body_from_cam.inverse() * truth.inverse() * world_from_tag
         }
     };
@@ -86,7 +86,7 @@ fn cube_seen<'a>(
     let mut all = Vec::new();
     for &world_from_cam in cameras {
         for normal in FACES {
-            let sight = Sight::OutsideIn { world_from_cam, body_from_tag: face(normal) };
+            let sight = Geometry::OutsideIn { world_from_cam, body_from_tag: face(normal) };
             all.extend(seen(camera, sight, truth, &mut *noise_px));
         }
     }
@@ -138,7 +138,7 @@ proptest! {
         let camera = webcam();
         let [a, b, c, d, e, f, g, h] = corners;
         let corners_px = [DVec2::new(a, b), DVec2::new(c, d), DVec2::new(e, f), DVec2::new(g, h)];
-        let sight = Sight::OutsideIn { world_from_cam: Pose::IDENTITY, body_from_tag: Pose::IDENTITY };
+        let sight = Geometry::OutsideIn { world_from_cam: Pose::IDENTITY, body_from_tag: Pose::IDENTITY };
         let sighting = Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.0 };
         if let Some(solved) = solve(&[sighting], &Motion::default(), None) {
             prop_assert!(solved.best.world_from_body.is_valid());
@@ -163,7 +163,7 @@ fn inside_out_and_outside_in_are_one_mathematics() {
     let mut noise_px = noise(3, 0.1);
     for (x, y) in [(0.0, 0.0), (0.3, 0.0), (0.3, -0.3), (0.6, -0.3)] {
         let world_from_tag = Pose::new(DVec3::new(x, y, 0.0), DQuat::from_rotation_z(x));
-        let sight = Sight::InsideOut { body_from_cam, world_from_tag };
+        let sight = Geometry::InsideOut { body_from_cam, world_from_tag };
         all.extend(seen(&camera, sight, &truth, &mut noise_px));
     }
     assert!(all.len() >= 3, "{} tags are in the picture", all.len());
@@ -205,7 +205,7 @@ fn a_far_square_seen_from_the_front_keeps_both_answers() {
     let camera = webcam();
     let truth = Pose::new(DVec3::new(6.0, 0.0, 0.0), DQuat::from_rotation_y(0.12));
     let world_from_cam = looking(DVec3::ZERO, DVec3::X);
-    let sight = Sight::OutsideIn { world_from_cam, body_from_tag: face(DVec3::NEG_X) };
+    let sight = Geometry::OutsideIn { world_from_cam, body_from_tag: face(DVec3::NEG_X) };
     let both = (0..50).filter(|&seed| {
         let one = seen(&camera, sight, &truth, noise(seed + 1, 0.1)).unwrap();
         let solved = solve(&[one], &Motion::default(), None).unwrap();

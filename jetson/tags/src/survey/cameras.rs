@@ -4,7 +4,7 @@ use glam::DVec2;
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose, cube_pose};
-use crate::bundle::{Bundle, Rigid, Role, Seen};
+use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid};
 use crate::detection::Detection;
 use crate::layout::{CORNERS, TagLayout};
 
@@ -165,11 +165,11 @@ fn adjust(
     bodies: &[Option<Pose<World, Body>>],
 ) -> Result<Vec<PlacedCamera>, SurveyError> {
     let mut bundle = Bundle { loss_px: LOSS_PX, ..Bundle::default() };
-    let world = bundle.pose(Rigid::IDENTITY, Role::Fixed);
+    let world = bundle.pose(Rigid::IDENTITY, Parameter::Fixed);
     let numbers: Vec<usize> =
-        start.iter().map(|pose| bundle.pose(pose.inverse(), Role::Shared)).collect();
+        start.iter().map(|pose| bundle.pose(pose.inverse(), Parameter::Shared)).collect();
     let moments: Vec<Option<usize>> =
-        bodies.iter().map(|body| body.map(|body| bundle.pose(body, Role::View))).collect();
+        bodies.iter().map(|body| body.map(|body| bundle.pose(body, Parameter::View))).collect();
     for (lens, (camera, &left)) in cameras.iter().zip(&numbers).enumerate() {
         bundle.lenses.push((camera.intrinsics, false));
         for (moment, image) in camera.images.iter().enumerate() {
@@ -181,7 +181,7 @@ fn adjust(
                 let on_mat = mat.find(d.family, d.id).map(|tag| (tag, world));
                 let Some((tag, right)) = on_mat.or_else(on_cube) else { continue };
                 for (point_m, pixel) in tag.corners_m().into_iter().zip(d.corners_px) {
-                    bundle.seen.push(Seen { lens, left, right, point_m, pixel });
+                    bundle.seen.push(CornerObservation { lens, left, right, point_m, pixel });
                 }
             }
         }

@@ -6,7 +6,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose};
-use crate::bundle::{Bundle, Role, Seen};
+use crate::bundle::{Bundle, CornerObservation, Parameter};
 use crate::detection::Detection;
 use crate::family::TagFamily;
 use crate::layout::{CORNERS, LayoutFrame, Square, Tag, TagLayout};
@@ -295,7 +295,7 @@ fn adjust(
         .tags
         .iter()
         .map(|(key, pose)| {
-            let role = if Some(*key) == held { Role::Fixed } else { Role::Shared };
+            let role = if Some(*key) == held { Parameter::Fixed } else { Parameter::Shared };
             (*key, bundle.pose(*pose, role))
         })
         .collect();
@@ -307,11 +307,11 @@ fn adjust(
         if tags().count() < 1 {
             continue;
         }
-        let left = bundle.pose(world_from_cam.inverse(), Role::View);
+        let left = bundle.pose(world_from_cam.inverse(), Parameter::View);
         for (&right, size_m, corners_px) in tags() {
             for (corner, &pixel) in CORNERS.iter().zip(corners_px) {
                 let point_m = (*corner * size_m).extend(0.0);
-                bundle.seen.push(Seen { lens: 0, left, right, point_m, pixel });
+                bundle.seen.push(CornerObservation { lens: 0, left, right, point_m, pixel });
             }
         }
     }
@@ -322,7 +322,7 @@ fn adjust(
 }
 
 /// Returns the distance of corners from where the answer puts them, at the corner. [m]
-fn rms_m(bundle: &Bundle, lens: &Intrinsics, which: impl Fn(&Seen) -> bool) -> f64 {
+fn rms_m(bundle: &Bundle, lens: &Intrinsics, which: impl Fn(&CornerObservation) -> bool) -> f64 {
     let (mut sum, mut count) = (0.0, 0u32);
     for seen in bundle.seen.iter().filter(|seen| which(seen)) {
         if let Some(residual) = bundle.residual(seen) {

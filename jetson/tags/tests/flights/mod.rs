@@ -5,7 +5,7 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::layout::TagLayout;
-use vizflyt_tags::locate::{LocateSettings, Locator, View};
+use vizflyt_tags::locate::{LocateSettings, Locator, StampedImage};
 use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth};
 
 /// A path, by the way flown on it. [m -> m, world]
@@ -140,9 +140,9 @@ pub(crate) fn locate(
         if images.is_empty() {
             continue;
         }
-        let views: Vec<View> = images
+        let views: Vec<StampedImage> = images
             .iter()
-            .map(|(camera, (stamp, image))| View { camera: *camera, stamp: *stamp, image })
+            .map(|(camera, (stamp, image))| StampedImage { camera: *camera, stamp: *stamp, image })
             .collect();
         let outcome = locator.handle_images(&views);
         figures.sets += 1;

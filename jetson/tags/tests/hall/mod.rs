@@ -1,4 +1,4 @@
-//! The lab's hall behind the tags: generated splats, drawn by the renderer of the images.
+//! The lab's hall behind the tags: generated splats, rendered as the images are.
 
 use std::sync::{Arc, Mutex};
 
@@ -7,7 +7,7 @@ use vizflyt_scenes::{SceneKind, generate};
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage};
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
-use vizflyt_tags::simulated::{Behind, Sensor, SimulatedCamera};
+use vizflyt_tags::simulated::{Background, Sensor, SimulatedCamera};
 
 /// Returns the cameras in the hall, spread over the interval as free webcams are.
 pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
@@ -15,16 +15,16 @@ pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
     let count = cameras.len() as f64;
     let seen = cameras.into_iter().enumerate().map(|(i, camera)| {
         let sensor = Sensor { phase: i as f64 / count, ..Sensor::default() };
-        let behind = drawn(hall.clone(), camera.intrinsics);
+        let behind = background(hall.clone(), camera.intrinsics);
         SimulatedCamera::before(camera, sensor, behind)
     });
     seen.collect()
 }
 
-/// Draws for one lens; again only where the camera has moved.
-fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
+/// Renders for one lens; again only where the camera has moved.
+fn background(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Background {
     let mut last: Option<(Pose<World, Cam>, Gray)> = None;
-    Behind::new(move |world_from_cam: &Pose<World, Cam>| {
+    Background::new(move |world_from_cam: &Pose<World, Cam>| {
         if let Some((at, image)) = &last
             && at == world_from_cam
         {
@@ -35,7 +35,7 @@ fn drawn(hall: Arc<Mutex<CpuRenderer>>, intrinsics: Intrinsics) -> Behind {
         hall.lock()
             .expect("no test panics here")
             .render(&[], &[camera], &mut images)
-            .expect("drawn");
+            .expect("rendered");
         let mut rgb = Vec::new();
         images[0].write_rgb8(&mut rgb);
         let grey =

@@ -79,7 +79,7 @@ fn light_and_fog_agree() {
     let fog = Atmosphere { fog_per_m: 0.7, fog: [0.7, 0.6, 0.5], ..dim };
     let soup = Atmosphere { fog_per_m: 60.0, ..fog };
     let cameras = [Atmosphere::CLEAR, dim, fog, soup]
-        .map(|air| Camera { air, ..twins::camera(96, 64, 70.0) });
+        .map(|atmosphere| Camera { atmosphere, ..twins::camera(96, 64, 70.0) });
     check("atmosphere", &splats, &[], &cameras);
 }
 

@@ -16,7 +16,7 @@ use jpeg_encoder::{ColorType, Encoder};
 use serde_json::{Value, json};
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
-use vizflyt_tags::locate::{Look, Outcome};
+use vizflyt_tags::locate::{CameraResult, LocateOutcome};
 
 use super::Shot;
 
@@ -79,7 +79,7 @@ impl LiveView {
     }
 
     /// Shows a set of images and what came of it.
-    pub(super) fn show(&self, shots: &[Shot], outcome: &Outcome, image_ms: f64) {
+    pub(super) fn show(&self, shots: &[Shot], outcome: &LocateOutcome, image_ms: f64) {
         let mut shown = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
         if shown.asked.is_none_or(|asked| asked.elapsed() > FORGET_AFTER) {
             return;
@@ -106,7 +106,7 @@ impl LiveView {
     }
 }
 
-fn look_json(look: &Look) -> Value {
+fn look_json(look: &CameraResult) -> Value {
     let corners = |corners: &[DVec2; 4]| corners.map(|corner| corner.to_array());
     let seen: Vec<Value> = look
         .seen

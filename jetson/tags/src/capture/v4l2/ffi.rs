@@ -40,7 +40,7 @@ impl Fourcc {
 
 /// What a driver's stamp means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Stamped {
+pub(super) enum StampKind {
     /// The first row's exposure began.
     ExposureBegan,
     /// The last byte was read.
@@ -267,7 +267,7 @@ impl Buffers {
     pub(super) fn take<T>(
         &mut self,
         wait: Duration,
-        read: impl FnOnce(&[u8], u64, Stamped) -> T,
+        read: impl FnOnce(&[u8], u64, StampKind) -> T,
     ) -> io::Result<Option<T>> {
         let timeout = PollTimeout::try_from(wait).map_err(io::Error::other)?;
         let mut fds = [PollFd::new(self.file.as_fd(), PollFlags::POLLIN)];
@@ -284,9 +284,9 @@ impl Buffers {
         let bytes = &memory[..(buffer.bytesused as usize).min(memory.len())];
         let stamp_ns = buffer.seconds as u64 * 1_000_000_000 + buffer.microseconds as u64 * 1000;
         let stamped = if buffer.flags & STAMP_SOURCE == EXPOSURE_BEGAN {
-            Stamped::ExposureBegan
+            StampKind::ExposureBegan
         } else {
-            Stamped::LastByte
+            StampKind::LastByte
         };
         let result = read(bytes, stamp_ns, stamped);
         // SAFETY: as above; the slice is not used any more.

@@ -23,10 +23,10 @@ pub(crate) fn webcam() -> Intrinsics {
     }
 }
 
-/// Draws what the webcam sees; made once for all tests.
+/// Renders what the webcam sees; made once for all tests.
 pub(crate) static PAINTER: LazyLock<Painter> = LazyLock::new(|| Painter::new(webcam()));
 
-/// Draws the board: rays through nine places of each pixel.
+/// Renders the board: rays through nine places of each pixel.
 pub(crate) struct Painter {
     lens: Intrinsics,
     slopes: Vec<DVec2>,

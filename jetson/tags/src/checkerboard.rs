@@ -24,7 +24,7 @@ use crate::image::Gray;
 ///
 /// ```
 /// let text = "[checkerboard]\ncolumns = 9\nrows = 6\nsquare_m = 0.025\n";
-/// let board = vizflyt_tags::checkers::Checkerboard::parse(text).unwrap();
+/// let board = vizflyt_tags::checkerboard::Checkerboard::parse(text).unwrap();
 /// assert_eq!(board.corners_m().len(), 54);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

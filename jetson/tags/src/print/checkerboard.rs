@@ -2,7 +2,7 @@
 
 use super::sheet::{FOOT_MM, MARGIN_MM, Sheet};
 use super::{Paper, PrintError, check_positive, scale};
-use crate::checkers::Checkerboard;
+use crate::checkerboard::Checkerboard;
 
 /// Returns a sheet full of squares of this edge, and what is then on it; `bar_mm` is what the printed scale bar measures.
 ///
@@ -10,7 +10,7 @@ use crate::checkers::Checkerboard;
 ///
 /// # Errors
 /// [`PrintError`] for squares that are too large or make no sense.
-pub fn checkers(
+pub fn checkerboard(
     paper: Paper,
     square_mm: f64,
     bar_mm: f64,
@@ -55,7 +55,7 @@ mod tests {
     #[test]
     fn a_sheet_is_filled_within_its_margins() {
         for (paper, square_mm) in [(Paper::A4, 25.0), (Paper::Letter, 20.0), (Paper::A3, 30.0)] {
-            let (sheet, board) = checkers(paper, square_mm, BAR_MM).unwrap();
+            let (sheet, board) = checkerboard(paper, square_mm, BAR_MM).unwrap();
             assert_eq!(Checkerboard::parse(&board.to_toml().unwrap()).unwrap(), board);
             assert!((board.columns + board.rows) % 2 == 1, "{board:?}");
             let [width, height] = paper.size_mm();
@@ -78,10 +78,10 @@ mod tests {
             }
         }
         // A printer that shrinks to 97 %.
-        let (_, board) = checkers(Paper::A4, 25.0, 97.0).unwrap();
+        let (_, board) = checkerboard(Paper::A4, 25.0, 97.0).unwrap();
         assert!((board.square_m - 0.02425).abs() < 1e-12);
-        let error = checkers(Paper::A4, 80.0, BAR_MM).unwrap_err().to_string();
+        let error = checkerboard(Paper::A4, 80.0, BAR_MM).unwrap_err().to_string();
         assert!(error.contains("a board of four squares of 320 mm does not fit on A4"), "{error}");
-        assert!(checkers(Paper::A4, f64::NAN, BAR_MM).is_err());
+        assert!(checkerboard(Paper::A4, f64::NAN, BAR_MM).is_err());
     }
 }
