@@ -20,8 +20,8 @@ fn main() {
                 told_s = now_s;
                 let target = plugin.target().map_or("nothing", |kind| kind.name());
                 println!("{now_s:5.2} s at {camera_m:.2}, own {:.2}, to {target}", plugin.here_m());
-                for screen in plugin.known().screens() {
-                    println!("    {:?} {:?} {:?}", screen.kind, screen.plane, screen.opening);
+                for obstacle in plugin.known().obstacles() {
+                    println!("    {:?} {:?} {:?}", obstacle.kind, obstacle.plane, obstacle.opening);
                 }
                 if let Some(motion) = plugin.hand() {
                     println!("    {motion:.2?}");

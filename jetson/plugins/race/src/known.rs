@@ -1,17 +1,17 @@
-//! What has been found so far: the screens, which are passed, and which comes next.
+//! What has been found so far: the obstacles, which are passed, and which comes next.
 
 use vizflyt_sdk::glam::DVec3;
 
-use crate::eye::Lattice;
-use crate::paint::Paint;
-use crate::screen::{Kind, Plane, Screen};
-use crate::spot;
+use crate::color_class::ColorClass;
+use crate::planar_obstacle::{ObstacleKind, PlanarObstacle, Plane};
+use crate::plane_detection;
+use crate::sampling::PixelGrid;
 
 /// The course as far as it has been seen.
 #[derive(Clone, Debug, Default)]
 pub struct Known {
-    screens: Vec<Screen>,
-    passed: Vec<Kind>,
+    obstacles: Vec<PlanarObstacle>,
+    passed: Vec<ObstacleKind>,
 }
 
 impl Known {
@@ -21,55 +21,62 @@ impl Known {
         &mut self,
         now_s: f64,
         camera_m: DVec3,
-        lattice: &Lattice,
-        settled: Option<Kind>,
+        grid: &PixelGrid,
+        settled: Option<ObstacleKind>,
     ) {
-        let windows = Paint::WINDOWS.into_iter().map(Kind::Window);
-        for kind in windows.chain([Kind::Wall]) {
+        let windows = ColorClass::WINDOWS.into_iter().map(ObstacleKind::Window);
+        for kind in windows.chain([ObstacleKind::Wall]) {
             if self.has_passed(kind) || settled == Some(kind) {
                 continue;
             }
-            let known = self.screens.iter().position(|screen| screen.kind == kind);
+            let known = self.obstacles.iter().position(|obstacle| obstacle.kind == kind);
             let found = match (kind, known) {
-                (Kind::Window(paint), Some(at)) => {
-                    spot::again(lattice, camera_m, paint, &self.screens[at].plane)
+                (ObstacleKind::Window(color), Some(at)) => {
+                    plane_detection::again(grid, camera_m, color, &self.obstacles[at].plane)
                 }
-                (Kind::Window(paint), None) => spot::window(lattice, camera_m, paint),
-                (Kind::Wall, _) => spot::wall(lattice, camera_m),
+                (ObstacleKind::Window(color), None) => {
+                    plane_detection::window(grid, camera_m, color)
+                }
+                (ObstacleKind::Wall, _) => plane_detection::wall(grid, camera_m),
             };
             let Some(found) = found else { continue };
             match known {
-                Some(at) => self.screens[at].settle(found.plane, found.range_m),
+                Some(at) => self.obstacles[at].settle(found.plane, found.range_m),
                 // Arrowheads of one window may look like bars of another.
                 None if self.is_another(kind, &found.plane) => {}
                 None => {
-                    self.screens.push(Screen::new(kind, found.plane, found.range_m, now_s));
+                    self.obstacles.push(PlanarObstacle::new(
+                        kind,
+                        found.plane,
+                        found.range_m,
+                        now_s,
+                    ));
                 }
             }
         }
-        for screen in &mut self.screens {
-            screen.update(now_s, camera_m, lattice);
+        for obstacle in &mut self.obstacles {
+            obstacle.update(now_s, camera_m, grid);
         }
         self.forget(now_s, camera_m);
     }
 
     /// Returns everything found, passed or not.
-    pub fn screens(&self) -> &[Screen] {
-        &self.screens
+    pub fn obstacles(&self) -> &[PlanarObstacle] {
+        &self.obstacles
     }
 
-    /// Returns the screen of a kind; there is at most one.
-    pub fn screen(&self, kind: Kind) -> Option<&Screen> {
-        self.screens.iter().find(|screen| screen.kind == kind)
+    /// Returns the obstacle of a kind; there is at most one.
+    pub fn obstacle(&self, kind: ObstacleKind) -> Option<&PlanarObstacle> {
+        self.obstacles.iter().find(|obstacle| obstacle.kind == kind)
     }
 
-    /// Notes that the vehicle has flown through a screen.
-    pub fn pass(&mut self, kind: Kind) {
+    /// Notes that the vehicle has flown through an obstacle.
+    pub fn pass(&mut self, kind: ObstacleKind) {
         self.passed.push(kind);
     }
 
     /// Whether the vehicle has flown through it.
-    pub fn has_passed(&self, kind: Kind) -> bool {
+    pub fn has_passed(&self, kind: ObstacleKind) -> bool {
         self.passed.contains(&kind)
     }
 
@@ -78,13 +85,13 @@ impl Known {
         !self.passed.is_empty()
     }
 
-    /// Returns the nearest screen before `p_m` [m, home] that is not passed; `after` leaves one out.
-    pub fn next(&self, p_m: DVec3, after: Option<Kind>) -> Option<&Screen> {
-        let before_m = |screen: &Screen| -screen.plane.behind_m(p_m);
-        self.screens
+    /// Returns the nearest obstacle ahead of `p_m` [m, home] that is not passed; `after` leaves one out.
+    pub fn next(&self, p_m: DVec3, after: Option<ObstacleKind>) -> Option<&PlanarObstacle> {
+        let before_m = |obstacle: &PlanarObstacle| -obstacle.plane.behind_m(p_m);
+        self.obstacles
             .iter()
-            .filter(|screen| !self.has_passed(screen.kind) && after != Some(screen.kind))
-            .filter(|screen| before_m(screen) > -PASSED_M)
+            .filter(|obstacle| !self.has_passed(obstacle.kind) && after != Some(obstacle.kind))
+            .filter(|obstacle| before_m(obstacle) > -PASSED_M)
             .min_by(|a, b| before_m(a).total_cmp(&before_m(b)))
     }
 
@@ -93,27 +100,31 @@ impl Known {
     fn forget(&mut self, now_s: f64, camera_m: DVec3) {
         let walls: Vec<Plane> = self.walls().collect();
         let passed = &self.passed;
-        self.screens.retain(|screen| {
-            if screen.plane.behind_m(camera_m) > LEFT_BEHIND_M && !passed.contains(&screen.kind) {
+        self.obstacles.retain(|obstacle| {
+            if obstacle.plane.behind_m(camera_m) > LEFT_BEHIND_M && !passed.contains(&obstacle.kind)
+            {
                 return false;
             }
-            let is_window = screen.kind != Kind::Wall;
-            let painted = is_window && walls.iter().any(|wall| lies_on(wall, &screen.plane));
-            screen.opening.is_some() || now_s - screen.seen_s < FORGET_S && !painted
+            let is_window = obstacle.kind != ObstacleKind::Wall;
+            let colored = is_window && walls.iter().any(|wall| lies_on(wall, &obstacle.plane));
+            obstacle.opening.is_some() || now_s - obstacle.seen_s < FORGET_S && !colored
         });
     }
 
     fn walls(&self) -> impl Iterator<Item = Plane> {
-        self.screens.iter().filter(|screen| screen.kind == Kind::Wall).map(|screen| screen.plane)
+        self.obstacles
+            .iter()
+            .filter(|obstacle| obstacle.kind == ObstacleKind::Wall)
+            .map(|obstacle| obstacle.plane)
     }
 
-    /// Whether a plane is that of a screen of another kind.
-    fn is_another(&self, kind: Kind, plane: &Plane) -> bool {
-        self.screens.iter().filter(|screen| screen.kind != kind).any(|screen| {
-            let aside_m = screen.plane.within_m(plane.origin_m).x.abs();
-            lies_on(&screen.plane, plane)
-                && kind != Kind::Wall
-                && (screen.kind == Kind::Wall || aside_m < SAME_M)
+    /// Whether a plane is that of an obstacle of another kind.
+    fn is_another(&self, kind: ObstacleKind, plane: &Plane) -> bool {
+        self.obstacles.iter().filter(|obstacle| obstacle.kind != kind).any(|obstacle| {
+            let aside_m = obstacle.plane.within_m(plane.origin_m).x.abs();
+            lies_on(&obstacle.plane, plane)
+                && kind != ObstacleKind::Wall
+                && (obstacle.kind == ObstacleKind::Wall || aside_m < SAME_M)
         })
     }
 }
@@ -123,7 +134,7 @@ fn lies_on(wall: &Plane, plane: &Plane) -> bool {
     wall.behind_m(plane.origin_m).abs() < 0.2
 }
 
-/// A screen is passed when the whole vehicle, and a hand's breadth, is behind it. [m]
+/// An obstacle is passed when the whole vehicle, and a hand's breadth, is behind it. [m]
 pub const PASSED_M: f64 = 0.32;
 /// Farther behind than anything that is being flown through. [m]
 const LEFT_BEHIND_M: f64 = 0.8;
@@ -135,16 +146,16 @@ const FORGET_S: f64 = 2.0;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::booth::{Brick, picture, room, window};
+    use crate::test_scene::{Brick, picture, room, window};
 
     const RED: [u8; 3] = [200, 28, 40];
     const BLUE: [u8; 3] = [30, 80, 210];
 
     fn looked(bricks: &[Brick], from_m: DVec3, seconds: u32) -> Known {
         let mut known = Known::default();
-        let lattice = picture(bricks, from_m, 0.0);
+        let grid = picture(bricks, from_m, 0.0);
         for n in 0..10 * seconds {
-            known.update(f64::from(n) * 0.1, from_m, &lattice, None);
+            known.update(f64::from(n) * 0.1, from_m, &grid, None);
         }
         known
     }
@@ -156,12 +167,12 @@ mod tests {
         bricks.extend(window(DVec3::new(3.4, 0.0, 1.3), 0.6, BLUE));
         let from_m = DVec3::new(0.0, 0.0, 1.3);
         let mut known = looked(&bricks, from_m, 1);
-        let red = Kind::Window(Paint::Red);
-        assert_eq!(known.next(from_m, None).map(|screen| screen.kind), Some(red));
-        let blue = Some(Kind::Window(Paint::Blue));
-        assert_eq!(known.next(from_m, Some(red)).map(|screen| screen.kind), blue);
+        let red = ObstacleKind::Window(ColorClass::Red);
+        assert_eq!(known.next(from_m, None).map(|obstacle| obstacle.kind), Some(red));
+        let blue = Some(ObstacleKind::Window(ColorClass::Blue));
+        assert_eq!(known.next(from_m, Some(red)).map(|obstacle| obstacle.kind), blue);
         known.pass(red);
-        assert_eq!(known.next(from_m, None).map(|screen| screen.kind), blue);
+        assert_eq!(known.next(from_m, None).map(|obstacle| obstacle.kind), blue);
         assert!(known.has_begun());
         let behind_m = DVec3::new(4.0, 0.0, 1.3);
         assert!(known.next(behind_m, None).is_none());
@@ -178,7 +189,8 @@ mod tests {
             rgb: [150, 80, 60],
         });
         let known = looked(&bricks, DVec3::new(0.3, 0.0, 1.3), 1);
-        let kinds: Vec<Kind> = known.screens().iter().map(|screen| screen.kind).collect();
-        assert_eq!(kinds, [Kind::Wall]);
+        let kinds: Vec<ObstacleKind> =
+            known.obstacles().iter().map(|obstacle| obstacle.kind).collect();
+        assert_eq!(kinds, [ObstacleKind::Wall]);
     }
 }

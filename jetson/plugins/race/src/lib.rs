@@ -2,25 +2,25 @@
 //!
 //! It knows no map and no place of anything, nor where it is itself: only what its camera shows,
 //! and how it is tilted. What happens at every image, in this order:
-//! 1. [`eye`]: pixels become vectors and paints (colours of known windows), [`paint`];
-//! 2. [`odometry`]: where the camera is, by laying its depth against an earlier image;
-//! 3. [`spot`]: new windows by their paint, walls by their size;
-//! 4. [`screen`]: what of each is solid and what is free, and where its opening is widest;
+//! 1. [`sampling`]: pixels become vectors and colour classes (bars of known windows), [`color_class`];
+//! 2. [`odometry`]: where the camera is, by registering its depth to an earlier image;
+//! 3. [`plane_detection`]: new windows by their colour, walls by their size;
+//! 4. [`planar_obstacle`]: what of each is solid and what is free, and where its opening is widest;
 //!    [`known`] keeps them, and says which comes next;
 //! 5. [`hand`]: what moves in that opening, and when it will be away;
 //! 6. [`steer`]: through the opening of the nearest, clear of everything solid.
 //!
-//! All is kept in the frame [`eye::Home`], so a window that has left the image is still there.
+//! All is kept in the frame [`sampling::Home`], so a window that has left the image is still there.
 
 #[cfg(test)]
-mod booth;
-pub mod eye;
+mod test_scene;
+pub mod sampling;
 pub mod hand;
 pub mod known;
 pub mod odometry;
-pub mod paint;
-pub mod screen;
-pub mod spot;
+pub mod color_class;
+pub mod planar_obstacle;
+pub mod plane_detection;
 pub mod steer;
 
 use std::f64::consts::TAU;
@@ -31,12 +31,12 @@ use vizflyt_sdk::{
     ArenaInfo, Autonomy, CameraImage, Event, EventKind, Observation, Setpoint, Vehicle, YawTarget,
 };
 
-use eye::{Lattice, View};
+use sampling::{PixelGrid, RgbdView};
 use hand::Hand;
 use known::{Known, PASSED_M};
 use odometry::Odometry;
-use paint::Paint;
-use screen::{Kind, Screen};
+use color_class::ColorClass;
+use planar_obstacle::{ObstacleKind, PlanarObstacle};
 use steer::Aim;
 
 /// The plugin.
@@ -44,14 +44,14 @@ use steer::Aim;
 pub struct Race {
     /// Where the flight shall end, if the course says. [m, world]
     goal_m: Option<DVec3>,
-    lattice: Lattice,
+    grid: PixelGrid,
     odometry: Odometry,
     /// Turn from world axes to home axes about z, set by the first image. [rad]
     home_yaw_rad: Option<f64>,
     known: Known,
     hand: Hand,
     /// What it flies through now.
-    target: Option<Kind>,
+    target: Option<ObstacleKind>,
     /// Since when the passage is under way: nothing else counts any more. [s]
     committed_s: Option<f64>,
     /// Since when nothing has been found to fly through. [s]
@@ -118,7 +118,7 @@ impl Race {
     }
 
     /// Returns what it flies through now.
-    pub fn target(&self) -> Option<Kind> {
+    pub fn target(&self) -> Option<ObstacleKind> {
         self.target
     }
 
@@ -151,9 +151,9 @@ impl Race {
             return Setpoint::Hold;
         }
         let settled = self.target.filter(|_| self.committed_s.is_some());
-        self.known.update(now_s, here.camera_m, &self.lattice, settled);
+        self.known.update(now_s, here.camera_m, &self.grid, settled);
         let (wanted_mps, look_rad) = self.choose(now_s, &here);
-        let solid = self.known.screens().iter();
+        let solid = self.known.obstacles().iter();
         let wanted_mps = steer::clear_of(wanted_mps, here.p_m, solid).clamp_length_max(MOST_MPS);
         // Before take-off nobody follows: the setpoint must not run away from the vehicle.
         let from_mps = self.odometry.v_mps
@@ -173,13 +173,13 @@ impl Race {
         let home_yaw_rad = *self.home_yaw_rad.get_or_insert_with(|| yaw_of(world_from_body));
         let home_from_body = DQuat::from_rotation_z(-home_yaw_rad) * world_from_body;
         let home_from_cam = home_from_body * camera.body_from_cam.rotation;
-        self.lattice.update(&View {
+        self.grid.update(&RgbdView {
             rgb: camera.rgb,
             depth_mm: camera.depth_mm,
             intrinsics: camera.intrinsics,
             home_from_cam,
         });
-        self.odometry.update(now_s, &mut self.lattice);
+        self.odometry.update(now_s, &mut self.grid);
         let camera_m = self.odometry.p_m;
         let p_m = camera_m - home_from_body * camera.body_from_cam.translation_m;
         Here {
@@ -194,7 +194,7 @@ impl Race {
 
     /// Returns a velocity [m/s, home] and where to look [rad, home].
     fn choose(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
-        let behind_m = |kind| self.known.screen(kind).map(|screen| screen.plane.behind_m(here.p_m));
+        let behind_m = |kind| self.known.obstacle(kind).map(|obstacle| obstacle.plane.behind_m(here.p_m));
         if let Some(kind) = self.target.filter(|&kind| behind_m(kind) > Some(PASSED_M)) {
             println!("through {}", kind.name());
             self.known.pass(kind);
@@ -203,27 +203,27 @@ impl Race {
         }
         self.committed_s = self.committed_s.filter(|since_s| now_s - since_s < THROUGH_S);
         if self.committed_s.is_none() {
-            self.target = self.known.next(here.p_m, None).map(|screen| screen.kind);
+            self.target = self.known.next(here.p_m, None).map(|obstacle| obstacle.kind);
         }
-        let Some(screen) = self.target.and_then(|kind| self.known.screen(kind)) else {
+        let Some(obstacle) = self.target.and_then(|kind| self.known.obstacle(kind)) else {
             return self.search(now_s, here);
         };
         self.searching_s = None;
-        let Some(opening) = screen.opening else {
+        let Some(opening) = obstacle.opening else {
             // Go where its middle can be seen from.
-            let middle_m = screen.plane.point_m(DVec2::new(0.0, VIEW_HEIGHT_M));
-            let to_m = middle_m - screen.plane.normal() * VIEW_M - here.p_m;
+            let middle_m = obstacle.plane.point_m(DVec2::new(0.0, VIEW_HEIGHT_M));
+            let to_m = middle_m - obstacle.plane.normal() * VIEW_M - here.p_m;
             let look_rad = (middle_m - here.p_m).truncate().to_angle();
             return (to_m.clamp_length_max(VIEW_MPS), look_rad);
         };
-        let aim = Aim::from(here.p_m, &screen.plane, &opening);
+        let aim = Aim::from(here.p_m, &obstacle.plane, &opening);
         let mut held = opening.radius_m < WIDE_ENOUGH_M;
         let mut begins = !held && aim.before_m < COMMIT_M && aim.off_m.length() < COMMIT_OFF_M;
-        if screen.kind == Kind::Window(Paint::Orange) && self.committed_s.is_none() {
-            self.hand.update(now_s, &screen.hand_m(here.camera_m, &self.lattice));
+        if obstacle.kind == ObstacleKind::Window(ColorClass::Orange) && self.committed_s.is_none() {
+            self.hand.update(now_s, &obstacle.hand_m(here.camera_m, &self.grid));
             let there_s = now_s + START_LAG_S + (aim.before_m - 0.2).max(0.0) / steer::CRUISE_MPS;
             let (from_s, to_s) = (there_s - EARLY_S, there_s + LATE_S);
-            let within_m = screen.plane.within_m(opening.center_m);
+            let within_m = obstacle.plane.within_m(opening.center_m);
             let waits = aim.before_m < steer::WAIT_M + 0.1 && aim.off_m.length() < 0.12;
             begins = !held && waits && self.hand.is_clear(within_m, HAND_ROOM_M, from_s, to_s);
             held = !begins;
@@ -234,14 +234,14 @@ impl Race {
         let look_rad = if aim.before_m > LOOK_M {
             (opening.center_m - here.p_m).truncate().to_angle()
         } else {
-            self.beyond_rad(here, screen).unwrap_or(screen.plane.yaw_rad)
+            self.beyond_rad(here, obstacle).unwrap_or(obstacle.plane.yaw_rad)
         };
-        (steer::through(&aim, &screen.plane, held && self.committed_s.is_none()), look_rad)
+        (steer::through(&aim, &obstacle.plane, held && self.committed_s.is_none()), look_rad)
     }
 
-    /// Returns where the screen after this one is seen. [rad, home]
-    fn beyond_rad(&self, here: &Here, screen: &Screen) -> Option<f64> {
-        let next = self.known.next(here.p_m, Some(screen.kind))?;
+    /// Returns where the obstacle after this one is seen. [rad, home]
+    fn beyond_rad(&self, here: &Here, obstacle: &PlanarObstacle) -> Option<f64> {
+        let next = self.known.next(here.p_m, Some(obstacle.kind))?;
         let middle_m = next.opening.map_or(next.plane.origin_m, |opening| opening.center_m);
         let look_rad = (middle_m - here.p_m).truncate().to_angle();
         Some(look_rad.clamp(-MOST_LOOK_RAD, MOST_LOOK_RAD))
@@ -250,7 +250,7 @@ impl Race {
     /// Looks about for something to fly through.
     fn search(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
         let since_s = now_s - *self.searching_s.get_or_insert(now_s);
-        let last = self.known.has_passed(Kind::Window(Paint::Orange)) || since_s > SEARCH_S;
+        let last = self.known.has_passed(ObstacleKind::Window(ColorClass::Orange)) || since_s > SEARCH_S;
         if let Some(goal_m) = here.goal_m.filter(|_| last && self.known.has_begun()) {
             let to_m = goal_m - here.p_m;
             return ((to_m * GOAL_PER_S).clamp_length_max(steer::CRUISE_MPS), 0.0);

@@ -1,4 +1,4 @@
-//! Where the camera is, from depth alone: each image is laid against a key image.
+//! Where the camera is, from depth alone: each image is registered to a key image.
 //!
 //! The attitude is known but for a fraction of a degree, so there is the place to find and a small
 //! turn. Each sample of the new image is looked up in
@@ -11,7 +11,7 @@
 
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 
-use crate::eye::{Eye, Lattice, Sample};
+use crate::sampling::{SampleCamera, PixelGrid, Sample};
 
 /// Position and velocity of the camera.
 #[derive(Clone, Debug, Default)]
@@ -26,10 +26,10 @@ pub struct Odometry {
     key: Option<Key>,
 }
 
-/// The image that others are laid against: every second sample of its lattice.
+/// The image that later ones are registered to: every second sample of its grid.
 #[derive(Clone, Debug)]
 struct Key {
-    eye: Eye,
+    camera: SampleCamera,
     camera_m: DVec3,
     columns: usize,
     rows: usize,
@@ -109,54 +109,54 @@ impl NormalEquations {
 impl Odometry {
     /// Takes the image of time `now_s` on any steady clock, and turns it by what the attitude is
     /// found to be off. Without depth the vehicle is taken to go on as it went.
-    pub fn update(&mut self, now_s: f64, lattice: &mut Lattice) {
-        let Some(eye) = lattice.eye else { return };
+    pub fn update(&mut self, now_s: f64, grid: &mut PixelGrid) {
+        let Some(camera) = grid.camera else { return };
         let dt_s = self.last_s.map_or(0.0, |last_s| now_s - last_s).clamp(0.0, MAX_DT_S);
         self.last_s = Some(now_s);
         let expected_m = self.p_m + self.v_mps * dt_s;
         let Some(key) = &self.key else {
-            if let Some(height_m) = height_over_floor_m(lattice) {
+            if let Some(height_m) = height_over_floor_m(grid) {
                 self.p_m = DVec3::new(0.0, 0.0, height_m);
-                self.key = Some(Key::new(&eye, self.p_m, lattice));
+                self.key = Some(Key::new(&camera, self.p_m, grid));
             }
             return;
         };
         self.turn_rad *= STEADY;
-        lattice.turn(DQuat::from_scaled_axis(self.turn_rad));
-        let Found { mut p_m, turn_rad, overlap } = key.locate(expected_m, lattice);
-        lattice.turn(DQuat::from_scaled_axis(turn_rad));
+        grid.turn(DQuat::from_scaled_axis(self.turn_rad));
+        let Found { mut p_m, turn_rad, overlap } = key.locate(expected_m, grid);
+        grid.turn(DQuat::from_scaled_axis(turn_rad));
         self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MOST_TURN_RAD);
-        p_m.z -= floor_error_m(lattice, p_m.z);
+        p_m.z -= floor_error_m(grid, p_m.z);
         if dt_s > 0.0 {
             let v_mps = ((p_m - self.p_m) / dt_s).clamp_length_max(MAX_SPEED_MPS);
             self.v_mps += (v_mps - self.v_mps) * (dt_s / (dt_s + VELOCITY_LAG_S));
         }
         self.p_m = p_m;
-        let turned_rad = key.eye.home_from_cam.angle_between(eye.home_from_cam);
+        let turned_rad = key.camera.home_from_cam.angle_between(camera.home_from_cam);
         if overlap < OVERLAP || turned_rad > TURN_RAD || key.camera_m.distance(p_m) > REACH_M {
-            self.key = Some(Key::new(&eye, p_m, lattice));
+            self.key = Some(Key::new(&camera, p_m, grid));
         }
     }
 }
 
 impl Key {
-    fn new(eye: &Eye, camera_m: DVec3, lattice: &Lattice) -> Self {
-        let (columns, rows) = (lattice.columns / SKIP, lattice.rows / SKIP);
+    fn new(camera: &SampleCamera, camera_m: DVec3, grid: &PixelGrid) -> Self {
+        let (columns, rows) = (grid.columns / SKIP, grid.rows / SKIP);
         let mut cells = Vec::with_capacity(columns * rows);
         for row in 0..rows {
             for column in 0..columns {
                 let grey = |across: isize, down: isize| {
                     let (column, row) =
                         (column.checked_add_signed(across)?, row.checked_add_signed(down)?);
-                    (column < columns && row < rows).then(|| grey_of(lattice, column, row))
+                    (column < columns && row < rows).then(|| grey_of(grid, column, row))
                 };
                 let slope = |high: Option<f64>, low: Option<f64>| {
                     high.zip(low).map_or(0.0, |(high, low)| (high - low) / 2.0)
                 };
                 cells.push(Cell {
-                    offset_m: sample_of(lattice, column, row).offset_m,
-                    normal: normal(lattice, SKIP * column + 1, SKIP * row + 1),
-                    grey: grey_of(lattice, column, row),
+                    offset_m: sample_of(grid, column, row).offset_m,
+                    normal: normal(grid, SKIP * column + 1, SKIP * row + 1),
+                    grey: grey_of(grid, column, row),
                     slope: DVec2::new(
                         slope(grey(1, 0), grey(-1, 0)),
                         slope(grey(0, 1), grey(0, -1)),
@@ -166,7 +166,7 @@ impl Key {
         }
         let surfaces = cells.iter().filter(|cell| cell.normal.is_some()).count();
         Self {
-            eye: Eye { stride: SKIP * eye.stride, ..*eye },
+            camera: SampleCamera { stride: SKIP * camera.stride, ..*camera },
             camera_m,
             columns,
             rows,
@@ -175,8 +175,8 @@ impl Key {
         }
     }
 
-    /// Returns where a camera with this lattice is, near `expected_m`. [m, home]
-    fn locate(&self, expected_m: DVec3, lattice: &Lattice) -> Found {
+    /// Returns where a camera with this grid is, near `expected_m`. [m, home]
+    fn locate(&self, expected_m: DVec3, grid: &PixelGrid) -> Found {
         let (mut p_m, mut turn_rad, mut overlap) = (expected_m, DVec3::ZERO, 0.0);
         for round in 0..ROUNDS {
             let gate_m = GATE_M / f64::from(1 << round.min(2));
@@ -190,9 +190,9 @@ impl Key {
                 sums.add(&angle, -turn_rad[axis], ATTITUDE_RAD.powi(-2));
             }
             let mut met = 0;
-            for row in 0..lattice.rows / SKIP {
-                for column in 0..lattice.columns / SKIP {
-                    let sample = sample_of(lattice, column, row);
+            for row in 0..grid.rows / SKIP {
+                for column in 0..grid.columns / SKIP {
+                    let sample = sample_of(grid, column, row);
                     if !sample.is_seen() {
                         continue;
                     }
@@ -213,9 +213,9 @@ impl Key {
                             sums.add_point(n, offset_m, residual_m, weight);
                         }
                     }
-                    let dimmer = cell.grey + cell.slope.dot(aside) - grey_of(lattice, column, row);
+                    let dimmer = cell.grey + cell.slope.dot(aside) - grey_of(grid, column, row);
                     if dimmer.abs() < GREY_GATE {
-                        let slope = self.eye.slope_along(from_key_m, cell.slope);
+                        let slope = self.camera.slope_along(from_key_m, cell.slope);
                         let weight = huber(dimmer / GREY) / (GREY * GREY);
                         sums.add_point(slope, offset_m, -dimmer, weight);
                     }
@@ -238,7 +238,7 @@ impl Key {
     /// Returns the cell that a point [m, home axes, from the key's camera] is seen in, and where in
     /// it, from its middle.
     fn cell_at(&self, from_key_m: DVec3) -> Option<(&Cell, DVec2)> {
-        let at = self.eye.sample_at(from_key_m)?;
+        let at = self.camera.sample_at(from_key_m)?;
         let (column, row) = (at.x as usize, at.y as usize);
         if column >= self.columns || row >= self.rows {
             return None;
@@ -249,14 +249,14 @@ impl Key {
 }
 
 /// Returns the sample in the middle of a cell of two by two.
-fn sample_of(lattice: &Lattice, column: usize, row: usize) -> Sample {
-    lattice.at(SKIP * column + 1, SKIP * row + 1).copied().unwrap_or_default()
+fn sample_of(grid: &PixelGrid, column: usize, row: usize) -> Sample {
+    grid.at(SKIP * column + 1, SKIP * row + 1).copied().unwrap_or_default()
 }
 
 /// Returns the brightness of a cell.
-fn grey_of(lattice: &Lattice, column: usize, row: usize) -> f64 {
-    let at = SKIP * row * lattice.columns + SKIP * column;
-    let (upper, lower) = (&lattice.samples[at..], &lattice.samples[at + lattice.columns..]);
+fn grey_of(grid: &PixelGrid, column: usize, row: usize) -> f64 {
+    let at = SKIP * row * grid.columns + SKIP * column;
+    let (upper, lower) = (&grid.samples[at..], &grid.samples[at + grid.columns..]);
     0.25 * f64::from(upper[0].grey + upper[1].grey + lower[0].grey + lower[1].grey)
 }
 
@@ -268,9 +268,9 @@ fn huber(deviations: f64) -> f64 {
 
 /// Returns the normal of the surface at a sample from its neighbours; `None` at an edge of
 /// something.
-fn normal(lattice: &Lattice, column: usize, row: usize) -> Option<DVec3> {
+fn normal(grid: &PixelGrid, column: usize, row: usize) -> Option<DVec3> {
     let seen = |column: usize, row: usize| {
-        lattice.at(column, row).filter(|sample| sample.is_seen()).map(|sample| sample.offset_m)
+        grid.at(column, row).filter(|sample| sample.is_seen()).map(|sample| sample.offset_m)
     };
     let p_m = seen(column, row)?;
     let (left_m, right_m) = (seen(column.checked_sub(2)?, row)?, seen(column + 2, row)?);
@@ -286,9 +286,9 @@ fn normal(lattice: &Lattice, column: usize, row: usize) -> Option<DVec3> {
 }
 
 /// Returns how high the camera is above the largest level surface below it. [m]
-fn height_over_floor_m(lattice: &Lattice) -> Option<f64> {
+fn height_over_floor_m(grid: &PixelGrid) -> Option<f64> {
     let mut bins = [0_u32; 200];
-    for sample in lattice.samples.iter().filter(|sample| sample.is_seen()) {
+    for sample in grid.samples.iter().filter(|sample| sample.is_seen()) {
         let below_m = -sample.offset_m.z;
         if below_m > 0.02
             && sample.offset_m.truncate().length() < 6.0
@@ -301,14 +301,14 @@ fn height_over_floor_m(lattice: &Lattice) -> Option<f64> {
     let low_m = (most as f64 - 1.0) * BIN_M;
     let of_floor = |below_m: &f64| (low_m..low_m + 3.0 * BIN_M).contains(below_m);
     let all: Vec<f64> =
-        lattice.samples.iter().map(|sample| -sample.offset_m.z).filter(of_floor).collect();
+        grid.samples.iter().map(|sample| -sample.offset_m.z).filter(of_floor).collect();
     (*count as usize > FLOOR_SAMPLES).then(|| all.iter().sum::<f64>() / all.len() as f64)
 }
 
 /// Returns how far the floor seems to lie above zero, or 0 if too little of it is seen. [m]
-fn floor_error_m(lattice: &Lattice, camera_z_m: f64) -> f64 {
+fn floor_error_m(grid: &PixelGrid, camera_z_m: f64) -> f64 {
     let (mut sum_m, mut count) = (0.0, 0);
-    for sample in lattice.samples.iter().filter(|sample| sample.is_seen()) {
+    for sample in grid.samples.iter().filter(|sample| sample.is_seen()) {
         let z_m = camera_z_m + sample.offset_m.z;
         if z_m.abs() < 0.06 && sample.offset_m.length() < 5.0 {
             sum_m += z_m;
@@ -318,7 +318,7 @@ fn floor_error_m(lattice: &Lattice, camera_z_m: f64) -> f64 {
     if count > FLOOR_SAMPLES { FLOOR_TRUST * sum_m / count as f64 } else { 0.0 }
 }
 
-/// Every second sample of the lattice, so every fourth pixel: 80 x 60.
+/// Every second sample of the grid, so every fourth pixel: 80 x 60.
 const SKIP: usize = 2;
 /// Gauss-Newton needs three rounds from 5 cm away.
 const ROUNDS: u32 = 6;

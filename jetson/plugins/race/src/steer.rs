@@ -2,9 +2,9 @@
 
 use vizflyt_sdk::glam::DVec3;
 
-use crate::screen::{Opening, Plane, Screen};
+use crate::planar_obstacle::{Opening, Plane, PlanarObstacle};
 
-/// How far it is to a screen and how far off the line through its opening.
+/// How far it is to an obstacle and how far off the line through its opening.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aim {
     /// Before the plane; negative is behind it. [m]
@@ -43,12 +43,12 @@ pub fn through(aim: &Aim, plane: &Plane, held: bool) -> DVec3 {
     plane.normal() * ahead_mps + sideways_mps
 }
 
-/// Returns `v_mps` without what would bring the vehicle near to anything solid of the screens, and
+/// Returns `v_mps` without what would bring the vehicle near to anything solid of the obstacles, and
 /// with a push away from it. [m/s, home]
-pub fn clear_of<'a>(v_mps: DVec3, p_m: DVec3, screens: impl Iterator<Item = &'a Screen>) -> DVec3 {
+pub fn clear_of<'a>(v_mps: DVec3, p_m: DVec3, obstacles: impl Iterator<Item = &'a PlanarObstacle>) -> DVec3 {
     let mut v_mps = v_mps;
-    for screen in screens {
-        let Some(solid_m) = screen.nearest_solid_m(p_m, KEEP_M) else { continue };
+    for obstacle in obstacles {
+        let Some(solid_m) = obstacle.nearest_solid_m(p_m, KEEP_M) else { continue };
         let apart_m = p_m.distance(solid_m);
         let Some(away) = (p_m - solid_m).try_normalize() else { continue };
         let allowed_mps = (apart_m - LEAST_M) * OFF_PER_S;

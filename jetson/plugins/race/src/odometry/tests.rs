@@ -1,7 +1,7 @@
 use vizflyt_sdk::glam::DVec2;
 
 use super::*;
-use crate::booth::{Brick, picture, room, window};
+use crate::test_scene::{Brick, picture, room, window};
 
 fn furnished() -> Vec<Brick> {
     let mut bricks = room();

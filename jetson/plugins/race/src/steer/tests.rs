@@ -1,7 +1,7 @@
 use super::*;
-use crate::booth::{Brick, clearance_m, picture, room, window};
-use crate::paint::Paint;
-use crate::screen::Kind;
+use crate::test_scene::{Brick, clearance_m, picture, room, window};
+use crate::color_class::ColorClass;
+use crate::planar_obstacle::ObstacleKind;
 
 fn ahead() -> (Plane, Opening) {
     let plane = Plane { origin_m: DVec3::new(2.0, 0.0, 0.0), yaw_rad: 0.0 };
@@ -49,19 +49,19 @@ fn a_bar_in_the_way_takes_the_speed_towards_it() {
     let mut bricks: Vec<Brick> = room();
     bricks.extend(window(DVec3::new(2.0, 0.0, 1.5), 0.6, [30, 80, 210]));
     let plane = Plane { origin_m: DVec3::new(2.0, 0.0, 0.0), yaw_rad: 0.0 };
-    let mut screen = Screen::new(Kind::Window(Paint::Blue), plane, 1.5, 0.0);
+    let mut obstacle = PlanarObstacle::new(ObstacleKind::Window(ColorClass::Blue), plane, 1.5, 0.0);
     let camera_m = DVec3::new(0.5, 0.0, 1.5);
     for n in 0..4 {
-        screen.update(f64::from(n), camera_m, &picture(&bricks, camera_m, 0.0));
+        obstacle.update(f64::from(n), camera_m, &picture(&bricks, camera_m, 0.0));
     }
     // Straight at the left bar: it stops short.
     let mut p_m = DVec3::new(1.0, 0.68, 1.5);
     for _ in 0..100 {
-        let v_mps = clear_of(DVec3::X, p_m, std::iter::once(&screen));
+        let v_mps = clear_of(DVec3::X, p_m, std::iter::once(&obstacle));
         p_m += v_mps * 0.04;
     }
     assert!(clearance_m(&bricks, p_m) > 0.13, "{p_m}");
     // And nothing is taken where nothing is near.
     let free_m = DVec3::new(1.0, 0.0, 1.5);
-    assert_eq!(clear_of(DVec3::X, free_m, std::iter::once(&screen)), DVec3::X);
+    assert_eq!(clear_of(DVec3::X, free_m, std::iter::once(&obstacle)), DVec3::X);
 }

@@ -1,4 +1,4 @@
-//! Image -> lattice: what each second pixel sees, as a vector in home axes and as a paint.
+//! Image -> grid: what each second pixel sees, as a vector in home axes and as a colour class.
 //!
 //! 160 x 120 samples of a 320 x 240 image are enough: a bar of 0.16 m is three samples wide at
 //! 4 m. Vectors are from the camera; where the camera is, [`crate::odometry`] finds out.
@@ -7,7 +7,7 @@ use vizflyt_sdk::Intrinsics;
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::protocol::geometry::Frame;
 
-use crate::paint::Paint;
+use crate::color_class::ColorClass;
 
 /// The frame that the plugin finds its way in: x along the nose as it was at the first image,
 /// z up, origin on the floor below the place of that image.
@@ -20,7 +20,7 @@ impl Frame for Home {
 
 /// One RGB-D image and how the camera was turned.
 #[derive(Clone, Copy, Debug)]
-pub struct View<'a> {
+pub struct RgbdView<'a> {
     /// Colour, H x W x 3, sRGB.
     pub rgb: &'a [u8],
     /// Camera-z depth, H x W; 0 is no return. [mm, cam]
@@ -37,7 +37,7 @@ pub struct Sample {
     /// From the camera to the surface; zero where nothing came back. [m, home axes]
     pub offset_m: DVec3,
     /// Colour of a bar, if it is one.
-    pub paint: Option<Paint>,
+    pub color: Option<ColorClass>,
     /// Brightness of the pixels about it, 0 to 1.
     pub grey: f32,
 }
@@ -51,7 +51,7 @@ impl Sample {
 
 /// Samples of an image, row-major; reused from image to image.
 #[derive(Clone, Debug, Default)]
-pub struct Lattice {
+pub struct PixelGrid {
     /// Samples of a row.
     pub columns: usize,
     /// Rows of samples.
@@ -59,14 +59,14 @@ pub struct Lattice {
     /// Row-major.
     pub samples: Vec<Sample>,
     /// The lens, in samples instead of pixels, and how the camera was turned.
-    pub eye: Option<Eye>,
+    pub camera: Option<SampleCamera>,
     slopes: Vec<DVec2>,
     slopes_of: Option<Intrinsics>,
 }
 
-/// The lens of a lattice and the camera's attitude.
+/// The lens of a grid and the camera's attitude.
 #[derive(Clone, Copy, Debug)]
-pub struct Eye {
+pub struct SampleCamera {
     /// Of the image. [px]
     pub intrinsics: Intrinsics,
     /// Pixels from sample to sample.
@@ -75,8 +75,8 @@ pub struct Eye {
     pub home_from_cam: DQuat,
 }
 
-impl Eye {
-    /// Returns where in the lattice, column and row, the image is of what a vector from the camera falls on [m, home axes].
+impl SampleCamera {
+    /// Returns where in the grid, column and row, the image is of what a vector from the camera falls on [m, home axes].
     pub fn sample_at(&self, offset_m: DVec3) -> Option<DVec2> {
         let pixel = self.intrinsics.project(self.home_from_cam.conjugate() * offset_m)?;
         let at = pixel / self.stride as f64;
@@ -95,9 +95,9 @@ impl Eye {
     }
 }
 
-impl Lattice {
+impl PixelGrid {
     /// Takes a new image; an image whose planes are shorter than its size is not looked at.
-    pub fn update(&mut self, view: &View<'_>) {
+    pub fn update(&mut self, view: &RgbdView<'_>) {
         let k = view.intrinsics;
         let (width, height) = (k.width_px as usize, k.height_px as usize);
         let stride = (width / COLUMNS).max(1);
@@ -106,7 +106,7 @@ impl Lattice {
         if view.rgb.len() < 3 * width * height || view.depth_mm.len() < width * height {
             (self.columns, self.rows) = (0, 0);
         }
-        self.eye = Some(Eye { intrinsics: k, stride, home_from_cam: view.home_from_cam });
+        self.camera = Some(SampleCamera { intrinsics: k, stride, home_from_cam: view.home_from_cam });
         self.lay_out(k, stride);
         for row in 0..self.rows {
             for column in 0..self.columns {
@@ -118,7 +118,7 @@ impl Lattice {
                 self.samples.push(Sample {
                     grey,
                     offset_m: view.home_from_cam * in_cam_m,
-                    paint: Paint::of([
+                    color: ColorClass::of([
                         view.rgb[3 * at],
                         view.rgb[3 * at + 1],
                         view.rgb[3 * at + 2],
@@ -133,12 +133,12 @@ impl Lattice {
         for sample in &mut self.samples {
             sample.offset_m = turn * sample.offset_m;
         }
-        if let Some(eye) = &mut self.eye {
-            eye.home_from_cam = turn * eye.home_from_cam;
+        if let Some(camera) = &mut self.camera {
+            camera.home_from_cam = turn * camera.home_from_cam;
         }
     }
 
-    /// Returns a sample; `None` outside the lattice.
+    /// Returns a sample; `None` outside the grid.
     pub fn at(&self, column: usize, row: usize) -> Option<&Sample> {
         if column >= self.columns { None } else { self.samples.get(row * self.columns + column) }
     }

@@ -1,15 +1,15 @@
 use super::*;
-use crate::booth::{Brick, picture, room, window};
+use crate::test_scene::{Brick, picture, room, window};
 
 const BLUE: [u8; 3] = [30, 80, 210];
 
-fn watched(bricks: &[Brick], kind: Kind, x_m: f64, from_m: DVec3) -> Screen {
+fn watched(bricks: &[Brick], kind: ObstacleKind, x_m: f64, from_m: DVec3) -> PlanarObstacle {
     let plane = Plane { origin_m: DVec3::new(x_m, from_m.y, 0.0), yaw_rad: 0.0 };
-    let mut screen = Screen::new(kind, plane, 2.0, 0.0);
+    let mut obstacle = PlanarObstacle::new(kind, plane, 2.0, 0.0);
     for n in 0..5 {
-        screen.update(f64::from(n), from_m, &picture(bricks, from_m, 0.0));
+        obstacle.update(f64::from(n), from_m, &picture(bricks, from_m, 0.0));
     }
-    screen
+    obstacle
 }
 
 #[test]
@@ -17,8 +17,8 @@ fn the_middle_of_a_window_is_its_opening() {
     let middle_m = DVec3::new(2.0, 0.3, 1.5);
     let mut bricks = room();
     bricks.extend(window(middle_m, 0.55, BLUE));
-    let screen = watched(&bricks, Kind::Window(Paint::Blue), 2.0, DVec3::new(0.2, 0.0, 1.3));
-    let opening = screen.opening.expect("an opening");
+    let obstacle = watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.2, 0.0, 1.3));
+    let opening = obstacle.opening.expect("an opening");
     assert!(opening.center_m.distance(middle_m) < 0.06, "{opening:?}");
     assert!((opening.radius_m - 0.55).abs() < 0.08, "{opening:?}");
 }
@@ -28,8 +28,8 @@ fn the_middle_of_a_window_is_its_opening() {
 fn between_the_legs_is_no_opening() {
     let mut bricks = room();
     bricks.extend(window(DVec3::new(2.0, 0.0, 2.6), 0.5, BLUE));
-    let screen = watched(&bricks, Kind::Window(Paint::Blue), 2.0, DVec3::new(0.0, 0.0, 0.8));
-    assert!(screen.opening.is_none_or(|opening| opening.center_m.z > 2.0), "{:?}", screen.opening);
+    let obstacle = watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.0, 0.0, 0.8));
+    assert!(obstacle.opening.is_none_or(|opening| opening.center_m.z > 2.0), "{:?}", obstacle.opening);
 }
 
 #[test]
@@ -48,8 +48,8 @@ fn a_gap_is_passed_where_it_is_widest() {
         part(DVec2::new(0.7, 1.0), DVec2::new(2.2, 1.9)),
         part(DVec2::new(-0.7, 1.5), DVec2::new(-0.2, 1.9)),
     ]);
-    let screen = watched(&bricks, Kind::Wall, 3.0, DVec3::new(1.0, 0.0, 1.2));
-    let opening = screen.opening.expect("an opening");
+    let obstacle = watched(&bricks, ObstacleKind::Wall, 3.0, DVec3::new(1.0, 0.0, 1.2));
+    let opening = obstacle.opening.expect("an opening");
     assert!((opening.center_m - DVec3::new(3.0, 0.25, 1.45)).length() < 0.08, "{opening:?}");
 }
 
@@ -61,9 +61,9 @@ fn a_whole_wall_has_none_and_pushes_back() {
         max_m: DVec3::new(2.1, 2.2, 3.0),
         rgb: [150, 80, 60],
     });
-    let screen = watched(&bricks, Kind::Wall, 2.0, DVec3::new(0.5, 0.0, 1.2));
-    assert_eq!(screen.opening, None);
-    let near_m = screen.nearest_solid_m(DVec3::new(1.6, 0.1, 1.2), 0.6).expect("a wall");
+    let obstacle = watched(&bricks, ObstacleKind::Wall, 2.0, DVec3::new(0.5, 0.0, 1.2));
+    assert_eq!(obstacle.opening, None);
+    let near_m = obstacle.nearest_solid_m(DVec3::new(1.6, 0.1, 1.2), 0.6).expect("a wall");
     assert!(near_m.distance(DVec3::new(2.0, 0.1, 1.2)) < CELL_M, "{near_m}");
-    assert_eq!(screen.nearest_solid_m(DVec3::new(1.2, 0.1, 1.2), 0.6), None);
+    assert_eq!(obstacle.nearest_solid_m(DVec3::new(1.2, 0.1, 1.2), 0.6), None);
 }

@@ -1,11 +1,11 @@
-//! Colour of a pixel -> which racing window's paint it is.
+//! Colour of a pixel -> which racing window it belongs to.
 //!
 //! The course's windows are known by their colours, as the real ones are. Hue tells them apart;
 //! saturation keeps brick, mats and grey steel out. Light changes value much, hue little.
 
 /// The coloured bars of the course's windows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Paint {
+pub enum ColorClass {
     /// Red bars, white arrowheads.
     Red,
     /// Blue bars, yellow arrowheads.
@@ -18,11 +18,11 @@ pub enum Paint {
     Teal,
 }
 
-impl Paint {
-    /// The paints of windows.
+impl ColorClass {
+    /// The colour classes of windows.
     pub const WINDOWS: [Self; 4] = [Self::Red, Self::Blue, Self::Magenta, Self::Orange];
 
-    /// Returns the paint of an sRGB pixel; `None` if it is none of them.
+    /// Returns the class of an sRGB pixel; `None` if it is in none.
     pub fn of(rgb: [u8; 3]) -> Option<Self> {
         let [r, g, b] = rgb.map(i32::from);
         let (most, least) = (r.max(g).max(b), r.min(g).min(b));
@@ -59,20 +59,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paints_are_told_from_each_other_and_from_the_hall() {
-        let check = |rgb: u32, expected: Option<Paint>| {
+    fn colour_classes_are_distinct_from_each_other_and_from_the_hall() {
+        let check = |rgb: u32, expected: Option<ColorClass>| {
             let [_, r, g, b] = rgb.to_be_bytes();
             for light in [30, 60, 100] {
                 let lit = [r, g, b].map(|c| (u32::from(c) * light / 100) as u8);
                 let dark = lit.iter().max().is_some_and(|&most| i32::from(most) < DARKEST);
-                assert_eq!(Paint::of(lit), expected.filter(|_| !dark), "{rgb:06x} at {light} %");
+                assert_eq!(ColorClass::of(lit), expected.filter(|_| !dark), "{rgb:06x} at {light} %");
             }
         };
-        check(0xd8_1f2a, Some(Paint::Red));
-        check(0x1f_54d8, Some(Paint::Blue));
-        check(0xe0_218a, Some(Paint::Magenta));
-        check(0xf0_8a12, Some(Paint::Orange));
-        check(0x12_b5a6, Some(Paint::Teal));
+        check(0xd8_1f2a, Some(ColorClass::Red));
+        check(0x1f_54d8, Some(ColorClass::Blue));
+        check(0xe0_218a, Some(ColorClass::Magenta));
+        check(0xf0_8a12, Some(ColorClass::Orange));
+        check(0x12_b5a6, Some(ColorClass::Teal));
         // Arrowheads, chequers, steel, floor mats, plaster, brick.
         for rgb in [0xf2_d21f, 0xf6_f2ea, 0x12_1214, 0x8b_8e93, 0x4a_6f94, 0xca_bfae, 0x8a_4a36] {
             check(rgb, None);

@@ -9,27 +9,27 @@ use std::ops::Range;
 
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-use crate::eye::{Lattice, Sample};
-use crate::paint::Paint;
+use crate::sampling::{PixelGrid, Sample};
+use crate::color_class::ColorClass;
 
-/// What a screen is.
+/// What an obstacle is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// A frame of bars of this paint.
-    Window(Paint),
+pub enum ObstacleKind {
+    /// A frame of bars of this colour.
+    Window(ColorClass),
     /// A wall with a gap.
     Wall,
 }
 
-impl Kind {
+impl ObstacleKind {
     /// Returns what to call it.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Window(Paint::Red) => "the red window",
-            Self::Window(Paint::Blue) => "the blue window",
-            Self::Window(Paint::Magenta) => "the magenta window",
-            Self::Window(Paint::Orange) => "the window with the hand",
-            Self::Window(Paint::Teal) => "a teal window",
+            Self::Window(ColorClass::Red) => "the red window",
+            Self::Window(ColorClass::Blue) => "the blue window",
+            Self::Window(ColorClass::Magenta) => "the magenta window",
+            Self::Window(ColorClass::Orange) => "the window with the hand",
+            Self::Window(ColorClass::Teal) => "a teal window",
             Self::Wall => "the gap",
         }
     }
@@ -76,8 +76,8 @@ impl Plane {
 pub struct Cell {
     /// Looked through (negative) or met (positive), newest counting most.
     evidence: i8,
-    /// How often a surface was met here that is a bar by its paint.
-    painted: u8,
+    /// How often a surface was met here that is a bar by its colour.
+    colored: u8,
 }
 
 impl Cell {
@@ -92,12 +92,12 @@ impl Cell {
     }
 
     fn is_bar(self) -> bool {
-        self.is_solid() && self.painted >= 2
+        self.is_solid() && self.colored >= 2
     }
 
-    fn meet(&mut self, painted: bool) {
+    fn meet(&mut self, colored: bool) {
         self.evidence = (self.evidence + 1).min(MOST);
-        self.painted = self.painted.saturating_add(u8::from(painted));
+        self.colored = self.colored.saturating_add(u8::from(colored));
     }
 
     fn look_through(&mut self) {
@@ -114,11 +114,11 @@ pub struct Opening {
     pub radius_m: f64,
 }
 
-/// A screen and what has been seen of it.
+/// An obstacle and what has been seen of it.
 #[derive(Clone, Debug)]
-pub struct Screen {
+pub struct PlanarObstacle {
     /// What it is.
-    pub kind: Kind,
+    pub kind: ObstacleKind,
     /// Where it is.
     pub plane: Plane,
     /// From how near the plane was measured. [m]
@@ -131,9 +131,9 @@ pub struct Screen {
     room_m: Vec<f32>,
 }
 
-impl Screen {
-    /// Makes a screen of which nothing is seen yet.
-    pub fn new(kind: Kind, plane: Plane, range_m: f64, now_s: f64) -> Self {
+impl PlanarObstacle {
+    /// Makes an obstacle of which nothing is seen yet.
+    pub fn new(kind: ObstacleKind, plane: Plane, range_m: f64, now_s: f64) -> Self {
         let cells = vec![Cell::default(); COLUMNS * ROWS];
         Self {
             kind,
@@ -166,7 +166,7 @@ impl Screen {
     }
 
     /// Takes an image seen from `camera_m` [m, home].
-    pub fn update(&mut self, now_s: f64, camera_m: DVec3, lattice: &Lattice) {
+    pub fn update(&mut self, now_s: f64, camera_m: DVec3, grid: &PixelGrid) {
         let before_m = -self.plane.behind_m(camera_m);
         if before_m < TOO_NEAR_M {
             return;
@@ -174,8 +174,8 @@ impl Screen {
         let (normal, left) = (self.plane.normal(), self.plane.left());
         let own_left_m = left.dot(camera_m - self.plane.origin_m);
         // What moves says nothing of what stands still.
-        let still = |sample: &&Sample| sample.is_seen() && sample.paint != Some(Paint::Teal);
-        for sample in lattice.samples.iter().filter(still) {
+        let still = |sample: &&Sample| sample.is_seen() && sample.color != Some(ColorClass::Teal);
+        for sample in grid.samples.iter().filter(still) {
             let depth_m = normal.dot(sample.offset_m);
             let deeper_m = depth_m - before_m;
             if deeper_m < -THICK_M || depth_m < 0.05 {
@@ -192,7 +192,7 @@ impl Screen {
             let Some(at) = index_of(DVec2::new(across_m, up_m)) else { continue };
             if met {
                 self.cells[at]
-                    .meet(sample.paint.is_some_and(|paint| self.kind == Kind::Window(paint)));
+                    .meet(sample.color.is_some_and(|color| self.kind == ObstacleKind::Window(color)));
                 self.seen_s = now_s;
             } else {
                 self.cells[at].look_through();
@@ -234,9 +234,9 @@ impl Screen {
     }
 
     /// Returns where an image seen from `camera_m` [m, home] shows a hand. [m, plane]
-    pub fn hand_m(&self, camera_m: DVec3, lattice: &Lattice) -> Vec<DVec2> {
-        let teal = |sample: &&Sample| sample.paint == Some(Paint::Teal) && sample.is_seen();
-        let points_m = lattice.samples.iter().filter(teal).map(|sample| camera_m + sample.offset_m);
+    pub fn hand_m(&self, camera_m: DVec3, grid: &PixelGrid) -> Vec<DVec2> {
+        let teal = |sample: &&Sample| sample.color == Some(ColorClass::Teal) && sample.is_seen();
+        let points_m = grid.samples.iter().filter(teal).map(|sample| camera_m + sample.offset_m);
         points_m
             .filter(|p_m| self.plane.behind_m(*p_m).abs() < HAND_M)
             .map(|p_m| self.plane.within_m(p_m))
@@ -332,7 +332,7 @@ impl Screen {
     }
 
     /// Whether the frame is around a cell: something solid to both sides and above or below, which
-    /// in a window has its paint. Between a window's legs there is none.
+    /// in a window has its colour. Between a window's legs there is none.
     fn is_framed(&self, column: usize, row: usize) -> bool {
         let look = |along: &mut dyn Iterator<Item = usize>| self.is_met(along);
         let sides = look(&mut (0..column).rev().map(|c| row * COLUMNS + c))
@@ -343,8 +343,8 @@ impl Screen {
         let below = look(&mut (0..row).rev().map(|r| r * COLUMNS + column));
         let above = look(&mut (row + 1..ROWS).map(|r| r * COLUMNS + column));
         match self.kind {
-            Kind::Window(_) => below || above,
-            Kind::Wall => below && above,
+            ObstacleKind::Window(_) => below || above,
+            ObstacleKind::Wall => below && above,
         }
     }
 
@@ -352,8 +352,8 @@ impl Screen {
     fn is_met(&self, along: &mut dyn Iterator<Item = usize>) -> bool {
         let along = along.take(REACH).skip_while(|&at| !self.cells[at].is_solid());
         match self.kind {
-            Kind::Window(_) => along.take(BAR).any(|at| self.cells[at].is_bar()),
-            Kind::Wall => along.take(BAR).filter(|&at| self.cells[at].is_solid()).count() >= 2,
+            ObstacleKind::Window(_) => along.take(BAR).any(|at| self.cells[at].is_bar()),
+            ObstacleKind::Wall => along.take(BAR).filter(|&at| self.cells[at].is_solid()).count() >= 2,
         }
     }
 }

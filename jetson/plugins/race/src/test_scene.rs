@@ -4,7 +4,7 @@ use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
 use vizflyt_sdk::{Intrinsics, Volume};
 
-use crate::eye::{Lattice, View};
+use crate::sampling::{PixelGrid, RgbdView};
 
 /// A box of one colour. [m, home]
 #[derive(Clone, Copy, Debug)]
@@ -49,7 +49,7 @@ pub(crate) fn window(middle_m: DVec3, half_m: f64, rgb: [u8; 3]) -> Vec<Brick> {
 }
 
 /// Returns what a level camera sees from a place [m, home], its heading from x [rad].
-pub(crate) fn picture(bricks: &[Brick], camera_m: DVec3, yaw_rad: f64) -> Lattice {
+pub(crate) fn picture(bricks: &[Brick], camera_m: DVec3, yaw_rad: f64) -> PixelGrid {
     let intrinsics = Intrinsics::from_horizontal_fov(160, 120, 90_f64.to_radians());
     let home_from_cam =
         DQuat::from_rotation_z(yaw_rad) * body_from_forward_cam(DVec3::ZERO, 0.0).rotation;
@@ -68,9 +68,9 @@ pub(crate) fn picture(bricks: &[Brick], camera_m: DVec3, yaw_rad: f64) -> Lattic
             depth_mm.push((depth_m * 1e3).round() as u16);
         }
     }
-    let mut lattice = Lattice::default();
-    lattice.update(&View { rgb: &rgb, depth_mm: &depth_mm, intrinsics, home_from_cam });
-    lattice
+    let mut grid = PixelGrid::default();
+    grid.update(&RgbdView { rgb: &rgb, depth_mm: &depth_mm, intrinsics, home_from_cam });
+    grid
 }
 
 /// Returns where a ray enters a box, in lengths of the ray.

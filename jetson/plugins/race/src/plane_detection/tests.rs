@@ -1,5 +1,5 @@
 use super::*;
-use crate::booth::{Brick, picture, room, window as frame};
+use crate::test_scene::{Brick, picture, room, window as frame};
 
 const RED: [u8; 3] = [200, 28, 40];
 const MAGENTA: [u8; 3] = [200, 30, 120];
@@ -9,12 +9,12 @@ fn a_window_is_found_where_it_stands() {
     let mut bricks = room();
     bricks.extend(frame(DVec3::new(2.2, 0.5, 1.4), 0.6, RED));
     let camera_m = DVec3::new(0.0, 0.0, 1.2);
-    let lattice = picture(&bricks, camera_m, 0.0);
-    let found = window(&lattice, camera_m, Paint::Red).expect("a red window");
+    let grid = picture(&bricks, camera_m, 0.0);
+    let found = window(&grid, camera_m, ColorClass::Red).expect("a red window");
     // Its front and the inner sides of its bars.
     assert!((found.plane.origin_m.x - 2.2).abs() < 0.06, "{found:?}");
     assert!((found.plane.origin_m.y - 0.5).abs() < 0.1 && found.plane.yaw_rad.abs() < 0.05);
-    assert_eq!(window(&lattice, camera_m, Paint::Blue), None);
+    assert_eq!(window(&grid, camera_m, ColorClass::Blue), None);
 }
 
 #[test]
@@ -27,7 +27,7 @@ fn of_the_same_paint_the_frame_counts_and_not_the_wall_behind() {
         rgb: MAGENTA,
     });
     let camera_m = DVec3::new(0.0, 0.2, 1.2);
-    let found = window(&picture(&bricks, camera_m, 0.0), camera_m, Paint::Magenta).expect("found");
+    let found = window(&picture(&bricks, camera_m, 0.0), camera_m, ColorClass::Magenta).expect("found");
     assert!((found.plane.origin_m.x - 2.0).abs() < 0.06, "{found:?}");
 }
 

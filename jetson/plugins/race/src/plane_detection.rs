@@ -1,14 +1,14 @@
-//! Finds upright planes in an image: bars by their paint, walls by their size.
+//! Finds upright planes in an image: bars by their colour, walls by their size.
 
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-use crate::eye::Lattice;
-use crate::paint::Paint;
-use crate::screen::Plane;
+use crate::sampling::PixelGrid;
+use crate::color_class::ColorClass;
+use crate::planar_obstacle::Plane;
 
 /// A plane found in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Spotted {
+pub struct DetectedPlane {
     /// Where.
     pub plane: Plane,
     /// From the camera to the middle of what was seen of it. [m]
@@ -17,18 +17,18 @@ pub struct Spotted {
     pub framed: bool,
 }
 
-/// Returns the nearest upright plane with enough of a paint. `camera_m` [m, home].
-pub fn window(lattice: &Lattice, camera_m: DVec3, paint: Paint) -> Option<Spotted> {
-    let mut points_m: Vec<DVec3> = lattice
+/// Returns the nearest upright plane with enough of a colour. `camera_m` [m, home].
+pub fn window(grid: &PixelGrid, camera_m: DVec3, color: ColorClass) -> Option<DetectedPlane> {
+    let mut points_m: Vec<DVec3> = grid
         .samples
         .iter()
-        .filter(|sample| sample.paint == Some(paint) && sample.is_seen())
+        .filter(|sample| sample.color == Some(color) && sample.is_seen())
         .filter(|sample| sample.offset_m.length_squared() < FAR_M * FAR_M)
         .map(|sample| camera_m + sample.offset_m)
         .filter(|p_m| p_m.z > LOWEST_M)
         .collect();
-    let mut nearest: Option<Spotted> = None;
-    // The paint may be seen on something else too, farther away: graffiti, mats.
+    let mut nearest: Option<DetectedPlane> = None;
+    // The colour may be seen on something else too, farther away: graffiti, mats.
     for _ in 0..3 {
         let Some(line) = upright_line(&points_m) else { break };
         let (on, off): (Vec<DVec3>, Vec<DVec3>) =
@@ -42,12 +42,12 @@ pub fn window(lattice: &Lattice, camera_m: DVec3, paint: Paint) -> Option<Spotte
     nearest
 }
 
-/// Returns the plane of a paint near where it is known to be.
-pub fn again(lattice: &Lattice, camera_m: DVec3, paint: Paint, known: &Plane) -> Option<Spotted> {
-    let points_m: Vec<DVec3> = lattice
+/// Returns the plane of a colour near where it is known to be.
+pub fn again(grid: &PixelGrid, camera_m: DVec3, color: ColorClass, known: &Plane) -> Option<DetectedPlane> {
+    let points_m: Vec<DVec3> = grid
         .samples
         .iter()
-        .filter(|sample| sample.paint == Some(paint) && sample.is_seen())
+        .filter(|sample| sample.color == Some(color) && sample.is_seen())
         .map(|sample| camera_m + sample.offset_m)
         .filter(|p_m| p_m.z > LOWEST_M && known.behind_m(*p_m).abs() < 0.3)
         .filter(|p_m| known.within_m(*p_m).x.abs() < 1.2)
@@ -57,11 +57,11 @@ pub fn again(lattice: &Lattice, camera_m: DVec3, paint: Paint, known: &Plane) ->
 }
 
 /// Returns the nearest large wall across the way.
-pub fn wall(lattice: &Lattice, camera_m: DVec3) -> Option<Spotted> {
+pub fn wall(grid: &PixelGrid, camera_m: DVec3) -> Option<DetectedPlane> {
     let mut areas_m2 = [0.0_f64; BINS];
-    let eye = lattice.eye?;
-    let pixel = eye.stride as f64 / eye.intrinsics.fx_px;
-    for sample in lattice.samples.iter().filter(|sample| is_of_wall(camera_m, sample.offset_m)) {
+    let camera = grid.camera?;
+    let pixel = camera.stride as f64 / camera.intrinsics.fx_px;
+    for sample in grid.samples.iter().filter(|sample| is_of_wall(camera_m, sample.offset_m)) {
         let depth_m = sample.offset_m.x;
         if let Some(area_m2) = areas_m2.get_mut((depth_m / BIN_M) as usize) {
             *area_m2 += (pixel * depth_m).powi(2);
@@ -69,7 +69,7 @@ pub fn wall(lattice: &Lattice, camera_m: DVec3) -> Option<Spotted> {
     }
     let bin = (0..BINS - 1).find(|&bin| areas_m2[bin] + areas_m2[bin + 1] > WALL_M2)?;
     let (low_m, high_m) = (bin as f64 * BIN_M, (bin + 2) as f64 * BIN_M);
-    let points_m: Vec<DVec3> = lattice
+    let points_m: Vec<DVec3> = grid
         .samples
         .iter()
         .filter(|sample| is_of_wall(camera_m, sample.offset_m))
@@ -86,7 +86,7 @@ fn is_of_wall(camera_m: DVec3, offset_m: DVec3) -> bool {
     offset_m.x > 0.2 && offset_m.y.abs() < 3.0 && (0.3..2.9).contains(&z_m)
 }
 
-fn describe(plane: Plane, points_m: &[DVec3], camera_m: DVec3) -> Spotted {
+fn describe(plane: Plane, points_m: &[DVec3], camera_m: DVec3) -> DetectedPlane {
     let (mut low, mut high) = (DVec2::MAX, DVec2::MIN);
     for p_m in points_m {
         let at_m = plane.within_m(*p_m);
@@ -103,7 +103,7 @@ fn describe(plane: Plane, points_m: &[DVec3], camera_m: DVec3) -> Spotted {
     let hollow = inner * 20 < points_m.len();
     let wide = (0.8..2.2).contains(&size.x) && (0.45..2.2).contains(&size.y);
     let origin_m = plane.point_m(DVec2::new(middle.x, 0.0)).with_z(0.0);
-    Spotted {
+    DetectedPlane {
         plane: Plane { origin_m, ..plane },
         range_m: plane.point_m(middle).distance(camera_m),
         framed: hollow && wide && points_m.len() >= FEWEST,
