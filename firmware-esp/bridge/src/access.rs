@@ -8,7 +8,7 @@
 //!
 //! ```text
 //! request   op, counter (u32), body, [16 bytes of HMAC if it changes something]
-//! answer    op | 0x80, verdict, body
+//! answer    op | 0x80, status, body
 //! HELLO     -> random (16), counter (u32), flags (1 claimed, 2 armed), version text
 //! STATS     -> counters (u32 each), see `report`
 //! READ      name -> value
@@ -70,7 +70,7 @@ impl Op {
 /// How a request fared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Verdict {
+pub enum Status {
     /// Done.
     Done = 0,
     /// There is no such request or setting.
@@ -89,17 +89,17 @@ pub enum Verdict {
     Armed = 7,
 }
 
-impl Verdict {
-    /// Returns the verdict of a number.
+impl Status {
+    /// Returns the status of a number.
     pub fn from_number(number: u8) -> Option<Self> {
-        use Verdict::{Armed, Claimed, Done, Malformed, OutOfRange, Unclaimed, Unknown, WrongKey};
+        use Status::{Armed, Claimed, Done, Malformed, OutOfRange, Unclaimed, Unknown, WrongKey};
         [Done, Unknown, Malformed, OutOfRange, WrongKey, Unclaimed, Claimed, Armed]
             .into_iter()
-            .find(|&verdict| verdict as u8 == number)
+            .find(|&status| status as u8 == number)
     }
 
     /// Returns it in words.
-    pub fn words(self) -> &'static str {
+    pub fn message(self) -> &'static str {
         match self {
             Self::Done => "done",
             Self::Unknown => "the bridge does not know it",
@@ -117,7 +117,7 @@ impl Verdict {
 
 /// A change that asks the shell for something.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Wish {
+pub(crate) enum ShellRequest {
     Save,
     Reset,
     Restart,
@@ -142,9 +142,9 @@ impl Access {
         let Some(at) = request.len().checked_sub(PROOF).filter(|&at| at >= HEAD) else {
             return false;
         };
-        let (said, given) = request.split_at(at);
-        let counter = u32::from_le_bytes([said[1], said[2], said[3], said[4]]);
-        let right = mac(key, &self.random, said).verify_truncated_left(given).is_ok();
+        let (signed, given) = request.split_at(at);
+        let counter = u32::from_le_bytes([signed[1], signed[2], signed[3], signed[4]]);
+        let right = mac(key, &self.random, signed).verify_truncated_left(given).is_ok();
         if right && counter > self.counter {
             self.counter = counter;
             return true;
@@ -157,10 +157,10 @@ impl Access {
     pub(crate) fn signed_by(&mut self, key: Option<&Key>, packet: Raw<'_>) -> bool {
         let Some(key) = key.filter(|_| packet.is_signed()) else { return false };
         let bytes = packet.bytes();
-        let (said, given) = bytes.split_at(bytes.len() - 6);
-        let right = Sha256::new().chain_update(key).chain_update(said).finalize();
+        let (signed, given) = bytes.split_at(bytes.len() - 6);
+        let right = Sha256::new().chain_update(key).chain_update(signed).finalize();
         let mut stamp = [0; 8];
-        stamp[..6].copy_from_slice(&said[said.len() - 6..]);
+        stamp[..6].copy_from_slice(&signed[signed.len() - 6..]);
         let signed_at = u64::from_le_bytes(stamp);
         // Why: six bytes are compared at once; how long that takes says nothing of a hash.
         let fresh = right[..6] == *given && signed_at > self.signed_at;
@@ -172,18 +172,18 @@ impl Access {
 }
 
 /// Returns the proof of a request by a key, for [`PROOF`] bytes behind it.
-pub fn proof(key: &Key, random: &[u8; 16], said: &[u8]) -> [u8; PROOF] {
-    let whole = mac(key, random, said).finalize().into_bytes();
+pub fn proof(key: &Key, random: &[u8; 16], signed: &[u8]) -> [u8; PROOF] {
+    let whole = mac(key, random, signed).finalize().into_bytes();
     core::array::from_fn(|at| whole[at])
 }
 
-fn mac(key: &Key, random: &[u8; 16], said: &[u8]) -> Hmac<Sha256> {
+fn mac(key: &Key, random: &[u8; 16], signed: &[u8]) -> Hmac<Sha256> {
     // HMAC fills a short key up with zeros to a block of the hash (RFC 2104, section 2).
     let mut block = [0; 64];
     block[..key.len()].copy_from_slice(key);
     let mut mac = <Hmac<Sha256> as Mac>::new(&block.into());
     mac.update(b"vizflyt bridge 1");
     mac.update(random);
-    mac.update(said);
+    mac.update(signed);
     mac
 }

@@ -11,7 +11,7 @@ const PERIOD: Duration = Duration::from_secs(2);
 /// Fast: nobody takes it for counted blinks.
 const FAST: Duration = Duration::from_millis(60);
 
-/// Shows what `light` says by `led`, for ever; a change shows after the period under way.
+/// Shows `light` on `led`, for ever; a change shows after the period under way.
 pub async fn run(light: impl Fn() -> Light, mut led: impl FnMut(bool)) -> ! {
     loop {
         match light() {

@@ -18,7 +18,7 @@ pub const ANSWER: usize = OPTIONS + 4 + 22;
 #[derive(Clone, Debug)]
 pub struct Leases {
     taken: [Option<Lease>; LEASES],
-    /// Counts requests: the smaller a lease's, the longer ago it was heard of.
+    /// Counts requests: the smaller a lease's, the longer ago it was used.
     turn: u32,
 }
 
@@ -92,10 +92,11 @@ impl Leases {
     /// for longest.
     fn place(&mut self, mac: [u8; 6]) -> usize {
         self.turn = self.turn.wrapping_add(1);
-        let own = self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
+        let bridge_messages =
+            self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
         let turn = self.turn;
         let age = |lease: &Option<Lease>| lease.map_or(u32::MAX, |l| turn.wrapping_sub(l.heard));
-        let place = own
+        let place = bridge_messages
             .or_else(|| (0..LEASES).rev().max_by_key(|&place| age(&self.taken[place])))
             .unwrap_or(0);
         self.taken[place] = Some(Lease { mac, heard: turn });

@@ -16,17 +16,17 @@ pub mod access;
 pub mod blink;
 pub mod bridge;
 pub mod dhcp;
+pub mod mavlink_writer;
 pub mod mdns;
+mod message_target;
 pub mod packet;
 pub mod page;
 mod ring;
-pub mod seal;
 pub mod settings;
 #[cfg(feature = "net")]
 pub mod shell;
 pub mod stats;
 pub mod storage;
-mod targets;
 #[cfg(feature = "update")]
 pub mod update;
 #[cfg(feature = "net")]

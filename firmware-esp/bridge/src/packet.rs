@@ -53,9 +53,9 @@ impl<'a> Raw<'a> {
         &self.bytes[header..header + usize::from(self.bytes[1])]
     }
 
-    /// Returns whom it is for (system, component); zero is everybody.
+    /// Returns the target (system, component); zero is everybody.
     pub fn target(self) -> (u8, u8) {
-        let Some((system_at, has_component)) = crate::targets::offset(self.id()) else {
+        let Some((system_at, has_component)) = crate::message_target::offset(self.id()) else {
             return (0, 0);
         };
         let byte = |at: usize| self.payload().get(at).copied().unwrap_or(0);

@@ -109,14 +109,14 @@ mod tests {
 
     use super::*;
     use crate::settings::Settings;
-    use crate::{Chip, seal};
+    use crate::{Chip, mavlink_writer};
 
     fn crowded() -> Bridge {
         let mut settings = Settings::default();
         settings.set("wifi.password", "not to be shown").unwrap();
         let mut bridge = Bridge::new(HostTime::ZERO, settings, Chip::default());
         let mut packet = [0; 280];
-        let len = seal::seal(&mut packet, (255, 1), 0, 0, &[1; 9]);
+        let len = mavlink_writer::write_packet(&mut packet, (255, 1), 0, 0, &[1; 9]);
         for last in 100..108 {
             let from = SocketAddrV4::new(Ipv4Addr::new(192, 168, 100, last), 60_000);
             bridge.handle_datagram(HostTime::ZERO, from, &packet[..len]);

@@ -20,7 +20,7 @@ pub enum WifiRole {
 /// The key that opens the configuration.
 pub type Key = [u8; 32];
 
-/// Everything a bridge can be told. Lives in flash; see `storage`.
+/// All settings of a bridge. Lives in flash; see `storage`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Settings {
     /// Speed of the autopilot's port, 57600 to 3000000. [baud]
@@ -58,7 +58,7 @@ pub struct Settings {
     pub password: String<64>,
     /// Name of the network we make; empty: `vizflyt-` and three bytes of the chip's address.
     pub ap_ssid: String<32>,
-    /// Its password, 8 characters at least; empty leaves it open, which a bridge says aloud.
+    /// Its password, 8 characters at least; empty leaves it open, which the bridge announces.
     pub ap_password: String<64>,
     /// Name that `NAME.local` finds us by.
     pub hostname: String<32>,

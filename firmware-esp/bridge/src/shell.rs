@@ -32,7 +32,7 @@ pub trait Platform {
     /// Shows how things are, by a light.
     fn show(&mut self, light: Light);
 
-    /// Returns how well the radio hears its partner; `None` where it does not know. [dBm]
+    /// Returns how well the radio receives its peer; `None` where it does not know. [dBm]
     fn signal_dbm(&mut self) -> Option<i8>;
 
     /// Takes the next bytes of a new firmware, of which `first` are the beginning; returns true with
@@ -46,7 +46,7 @@ pub trait Platform {
     }
 }
 
-/// What the light says; the number is how often it blinks in a period of two seconds.
+/// State shown by the light; the number is how often it blinks in a period of two seconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Light {

@@ -31,7 +31,7 @@ pub enum Target {
     Esp8266 = 2,
 }
 
-/// What a header says of the firmware behind it.
+/// Header of a firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// Its chip, by number.
@@ -59,7 +59,7 @@ impl Header {
     }
 
     /// Returns the header's bytes; `sign` signs what it is given by Ed25519.
-    pub fn seal(&self, sign: impl FnOnce(&[u8]) -> [u8; 64]) -> [u8; HEADER] {
+    pub fn sign(&self, sign: impl FnOnce(&[u8]) -> [u8; 64]) -> [u8; HEADER] {
         let message = self.message();
         let mut bytes = [0; HEADER];
         bytes[..SIGNED].copy_from_slice(&message[CONTEXT.len()..]);
@@ -114,7 +114,7 @@ pub enum Fault {
 
 impl Fault {
     /// Returns it in words.
-    pub fn words(self) -> &'static str {
+    pub fn message(self) -> &'static str {
         match self {
             Self::NoFirmware => "these bytes are no firmware for a bridge",
             Self::Signature => "the signature is not of this bridge's firmware key",
@@ -279,7 +279,7 @@ pub struct Trial<F> {
 
 /// What a start shall do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum StartAction {
     /// Run; nothing is on trial.
     Settled,
     /// Run, and call [`Trial::keep`] once healthy.
@@ -305,22 +305,22 @@ impl<F: NorFlash> Trial<F> {
         self.write(0, ON_TRIAL)
     }
 
-    /// Counts a start and says what it shall do.
+    /// Counts a start and returns what to do.
     ///
     /// # Errors
     /// [`Fault::Flash`]; then run: a flash that cannot count cannot switch either.
-    pub fn start(&mut self) -> Result<Verdict, Fault> {
+    pub fn start(&mut self) -> Result<StartAction, Fault> {
         if self.read(0)? != ON_TRIAL || self.read(4)? == 0 {
-            return Ok(Verdict::Settled);
+            return Ok(StartAction::Settled);
         }
         let left = self.read(8)?;
         let starts = left.count_zeros();
         if starts >= STARTS {
             self.write(4, 0)?;
-            return Ok(Verdict::GoBack);
+            return Ok(StartAction::GoBack);
         }
         self.write(8, left << 1)?;
-        Ok(Verdict::OnTrial)
+        Ok(StartAction::OnTrial)
     }
 
     /// Ends the trial: the firmware works.

@@ -159,7 +159,7 @@ async fn be_station<R: Radio>(stack: Stack<'_>, radio: &mut R, settings: &Settin
         }
         stack.set_config_v4(match settings.address {
             Some((address, prefix)) => ConfigV4::Static(fixed(address, prefix, settings.gateway)),
-            None => ConfigV4::Dhcp(asks(settings)),
+            None => ConfigV4::Dhcp(dhcp_config(settings)),
         });
         let mut has_address = false;
         let address = async {
@@ -185,7 +185,7 @@ fn fixed(address: Ipv4Addr, prefix: u8, gateway: Option<Ipv4Addr>) -> StaticConf
     }
 }
 
-fn asks(settings: &Settings) -> DhcpConfig {
+fn dhcp_config(settings: &Settings) -> DhcpConfig {
     let mut config = DhcpConfig::default();
     config.hostname = settings.hostname.as_str().try_into().ok();
     config
@@ -210,10 +210,10 @@ async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket:
     loop {
         // Asked first: the stack cannot be asked while it lends out a datagram.
         socket.wait_recv_ready().await;
-        let own = own_address(stack) == Some(OWN_ADDRESS);
+        let bridge_messages = own_address(stack) == Some(OWN_ADDRESS);
         let len = socket
             .recv_from_with(|request, _| {
-                own.then(|| leases.answer(OWN_ADDRESS, request, &mut answer)).flatten()
+                bridge_messages.then(|| leases.answer(OWN_ADDRESS, request, &mut answer)).flatten()
             })
             .await;
         if let Some(len) = len {

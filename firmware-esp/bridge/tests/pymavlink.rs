@@ -11,7 +11,7 @@ use vizflyt_protocol::time::HostTime;
 const BYTES: &[u8] = include_bytes!("data/pymavlink.bin");
 const LINES: &str = include_str!("data/pymavlink.txt");
 
-/// What a packet is: its bytes, and what pymavlink says of it.
+/// What a packet is: its bytes, and what pymavlink read from it.
 struct Expected {
     bytes: &'static [u8],
     id: u32,

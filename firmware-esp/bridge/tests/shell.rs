@@ -17,8 +17,8 @@ use embassy_time::{Duration, with_timeout};
 use embedded_io_async::Write;
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashErrorKind, ReadNorFlash};
 use sha2::{Digest, Sha256};
+use vizflyt_bridge::mavlink_writer::write_packet;
 use vizflyt_bridge::packet::{CutStats, Cutter, each_in_datagram};
-use vizflyt_bridge::seal::seal;
 use vizflyt_bridge::shell::{Buffers, Light, Platform, SOCKETS, Shared, run};
 use vizflyt_bridge::storage::Store;
 use vizflyt_bridge::update::{Fault, Header, Slots, Target, Updater, Wanted};
@@ -57,7 +57,7 @@ impl Platform for Bare {
             self.updater = None;
         }
         let updater = self.updater.get_or_insert_with(|| Updater::new(wanted()));
-        updater.feed(&mut self.halves, bytes).map_err(Fault::words)
+        updater.feed(&mut self.halves, bytes).map_err(Fault::message)
     }
 }
 
@@ -203,7 +203,7 @@ fn packet(from: (u8, u8), id: u32, number: u32) -> Vec<u8> {
     let mut payload = [0x5A; 28];
     payload[..4].copy_from_slice(&number.to_le_bytes());
     let mut out = [0; 280];
-    let len = seal(&mut out, from, number as u8, id, &payload);
+    let len = write_packet(&mut out, from, number as u8, id, &payload);
     out[..len].to_vec()
 }
 
@@ -329,7 +329,7 @@ fn signed(body: &[u8]) -> Vec<u8> {
         hash: Sha256::digest(body).into(),
     };
     let key = SigningKey::from_bytes(&FIRMWARE_SECRET);
-    [&header.seal(|message| key.sign(message).to_bytes())[..], body].concat()
+    [&header.sign(|message| key.sign(message).to_bytes())[..], body].concat()
 }
 
 /// Brings a firmware and returns the answer.
@@ -387,7 +387,7 @@ fn an_armed_vehicle_keeps_its_firmware() {
         // Custom mode GUIDED, a quadrotor of ArduPilot's, armed, active, MAVLink 2.
         let payload = [4, 0, 0, 0, 2, 3, 0x80 | 0x09, 4, 3];
         let mut heartbeat = [0; 280];
-        let len = seal(&mut heartbeat, (1, 1), 0, 0, &payload);
+        let len = write_packet(&mut heartbeat, (1, 1), 0, 0, &payload);
         uart_out.write_all(&heartbeat[..len]).await.unwrap();
         // Taken when the page says so.
         loop {

@@ -17,7 +17,7 @@ const HELD: Duration = Duration::from_secs(5);
 
 static LIGHT: AtomicU8 = AtomicU8::new(Light::NoNetwork as u8);
 
-/// Returns what the light says now.
+/// Returns the state to show by the light.
 pub(crate) fn light() -> Light {
     let code = LIGHT.load(Ordering::Relaxed);
     [Light::Forwarding, Light::NoAutopilot, Light::NoClient, Light::Unclaimed, Light::Landing]

@@ -106,7 +106,7 @@ const JOIN: Duration = Duration::from_secs(10);
 
 static SIGNAL_DBM: AtomicI8 = AtomicI8::new(0);
 
-/// Returns how well the network is heard that we are in. [dBm]
+/// Returns the signal strength of the network we have joined. [dBm]
 pub(crate) fn signal_dbm() -> Option<i8> {
     match SIGNAL_DBM.load(Ordering::Relaxed) {
         0 => None,

@@ -8,7 +8,7 @@ use esp_bootloader_esp_idf::partitions::{
     AppPartitionSubType, Error, PARTITION_TABLE_MAX_LEN, PartitionType, read_partition_table,
 };
 use vizflyt_bridge::settings::key_from_hex;
-use vizflyt_bridge::update::{Fault, Slots, Target, Trial, Updater, Verdict, Wanted};
+use vizflyt_bridge::update::{Fault, Slots, StartAction, Target, Trial, Updater, Wanted};
 
 use crate::flash::{self, Flash, Region};
 
@@ -41,14 +41,14 @@ fn trial(flash: &'static Flash) -> Trial<Region> {
 /// Comes before everything that may fail. Returns whether this one is on trial.
 pub(crate) fn start(flash: &'static Flash) -> bool {
     match trial(flash).start() {
-        Ok(Verdict::OnTrial) => true,
-        Ok(Verdict::GoBack) => {
+        Ok(StartAction::OnTrial) => true,
+        Ok(StartAction::GoBack) => {
             if Halves::of(flash).is_some_and(|mut halves| halves.select_spare().is_ok()) {
                 esp_hal::system::software_reset();
             }
             false
         }
-        Ok(Verdict::Settled) | Err(_) => false,
+        Ok(StartAction::Settled) | Err(_) => false,
     }
 }
 
@@ -66,7 +66,7 @@ pub(crate) struct Updates {
 }
 
 impl Updates {
-    /// Returns `None` if this firmware has no key, or the flash does not say which half runs.
+    /// Returns `None` if this firmware has no key, or the flash does not tell which half runs.
     pub(crate) fn new(flash: &'static Flash) -> Option<Self> {
         let wanted = Wanted { target: Target::Esp32C3, build: BUILD, key: KEY? };
         Some(Self { wanted, halves: Halves::of(flash)?, updater: None })
@@ -78,7 +78,7 @@ impl Updates {
             self.updater = None;
         }
         let updater = self.updater.get_or_insert_with(|| Updater::new(self.wanted));
-        updater.feed(&mut self.halves, bytes).map_err(Fault::words)
+        updater.feed(&mut self.halves, bytes).map_err(Fault::message)
     }
 }
 

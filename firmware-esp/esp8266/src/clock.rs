@@ -46,7 +46,7 @@ impl Driver for Clock {
     }
 }
 
-/// Wakes whom the time has come for; returns how long until the next one. [us]
+/// Wakes the tasks whose time has come; returns how long until the next one. [us]
 pub(crate) fn wake_due() -> u32 {
     critical_section::with(|section| {
         let mut state = CLOCK.0.borrow_ref_mut(section);

@@ -8,7 +8,7 @@ use crate::platform;
 
 static LIGHT: AtomicU8 = AtomicU8::new(Light::NoNetwork as u8);
 
-/// Returns what the light says now.
+/// Returns the state to show by the light.
 pub(crate) fn light() -> Light {
     let code = LIGHT.load(Ordering::Relaxed);
     [Light::Forwarding, Light::NoAutopilot, Light::NoClient, Light::Unclaimed, Light::Landing]

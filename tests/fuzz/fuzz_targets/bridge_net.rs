@@ -8,8 +8,8 @@ use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;
 use vizflyt_bridge::access::{self, TUNNEL_TYPE};
 use vizflyt_bridge::bridge::CLIENTS;
+use vizflyt_bridge::mavlink_writer::write_packet;
 use vizflyt_bridge::packet::{CutStats, each_in_datagram};
-use vizflyt_bridge::seal::seal;
 use vizflyt_bridge::{Bridge, Chip, Settings};
 use vizflyt_protocol::time::HostTime;
 
@@ -42,7 +42,7 @@ fuzz_target!(|steps: Vec<Step<'_>>| {
             Step::Packet(from, id, payload) => {
                 let mut packet = [0; 280];
                 let payload = &payload[..payload.len().min(255)];
-                let len = seal(&mut packet, (255, from), 0, id.into(), payload);
+                let len = write_packet(&mut packet, (255, from), 0, id.into(), payload);
                 bridge.handle_datagram(now, address(from), &packet[..len]);
             }
             Step::Request(request, with_key) => {
@@ -56,7 +56,7 @@ fuzz_target!(|steps: Vec<Step<'_>>| {
                 let mut payload = vec![low, high, 1, 240, request.len() as u8];
                 payload.extend_from_slice(&request);
                 let mut packet = [0; 280];
-                let len = seal(&mut packet, (255, 1), 0, 385, &payload);
+                let len = write_packet(&mut packet, (255, 1), 0, 385, &payload);
                 bridge.handle_datagram(now, address(1), &packet[..len]);
             }
             Step::Stream(slot, bytes) => bridge.handle_stream(now, slot, bytes),

@@ -10,12 +10,12 @@ use vizflyt_protocol::mavlink::dialect::{
 use vizflyt_protocol::time::HostTime;
 
 use super::clients::bit;
-use super::hub::{Hub, kind, millis};
-use super::loss::{Act, Flight};
+use super::loss::{Flight, LossAction};
+use super::router::{PacketRouter, kind, millis};
 use crate::access::{self, Access};
+use crate::mavlink_writer::{BridgeMessage, write_message, write_packet};
 use crate::packet::Raw;
 use crate::ring::Tag;
-use crate::seal::{Own, seal, seal_message};
 use crate::settings::{NUMBERS, Settings};
 
 /// Our component: MAV_COMP_ID_UDP_BRIDGE.
@@ -34,7 +34,7 @@ pub enum Event {
 
 /// What was asked of others and awaits its answer, and who may ask us.
 #[derive(Clone, Debug)]
-pub(super) struct Asked {
+pub(super) struct OutstandingRequests {
     /// TIMESYNC requests under way: their `ts1`, and when they passed.
     syncs: heapless::Deque<(i64, HostTime), 4>,
     /// When a client last asked: then we need not.
@@ -44,7 +44,7 @@ pub(super) struct Asked {
     pub(super) access: Access,
 }
 
-impl Asked {
+impl OutstandingRequests {
     pub(super) const fn new(random: [u8; 16]) -> Self {
         Self {
             syncs: heapless::Deque::new(),
@@ -79,7 +79,7 @@ const COMMAND_ACK: u32 = 77;
 const TIMESYNC: u32 = 111;
 const TUNNEL: u32 = 385;
 
-impl Hub {
+impl PacketRouter {
     /// Returns our system and component.
     pub(super) fn address(&self) -> (u8, u8) {
         (self.autopilot.map_or(SYSTEM_ID, |(system, _)| system), COMPONENT_ID)
@@ -93,7 +93,7 @@ impl Hub {
 
     // ---- what passes by ----
 
-    /// Takes note of what the autopilot says; returns whether it is an answer to us alone.
+    /// Takes note of a packet from the autopilot; returns whether it is an answer to us alone.
     pub(super) fn note_from_autopilot(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
         let field = Fields(packet.payload());
         match packet.id() {
@@ -122,10 +122,12 @@ impl Hub {
             }
             TIMESYNC if field.i64(0) != 0 => {
                 let ts1 = field.i64(8);
-                if let Some(&(_, at)) = self.asked.syncs.iter().find(|&&(sent, _)| sent == ts1) {
+                if let Some(&(_, at)) =
+                    self.outstanding.syncs.iter().find(|&&(sent, _)| sent == ts1)
+                {
                     self.stats.round_trip_us = (now.seconds_since(at) * 1e6) as u32;
                 }
-                self.asked.ours == Some(ts1)
+                self.outstanding.ours == Some(ts1)
             }
             _ => false,
         }
@@ -135,8 +137,8 @@ impl Hub {
     pub(super) fn note_to_autopilot(&mut self, now: HostTime, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         if packet.id() == TIMESYNC && field.i64(0) == 0 {
-            self.asked.note_sync(now, field.i64(8));
-            self.asked.client_asked_at = Some(now);
+            self.outstanding.note_sync(now, field.i64(8));
+            self.outstanding.client_asked_at = Some(now);
         }
     }
 
@@ -148,7 +150,7 @@ impl Hub {
         match packet.id() {
             PARAM_REQUEST_LIST => {
                 for index in 0..NUMBERS.len() {
-                    self.say_param(now, from, index);
+                    self.send_param(now, from, index);
                 }
             }
             PARAM_REQUEST_READ => {
@@ -157,7 +159,7 @@ impl Hub {
                     index => usize::try_from(index).ok().filter(|&index| index < NUMBERS.len()),
                 };
                 if let Some(index) = index {
-                    self.say_param(now, from, index);
+                    self.send_param(now, from, index);
                 }
             }
             PARAM_SET => {
@@ -170,7 +172,7 @@ impl Hub {
                     // A value out of range changes nothing, as the answer shows.
                     let _ = NUMBERS[index].set(&mut self.settings, value as u32);
                 }
-                self.say_param(now, from, index);
+                self.send_param(now, from, index);
             }
             COMMAND_LONG if self.is_ours(packet.target()) => {
                 self.handle_command(now, from, packet);
@@ -184,34 +186,34 @@ impl Hub {
     fn may_change(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
         let reason = if self.flight.armed {
             "bridge: nothing is changed while armed"
-        } else if !self.asked.access.signed_by(self.settings.key.as_ref(), packet) {
+        } else if !self.outstanding.access.signed_by(self.settings.key.as_ref(), packet) {
             "bridge: changes need its key: vizflyt bridge configure"
         } else {
             return true;
         };
         self.stats.refused = self.stats.refused.wrapping_add(1);
-        self.say(now, MavSeverity::MAV_SEVERITY_WARNING, reason);
+        self.send_status_text(now, MavSeverity::MAV_SEVERITY_WARNING, reason);
         false
     }
 
     fn handle_command(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         let command = u32::from(field.u16(28));
-        let wish = if command == MavCmd::MAV_CMD_PREFLIGHT_STORAGE as u32 {
+        let request = if command == MavCmd::MAV_CMD_PREFLIGHT_STORAGE as u32 {
             match field.f32(0) {
-                1.0 => Some(access::Wish::Save),
-                2.0 => Some(access::Wish::Reset),
+                1.0 => Some(access::ShellRequest::Save),
+                2.0 => Some(access::ShellRequest::Reset),
                 _ => None,
             }
         } else if command == MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN as u32 {
-            Some(access::Wish::Restart)
+            Some(access::ShellRequest::Restart)
         } else {
             None
         };
-        let result = match wish {
+        let result = match request {
             None => MavResult::MAV_RESULT_UNSUPPORTED,
-            Some(wish) if self.may_change(now, packet) => {
-                self.grant(now, wish);
+            Some(request) if self.may_change(now, packet) => {
+                self.grant(now, request);
                 MavResult::MAV_RESULT_ACCEPTED
             }
             Some(_) => MavResult::MAV_RESULT_DENIED,
@@ -223,19 +225,19 @@ impl Hub {
     }
 
     /// Does what was rightfully asked.
-    pub(super) fn grant(&mut self, now: HostTime, wish: access::Wish) {
-        match wish {
-            access::Wish::Save => {
+    pub(super) fn grant(&mut self, now: HostTime, request: access::ShellRequest) {
+        match request {
+            access::ShellRequest::Save => {
                 // Twice the same wish is one; four different ones do not exist.
                 let _ = self.events.push_back(Event::Save);
             }
-            access::Wish::Reset => {
+            access::ShellRequest::Reset => {
                 // The key stays: who resets the settings does not open the bridge to others.
                 let key = self.settings.key;
                 self.settings = Settings { key, ..Settings::default() };
                 self.fix_client(now);
             }
-            access::Wish::Restart => {
+            access::ShellRequest::Restart => {
                 let _ = self.events.push_back(Event::Restart);
             }
         }
@@ -271,9 +273,9 @@ impl Hub {
         }
         self.second_at = now.plus_seconds(SECOND_S);
         self.beacon_due = self.settings.beacon && self.autopilot.is_some();
-        self.tell_clients(
+        self.send_to_clients(
             now,
-            &Own::HEARTBEAT(HEARTBEAT_DATA {
+            &BridgeMessage::HEARTBEAT(HEARTBEAT_DATA {
                 mavtype: MavType::MAV_TYPE_GENERIC,
                 autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
                 system_status: MavState::MAV_STATE_ACTIVE,
@@ -285,29 +287,32 @@ impl Hub {
             return;
         }
         if self.settings.radio_status {
-            let status = Own::RADIO_STATUS(self.radio_status());
-            self.tell_clients(now, &status);
-            self.tell_autopilot(now, &status);
+            let status = BridgeMessage::RADIO_STATUS(self.radio_status());
+            self.send_to_clients(now, &status);
+            self.send_to_autopilot(now, &status);
         }
-        let asked_s = self.asked.client_asked_at.map(|at| now.seconds_since(at));
+        let asked_s = self.outstanding.client_asked_at.map(|at| now.seconds_since(at));
         if !asked_s.is_some_and(|asked_s| asked_s < SYNC_S) {
             let ts1 = now.as_ns().cast_signed().max(1);
-            self.asked.note_sync(now, ts1);
-            self.asked.ours = Some(ts1);
-            self.tell_autopilot(now, &Own::TIMESYNC(TIMESYNC_DATA { ts1, ..Default::default() }));
+            self.outstanding.note_sync(now, ts1);
+            self.outstanding.ours = Some(ts1);
+            self.send_to_autopilot(
+                now,
+                &BridgeMessage::TIMESYNC(TIMESYNC_DATA { ts1, ..Default::default() }),
+            );
         }
     }
 
-    fn act(&mut self, now: HostTime, Act::Land { confirmation }: Act) {
+    fn act(&mut self, now: HostTime, LossAction::Land { confirmation }: LossAction) {
         let Some(target) = self.autopilot else { return };
         if confirmation == 0 {
             self.stats.landings = self.stats.landings.wrapping_add(1);
             let text = "bridge: the companion is silent: landing";
-            self.say(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
+            self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
         }
-        self.tell_autopilot(
+        self.send_to_autopilot(
             now,
-            &Own::COMMAND_LONG(COMMAND_LONG_DATA {
+            &BridgeMessage::COMMAND_LONG(COMMAND_LONG_DATA {
                 command: MavCmd::MAV_CMD_NAV_LAND,
                 target_system: target.0,
                 target_component: target.1,
@@ -320,7 +325,7 @@ impl Hub {
     pub(super) fn note_saved(&mut self, now: HostTime, saved: bool) {
         if !saved {
             let text = "bridge: its flash did not take the settings";
-            self.say(now, MavSeverity::MAV_SEVERITY_ERROR, text);
+            self.send_status_text(now, MavSeverity::MAV_SEVERITY_ERROR, text);
         }
     }
 
@@ -336,23 +341,26 @@ impl Hub {
             rssi,
             remrssi: UNKNOWN,
             // What the autopilot slows its streams by: the slowest client's room.
-            txbuf: 100 - (most * 100 / super::hub::DOWN as u32).min(100) as u8,
+            txbuf: 100 - (most * 100 / super::router::DOWN as u32).min(100) as u8,
             noise: UNKNOWN,
             remnoise: UNKNOWN,
         }
     }
 
     /// Says a sentence of at most 50 characters to everybody.
-    fn say(&mut self, now: HostTime, severity: MavSeverity, text: &str) {
-        let message =
-            Own::STATUSTEXT(STATUSTEXT_DATA { severity, text: text.into(), ..Default::default() });
-        self.tell_clients(now, &message);
-        self.tell_autopilot(now, &message);
+    fn send_status_text(&mut self, now: HostTime, severity: MavSeverity, text: &str) {
+        let message = BridgeMessage::STATUSTEXT(STATUSTEXT_DATA {
+            severity,
+            text: text.into(),
+            ..Default::default()
+        });
+        self.send_to_clients(now, &message);
+        self.send_to_autopilot(now, &message);
     }
 
-    fn say_param(&mut self, now: HostTime, to: Option<usize>, index: usize) {
+    fn send_param(&mut self, now: HostTime, to: Option<usize>, index: usize) {
         let number = &NUMBERS[index];
-        let message = Own::PARAM_VALUE(PARAM_VALUE_DATA {
+        let message = BridgeMessage::PARAM_VALUE(PARAM_VALUE_DATA {
             param_value: number.value(&self.settings) as f32,
             param_count: NUMBERS.len() as u16,
             param_index: index as u16,
@@ -360,27 +368,27 @@ impl Hub {
             param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
         });
         let mut packet = [0; MAX_PACKET];
-        let len = seal_message(&mut packet, self.address(), 0, &message);
+        let len = write_message(&mut packet, self.address(), 0, &message);
         self.deliver(now, to, message.id(), &packet[..len]);
     }
 
     /// Sends a message to whoever asked.
     fn reply(&mut self, now: HostTime, to: Option<usize>, id: u32, payload: &[u8]) {
         let mut packet = [0; MAX_PACKET];
-        let len = seal(&mut packet, self.address(), 0, id, payload);
+        let len = write_packet(&mut packet, self.address(), 0, id, payload);
         self.deliver(now, to, id, &packet[..len]);
     }
 
-    fn tell_clients(&mut self, now: HostTime, message: &Own) {
+    fn send_to_clients(&mut self, now: HostTime, message: &BridgeMessage) {
         let mut packet = [0; MAX_PACKET];
-        let len = seal_message(&mut packet, self.address(), 0, message);
+        let len = write_message(&mut packet, self.address(), 0, message);
         let everybody = self.listeners((0, 0), None);
         self.push_down(now, self.address(), kind(message.id()), everybody, true, &packet[..len]);
     }
 
-    fn tell_autopilot(&mut self, now: HostTime, message: &Own) {
+    fn send_to_autopilot(&mut self, now: HostTime, message: &BridgeMessage) {
         let mut packet = [0; MAX_PACKET];
-        let len = seal_message(&mut packet, self.address(), 0, message);
+        let len = write_message(&mut packet, self.address(), 0, message);
         self.deliver(now, None, message.id(), &packet[..len]);
     }
 

@@ -9,7 +9,7 @@
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::time::HostTime;
 
-/// What the autopilot's heartbeat says.
+/// Contents of the autopilot's heartbeat.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Flight {
     pub armed: bool,
@@ -22,7 +22,7 @@ impl Flight {
     /// Before the first heartbeat; as the default, but `const`.
     pub(crate) const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
 
-    /// Whether the vehicle does what a companion says.
+    /// Whether the vehicle obeys a companion.
     pub(crate) fn follows(self) -> bool {
         let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
         self.armed && self.mode == mode
@@ -35,7 +35,7 @@ const PX4_OFFBOARD: u32 = 6 << 16;
 const STREAM: u8 = 10;
 const STREAM_S: f64 = 2.0;
 /// A companion silent for this long has ended, if nothing follows it. Longer than the time from the
-/// last pose before arming to the heartbeat that tells of it. [s]
+/// last pose before arming to the heartbeat that reports it. [s]
 const ENDED_S: f64 = 5.0;
 /// LAND is repeated this often until it is acknowledged. [s]
 const REPEAT_S: f64 = 0.3;
@@ -66,8 +66,8 @@ struct Landing {
 
 /// What is to be done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Act {
-    /// Send LAND with this count of repetitions; zero means it begins: say so.
+pub(crate) enum LossAction {
+    /// Send LAND with this count of repetitions; zero means it begins: announce it.
     Land {
         /// MAVLink's count of repetitions.
         confirmation: u8,
@@ -127,7 +127,12 @@ impl LinkLoss {
     }
 
     /// Returns what is to be done at `now`.
-    pub(crate) fn poll(&mut self, now: HostTime, flight: Flight, loss_ms: u16) -> Option<Act> {
+    pub(crate) fn poll(
+        &mut self,
+        now: HostTime,
+        flight: Flight,
+        loss_ms: u16,
+    ) -> Option<LossAction> {
         if self.landing.is_some() && !flight.follows() {
             self.landing = None;
             // Its stream is to be seen anew before it is followed again.
@@ -147,7 +152,7 @@ impl LinkLoss {
         let repeat_s = if acknowledged { REPEAT_ACKNOWLEDGED_S } else { REPEAT_S };
         let repeat_at = now.plus_seconds(repeat_s);
         self.landing = Some(Landing { repeat_at, confirmation, acknowledged });
-        Some(Act::Land { confirmation })
+        Some(LossAction::Land { confirmation })
     }
 }
 
@@ -179,7 +184,8 @@ mod tests {
             if ms <= 1000 && ms % period_ms == 0 {
                 loss.note_packet(at(ms), RUNTIME, true);
             }
-            if let Some(Act::Land { confirmation }) = loss.poll(at(ms), flight(ms), loss_ms) {
+            if let Some(LossAction::Land { confirmation }) = loss.poll(at(ms), flight(ms), loss_ms)
+            {
                 sent.push((ms, confirmation));
             }
         }
@@ -233,12 +239,12 @@ mod tests {
         for ms in (0..=500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);
         }
-        assert_eq!(loss.poll(at(1500), GUIDED, 1000), Some(Act::Land { confirmation: 0 }));
+        assert_eq!(loss.poll(at(1500), GUIDED, 1000), Some(LossAction::Land { confirmation: 0 }));
         loss.note_acknowledged(at(1510));
         assert_eq!(loss.due(GUIDED, 1000), Some(at(3010)));
         // It comes back: the landing goes on.
         loss.note_packet(at(1600), RUNTIME, true);
-        assert_eq!(loss.poll(at(3010), GUIDED, 1000), Some(Act::Land { confirmation: 1 }));
+        assert_eq!(loss.poll(at(3010), GUIDED, 1000), Some(LossAction::Land { confirmation: 1 }));
         assert_eq!(loss.poll(at(3100), Flight { mode: 9, ..GUIDED }, 1000), None);
         assert!(!loss.is_landing());
     }

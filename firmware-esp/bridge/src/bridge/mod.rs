@@ -11,9 +11,9 @@
 
 mod clients;
 mod component;
-mod hub;
 mod loss;
 mod requests;
+mod router;
 #[cfg(test)]
 mod tests;
 
@@ -24,7 +24,7 @@ use vizflyt_protocol::time::HostTime;
 
 pub use clients::{CLIENTS, Peer, TCP_SLOTS};
 pub use component::{COMPONENT_ID, Event};
-use hub::Hub;
+use router::PacketRouter;
 
 use crate::packet::{Cutter, each_in_datagram};
 use crate::settings::Settings;
@@ -50,7 +50,7 @@ const STALL_NS: i64 = 50_000_000;
 pub struct Bridge {
     uart: Cutter,
     tcp: [Cutter; TCP_SLOTS],
-    hub: Hub,
+    router: PacketRouter,
 }
 
 impl Bridge {
@@ -64,167 +64,173 @@ impl Bridge {
     /// A bridge that has not begun: `const`, for a chip's static memory, whose stack has no room
     /// for one.
     pub const fn empty() -> Self {
-        Self { uart: Cutter::new(), tcp: [const { Cutter::new() }; TCP_SLOTS], hub: Hub::empty() }
+        Self {
+            uart: Cutter::new(),
+            tcp: [const { Cutter::new() }; TCP_SLOTS],
+            router: PacketRouter::empty(),
+        }
     }
 
     /// Begins at `now`; once, before anything else.
     pub fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
-        self.hub.begin(now, settings, chip);
+        self.router.begin(now, settings, chip);
     }
 
     // ---- what goes in ----
 
     /// Takes bytes from the autopilot's port, in any portions.
     pub fn handle_uart(&mut self, now: HostTime, bytes: &[u8]) {
-        let Self { uart, hub, .. } = self;
-        hub.note_uart_bytes(now, bytes.len());
-        uart.push(bytes, |packet| hub.take_uart(now, packet));
-        hub.note_uart_cut(uart.stats(), uart.is_waiting());
-        hub.poll(now);
+        let Self { uart, router, .. } = self;
+        router.note_uart_bytes(now, bytes.len());
+        uart.push(bytes, |packet| router.take_uart(now, packet));
+        router.note_uart_cut(uart.stats(), uart.is_waiting());
+        router.poll(now);
     }
 
     /// Takes a datagram. Its sender becomes a client if it holds a packet.
     pub fn handle_datagram(&mut self, now: HostTime, from: SocketAddrV4, bytes: &[u8]) {
-        let hub = &mut self.hub;
-        let mut cut = hub.stats.net.cut;
-        hub.stats.net.bytes_in = hub.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
-        each_in_datagram(bytes, &mut cut, |packet| hub.take_client(now, Peer::Udp(from), packet));
-        hub.stats.net.cut = cut;
-        hub.poll(now);
+        let router = &mut self.router;
+        let mut cut = router.stats.net.cut;
+        router.stats.net.bytes_in = router.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        each_in_datagram(bytes, &mut cut, |packet| {
+            router.take_client(now, Peer::Udp(from), packet);
+        });
+        router.stats.net.cut = cut;
+        router.poll(now);
     }
 
     /// Somebody has connected by TCP to this slot.
     pub fn open_stream(&mut self, now: HostTime, slot: u8) {
         if let Some(cutter) = self.tcp.get_mut(usize::from(slot)) {
             cutter.restart();
-            self.hub.open(now, Peer::Tcp(slot));
+            self.router.open(now, Peer::Tcp(slot));
         }
     }
 
     /// Takes bytes from a TCP connection.
     pub fn handle_stream(&mut self, now: HostTime, slot: u8, bytes: &[u8]) {
-        let Self { tcp, hub, .. } = self;
+        let Self { tcp, router, .. } = self;
         let Some(cutter) = tcp.get_mut(usize::from(slot)) else { return };
-        hub.stats.net.bytes_in = hub.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        router.stats.net.bytes_in = router.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
         let before = cutter.stats();
-        cutter.push(bytes, |packet| hub.take_client(now, Peer::Tcp(slot), packet));
-        hub.note_stream_cut(before, cutter.stats());
-        hub.poll(now);
+        cutter.push(bytes, |packet| router.take_client(now, Peer::Tcp(slot), packet));
+        router.note_stream_cut(before, cutter.stats());
+        router.poll(now);
     }
 
     /// The TCP connection of this slot has ended.
     pub fn close_stream(&mut self, slot: u8) {
-        self.hub.close(Peer::Tcp(slot));
+        self.router.close(Peer::Tcp(slot));
     }
 
-    /// Tells how well the radio hears its partner; `None` where it does not know. [dBm]
+    /// Sets how well the radio receives its peer; `None` where it does not know. [dBm]
     pub fn set_signal(&mut self, dbm: Option<i8>) {
-        self.hub.signal_dbm = dbm;
+        self.router.signal_dbm = dbm;
     }
 
     /// Tells whether the network is up, and the address to which heartbeats are broadcast until
     /// somebody answers.
     pub fn set_network(&mut self, broadcast: Option<SocketAddrV4>) {
-        self.hub.broadcast = broadcast;
+        self.router.broadcast = broadcast;
     }
 
     /// Network or port refused what was taken from [`Self::poll_udp`] or [`Self::poll_uart`].
     pub fn note_not_sent(&mut self) {
-        self.hub.stats.drop(crate::stats::Reason::NotSent, 1);
+        self.router.stats.drop(crate::stats::Reason::NotSent, 1);
     }
 
-    /// Tells how [`Event::Save`] went; a bridge that could not save says so.
+    /// Reports the result of [`Event::Save`]; a failure is announced.
     pub fn note_saved(&mut self, now: HostTime, saved: bool) {
-        self.hub.note_saved(now, saved);
+        self.router.note_saved(now, saved);
     }
 
     /// Does what is due at `now`.
     pub fn handle_timeout(&mut self, now: HostTime) {
-        let Self { uart, hub, .. } = self;
-        if uart.is_waiting() && now >= hub.uart_at.plus_ns(STALL_NS) {
-            uart.flush(|packet| hub.take_uart(now, packet));
-            hub.note_uart_cut(uart.stats(), false);
+        let Self { uart, router, .. } = self;
+        if uart.is_waiting() && now >= router.uart_at.plus_ns(STALL_NS) {
+            uart.flush(|packet| router.take_uart(now, packet));
+            router.note_uart_cut(uart.stats(), false);
         }
-        hub.poll(now);
+        router.poll(now);
     }
 
     // ---- what comes out ----
 
     /// Writes the next packet for the autopilot into `out`; returns its length, 0 if there is none.
     pub fn poll_uart(&mut self, now: HostTime, out: &mut [u8; MAX_PACKET]) -> usize {
-        self.hub.poll_uart(now, out)
+        self.router.poll_uart(now, out)
     }
 
-    /// Writes the next datagram into `out` (300 bytes at least); returns whom it is for and its
+    /// Writes the next datagram into `out` (300 bytes at least); returns its destination and its
     /// length.
     pub fn poll_udp(&mut self, now: HostTime, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
-        self.hub.poll_udp(now, out)
+        self.router.poll_udp(now, out)
     }
 
     /// Writes what is due to a TCP client into `out` (300 bytes at least); returns its length, 0
     /// if nothing is.
     pub fn poll_tcp(&mut self, now: HostTime, slot: u8, out: &mut [u8]) -> usize {
-        self.hub.poll_tcp(now, slot, out)
+        self.router.poll_tcp(now, slot, out)
     }
 
     /// Returns what the shell is to do: save, restart.
     pub fn poll_event(&mut self) -> Option<Event> {
-        self.hub.events.pop_front()
+        self.router.events.pop_front()
     }
 
     /// Returns when the next datagram is due; `None` while none waits.
     pub fn udp_due(&self) -> Option<HostTime> {
-        self.hub.batches_due(|peer| matches!(peer, Peer::Udp(_)))
+        self.router.batches_due(|peer| matches!(peer, Peer::Udp(_)))
     }
 
     /// Returns when something is due to a TCP client; `None` while nothing waits.
     pub fn tcp_due(&self, slot: u8) -> Option<HostTime> {
-        self.hub.batches_due(|peer| peer == Peer::Tcp(slot))
+        self.router.batches_due(|peer| peer == Peer::Tcp(slot))
     }
 
     /// Returns when [`Self::handle_timeout`] is due.
     pub fn poll_timeout(&self) -> HostTime {
-        let due = self.hub.due();
-        if self.uart.is_waiting() { due.min(self.hub.uart_at.plus_ns(STALL_NS)) } else { due }
+        let due = self.router.due();
+        if self.uart.is_waiting() { due.min(self.router.uart_at.plus_ns(STALL_NS)) } else { due }
     }
 
     /// Returns the counters.
     pub fn stats(&self) -> &Stats {
-        &self.hub.stats
+        &self.router.stats
     }
 
     /// Returns how long it has run. [s]
     pub fn uptime_s(&self, now: HostTime) -> u32 {
-        now.seconds_since(self.hub.started_at) as u32
+        now.seconds_since(self.router.started_at) as u32
     }
 
-    /// Returns the settings as they are now; the shell writes them to flash when told.
+    /// Returns the settings as they are now; the shell writes them to flash on [`Event::Save`].
     pub fn settings(&self) -> &Settings {
-        &self.hub.settings
+        &self.router.settings
     }
 
     /// Returns what it knows of its chip.
     pub fn chip(&self) -> &Chip {
-        &self.hub.chip
+        &self.router.chip
     }
 
     /// Returns the system and component of the autopilot, while its heartbeats come.
     pub fn autopilot(&self) -> Option<(u8, u8)> {
-        self.hub.autopilot
+        self.router.autopilot
     }
 
     /// Whether the vehicle is armed: then nothing about the bridge is changed.
     pub fn is_armed(&self) -> bool {
-        self.hub.flight.armed
+        self.router.flight.armed
     }
 
     /// Whether it is landing the vehicle because the companion is silent.
     pub fn is_landing(&self) -> bool {
-        self.hub.loss.is_landing()
+        self.router.loss.is_landing()
     }
 
     /// Returns each client: where, packets sent to it, packets it was too slow for.
     pub fn clients(&self) -> impl Iterator<Item = (Peer, u32, u32)> {
-        self.hub.clients.iter().flatten().map(|client| (client.peer, client.sent, client.slow))
+        self.router.clients.iter().flatten().map(|client| (client.peer, client.sent, client.slow))
     }
 }

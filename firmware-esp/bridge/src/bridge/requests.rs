@@ -2,11 +2,11 @@
 
 use vizflyt_protocol::time::HostTime;
 
-use super::hub::Hub;
-use crate::access::{HEAD, Op, PROOF, Verdict, Wish};
+use super::router::PacketRouter;
+use crate::access::{HEAD, Op, PROOF, ShellRequest, Status};
 use crate::settings::Refused;
 
-impl Hub {
+impl PacketRouter {
     /// Answers a request; returns the answer's length.
     pub(super) fn handle_request(
         &mut self,
@@ -16,16 +16,16 @@ impl Hub {
     ) -> usize {
         let number = request.first().copied().unwrap_or(0);
         let mut body = 2;
-        let verdict = match (Op::from_number(number), request.get(HEAD..)) {
+        let status = match (Op::from_number(number), request.get(HEAD..)) {
             (Some(op), Some(rest)) => {
-                let (verdict, len) = self.answer(now, op, request, rest, &mut answer[2..]);
+                let (status, len) = self.answer(now, op, request, rest, &mut answer[2..]);
                 body += len;
-                verdict
+                status
             }
-            _ => Verdict::Unknown,
+            _ => Status::Unknown,
         };
         answer[0] = number | 0x80;
-        answer[1] = verdict as u8;
+        answer[1] = status as u8;
         body
     }
 
@@ -36,12 +36,12 @@ impl Hub {
         request: &[u8],
         rest: &[u8],
         out: &mut [u8],
-    ) -> (Verdict, usize) {
+    ) -> (Status, usize) {
         let mut rest = rest;
         if op.changes() || op == Op::Claim {
-            if let Some(verdict) = self.refusal(op, request) {
+            if let Some(status) = self.refusal(op, request) {
                 self.stats.refused = self.stats.refused.wrapping_add(1);
-                return (verdict, 0);
+                return (status, 0);
             }
             if op.changes() {
                 rest = &rest[..rest.len() - PROOF];
@@ -49,63 +49,63 @@ impl Hub {
         }
         let text = core::str::from_utf8(rest).unwrap_or_default();
         match op {
-            Op::Hello => (Verdict::Done, self.hello(out)),
-            Op::Stats => (Verdict::Done, self.report(now, out)),
+            Op::Hello => (Status::Done, self.hello(out)),
+            Op::Stats => (Status::Done, self.report(now, out)),
             Op::Read => match self.settings.read(text) {
                 Some(value) => {
                     out[..value.len()].copy_from_slice(value.as_bytes());
-                    (Verdict::Done, value.len())
+                    (Status::Done, value.len())
                 }
-                None => (Verdict::Unknown, 0),
+                None => (Status::Unknown, 0),
             },
             Op::Set => {
-                let verdict = match text.split_once('=') {
-                    Some((name, value)) => verdict_of(self.settings.set(name, value)),
-                    None => Verdict::Malformed,
+                let status = match text.split_once('=') {
+                    Some((name, value)) => status_of(self.settings.set(name, value)),
+                    None => Status::Malformed,
                 };
                 self.fix_client(now);
-                (verdict, 0)
+                (status, 0)
             }
             Op::Save => {
-                self.grant(now, Wish::Save);
-                (Verdict::Done, 0)
+                self.grant(now, ShellRequest::Save);
+                (Status::Done, 0)
             }
             Op::Reset => {
-                self.grant(now, Wish::Reset);
-                (Verdict::Done, 0)
+                self.grant(now, ShellRequest::Reset);
+                (Status::Done, 0)
             }
             Op::Restart => {
-                self.grant(now, Wish::Restart);
-                (Verdict::Done, 0)
+                self.grant(now, ShellRequest::Restart);
+                (Status::Done, 0)
             }
             Op::Claim => match rest.try_into() {
                 Ok(key) => {
                     self.settings.key = Some(key);
-                    self.grant(now, Wish::Save);
-                    (Verdict::Done, 0)
+                    self.grant(now, ShellRequest::Save);
+                    (Status::Done, 0)
                 }
-                Err(_) => (Verdict::Malformed, 0),
+                Err(_) => (Status::Malformed, 0),
             },
         }
     }
 
     /// Returns why a change is refused, if it is.
-    fn refusal(&mut self, op: Op, request: &[u8]) -> Option<Verdict> {
+    fn refusal(&mut self, op: Op, request: &[u8]) -> Option<Status> {
         if self.flight.armed {
-            return Some(Verdict::Armed);
+            return Some(Status::Armed);
         }
         match (self.settings.key, op) {
             (None, Op::Claim) => None,
-            (None, _) => Some(Verdict::Unclaimed),
-            (Some(_), Op::Claim) => Some(Verdict::Claimed),
+            (None, _) => Some(Status::Unclaimed),
+            (Some(_), Op::Claim) => Some(Status::Claimed),
             (Some(key), _) => {
-                (!self.asked.access.proves(&key, request)).then_some(Verdict::WrongKey)
+                (!self.outstanding.access.proves(&key, request)).then_some(Status::WrongKey)
             }
         }
     }
 
     fn hello(&self, out: &mut [u8]) -> usize {
-        let access = &self.asked.access;
+        let access = &self.outstanding.access;
         out[..16].copy_from_slice(&access.random);
         out[16..20].copy_from_slice(&access.counter.to_le_bytes());
         out[20] = u8::from(self.settings.key.is_some()) | u8::from(self.flight.armed) << 1;
@@ -123,11 +123,11 @@ impl Hub {
     }
 }
 
-fn verdict_of(result: Result<(), Refused>) -> Verdict {
+fn status_of(result: Result<(), Refused>) -> Status {
     match result {
-        Ok(()) => Verdict::Done,
-        Err(Refused::Unknown) => Verdict::Unknown,
-        Err(Refused::Malformed) => Verdict::Malformed,
-        Err(Refused::OutOfRange) => Verdict::OutOfRange,
+        Ok(()) => Status::Done,
+        Err(Refused::Unknown) => Status::Unknown,
+        Err(Refused::Malformed) => Status::Malformed,
+        Err(Refused::OutOfRange) => Status::OutOfRange,
     }
 }

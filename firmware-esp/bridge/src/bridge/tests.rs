@@ -61,7 +61,7 @@ fn param(index: u16) -> MavMessage {
     MavMessage::PARAM_VALUE(PARAM_VALUE_DATA { param_index: index, ..Default::default() })
 }
 
-/// Settings of a bridge that says nothing by itself but what it must.
+/// Settings of a bridge that sends nothing by itself but what it must.
 fn quiet() -> Settings {
     Settings { radio_status: false, beacon: false, ..Settings::default() }
 }
@@ -391,7 +391,7 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
     uart(&mut bridge, at(108));
     // Once clients have stopped asking, the bridge asks; the answer stays here.
     bridge.handle_timeout(at(5000));
-    let asked = |bridge: &mut Bridge, now| -> Vec<i64> {
+    let outstanding = |bridge: &mut Bridge, now| -> Vec<i64> {
         uart(bridge, now)
             .iter()
             .flat_map(|packet| decode(packet))
@@ -401,13 +401,17 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
             })
             .collect()
     };
-    assert_eq!(asked(&mut bridge, at(5000)), [], "the autopilot is silent, nobody is there to ask");
+    assert_eq!(
+        outstanding(&mut bridge, at(5000)),
+        [],
+        "the autopilot is silent, nobody is there to ask"
+    );
     bridge.handle_uart(at(5500), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_timeout(at(6001));
-    let asked = asked(&mut bridge, at(6001));
-    assert_eq!(asked.len(), 1);
+    let outstanding = outstanding(&mut bridge, at(6001));
+    assert_eq!(outstanding.len(), 1);
     datagrams(&mut bridge, at(6010));
-    bridge.handle_uart(at(6004), &bytes(0, AUTOPILOT, &sync(9, asked[0])));
+    bridge.handle_uart(at(6004), &bytes(0, AUTOPILOT, &sync(9, outstanding[0])));
     assert_eq!(bridge.stats().round_trip_us, 3000);
     assert_eq!(datagrams(&mut bridge, at(6100)), []);
 }

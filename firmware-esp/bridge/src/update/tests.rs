@@ -23,11 +23,11 @@ fn firmware(len: usize) -> Vec<u8> {
     (0..len).map(|at| (at * 31 % 251) as u8).collect()
 }
 
-fn sealed(body: &[u8], change: impl FnOnce(&mut Header)) -> Vec<u8> {
+fn signed_firmware(body: &[u8], change: impl FnOnce(&mut Header)) -> Vec<u8> {
     let mut header =
         Header { target: 0, build: 8, len: body.len() as u32, hash: Sha256::digest(body).into() };
     change(&mut header);
-    let head = header.seal(|message| signer().sign(message).to_bytes());
+    let head = header.sign(|message| signer().sign(message).to_bytes());
     [&head[..], body].concat()
 }
 
@@ -67,7 +67,7 @@ proptest! {
     fn a_signed_firmware_is_taken_in_any_portions(len in 1..16384usize, chunk in 1..2000usize) {
         let body = firmware(len);
         let mut halves = halves();
-        prop_assert_eq!(feed(&mut halves, &sealed(&body, |_| {}), chunk), Ok(true));
+        prop_assert_eq!(feed(&mut halves, &signed_firmware(&body, |_| {}), chunk), Ok(true));
         prop_assert!(halves.starts_spare);
         prop_assert_eq!(&halves.spare.bytes[..len], &body[..]);
     }
@@ -83,13 +83,13 @@ fn nothing_else_is_taken_and_nothing_is_erased_for_it() {
         assert!(!halves.starts_spare);
         assert!(halves.spare.bytes.iter().all(|&byte| byte == 0xA5), "{expected:?} erased");
     };
-    check(&sealed(&body, |header| header.target = 1), Fault::OtherChip);
-    check(&sealed(&body, |header| header.build = 6), Fault::Older);
-    check(&sealed(&body, |header| header.len = 1 << 20), Fault::TooLong);
-    check(&sealed(&body, |header| header.len = 0), Fault::TooLong);
+    check(&signed_firmware(&body, |header| header.target = 1), Fault::OtherChip);
+    check(&signed_firmware(&body, |header| header.build = 6), Fault::Older);
+    check(&signed_firmware(&body, |header| header.len = 1 << 20), Fault::TooLong);
+    check(&signed_firmware(&body, |header| header.len = 0), Fault::TooLong);
     check(&body, Fault::NoFirmware);
     for at in [4, 9, 13, 20, 60, 111] {
-        let mut forged = sealed(&body, |_| {});
+        let mut forged = signed_firmware(&body, |_| {});
         forged[at] ^= 1;
         check(&forged, Fault::Signature);
     }
@@ -97,7 +97,7 @@ fn nothing_else_is_taken_and_nothing_is_erased_for_it() {
 
 #[test]
 fn damage_behind_the_header_is_found() {
-    let whole = sealed(&firmware(5000), |_| {});
+    let whole = signed_firmware(&firmware(5000), |_| {});
     let check = |bytes: &[u8], expected: Result<bool, Fault>| {
         let mut halves = halves();
         assert_eq!(feed(&mut halves, bytes, 100), expected);
@@ -117,28 +117,28 @@ fn damage_behind_the_header_is_found() {
 #[test]
 fn a_firmware_that_never_gets_well_is_given_up_after_three_starts() {
     let mut trial = Trial::new(Memory::of(4096), 0);
-    assert_eq!(trial.start(), Ok(Verdict::Settled), "nothing was ever updated");
+    assert_eq!(trial.start(), Ok(StartAction::Settled), "nothing was ever updated");
     trial.begin().unwrap();
     for _ in 0..STARTS {
-        assert_eq!(trial.start(), Ok(Verdict::OnTrial));
+        assert_eq!(trial.start(), Ok(StartAction::OnTrial));
     }
-    assert_eq!(trial.start(), Ok(Verdict::GoBack));
+    assert_eq!(trial.start(), Ok(StartAction::GoBack));
     // The half before runs, for good.
-    assert_eq!(trial.start(), Ok(Verdict::Settled));
+    assert_eq!(trial.start(), Ok(StartAction::Settled));
 }
 
 #[test]
 fn a_healthy_firmware_stays() {
     let mut trial = Trial::new(Memory::of(4096), 0);
     trial.begin().unwrap();
-    assert_eq!(trial.start(), Ok(Verdict::OnTrial));
+    assert_eq!(trial.start(), Ok(StartAction::OnTrial));
     trial.keep().unwrap();
     for _ in 0..5 {
-        assert_eq!(trial.start(), Ok(Verdict::Settled));
+        assert_eq!(trial.start(), Ok(StartAction::Settled));
     }
     // And the next one is tried again.
     trial.begin().unwrap();
-    assert_eq!(trial.start(), Ok(Verdict::OnTrial));
+    assert_eq!(trial.start(), Ok(StartAction::OnTrial));
 }
 
 /// Power may fail within any write of a start: it is counted, or it was no start.
@@ -151,12 +151,12 @@ fn a_power_cut_never_loses_the_way_back() {
         let mut verdicts = vec![];
         while let Ok(verdict) = trial.start() {
             verdicts.push(verdict);
-            if verdict == Verdict::GoBack {
+            if verdict == StartAction::GoBack {
                 break;
             }
         }
         trial.flash.power = usize::MAX;
-        let more = (0..=STARTS).find(|_| trial.start() == Ok(Verdict::GoBack));
-        assert!(verdicts.contains(&Verdict::GoBack) || more.is_some(), "power {power}");
+        let more = (0..=STARTS).find(|_| trial.start() == Ok(StartAction::GoBack));
+        assert!(verdicts.contains(&StartAction::GoBack) || more.is_some(), "power {power}");
     }
 }

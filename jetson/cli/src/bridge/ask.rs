@@ -4,10 +4,10 @@ use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use vizflyt_bridge::access::{BODY, HEAD, Op, TUNNEL_TYPE, Verdict, proof};
+use vizflyt_bridge::access::{BODY, HEAD, Op, Status, TUNNEL_TYPE, proof};
 use vizflyt_bridge::bridge::COMPONENT_ID;
+use vizflyt_bridge::mavlink_writer::write_packet;
 use vizflyt_bridge::packet::{CutStats, each_in_datagram};
-use vizflyt_bridge::seal::seal;
 use vizflyt_bridge::settings::Key;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
@@ -69,13 +69,13 @@ impl Asked {
         Ok(asked)
     }
 
-    /// Asks, and returns verdict and body of the answer; `key` proves a change.
+    /// Asks, and returns status and body of the answer; `key` proves a change.
     pub(crate) fn ask(
         &mut self,
         op: Op,
         body: &[u8],
         key: Option<&Key>,
-    ) -> Result<(Verdict, Vec<u8>)> {
+    ) -> Result<(Status, Vec<u8>)> {
         let proof_len = if key.is_some() { vizflyt_bridge::access::PROOF } else { 0 };
         if HEAD + body.len() + proof_len > BODY {
             bail!("bridge: a request of {} bytes is too long", body.len());
@@ -110,7 +110,7 @@ impl Asked {
         let mut payload = vec![low, high, 0, COMPONENT_ID, request.len() as u8];
         payload.extend_from_slice(request);
         let mut packet = [0; MAX_PACKET];
-        let len = seal(&mut packet, SOURCE, self.sequence, TUNNEL, &payload);
+        let len = write_packet(&mut packet, SOURCE, self.sequence, TUNNEL, &payload);
         self.sequence = self.sequence.wrapping_add(1);
         self.socket
             .send_to(&packet[..len], self.address)
@@ -119,7 +119,7 @@ impl Asked {
     }
 
     /// Waits a moment for the answer; telemetry that comes too is left aside.
-    fn receive(&self, op: Op) -> Option<(Verdict, Vec<u8>)> {
+    fn receive(&self, op: Op) -> Option<(Status, Vec<u8>)> {
         let mut bytes = [0; 2048];
         // Nothing yet, or refused: asked again.
         let (len, from) = self.socket.recv_from(&mut bytes).ok()?;
@@ -136,11 +136,11 @@ impl Asked {
             let len = usize::from(payload[4]).min(BODY);
             let body = &payload[5..5 + len];
             if payload[..2] == TUNNEL_TYPE.to_le_bytes()
-                && let [number, verdict, rest @ ..] = body
+                && let [number, status, rest @ ..] = body
                 && *number == op as u8 | 0x80
-                && let Some(verdict) = Verdict::from_number(*verdict)
+                && let Some(status) = Status::from_number(*status)
             {
-                answer = Some((verdict, rest.to_vec()));
+                answer = Some((status, rest.to_vec()));
             }
         });
         answer

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::{Map, Value};
-use vizflyt_bridge::access::{Op, Verdict};
+use vizflyt_bridge::access::{Op, Status};
 use vizflyt_bridge::settings::{Key, NUMBERS, TEXTS, key_from_hex, key_to_hex};
 use vizflyt_bridge::stats::REPORT;
 use vizflyt_trust::KeysFolder;
@@ -107,9 +107,9 @@ fn claim(asked: &mut Asked, args: &ConfigureArgs) -> Result<()> {
         folder.write(KEY_FILE, &format!("{}\n", key_to_hex(&key)))?;
         key
     };
-    let (verdict, _) = asked.ask(Op::Claim, &key, None)?;
-    if verdict != Verdict::Done {
-        bail!("bridge: not claimed: {}", verdict.words());
+    let (status, _) = asked.ask(Op::Claim, &key, None)?;
+    if status != Status::Done {
+        bail!("bridge: not claimed: {}", status.message());
     }
     let path = KeysFolder::open(args.keys.as_deref())?.file(KEY_FILE);
     tell(format!("claimed; its key is in {}", path.display()));
@@ -127,11 +127,11 @@ fn read_key(args: &ConfigureArgs) -> Result<Option<Key>> {
 
 fn change(asked: &mut Asked, op: Op, body: &str, key: &Key) -> Result<()> {
     match asked.ask(op, body.as_bytes(), Some(key))? {
-        (Verdict::Done, _) => Ok(()),
-        (verdict, _) => {
+        (Status::Done, _) => Ok(()),
+        (status, _) => {
             // A password must not end up in somebody's terminal log.
             let name = body.split('=').next().unwrap_or_default();
-            bail!("bridge: {op:?} {name} is refused: {}", verdict.words())
+            bail!("bridge: {op:?} {name} is refused: {}", status.message())
         }
     }
 }
@@ -142,7 +142,7 @@ fn show(asked: &mut Asked) -> Result<()> {
     let names = NUMBERS.iter().map(|number| number.name);
     for name in names.chain(TEXTS.iter().map(|&(name, _)| name)) {
         // An older firmware may not know a name of ours.
-        if let (Verdict::Done, value) = asked.ask(Op::Read, name.as_bytes(), None)? {
+        if let (Status::Done, value) = asked.ask(Op::Read, name.as_bytes(), None)? {
             tell(format!("{name:18} {}", String::from_utf8_lossy(&value)));
         }
     }

@@ -147,7 +147,7 @@ fn sign(args: &SignArgs) -> Result<()> {
 fn signed(key: &SigningKey, target: Target, build: u32, image: &[u8]) -> Result<Vec<u8>> {
     let len = u32::try_from(image.len()).context("an image of more than 4 GB")?;
     let header = Header { target: target as u8, build, len, hash: Sha256::digest(image).into() };
-    let head = header.seal(|message| key.sign(message).to_bytes());
+    let head = header.sign(|message| key.sign(message).to_bytes());
     Ok([&head[..], image].concat())
 }
 

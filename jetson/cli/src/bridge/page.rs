@@ -183,7 +183,7 @@ impl Visitor {
                 self.restart = true;
                 Some(page::respond_firmware(Ok(())).as_bytes().to_vec())
             }
-            Err(fault) => Some(refuse(Fault::words(fault))),
+            Err(fault) => Some(refuse(Fault::message(fault))),
         }
     }
 }

@@ -3,19 +3,19 @@
 use sha2::{Digest, Sha256};
 
 use super::*;
-use crate::access::{self, Op, PROOF, TUNNEL_TYPE, Verdict};
+use crate::access::{self, Op, PROOF, Status, TUNNEL_TYPE};
 use crate::settings::Key;
 use crate::stats::REPORT;
 
 const KEY: Key = [0x42; 32];
 
-/// Asks the bridge; returns verdict and body of the answer.
-fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Verdict, Vec<u8>) {
+/// Asks the bridge; returns status and body of the answer.
+fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Status, Vec<u8>) {
     let [low, high] = TUNNEL_TYPE.to_le_bytes();
     let mut payload = vec![low, high, 1, COMPONENT_ID, request.len() as u8];
     payload.extend_from_slice(request);
     let mut packet = [0; MAX_PACKET];
-    let len = crate::seal::seal(&mut packet, RUNTIME, 0, 385, &payload);
+    let len = crate::mavlink_writer::write_packet(&mut packet, RUNTIME, 0, 385, &payload);
     bridge.handle_datagram(at(now), address(2), &packet[..len]);
     let mut answer = None;
     for (_, datagram) in datagrams(bridge, at(now + 50)) {
@@ -31,7 +31,7 @@ fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Verdict, Vec<u8>) {
                     let len = usize::from(body[4]);
                     assert_eq!(body[5], request[0] | 0x80);
                     answer =
-                        Some((Verdict::from_number(body[6]).unwrap(), body[7..5 + len].to_vec()));
+                        Some((Status::from_number(body[6]).unwrap(), body[7..5 + len].to_vec()));
                 }
             },
         );
@@ -55,43 +55,43 @@ fn a_bridge_is_claimed_once_and_then_obeys_its_key_alone() {
     let mut bridge = bridge(quiet());
     let mut check = |op, counter, body: &[u8], key: Option<&Key>, expected| {
         let now = 10 + 100 * u64::from(counter);
-        let (verdict, _) = ask(&mut bridge, now, &request(op, counter, body, key));
-        assert_eq!(verdict, expected, "{op:?} {counter}");
+        let (status, _) = ask(&mut bridge, now, &request(op, counter, body, key));
+        assert_eq!(status, expected, "{op:?} {counter}");
         (bridge.settings().loss_ms, bridge.poll_event())
     };
-    check(Op::Set, 1, b"LOSS_MS=700", Some(&KEY), Verdict::Unclaimed);
-    let (_, event) = check(Op::Claim, 2, &KEY, None, Verdict::Done);
+    check(Op::Set, 1, b"LOSS_MS=700", Some(&KEY), Status::Unclaimed);
+    let (_, event) = check(Op::Claim, 2, &KEY, None, Status::Done);
     assert_eq!(event, Some(Event::Save));
-    check(Op::Claim, 3, &[1; 32], None, Verdict::Claimed);
-    check(Op::Set, 4, b"LOSS_MS=700", Some(&[1; 32]), Verdict::WrongKey);
-    check(Op::Set, 4, b"LOSS_MS=700", None, Verdict::WrongKey);
-    assert_eq!(check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Verdict::Done).0, 700);
+    check(Op::Claim, 3, &[1; 32], None, Status::Claimed);
+    check(Op::Set, 4, b"LOSS_MS=700", Some(&[1; 32]), Status::WrongKey);
+    check(Op::Set, 4, b"LOSS_MS=700", None, Status::WrongKey);
+    assert_eq!(check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Status::Done).0, 700);
     // The same once more, as somebody might have recorded it.
-    check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Verdict::WrongKey);
-    check(Op::Set, 5, b"LOSS_MS=1", Some(&KEY), Verdict::OutOfRange);
-    check(Op::Set, 6, b"LOSS_MS", Some(&KEY), Verdict::Malformed);
-    check(Op::Set, 7, b"NO=1", Some(&KEY), Verdict::Unknown);
-    assert_eq!(check(Op::Save, 8, b"", Some(&KEY), Verdict::Done).1, Some(Event::Save));
-    assert_eq!(check(Op::Restart, 9, b"", Some(&KEY), Verdict::Done).1, Some(Event::Restart));
-    assert_eq!(check(Op::Reset, 10, b"", Some(&KEY), Verdict::Done).0, 1000);
-    check(Op::Claim, 11, &KEY, None, Verdict::Claimed);
+    check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Status::WrongKey);
+    check(Op::Set, 5, b"LOSS_MS=1", Some(&KEY), Status::OutOfRange);
+    check(Op::Set, 6, b"LOSS_MS", Some(&KEY), Status::Malformed);
+    check(Op::Set, 7, b"NO=1", Some(&KEY), Status::Unknown);
+    assert_eq!(check(Op::Save, 8, b"", Some(&KEY), Status::Done).1, Some(Event::Save));
+    assert_eq!(check(Op::Restart, 9, b"", Some(&KEY), Status::Done).1, Some(Event::Restart));
+    assert_eq!(check(Op::Reset, 10, b"", Some(&KEY), Status::Done).0, 1000);
+    check(Op::Claim, 11, &KEY, None, Status::Claimed);
 }
 
 #[test]
 fn reading_is_open_and_tells_no_secret() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
-    let (verdict, hello) = ask(&mut bridge, 10, &request(Op::Hello, 0, b"", None));
-    assert_eq!((verdict, &hello[..16], hello[20]), (Verdict::Done, &[7; 16][..], 1));
+    let (status, hello) = ask(&mut bridge, 10, &request(Op::Hello, 0, b"", None));
+    assert_eq!((status, &hello[..16], hello[20]), (Status::Done, &[7; 16][..], 1));
     let (_, value) = ask(&mut bridge, 200, &request(Op::Read, 0, b"LOSS_MS", None));
     assert_eq!(value, b"1000");
     let (_, value) = ask(&mut bridge, 300, &request(Op::Read, 0, b"key", None));
     assert_eq!(value, b"***");
     let before = bridge.stats().net.cut.packets;
-    let (verdict, report) = ask(&mut bridge, 400, &request(Op::Stats, 0, b"", None));
-    assert_eq!((verdict, report.len()), (Verdict::Done, 4 * REPORT.len()));
+    let (status, report) = ask(&mut bridge, 400, &request(Op::Stats, 0, b"", None));
+    assert_eq!((status, report.len()), (Status::Done, 4 * REPORT.len()));
     assert_eq!(report[40..44], before.to_le_bytes());
-    let (verdict, _) = ask(&mut bridge, 500, &[200, 0, 0, 0, 0]);
-    assert_eq!(verdict, Verdict::Unknown);
+    let (status, _) = ask(&mut bridge, 500, &[200, 0, 0, 0, 0]);
+    assert_eq!(status, Status::Unknown);
 }
 
 #[test]
@@ -99,12 +99,12 @@ fn nothing_changes_while_armed() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     bridge.handle_uart(at(0), &bytes(0, AUTOPILOT, &heartbeat(true, 5)));
     let change = request(Op::Set, 1, b"LOSS_MS=0", Some(&KEY));
-    assert_eq!(ask(&mut bridge, 10, &change).0, Verdict::Armed);
+    assert_eq!(ask(&mut bridge, 10, &change).0, Status::Armed);
     assert_eq!(bridge.settings().loss_ms, 1000);
     assert_eq!(bridge.stats().refused, 1);
 }
 
-/// Signs a packet as the MAVLink guide says.
+/// Signs a packet as the MAVLink guide specifies.
 fn sign(packet: &[u8], key: &Key, stamp: u64) -> Vec<u8> {
     let mut packet = packet.to_vec();
     let id = u32::from_le_bytes([packet[7], packet[8], packet[9], 0]);

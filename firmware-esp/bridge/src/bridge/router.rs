@@ -10,9 +10,9 @@ use super::clients::{CLIENTS, Client, Peer, bit};
 use super::component::{Event, SECOND_S};
 use super::loss::{Flight, LinkLoss};
 use super::{Chip, IDLE_NS};
+use crate::mavlink_writer::renumber;
 use crate::packet::{CutStats, Raw};
 use crate::ring::{Ring, Tag};
-use crate::seal::renumber;
 use crate::settings::Settings;
 use crate::stats::{Reason, Sequences, Stats};
 
@@ -31,7 +31,7 @@ const LOST_AFTER_S: f64 = 3.5;
 const REPLACEABLE_S: f64 = 2.0;
 
 #[derive(Clone, Debug)]
-pub(super) struct Hub {
+pub(super) struct PacketRouter {
     pub(super) settings: Settings,
     pub(super) chip: Chip,
     pub(super) stats: Stats,
@@ -50,7 +50,7 @@ pub(super) struct Hub {
     pub(super) autopilot: Option<(u8, u8)>,
     pub(super) autopilot_at: HostTime,
     pub(super) flight: Flight,
-    /// Its newest heartbeat, as it came: what the beacon says.
+    /// Its newest heartbeat, as it came: what the beacon repeats.
     pub(super) heartbeat: heapless::Vec<u8, 48>,
     pub(super) loss: LinkLoss,
     pub(super) events: Deque<Event, 4>,
@@ -61,10 +61,10 @@ pub(super) struct Hub {
     pub(super) signal_dbm: Option<i8>,
     /// Counter of our own packets to the autopilot.
     pub(super) uart_sequence: u8,
-    pub(super) asked: super::component::Asked,
+    pub(super) outstanding: super::component::OutstandingRequests,
 }
 
-impl Hub {
+impl PacketRouter {
     /// One that has not begun; `const`, so that it lies in a chip's static memory from the start
     /// and never on its stack.
     pub(super) const fn empty() -> Self {
@@ -91,14 +91,14 @@ impl Hub {
             broadcast: None,
             signal_dbm: None,
             uart_sequence: 0,
-            asked: super::component::Asked::new([0; 16]),
+            outstanding: super::component::OutstandingRequests::new([0; 16]),
             settings: Settings::unnamed(),
         }
     }
 
     /// Begins at `now`.
     pub(super) fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
-        self.asked = super::component::Asked::new(chip.random);
+        self.outstanding = super::component::OutstandingRequests::new(chip.random);
         self.chip = chip;
         self.settings = settings;
         self.uart_at = now;
@@ -239,12 +239,12 @@ impl Hub {
             self.stats.net.lost = self.stats.net.lost.wrapping_add(lost);
         }
         let target = packet.target();
-        let own = self.address();
+        let bridge_messages = self.address();
         if self.is_ours(target) {
             self.handle_own(now, Some(index), packet);
             return;
         }
-        if target.0 == 0 || (target.0 == own.0 && target.1 == 0) {
+        if target.0 == 0 || (target.0 == bridge_messages.0 && target.1 == 0) {
             // For everybody, us among them.
             self.handle_own(now, Some(index), packet);
         }

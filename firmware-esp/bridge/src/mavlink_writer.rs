@@ -6,7 +6,7 @@ use vizflyt_protocol::mavlink::{MAX_PACKET, MavlinkVersion, Message};
 use crate::packet::x25;
 
 /// Writes a packet of message `id` into `out`; returns its length. The dialect knows the message.
-pub fn seal(
+pub fn write_packet(
     out: &mut [u8; MAX_PACKET],
     source: (u8, u8),
     sequence: u8,
@@ -27,15 +27,15 @@ pub fn seal(
 }
 
 /// Writes a message of the dialect into `out`; returns its length.
-pub(crate) fn seal_message(
+pub(crate) fn write_message(
     out: &mut [u8; MAX_PACKET],
     source: (u8, u8),
     sequence: u8,
-    message: &Own,
+    message: &BridgeMessage,
 ) -> usize {
     let mut payload = [0; 255];
     let len = message.payload(&mut payload);
-    seal(out, source, sequence, message.id(), &payload[..len])
+    write_packet(out, source, sequence, message.id(), &payload[..len])
 }
 
 /// Gives an unsigned packet of ours another sequence number.
@@ -52,17 +52,17 @@ fn write_crc(packet: &mut [u8], id: u32) {
     packet[at..].copy_from_slice(&crc.to_le_bytes());
 }
 
-macro_rules! own {
+macro_rules! bridge_messages {
     ($($name:ident($data:ident)),* $(,)?) => {
         /// The messages we send. Not the dialect's own enum: that would bring all 300 of them
         /// into a chip's flash.
         #[allow(non_camel_case_types, clippy::upper_case_acronyms)] // Why: named as MAVLink names them.
         #[derive(Clone, Debug)]
-        pub(crate) enum Own {
+        pub(crate) enum BridgeMessage {
             $($name(vizflyt_protocol::mavlink::dialect::$data)),*
         }
 
-        impl Own {
+        impl BridgeMessage {
             pub(crate) fn id(&self) -> u32 {
                 use vizflyt_protocol::mavlink::MessageData;
                 match self {
@@ -80,7 +80,7 @@ macro_rules! own {
     };
 }
 
-own!(
+bridge_messages!(
     HEARTBEAT(HEARTBEAT_DATA),
     PARAM_VALUE(PARAM_VALUE_DATA),
     RADIO_STATUS(RADIO_STATUS_DATA),
@@ -104,13 +104,13 @@ mod tests {
         let timesync = TIMESYNC_DATA { ts1: 5, ..Default::default() };
         let empty = TIMESYNC_DATA::default();
         for (own, message) in [
-            (Own::HEARTBEAT(heartbeat.clone()), MavMessage::HEARTBEAT(heartbeat)),
-            (Own::TIMESYNC(timesync.clone()), MavMessage::TIMESYNC(timesync)),
-            (Own::TIMESYNC(empty.clone()), MavMessage::TIMESYNC(empty)),
+            (BridgeMessage::HEARTBEAT(heartbeat.clone()), MavMessage::HEARTBEAT(heartbeat)),
+            (BridgeMessage::TIMESYNC(timesync.clone()), MavMessage::TIMESYNC(timesync)),
+            (BridgeMessage::TIMESYNC(empty.clone()), MavMessage::TIMESYNC(empty)),
         ] {
             let (mut ours, mut theirs) = ([0; MAX_PACKET], [0; MAX_PACKET]);
             let header = MavHeader { system_id: 1, component_id: 240, sequence: 9 };
-            let len = seal_message(&mut ours, (1, 240), 3, &own);
+            let len = write_message(&mut ours, (1, 240), 3, &own);
             renumber(&mut ours[..len], 9);
             assert_eq!(&ours[..len], encode(header, &message, &mut theirs));
         }
