@@ -92,11 +92,10 @@ impl Leases {
     /// for longest.
     fn place(&mut self, mac: [u8; 6]) -> usize {
         self.turn = self.turn.wrapping_add(1);
-        let bridge_messages =
-            self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
+        let own = self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
         let turn = self.turn;
         let age = |lease: &Option<Lease>| lease.map_or(u32::MAX, |l| turn.wrapping_sub(l.heard));
-        let place = bridge_messages
+        let place = own
             .or_else(|| (0..LEASES).rev().max_by_key(|&place| age(&self.taken[place])))
             .unwrap_or(0);
         self.taken[place] = Some(Lease { mac, heard: turn });

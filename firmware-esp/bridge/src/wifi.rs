@@ -210,10 +210,10 @@ async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket:
     loop {
         // Asked first: the stack cannot be asked while it lends out a datagram.
         socket.wait_recv_ready().await;
-        let bridge_messages = own_address(stack) == Some(OWN_ADDRESS);
+        let own = own_address(stack) == Some(OWN_ADDRESS);
         let len = socket
             .recv_from_with(|request, _| {
-                bridge_messages.then(|| leases.answer(OWN_ADDRESS, request, &mut answer)).flatten()
+                own.then(|| leases.answer(OWN_ADDRESS, request, &mut answer)).flatten()
             })
             .await;
         if let Some(len) = len {

@@ -128,6 +128,14 @@ fn damaged(folder: &KeysFolder, owner: Owner, what: &str) -> KeyError {
 /// First line of a file; text between PEM sections is for people (RFC 7468, section 2).
 const HEAD: &str = "VizFlyt key, keep it secret. SHA-256 of the certificate: ";
 
+/// Returns a number that identifies this run of a program: random, so that two runs have the same
+/// with negligible probability; never 0.
+pub fn random_instance_id() -> u64 {
+    use std::hash::{BuildHasher, RandomState};
+    // Keyed by the system's randomness.
+    RandomState::new().hash_one(std::process::id()) | 1
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -23,7 +23,7 @@ pub mod tls;
 
 pub use fingerprint::Fingerprint;
 pub use folder::{FileStamp, KeyError, KeysFolder};
-pub use identity::{Identity, Owner, secret};
+pub use identity::{Identity, Owner, random_instance_id, secret};
 pub use paired::{Client, Paired, Role};
 pub use servers::{KnownServer, Servers};
 

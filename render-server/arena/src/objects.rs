@@ -162,7 +162,7 @@ impl MovingObject {
         let period_ns = ((period_s * 1e9).round() as u64).max(1);
         let phase_ns = match config.phase_s {
             Some(phase_s) => (phase_s * 1e9).round() as u64 % period_ns,
-            None => lot(seed, index as u64) % period_ns,
+            None => random_u64(seed, index as u64) % period_ns,
         };
         let yaw_rad = config.yaw_deg.to_radians();
         let rest = Pose::new(config.position_m, turn(DVec3::Z, yaw_rad));
@@ -214,8 +214,8 @@ fn turn(axis: DVec3, angle_rad: f64) -> DQuat {
     DQuat::from_xyzw(axis.x * sin, axis.y * sin, axis.z * sin, cos)
 }
 
-/// Returns a number drawn for the `index`-th object of a seed (SplitMix64, Steele et al. 2014).
-fn lot(seed: u64, index: u64) -> u64 {
+/// Returns a random number for the `index`-th object of a seed (SplitMix64, Steele et al. 2014).
+fn random_u64(seed: u64, index: u64) -> u64 {
     let mut z = seed.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -10,8 +10,8 @@ use support::{
 };
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{
-    ClockRequest, Event, EventKind, FlightPhase, HeardEvents, Hello, Purpose, Telemetry, ToRuntime,
-    ToServer, bounded,
+    ClockRequest, Event, EventKind, FlightPhase, Hello, Purpose, ReceivedEvents, Telemetry,
+    ToRuntime, ToServer, bounded,
 };
 use vizflyt_protocol::packet::{ImageHeader, Preamble};
 use vizflyt_protocol::time::HostTime;
@@ -269,8 +269,8 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let emitter = Emitter::start(server.vicon, "vizflyt");
-    let (boot, mut heard) = (4711, HeardEvents::default());
-    let hello = |heard_events| Hello { boot, heard_events, ..hello("vizflyt", Purpose::Fly) };
+    let (boot, mut heard) = (4711, ReceivedEvents::default());
+    let hello = |received_events| Hello { boot, received_events, ..hello("vizflyt", Purpose::Fly) };
     let event = |message| match message {
         ToRuntime::Event { seq, event } => Some((seq, event)),
         _ => None,
@@ -282,25 +282,25 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     };
     let mut client = Client::greet(&server, hello(heard), usual()).await;
     let welcome = client.welcome().await;
-    assert_eq!(welcome.heard_events.of(boot), 0);
+    assert_eq!(welcome.received_events.of(boot), 0);
     client.image().await;
     let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
     client.say(&ToServer::Telemetry(flying)).await;
     for (seq, text) in [(1, "one"), (2, "two"), (2, "two"), (1, "one")] {
         client.say(&ToServer::Event { seq, event: note(text) }).await;
     }
-    client.until(|message| (message == ToRuntime::Heard(2)).then_some(())).await;
+    client.until(|message| (message == ToRuntime::EventsReceived(2)).then_some(())).await;
     emitter.pause(true);
     let (seq, lost) = client.until(event).await;
     assert!(matches!(lost.kind, EventKind::PoseLost { .. }));
-    assert!(heard.hear(welcome.boot, seq));
+    assert!(heard.receive(welcome.boot, seq));
     client.close().await;
     emitter.pause(false);
     // Back in flight: what it has heard is not told again, what it has not is.
     let mut client = loop {
         let mut client = Client::greet(&server, hello(heard), usual()).await;
         if let ToRuntime::Welcome(again) = client.next().await {
-            assert_eq!((again.boot, again.heard_events.of(boot)), (welcome.boot, 2));
+            assert_eq!((again.boot, again.received_events.of(boot)), (welcome.boot, 2));
             break client;
         }
     };
@@ -308,7 +308,7 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     assert!(next > seq && back.kind == EventKind::PoseRegained, "{back:?}");
     client.say(&ToServer::Event { seq: 2, event: note("two") }).await;
     client.say(&ToServer::Event { seq: 3, event: note("three") }).await;
-    client.until(|message| (message == ToRuntime::Heard(3)).then_some(())).await;
+    client.until(|message| (message == ToRuntime::EventsReceived(3)).then_some(())).await;
     let page = server.http;
     let log = tokio::task::spawn_blocking(move || {
         let mut socket = support::Socket::open(page, &format!("http://{page}")).unwrap();

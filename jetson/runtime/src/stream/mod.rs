@@ -26,11 +26,11 @@ use std::time::Duration;
 use quinn::{AckFrequencyConfig, ClientConfig, Endpoint, EndpointConfig, TransportConfig, VarInt};
 use socket2::{Domain, Protocol, Socket, Type};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, ClockState, Event, HeardEvents, Name, PoseSample, Purpose, Text,
+    ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, Purpose, ReceivedEvents, Text,
 };
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 use vizflyt_trust::tls::Pin;
-use vizflyt_trust::{ALPN, Fingerprint, Identity};
+use vizflyt_trust::{ALPN, Fingerprint, Identity, random_instance_id};
 
 pub use mailbox::{Arrival, Fates, Mailbox, Step, Ticket, Whole};
 pub use outbox::Outbox;
@@ -162,7 +162,8 @@ pub async fn run_over(
     outbox: Arc<Outbox>,
     tell: impl Fn(StreamEvent) -> bool + Send + Sync,
 ) {
-    let mut past = Past { boot: lot(), heard: HeardEvents::default(), welcomed: false };
+    let mut past =
+        Past { boot: random_instance_id(), heard: ReceivedEvents::default(), welcomed: false };
     let mut last = String::new();
     loop {
         let error = match connect(&open, &settings).await {
@@ -200,16 +201,9 @@ struct Past {
     /// Tells our events from those of another run.
     boot: u64,
     /// What we have heard of the server's events.
-    heard: HeardEvents,
+    heard: ReceivedEvents,
     /// The server welcomed us since the last outage was told.
     welcomed: bool,
-}
-
-/// Returns a number that no other run has drawn, as good as certainly; never 0.
-fn lot() -> u64 {
-    use std::hash::{BuildHasher, RandomState};
-    // Keyed by the system's randomness.
-    RandomState::new().hash_one(std::process::id()) | 1
 }
 
 /// Why a conversation ended.

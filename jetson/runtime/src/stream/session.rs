@@ -75,7 +75,7 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
         purpose: with.settings.purpose,
         program: with.settings.program.clone(),
         boot: past.boot,
-        heard_events: past.heard,
+        received_events: past.heard,
     };
     write(&mut send, &ToServer::Hello(hello)).await?;
     check_preamble(&mut receive).await?;
@@ -100,7 +100,7 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
                     }
                 }
                 if listener.past.heard != before {
-                    write(&mut send, &ToServer::Heard(listener.past.heard.seq)).await?;
+                    write(&mut send, &ToServer::EventsReceived(listener.past.heard.seq)).await?;
                 }
             }
             datagram = connection.read_datagram() => {
@@ -152,9 +152,9 @@ struct Listener<'a, T> {
 impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
     fn take(&mut self, message: Result<ToRuntime, FramingError>) -> Result<(), SessionEnd> {
         match message {
-            Ok(ToRuntime::Welcome(Welcome { boot, heard_events, arena })) => {
+            Ok(ToRuntime::Welcome(Welcome { boot, received_events, arena })) => {
                 (self.server, self.past.welcomed) = (Some(boot), true);
-                self.with.outbox.resume(heard_events.of(self.past.boot));
+                self.with.outbox.resume(received_events.of(self.past.boot));
                 self.hand(StreamEvent::Welcome(Box::new(arena)))?;
             }
             // Another runtime may be leaving: try again.
@@ -167,12 +167,12 @@ impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
             Ok(ToRuntime::Event { seq, event }) => {
                 let Some(boot) = self.server else { return Err(lost("an event before Welcome")) };
                 let mut heard = self.past.heard;
-                if heard.hear(boot, seq) {
+                if heard.receive(boot, seq) {
                     self.hand(StreamEvent::Event(event))?;
                     self.past.heard = heard;
                 }
             }
-            Ok(ToRuntime::Heard(seq)) => self.with.outbox.heard(seq),
+            Ok(ToRuntime::EventsReceived(seq)) => self.with.outbox.heard(seq),
             Ok(ToRuntime::Camera { index, camera }) => {
                 self.hand(StreamEvent::Camera(index, Box::new(camera)))?;
             }

@@ -58,8 +58,8 @@ impl Server {
         let mut peer = self.accept(Preamble::of(PeerRole::Server)).await;
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
         assert_eq!((hello.vehicle.as_str(), hello.purpose), ("vizflyt", Purpose::Fly));
-        let heard_events = HeardEvents { boot: hello.boot, seq: heard(&hello) };
-        let welcome = Welcome { boot, heard_events, arena: arena() };
+        let received_events = ReceivedEvents { boot: hello.boot, seq: heard(&hello) };
+        let welcome = Welcome { boot, received_events, arena: arena() };
         peer.say(&ToRuntime::Welcome(welcome)).await;
         (peer, hello)
     }
@@ -103,7 +103,7 @@ impl Peer {
 
     /// Returns when the runtime acknowledges the event `seq`.
     async fn heard(&mut self, seq: u64) {
-        while self.next_but_clock().await != Some(ToServer::Heard(seq)) {}
+        while self.next_but_clock().await != Some(ToServer::EventsReceived(seq)) {}
     }
 
     fn pose(&self, pose: &PoseSample) {
@@ -292,13 +292,13 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
     let client = Client::start(&server, server.fingerprint);
     let (mut peer, hello) = server.welcome_as(BOOT, |_| 0).await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
-    assert_eq!(hello.heard_events, HeardEvents::default());
+    assert_eq!(hello.received_events, ReceivedEvents::default());
     client.outbox.tell(note("one"));
     client.outbox.tell(note("two"));
     assert_eq!(peer.event().await.unwrap(), (1, note("one")));
     assert_eq!(peer.event().await.unwrap(), (2, note("two")));
     // Only the first is acknowledged before the outage; the second was heard all the same.
-    peer.say(&ToRuntime::Heard(1)).await;
+    peer.say(&ToRuntime::EventsReceived(1)).await;
     for (seq, text) in [(4, "four"), (9, "nine")] {
         peer.tell(seq, text).await;
         assert!(matches!(client.next(), StreamEvent::Event(event) if event == note(text)));
@@ -311,7 +311,10 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
 
     let (mut peer, again) = server.welcome_as(BOOT, |_| 2).await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
-    assert_eq!((again.boot, again.heard_events), (hello.boot, HeardEvents { boot: BOOT, seq: 9 }));
+    assert_eq!(
+        (again.boot, again.received_events),
+        (hello.boot, ReceivedEvents { boot: BOOT, seq: 9 })
+    );
     // A server that tells something twice is heard once.
     peer.tell(9, "nine").await;
     peer.tell(10, "ten").await;
@@ -327,7 +330,7 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
     assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("first")));
     // It ends when the last event is heard.
     client.outbox.close();
-    peer.say(&ToRuntime::Heard(3)).await;
+    peer.say(&ToRuntime::EventsReceived(3)).await;
     while peer.next_but_clock().await.is_some() {}
     peer.connection.closed().await;
 }
@@ -356,7 +359,7 @@ async fn an_event_that_found_no_room_is_told_again() {
     let mut peer = server.welcome().await;
     peer.tell(1, "stop").await;
     let (mut again, hello) = server.welcome_as(BOOT, |_| 0).await;
-    assert_eq!(hello.heard_events.of(BOOT), 0);
+    assert_eq!(hello.received_events.of(BOOT), 0);
     again.tell(1, "stop").await;
     let wait = || events.recv_timeout(WAIT).unwrap();
     while !matches!(tokio::task::block_in_place(wait), StreamEvent::Event(e) if e == note("stop")) {

@@ -1,4 +1,4 @@
-//! MAVLink 2 message signing: who has the key may speak, and nothing said before can be said again
+//! MAVLink 2 message signing: only holders of the key are accepted, and no packet can be replayed
 //! (MAVLink guide, "Message Signing"). Pure: bytes and the time in, bytes or a refusal out.
 //!
 //! A signed packet carries 13 bytes more: link id, a 48-bit stamp in units of 10 us since 2015, and
@@ -76,8 +76,8 @@ pub enum SigningFault {
     /// Its signature is not of our key, or the packet was changed.
     #[error("a packet is signed with another key, or was changed")]
     Forged,
-    /// Its stamp is not newer than one heard before, or a minute old.
-    #[error("a packet was heard before")]
+    /// Its stamp is not newer than one received before, or a minute old.
+    #[error("a packet is a replay")]
     Replayed,
     /// More senders than can be kept apart.
     #[error("more than 16 senders sign")]
@@ -93,7 +93,7 @@ pub struct Signer {
 }
 
 impl Signer {
-    /// Makes a signer; `link` tells apart several ways that one sender sends on.
+    /// Makes a signer; `link` distinguishes several links of one sender.
     pub const fn new(key: SigningKey, link: u8) -> Self {
         Self { key, link, next: 0 }
     }
@@ -124,7 +124,7 @@ impl Signer {
     }
 }
 
-/// Judges what one end hears.
+/// Verifies what one end receives.
 #[derive(Clone, Debug)]
 pub struct Verifier {
     key: SigningKey,
@@ -135,11 +135,11 @@ pub struct Verifier {
 
 /// Senders kept apart. A vehicle's link has two or three.
 const SENDERS: usize = 16;
-/// A sender heard for the first time may be this much behind. [10 us]
+/// A sender received for the first time may be this much behind. [10 us]
 const MINUTE: u64 = 6_000_000;
 
 impl Verifier {
-    /// Makes one that has heard nothing.
+    /// Makes one that has received nothing.
     pub const fn new(key: SigningKey) -> Self {
         Self { key, newest: 0, senders: Vec::new() }
     }
@@ -154,13 +154,13 @@ impl Verifier {
         if !signed {
             return Err(SigningFault::Unsigned);
         }
-        let (said, theirs) = packet.split_at(packet.len() - 6);
-        let ours = signature(&self.key, said);
+        let (signed_bytes, theirs) = packet.split_at(packet.len() - 6);
+        let ours = signature(&self.key, signed_bytes);
         // In constant time: a forger learns nothing from how long it took.
         if ours.iter().zip(theirs).fold(0, |differ, (a, b)| differ | (a ^ b)) != 0 {
             return Err(SigningFault::Forged);
         }
-        let tail = &said[said.len() - 7..];
+        let tail = &signed_bytes[signed_bytes.len() - 7..];
         let stamp =
             u64::from_le_bytes([tail[1], tail[2], tail[3], tail[4], tail[5], tail[6], 0, 0]);
         let sender = [packet[5], packet[6], tail[0]];
@@ -182,10 +182,10 @@ impl Verifier {
 const SIGNED: u8 = 0x01;
 
 /// Returns the signature of a packet up to and with its stamp.
-fn signature(key: &SigningKey, said: &[u8]) -> [u8; 6] {
+fn signature(key: &SigningKey, signed_bytes: &[u8]) -> [u8; 6] {
     let mut hash = Sha256::new();
     hash.update(key.0);
-    hash.update(said);
+    hash.update(signed_bytes);
     let digest = hash.finalize();
     [digest[0], digest[1], digest[2], digest[3], digest[4], digest[5]]
 }
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unsigned_forged_or_said_before_is_refused() {
+    fn unsigned_forged_and_replayed_packets_are_refused() {
         let (mut signer, mut verifier) = (Signer::new(key(), 0), Verifier::new(key()));
         let (packet, len) = signed(&mut signer, NOW, 1);
         assert_eq!(verifier.check(NOW, &packet[..len]), Ok(()));

@@ -8,9 +8,9 @@
 //! 3. then events, changed cameras and clock replies flow down; telemetry, events and clock
 //!    requests up.
 //!
-//! Events are numbered from 1 by who makes them, and acknowledged with `Heard`. Each side says at
-//! the start what it has heard of the other ([`HeardEvents`]), so that after an outage whatever is
-//! missing is told again, and nothing twice.
+//! Events are numbered from 1 by who makes them, and acknowledged with `EventsReceived`. Each side says at
+//! the start what it has received of the other ([`ReceivedEvents`]), so that after an outage whatever is
+//! missing is sent again, and nothing twice.
 //!
 //! Poses come as datagrams ([`Datagram`]): a lost one holds up nothing, the newest by stamp counts.
 //!
@@ -32,8 +32,8 @@ pub use kinds::{SetpointKind, SetpointKinds};
 pub use pairing::{Grant, MAX_GRANTED, PairingProof, PairingReply, PairingRequest, PairingShare};
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
-    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, ImuReading,
-    Limits, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ToRuntime, ToServer, Welcome,
+    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, Hello, ImuReading, Limits,
+    MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ReceivedEvents, ToRuntime, ToServer, Welcome,
 };
 pub use setpoint::{Axes, InvalidSetpoint, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, OutcomeKind, Telemetry, VehicleState};

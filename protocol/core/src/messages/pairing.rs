@@ -55,7 +55,7 @@ pub enum PairingReply {
         /// What the client may do from now on.
         grant: Grant,
     },
-    /// Not done; why, in a sentence that says what to do.
+    /// Not done; the reason, and what to do.
     Refused(Text),
 }
 

@@ -10,10 +10,10 @@ use crate::time::{HostTime, ServerTime};
 /// What a client is there for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Purpose {
-    /// Flies the vehicle: gets all, reports, tells events. One at a time.
+    /// Flies the vehicle: gets all, reports, sends events. One at a time.
     #[default]
     Fly,
-    /// Watches it: gets images, poses and events; what it tells but clock requests is ignored.
+    /// Watches it: gets images, poses and events; what it sends but clock requests is ignored.
     Watch,
 }
 
@@ -26,40 +26,40 @@ pub struct Hello {
     pub purpose: Purpose,
     /// The program and its version, for the page and the log.
     pub program: Text,
-    /// Drawn by lot when the program started: tells its events from those of another run.
+    /// Random, chosen when the program started: distinguishes its events from those of another run.
     pub boot: u64,
-    /// What it has heard of the server's events before.
-    pub heard_events: HeardEvents,
+    /// What it has received of the server's events before.
+    pub received_events: ReceivedEvents,
 }
 
 /// Accepts a client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Welcome {
-    /// Drawn by lot when the server started: another one means that it was restarted.
+    /// Random, chosen when the server started: another one means that it was restarted.
     pub boot: u64,
-    /// What the server has heard of this client's events before.
-    pub heard_events: HeardEvents,
+    /// What the server has received of this client's events before.
+    pub received_events: ReceivedEvents,
     /// What it must know of the arena.
     pub arena: ArenaInfo,
 }
 
-/// How far one side has heard the other's events.
+/// How many of the other side's events have been received.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct HeardEvents {
+pub struct ReceivedEvents {
     /// Whose they were: the other side's `boot`; 0 is nobody's.
     pub boot: u64,
     /// Number of the newest; 0 is none.
     pub seq: u64,
 }
 
-impl HeardEvents {
-    /// Returns the newest number heard of the run `boot`; 0 of any other.
+impl ReceivedEvents {
+    /// Returns the newest number received of the run `boot`; 0 of any other.
     pub fn of(&self, boot: u64) -> u64 {
         if self.boot == boot { self.seq } else { 0 }
     }
 
     /// Takes note of an event of the run `boot`; returns whether it is new.
-    pub fn hear(&mut self, boot: u64, seq: u64) -> bool {
+    pub fn receive(&mut self, boot: u64, seq: u64) -> bool {
         let is_new = seq > self.of(boot);
         if is_new {
             *self = Self { boot, seq };
@@ -101,8 +101,8 @@ pub enum ToServer {
         /// What.
         event: Event,
     },
-    /// Every event of the server up to this number has been heard.
-    Heard(u64),
+    /// Every event of the server up to this number has been received.
+    EventsReceived(u64),
     /// Reports where images get their age. 1 Hz.
     Timing(Timing),
     /// What the autopilot's IMU felt, oldest first; each reading once. 25 to 50 Hz.
@@ -115,7 +115,7 @@ pub enum ToServer {
 pub enum ToRuntime {
     /// Accepts the client.
     Welcome(Welcome),
-    /// Declines it, with the reason in a sentence that says what to do.
+    /// Declines it, with the reason and what to do.
     Refused(Text),
     /// Tells the time.
     Clock(ClockReply),
@@ -126,10 +126,10 @@ pub enum ToRuntime {
         /// What.
         event: Event,
     },
-    /// Every event of this client up to this number has been heard.
-    Heard(u64),
+    /// Every event of this client up to this number has been received.
+    EventsReceived(u64),
     /// A camera was changed while flying. Images drawn with it may come before this does: each
-    /// says itself how it was drawn.
+    /// states itself how it was rendered.
     Camera {
         /// Index into [`ArenaInfo::cameras`].
         index: u8,
@@ -164,7 +164,7 @@ pub struct PoseSample {
 }
 
 impl PoseSample {
-    /// Makes the sample of a vehicle that stands still, of which nobody says how far it may be off.
+    /// Makes the sample of a vehicle that stands still, of unknown uncertainty.
     pub const fn still(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
         let twist = Twist { linear_mps: DVec3::ZERO, angular_radps: DVec3::ZERO };
         let (position_sigma_m, rotation_sigma_rad) = (Vec3::ZERO, Vec3::ZERO);
@@ -315,12 +315,12 @@ mod tests {
 
     #[test]
     fn each_event_of_a_run_is_new_once() {
-        let mut heard = HeardEvents::default();
-        assert!(heard.hear(7, 1) && heard.hear(7, 4));
-        assert!(!heard.hear(7, 1) && !heard.hear(7, 4));
-        assert_eq!((heard.of(7), heard.of(8)), (4, 0));
-        // The other side was restarted and counts anew.
-        assert!(heard.hear(8, 1));
-        assert_eq!((heard.of(7), heard.of(8)), (0, 1));
+        let mut received = ReceivedEvents::default();
+        assert!(received.receive(7, 1) && received.receive(7, 4));
+        assert!(!received.receive(7, 1) && !received.receive(7, 4));
+        assert_eq!((received.of(7), received.of(8)), (4, 0));
+        // The other side was restarted and counts from the start.
+        assert!(received.receive(8, 1));
+        assert_eq!((received.of(7), received.of(8)), (0, 1));
     }
 }

@@ -26,7 +26,7 @@ pub enum FlightPhase {
     Waiting,
 }
 
-/// How a flight ended, as runtime, grades and leaderboard say it.
+/// How a flight ended, for runtime, grades and leaderboard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OutcomeKind {
@@ -68,7 +68,7 @@ impl core::fmt::Display for OutcomeKind {
     }
 }
 
-/// What the autopilot says of the vehicle, in our frames.
+/// The autopilot's state of the vehicle, in our frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct VehicleState {
     /// Motors may turn.
@@ -89,7 +89,7 @@ pub struct VehicleState {
     pub battery_fraction: f32,
 }
 
-/// How images fare between the pose and the plugin, over the last second.
+/// Delivery of images between the pose and the plugin, over the last second.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ImageStats {
     /// Images handed to the plugin since the start.

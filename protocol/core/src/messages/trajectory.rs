@@ -19,7 +19,7 @@ pub const COEFFICIENTS: usize = 8;
 /// another `id`. A vehicle that the guard slows down does not lose its path: the path waits.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
-    /// The plugin's own number for it: the same one goes on, another one starts anew.
+    /// The plugin's own number for it: the same one goes on, another one starts a new flight along it.
     pub id: u32,
     /// Axes of the points. With [`Axes::Heading`] and [`Axes::Body`] they count from where the
     /// vehicle is, and along how it points, when the runtime takes the trajectory.

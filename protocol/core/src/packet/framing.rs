@@ -131,8 +131,8 @@ mod tests {
     }
 
     fn welcome() -> Welcome {
-        let heard_events = HeardEvents { boot: u64::MAX, seq: u64::MAX };
-        Welcome { boot: u64::MAX, heard_events, arena: widest_arena() }
+        let received_events = ReceivedEvents { boot: u64::MAX, seq: u64::MAX };
+        Welcome { boot: u64::MAX, received_events, arena: widest_arena() }
     }
 
     fn messages() -> Vec<ToRuntime> {
@@ -143,7 +143,7 @@ mod tests {
                 sent: HostTime::from_ns(u64::MAX),
                 answered: ServerTime::from_ns(1),
             }),
-            ToRuntime::Heard(u64::MAX),
+            ToRuntime::EventsReceived(u64::MAX),
             ToRuntime::Event {
                 seq: u64::MAX,
                 event: Event {

@@ -211,10 +211,10 @@ pub enum InvalidImageTrailer {
     #[error("the image does not end with a trailer")]
     Foreign,
     /// What came is not as long as what was sent.
-    #[error("image trailer: {said} bytes were sent, {came} came")]
+    #[error("image trailer: {announced} bytes were announced, {came} came")]
     Length {
         /// Bytes of bitstream by the trailer.
-        said: u32,
+        announced: u32,
         /// Bytes of bitstream received.
         came: u64,
     },
@@ -243,9 +243,9 @@ impl ImageTrailer {
         if trailer.magic != Self::MAGIC {
             return Err(InvalidImageTrailer::Foreign);
         }
-        let said = trailer.payload_len.get();
-        if u64::from(said) != came {
-            return Err(InvalidImageTrailer::Length { said, came });
+        let announced = trailer.payload_len.get();
+        if u64::from(announced) != came {
+            return Err(InvalidImageTrailer::Length { announced, came });
         }
         Ok(trailer)
     }
@@ -298,7 +298,7 @@ mod tests {
         let trailer = ImageTrailer::new(7, ServerTime::from_ns(3), ServerTime::from_ns(2));
         let mut bytes = [0; ImageTrailer::SIZE];
         bytes.copy_from_slice(trailer.as_bytes());
-        let short = InvalidImageTrailer::Length { said: 7, came: 6 };
+        let short = InvalidImageTrailer::Length { announced: 7, came: 6 };
         assert_eq!(ImageTrailer::parse(&bytes, 6), Err(short));
         bytes[3] = b'M';
         assert_eq!(ImageTrailer::parse(&bytes, 7), Err(InvalidImageTrailer::Foreign));

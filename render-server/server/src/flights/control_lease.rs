@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::Notify;
-use vizflyt_protocol::messages::{HeardEvents, Hello, Text};
+use vizflyt_protocol::messages::{ReceivedEvents, Hello, Text};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::lock::lock;
@@ -23,7 +23,7 @@ struct State {
     /// Random number of the runtime that holds the lease, or held it last.
     boot: u64,
     /// Which of its events were received.
-    received: HeardEvents,
+    received: ReceivedEvents,
     watchers: usize,
     /// How many flights have begun; the pose thread restarts its referee with each.
     flights: u64,
@@ -93,7 +93,7 @@ impl Leases {
             resumed,
             first_event: state.first_event,
             boot: hello.boot,
-            heard_events: state.received,
+            received_events: state.received,
         })
     }
 
@@ -159,7 +159,7 @@ pub struct ControlLease {
     /// Tells this runtime's events from those of another run.
     boot: u64,
     /// Which of the runtime's events had been received.
-    pub heard_events: HeardEvents,
+    pub received_events: ReceivedEvents,
 }
 
 /// The right to watch a vehicle; given back when dropped.
@@ -181,7 +181,7 @@ impl Drop for WatchLease {
 impl ControlLease {
     /// Notes that the runtime's event `seq` was received; returns whether it is new.
     pub fn receive_event(&self, seq: u64) -> bool {
-        lock(&self.leases).received.hear(self.boot, seq)
+        lock(&self.leases).received.receive(self.boot, seq)
     }
 
     /// Notes that the runtime has sent something at `now`.

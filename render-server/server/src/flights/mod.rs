@@ -20,7 +20,6 @@ pub mod vehicle;
 
 pub(crate) use recorder::record;
 
-use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 
 use self::leaderboard::Leaderboard;
@@ -42,7 +41,7 @@ impl Flights {
     /// Returns the state of a server that has seen nothing yet.
     pub fn new(vehicles: Vec<VehicleFlight>, leaderboard: Option<Leaderboard>) -> Self {
         Self {
-            instance_id: random_instance_id(),
+            instance_id: vizflyt_trust::random_instance_id(),
             vehicles: vehicles.into_iter().map(Arc::new).collect(),
             leaderboard,
         }
@@ -74,12 +73,6 @@ impl Flights {
     pub fn any_under_way(&self) -> bool {
         self.vehicles.iter().any(|vehicle| vehicle.under_way())
     }
-}
-
-/// Returns a number that no other run has, with negligible probability of a collision; never 0.
-fn random_instance_id() -> u64 {
-    // Keyed by the system's randomness.
-    RandomState::new().hash_one(std::process::id()) | 1
 }
 
 #[cfg(test)]

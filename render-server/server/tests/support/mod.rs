@@ -19,7 +19,7 @@ use quinn::{ClientConfig, Connection, Endpoint, RecvStream, SendStream, Transpor
 use serde_json::Value;
 use tempfile::TempDir;
 use vizflyt_protocol::messages::{
-    ArenaInfo, Datagram, HeardEvents, Hello, PoseSample, Purpose, ToRuntime, ToServer, Welcome,
+    ArenaInfo, Datagram, Hello, PoseSample, Purpose, ReceivedEvents, ToRuntime, ToServer, Welcome,
     bounded,
 };
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, decode_body, encode};
@@ -296,7 +296,7 @@ pub fn hello(vehicle: &str, purpose: Purpose) -> Hello {
         purpose,
         program: bounded("test 1"),
         boot: BOOTS.fetch_add(1, Ordering::Relaxed),
-        heard_events: HeardEvents::default(),
+        received_events: ReceivedEvents::default(),
     }
 }
 

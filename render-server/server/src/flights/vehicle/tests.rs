@@ -6,7 +6,7 @@ use super::*;
 use crate::flights::control_lease::MAX_WATCHERS;
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::{HeardEvents, Limits, PoseAges, Purpose};
+use vizflyt_protocol::messages::{ReceivedEvents, Limits, PoseAges, Purpose};
 
 pub(crate) fn named(index: usize, name: &str) -> VehicleFlight {
     let arena = ArenaInfo {
@@ -38,7 +38,7 @@ fn hello(boot: u64) -> Hello {
         purpose: Purpose::Fly,
         program: bounded("runtime 0.1"),
         boot,
-        heard_events: HeardEvents::default(),
+        received_events: ReceivedEvents::default(),
     }
 }
 
@@ -94,13 +94,13 @@ fn the_same_runtime_goes_on_with_its_flight_and_tells_each_event_once() {
     vehicle.publish(EventKind::EmergencyStop, "stop");
     let second = vehicle.take_control(&hello(7), address()).unwrap();
     assert_eq!((second.first_event, second.resumed, vehicle.flights()), (0, true, 1));
-    assert_eq!(second.heard_events, HeardEvents { boot: 7, seq: 2 });
+    assert_eq!(second.received_events, ReceivedEvents { boot: 7, seq: 2 });
     assert!(!second.receive_event(2) && second.receive_event(3));
     drop(second);
     // Another run of the runtime: a new flight, and its events count anew.
     let third = vehicle.take_control(&hello(8), address()).unwrap();
     assert_eq!((third.first_event, third.resumed, vehicle.flights()), (1, false, 2));
-    assert_eq!(third.heard_events.of(8), 0);
+    assert_eq!(third.received_events.of(8), 0);
     assert!(third.receive_event(1));
 }
 

@@ -4,7 +4,7 @@ use quinn::{Connection, SendStream};
 use tokio::sync::{mpsc, watch as cell};
 use tracing::{debug, info};
 use vizflyt_protocol::messages::{
-    ArenaInfo, ClockReply, ClockRequest, Datagram, HeardEvents, Hello, PoseSample, Purpose,
+    ArenaInfo, ClockReply, ClockRequest, Datagram, ReceivedEvents, Hello, PoseSample, Purpose,
     ToRuntime, ToServer, Welcome,
 };
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
@@ -86,11 +86,11 @@ impl Session<'_> {
         let purpose = if lease.is_some() { Purpose::Fly } else { Purpose::Watch };
         let (rooms, vehicle) = (self.rooms.clone(), self.vehicle.index);
         let senders = ImageSenders::open(rooms, vehicle, self.connection.clone(), id, purpose);
-        let heard_events = lease.map_or_else(HeardEvents::default, |lease| lease.heard_events);
-        let heard = self.hello.heard_events.of(self.rooms.flights.instance_id);
+        let received_events = lease.map_or_else(ReceivedEvents::default, |lease| lease.received_events);
+        let heard = self.hello.received_events.of(self.rooms.flights.instance_id);
         let cursor = first_event.max(heard);
         tokio::select! {
-            ending = self.send(send, heard_events, cursor, clock_requests, received) => ending,
+            ending = self.send(send, received_events, cursor, clock_requests, received) => ending,
             ending = self.receive(lease, incoming, &clock_sender, &received_sender) => ending,
             ending = senders.run() => ending,
             error = self.connection.closed() => gone(&error),
@@ -102,7 +102,7 @@ impl Session<'_> {
     async fn send(
         &self,
         send: SendStream,
-        heard_events: HeardEvents,
+        received_events: ReceivedEvents,
         mut cursor: u64,
         mut clock_requests: mpsc::Receiver<ClockRequest>,
         mut received: cell::Receiver<u64>,
@@ -117,7 +117,7 @@ impl Session<'_> {
         let arena =
             ArenaInfo { cameras: sent.infos.iter().cloned().collect(), ..vehicle.arena.clone() };
         let boot = self.rooms.flights.instance_id;
-        let welcome = Welcome { boot, heard_events, arena };
+        let welcome = Welcome { boot, received_events, arena };
         if let Err(ending) = out.write(&ToRuntime::Welcome(welcome)).await {
             return ending;
         }
@@ -131,7 +131,7 @@ impl Session<'_> {
                 }
                 Ok(()) = received.changed() => {
                     let seq = *received.borrow_and_update();
-                    out.write(&ToRuntime::Heard(seq)).await
+                    out.write(&ToRuntime::EventsReceived(seq)).await
                 }
                 _ = cameras.changed() => {
                     let newest = cameras.borrow_and_update().clone();
@@ -192,7 +192,7 @@ impl Session<'_> {
                     }
                     received.send_modify(|newest| *newest = seq.max(*newest));
                 }
-                (ToServer::Heard(seq), _) => debug!("events up to {seq} were received"),
+                (ToServer::EventsReceived(seq), _) => debug!("events up to {seq} were received"),
                 (ToServer::Hello(_), _) => debug!("a second Hello is ignored"),
                 (_, None) => debug!("a report of a watcher is ignored"),
             }
