@@ -162,7 +162,7 @@ impl Access {
         let mut stamp = [0; 8];
         stamp[..6].copy_from_slice(&signed[signed.len() - 6..]);
         let signed_at = u64::from_le_bytes(stamp);
-        // Why: six bytes are compared at once; how long that takes says nothing of a hash.
+        // Why: six bytes are compared at once; how long that takes carries no information on a hash.
         let fresh = right[..6] == *given && signed_at > self.signed_at;
         if fresh {
             self.signed_at = signed_at;

@@ -1,4 +1,4 @@
-//! What a bridge can be told, and the names it is told by. Numbers are MAVLink parameters of our
+//! All settings of a bridge, and their names. Numbers are MAVLink parameters of our
 //! component as well; texts (networks, passwords, addresses) go through `vizflyt bridge configure`
 //! alone. Passwords and the key are written, never read back.
 

@@ -160,7 +160,7 @@ struct Sender {
 }
 
 /// A jump this far or further is taken for a restart or an overtaken packet: a loss of half the
-/// counter's range at once cannot be told from either.
+/// counter's range at once cannot be distinguished from either.
 const MOST_LOST: u8 = 128;
 
 impl<const N: usize> Sequences<N> {

@@ -89,7 +89,7 @@ fn the_bridge_passes_them_on_unchanged() {
             Settings { client: Some(client), radio_status: false, ..Settings::default() };
         let mut bridge = Bridge::new(HostTime::ZERO, settings, Chip::default());
         let (mut out, mut came) = ([0; 1472], Vec::new());
-        // Whole within the first second: the bridge says nothing of its own yet.
+        // Whole within the first second: the bridge sends nothing of its own yet.
         for (step, part) in BYTES.chunks(portion).enumerate() {
             let now = HostTime::from_ns(step as u64 * 20_000);
             bridge.handle_uart(now, part);

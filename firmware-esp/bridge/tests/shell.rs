@@ -198,7 +198,7 @@ where
     bare
 }
 
-/// A whole packet of message `id`, told apart by `number`.
+/// A whole packet of message `id`, distinguished by `number`.
 fn packet(from: (u8, u8), id: u32, number: u32) -> Vec<u8> {
     let mut payload = [0x5A; 28];
     payload[..4].copy_from_slice(&number.to_le_bytes());

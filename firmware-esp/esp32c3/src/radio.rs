@@ -35,7 +35,7 @@ pub(crate) enum Role {
 static ROLE: Mutex<Cell<Role>> = Mutex::new(Cell::new(Role::Off));
 static CHANGED: AtomicWaker = AtomicWaker::new();
 
-/// Tells the network stack which interface counts from now on.
+/// Sets which interface the network stack uses from now on.
 pub(crate) fn set_role(role: Role) {
     critical_section::with(|section| ROLE.borrow(section).set(role));
     CHANGED.wake();

@@ -300,12 +300,12 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
             "ready": "simulator", "mavlink": addresses[0], "links": addresses,
             "mocap": driver.mocap_addresses()?,
         });
-        say(&ready);
+        print(&ready);
     } else {
         for (endpoint, address) in endpoints.iter().zip(&addresses) {
-            say(&format!("MAVLink {endpoint} (our address {address})"));
+            print(&format!("MAVLink {endpoint} (our address {address})"));
         }
-        say(&"simulator ready; Ctrl-C ends it");
+        print(&"simulator ready; Ctrl-C ends it");
     }
     // The loop has a thread of its own, whatever the caller's thread is busy with.
     let (simulation, lost_s) = std::thread::Builder::new()
@@ -318,10 +318,10 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     if args.json {
         let mut report = serde_json::to_value(&report).context("simulator: report")?;
         report["seconds_given_up"] = lost_s.into();
-        say(&serde_json::json!({ "report": report }));
+        print(&serde_json::json!({ "report": report }));
     } else {
         let truth = &report.truth;
-        say(&format!(
+        print(&format!(
             "flew {:.1} s, {:.1} m, at {:.1} m/s on average and {:.1} m/s at most; {}{}",
             truth.flight_seconds,
             truth.path_m,
@@ -337,7 +337,7 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
 }
 
 /// Prints a line; unlike `println!` it does not panic when the reader has gone.
-fn say(line: &impl Display) {
+fn print(line: &impl Display) {
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }

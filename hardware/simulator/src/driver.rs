@@ -76,7 +76,7 @@ impl Driver {
     /// Returns our address of each mocap feed.
     ///
     /// # Errors
-    /// If the operating system does not say.
+    /// If the operating system does not report it.
     pub fn mocap_addresses(&self) -> anyhow::Result<Vec<SocketAddr>> {
         self.mocap
             .iter()
@@ -87,7 +87,7 @@ impl Driver {
     /// Returns our address or path of each MAVLink link.
     ///
     /// # Errors
-    /// Fails if the operating system does not say.
+    /// Fails if the operating system does not report it.
     pub fn mavlink_addresses(&self) -> anyhow::Result<Vec<String>> {
         self.links
             .iter()
@@ -150,7 +150,7 @@ impl Driver {
     }
 }
 
-/// Says how many ticks are due, and gives up what cannot be caught up.
+/// Returns how many ticks are due, and gives up what cannot be caught up.
 #[derive(Clone, Copy, Debug)]
 struct Pacer {
     tick: Duration,

@@ -155,7 +155,7 @@ impl Simulation {
         let mut imu = Imu::new(config.seed);
         imu.set_vibration(config.vibration_mps2);
         let mut autopilot = Autopilot::with_params(&config.params)?;
-        autopilot.set_radio(if config.radio { Radio::Heard } else { Radio::Absent });
+        autopilot.set_radio(if config.radio { Radio::Receiving } else { Radio::Absent });
         Ok(Self {
             now: AutopilotTime::ZERO,
             booted_at: AutopilotTime::ZERO,
@@ -195,7 +195,7 @@ impl Simulation {
         &self.autopilot
     }
 
-    /// Returns the time on the autopilot's own clock, which starts anew when it reboots.
+    /// Returns the time on the autopilot's own clock, which restarts at 0 when it reboots.
     pub fn autopilot_now(&self) -> AutopilotTime {
         AutopilotTime::from_ns(self.now.as_ns().saturating_sub(self.booted_at.as_ns()))
     }
@@ -210,7 +210,7 @@ impl Simulation {
         self.airframe.break_motor(motor, share);
     }
 
-    /// Says what the receiver of the radio control hears.
+    /// Sets the state of the radio-control receiver.
     pub fn set_radio(&mut self, radio: Radio) {
         self.autopilot.set_radio(radio);
     }

@@ -69,7 +69,7 @@ pub struct Wifi {
 type Packet = (usize, Vec<u8>);
 
 impl Wifi {
-    /// Makes one direction; `direction` tells the two apart.
+    /// Makes one direction; `direction` distinguishes the two.
     pub fn new(config: WifiConfig, direction: u64) -> Self {
         Self {
             config,

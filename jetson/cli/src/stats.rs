@@ -37,7 +37,7 @@ pub(crate) struct StatsArgs {
     /// Prints the figures as JSON
     #[arg(long)]
     json: bool,
-    /// Prints them anew every second
+    /// Prints them every second
     #[arg(long)]
     watch: bool,
 }

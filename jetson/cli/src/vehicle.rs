@@ -89,7 +89,7 @@ Then, in jetson.toml:
 struct SignArgs {
     #[command(flatten)]
     autopilot: AutopilotArgs,
-    /// The key's file: made if it is not there, given anew if it is
+    /// The key's file: made if it is not there, sent again if it is
     #[arg(long, value_name = "FILE", required_unless_present = "off")]
     key: Option<PathBuf>,
     /// Takes signing back: the autopilot accepts everyone again

@@ -83,7 +83,7 @@ impl PluginEnd {
         Ok(Some(observation))
     }
 
-    /// Tells that `on_start` has returned.
+    /// Reports that `on_start` has returned.
     fn ready(&self, name: &str) -> PyResult<()> {
         self.send(&FromPlugin::Ready { name: bounded(name) })
     }
@@ -99,7 +99,7 @@ impl PluginEnd {
         })
     }
 
-    /// Tells that the plugin gives up, and why; leaves the runtime a moment to read it.
+    /// Reports that the plugin has failed, with the reason; leaves the runtime a moment to read it.
     fn failed(&self, py: Python<'_>, reason: &str) -> PyResult<()> {
         self.send(&FromPlugin::Failed { reason: bounded(reason) })?;
         py.detach(|| std::thread::sleep(LAST_WORDS));

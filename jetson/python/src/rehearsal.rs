@@ -49,7 +49,7 @@ impl Rehearsal {
         self.end.plugin_attached()
     }
 
-    /// Tells the plugin what it flies in.
+    /// Sends the plugin its arena.
     fn start(&self, info: &ArenaInfo) -> PyResult<()> {
         self.send(&ToPlugin::Start(info.0.clone()))
     }

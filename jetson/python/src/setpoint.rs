@@ -124,7 +124,7 @@ impl Setpoint {
     /// or one per point for the way to it) [m/s], and stay at the last.
     ///
     /// The runtime follows it as long as the plugin answers images, with None or the same path again. A
-    /// path of another `id` starts anew. With axes 'heading' or 'body' the points count from where the
+    /// path of another `id` starts again. With axes 'heading' or 'body' the points count from where the
     /// vehicle is when the runtime takes the path.
     #[staticmethod]
     #[pyo3(signature = (

@@ -80,7 +80,7 @@ impl<'m> ObservationWriter<'m> {
         Ok(Self { memory, layout })
     }
 
-    /// Starts `memory` as a copy of the observation `from` of `old_cameras`, laid out anew for
+    /// Starts `memory` as a copy of the observation `from` of `old_cameras`, laid out again for
     /// `cameras`: for when one of them has changed its size. The images in `from` of cameras whose
     /// size is the same come along.
     ///

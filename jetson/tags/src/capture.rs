@@ -58,7 +58,7 @@ pub enum CaptureError {
     Io {
         /// Which source.
         source_name: String,
-        /// What the system says.
+        /// The system's error.
         error: std::io::Error,
     },
     /// It is there and is not what is needed.

@@ -111,7 +111,7 @@ impl Checkerboard {
     }
 }
 
-/// Fewer corners make no grid that can be told from clutter.
+/// Fewer corners make no grid that can be distinguished from clutter.
 const LEAST_CORNERS: u32 = 3;
 /// More are smaller than any camera sees.
 const MOST_CORNERS: u32 = 100;

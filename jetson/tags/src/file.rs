@@ -16,7 +16,7 @@ pub enum FileError {
     Io {
         /// Which file.
         path: String,
-        /// What the system says.
+        /// The system's error.
         error: std::io::Error,
     },
     /// Syntax, type, absent or unknown key; the text points at line and column.

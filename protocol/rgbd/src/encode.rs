@@ -15,7 +15,7 @@ use crate::image::{ImageView, Parts};
 use crate::plane::{PlaneEncoder, Samples};
 
 /// What an encoder may choose; every choice is written into the bitstream, so a decoder needs to
-/// know none, and each image may choose anew.
+/// know none, and each image may choose again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EncodeOptions {
     /// JPEG quality of colour, 1 to 100.

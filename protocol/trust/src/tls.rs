@@ -2,7 +2,7 @@
 //!
 //! TLS proves that the other side holds the key of the certificate it shows; whether that
 //! certificate may do anything is decided afterwards, by its fingerprint. Sessions are never
-//! resumed: each connection proves it anew.
+//! resumed: each connection proves it again.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -367,7 +367,7 @@ impl Referee {
         }
     }
 
-    /// Says what ends the flight; of several in one pose the first counts.
+    /// Reports what ends the flight; of several in one pose the first counts.
     fn end(&mut self, stamp: ServerTime, kind: EventKind, text: &str) {
         if !std::mem::replace(&mut self.over, true) {
             self.tell(stamp, kind, text);

@@ -30,7 +30,7 @@ pub enum WriteError {
     Io {
         /// What was to be written.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         cause: io::Error,
     },
     /// The splats could not be written.

@@ -1,4 +1,4 @@
-//! Reads a scene of any format and writes it in any other, told by the names, in one of its variants
+//! Reads a scene of any format and writes it in any other, determined by the names, in one of its variants
 //! where it has several (`Format::variants`):
 //!
 //! ```text

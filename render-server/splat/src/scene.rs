@@ -9,7 +9,7 @@ use crate::Splats;
 pub struct Scene<'a> {
     /// What stands still. [m, world]
     pub splats: &'a Splats,
-    /// What moves; placed anew for every image, in this order.
+    /// What moves; placed again for every image, in this order.
     pub objects: &'a [RigidObject],
 }
 

@@ -34,7 +34,7 @@ fuzz_target!(|input: (bool, bool, Vec<(u8, &[u8])>)| {
         match what {
             250 => simulation.reboot(),
             251 => simulation.set_radio(Radio::Lost),
-            252 => simulation.set_radio(Radio::Heard),
+            252 => simulation.set_radio(Radio::Receiving),
             253 => simulation.break_motor(packet.len() % 4, 0.5),
             240..=249 => say(&mut simulation, what - 240, packet),
             link => simulation.handle_mavlink(usize::from(link) % MAX_LINKS, packet),

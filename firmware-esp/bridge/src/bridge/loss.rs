@@ -135,7 +135,7 @@ impl LinkLoss {
     ) -> Option<LossAction> {
         if self.landing.is_some() && !flight.follows() {
             self.landing = None;
-            // Its stream is to be seen anew before it is followed again.
+            // Its stream must be seen again before it is followed.
             self.streamer = None;
         }
         // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off

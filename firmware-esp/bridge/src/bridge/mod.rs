@@ -128,7 +128,7 @@ impl Bridge {
         self.router.signal_dbm = dbm;
     }
 
-    /// Tells whether the network is up, and the address to which heartbeats are broadcast until
+    /// Reports whether the network is up, and the address to which heartbeats are broadcast until
     /// somebody answers.
     pub fn set_network(&mut self, broadcast: Option<SocketAddrV4>) {
         self.router.broadcast = broadcast;

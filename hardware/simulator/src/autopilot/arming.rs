@@ -16,7 +16,7 @@ impl Autopilot {
         if !health.attitude {
             return Some("PreArm: AHRS: not healthy");
         }
-        // Any bit: which checks each one skips is not told apart here.
+        // Any bit: which checks each one skips is not distinguished here.
         if value(Param::ArmingSkipChecks) != 0.0 {
             return None;
         }
@@ -51,27 +51,27 @@ impl Autopilot {
         }
         if matches!(self.mode, CopterMode::Land | CopterMode::Rtl | CopterMode::Brake) {
             let text = format!("Arm: {} mode not armable", name_of(self.mode));
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
             return MavResult::MAV_RESULT_FAILED;
         }
         if let Some(reason) = self.arming_refusal(now)
             && !(force && self.estimator.health(now).attitude)
         {
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, reason);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_CRITICAL, reason);
             return MavResult::MAV_RESULT_FAILED;
         }
         self.armed = true;
         self.landed = true;
         self.home = Some(self.estimator.estimate().p_world_m);
         self.flight = FlightState::default();
-        self.say(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
+        self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
         self.streams.heartbeat_now();
         MavResult::MAV_RESULT_ACCEPTED
     }
 
     pub(super) fn disarm_on_command(&mut self, force: bool) -> MavResult {
         if self.armed && !self.landed && !force {
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, "Disarm: not landed");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_CRITICAL, "Disarm: not landed");
             return MavResult::MAV_RESULT_FAILED;
         }
         self.disarm();
@@ -85,7 +85,7 @@ impl Autopilot {
             self.landed = true;
             self.guided = Guided::Hold;
             self.flight = FlightState::default();
-            self.say(MavSeverity::MAV_SEVERITY_INFO, "Disarming motors");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "Disarming motors");
         }
     }
 
@@ -105,7 +105,7 @@ impl Autopilot {
             None
         };
         if let Some(text) = refusal {
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, text);
             return MavResult::MAV_RESULT_FAILED;
         }
         let ground_m = self.home.map_or(0.0, |home| home.z);
@@ -119,7 +119,7 @@ impl Autopilot {
         if what != 1.0 {
             MavResult::MAV_RESULT_UNSUPPORTED
         } else if self.armed && !force {
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, "Reboot refused: armed");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "Reboot refused: armed");
             MavResult::MAV_RESULT_FAILED
         } else {
             self.wants_reboot = true;

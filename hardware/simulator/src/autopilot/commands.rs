@@ -190,13 +190,13 @@ impl Autopilot {
     fn change_mode(&mut self, now: AutopilotTime, number: u32) -> MavResult {
         let Some(mode) = CopterMode::from_number(number) else {
             let text = format!("Mode change failed: no mode {number}");
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return MavResult::MAV_RESULT_FAILED;
         };
         // A disarmed vehicle may choose any mode; the arming checks judge it later.
         if self.armed && needs_position(mode) && !self.estimator.health(now).position {
             let text = format!("Mode change to {} failed: requires position", name_of(mode));
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return MavResult::MAV_RESULT_FAILED;
         }
         self.enter(mode);
@@ -228,7 +228,7 @@ impl Autopilot {
         }
         // Heard, and not flown by, unless the sources say external navigation.
         if self.params.value(Param::Ek3PosXy) != EXTERNAL_NAVIGATION {
-            self.estimator.hear_vision(now);
+            self.estimator.note_vision_alive(now);
             return;
         }
         let least_m = self.params.value(Param::VisoPosNoise);
@@ -251,7 +251,7 @@ impl Autopilot {
             && (-1_800_000_000..=1_800_000_000).contains(&longitude);
         if on_earth && self.estimator.set_origin() {
             self.origin = Some(origin);
-            self.say(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
         }
         // Answered even if it was set before: the first answer may have been lost.
         if let Some(message) = self.message(now, super::streams::GPS_GLOBAL_ORIGIN) {

@@ -162,7 +162,7 @@ impl Autopilot {
         self.polygons.upload = None;
         if count > MOST_CORNERS {
             let text = format!("Only {MOST_CORNERS} items are supported");
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return self.answer(from, MavMissionResult::MAV_MISSION_NO_SPACE);
         }
         if count == 0 {
@@ -223,7 +223,7 @@ impl Autopilot {
         if now.seconds_since(upload.heard_at) > TIMEOUT_S {
             let from = upload.from;
             self.polygons.upload = None;
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, "Fence upload timeout");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "Fence upload timeout");
             self.answer(from, MavMissionResult::MAV_MISSION_OPERATION_CANCELLED);
         } else if now.seconds_since(upload.asked_at) > REPEAT_S {
             self.ask_for_item(now);

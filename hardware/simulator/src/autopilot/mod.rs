@@ -78,7 +78,7 @@ pub enum Radio {
     #[default]
     Absent,
     /// A transmitter is heard.
-    Heard,
+    Receiving,
     /// The transmitter has fallen silent.
     Lost,
 }
@@ -185,7 +185,7 @@ impl Autopilot {
         self.wants_reboot
     }
 
-    /// Says what the receiver of the radio control hears.
+    /// Sets the state of the radio-control receiver.
     pub fn set_radio(&mut self, radio: Radio) {
         self.radio = radio;
     }
@@ -290,7 +290,7 @@ impl Autopilot {
     }
 
     /// Says something to people, at most 50 characters.
-    fn say(&mut self, severity: MavSeverity, text: &str) {
+    fn send_status_text(&mut self, severity: MavSeverity, text: &str) {
         tracing::info!(target: "autopilot", "{text}");
         self.send(MavMessage::STATUSTEXT(dialect::STATUSTEXT_DATA {
             severity,

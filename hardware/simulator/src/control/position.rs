@@ -122,7 +122,7 @@ impl Axis {
 }
 
 impl PositionController {
-    /// Starts anew from what the vehicle does at the moment.
+    /// Starts again from what the vehicle does at the moment.
     pub fn reset(&mut self, estimate: &Estimate) {
         let v = estimate.v_world_mps;
         *self = Self {

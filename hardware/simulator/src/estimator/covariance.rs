@@ -42,7 +42,7 @@ impl Covariance {
         Self { p, correction: [0.0; N] }
     }
 
-    /// Forgets what is known of one axis and states its deviation anew.
+    /// Forgets what is known of one axis and states its deviation.
     pub(super) fn reset(&mut self, index: usize, sigma: f64) {
         for i in 0..N {
             self.p[index][i] = 0.0;
@@ -51,8 +51,8 @@ impl Covariance {
         self.p[index][index] = sigma * sigma;
     }
 
-    /// Adds to the deviation of one error.
-    pub(super) fn doubt(&mut self, index: usize, sigma: f64) {
+    /// Adds variance to one error.
+    pub(super) fn inflate_variance(&mut self, index: usize, sigma: f64) {
         self.p[index][index] += sigma * sigma;
     }
 
@@ -92,9 +92,14 @@ impl Covariance {
         }
     }
 
-    /// Weighs one scalar measurement: `innovation` is measured minus expected, `row` its derivative
+    /// Normalises one scalar measurement: `innovation` is measured minus expected, `row` its derivative
     /// by the errors as (index, value). Returns the innovation over its expected deviation.
-    pub(super) fn weigh(&self, row: &[(usize, f64)], innovation: f64, sigma: f64) -> f64 {
+    pub(super) fn normalized_innovation(
+        &self,
+        row: &[(usize, f64)],
+        innovation: f64,
+        sigma: f64,
+    ) -> f64 {
         let variance: f64 = row
             .iter()
             .flat_map(|&(i, hi)| row.iter().map(move |&(j, hj)| hi * hj * self.p[i][j]))

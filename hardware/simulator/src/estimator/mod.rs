@@ -37,10 +37,10 @@ const BARO_AFTER_S: f64 = 1.0;
 const MIN_INTERVAL_S: f64 = 0.018;
 /// Innovations beyond this many deviations are dropped (EK3_POS_I_GATE = 500 %).
 const GATE: f64 = 5.0;
-/// A sample at the accelerometer's end hides a change of velocity of unknown size: doubt it by this
+/// A sample at the accelerometer's end hides a change of velocity of unknown size: inflate its sigma by this
 /// much. [m/s]
 const CLIPPED_MPS: f64 = 3.0;
-/// Beyond these the filter has lost itself and starts anew. [m], [m/s]
+/// Beyond these the filter has diverged and is reset. [m], [m/s]
 const ABSURD_M: f64 = 1e5;
 const ABSURD_MPS: f64 = 300.0;
 /// How much of the past is remembered for late measurements. [s]
@@ -53,7 +53,7 @@ const SAMPLES_PER_PREDICTION: u32 = 4;
 pub struct VisionMeasurement {
     /// The pose.
     pub world_from_body: Pose<World, Body>,
-    /// The sender's stamp on the sender's clock; 0 if it does not say. [us]
+    /// The sender's stamp on the sender's clock; 0 if it does not report it. [us]
     pub usec: u64,
     /// Raised by the sender when its poses jump on purpose.
     pub reset_counter: u8,
@@ -256,7 +256,7 @@ impl Estimator {
         let clipped = sample.accel_body_mps2.abs().max_element() > 0.98 * ACCEL_RANGE_MPS2;
         if clipped {
             for i in 0..3 {
-                self.covariance.doubt(VELOCITY + i, CLIPPED_MPS);
+                self.covariance.inflate_variance(VELOCITY + i, CLIPPED_MPS);
             }
         }
         self.recover();
@@ -277,8 +277,8 @@ impl Estimator {
         self.hold_still(now, still);
     }
 
-    /// Takes note that external navigation speaks, without flying by it.
-    pub fn hear_vision(&mut self, now: AutopilotTime) {
+    /// Records that external navigation sends, without using it.
+    pub fn note_vision_alive(&mut self, now: AutopilotTime) {
         self.last_vision = Some(now);
     }
 
@@ -297,7 +297,7 @@ impl Estimator {
             return;
         }
         self.last_measured = Some(valid_at);
-        let Some(past) = self.remembered(valid_at) else { return };
+        let Some(past) = self.past_at(valid_at) else { return };
         let jumped = m.reset_counter != self.reset_counter;
         self.reset_counter = m.reset_counter;
 
@@ -372,7 +372,7 @@ impl Estimator {
     }
 
     /// The state nearest to `stamp`; the oldest remembered for anything older.
-    fn remembered(&self, stamp: AutopilotTime) -> Option<Past> {
+    fn past_at(&self, stamp: AutopilotTime) -> Option<Past> {
         let after = self.history.partition_point(|past| past.stamp < stamp);
         self.history.get(after).or(self.history.back()).copied()
     }
@@ -396,7 +396,7 @@ impl Estimator {
         let by_world = DVec3::new(-nose.z * nose.x / level, -nose.z * nose.y / level, 1.0);
         let by_body = attitude.conjugate() * by_world;
         let row = [(ATTITUDE, by_body.x), (ATTITUDE + 1, by_body.y), (ATTITUDE + 2, by_body.z)];
-        if self.covariance.weigh(&row, innovation, sigma_rad).abs() < GATE {
+        if self.covariance.normalized_innovation(&row, innovation, sigma_rad).abs() < GATE {
             self.covariance.fuse(&row, innovation, sigma_rad);
             self.apply(None);
         }
@@ -414,7 +414,10 @@ impl Estimator {
     fn fuse_position(&mut self, now: AutopilotTime, p: DVec3, past: DVec3, sigma_m: f64) -> bool {
         let innovation = p - past;
         let passes = (0..3).all(|i| {
-            self.covariance.weigh(&[(POSITION + i, 1.0)], innovation[i], sigma_m).abs() < GATE
+            self.covariance
+                .normalized_innovation(&[(POSITION + i, 1.0)], innovation[i], sigma_m)
+                .abs()
+                < GATE
         });
         if passes {
             for i in 0..3 {
@@ -436,7 +439,7 @@ impl Estimator {
         self.baro.datum_m = None;
     }
 
-    /// A position found anew after a loss comes with the velocity that vision shows, if it shows
+    /// A position found again after a loss comes with the velocity that vision shows, if it shows
     /// one: the velocity of the IMU alone may be anything by then.
     fn reset_velocity(&mut self, p: DVec3, valid_at: AutopilotTime) {
         let Some((before, p_before)) = self.measured[0] else { return };
@@ -453,7 +456,7 @@ impl Estimator {
         }
     }
 
-    /// Starts the filter anew if its numbers have become absurd: from level, at rest, keeping the
+    /// Starts the filter again if its numbers have become absurd: from level, at rest, keeping the
     /// heading if there is one left.
     fn recover(&mut self) {
         let e = &mut self.estimate;

@@ -1,6 +1,6 @@
 //! When a vision measurement was valid, on the autopilot's clock.
 //!
-//! The companion stamps with its own clock, whose offset nobody told us. As ArduPilot does, the
+//! The companion stamps with its own clock, whose offset is unknown. As ArduPilot does, the
 //! least difference seen between arrival and stamp is taken for the offset, which removes jitter
 //! but not the constant part of the latency: that is what VISO_DELAY_MS is for.
 
@@ -8,7 +8,7 @@ use vizflyt_protocol::time::AutopilotTime;
 
 /// A measurement older than this is a clock that jumped, not a late packet. [ns]
 const MAX_AGE_NS: i64 = 500_000_000;
-/// Packets after which the least difference is taken anew, so that the estimate follows drift.
+/// Packets after which the least difference is taken again, so that the estimate follows drift.
 const WINDOW: u32 = 100;
 
 /// Turns remote stamps into local ones.
@@ -21,7 +21,7 @@ pub(super) struct StampCorrector {
 
 impl StampCorrector {
     /// Returns when a measurement stamped `usec` by its sender and received `now` was valid; a
-    /// stamp of 0 means the sender does not say.
+    /// stamp of 0 means the sender does not report it.
     pub(super) fn correct(&mut self, usec: u64, now: AutopilotTime) -> AutopilotTime {
         if usec == 0 {
             return now;

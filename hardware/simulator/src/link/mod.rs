@@ -176,7 +176,7 @@ impl Link {
                     match socket.recv_from(&mut buffer) {
                         Ok((length, sender)) => {
                             if target.is_none() {
-                                remember(peers, sender);
+                                touch_peer(peers, sender);
                             }
                             sink(&buffer[..length]);
                         }
@@ -287,7 +287,7 @@ pub fn bind_udp(address: impl ToSocketAddrs) -> io::Result<UdpSocket> {
     Ok(socket)
 }
 
-fn remember(peers: &mut Vec<(SocketAddr, Instant)>, sender: SocketAddr) {
+fn touch_peer(peers: &mut Vec<(SocketAddr, Instant)>, sender: SocketAddr) {
     let now = Instant::now();
     if let Some(peer) = peers.iter_mut().find(|(address, _)| *address == sender) {
         peer.1 = now;

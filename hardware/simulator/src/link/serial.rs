@@ -41,8 +41,8 @@ pub struct SerialPort {
     allowance: f64,
     counted: Instant,
     retry_at: Instant,
-    /// A device that is not there is said once.
-    said: bool,
+    /// A device that is not there is reported once.
+    is_reported: bool,
     dropped: u64,
 }
 
@@ -102,7 +102,7 @@ impl SerialPort {
             allowance: 0.0,
             counted: now,
             retry_at: now,
-            said: false,
+            is_reported: false,
             dropped: 0,
         }
     }
@@ -192,15 +192,15 @@ impl SerialPort {
         match open_device(&self.path, self.baud) {
             Ok(line) => {
                 self.line = Some(line);
-                self.said = false;
+                self.is_reported = false;
             }
             Err(error) => {
-                if !self.said {
+                if !self.is_reported {
                     tracing::warn!(
                         "simulator: cannot open {}: {error}; trying again until it is there",
                         self.path.display()
                     );
-                    self.said = true;
+                    self.is_reported = true;
                 }
                 self.retry_at = Instant::now() + RETRY;
             }

@@ -91,7 +91,7 @@ impl Feed {
     /// Returns the socket's own address.
     ///
     /// # Errors
-    /// If the operating system does not say.
+    /// If the operating system does not report it.
     pub fn address(&self) -> std::io::Result<SocketAddr> {
         self.socket.local_addr()
     }

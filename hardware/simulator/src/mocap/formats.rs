@@ -6,7 +6,7 @@
 //!
 //! VizFlyt's own pose packet: a JSON object, described in `docs/guides/localization.md`.
 //!
-//! OptiTrack's NatNet 4.1, as Motive streams it unless told otherwise: y up, so that the world's x, y
+//! OptiTrack's NatNet 4.1, as Motive streams it by default: y up, so that the world's x, y
 //! and z are its x, -z and y.
 //!
 //! An autopilot's LOCAL_POSITION_NED and ATTITUDE_QUATERNION, as if it had a localization of its own.

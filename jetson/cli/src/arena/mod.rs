@@ -24,7 +24,7 @@ enum ArenaCommand {
     Check(CheckArgs),
 }
 
-/// Says whether a course can be flown: the start is free, gates fit the vehicle and the room, a way leads
+/// Reports whether a course can be flown: the start is free, gates fit the vehicle and the room, a way leads
 /// through all of them, and nothing that moves bars it for good.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:

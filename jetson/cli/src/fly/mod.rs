@@ -37,7 +37,7 @@ What the command line leaves out, jetson.toml says.")]
 pub(crate) struct FlyArgs {
     #[command(flatten)]
     runtime: vizflyt_runtime::FlyArgs,
-    /// Starts the plugin anew whenever one of its files is saved; the vehicle holds meanwhile.
+    /// Starts the plugin again whenever one of its files is saved; the vehicle holds meanwhile.
     #[arg(long, conflicts_with = "attach")]
     watch: bool,
     /// Flies the simulated lab even where jetson.toml names a real one.

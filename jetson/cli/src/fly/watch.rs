@@ -1,4 +1,4 @@
-//! `--watch`: looks at a plugin's files and has it started anew when one is saved. A Cargo project is
+//! `--watch`: looks at a plugin's files and has it started again when one is saved. A Cargo project is
 //! built first, and a script compiled, while the old plugin flies on; what fails there changes nothing.
 
 use std::collections::BTreeMap;
@@ -18,7 +18,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Folders deeper than this are not a student's sources.
 const DEEPEST: usize = 8;
 
-/// Starts looking; something arrives each time the plugin is to be started anew.
+/// Starts looking; something arrives each time the plugin is to be started again.
 ///
 /// # Errors
 /// If there is no thread for it.

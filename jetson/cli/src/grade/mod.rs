@@ -133,7 +133,7 @@ struct ResultArgs {
 
 #[derive(Subcommand, Clone, Debug)]
 enum GradeCommand {
-    /// Says whether a grade is as it was signed; status 1 if not
+    /// Reports whether a grade is as it was signed; status 1 if not
     Verify {
         /// The grade
         file: PathBuf,

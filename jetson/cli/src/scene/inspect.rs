@@ -10,7 +10,7 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::Loaded;
 
-/// Says what a scene holds, and what looks wrong with it.
+/// Reports what a scene holds, and what looks wrong with it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene inspect room.ply

@@ -52,7 +52,7 @@ impl Default for Field {
 }
 
 impl Field {
-    /// Computes the field anew from obstacle points. [m, world]
+    /// Computes the field again from obstacle points. [m, world]
     pub fn update(&mut self, around: &Surroundings<'_>, points_m: impl Iterator<Item = DVec3>) {
         let half_m = CELL_M * (SIDE as f64 - 1.0) / 2.0;
         // On whole cells, so that the same obstacle falls on the same cells in every image.

@@ -1,6 +1,6 @@
 //! Colour of a pixel -> which racing window it belongs to.
 //!
-//! The course's windows are known by their colours, as the real ones are. Hue tells them apart;
+//! The course's windows are known by their colours, as the real ones are. Hue distinguishes them;
 //! saturation keeps brick, mats and grey steel out. Light changes value much, hue little.
 
 /// The coloured bars of the course's windows.
@@ -65,7 +65,11 @@ mod tests {
             for light in [30, 60, 100] {
                 let lit = [r, g, b].map(|c| (u32::from(c) * light / 100) as u8);
                 let dark = lit.iter().max().is_some_and(|&most| i32::from(most) < DARKEST);
-                assert_eq!(ColorClass::of(lit), expected.filter(|_| !dark), "{rgb:06x} at {light} %");
+                assert_eq!(
+                    ColorClass::of(lit),
+                    expected.filter(|_| !dark),
+                    "{rgb:06x} at {light} %"
+                );
             }
         };
         check(0xd8_1f2a, Some(ColorClass::Red));

@@ -12,16 +12,16 @@
 //!
 //! All is kept in the frame [`sampling::Home`], so a window that has left the image is still there.
 
-#[cfg(test)]
-mod test_scene;
-pub mod sampling;
+pub mod color_class;
 pub mod hand;
 pub mod known;
 pub mod odometry;
-pub mod color_class;
 pub mod planar_obstacle;
 pub mod plane_detection;
+pub mod sampling;
 pub mod steer;
+#[cfg(test)]
+mod test_scene;
 
 use std::f64::consts::TAU;
 
@@ -31,12 +31,12 @@ use vizflyt_sdk::{
     ArenaInfo, Autonomy, CameraImage, Event, EventKind, Observation, Setpoint, Vehicle, YawTarget,
 };
 
-use sampling::{PixelGrid, RgbdView};
+use color_class::ColorClass;
 use hand::Hand;
 use known::{Known, PASSED_M};
 use odometry::Odometry;
-use color_class::ColorClass;
 use planar_obstacle::{ObstacleKind, PlanarObstacle};
+use sampling::{PixelGrid, RgbdView};
 use steer::Aim;
 
 /// The plugin.
@@ -194,7 +194,8 @@ impl Race {
 
     /// Returns a velocity [m/s, home] and where to look [rad, home].
     fn choose(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
-        let behind_m = |kind| self.known.obstacle(kind).map(|obstacle| obstacle.plane.behind_m(here.p_m));
+        let behind_m =
+            |kind| self.known.obstacle(kind).map(|obstacle| obstacle.plane.behind_m(here.p_m));
         if let Some(kind) = self.target.filter(|&kind| behind_m(kind) > Some(PASSED_M)) {
             println!("through {}", kind.name());
             self.known.pass(kind);
@@ -250,7 +251,8 @@ impl Race {
     /// Looks about for something to fly through.
     fn search(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
         let since_s = now_s - *self.searching_s.get_or_insert(now_s);
-        let last = self.known.has_passed(ObstacleKind::Window(ColorClass::Orange)) || since_s > SEARCH_S;
+        let last =
+            self.known.has_passed(ObstacleKind::Window(ColorClass::Orange)) || since_s > SEARCH_S;
         if let Some(goal_m) = here.goal_m.filter(|_| last && self.known.has_begun()) {
             let to_m = goal_m - here.p_m;
             return ((to_m * GOAL_PER_S).clamp_length_max(steer::CRUISE_MPS), 0.0);
@@ -273,7 +275,7 @@ const MAX_LEAD_MPS: f64 = 1.2;
 /// From here on, this near to the line, the passage has begun. [m]
 const COMMIT_M: f64 = 0.35;
 const COMMIT_OFF_M: f64 = 0.15;
-/// A passage that takes longer has failed, and is begun anew: a metre takes 1.4 s. [s]
+/// A passage that takes longer has failed, and is begun again: a metre takes 1.4 s. [s]
 const THROUGH_S: f64 = 4.0;
 /// What is free must be as wide as the vehicle with half of it again on each side. [m]
 const WIDE_ENOUGH_M: f64 = 0.27;

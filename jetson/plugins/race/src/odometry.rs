@@ -6,12 +6,12 @@
 //! made small (point to plane: Y. Chen and G. Medioni, "Object modelling by registration of multiple
 //! range images", Image and Vision Computing 10(3), 1992), and so is the difference in brightness,
 //! which says where a flat wall slides (F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual
-//! odometry from dense RGB-D images", ICCV Workshops, 2011). Where the image says nothing about a
+//! odometry from dense RGB-D images", ICCV Workshops, 2011). Where the image carries no information on a
 //! direction, the vehicle's own velocity does. The floor gives the height without drift.
 
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 
-use crate::sampling::{SampleCamera, PixelGrid, Sample};
+use crate::sampling::{PixelGrid, Sample, SampleCamera};
 
 /// Position and velocity of the camera.
 #[derive(Clone, Debug, Default)]

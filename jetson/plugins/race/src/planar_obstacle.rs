@@ -9,8 +9,8 @@ use std::ops::Range;
 
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-use crate::sampling::{PixelGrid, Sample};
 use crate::color_class::ColorClass;
+use crate::sampling::{PixelGrid, Sample};
 
 /// What an obstacle is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -146,7 +146,7 @@ impl PlanarObstacle {
         }
     }
 
-    /// Moves the plane to where a nearer look shows it; what was seen starts anew if it moved.
+    /// Moves the plane to where a nearer look shows it; what was seen starts again if it moved.
     pub fn settle(&mut self, plane: Plane, range_m: f64) {
         let moved_m = self.plane.behind_m(plane.origin_m).abs();
         let turned_rad = (self.plane.yaw_rad - plane.yaw_rad).abs();
@@ -173,7 +173,7 @@ impl PlanarObstacle {
         }
         let (normal, left) = (self.plane.normal(), self.plane.left());
         let own_left_m = left.dot(camera_m - self.plane.origin_m);
-        // What moves says nothing of what stands still.
+        // Moving samples carry no information on what stands still.
         let still = |sample: &&Sample| sample.is_seen() && sample.color != Some(ColorClass::Teal);
         for sample in grid.samples.iter().filter(still) {
             let depth_m = normal.dot(sample.offset_m);
@@ -191,8 +191,9 @@ impl PlanarObstacle {
             let up_m = camera_m.z + sample.offset_m.z * share;
             let Some(at) = index_of(DVec2::new(across_m, up_m)) else { continue };
             if met {
-                self.cells[at]
-                    .meet(sample.color.is_some_and(|color| self.kind == ObstacleKind::Window(color)));
+                self.cells[at].meet(
+                    sample.color.is_some_and(|color| self.kind == ObstacleKind::Window(color)),
+                );
                 self.seen_s = now_s;
             } else {
                 self.cells[at].look_through();
@@ -353,7 +354,9 @@ impl PlanarObstacle {
         let along = along.take(REACH).skip_while(|&at| !self.cells[at].is_solid());
         match self.kind {
             ObstacleKind::Window(_) => along.take(BAR).any(|at| self.cells[at].is_bar()),
-            ObstacleKind::Wall => along.take(BAR).filter(|&at| self.cells[at].is_solid()).count() >= 2,
+            ObstacleKind::Wall => {
+                along.take(BAR).filter(|&at| self.cells[at].is_solid()).count() >= 2
+            }
         }
     }
 }

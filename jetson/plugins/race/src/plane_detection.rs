@@ -2,9 +2,9 @@
 
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-use crate::sampling::PixelGrid;
 use crate::color_class::ColorClass;
 use crate::planar_obstacle::Plane;
+use crate::sampling::PixelGrid;
 
 /// A plane found in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,7 +43,12 @@ pub fn window(grid: &PixelGrid, camera_m: DVec3, color: ColorClass) -> Option<De
 }
 
 /// Returns the plane of a colour near where it is known to be.
-pub fn again(grid: &PixelGrid, camera_m: DVec3, color: ColorClass, known: &Plane) -> Option<DetectedPlane> {
+pub fn again(
+    grid: &PixelGrid,
+    camera_m: DVec3,
+    color: ColorClass,
+    known: &Plane,
+) -> Option<DetectedPlane> {
     let points_m: Vec<DVec3> = grid
         .samples
         .iter()
@@ -179,7 +184,7 @@ const ON_LINE_M: f64 = 0.06;
 /// Points that make a plane.
 const FEWEST: usize = 60;
 const TRIES: usize = 48;
-/// Two points nearer to each other say nothing of the direction. [m]
+/// Two points nearer to each other carry no information on the direction. [m]
 const SPREAD_M: f64 = 0.4;
 /// Windows face the way within 20 degrees; twice that is another thing. [rad]
 const MOST_YAW_RAD: f64 = 0.7;

@@ -90,5 +90,5 @@ const COLUMNS: usize = 5;
 const ROWS: usize = 4;
 /// Corners that a part of the image must have.
 const ENOUGH: u32 = 4;
-/// Boards that face the camera say little of the focal length: 18 degrees at least. [rad]
+/// Boards that face the camera carry little information on the focal length: 18 degrees at least. [rad]
 const LEAST_TILT_RAD: f64 = 0.314;

@@ -177,7 +177,7 @@ fn a_bad_set_is_refused_and_what_to_add_is_said() {
     };
     // Too few.
     refused(&gather(&webcam(), 8, 0.7, 0.1), &["more views"]);
-    // Never tilted: focal length and distance cannot be told apart.
+    // Never tilted: focal length and distance cannot be separated.
     refused(&gather(&webcam(), 45, 0.02, 0.1), &["turn the board to face to the left"]);
     // Only in the middle.
     let mut random = Random::new(1);

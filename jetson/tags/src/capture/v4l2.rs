@@ -23,7 +23,7 @@ pub struct Camera {
     layout: Pixels,
     /// Period of images. [ns]
     period_ns: u64,
-    /// Time that the shutter is open; 0 if the camera does not say. [ns]
+    /// Time that the shutter is open; 0 if the camera does not report it. [ns]
     exposure_ns: u64,
 }
 

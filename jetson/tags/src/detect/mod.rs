@@ -197,9 +197,9 @@ fn enlarge(
 
 /// Half a cell of white around eight cells, as seen from the middle, and a little more for the perspective.
 const RIM: f64 = 1.15;
-/// Tags smaller than this cannot be told from noise: a cell of 36h11 has one pixel then. [px]
+/// Tags smaller than this cannot be distinguished from noise: a cell of 36h11 has one pixel then. [px]
 const LEAST_EDGE_PX: f64 = 8.0;
-/// From here on edges measured anew, through the lens, are better than the library's: 0.05 px instead of
+/// From here on edges measured again, through the lens, are better than the library's: 0.05 px instead of
 /// 0.16 at 150 px behind a common webcam's lens, the same at 75 px (`detect/tests.rs`). [px]
 const REFINE_ABOVE_PX: f64 = 75.0;
 /// Tags larger than this are found at half the raster in a quarter of the time, twice as large ones at a quarter. [px]

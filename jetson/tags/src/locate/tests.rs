@@ -6,7 +6,7 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(3_000_000_000 + ms * 1_000_000)
 }
 
-/// Returns what one camera sees of a vehicle that moves as told, by milliseconds.
+/// Returns what one camera sees of a vehicle that moves as given, by milliseconds.
 fn images(
     camera: &TagCamera,
     layouts: &[TagLayout],

@@ -181,7 +181,7 @@ fn world_from_body(sight: &Geometry, cam_from_tag: &Pose<Cam, Square>) -> Pose<W
     }
 }
 
-/// Two valleys of one square lie further apart than this, or cannot be told apart at all. [rad]
+/// Two valleys of one square lie further apart than this, or cannot be distinguished at all. [rad]
 const SAME_ANSWER_RAD: f64 = 0.06;
 /// Starts closer together than this are one. [rad]
 const SAME_START_RAD: f64 = 0.1;

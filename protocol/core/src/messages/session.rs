@@ -117,7 +117,7 @@ pub enum ToRuntime {
     Welcome(Welcome),
     /// Declines it, with the reason and what to do.
     Refused(Text),
-    /// Tells the time.
+    /// Returns the time.
     Clock(ClockReply),
     /// Something happened.
     Event {

@@ -1,7 +1,7 @@
 //! The colour of a bitstream as one JPEG file that any viewer opens, and back: bytes are moved, not
 //! decoded. Logs keep images so: each byte once.
 //!
-//! Slices hold scans of their own that share their tables. Whole blocks, each scan beginning anew:
+//! Slices hold scans of their own that share their tables. Whole blocks, each scan beginning again:
 //! that is what restart intervals are (ITU-T T.81, E.1.4), so scans joined by restart markers are
 //! the scan of the whole image.
 

@@ -10,7 +10,7 @@
 //!    values (0) like any other. The residual is taken modulo 2^16 and zig-zagged, so that small
 //!    errors of either sign are small numbers.
 //! 3. **Blocks.** Residuals are grouped into blocks of [`BLOCK_COLUMNS`] x [`BLOCK_ROWS`]. Rendered
-//!    depth is smooth but for edges, so a block's largest residual says little of the others: so
+//!    depth is smooth but for edges, so a block's largest residual carries little information on the others: so
 //!    many low bits of all are stored, then a mask that names the few that need more, then their
 //!    high bits. The cheapest split is taken. Columns and rows beyond the image are residuals 0.
 //! 4. **Packing.** The bases, little-endian; a byte per block, row of blocks by row of blocks: low

@@ -443,7 +443,7 @@ const BEGIN_ANEW_AFTER_S: f64 = 1.0;
 const TRUSTED_FOR_S: f64 = 0.15;
 /// What is further off is no noise of a localization that flies. [m]
 const LEARNS_WITHIN_M: f64 = 0.3;
-/// Measurements closer together say nothing of speed. [s]
+/// Measurements closer together carry no information on speed. [s]
 const LEAST_DT_S: f64 = 1e-4;
 /// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
 /// [m/s]

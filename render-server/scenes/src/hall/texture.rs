@@ -23,7 +23,7 @@ pub(crate) fn wall(seed: u64, p: DVec2) -> DVec3 {
     base * stain * if seam { 0.72 } else { 1.0 }
 }
 
-/// Returns the wall with what hangs on it; `side` tells walls apart.
+/// Returns the wall with what hangs on it; `side` distinguishes walls.
 pub(crate) fn with_pictures(seed: u64, side: u64, p: DVec2) -> Look {
     for (n, picture) in pictures(side).iter().enumerate() {
         let (min, size) = (DVec2::new(picture.x_m, picture.y_m), picture.size_m);

@@ -113,7 +113,7 @@ fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-/// Returns the processor time of all threads so far; 0 where the system does not say. [ms]
+/// Returns the processor time of all threads so far; 0 where the system does not report it. [ms]
 fn processor_ms() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten();
     let spent_ns = tasks
@@ -122,7 +122,7 @@ fn processor_ms() -> f64 {
     spent_ns.sum::<f64>() * 1e-6
 }
 
-/// Returns the memory in use; 0 where the system does not say. [MB]
+/// Returns the memory in use; 0 where the system does not report it. [MB]
 fn resident_mb() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));

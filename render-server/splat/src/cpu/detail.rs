@@ -284,7 +284,7 @@ fn cluster(count: usize, max_error_px: f64, scratch: &mut Scratch) -> f64 {
             break;
         }
         if cut == 0 || cut == members.len() {
-            // Rounding: too close to tell apart.
+            // Rounding: too close to distinguish.
             clusters[worst].score = 0.0;
             continue;
         }

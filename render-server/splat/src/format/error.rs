@@ -16,7 +16,7 @@ pub enum FormatError {
         path: PathBuf,
         /// `read` or `write`.
         verb: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Neither the content nor the name tells a format.

@@ -168,7 +168,7 @@ impl Format {
     /// Returns the format that a file's first bytes say; `.splat` has no mark.
     pub fn of_content(bytes: &[u8]) -> Option<Self> {
         if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
-            // Which of the two PLYs is told by its header.
+            // Which of the two PLYs is determined by its header.
             Some(Self::Ply)
         } else if bytes.starts_with(&spz::GZIP_MAGIC)
             || bytes.starts_with(&spz::MAGIC.to_le_bytes())
@@ -200,7 +200,7 @@ impl fmt::Display for Format {
     }
 }
 
-/// Reads a scene file of any supported format, told by its content, then by its name. A folder is
+/// Reads a scene file of any supported format, determined by its content, then by its name. A folder is
 /// read as SOG, as is a `meta.json`.
 ///
 /// # Errors

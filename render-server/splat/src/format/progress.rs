@@ -32,7 +32,7 @@ impl<'a> Meter<'a> {
         Self(Some(Mutex::new(State { at: Progress { done: 0, total: 1 }, report })))
     }
 
-    /// Says how much work there is, once it is known.
+    /// Reports how much work there is, once it is known.
     pub(super) fn expect(&self, total: usize) {
         self.update(|at| at.total = (total as u64).max(1));
     }

@@ -415,7 +415,7 @@ fn a_full_bucket_or_chunk_is_followed_by_another() {
     }
     for case in &FORMAT_CASES {
         let after = parse(&(case.encode)(&splats), case.format).unwrap().splats;
-        // Whatever the order: every splat has one near it, and positions tell them apart.
+        // Whatever the order: every splat has one near it, and positions distinguishes them.
         let most = (case.loss.mean_m)(7.0) * 2.0;
         let mut before: Vec<Vec3> = splats.means_m.clone();
         let mut after: Vec<Vec3> = after.means_m;

@@ -13,7 +13,7 @@ use super::Budget;
 /// What adapters are there, for reports.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdapterName {
-    /// As the driver says: `NVIDIA GeForce RTX 3080 (Vulkan)`.
+    /// As the driver reports it: `NVIDIA GeForce RTX 3080 (Vulkan)`.
     pub name: String,
     /// Whether it is the processor in disguise (llvmpipe, SwiftShader, WARP).
     pub is_software: bool,

@@ -138,7 +138,7 @@ impl GpuRenderer {
     /// Uploads a scene to a device on `adapter`. Splats that no image would show are left out.
     ///
     /// # Errors
-    /// [`RenderError::Device`] with what the driver said, if the device does not open or has no
+    /// [`RenderError::Device`] with the driver's message, if the device does not open or has no
     /// room.
     pub fn new<'a>(
         scene: impl Into<Scene<'a>>,

@@ -131,7 +131,7 @@ impl Staging {
 
     /// Asks for the host's view; [`Self::read`] waits for it.
     pub(super) fn map(&self) {
-        // Whether it worked is told by what follows: no view without it.
+        // Whether it worked is determined by what follows: no view without it.
         self.buffer.map_async(wgpu::MapMode::Read, .., |_| ());
     }
 

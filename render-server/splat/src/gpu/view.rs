@@ -62,7 +62,7 @@ pub(super) struct Lenses {
     known: Vec<(Intrinsics, Lens)>,
 }
 
-/// More different cameras than this at once find their lenses anew for every image.
+/// More different cameras than this at once find their lenses again for every image.
 const MAX_LENSES: usize = 32;
 
 impl Lenses {

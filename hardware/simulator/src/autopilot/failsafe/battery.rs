@@ -80,7 +80,7 @@ impl Autopilot {
         };
         let used_mah = self.gauge.used_mah;
         let text = format!("Battery 1 is {name} {volts:.2}V used {used_mah:.0} mAh");
-        self.say(MavSeverity::MAV_SEVERITY_WARNING, &text);
+        self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
         if !self.armed {
             return;
         }

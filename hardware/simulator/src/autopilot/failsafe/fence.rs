@@ -138,7 +138,7 @@ impl Autopilot {
             self.failsafe.fence.count = self.failsafe.fence.count.saturating_add(1);
             self.failsafe.fence.at = Some(now);
             let text = format!("{} fence breached", breached.names());
-            self.say(MavSeverity::MAV_SEVERITY_NOTICE, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_NOTICE, &text);
             let action = match self.params.value(Param::FenceAction) as u8 {
                 0 => Action::Nothing,
                 2 | 5 => Action::Land,

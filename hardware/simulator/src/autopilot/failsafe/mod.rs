@@ -84,7 +84,7 @@ impl Autopilot {
                 _ => (CopterMode::Land, "LAND"),
             };
             let text = format!("EKF Failsafe: changed to {name} Mode");
-            self.say(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
             self.enter(mode);
         }
     }
@@ -96,7 +96,7 @@ impl Autopilot {
         if action == 0 || now.seconds_since(heard) <= self.params.value(Param::FsGcsTimeout) {
             if self.failsafe.gcs {
                 self.failsafe.gcs = false;
-                self.say(MavSeverity::MAV_SEVERITY_WARNING, "GCS Failsafe Cleared");
+                self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "GCS Failsafe Cleared");
             }
             return;
         }
@@ -112,7 +112,7 @@ impl Autopilot {
             7 => Action::Brake,
             _ => Action::Land,
         };
-        self.lose("GCS", now, action);
+        self.failsafe("GCS", now, action);
     }
 
     /// A receiver that falls silent (FS_THR_ENABLE). Without a receiver nothing can fall silent.
@@ -123,7 +123,7 @@ impl Autopilot {
             self.failsafe.radio_lost_at = None;
             if self.failsafe.radio {
                 self.failsafe.radio = false;
-                self.say(MavSeverity::MAV_SEVERITY_WARNING, "Radio Failsafe Cleared");
+                self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "Radio Failsafe Cleared");
             }
             return;
         }
@@ -139,7 +139,7 @@ impl Autopilot {
         let in_guided = self.mode == CopterMode::Guided && !self.landed;
         if in_guided && options & CONTINUE_GUIDED_WITHOUT_RADIO != 0 {
             let text = "Radio Failsafe - Continuing Guided Mode";
-            self.say(MavSeverity::MAV_SEVERITY_WARNING, text);
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, text);
             return;
         }
         let action = match setting {
@@ -147,11 +147,11 @@ impl Autopilot {
             7 => Action::Brake,
             _ => Action::Return,
         };
-        self.lose("Radio", now, action);
+        self.failsafe("Radio", now, action);
     }
 
-    /// Says what is lost and what is done about it, and does it.
-    fn lose(&mut self, what: &str, now: AutopilotTime, action: Action) {
+    /// Announces the loss and the action, and takes it.
+    fn failsafe(&mut self, what: &str, now: AutopilotTime, action: Action) {
         let words = match action {
             _ if self.landed => "Disarming",
             _ if self.is_to_continue() => "Continuing Landing",
@@ -160,7 +160,10 @@ impl Autopilot {
             Action::Terminate => "Terminating",
             Action::Land | Action::Nothing => "Landing",
         };
-        self.say(MavSeverity::MAV_SEVERITY_WARNING, &format!("{what} Failsafe - {words}"));
+        self.send_status_text(
+            MavSeverity::MAV_SEVERITY_WARNING,
+            &format!("{what} Failsafe - {words}"),
+        );
         if self.landed {
             self.disarm();
         } else {
@@ -199,7 +202,7 @@ impl Autopilot {
             let altitude_mm = value(Param::AhrsOriginAlt) * 1000.0;
             self.origin =
                 Some(((place.0 * 1e7) as i32, (place.1 * 1e7) as i32, altitude_mm as i32));
-            self.say(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
         }
     }
 
@@ -211,7 +214,7 @@ impl Autopilot {
         self.flight.toppled_s =
             if toppled { self.flight.toppled_s + elapsed_s.max(0.0) } else { 0.0 };
         if self.flight.toppled_s > TOPPLED_S && self.params.value(Param::FsCrashCheck) != 0.0 {
-            self.say(MavSeverity::MAV_SEVERITY_EMERGENCY, "Crash: Disarming");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_EMERGENCY, "Crash: Disarming");
             self.disarm();
         }
     }
@@ -225,7 +228,7 @@ impl Autopilot {
         if now.seconds_since(since) > DATUM_S {
             self.datum_reset = true;
             self.estimator.reset_height_datum();
-            self.say(MavSeverity::MAV_SEVERITY_INFO, "Field Elevation Set: 0m");
+            self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "Field Elevation Set: 0m");
         }
     }
 }

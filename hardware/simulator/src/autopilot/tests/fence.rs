@@ -132,7 +132,7 @@ fn a_no_fly_box_lands_what_flies_into_it() {
     c.fly(GuidedMotion::Velocity(DVec3::X * 0.5), YawTarget::Angle(0.0));
     c.until(10.0, "LAND", |c| c.mode() == CopterMode::Land);
     assert!((c.p().x - 1.5).abs() < 0.15, "{:?}", c.p());
-    assert!(c.said("Polygon fence breached"), "{:?}", c.texts);
+    assert!(c.texts_contain("Polygon fence breached"), "{:?}", c.texts);
     c.wait(1.1);
     let Some(MavMessage::FENCE_STATUS(m)) = c.newest.get(&162) else { panic!() };
     assert_eq!((m.breach_count, m.breach_type), (1, FenceBreach::FENCE_BREACH_BOUNDARY));
@@ -207,7 +207,7 @@ fn an_upload_that_is_not_whole_changes_nothing() {
     c.wait(2.5);
     assert_eq!((c.counts[&40] - before, c.asked_for()), (2, Some(1)));
     c.wait(6.5);
-    assert!(c.said("Fence upload timeout"));
+    assert!(c.texts_contain("Fence upload timeout"));
     assert_eq!(c.answered(), Some(MavMissionResult::MAV_MISSION_OPERATION_CANCELLED));
     assert_eq!(c.download(), kept);
 }
@@ -220,7 +220,7 @@ fn the_floor_counts_between_rising_and_landing() {
     c.takes_off();
     c.fly(GuidedMotion::Velocity(-DVec3::Z * 0.3), YawTarget::Angle(0.0));
     c.until(10.0, "LAND", |c| c.mode() == CopterMode::Land);
-    assert!(c.said("Min Alt fence breached"), "{:?}", c.texts);
+    assert!(c.texts_contain("Min Alt fence breached"), "{:?}", c.texts);
     assert!((c.p().z - 0.3).abs() < 0.1, "{:?}", c.p());
     c.until(15.0, "the disarm", |c| !c.armed());
     let breaches = |c: &Companion| match c.newest.get(&162) {

@@ -18,7 +18,7 @@ const ACCEPTED: MavResult = MavResult::MAV_RESULT_ACCEPTED;
 const FAILED: MavResult = MavResult::MAV_RESULT_FAILED;
 
 impl Companion {
-    fn said(&self, text: &str) -> bool {
+    fn texts_contain(&self, text: &str) -> bool {
         self.texts.iter().any(|t| t.contains(text))
     }
 
@@ -78,7 +78,7 @@ fn without_an_origin_it_arms_and_refuses_to_take_off() {
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), ACCEPTED);
     assert_eq!(c.take_off(1.0), FAILED);
-    assert!(c.said("no EKF origin"));
+    assert!(c.texts_contain("no EKF origin"));
     // Left on the ground it gives up by itself.
     c.until(11.0, "the disarm", |c| !c.armed());
     assert!(c.p().z.abs() < 0.01);
@@ -89,20 +89,20 @@ fn refusals_say_why() {
     let mut c = Companion::new(SimulationConfig::default());
     c.vision = false;
     assert_eq!(c.arm(), FAILED);
-    assert!(c.said("PreArm: AHRS: not healthy"));
+    assert!(c.texts_contain("PreArm: AHRS: not healthy"));
     c.wait(3.0);
     assert_eq!(c.arm(), FAILED);
-    assert!(c.said("PreArm: VisOdom: not healthy") && !c.prearm_good());
+    assert!(c.texts_contain("PreArm: VisOdom: not healthy") && !c.prearm_good());
     c.vision = true;
     c.prepare();
     assert_eq!(c.take_off(1.0), FAILED);
-    assert!(c.said("not in GUIDED"));
+    assert!(c.texts_contain("not in GUIDED"));
     c.set_mode(CopterMode::Guided);
     assert_eq!(c.take_off(1.0), FAILED);
-    assert!(c.said("Takeoff refused: not armed"));
+    assert!(c.texts_contain("Takeoff refused: not armed"));
     c.set_mode(CopterMode::Land);
     assert_eq!(c.arm(), FAILED);
-    assert!(c.said("LAND mode not armable"));
+    assert!(c.texts_contain("LAND mode not armable"));
     assert_eq!(
         c.command(MavCmd::MAV_CMD_DO_SET_MODE, [1.0, 27.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
         FAILED
@@ -117,7 +117,7 @@ fn refusals_say_why() {
     c.wait(3.0);
     let disarm = |p2| [0.0, p2, 0.0, 0.0, 0.0, 0.0, 0.0];
     assert_eq!(c.command(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, disarm(0.0)), FAILED);
-    assert!(c.armed() && c.said("not landed"));
+    assert!(c.armed() && c.texts_contain("not landed"));
     assert_eq!(c.command(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, disarm(21196.0)), ACCEPTED);
     assert!(!c.armed());
     c.wait(2.0);
@@ -163,7 +163,7 @@ fn lost_vision_is_noticed_after_seven_seconds_and_lands() {
     assert!((7.0..7.5).contains(&lost), "{lost}");
     let land = c.until(3.0, "LAND", |c| c.mode() == CopterMode::Land);
     assert!((7.8..8.4).contains(&(lost + land)), "{}", lost + land);
-    assert!(c.said("EKF Failsafe"));
+    assert!(c.texts_contain("EKF Failsafe"));
     c.until(20.0, "the disarm", |c| !c.armed());
     let drift = (c.p() - start).truncate().length();
     println!("drift without vision {drift:.2} m");
@@ -189,7 +189,7 @@ fn lost_heartbeats_land_after_five_seconds() {
     c.heartbeats = false;
     let seconds = c.until(8.0, "LAND", |c| c.mode() == CopterMode::Land);
     assert!((4.0..6.1).contains(&seconds), "{seconds}");
-    assert!(c.said("GCS Failsafe - Landing"));
+    assert!(c.texts_contain("GCS Failsafe - Landing"));
     c.until(15.0, "the disarm", |c| !c.armed());
 
     // Never heard, never missed.
@@ -258,7 +258,7 @@ fn the_height_datum_is_reset_once() {
     let spawn_m = DVec3::new(0.0, 0.0, 0.59);
     let mut c = Companion::new(SimulationConfig { spawn_m, ..Default::default() });
     c.prepare();
-    c.until(5.0, "the text", |c| c.said("Field Elevation Set"));
+    c.until(5.0, "the text", |c| c.texts_contain("Field Elevation Set"));
     c.wait(1.0);
     let z = c.lab.autopilot().estimator().estimate().p_world_m.z;
     assert!((z - 1.18).abs() < 0.05, "{z}");

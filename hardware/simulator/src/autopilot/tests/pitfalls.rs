@@ -67,7 +67,7 @@ fn p1_a_recorded_origin_needs_nobody_to_set_it() {
 fn p2_vision_that_starts_after_the_datum_keeps_its_height() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
-    c.until(5.0, "the text", |c| c.said("Field Elevation Set"));
+    c.until(5.0, "the text", |c| c.texts_contain("Field Elevation Set"));
     c.vision_shift = (DVec3::Z * 0.59, 1);
     c.wait(2.0);
     let z = c.lab.autopilot().estimator().estimate().p_world_m.z;
@@ -192,7 +192,7 @@ fn p8_without_a_receiver_it_does_not_arm_unless_told() {
             Companion::new(SimulationConfig { radio, ..config(&[("FS_THR_ENABLE", throttle)]) });
         c.prepare();
         let result = c.arm();
-        (result == ACCEPTED, c.said("RC not found"))
+        (result == ACCEPTED, c.texts_contain("RC not found"))
     };
     assert_eq!(armed(1.0, false), (false, true));
     assert_eq!(armed(0.0, false), (true, false));
@@ -217,7 +217,7 @@ fn p9_a_jump_with_a_new_counter_is_followed_and_one_without_is_not() {
     assert!((c.p() - start + DVec3::X * 0.8).length() < 0.15, "{:?}", c.p());
 }
 
-/// The sources of the estimator decide: vision that is not among them is heard and not flown by.
+/// The sources of the estimator decide: vision that is not among them is received and not used.
 #[test]
 fn vision_counts_only_as_a_source() {
     let mut c = Companion::new(config(&[("EK3_SRC1_POSXY", 3.0)]));
@@ -227,11 +227,11 @@ fn vision_counts_only_as_a_source() {
     assert!(!c.flags().contains(EkfStatusFlags::EKF_POS_HORIZ_ABS));
     c.set_mode(CopterMode::Guided);
     assert_eq!(c.arm(), FAILED);
-    assert!(c.said("Need Position Estimate"));
+    assert!(c.texts_contain("Need Position Estimate"));
     let mut c = Companion::new(config(&[("GPS1_TYPE", 1.0)]));
     c.prepare();
     assert_eq!(c.arm(), FAILED);
-    assert!(c.said("GPS 1: not healthy"));
+    assert!(c.texts_contain("GPS 1: not healthy"));
     let mut c = Companion::new(config(&[("GPS1_TYPE", 1.0), ("ARMING_SKIPCHK", -1.0)]));
     c.prepare();
     assert_eq!(c.arm(), ACCEPTED);

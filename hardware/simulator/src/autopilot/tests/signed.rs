@@ -9,7 +9,7 @@ use vizflyt_protocol::mavlink::{
 const START: SigningTime = SigningTime::from_units(5_000_000_000);
 const TELEMETRY: usize = 1;
 
-fn give(c: &mut Companion, secret_key: [u8; 32], initial_timestamp: u64) {
+fn setup_signing(c: &mut Companion, secret_key: [u8; 32], initial_timestamp: u64) {
     c.send(&MavMessage::SETUP_SIGNING(SETUP_SIGNING_DATA {
         target_system: 1,
         target_component: 1,
@@ -19,7 +19,12 @@ fn give(c: &mut Companion, secret_key: [u8; 32], initial_timestamp: u64) {
 }
 
 /// Asks for GUIDED over a link, and whether it was obeyed.
-fn obeyed(c: &mut Companion, link: usize, mode: CopterMode, signer: Option<&mut Signer>) -> bool {
+fn is_accepted(
+    c: &mut Companion,
+    link: usize,
+    mode: CopterMode,
+    signer: Option<&mut Signer>,
+) -> bool {
     let message = MavMessage::SET_MODE(SET_MODE_DATA {
         custom_mode: mode as u32,
         target_system: 1,
@@ -40,14 +45,17 @@ fn obeyed(c: &mut Companion, link: usize, mode: CopterMode, signer: Option<&mut 
 fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
     let mut c = Companion::new(SimulationConfig::default());
     let key = SigningKey::new([7; 32]);
-    assert!(obeyed(&mut c, TELEMETRY, CopterMode::AltHold, None), "everybody, before");
-    give(&mut c, [7; 32], START.units());
-    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, None), "unsigned");
+    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "everybody, before");
+    setup_signing(&mut c, [7; 32], START.units());
+    assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Stabilize, None), "unsigned");
     let mut other = Signer::new(SigningKey::new([8; 32]), 0);
-    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut other)), "another key");
+    assert!(
+        !is_accepted(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut other)),
+        "another key"
+    );
     let mut owner = Signer::new(key.clone(), 0);
-    assert!(obeyed(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut owner)));
-    assert!(obeyed(&mut c, 0, CopterMode::AltHold, None), "USB is trusted");
+    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::Stabilize, Some(&mut owner)));
+    assert!(is_accepted(&mut c, 0, CopterMode::AltHold, None), "USB is trusted");
     assert_eq!(c.lab.report().mavlink_packets_refused, 2);
 
     // What it sends is signed, with stamps that go on after a reboot.
@@ -70,8 +78,8 @@ fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
         c.lab.tick();
     }
     assert!(heard(&mut c) > 10);
-    assert!(!obeyed(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is kept");
+    assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is kept");
 
-    give(&mut c, [0; 32], 0);
-    assert!(obeyed(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends it");
+    setup_signing(&mut c, [0; 32], 0);
+    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends it");
 }

@@ -63,7 +63,7 @@ fn what_is_not_known_yet_is_not_clear() {
     assert!(none.is_clear(DVec2::ZERO, 0.2, 0.0, 1.0));
 }
 
-/// The hand is out of sight for more than half a turn: which way it came back is told by its speed.
+/// The hand is out of sight for more than half a turn: which way it came back is determined by its speed.
 #[test]
 fn a_turn_out_of_sight_is_counted() {
     for omega_radps in [TAU / 7.6, -TAU / 5.9] {

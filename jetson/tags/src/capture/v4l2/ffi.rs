@@ -183,7 +183,7 @@ pub(super) fn set_format(file: &File, kind: Fourcc, size: [u32; 2]) -> io::Resul
     // SAFETY: the request reads and writes a `v4l2_format`, whose layout the type above has.
     unsafe { s_fmt(file.as_raw_fd(), &raw mut format) }?;
     let found = Fourcc::ALL.into_iter().find(|f| f.code() == format.pix.pixelformat);
-    // A kind that is not understood is told apart from `kind` by being any other.
+    // A kind that is not understood is distinguished from `kind` by being any other.
     let other = Fourcc::ALL[usize::from(kind == Fourcc::ALL[0])];
     let bytes = if kind == Fourcc::Yuyv { 2 } else { 1 };
     let least = format.pix.width as usize * bytes;
@@ -195,7 +195,7 @@ pub(super) fn set_format(file: &File, kind: Fourcc, size: [u32; 2]) -> io::Resul
     })
 }
 
-/// Asks for a rate and returns the period that the driver gives; `None` if it does not say. [ns]
+/// Asks for a rate and returns the period that the driver gives; `None` if it does not report it. [ns]
 pub(super) fn set_rate(file: &File, rate_hz: u32) -> Option<u64> {
     let mut parm = StreamParm {
         kind: VIDEO_CAPTURE,
@@ -211,7 +211,7 @@ pub(super) fn set_rate(file: &File, rate_hz: u32) -> Option<u64> {
     (1..=10_000_000_000).contains(&period_ns).then_some(period_ns)
 }
 
-/// Returns how long the shutter is open; `None` if the camera does not say. [ns]
+/// Returns how long the shutter is open; `None` if the camera does not report it. [ns]
 pub(super) fn exposure_ns(file: &File) -> Option<u64> {
     let mut control = Control { id: EXPOSURE_ABSOLUTE, value: 0 };
     // SAFETY: the request reads and writes a `v4l2_control`, whose layout the type above has.

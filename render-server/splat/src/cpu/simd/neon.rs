@@ -74,7 +74,7 @@ fn from_f16(halves: uint32x4_t) -> float32x4_t {
     })
 }
 
-/// Returns `2^a`, as [`Simd::exp2`] says.
+/// Returns `2^a`, as [`Simd::exp2`] specifies.
 #[inline(always)]
 fn exp2(a: float32x4_t) -> float32x4_t {
     /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.

@@ -13,7 +13,7 @@ pub enum PlyError {
         path: PathBuf,
         /// `read` or `write`.
         verb: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The file does not start with `ply`.

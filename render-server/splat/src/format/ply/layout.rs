@@ -103,7 +103,7 @@ fn column(vertex: &Element, name: &str) -> Option<usize> {
     vertex.properties.iter().position(|property| property.name == name)
 }
 
-/// Says what a PLY without splats seems to be.
+/// Reports what a PLY without splats seems to be.
 fn describe(header: &Header, missing: &[&str]) -> String {
     let names = missing.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
     let kind = if header.elements.iter().any(|e| e.name == "face") {

@@ -70,7 +70,7 @@ pub(super) fn read_binary(
     }))
 }
 
-/// Decodes the vertex element of an ascii file. Rows are told apart by counting numbers, so line
+/// Decodes the vertex element of an ascii file. Rows are distinguished by counting numbers, so line
 /// ends carry no meaning.
 pub(super) fn read_ascii(
     bytes: &[u8],
