@@ -23,7 +23,7 @@ use crate::terminal::tell;
 pub(crate) struct DemoArgs {
     #[command(flatten)]
     lab: LabArgs,
-    /// Plugin to fly: whatever `vizflyt fly` takes [default: race in the race and in projects p3 to p5, else avoid].
+    /// Plugin to fly: whatever `vizflyt fly` takes [default: race where a course ends with its last stage, else avoid].
     #[arg(long)]
     plugin: Option<String>,
     /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]

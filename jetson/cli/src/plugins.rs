@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
+use vizflyt_scenes::projects::CourseProject;
 
 /// A plugin that is linked into this program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -28,7 +29,8 @@ pub(crate) fn is_built_in(name: &str) -> bool {
 
 /// Returns the built-in that flies a scene or a project of the course.
 pub(crate) fn default_for(scene: &str) -> &'static str {
-    if matches!(scene, "race" | "p3" | "p4" | "p5") { "race" } else { "avoid" }
+    let is_race = CourseProject::named(scene).map_or(scene == "race", |project| project.is_race());
+    if is_race { "race" } else { "avoid" }
 }
 
 /// Arguments of the hidden `vizflyt plugin`.

@@ -44,6 +44,11 @@ impl SceneKind {
     /// Every kind.
     pub const ALL: [Self; 4] = [Self::Forest, Self::Race, Self::Room, Self::Moving];
 
+    /// Returns the names of all, as help and messages list them.
+    pub fn names() -> String {
+        Self::ALL.map(Self::name).join(", ")
+    }
+
     /// Returns the kind's name as the command line takes it.
     pub fn name(self) -> &'static str {
         match self {
@@ -74,7 +79,7 @@ impl FromStr for SceneKind {
 
 /// A name that is no [`SceneKind`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no generated scene is called '{0}'; give forest, race, room or moving")]
+#[error("no generated scene is called '{0}'; there are {all}", all = SceneKind::names())]
 pub struct UnknownScene(pub String);
 
 /// A generated place.

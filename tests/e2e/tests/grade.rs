@@ -225,7 +225,7 @@ fn a_plugin_that_fails_is_graded_and_explained() {
 #[test]
 fn what_makes_no_sense_is_refused_before_anything_is_flown() {
     let rig = Rig::new();
-    rig.refused(&["avoid", "--project=p9"], "p2, p3, p4, p5, forest");
+    rig.refused(&["avoid", "--project=p9"], "p2, p3");
     rig.refused(&["avoid", "--variants=noon"], "noon");
     rig.refused(&["avoid", "--variants=day,day"], "twice");
     rig.refused(&["avoid", "--shard=3/2"], "is no part");

@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use vizflyt_arena::check::{Checked, check};
 use vizflyt_arena::config::line_of;
 use vizflyt_scenes::Variant;
-use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::scene::{self, Up};
 
 /// Looks at rooms and courses before anyone flies in them.
@@ -34,8 +34,9 @@ struct CheckArgs {
     /// An arena.toml or its folder
     #[arg(required_unless_present = "project", conflicts_with = "project")]
     arena: Option<PathBuf>,
-    /// A project of the course: p2, p3, p4, p5 or forest
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", help = format!(
+        "A project of the course: {}", projects::NAMES.join(", ")
+    ))]
     project: Option<String>,
     /// This seed of the project alone
     #[arg(long, requires = "project", conflicts_with = "seeds")]
@@ -50,7 +51,7 @@ pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
     let ArenaCommand::Check(args) = &args.command;
     let good = match (&args.project, &args.arena) {
         (Some(project), _) => {
-            let project = Project::named(project)?;
+            let project = CourseProject::named(project)?;
             let seeds = args.seed.map_or(0..args.seeds, |seed| seed..seed + 1);
             if seeds.is_empty() {
                 bail!("--seeds 0 checks nothing; give at least 1");
@@ -64,7 +65,7 @@ pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
     Ok(if good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-fn check_seed(project: &Project, seed: u64) -> bool {
+fn check_seed(project: &CourseProject, seed: u64) -> bool {
     // Levels differ in sensors, variants in light: neither changes where one can fly.
     let generated = project.generate(seed, Level::default(), Variant::default());
     let still = Arc::new(scene::bake(&generated.splats, &generated.arena));

@@ -16,8 +16,8 @@ use anyhow::{Context, Result, bail};
 use serde_json::Value;
 
 use super::sources;
+use crate::manifest::{LabConfig, PluginManifest};
 use crate::plugins::{BuiltIn, is_built_in};
-use crate::project::{LabConfig, Project};
 
 /// A plugin that was found.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,8 +50,8 @@ impl Plugin {
             return found(Kind::BuiltIn, None);
         }
         if path.is_dir() {
-            if let Some(project) = Project::read(path)? {
-                return found(kind_of(&project.plugin)?, Some(project.lab));
+            if let Some(manifest) = PluginManifest::read(path)? {
+                return found(kind_of(&manifest.plugin)?, Some(manifest.lab));
             }
             for file in ["Cargo.toml", "plugin.py"] {
                 if path.join(file).is_file() {
@@ -83,7 +83,7 @@ impl Plugin {
         &self.name
     }
 
-    /// Returns the simulated lab that its project asks for.
+    /// Returns the simulated lab that its manifest asks for.
     pub(crate) fn lab(&self) -> Option<&LabConfig> {
         self.lab.as_ref()
     }

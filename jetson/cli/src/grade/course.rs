@@ -8,14 +8,14 @@ use sha2::{Digest, Sha256};
 use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Obstacles};
 use vizflyt_scenes::Variant;
-use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_scenes::projects::{CourseProject, Level};
 use vizflyt_server::scene::{bake_with, obstacles};
 use vizflyt_splat::{RigidObject, Splats};
 
 use super::document::hex;
 
-/// A place to fly in. It is nowhere but in this process's memory.
-pub(crate) struct Place {
+/// A course to fly, in memory. It is nowhere but in this process's memory.
+pub(crate) struct CourseInstance {
     /// The room and its rules.
     pub arena: ArenaConfig,
     /// What cameras see. [m, world]
@@ -34,13 +34,13 @@ pub(crate) struct Place {
     pub rules_sha256: String,
 }
 
-impl Place {
+impl CourseInstance {
     /// Makes the place of a seed.
     ///
     /// # Errors
     /// If its arena cannot be written down, which a test of the projects excludes.
     pub(crate) fn make(
-        project: &Project,
+        project: &CourseProject,
         level: Level,
         variant: Variant,
         seed: u64,
@@ -113,8 +113,9 @@ mod tests {
 
     #[test]
     fn a_place_is_known_by_its_hashes() {
-        let project = Project::named("forest").unwrap();
-        let place = |variant, seed| Place::make(&project, Level::Ug, variant, seed).unwrap();
+        let project = CourseProject::named("forest").unwrap();
+        let place =
+            |variant, seed| CourseInstance::make(&project, Level::Ug, variant, seed).unwrap();
         let (one, again) = (place(Variant::DAY, 1), place(Variant::DAY, 1));
         assert_eq!(
             (one.scene_sha256.as_str(), &one.rules_sha256),
@@ -123,7 +124,7 @@ mod tests {
         let night = place("night".parse().unwrap(), 1);
         assert_eq!(night.rules_sha256, one.rules_sha256, "the rules are those of the day");
         assert_ne!(night.scene_sha256, one.scene_sha256);
-        let other = Place::make(&project, Level::G, Variant::DAY, 1).unwrap();
+        let other = CourseInstance::make(&project, Level::G, Variant::DAY, 1).unwrap();
         assert_ne!(other.rules_sha256, one.rules_sha256);
     }
 }

@@ -1,5 +1,5 @@
-//! `vizflyt grade`: flies a plugin through a project's course, once for each seed, and says what it
-//! was worth.
+//! `vizflyt grade`: flies a plugin through a project's course, once for each seed, and scores
+//! it.
 //!
 //! ```text
 //! project, level, variant, seed -> course  place in memory: splats, arena, distance field
@@ -35,10 +35,10 @@ use ed25519_dalek::SigningKey;
 use vizflyt_arena::crash::probable_cause;
 use vizflyt_runtime::supervisor::PluginLimits;
 use vizflyt_scenes::Variant;
-use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
-use self::course::Place;
+use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
 use self::document::{DelaysMs, MOST_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
@@ -46,7 +46,7 @@ use self::trial::{Delays, Flown, Trial};
 use crate::fly::plugin::Plugin;
 use crate::terminal::{stop_flag, tell};
 
-/// Flies a project's course in lock-step, once for each seed, and says what the plugin is worth.
+/// Flies a project's course in lock-step, once for each seed, and scores the plugin.
 #[derive(Args, Clone, Debug)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 #[command(after_help = "Examples:
@@ -55,7 +55,7 @@ use crate::terminal::{stop_flag, tell};
   vizflyt grade ./first --project p5 --level g --json > me.json   the signed grade, for programs
   vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        an eighth of the flights, on a cluster
   vizflyt grade merge *.json -o whole.json --report out           all eighths make the whole
-  vizflyt grade verify whole.json                                 is it as it was signed?
+  vizflyt grade verify whole.json                                 checks its signature
 
 The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
 1 if --least was not reached.")]
@@ -71,37 +71,39 @@ struct FlyArgs {
     /// The plugin, as for `vizflyt fly`
     #[arg(value_name = "PLUGIN", required = true)]
     plugin: Option<OsString>,
-    /// The project whose course is flown: p2, p3, p4, p5 or forest
-    #[arg(long, value_name = "NAME", default_value = "p4")]
+    #[arg(long, value_name = "NAME", default_value = "p4", help = format!(
+        "The project whose course is flown: {}", projects::NAMES.join(", ")
+    ))]
     project: String,
-    /// Which sensors there are: ug has depth, g has not
+    /// Sensors: ug has depth, g has not
     #[arg(long, value_name = "ug|g", default_value_t)]
     level: Level,
-    /// Surroundings that each seed is flown in: day, dusk, night, fog, night-fog
-    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day")]
+    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day", help = format!(
+        "Light and fog that each seed is flown in: {}", Variant::names()
+    ))]
     variants: Vec<Variant>,
-    /// How many seeds are flown: each is another place
+    /// Number of seeds: each is another place
     #[arg(long, value_name = "N", default_value_t = 10)]
     seeds: u64,
-    /// The first of them; one that nobody knows beforehand keeps a course from being learnt by heart
+    /// The first seed; keep it secret, so that nobody prepares for the courses
     #[arg(long, value_name = "SEED", default_value_t = 1)]
     first_seed: u64,
     /// Only part I of N of the flights; `merge` makes the whole of all parts
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Flights at a time [default: as many as there are processors]
+    /// Flights at a time [default: the number of processors]
     #[arg(long, value_name = "N")]
     jobs: Option<NonZero<usize>>,
-    /// Images a second, of cameras that do not say it themselves
+    /// Images a second, of cameras without a rate of their own
     #[arg(long, value_name = "HZ", default_value_t = 30.0)]
     image_rate: f64,
-    /// Age of an image when the plugin gets it
+    /// Age of an image on arrival at the plugin
     #[arg(long, value_name = "MS", default_value_t = 30.0)]
     image_delay: f64,
-    /// From then until its answer counts
+    /// From then until the answer takes effect
     #[arg(long, value_name = "MS", default_value_t = 10.0)]
     answer_delay: f64,
-    /// By the clock on the wall: a plugin that takes longer for an answer has failed
+    /// Wall-clock limit of one answer: a plugin that takes longer has failed
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     answer_within: f64,
     /// Writes a report there: index.html, a crash card for each failure, grade.json
@@ -117,7 +119,7 @@ struct FlyArgs {
     result: ResultArgs,
 }
 
-/// Where a grade goes, and whose it is.
+/// Where a grade goes, and who signs it.
 #[derive(Args, Clone, Debug)]
 struct ResultArgs {
     /// Prints the signed grade as JSON instead of figures for people
@@ -133,11 +135,11 @@ struct ResultArgs {
 
 #[derive(Subcommand, Clone, Debug)]
 enum GradeCommand {
-    /// Reports whether a grade is as it was signed; status 1 if not
+    /// Verifies the signature of a grade; status 1 if it is not valid
     Verify {
         /// The grade
         file: PathBuf,
-        /// Whose signature counts: a public key or a file with one [default: this computer's own]
+        /// Accepted signer: a public key or a file with one [default: this computer's own]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
         /// Folder of this computer's own key [default: ~/.config/vizflyt]
@@ -149,7 +151,7 @@ enum GradeCommand {
         /// The parts, as `--shard` wrote them
         #[arg(required = true)]
         files: Vec<PathBuf>,
-        /// Whose signature counts: a public key or a file with one [default: this computer's own]
+        /// Accepted signer: a public key or a file with one [default: this computer's own]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
         /// Writes a report of the whole there: index.html, grade.json; images are in the parts' reports
@@ -220,7 +222,7 @@ pub(crate) fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> R
 /// Flies, judges, reports.
 fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let plugin = Plugin::find(args.plugin.as_deref().context("no plugin is named")?)?;
-    let project = Project::named(&args.project)?;
+    let project = CourseProject::named(&args.project)?;
     let command = plugin.command()?;
     let delays = delays(args)?;
     let subject = subject(args, &plugin, &project)?;
@@ -239,7 +241,8 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<Done>> {
         let named = || format!("seed {seed}, {variant}");
-        let place = Place::make(&project, args.level, variant, seed).with_context(named)?;
+        let place =
+            CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
         let limits = PluginLimits { map: place.map.clone(), ..limits.clone() };
         let (place, command, limits) = (&place, &command[..], &limits);
         let trial = Trial { place, seed, command, limits, answer_within, delays, stop };
@@ -306,7 +309,7 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     })
 }
 
-fn subject(args: &FlyArgs, plugin: &Plugin, project: &Project) -> Result<Subject> {
+fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<Subject> {
     let mut variants: Vec<String> = Vec::new();
     for variant in args.variants.iter().map(Variant::to_string) {
         ensure!(!variants.contains(&variant), "--variants: {variant} is there twice");
@@ -332,7 +335,13 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &Project) -> Result<Subject
     })
 }
 
-fn run_of(place: &Place, delays: &Delays, seed: u64, variant: Variant, flown: &Flown) -> Run {
+fn run_of(
+    place: &CourseInstance,
+    delays: &Delays,
+    seed: u64,
+    variant: Variant,
+    flown: &Flown,
+) -> Run {
     let verdict = &flown.verdict;
     Run {
         seed,

@@ -36,14 +36,14 @@ use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
-use super::course::Place;
+use super::course::CourseInstance;
 
 /// How long things take in a graded flight, always the same.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Delays {
     /// From one image to the next, of cameras that do not say it themselves. [ns]
     pub image_period_ns: i64,
-    /// From the start of drawing until the plugin is given the image, which shows the vehicle where
+    /// From the start of rendering until the plugin is given the image, which shows the vehicle where
     /// it is by then, as far as can be foretold. [ns]
     pub image_ns: i64,
     /// From when the plugin is given an image until its answer counts. [ns]
@@ -53,7 +53,7 @@ pub(crate) struct Delays {
 /// What is flown, and how.
 pub(crate) struct Trial<'a> {
     /// Where.
-    pub place: &'a Place,
+    pub place: &'a CourseInstance,
     /// Of the place, and of the simulator's noise.
     pub seed: u64,
     /// The command that starts the plugin.
@@ -167,7 +167,7 @@ struct Pending {
     pose: ServerTime,
     /// What it shows.
     shown: ServerTime,
-    /// By camera; those not drawn this time are `None`.
+    /// By camera; those not rendered this time are `None`.
     drawn: Vec<Option<Picture>>,
 }
 
@@ -400,7 +400,9 @@ impl<'a> Flight<'a> {
         // What moves is where it is at the instant that the images show, as for the referee.
         let since_start_ns = shown.as_ns().wrapping_sub(START_NS).cast_signed();
         let placements = self.trial.place.obstacles.objects.placements(since_start_ns);
-        self.renderer.render(&placements, &cameras, images).context("an image cannot be drawn")?;
+        self.renderer
+            .render(&placements, &cameras, images)
+            .context("an image cannot be rendered")?;
         let mut drawn: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for (&index, image) in due.iter().zip(images) {
             let mut picture = Picture::default();

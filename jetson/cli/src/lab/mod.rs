@@ -37,8 +37,8 @@ use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
-use vizflyt_scenes::Variant;
-use vizflyt_scenes::projects::{Level, Project, UnknownProject};
+use vizflyt_scenes::projects::{self, CourseProject, Level, UnknownProject};
+use vizflyt_scenes::{SceneKind, Variant};
 
 use self::localization::Localization;
 use self::memory::MemoryWatch;
@@ -51,19 +51,22 @@ pub(crate) use self::report::Report;
 /// What the simulated lab looks like.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct LabArgs {
-    /// forest, race, room, moving; or the path of a scene folder, an arena.toml or a scene file
-    /// [default: forest; room with --localization tags].
-    #[arg(long)]
+    #[arg(long, help = format!(
+        "{}; or the path of a scene folder, an arena.toml or a scene file [default: forest; room with \
+         --localization tags]", SceneKind::names()
+    ))]
     pub scene: Option<String>,
-    /// A project of the course, with its place, sensors and rules: p2, p3, p4, p5 or forest; takes the
-    /// place of --scene.
-    #[arg(long, value_name = "NAME", value_parser = project_name)]
+    #[arg(long, value_name = "NAME", value_parser = project_name, help = format!(
+        "A project of the course, with its place, sensors and rules: {}; takes the place of --scene",
+        projects::NAMES.join(", ")
+    ))]
     pub project: Option<String>,
     /// Whom the project is for: ug, with depth, or g, without [default: ug].
     #[arg(long, value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
-    /// The project's light and fog: day, dusk, night, fog or night-fog [default: day].
-    #[arg(long, value_name = "NAME", requires = "project")]
+    #[arg(long, value_name = "NAME", requires = "project", help = format!(
+        "The project's light and fog: {} [default: day]", Variant::names()
+    ))]
     pub variant: Option<Variant>,
     /// Seed of the generated scene and of the simulator's noise [default: 7].
     #[arg(long)]
@@ -98,8 +101,8 @@ impl LabArgs {
     }
 
     /// Returns the project of the course that is flown, if one is.
-    pub(crate) fn project(&self) -> Option<Project> {
-        self.project.as_deref().and_then(|name| Project::named(name).ok())
+    pub(crate) fn project(&self) -> Option<CourseProject> {
+        self.project.as_deref().and_then(|name| CourseProject::named(name).ok())
     }
 
     /// Returns whom the project is for.
@@ -119,7 +122,7 @@ impl LabArgs {
 }
 
 fn project_name(name: &str) -> Result<String, UnknownProject> {
-    Project::named(name).map(|project| project.name().to_owned())
+    CourseProject::named(name).map(|project| project.name().to_owned())
 }
 
 /// One flight in the simulated lab.

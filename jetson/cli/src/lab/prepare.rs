@@ -47,8 +47,9 @@ impl Stage {
         let path = Path::new(scene);
         if !path.exists() {
             bail!(
-                "--scene '{scene}' is neither forest, race, room nor moving, nor a path that exists; \
-                 give one of the names, a folder with an arena.toml, or a scene file"
+                "--scene '{scene}' is no generated scene ({}) and no path that exists; give one of the \
+                 names, a folder with an arena.toml, or a scene file",
+                SceneKind::names()
             );
         }
         if path.join("arena.toml").is_file() {

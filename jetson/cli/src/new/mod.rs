@@ -2,17 +2,20 @@
 //!
 //! The files are the ones under `jetson/cli/templates`, with the names filled in.
 
+mod course_folder;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use vizflyt_scenes::projects::Project;
+use vizflyt_scenes::SceneKind;
+use vizflyt_scenes::projects::{self, CourseProject};
 
 use crate::fly::sources;
+use crate::manifest;
 use crate::plugins::BuiltIn;
-use crate::project;
 use crate::terminal::tell;
 
 /// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
@@ -27,8 +30,9 @@ pub(crate) struct NewArgs {
     /// What it is written in
     #[arg(long, value_enum)]
     lang: Language,
-    /// The course's project that it is for: p2, p3, p4, p5 or forest, or a folder projects/NAME
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", help = format!(
+        "The course's project that it is for: {}; or a folder projects/NAME", projects::NAMES.join(", ")
+    ))]
     project: Option<String>,
 }
 
@@ -45,11 +49,12 @@ enum Language {
 pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     let name = name_of(&args.path)?;
     let place = match &args.project {
-        Some(name) if Project::named(name).is_ok() => format!("project = {name:?}"),
+        Some(name) if CourseProject::named(name).is_ok() => format!("project = {name:?}"),
         Some(name) => {
             let roots: Vec<PathBuf> = sources().into_iter().collect();
-            let known = Project::named(name).map(|_| ()).map_err(|unknown| unknown.to_string());
-            let folder = project::course(name, &roots);
+            let known =
+                CourseProject::named(name).map(|_| ()).map_err(|unknown| unknown.to_string());
+            let folder = course_folder::find(name, &roots);
             let folder = folder.with_context(|| known.err().unwrap_or_default())?;
             format!("scene = {:?}", folder.display().to_string())
         }
@@ -99,7 +104,7 @@ fn python(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
         ("pyrightconfig.json", fill(include_str!("../../templates/python/pyrightconfig.json"))),
         (".vscode/settings.json", fill(include_str!("../../templates/python/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/python/gitignore"))),
-        (project::FILE, lab("plugin.py", place)),
+        (manifest::FILE, lab("plugin.py", place)),
     ])
 }
 
@@ -118,13 +123,16 @@ fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
         ("README.md", fill(include_str!("../../templates/rust/README.md"))),
         (".vscode/settings.json", fill(include_str!("../../templates/rust/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/rust/gitignore"))),
-        (project::FILE, lab("Cargo.toml", place)),
+        (manifest::FILE, lab("Cargo.toml", place)),
     ])
 }
 
 fn lab(plugin: &str, place: &str) -> String {
     let text = include_str!("../../templates/vizflyt.toml");
-    text.replace("{{plugin}}", plugin).replace("{{place}}", place)
+    text.replace("{{plugin}}", plugin)
+        .replace("{{place}}", place)
+        .replace("{{scenes}}", &SceneKind::names())
+        .replace("{{projects}}", &projects::NAMES.join(", "))
 }
 
 /// Returns the plugin's name, if it can be one: of a folder, a crate and a class at once.

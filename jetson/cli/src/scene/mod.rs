@@ -29,7 +29,7 @@ enum SceneCommand {
   vizflyt scene generate forest --seed 7 -o my-forest
   vizflyt demo --scene my-forest")]
     Generate {
-        /// forest, race, room or moving.
+        #[arg(help = format!("What to generate: {}", SceneKind::names()))]
         kind: SceneKind,
         /// Same seed, same scene.
         #[arg(long, default_value_t = 7)]

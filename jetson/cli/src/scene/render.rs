@@ -46,8 +46,9 @@ pub(crate) struct RenderArgs {
     /// png to look at, npy to compute with
     #[arg(long, value_enum, default_value_t)]
     format: FileFormat,
-    /// The light and the fog it is seen in: day, dusk, night, fog, night-fog
-    #[arg(long, value_name = "NAME", default_value_t)]
+    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+        "The light and the fog it is seen in: {}", Variant::names()
+    ))]
     environment: Variant,
     /// The instant at which what moves is drawn, since the arena's clock began
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]

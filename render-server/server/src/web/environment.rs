@@ -63,12 +63,13 @@ fn parse(wish: Map<String, Value>) -> Result<EnvironmentConfig, String> {
     };
     let named = name.as_str().and_then(EnvironmentConfig::named);
     named.ok_or_else(|| {
-        let names = EnvironmentConfig::NAMED.map(|(name, _)| name).join(", ");
+        let names =
+            EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
         format!("no environment is called {name}; there are {names}")
     })
 }
 
 fn told(now: EnvironmentConfig) -> Told {
-    let names = EnvironmentConfig::NAMED.into_iter().map(|(name, _)| name).collect();
+    let names = EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect();
     Told { name: now.name(), now, names }
 }

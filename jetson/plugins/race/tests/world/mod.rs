@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_race::Race;
 use vizflyt_scenes::Variant;
-use vizflyt_scenes::projects::{Level, Project};
+use vizflyt_scenes::projects::{CourseProject, Level};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::protocol::geometry::Object;
 use vizflyt_sdk::{
@@ -48,7 +48,7 @@ pub(crate) fn fly(
     limit_s: f64,
     mut watch: impl FnMut(f64, &Race, DVec3, &RgbdImage),
 ) -> Outcome {
-    let project = Project::named(project).expect("a project of the course");
+    let project = CourseProject::named(project).expect("a project of the course");
     let mut generated = project.generate(seed, Level::Ug, Variant::DAY);
     let movers = MovingObjects::new(&generated.arena, seed);
     generated.truth.retain(is_near);
