@@ -230,10 +230,10 @@ def main():
     parser.add_argument('--keep', type=pathlib.Path)
     parser.add_argument('--count', type=int, help='splats of every scene')
     parser.add_argument('--only', default='', help='part of "tool format"')
-    parser.add_argument('convert', type=pathlib.Path)
+    parser.add_argument('vizflyt', type=pathlib.Path)
     args = parser.parse_args()
     folder = args.tools.resolve()
-    convert = args.convert.resolve()
+    vizflyt = args.vizflyt.resolve()
     passed = failed = 0
     with tempfile.TemporaryDirectory() as scratch:
         scratch = pathlib.Path(scratch)
@@ -256,7 +256,7 @@ def main():
             if args.only not in f'{tool} {kind}':
                 continue
             extension = kind.rstrip('0123456789')
-            variant = [kind[-1]] if kind[-1].isdigit() else []
+            variant = ['--variant', kind[-1]] if kind[-1].isdigit() else []
             turn = turned if note == 'axes' else lambda scene: scene
             for degree in degrees:
                 # The palettes of harmonics keep every splat's own at these sizes; sogpy has no
@@ -276,11 +276,11 @@ def main():
                         stem = f"{tool.split()[0]}-{kind.replace('.', '-')}-sh{degree}"
                         shutil.copy(theirs, args.keep / f'{stem}.{extension}')
                         shutil.copy(source, args.keep / f'known-sh{degree}.ply')
-                    run(convert, theirs, out)
+                    run(vizflyt, 'scene', 'convert', theirs, out)
                     return read_ply(out)
 
                 def they_read():
-                    run(convert, source, ours, *variant)
+                    run(vizflyt, 'scene', 'convert', source, ours, *variant)
                     reader(ours, out)
                     return turn(read_ply(out))
 

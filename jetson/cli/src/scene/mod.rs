@@ -1,7 +1,8 @@
-//! `vizflyt scene`: makes scenes, bakes their obstacles, looks at them, draws them.
+//! `vizflyt scene`: makes, bakes, inspects and renders scenes.
 
 mod bake;
 pub(crate) mod camera;
+mod convert;
 mod inspect;
 mod npy;
 mod render;
@@ -15,7 +16,7 @@ use vizflyt_scenes::SceneKind;
 
 use crate::terminal::{open_browser, tell};
 
-/// Makes scenes, bakes their obstacles, looks at them, draws them.
+/// Makes, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -42,6 +43,7 @@ enum SceneCommand {
         force: bool,
     },
     Bake(bake::BakeArgs),
+    Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
     View(vizflyt_server::ViewArgs),
@@ -54,6 +56,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
             generate(kind, seed, &output, force)?;
         }
         SceneCommand::Bake(args) => bake::run(&args)?,
+        SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::View(args) => view(args)?,

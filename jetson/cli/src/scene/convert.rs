@@ -1,0 +1,57 @@
+//! `vizflyt scene convert`: a scene of any format in any other.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use vizflyt_splat::format::{self, Format, Progress};
+
+use crate::terminal::tell;
+
+/// Converts a scene file to another format; the files' names decide, and content where it has a mark.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt scene convert scene.spz scene.ply
+  vizflyt scene convert scene.ply scene.spz --variant 3")]
+pub(crate) struct ConvertArgs {
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
+    from: PathBuf,
+    /// The file to write; a `meta.json` becomes a SOG scene of separate files
+    to: PathBuf,
+    /// Version of SPZ, or level of KSPLAT, to write
+    #[arg(long, value_name = "N")]
+    variant: Option<u32>,
+}
+
+/// Converts.
+pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
+    let start = Instant::now();
+    let mut shown_s = 1;
+    // Progress once a second.
+    let loaded = format::read_with_progress(&args.from, &mut |Progress { done, total }| {
+        if start.elapsed().as_secs() >= shown_s {
+            shown_s += 1;
+            tell(format!("{} %", done * 100 / total));
+        }
+    })?;
+    println!(
+        "{}: {} splats, degree {}, {} dropped, {:.0} ms",
+        loaded.format,
+        loaded.splats.len(),
+        loaded.splats.sh_degree,
+        loaded.dropped.total(),
+        start.elapsed().as_secs_f64() * 1e3
+    );
+    for skipped in loaded.skipped_properties.iter().chain(&loaded.skipped_elements) {
+        println!("left out: {skipped}");
+    }
+    match (args.variant, Format::of_name(&args.to)) {
+        (Some(variant), Some(format)) => {
+            let bytes = format::encode_variant(format, variant, &loaded.splats)?;
+            std::fs::write(&args.to, bytes)
+                .with_context(|| format!("cannot write {}", args.to.display()))
+        }
+        _ => Ok(format::write(&args.to, &loaded.splats)?),
+    }
+}
