@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
+use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, LensConfig, Pose, World};
 
 use crate::file::{self, FileError, PoseConfig, check_number, invalid};
 
@@ -88,60 +88,6 @@ struct CameraFile {
     world_from_cam: Option<PoseConfig>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     body_from_cam: Option<PoseConfig>,
-}
-
-/// `distortion`, as `arena.toml` writes it, too: coefficients as OpenCV prints them; those not given
-/// are 0.
-#[derive(Clone, Copy, Serialize, Deserialize)]
-#[serde(tag = "model", rename_all = "kebab-case", deny_unknown_fields)]
-enum LensConfig {
-    BrownConrady {
-        #[serde(default)]
-        k1: f64,
-        #[serde(default)]
-        k2: f64,
-        #[serde(default)]
-        p1: f64,
-        #[serde(default)]
-        p2: f64,
-        #[serde(default)]
-        k3: f64,
-    },
-    KannalaBrandt {
-        #[serde(default)]
-        k1: f64,
-        #[serde(default)]
-        k2: f64,
-        #[serde(default)]
-        k3: f64,
-        #[serde(default)]
-        k4: f64,
-    },
-}
-
-impl From<LensConfig> for Distortion {
-    fn from(lens: LensConfig) -> Self {
-        match lens {
-            LensConfig::BrownConrady { k1, k2, p1, p2, k3 } => {
-                Self::BrownConrady { k1, k2, p1, p2, k3 }
-            }
-            LensConfig::KannalaBrandt { k1, k2, k3, k4 } => Self::KannalaBrandt { k1, k2, k3, k4 },
-        }
-    }
-}
-
-impl LensConfig {
-    fn new(lens: Distortion) -> Option<Self> {
-        match lens {
-            Distortion::None => None,
-            Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
-                Some(Self::BrownConrady { k1, k2, p1, p2, k3 })
-            }
-            Distortion::KannalaBrandt { k1, k2, k3, k4 } => {
-                Some(Self::KannalaBrandt { k1, k2, k3, k4 })
-            }
-        }
-    }
 }
 
 impl TagCamera {

@@ -28,7 +28,7 @@ pub(crate) mod validate;
 mod vehicle;
 
 pub use body::BodyPart;
-pub use camera::{CameraConfig, LensConfig};
+pub use camera::CameraConfig;
 pub use environment::EnvironmentConfig;
 pub use line::line_of;
 pub use localization::{

@@ -14,8 +14,7 @@ use std::str::FromStr;
 use anyhow::{Context, Result, bail};
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
-use vizflyt_arena::config::LensConfig;
-use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
+use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, LensConfig, Pose, World};
 use vizflyt_splat::{Atmosphere, Camera};
 
 #[derive(Debug, Deserialize)]

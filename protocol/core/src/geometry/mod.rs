@@ -6,11 +6,16 @@
 mod distortion;
 mod frame;
 mod intrinsics;
+// Parsing it needs allocation, which chips do not have.
+#[cfg(feature = "std")]
+mod lens_config;
 mod pose;
 mod volume;
 
 pub use distortion::Distortion;
 pub use frame::{Body, Cam, Frame, Object, Scene, World};
 pub use intrinsics::{Intrinsics, InvalidIntrinsics};
+#[cfg(feature = "std")]
+pub use lens_config::LensConfig;
 pub use pose::{Pose, Twist, body_from_forward_cam, wrap_pi, yaw_of};
 pub use volume::Volume;

@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{
-    Body, Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, body_from_forward_cam,
+    Body, Cam, Distortion, Intrinsics, InvalidIntrinsics, LensConfig, Pose, body_from_forward_cam,
 };
 use vizflyt_protocol::messages::{CameraInfo, bounded};
 
@@ -89,56 +89,6 @@ pub struct CameraConfig {
     /// not leave the server: plugins get "no return" in every pixel.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub depth: bool,
-}
-
-/// `distortion`: a lens, with the coefficients as OpenCV prints them; those not given are 0.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "model", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum LensConfig {
-    /// [`Distortion::BrownConrady`].
-    BrownConrady {
-        /// Radial, r^2.
-        #[serde(default)]
-        k1: f64,
-        /// Radial, r^4.
-        #[serde(default)]
-        k2: f64,
-        /// Tangential, along y.
-        #[serde(default)]
-        p1: f64,
-        /// Tangential, along x.
-        #[serde(default)]
-        p2: f64,
-        /// Radial, r^6.
-        #[serde(default)]
-        k3: f64,
-    },
-    /// [`Distortion::KannalaBrandt`], a fisheye.
-    KannalaBrandt {
-        /// t^3.
-        #[serde(default)]
-        k1: f64,
-        /// t^5.
-        #[serde(default)]
-        k2: f64,
-        /// t^7.
-        #[serde(default)]
-        k3: f64,
-        /// t^9.
-        #[serde(default)]
-        k4: f64,
-    },
-}
-
-impl From<LensConfig> for Distortion {
-    fn from(lens: LensConfig) -> Self {
-        match lens {
-            LensConfig::BrownConrady { k1, k2, p1, p2, k3 } => {
-                Self::BrownConrady { k1, k2, p1, p2, k3 }
-            }
-            LensConfig::KannalaBrandt { k1, k2, k3, k4 } => Self::KannalaBrandt { k1, k2, k3, k4 },
-        }
-    }
 }
 
 impl CameraConfig {
