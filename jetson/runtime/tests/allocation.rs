@@ -3,11 +3,10 @@
 //! small one.
 //! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::sync::Arc;
 use std::time::Duration;
 
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_protocol::messages::{CameraInfo, bounded};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
@@ -19,35 +18,8 @@ use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
 use vizflyt_sdk::{Observation, ObservationWriter, host_now};
 
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
-// without destructor, so it allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 const SIZE: (u32, u32) = (64, 48);
 
@@ -113,9 +85,9 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
     let names = [bounded("front")];
     let mut count = 0;
     for seq in 1..=60 {
-        let before = ALLOCATIONS.get();
+        let before = CountingAllocator::thread_allocations();
         let published = publish(seq);
-        let allocations = ALLOCATIONS.get() - before;
+        let allocations = CountingAllocator::thread_allocations() - before;
         assert_eq!(published, 1, "image {seq}");
         let sample = plugin.observation().unwrap().expect("the plugin sees it");
         let seen = Observation::from_bytes(sample.bytes(), &names).unwrap();

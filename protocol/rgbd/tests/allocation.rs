@@ -1,40 +1,11 @@
 //! Depth allocates nothing once the scratch memory has grown to the image's size. (Colour
 //! allocates inside the JPEG libraries, a handful of small buffers an image.)
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
 
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
-// without destructor, so it allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 #[test]
 fn depth_allocates_for_the_first_image_only() {
@@ -43,10 +14,10 @@ fn depth_allocates_for_the_first_image_only() {
     let (mut encoder, mut decoder) = (Encoder::new(EncodeOptions::default()), Decoder::new());
     let (mut bytes, mut depth_out) = (Vec::new(), vec![0; depth_mm.len()]);
     let mut turn = || {
-        let before = ALLOCATIONS.get();
+        let before = CountingAllocator::thread_allocations();
         encoder.encode(&view, &mut bytes).unwrap();
         decoder.decode(&bytes, &mut [], &mut depth_out).unwrap();
-        ALLOCATIONS.get() - before
+        CountingAllocator::thread_allocations() - before
     };
     assert!(turn() > 0, "the counter counts");
     for _ in 0..3 {

@@ -1,14 +1,13 @@
 //! The render thread allocates nothing once every buffer has been used: two vehicles, four
 //! cameras, of which some ticks are encoded, some skipped, and all passed on to the previews.
 
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::borrow::Cow;
-use std::cell::Cell;
 use std::sync::Arc;
 use std::time::Duration;
 
 use glam::{DQuat, DVec3};
 use vizflyt_arena::{ArenaConfig, MovingObjects};
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
@@ -23,35 +22,8 @@ use vizflyt_server::stream::Rooms;
 use vizflyt_server::stream::rate_control::Adaptation;
 use vizflyt_splat::{Camera, PassTimes, Placement, Rasterizer, RenderError, RgbdImage, Workload};
 
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
-// without destructor, so it allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 const ARENA: &str = r#"
 name = "two"
@@ -126,7 +98,7 @@ impl Rasterizer for Everyone {
         self.calls += 1;
         self.images += cameras.len();
         match self.calls {
-            WARM_UP => self.warm = ALLOCATIONS.with(Cell::get),
+            WARM_UP => self.warm = CountingAllocator::thread_allocations(),
             TICKS => self.stop.set(),
             _ => {}
         }
@@ -186,7 +158,7 @@ fn drawing_allocates_nothing_once_it_is_warm() {
         1000.0,
         &rooms.stop,
     );
-    let allocated = ALLOCATIONS.with(Cell::get) - everyone.warm;
+    let allocated = CountingAllocator::thread_allocations() - everyone.warm;
     assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);
     // Leaving the function frees, which is not counted.
     assert_eq!(allocated, 0, "in {} ticks", TICKS - WARM_UP);

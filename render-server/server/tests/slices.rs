@@ -2,13 +2,12 @@
 //! the buffers have their size: quantised, encoded, handed to two subscribers, acknowledged.
 //! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
 
 use glam::DVec3;
 use vizflyt_arena::config::CameraConfig;
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::Purpose;
 use vizflyt_rgbd::{ColorMode, EncodeOptions};
@@ -17,35 +16,8 @@ use vizflyt_server::render::rendered::RenderedImage;
 use vizflyt_server::stream::encode::slices::SliceEncoder;
 use vizflyt_server::stream::subscriptions::{Part, Slots, Subscriptions};
 
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<usize> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system's allocator unchanged; the counter itself is const and
-// without destructor, so it allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Returns what is there already.
 fn now<T>(future: impl Future<Output = T>) -> T {
@@ -97,10 +69,10 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
             *depth_m = ((n * 7919 + round) % 9000) as f32 / 1000.0;
         }
         slot.seq += 1;
-        let before = ALLOCATIONS.get();
+        let before = CountingAllocator::thread_allocations();
         assert!(encoder.send(&subscriptions, &slot, 1).unwrap().is_some());
         let sent = [take(&subscriptions, 1, &runtime), take(&subscriptions, 2, &watcher)];
-        let allocations = ALLOCATIONS.get() - before;
+        let allocations = CountingAllocator::thread_allocations() - before;
         assert!(sent[0] > 50_000 && sent[0] == sent[1], "{sent:?}");
         allocations
     };

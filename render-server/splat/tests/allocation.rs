@@ -1,42 +1,15 @@
 //! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
 //! cameras, their lenses, and the objects that come and go.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-
 use glam::{DQuat, DVec3, Quat, Vec3};
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
 use vizflyt_splat::{
     Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
 
-struct Counting;
-
-/// Of all threads: the passes run on the pool's.
-static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
-
-// SAFETY: every call goes to the system's allocator unchanged; counting allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Relaxed);
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Relaxed);
-        // SAFETY: the caller's contract is the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// `count` splats all around, up to 4 m away.
 fn cloud(count: u32, half_m: f32) -> Splats {
@@ -105,11 +78,11 @@ fn nothing_is_allocated_once_every_view_was_seen() {
         let mut images = vec![RgbdImage::default(); calls[0].1.len()];
         let counts = pool.install(|| {
             [(); 4].map(|()| {
-                let before = ALLOCATIONS.load(Relaxed);
+                let before = CountingAllocator::allocations();
                 for (placements, cameras) in &calls {
                     renderer.render(placements, cameras, &mut images).expect("a valid call");
                 }
-                ALLOCATIONS.load(Relaxed) - before
+                CountingAllocator::allocations() - before
             })
         });
         assert!(counts[0] > 0, "the counter counts");

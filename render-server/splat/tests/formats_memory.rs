@@ -1,60 +1,13 @@
 //! Loading a scene takes at most twice the memory that it takes once loaded. (The file itself is
-//! mapped: its pages are the system's to drop.) Alone in its binary, which counts every allocation.
-
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+//! mapped: its pages are the system's to drop.) Alone in its binary.
 
 use glam::{Quat, Vec3};
+use vizflyt_fixtures::CountingAllocator;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{self, Format};
 
-/// Bytes allocated now, and the most since the mark was last set.
-static NOW: AtomicUsize = AtomicUsize::new(0);
-static PEAK: AtomicUsize = AtomicUsize::new(0);
-
-mod ffi {
-    use std::alloc::{GlobalAlloc, Layout, System};
-
-    use super::{NOW, PEAK, Relaxed};
-
-    struct Counting;
-
-    #[global_allocator]
-    static ALLOCATOR: Counting = Counting;
-
-    fn grow(bytes: usize) {
-        let now = NOW.fetch_add(bytes, Relaxed) + bytes;
-        PEAK.fetch_max(now, Relaxed);
-    }
-
-    // SAFETY: every call goes to the system's allocator unchanged; only sizes are counted besides.
-    unsafe impl GlobalAlloc for Counting {
-        unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-            grow(layout.size());
-            // SAFETY: the caller's promise about `layout` is handed on.
-            unsafe { System.alloc(layout) }
-        }
-
-        unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-            grow(layout.size());
-            // SAFETY: as above.
-            unsafe { System.alloc_zeroed(layout) }
-        }
-
-        unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-            NOW.fetch_sub(layout.size(), Relaxed);
-            // SAFETY: `at` came from `System` with this layout.
-            unsafe { System.dealloc(at, layout) }
-        }
-
-        unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-            // Counted as if both existed for a moment, as they may.
-            grow(size);
-            NOW.fetch_sub(layout.size(), Relaxed);
-            // SAFETY: `at` came from `System` with this layout.
-            unsafe { System.realloc(at, layout, size) }
-        }
-    }
-}
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Splats that compress as badly as real ones.
 fn scene(count: usize, sh_degree: u8) -> Splats {
@@ -84,11 +37,11 @@ fn a_load_takes_at_most_twice_the_scene() {
         let splats = scene(100_000, sh_degree);
         for &variant in format.variants() {
             let bytes = format::encode_variant(format, variant, &splats).expect("a file");
-            let before = NOW.load(Relaxed);
-            PEAK.store(before, Relaxed);
+            let before = CountingAllocator::live_bytes();
+            CountingAllocator::reset_peak();
             let loaded = format::parse(&bytes, format).expect("a scene");
-            let held = NOW.load(Relaxed) - before;
-            let peak = PEAK.load(Relaxed) - before;
+            let held = CountingAllocator::live_bytes() - before;
+            let peak = CountingAllocator::peak_bytes() - before;
             assert!(
                 peak <= 2 * held,
                 "{format} {variant}, degree {sh_degree}: {peak} bytes for {held}"

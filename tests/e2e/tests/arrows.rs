@@ -45,6 +45,8 @@ const ARROWS: &[(&str, &[&str])] = &[
         ],
     ),
     ("vizflyt-e2e", &[]),
+    // For tests alone: dev-dependencies are no arrows.
+    ("vizflyt-fixtures", &[]),
 ];
 
 #[test]
