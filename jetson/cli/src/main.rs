@@ -59,34 +59,34 @@ enum Command {
     New(new::NewArgs),
     /// Flies a plugin: in the simulated lab, or in the real one if it is configured.
     Fly(fly::FlyArgs),
-    /// Flies a project's course again and again in lock-step, and says what the plugin is worth.
+    /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
     Grade(grade::GradeArgs),
     /// The render server: pose in, RGB-D out, page and events.
     Serve(vizflyt_server::ServeArgs),
-    /// Makes this computer and a render server known to each other, once, by a short code.
+    /// Pairs this computer with a render server, once, by a short code.
     Pair(pair::PairArgs),
     Password(password::PasswordArgs),
     /// Finds what is wrong before it flies: the autopilot's parameters, the localization's axes.
     Doctor(doctor::DoctorArgs),
     #[cfg(feature = "crazyflie")]
     Crazyflie(crazyflie::CrazyflieArgs),
-    /// What is set up on the vehicle once: the key for MAVLink signing.
+    /// Sets up the vehicle: the key for MAVLink signing.
     Vehicle(vehicle::VehicleArgs),
     /// Teams, runs and standings of the lab's flights.
     Leaderboard(leaderboard::LeaderboardArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
     Sim(vizflyt_simulator::SimArgs),
-    /// The Wi-Fi bridge of a vehicle: emulated here, or asked over the network.
+    /// The Wi-Fi bridge of a vehicle: emulated here, or configured over the network.
     Bridge(bridge::BridgeArgs),
-    /// Makes scenes, looks at them, draws them.
+    /// Makes, inspects and renders scenes.
     Scene(scene::SceneArgs),
     Arena(arena::ArenaArgs),
     Tags(tags::TagsArgs),
-    /// Measures how fast this machine draws.
+    /// Measures how fast this machine renders.
     Bench(bench::BenchArgs),
-    /// Where images get their age, stage by stage, and why images were skipped.
+    /// Latency of images, stage by stage, and why images were skipped.
     Stats(stats::StatsArgs),
-    /// Feeds a flight's recorded images to a plugin and says where its answers differ.
+    /// Feeds a flight's recorded images to a plugin and reports where its answers differ.
     Replay(replay::ReplayArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
     #[command(hide = true)]
@@ -145,7 +145,8 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
 }
 
 /// Keeps one of Mesa's Vulkan layers from looking for a screen where there is none: it would print
-/// `error: XDG_RUNTIME_DIR is invalid` at every start, and we draw to memory.
+/// `error: XDG_RUNTIME_DIR is invalid` at every start, and we render to memory.
+#[allow(unsafe_code, reason = "sets an environment variable before any thread starts")]
 fn quiet_mesa() {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
         // SAFETY: the first statement of `main`: no other thread reads the environment yet.

@@ -35,7 +35,7 @@ pub(super) struct BandwidthArgs {
     /// Images of this size; may be given several times [default: 320x240, 640x480, 1280x720]
     #[arg(long, value_name = "WxH")]
     size: Vec<ImageSize>,
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// Prints a JSON array

@@ -1,4 +1,4 @@
-//! `vizflyt bench`: how fast this machine draws and streams, and what its images need; what the
+//! `vizflyt bench`: how fast this machine renders and streams, and what its images need; what the
 //! bridge adds to a packet's way.
 
 mod bandwidth;

@@ -1,4 +1,4 @@
-//! `vizflyt bench render`: how fast this machine draws.
+//! `vizflyt bench render`: how fast this machine renders.
 
 use std::path::PathBuf;
 
@@ -14,7 +14,7 @@ use crate::scene::camera::{self, ImageSize};
 /// Draws a scene many times over; prints milliseconds per image and pass.
 #[derive(Args, Debug)]
 #[command(after_help = "Each image has RGB, alpha, and expected and median depth. With several \
-cameras, each is drawn in turn, --images times; the figures are over all of them.
+cameras, each is rendered in turn, --images times; the figures are over all of them.
 
 Examples:
   vizflyt bench render room.ply --camera cam.json
@@ -29,7 +29,7 @@ pub(super) struct RenderArgs {
     /// Draws images of this size instead of the camera's; they show the same
     #[arg(long, value_name = "WxH")]
     size: Option<ImageSize>,
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
     /// Images per camera that count; a few before them do not

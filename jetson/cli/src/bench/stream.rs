@@ -3,7 +3,7 @@
 //! ```text
 //! packet  bytes handed to the transport -> QUIC -> shared memory -> plugin woken
 //! tcp     the same bytes, their length first, over TCP -> shared memory -> plugin woken
-//! pixels  drawn image -> encode -> QUIC -> decode -> shared memory -> plugin woken
+//! pixels  rendered image -> encode -> QUIC -> decode -> shared memory -> plugin woken
 //! ```
 //! One after the other in one process, so that their ratio holds on a busy machine too. The plugin
 //! is a thread behind the real shared memory.
@@ -418,7 +418,7 @@ fn payload([width, height]: [u32; 2]) -> Result<Bytes> {
     Ok(payload.into())
 }
 
-/// Returns a drawn image about as hard to encode as a captured scene: texture of every scale, and
+/// Returns a rendered image about as hard to encode as a captured scene: texture of every scale, and
 /// depth with edges.
 fn picture([width_px, height_px]: [u32; 2]) -> RgbdImage {
     let pixels = (width_px * height_px) as usize;

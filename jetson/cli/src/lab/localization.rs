@@ -58,7 +58,7 @@ impl Localization {
     }
 
     /// Returns the command that sees tags and sends poses to the server at `poses`; it says where it waits
-    /// for the true poses that its cameras' images are drawn by.
+    /// for the true poses that its cameras' images are rendered from.
     pub(crate) fn of_tags(poses: &str) -> Vec<OsString> {
         let words = ["tags", "locate", "--json", "--lifeline", "--simulated"];
         let mut args: Vec<OsString> = words.map(OsString::from).to_vec();

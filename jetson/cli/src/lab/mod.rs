@@ -61,7 +61,7 @@ pub(crate) struct LabArgs {
         projects::NAMES.join(", ")
     ))]
     pub project: Option<String>,
-    /// Whom the project is for: ug, with depth, or g, without [default: ug].
+    /// Level of the project: ug, with depth, or g, without [default: ug].
     #[arg(long, value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
     #[arg(long, value_name = "NAME", requires = "project", help = format!(
@@ -71,13 +71,13 @@ pub(crate) struct LabArgs {
     /// Seed of the generated scene and of the simulator's noise [default: 7].
     #[arg(long)]
     pub seed: Option<u64>,
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter.
+    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter.
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
-    /// How the vehicle is localized: as a motion capture in one of these forms streams it, or by AprilTags
+    /// Localization: a motion capture that streams in one of these formats, or AprilTags
     /// on it that two simulated webcams see.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub localization: Localization,
@@ -105,7 +105,7 @@ impl LabArgs {
         self.project.as_deref().and_then(|name| CourseProject::named(name).ok())
     }
 
-    /// Returns whom the project is for.
+    /// Returns the project's level.
     pub(crate) fn level(&self) -> Level {
         self.level.unwrap_or_default()
     }

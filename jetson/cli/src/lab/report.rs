@@ -28,7 +28,7 @@ pub(crate) struct Report {
     pub age_ms_p50: f64,
     /// Pose stamp to plugin callback, 99th percentile. [ms]
     pub age_ms_p99: f64,
-    /// Time to draw all cameras of a tick, median. [ms]
+    /// Time to render all cameras of a tick, median. [ms]
     pub render_ms_p50: f64,
     /// What each stage adds to the age, by name, as `p50`, `p90`, `p99`, `max`. [ms]
     pub stages: Value,
@@ -40,7 +40,7 @@ pub(crate) struct Report {
     pub intervals: Value,
     /// The server's clock by the runtime's.
     pub clock: Value,
-    /// What became of the images drawn for the runtime, by vehicle and camera.
+    /// Delivery of the images rendered for the runtime, by vehicle and camera.
     pub images: Value,
     /// Mean speed in flight, by the simulator's truth. [m/s]
     pub mean_speed_mps: f64,

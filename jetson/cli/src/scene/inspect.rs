@@ -185,7 +185,7 @@ fn warnings_of_file(loaded: &Loaded) -> Vec<String> {
     }
     if loaded.antialiased {
         warnings.push(
-            "trained with anti-aliasing: drawn without, its smallest splats look a little too \
+            "trained with anti-aliasing: rendered without, its smallest splats look a little too \
              bright"
                 .to_owned(),
         );
@@ -220,7 +220,7 @@ fn warnings_of_splats(splats: &Splats, [low, high]: [Vec3; 2]) -> Vec<String> {
         ));
     } else if share(visible) < 50.0 {
         warnings.push(format!(
-            "{:.0} % of the splats are too faint to be seen; prune them and the scene draws as \
+            "{:.0} % of the splats are too faint to be seen; prune them and the scene renders as \
              fast with less memory",
             100.0 - share(visible)
         ));

@@ -15,7 +15,7 @@ use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 use super::camera;
 use super::npy;
 
-/// Draws a scene as it is, from cameras in its own frame, to files.
+/// Renders a scene as it is, from cameras in its own frame, to files.
 #[derive(Args, Debug)]
 #[command(after_help = "CAM.json:
   {\"fx\": 251.1, \"fy\": 251.1, \"cx\": 160, \"cy\": 120, \"w\": 320, \"h\": 240, \"bg\": [0, 0, 0],
@@ -50,13 +50,13 @@ pub(crate) struct RenderArgs {
         "The light and the fog it is seen in: {}", Variant::names()
     ))]
     environment: Variant,
-    /// The instant at which what moves is drawn, since the arena's clock began
+    /// Instant at which moving objects are rendered, since the arena's clock began
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
     at: f64,
-    /// What the arena leaves to chance: where in their motion its objects begin
+    /// Seed for the initial phase of objects that set none
     #[arg(long, default_value_t = 7)]
     seed: u64,
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
 }

@@ -52,7 +52,7 @@ struct Mailbox {
     failed: Mutex<Option<String>>,
 }
 
-/// What the simulated cameras draw by.
+/// What the simulated cameras render from.
 #[derive(Default)]
 struct SharedTruth {
     truth: Mutex<Truth>,
