@@ -7,6 +7,8 @@
 //! the other; what is left to do is kept in the file named by the second argument, so that a plugin
 //! that is started again goes on with the next.
 
+#![allow(unsafe_code, reason = "it misbehaves: a bad pointer, a fork")]
+
 use std::ffi::OsString;
 use std::fs;
 use std::hint::black_box;

@@ -1,5 +1,7 @@
 //! The C interface. Types mirror `include/vizflyt.h` field by field; their meaning is said there.
 
+#![allow(unsafe_code, reason = "the C interface: pointers from the caller")]
+
 use std::ffi::{CString, c_char, c_int, c_void};
 use std::process::ExitCode;
 

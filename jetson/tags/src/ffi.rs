@@ -1,5 +1,7 @@
 //! What is asked of the AprilTag C library about its families.
 
+#![allow(unsafe_code, reason = "calls the AprilTag C library")]
+
 use apriltag_sys as sys;
 
 use crate::family::{Cells, TagFamily};

@@ -74,6 +74,7 @@ impl Disk for RealFile {
 
 /// Makes writes to a file that may not grow any further (`ulimit -f`) errors, as of any full disk,
 /// instead of the process's end. Call it before threads start: it is the whole process's.
+#[allow(unsafe_code, reason = "sets how a signal is handled")]
 pub fn keep_going_when_files_are_full() {
     use nix::sys::signal::{SigHandler, Signal, signal};
     // SAFETY: ignoring a signal installs no handler, so no code runs in its context.

@@ -10,6 +10,8 @@
 //!
 //! All is prepared before the fork; after it only system calls are made.
 
+#![allow(unsafe_code, reason = "system calls between fork and exec, where little is allowed")]
+
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs::{self, File};

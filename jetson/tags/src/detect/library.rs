@@ -4,6 +4,8 @@
 //! handed to C is a copy of ours, never the caller's image: with some settings the library blurs its
 //! input in place.
 
+#![allow(unsafe_code, reason = "owns objects of the AprilTag C library")]
+
 use std::ptr::NonNull;
 
 use apriltag_sys as c;

@@ -7,6 +7,11 @@
 //! each pixel's left neighbour. SSE2 and NEON belong to the base of their machines, so nothing is
 //! asked at run time; any other machine takes the plain version.
 
+#![allow(
+    unsafe_code,
+    reason = "calls of functions compiled for more instructions, after detection"
+)]
+
 use super::blocks::{Block, Lanes, Shape};
 use super::{BLOCK_COLUMNS, DepthDecoder, DepthEncoder, Layout, Parts, STRIPES};
 

@@ -1,6 +1,8 @@
 //! Adaptive frequencies of 16 symbols, moved as one vector (after Giesen, "Models for adaptive
 //! arithmetic coding", 2015: cumulative frequencies step towards those of a certain symbol).
 
+#![allow(unsafe_code, reason = "SIMD loads and stores")]
+
 /// Symbols of an alphabet.
 pub(super) const SYMBOLS: usize = 16;
 /// Frequencies add up to 2^15.

@@ -1,6 +1,8 @@
 //! Files in and out: bytes without a second copy of them in memory, writes that are whole or not
 //! there.
 
+#![allow(unsafe_code, reason = "maps a file")]
+
 use std::fs::File;
 use std::io::{self, Write as _};
 use std::path::Path;

@@ -1,6 +1,8 @@
 //! The few requests of V4L2 that a camera needs (Linux kernel, `videodev2.h`; "Video for Linux API",
 //! chapters 1.3, 3.2 and 7), on 64-bit machines.
 
+#![allow(unsafe_code, reason = "ioctl and mmap of Video4Linux")]
+
 use std::fs::File;
 use std::io;
 use std::os::fd::{AsFd as _, AsRawFd as _};

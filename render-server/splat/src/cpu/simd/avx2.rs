@@ -1,5 +1,7 @@
 //! AVX2 with FMA and F16C: every x86 server and laptop since 2013 (Intel) and 2017 (AMD).
 
+#![allow(unsafe_code, reason = "SIMD intrinsics, after detection of the instruction set")]
+
 #[allow(clippy::wildcard_imports, reason = "two dozen intrinsics, each named once below")]
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};

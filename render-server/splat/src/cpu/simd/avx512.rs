@@ -1,5 +1,7 @@
 //! AVX-512: sixteen lanes and real mask registers.
 
+#![allow(unsafe_code, reason = "SIMD intrinsics, after detection of the instruction set")]
+
 #[allow(clippy::wildcard_imports, reason = "two dozen intrinsics, each named once below")]
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};

@@ -1,5 +1,7 @@
 //! NEON: every 64-bit Arm processor. Two registers of four lanes make a vector of eight.
 
+#![allow(unsafe_code, reason = "SIMD intrinsics, after detection of the instruction set")]
+
 use std::arch::aarch64::{
     float32x4_t, uint32x4_t, vaddq_f32, vaddq_u32, vaddvq_u32, vandq_u32, vbslq_f32, vcltq_f32,
     vdivq_f32, vdupq_n_f32, vdupq_n_u32, vfmaq_f32, vfmsq_f32, vget_high_u16, vget_low_u16,
