@@ -24,7 +24,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::sender_clock::SenderClock;
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
-use super::{Measurement, SourceCounters, TagsSeen};
+use super::source::{Measurement, SourceCounters, TagsSeen};
 
 /// A packet, as it is written.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

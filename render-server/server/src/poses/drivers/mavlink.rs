@@ -24,7 +24,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::sender_clock::SenderClock;
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
-use super::{Measurement, SourceCounters};
+use super::source::{Measurement, SourceCounters};
 
 /// Selects our vehicles' autopilots.
 pub struct MavlinkStream {

@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use vizflyt_arena::config::MAX_VEHICLES;
 
-use super::{Measurement, PoseSource, SourceCounters};
+use super::source::{Measurement, PoseSource, SourceCounters};
 use crate::lock::lock;
 
 /// What came together from one source.

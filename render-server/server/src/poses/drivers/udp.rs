@@ -9,7 +9,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 use vizflyt_arena::config::Driver;
 use vizflyt_protocol::time::ServerTime;
 
-use super::{Measurement, PoseSource, SourceCounters};
+use super::source::{Measurement, PoseSource, SourceCounters};
 use crate::clock;
 
 /// What is behind the socket: bytes in, poses out. Sans-IO.

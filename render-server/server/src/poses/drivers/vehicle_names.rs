@@ -10,7 +10,7 @@ use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::time::ServerTime;
 
 use super::frame_clock::FrameClock;
-use super::{Measurement, SourceCounters};
+use super::source::{Measurement, SourceCounters};
 
 /// The vehicles of one stream.
 #[derive(Debug)]

@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{MOST_NAMES, VehicleNames};
-use super::{Measurement, SourceCounters};
+use super::source::{Measurement, SourceCounters};
 
 /// One object of a packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
