@@ -20,7 +20,6 @@ mod body;
 mod camera;
 mod environment;
 mod line;
-mod localization;
 mod no_fly;
 mod object;
 mod rules;
@@ -31,13 +30,10 @@ pub use body::BodyPart;
 pub use camera::CameraConfig;
 pub use environment::EnvironmentConfig;
 pub use line::line_of;
-pub use localization::{
-    Alignment, Axes, Driver, Euler, LocalizationConfig, MAX_SOURCES, Nose, Offset, Units, UpAxis,
-};
 pub use no_fly::NoFly;
 pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};
 pub use rules::RulesConfig;
-pub use validate::ConfigError;
+pub use validate::{ConfigError, check_number, check_position, invalid};
 pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
 /// The whole of `arena.toml`.
@@ -90,9 +86,9 @@ pub struct ArenaConfig {
     /// The vehicles, up to 8; without any, the server's command line names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<VehicleConfig>,
-    /// Where poses come from, up to 8; without any, the server's command line says, else Vicon.
+    /// Where poses come from, as the file has it: the settings are the server's, which reads them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub localization: Vec<LocalizationConfig>,
+    pub localization: Vec<toml::Table>,
     /// The course's gates in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<StageConfig>,

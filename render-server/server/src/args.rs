@@ -4,12 +4,12 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::Args;
-use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::messages::Grant;
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
 use crate::authorization::parse_grant;
 use crate::flights::leaderboard::{Database, UnknownDatabase};
+use crate::poses::settings::{Driver, LocalizationConfig};
 use crate::render::RendererKind;
 use crate::scene::{Up, parse_scale};
 use crate::stream::rate_control::Adaptation;
@@ -41,10 +41,8 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDR")]
     pub vicon: Option<SocketAddr>,
 
-    /// A source of poses instead of arena.toml's: vicon, natnet, json or mavlink,
-    /// with the keys of [[localization]], as natnet:239.255.42.99:1511,up=y or
-    /// 'vicon,pivot_m=[0.02,0,0.05]'; repeat for more
-    #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", value_parser = LocalizationConfig::parse)]
+    /// Sources of poses instead of those of `arena.toml`.
+    #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", help = pose_help(), value_parser = LocalizationConfig::parse)]
     pub pose: Vec<LocalizationConfig>,
 
     /// A vehicle: its object's name in the localization system; repeat for more
@@ -205,6 +203,15 @@ impl ServeArgs {
             ..EncodeOptions::default()
         }
     }
+}
+
+/// Returns the help of `--pose`, with the names of all drivers.
+fn pose_help() -> String {
+    format!(
+        "A source of poses instead of arena.toml's: {}, with the keys of [[localization]], as \
+         natnet:239.255.42.99:1511,up=y or 'vicon,pivot_m=[0.02,0,0.05]'; repeat for more",
+        Driver::names()
+    )
 }
 
 fn depth_bound(text: &str) -> Result<DepthBound, String> {

@@ -2,10 +2,10 @@
 //! numbers; and no packet makes us talk without end.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::poses::drivers::natnet::{Motive, NatnetStream};
 use vizflyt_server::poses::drivers::udp::PoseStream;
+use vizflyt_server::poses::settings::LocalizationConfig;
 
 fuzz_target!(|input: (u8, Vec<(u8, &[u8])>)| {
     let (minor, packets) = input;

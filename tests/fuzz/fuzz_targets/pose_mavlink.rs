@@ -2,12 +2,12 @@
 //! of finite numbers. Messages are made of the fuzzer's bytes with a checksum that holds.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::mavlink::dialect::MavMessage;
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, MavlinkVersion, Message, encode};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::poses::drivers::mavlink::MavlinkStream;
 use vizflyt_server::poses::drivers::udp::PoseStream;
+use vizflyt_server::poses::settings::LocalizationConfig;
 
 const IDS: [u32; 5] = [0, 30, 31, 32, 331];
 

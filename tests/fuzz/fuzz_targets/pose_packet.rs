@@ -1,10 +1,10 @@
 //! Pose packets in JSON: counted and dropped, or a measurement of finite numbers.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::poses::drivers::json::JsonStream;
 use vizflyt_server::poses::drivers::udp::PoseStream;
+use vizflyt_server::poses::settings::LocalizationConfig;
 
 fuzz_target!(|packets: Vec<&[u8]>| {
     let config = LocalizationConfig::parse("json,up=y,units=mm,nose=-y").unwrap();

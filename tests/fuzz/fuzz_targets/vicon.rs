@@ -1,10 +1,10 @@
 //! Vicon datagrams: counted and dropped, or a measurement of finite numbers.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
-use vizflyt_arena::config::{Driver, LocalizationConfig};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_server::poses::drivers::udp::PoseStream;
 use vizflyt_server::poses::drivers::vicon::ViconStream;
+use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 
 fuzz_target!(|packets: Vec<&[u8]>| {
     let mut source =

@@ -10,6 +10,7 @@ use vizflyt_arena::check::{Checked, check};
 use vizflyt_arena::config::line_of;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
+use vizflyt_server::poses::settings;
 use vizflyt_server::scene::{self, Up};
 
 /// Looks at rooms and courses before anyone flies in them.
@@ -82,6 +83,7 @@ fn check_file(path: &Path) -> Result<bool> {
     let file = if path.is_dir() { path.join("arena.toml") } else { path.to_owned() };
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
+    settings::of_arena(&file)?;
     let scene = scene::load(&file, Up::default(), None)?;
     let still = Arc::new(scene::bake(&scene.splats, &scene.arena));
     let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);

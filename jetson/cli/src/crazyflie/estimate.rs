@@ -67,7 +67,9 @@ mod tests {
         let record = [1500.0, -250.0, 1020.0, f64::from(packed(q))];
         let text = pose_packet("bee", 7, 1234, record).to_string();
         let mut stream = vizflyt_server::poses::drivers::json::JsonStream::new(
-            &vizflyt_arena::config::LocalizationConfig::new(vizflyt_arena::config::Driver::Json),
+            &vizflyt_server::poses::settings::LocalizationConfig::new(
+                vizflyt_server::poses::settings::Driver::Json,
+            ),
             0,
             &["bee"],
         );

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
 use clap::Args;
-use vizflyt_arena::config::{Driver, LocalizationConfig};
-use vizflyt_server::{poses::drivers, scene};
+use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
+use vizflyt_server::poses::{drivers, settings};
 
 use self::check::{Check, Step, Verdict};
 use self::words::pose_in_words;
@@ -120,7 +120,7 @@ impl LocalizationArgs {
             return Ok(config.clone());
         }
         let Some(arena) = &self.arena else { return Ok(LocalizationConfig::new(Driver::Vicon)) };
-        let sources = scene::localization(arena)?;
+        let sources = settings::of_arena(arena)?;
         if sources.len() > 1 {
             tell(format!(
                 "note     the first of {} sources is checked; --pose names another",

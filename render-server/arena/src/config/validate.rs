@@ -38,7 +38,8 @@ fn in_line(line: Option<usize>) -> String {
 
 impl ConfigError {
     /// Returns the error with the line of its key in the text that was read.
-    pub(super) fn in_text(self, text: &str) -> Self {
+    #[must_use]
+    pub fn in_text(self, text: &str) -> Self {
         match self {
             Self::Invalid { key, value, advice, .. } => {
                 let line = super::line_of(text, &key);
@@ -49,7 +50,8 @@ impl ConfigError {
     }
 }
 
-pub(crate) fn invalid(
+/// Returns the refusal of a value: its key, what it says, and what to do.
+pub fn invalid(
     key: impl Into<String>,
     value: impl Display,
     advice: impl Into<String>,
@@ -69,7 +71,11 @@ const MAX_STAGES: usize = 255;
 /// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
 const MAX_VOXELS: f64 = 4e8;
 
-pub(crate) fn check_number(
+/// Checks that a value lies within a range; `unit` is said in the refusal.
+///
+/// # Errors
+/// [`ConfigError::Invalid`], also for NaN.
+pub fn check_number(
     key: &str,
     value: f64,
     unit: &str,
@@ -82,7 +88,11 @@ pub(crate) fn check_number(
     Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
 }
 
-pub(super) fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError> {
+/// Checks that a place is finite and not absurdly far off.
+///
+/// # Errors
+/// [`ConfigError::Invalid`].
+pub fn check_position(key: &str, value: DVec3) -> Result<(), ConfigError> {
     if value.is_finite() && value.abs().max_element() <= MAX_COORDINATE_M {
         return Ok(());
     }
@@ -156,7 +166,6 @@ impl ArenaConfig {
         self.check_occupancy()?;
         self.check_cameras()?;
         self.check_vehicles()?;
-        self.check_localization()?;
         self.check_stages()?;
         self.check_no_fly()?;
         self.check_objects()?;

@@ -6,10 +6,11 @@
 //!      to `flights`: the referee's events, track and samples
 //!      to `render`: the newest motions of all vehicles
 //! ```
-//! Imports `flights` only.
+//! Imports `flights`, and `scene` for the file that names the sources.
 
 pub mod drivers;
 pub mod newest;
+pub mod settings;
 pub mod thread;
 mod vehicle;
 

@@ -25,7 +25,6 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use tracing::{info, warn};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::format::{self, Loaded, Progress};
 use vizflyt_splat::{RigidObject, Splats};
@@ -80,12 +79,19 @@ pub fn load_objects(path: &Path, seed: u64) -> Result<(Vec<RigidObject>, MovingO
     }
 }
 
-/// Returns where an arena's poses come from, as its file says; a bare scene says nothing.
-pub fn localization(path: &Path) -> Result<Vec<LocalizationConfig>> {
+/// Returns the path and the text of an `arena.toml`, given it or its folder; `None` for a bare scene.
+pub(crate) fn arena_text(path: &Path) -> Result<Option<(PathBuf, String)>> {
     match named(path)? {
-        Named::Arena(path) => Ok(read_arena(&path)?.localization),
-        Named::Scene(_) => Ok(Vec::new()),
+        Named::Arena(path) => {
+            let text = read_text(&path)?;
+            Ok(Some((path, text)))
+        }
+        Named::Scene(_) => Ok(None),
     }
+}
+
+fn read_text(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
 fn named(path: &Path) -> Result<Named> {
@@ -111,9 +117,7 @@ fn named(path: &Path) -> Result<Named> {
 }
 
 fn read_arena(path: &Path) -> Result<ArenaConfig> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    ArenaConfig::parse(&text).with_context(|| format!("{} is wrong", path.display()))
+    ArenaConfig::parse(&read_text(path)?).with_context(|| format!("{} is wrong", path.display()))
 }
 
 /// Returns an arena and where its scene lies.

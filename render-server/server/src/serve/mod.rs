@@ -16,7 +16,6 @@ use quinn::Endpoint;
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use tracing::warn;
-use vizflyt_arena::config::Driver;
 use vizflyt_protocol::messages::Grant;
 use vizflyt_trust::KeysFolder;
 
@@ -31,10 +30,11 @@ use crate::flights::{self, Flights};
 use crate::lock::lock;
 use crate::poses::Localization;
 use crate::poses::drivers::{self, Opened};
+use crate::poses::settings::{self, Driver};
 use crate::render::cameras::Cameras;
 use crate::render::environment::Environment;
 use crate::render::{RendererInfo, Rendering};
-use crate::scene::{self, Scenes};
+use crate::scene::Scenes;
 use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
 use crate::web::messages::Rates;
@@ -205,7 +205,7 @@ async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) ->
         let bound = async {
             let endpoint = transport::bind(args.quic, &authorizer.identity, args.congestion)?;
             let listener = web::bind(args.http).await?;
-            let sources = drivers::open(&args.localization(scene::localization(&args.arena)?))?;
+            let sources = drivers::open(&args.localization(settings::of_arena(&args.arena)?))?;
             anyhow::Ok(Sockets { endpoint, listener, sources })
         };
         match bound.await {

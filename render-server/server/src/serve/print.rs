@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::Driver;
 use vizflyt_arena::pose::PoseQuality;
 
 use crate::flights::events::Origin;
 use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
 use crate::poses::drivers::{Opened, SourceCounters};
+use crate::poses::settings::Driver;
 use crate::stream::Rooms;
 use crate::stream::delivery::CameraDelivery;
 use crate::stream::vehicle::ImageCounters;

@@ -12,8 +12,10 @@ use std::collections::VecDeque;
 use std::f64::consts::FRAC_PI_2;
 
 use glam::{DQuat, DVec3};
-use vizflyt_arena::config::{Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis};
 use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
+use vizflyt_server::poses::settings::{
+    Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis,
+};
 
 use super::words::direction;
 

@@ -17,14 +17,14 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::time::ServerTime;
 
 use super::sender_clock::SenderClock;
+use super::source::{Measurement, SourceCounters, TagsSeen};
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
-use super::source::{Measurement, SourceCounters, TagsSeen};
+use crate::poses::settings::LocalizationConfig;
 
 /// A packet, as it is written.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

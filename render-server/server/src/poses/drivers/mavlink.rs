@@ -10,7 +10,7 @@
 use std::net::SocketAddr;
 
 use glam::{DQuat, DVec3};
-use vizflyt_arena::config::{LocalizationConfig, MAX_VEHICLES};
+use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::mavlink::dialect::{
     ATTITUDE_QUATERNION_DATA, COMMAND_LONG_DATA, MavCmd, MavFrame, MavMessage, ODOMETRY_DATA,
@@ -22,9 +22,10 @@ use vizflyt_protocol::mavlink::{
 use vizflyt_protocol::time::ServerTime;
 
 use super::sender_clock::SenderClock;
+use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
-use super::source::{Measurement, SourceCounters};
+use crate::poses::settings::LocalizationConfig;
 
 /// Selects our vehicles' autopilots.
 pub struct MavlinkStream {

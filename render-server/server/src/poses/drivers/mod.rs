@@ -23,15 +23,15 @@ pub mod vicon;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs};
 
 use anyhow::{Context, Result};
-use vizflyt_arena::config::{Driver, LocalizationConfig};
 
 use self::json::JsonStream;
 use self::mavlink::MavlinkStream;
 use self::multi_source::MultiSource;
-pub use self::source::{Measurement, PoseSource, SourceCounters, TagsSeen};
 use self::natnet::{COMMAND_PORT, Motive, NatnetStream};
+pub use self::source::{Measurement, PoseSource, SourceCounters, TagsSeen};
 use self::udp::UdpPort;
 use self::vicon::ViconStream;
+use crate::poses::settings::{Driver, LocalizationConfig};
 
 /// A source whose address is taken, and which waits for the names of the vehicles.
 #[derive(Debug)]

@@ -19,13 +19,13 @@ use natnet::{
     Decoder, FrameOfData, Message, MessageHeader, NAT_FRAMEOFDATA, NAT_MODELDEF, NAT_SERVERINFO,
     ParsePolicy, RigidBody, ServerInfo, Version,
 };
-use vizflyt_arena::config::LocalizationConfig;
 use vizflyt_protocol::time::ServerTime;
 
 use super::sender_clock::SenderClock;
+use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
-use super::source::{Measurement, SourceCounters};
+use crate::poses::settings::LocalizationConfig;
 
 /// Who Motive is, and how it streams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use socket2::{Domain, Protocol, Socket, Type};
-use vizflyt_arena::config::Driver;
 use vizflyt_protocol::time::ServerTime;
 
 use super::source::{Measurement, PoseSource, SourceCounters};
 use crate::clock;
+use crate::poses::settings::Driver;
 
 /// What is behind the socket: bytes in, poses out. Sans-IO.
 pub trait PoseStream: Send {
@@ -207,7 +207,7 @@ const FIRST_SILENCE_S: f64 = 5.0;
 mod tests {
     use super::*;
     use crate::poses::drivers::vicon::ViconStream;
-    use vizflyt_arena::config::LocalizationConfig;
+    use crate::poses::settings::LocalizationConfig;
 
     #[test]
     fn a_stream_over_a_real_socket_is_read_and_its_end_noticed() {

@@ -5,12 +5,13 @@ use std::collections::VecDeque;
 use std::fmt::Display;
 
 use glam::{DMat3, DQuat, DVec3};
-use vizflyt_arena::config::{Alignment, Driver, LocalizationConfig, MAX_VEHICLES};
+use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_arena::pose::PoseSigma;
 use vizflyt_protocol::time::ServerTime;
 
 use super::frame_clock::FrameClock;
 use super::source::{Measurement, SourceCounters};
+use crate::poses::settings::{Alignment, Driver, LocalizationConfig};
 
 /// The vehicles of one stream.
 #[derive(Debug)]

@@ -18,12 +18,13 @@
 //! reveals ([`super::frame_clock`]). The constant part of Tracker's own delay (a few ms) stays in.
 
 use glam::DVec3;
-use vizflyt_arena::config::{Euler, LocalizationConfig, MAX_VEHICLES};
+use vizflyt_arena::config::MAX_VEHICLES;
 use vizflyt_protocol::time::ServerTime;
 
+use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{MOST_NAMES, VehicleNames};
-use super::source::{Measurement, SourceCounters};
+use crate::poses::settings::{Euler, LocalizationConfig};
 
 /// One object of a packet.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,7 +1,7 @@
 use super::*;
+use crate::poses::settings::Driver;
 use glam::DQuat;
 use proptest::prelude::*;
-use vizflyt_arena::config::Driver;
 
 fn stream(vehicles: &[&str]) -> ViconStream {
     ViconStream::new(&LocalizationConfig::new(Driver::Vicon), 0, vehicles)

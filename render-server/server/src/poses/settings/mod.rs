@@ -8,17 +8,22 @@
 //! Each setting is something a person can see in the room, so that `vizflyt doctor localization`
 //! can name the one to change.
 
+mod driver;
+
 use std::collections::BTreeMap;
 use std::fmt;
 use std::net::Ipv4Addr;
+use std::path::Path;
 use std::str::FromStr;
 
+use anyhow::{Context, Result};
 use glam::{DMat3, DQuat, DVec3, EulerRot};
 use serde::{Deserialize, Serialize};
+use vizflyt_arena::config::{ConfigError, check_number, check_position, invalid};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
-use super::ArenaConfig;
-use super::validate::{ConfigError, check_number, check_position, invalid};
+pub use self::driver::Driver;
+use crate::scene;
 
 /// `[[localization]]`: one source of poses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -56,57 +61,6 @@ pub struct LocalizationConfig {
     /// NatNet by multicast: our address in the network that it comes from, where there are several.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub interface: Option<Ipv4Addr>,
-}
-
-/// Who sends poses.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Driver {
-    /// Vicon Tracker's UDP object stream.
-    Vicon,
-    /// OptiTrack Motive's NatNet 3 and 4.
-    Natnet,
-    /// VizFlyt's own pose packet: JSON over UDP, from any program.
-    Json,
-    /// An autopilot's own estimate over MAVLink.
-    Mavlink,
-}
-
-impl Driver {
-    /// Every driver.
-    pub const ALL: [Self; 4] = [Self::Vicon, Self::Natnet, Self::Json, Self::Mavlink];
-
-    /// Returns the name by which it is chosen.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Vicon => "vicon",
-            Self::Natnet => "natnet",
-            Self::Json => "json",
-            Self::Mavlink => "mavlink",
-        }
-    }
-
-    /// Returns where its stream usually arrives.
-    pub fn usual_address(self) -> &'static str {
-        match self {
-            Self::Vicon => "0.0.0.0:51001",
-            // Motive's multicast group and data port, unless someone changed them.
-            Self::Natnet => "239.255.42.99:1511",
-            Self::Json => "0.0.0.0:51002",
-            Self::Mavlink => "0.0.0.0:14560",
-        }
-    }
-
-    /// Returns the length unit that it has unless somebody changed it.
-    pub fn usual_units(self) -> Units {
-        if self == Self::Vicon { Units::Millimetres } else { Units::Metres }
-    }
-}
-
-impl fmt::Display for Driver {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
 }
 
 /// A length unit.
@@ -415,7 +369,7 @@ impl Alignment {
     ///
     /// ```
     /// use glam::{DQuat, DVec3};
-    /// use vizflyt_arena::config::LocalizationConfig;
+    /// use vizflyt_server::poses::settings::LocalizationConfig;
     /// // Motive as installed, y up: 1 m up is y, and a turn to the left is one about y.
     /// let config = LocalizationConfig::parse("natnet:1.2.3.4,up=y").unwrap();
     /// let left = DQuat::from_rotation_y(0.5);
@@ -504,7 +458,7 @@ impl LocalizationConfig {
             format!(
                 "{}; write DRIVER:ADDRESS,KEY=VALUE; drivers are {}",
                 error.message(),
-                Driver::ALL.map(Driver::name).join(", ")
+                Driver::names()
             )
         })?;
         config.check("--pose").map_err(|error| error.to_string())?;
@@ -542,13 +496,14 @@ impl LocalizationConfig {
             let advice = "`up` is a short form of `axes`: leave one of them out";
             return Err(invalid(format!("{key}.axes"), axes, advice));
         }
-        if self.euler.is_some() && self.driver != Driver::Vicon {
-            let advice = "only Vicon streams angles; the others stream quaternions";
-            return Err(invalid(format!("{key}.euler"), self.euler.unwrap_or_default(), advice));
-        }
-        if let Some(interface) = self.interface.filter(|_| self.driver != Driver::Natnet) {
-            let advice = "only NatNet comes by multicast; for others, put it into `address`";
-            return Err(invalid(format!("{key}.interface"), interface, advice));
+        let own = [
+            ("euler", self.euler.map(|euler| euler.to_string())),
+            ("interface", self.interface.map(|address| address.to_string())),
+        ];
+        for (name, value) in own {
+            if let (Some(value), Some(advice)) = (value, self.driver.refuses(name)) {
+                return Err(invalid(format!("{key}.{name}"), value, advice));
+            }
         }
         check_position(&format!("{key}.offset.position_m"), self.offset.position_m)?;
         check_position(&format!("{key}.pivot_m"), self.pivot_m)?;
@@ -594,21 +549,39 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
-impl ArenaConfig {
-    pub(super) fn check_localization(&self) -> Result<(), ConfigError> {
-        if self.localization.len() > MAX_SOURCES {
-            let advice = format!("give at most {MAX_SOURCES} [[localization]]");
-            return Err(invalid(
-                "localization",
-                format!("{} of them", self.localization.len()),
-                advice,
-            ));
-        }
-        self.localization
-            .iter()
-            .enumerate()
-            .try_for_each(|(index, source)| source.check(&format!("localization[{index}]")))
+/// The part of `arena.toml` that is read here; the rest is the arena's.
+#[derive(Deserialize)]
+struct ArenaToml {
+    #[serde(default)]
+    localization: Vec<LocalizationConfig>,
+}
+
+/// Reads every `[[localization]]` of the text of an `arena.toml`.
+///
+/// # Errors
+/// Points at the line: unknown keys, values that cannot work, more than [`MAX_SOURCES`].
+pub fn read_all(arena_toml: &str) -> Result<Vec<LocalizationConfig>, ConfigError> {
+    let ArenaToml { localization } = toml::from_str(arena_toml)?;
+    check_all(&localization).map_err(|error| error.in_text(arena_toml))?;
+    Ok(localization)
+}
+
+fn check_all(sources: &[LocalizationConfig]) -> Result<(), ConfigError> {
+    if sources.len() > MAX_SOURCES {
+        let advice = format!("give at most {MAX_SOURCES} [[localization]]");
+        return Err(invalid("localization", format!("{} of them", sources.len()), advice));
     }
+    let mut sources = sources.iter().enumerate();
+    sources.try_for_each(|(index, source)| source.check(&format!("localization[{index}]")))
+}
+
+/// Returns the sources of poses of an arena, by its file or folder; a bare scene names none.
+///
+/// # Errors
+/// A file that cannot be read, or as [`read_all`].
+pub fn of_arena(path: &Path) -> Result<Vec<LocalizationConfig>> {
+    let Some((path, text)) = scene::arena_text(path)? else { return Ok(Vec::new()) };
+    read_all(&text).with_context(|| format!("{} is wrong", path.display()))
 }
 
 /// Sources of one server at most.

@@ -145,3 +145,20 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn the_file_is_read_strictly_and_errors_name_the_line() {
+    let arena = "name = \"x\"\n[[localization]]\ndriver = \"vicon\"\n[[localization]]\n";
+    let read = |rest: &str| read_all(&format!("{arena}{rest}")).map_err(|e| e.to_string());
+    let found = read("driver = \"json\"\n").unwrap();
+    assert_eq!(found.iter().map(|c| c.driver).collect::<Vec<_>>(), [Driver::Vicon, Driver::Json]);
+    let unknown = read("driver = \"json\"\ncolour = 1\n").unwrap_err();
+    assert!(unknown.contains("line 6") && unknown.contains("colour"), "{unknown}");
+    let wrong = read("driver = \"json\"\neuler = \"zyx\"\n").unwrap_err();
+    assert!(wrong.contains("localization[1].euler = zyx: only Vicon"), "{wrong}");
+    assert!(wrong.contains("(line 6)"), "{wrong}");
+    let many = "[[localization]]\ndriver = \"json\"\n".repeat(MAX_SOURCES + 1);
+    let many = read_all(&many).unwrap_err().to_string();
+    assert!(many.contains("give at most 8 [[localization]]"), "{many}");
+    assert_eq!(read_all("name = \"x\"").unwrap(), []);
+}

@@ -1,0 +1,130 @@
+//! The registry of pose drivers: what each is called, and its usual settings. What opens a driver's
+//! socket and reads its stream is matched to it in [`crate::poses::drivers`].
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::Units;
+
+/// Who sends poses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Driver {
+    /// Vicon Tracker's UDP object stream.
+    Vicon,
+    /// OptiTrack Motive's NatNet 3 and 4.
+    Natnet,
+    /// VizFlyt's own pose packet: JSON over UDP, from any program.
+    Json,
+    /// An autopilot's own estimate over MAVLink.
+    Mavlink,
+}
+
+/// What is known of a driver without its code.
+struct Entry {
+    driver: Driver,
+    name: &'static str,
+    usual_address: &'static str,
+    usual_units: Units,
+    /// Keys of `[[localization]]` that only this driver has, and why no other has them.
+    own_keys: &'static [(&'static str, &'static str)],
+}
+
+/// One line for each driver.
+const REGISTRY: [Entry; 4] = [
+    Entry {
+        driver: Driver::Vicon,
+        name: "vicon",
+        usual_address: "0.0.0.0:51001",
+        usual_units: Units::Millimetres,
+        own_keys: &[("euler", "only Vicon streams angles; the others stream quaternions")],
+    },
+    Entry {
+        driver: Driver::Natnet,
+        name: "natnet",
+        // Motive's multicast group and data port, unless someone changed them.
+        usual_address: "239.255.42.99:1511",
+        usual_units: Units::Metres,
+        own_keys: &[(
+            "interface",
+            "only NatNet comes by multicast; for others, put it into `address`",
+        )],
+    },
+    Entry {
+        driver: Driver::Json,
+        name: "json",
+        usual_address: "0.0.0.0:51002",
+        usual_units: Units::Metres,
+        own_keys: &[],
+    },
+    Entry {
+        driver: Driver::Mavlink,
+        name: "mavlink",
+        usual_address: "0.0.0.0:14560",
+        usual_units: Units::Metres,
+        own_keys: &[],
+    },
+];
+
+impl Driver {
+    /// Returns every driver.
+    pub fn all() -> impl Iterator<Item = Self> {
+        REGISTRY.iter().map(|entry| entry.driver)
+    }
+
+    /// Returns the names of all drivers, for help and errors: `vicon, natnet`.
+    pub fn names() -> String {
+        Self::all().map(Self::name).collect::<Vec<_>>().join(", ")
+    }
+
+    fn entry(self) -> &'static Entry {
+        // The registry is in the order of the variants; a test holds it to that.
+        &REGISTRY[self as usize]
+    }
+
+    /// Returns the name by which it is chosen.
+    pub fn name(self) -> &'static str {
+        self.entry().name
+    }
+
+    /// Returns the address at which its stream usually arrives.
+    pub fn usual_address(self) -> &'static str {
+        self.entry().usual_address
+    }
+
+    /// Returns the length unit that it has unless somebody changed it.
+    pub fn usual_units(self) -> Units {
+        self.entry().usual_units
+    }
+
+    /// Returns why a key of `[[localization]]` is refused for this driver; `None` if it is not.
+    pub(super) fn refuses(self, key: &str) -> Option<&'static str> {
+        let mut owned = REGISTRY.iter().flat_map(|entry| {
+            entry.own_keys.iter().map(|&(own, reason)| (entry.driver, own, reason))
+        });
+        let (driver, _, reason) = owned.find(|(_, own, _)| *own == key)?;
+        (driver != self).then_some(reason)
+    }
+}
+
+impl fmt::Display for Driver {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_registry_has_every_driver_once_and_the_guide_lists_it() {
+        let guide = include_str!("../../../../../docs/guides/localization.md");
+        for (index, driver) in Driver::all().enumerate() {
+            assert_eq!(driver as usize, index);
+            assert_eq!(toml::Value::try_from(driver).unwrap().as_str(), Some(driver.name()));
+            assert!(guide.contains(&format!("`{driver}`")), "the guide does not name `{driver}`");
+        }
+    }
+}
