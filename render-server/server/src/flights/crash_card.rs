@@ -79,3 +79,49 @@ impl CrashCard {
         Some(&self.shots.get(camera)?.get(number)?.preview)
     }
 }
+
+/// Returns what the page reads of cards, for the check of its scripts.
+#[cfg(test)]
+pub(crate) fn examples() -> Vec<serde_json::Value> {
+    let verdict = |passed_s| Verdict {
+        outcome: vizflyt_protocol::messages::OutcomeKind::Collided,
+        reason: "a sentence".to_owned(),
+        stages_passed: 0,
+        stages: vec![vizflyt_arena::verdict::StageVerdict { name: "gate".to_owned(), passed_s }],
+        seconds: 9.0,
+        penalty_s: 0.0,
+        score: 0.0,
+        min_clearance_m: passed_s,
+        max_speed_mps: 1.0,
+        path_m: 9.0,
+    };
+    let sample = |clearance_m| CardSample {
+        before_s: 0.1,
+        p_world_m: [0.0; 3],
+        v_world_mps: [0.0; 3],
+        yaw_rad: 0.0,
+        clearance_m,
+    };
+    let card = |some: Option<f64>| CrashCard {
+        id: 1,
+        vehicle: "vizflyt".to_owned(),
+        course: "race".to_owned(),
+        ended_unix_ms: 0,
+        event: Event {
+            stamp: vizflyt_protocol::time::ServerTime::from_ns(1),
+            kind: vizflyt_protocol::messages::EventKind::TimeLimit,
+            text: "a sentence".try_into().unwrap(),
+        },
+        verdict: verdict(some),
+        cause: "a sentence".to_owned(),
+        images: vec![CardImages { camera: "front".to_owned(), before_s: vec![0.1] }],
+        samples: vec![sample(some)],
+        clearance_svg: "<svg/>".to_owned(),
+        top_svg: "<svg/>".to_owned(),
+        top_height_m: 1.0,
+        events: vec![CardEvent { before_s: 0.1, text: "a sentence".to_owned() }],
+        printed: vec!["a line".to_owned()],
+        shots: Vec::new(),
+    };
+    vec![serde_json::json!(card(Some(1.0))), serde_json::json!(card(None))]
+}

@@ -73,3 +73,9 @@ fn told(now: EnvironmentConfig) -> Told {
     let names = EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect();
     Told { name: now.name(), now, names }
 }
+
+#[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    let own = EnvironmentConfig { fog_visibility_m: 7.5, ..EnvironmentConfig::default() };
+    [EnvironmentConfig::default(), own].map(|now| serde_json::json!(told(now))).into()
+}

@@ -189,3 +189,71 @@ fn failed(error: &LeaderboardError) -> Response {
 
 /// Runs that the page lists.
 const NEWEST: usize = 20;
+
+#[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    use crate::flights::leaderboard::{GradeEntry, GradePlace, RunState};
+
+    let place = |seconds| Standing {
+        rank: 1,
+        team: "wasps".to_owned(),
+        stages_passed: 1,
+        stages: 2,
+        seconds,
+        runs: 1,
+        run: "1".to_owned(),
+    };
+    let grade = |median_s| GradeEntry {
+        team: "wasps".to_owned(),
+        hash: "f00d".to_owned(),
+        plugin_sha256: "f00d".to_owned(),
+        project: "p4".to_owned(),
+        level: "ug".to_owned(),
+        conditions: "day".to_owned(),
+        flights: 1,
+        finished: 1,
+        stages: 2,
+        mean_stages_passed: 1.0,
+        median_s,
+        score: 50.0,
+    };
+    let graded = |median_s| GradeBoard {
+        project: "p4".to_owned(),
+        level: "ug".to_owned(),
+        conditions: "day".to_owned(),
+        places: vec![GradePlace { rank: 1, grades: 1, best: grade(median_s) }],
+    };
+    let run = |team: Option<String>, ended_unix_ms, seconds| Run {
+        id: "1".to_owned(),
+        team,
+        course: "race".to_owned(),
+        vehicle: "vizflyt".to_owned(),
+        attempt: Attempt::Official,
+        state: RunState::Ended,
+        began_unix_ms: 0,
+        ended_unix_ms,
+        outcome: "landed".to_owned(),
+        stages_passed: 1,
+        stages: 2,
+        seconds,
+        penalty_s: 0.0,
+        min_clearance_m: seconds,
+    };
+    let flyer = |team, flight_s| Flyer {
+        vehicle: "vizflyt".to_owned(),
+        team,
+        attempt: Attempt::Practice,
+        phase: FlightPhase::Flying,
+        flight_s,
+    };
+    let wasps = || Some("wasps".to_owned());
+    let board = Board {
+        course: "race".to_owned(),
+        official: vec![place(Some(9.0)), place(None)],
+        practice: vec![place(Some(9.0)), place(None)],
+        graded: vec![graded(Some(9.0)), graded(None)],
+        newest: vec![run(wasps(), Some(1), Some(9.0)), run(None, None, None)],
+        vehicles: vec![flyer(wasps(), Some(1.0)), flyer(None, None)],
+    };
+    vec![serde_json::json!(board)]
+}

@@ -247,6 +247,19 @@ const MOST_KIB: u32 = 256 << 10;
 const MOST_PASSES: u32 = 32;
 
 #[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    let full = Standing {
+        role: Some("instructor"),
+        vehicle: Some("vizflyt"),
+        by: Some("password"),
+        token: Some("f00d".to_owned()),
+        password: true,
+    };
+    let sparse = Standing { role: None, vehicle: None, by: None, token: None, password: false };
+    vec![serde_json::json!(full), serde_json::json!(sparse)]
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 

@@ -33,7 +33,7 @@ pub(super) enum Message<'a> {
         cameras: Vec<CameraLine>,
     },
     /// (x, y, z [m, world], speed [m/s]), oldest first.
-    Trail {
+    Track {
         points: &'a [[f32; 4]],
     },
     Events {
@@ -293,3 +293,8 @@ fn objects(moving: &DynamicObjects, now: ServerTime) -> Vec<ObjectLine> {
 fn since_start_s(page: &Page, stamp: ServerTime) -> f64 {
     stamp.seconds_since(page.boot).max(0.0)
 }
+
+#[cfg(test)]
+mod examples;
+#[cfg(test)]
+mod typescript;

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! GET /            the page (no framework, nothing fetched from elsewhere)
-//! GET /ws?vehicle=V   WebSocket: JSON text (arena, trail, events, state at 20 Hz) and binary
+//! GET /ws?vehicle=V   WebSocket: JSON text (arena, track, events, state at 20 Hz) and binary
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
 //!                  vehicle, if none is named
 //! GET /api/map     the top view: a JPEG drawn at the start

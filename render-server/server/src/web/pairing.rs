@@ -104,3 +104,16 @@ fn tell(page: &Page) -> Response {
     response.headers_mut().insert(axum::http::header::CACHE_CONTROL, no_store);
     response
 }
+
+#[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    let open = Open {
+        code: "123 456".to_owned(),
+        right: "instructor".to_owned(),
+        left_s: 60.0,
+        tries_left: 3,
+    };
+    let standing =
+        |open| serde_json::json!(PairingStatus { open, news: String::new(), port: 4433 });
+    vec![standing(Some(open)), standing(None)]
+}

@@ -47,33 +47,34 @@ impl Rights {
     }
 }
 
-/// The page's own files: path, type, text.
-const FILES: &[(&str, &str, &str)] = &[
-    ("/", "text/html; charset=utf-8", INDEX),
-    ("/style.css", "text/css; charset=utf-8", STYLE),
-    ("/app.js", "text/javascript; charset=utf-8", APP),
-    ("/map.js", "text/javascript; charset=utf-8", MAP),
-    ("/space.js", "text/javascript; charset=utf-8", SPACE),
-    ("/controls.js", "text/javascript; charset=utf-8", CONTROLS),
-    ("/three.module.min.js", "text/javascript; charset=utf-8", THREE),
-    ("/three.core.min.js", "text/javascript; charset=utf-8", THREE_CORE),
-    ("/cameras.js", "text/javascript; charset=utf-8", CAMERAS),
-    ("/waterfall.js", "text/javascript; charset=utf-8", WATERFALL),
-    ("/crash.js", "text/javascript; charset=utf-8", CRASH),
-    ("/pairing.js", "text/javascript; charset=utf-8", PAIRING),
-    ("/leaderboard.js", "text/javascript; charset=utf-8", LEADERBOARD),
-    ("/standings.js", "text/javascript; charset=utf-8", STANDINGS),
-    ("/wall", "text/html; charset=utf-8", WALL),
-    ("/wall.css", "text/css; charset=utf-8", WALL_STYLE),
-    ("/wall.js", "text/javascript; charset=utf-8", WALL_SCRIPT),
-    ("/icon.svg", "image/svg+xml", ICON),
-];
+/// The page's own files: path and text, as the build script finds them.
+pub(super) const FILES: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/page_files.rs"));
+
+/// Where a file of the page is served, and as what.
+fn served(file: &'static str) -> (&'static str, &'static str) {
+    let kind = match file.rsplit_once('.').map_or("", |(_, kind)| kind) {
+        "html" => "text/html; charset=utf-8",
+        "css" => "text/css; charset=utf-8",
+        "svg" => "image/svg+xml",
+        _ => "text/javascript; charset=utf-8",
+    };
+    // People type the addresses of documents.
+    let path = match file {
+        "/index.html" => "/",
+        "/wall.html" => "/wall",
+        other => other,
+    };
+    (path, kind)
+}
 
 fn table() -> Vec<Route> {
     use Takes::{Everything, Key, Nothing, Vehicle};
     let mut routes: Vec<_> = FILES
         .iter()
-        .map(|&(path, kind, text)| read(path, Nothing, async move || file(kind, text)))
+        .map(|&(name, text)| {
+            let (path, kind) = served(name);
+            read(path, Nothing, async move || file(kind, text))
+        })
         .collect();
     routes.extend([
         read("/enter", Nothing, access::enter),
@@ -167,23 +168,3 @@ pub fn list() -> Vec<(String, &'static str, Takes)> {
     let line = |route: Route| (route.method.to_string(), route.path, route.rule.takes);
     table().into_iter().map(line).collect()
 }
-
-pub(super) const INDEX: &str = include_str!("page/index.html");
-const STYLE: &str = include_str!("page/style.css");
-pub(super) const APP: &str = include_str!("page/app.js");
-pub(super) const SPACE: &str = include_str!("page/space.js");
-pub(super) const CONTROLS: &str = include_str!("page/controls.js");
-/// three.js 0.180.0, as its npm package has it (page/three/README.md).
-const THREE: &str = include_str!("page/three/three.module.min.js");
-const THREE_CORE: &str = include_str!("page/three/three.core.min.js");
-pub(super) const CAMERAS: &str = include_str!("page/cameras.js");
-pub(super) const CRASH: &str = include_str!("page/crash.js");
-pub(super) const PAIRING: &str = include_str!("page/pairing.js");
-pub(super) const MAP: &str = include_str!("page/map.js");
-pub(super) const WATERFALL: &str = include_str!("page/waterfall.js");
-const LEADERBOARD: &str = include_str!("page/leaderboard.js");
-const STANDINGS: &str = include_str!("page/standings.js");
-const WALL: &str = include_str!("page/wall.html");
-const WALL_STYLE: &str = include_str!("page/wall.css");
-const WALL_SCRIPT: &str = include_str!("page/wall.js");
-const ICON: &str = super::ICON;

@@ -73,3 +73,11 @@ pub(super) async fn change(
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
+
+#[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    let scenes = vec!["room".to_owned()];
+    [Some("room".to_owned()), None]
+        .map(|now| serde_json::json!(Choice { now, scenes: scenes.clone() }))
+        .into()
+}

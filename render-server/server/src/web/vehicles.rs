@@ -140,3 +140,14 @@ fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
 
 /// Who gives the orders of this file, as events name it.
 const BY: &str = "the page";
+
+#[cfg(test)]
+pub(super) fn examples() -> Vec<serde_json::Value> {
+    let line = |runtime| VehicleLine {
+        name: "vizflyt".to_owned(),
+        phase: FlightPhase::Flying,
+        runtime,
+        cameras: vec!["front".to_owned()],
+    };
+    vec![serde_json::json!(line(Some("vizflyt".to_owned()))), serde_json::json!(line(None))]
+}

@@ -67,7 +67,7 @@ async fn send_all(page: &Page, vehicle: &VehicleFlight, socket: &mut WebSocket) 
     let (entries, mut cursor) = vehicle.events.newest(HISTORY);
     send_json(socket, &messages::arena(page, vehicle)).await?;
     let points = lock(&vehicle.track).points.clone();
-    send_json(socket, &messages::Message::Trail { points: &points }).await?;
+    send_json(socket, &messages::Message::Track { points: &points }).await?;
     send_json(socket, &messages::events(page, entries)).await?;
     let mut previews = page.previews.subscribe(vehicle.index);
     for preview in &mut previews {

@@ -1,57 +1,63 @@
 // The leaderboard: what the server says of it, and rows of a table for the page and the wall.
 
-/** Asks for the standings; null where no runs are kept or nobody may see them. */
-export async function ask() {
+import { make } from "./dom.js";
+
+/** @typedef {import("./messages").Leaderboard} Leaderboard */
+
+/**
+ * Fetches the standings; null where no runs are kept or the viewer may not see them.
+ * @returns {Promise<Leaderboard | null>}
+ */
+export async function fetchLeaderboard() {
   const answer = await fetch("/api/leaderboard");
   return answer.ok ? answer.json() : null;
 }
 
-const cell = (text) => Object.assign(document.createElement("td"), { textContent: text });
+/** @param {(string | number)[]} texts */
+const makeRow = (...texts) => make("tr", {}, ...texts.map((text) => make("td", { textContent: String(text) })));
+/** @param {number | null} s */
+const seconds = (s) => (s == null ? "–" : `${s.toFixed(2)} s`);
 
-/** Fills a table's body with places. */
-export function fill(body, places) {
-  const rows = places.map((place) => {
-    const row = document.createElement("tr");
-    if (place.rank === 1) row.className = "first";
-    const time = place.seconds == null ? "–" : `${place.seconds.toFixed(2)} s`;
-    row.append(cell(place.rank), cell(place.team), cell(`${place.stages_passed}/${place.stages}`), cell(time));
+/**
+ * Fills a table's body with places.
+ * @param {HTMLElement} body
+ * @param {Leaderboard["official"]} places
+ */
+export function fillPlaces(body, places) {
+  const rows = places.map(({ rank, team, stages_passed, stages, seconds: s }) => {
+    const row = makeRow(rank, team, `${stages_passed}/${stages}`, seconds(s));
+    row.className = rank === 1 ? "first" : "";
     return row;
   });
-  if (!rows.length) {
-    const row = document.createElement("tr");
-    row.className = "none";
-    row.append(Object.assign(cell("nobody yet"), { colSpan: 4 }));
-    rows.push(row);
-  }
+  if (!rows.length) rows.push(make("tr", { className: "none" }, make("td", { textContent: "nobody yet", colSpan: 4 })));
   body.replaceChildren(...rows);
 }
 
-/** Fills a node with the standings of signed grades: a table for each course and conditions. */
+/**
+ * Fills a node with the standings of signed grades: a table for each course and conditions.
+ * @param {HTMLElement} node
+ * @param {Leaderboard["graded"]} boards
+ */
 export function fillGrades(node, boards) {
   const parts = boards.flatMap(({ project, level, conditions, places }) => {
     const rows = places.map(({ rank, team, mean_stages_passed, stages, finished, flights, median_s }) => {
-      const row = document.createElement("tr");
-      if (rank === 1) row.className = "first";
-      const time = median_s == null ? "–" : `${median_s.toFixed(2)} s`;
-      row.append(cell(rank), cell(team), cell(`${mean_stages_passed.toFixed(2)}/${stages}`), cell(`${finished} of ${flights}`), cell(time));
+      const row = makeRow(rank, team, `${mean_stages_passed.toFixed(2)}/${stages}`, `${finished} of ${flights}`, seconds(median_s));
+      row.className = rank === 1 ? "first" : "";
       return row;
     });
-    const title = Object.assign(document.createElement("h3"), { textContent: `graded: ${project} ${level}, ${conditions}` });
-    const table = document.createElement("table"), heads = document.createElement("tr"), body = document.createElement("tbody");
-    const head = (textContent) => Object.assign(document.createElement("th"), { textContent, scope: "col" });
-    heads.append(...["place", "team", "stages", "finished", "time"].map(head));
-    table.createTHead().append(heads);
-    body.append(...rows);
-    table.append(body);
-    return [title, table];
+    const heads = ["place", "team", "stages", "finished", "time"].map((textContent) => make("th", { textContent, scope: "col" }));
+    const title = make("h3", { textContent: `graded: ${project} ${level}, ${conditions}` });
+    return [title, make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...rows))];
   });
   node.replaceChildren(...parts);
 }
 
-/** Who flies now, in a sentence; empty if nobody. */
-export function flying(vehicles) {
+/**
+ * Returns who flies now, in a sentence; empty if nobody.
+ * @param {Leaderboard["vehicles"]} vehicles
+ */
+export function flyingText(vehicles) {
   return vehicles
-    .filter(({ flight_s }) => flight_s != null)
-    .map(({ team, vehicle, attempt, flight_s }) => `${team ?? vehicle}, ${attempt}: ${flight_s.toFixed(1)} s`)
+    .flatMap(({ team, vehicle, attempt, flight_s }) => (flight_s == null ? [] : [`${team ?? vehicle}, ${attempt}: ${flight_s.toFixed(1)} s`]))
     .join(" · ");
 }

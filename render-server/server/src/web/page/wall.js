@@ -1,28 +1,28 @@
 // The wall view: the standings, large, and who flies; asks every second, shows and can do nothing else.
-import { ask, fill, fillGrades, flying } from "/standings.js";
 
-const $ = (id) => document.getElementById(id);
-const light = matchMedia("(prefers-color-scheme: light)");
-const theme = () => (document.documentElement.dataset.theme = localStorage.getItem("theme") ?? (light.matches ? "light" : "dark"));
-light.addEventListener("change", theme);
-theme();
+import { $ } from "./dom.js";
+import { fetchLeaderboard, fillGrades, fillPlaces, flyingText } from "./standings.js";
+import { followTheme } from "./theme.js";
 
-async function show() {
+const EVERY_MS = 1000;
+
+async function refresh() {
   try {
-    const board = await ask();
+    const board = await fetchLeaderboard();
     $("said").textContent = board ? "" : "no standings: are runs kept here, and are you logged in?";
     if (board) {
       $("course").textContent = board.course;
       document.title = `${board.course} – VizFlyt leaderboard`;
-      fill($("official"), board.official);
-      fill($("practice"), board.practice);
+      fillPlaces($("official"), board.official);
+      fillPlaces($("practice"), board.practice);
       fillGrades($("graded"), board.graded);
       $("graded-panel").hidden = !board.graded.length;
-      $("flying").textContent = flying(board.vehicles);
+      $("flying").textContent = flyingText(board.vehicles);
     }
   } catch {
     $("said").textContent = "the server cannot be reached";
   }
-  setTimeout(show, 1000);
+  setTimeout(refresh, EVERY_MS);
 }
-show();
+followTheme();
+refresh();

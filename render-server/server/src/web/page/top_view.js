@@ -1,31 +1,57 @@
-// The top view: fence, obstacles at flight height, goal, gates, trail, vehicle. World x is right,
-// y is up; [m, world] throughout.
+// The top view: fence, obstacles at flight height, goal, gates, track, vehicle. World x is right, y is up; [m, world]
+// throughout.
+
+import { context2d, make } from "./dom.js";
+import { cssColours } from "./theme.js";
+
+/** @typedef {import("./messages").Arena} Arena */
+/** @typedef {import("./messages").State["objects"][number]} MovingObject */
+/** A point of the track: where, and how fast. [m, world; m/s] @typedef {import("./messages").Track["points"][number]} TrackPoint */
+/** @typedef {[x: number, y: number]} Point2 */
+/** At least x and y. @typedef {readonly [number, number, ...number[]]} Point */
+
+/** The colours of the style sheet. @typedef {ReturnType<typeof readStyle>} Style */
+function readStyle() {
+  const read = cssColours();
+  return {
+    text: read("--text"), muted: read("--muted"), accent: read("--accent"), good: read("--good"),
+    warn: read("--warn"), bad: read("--bad"), background: read("--map-bg"), shade: read("--shade"),
+    obstacle: read("--obstacle"), edge: read("--obstacle-edge"),
+  };
+}
 
 const SPEED_STOPS = [[75, 123, 255], [47, 214, 200], [216, 226, 74], [255, 154, 60], [255, 77, 94]];
 
+/** Returns the colour of a speed, given as a share of the highest. @param {number} share */
 export function speedColour(share) {
   const at = Math.max(0, Math.min(0.9999, share || 0)) * (SPEED_STOPS.length - 1);
   const k = Math.floor(at), t = at - k, [a, b] = [SPEED_STOPS[k], SPEED_STOPS[k + 1]];
   return `rgb(${a.map((v, c) => Math.round(v + (b[c] - v) * t)).join(" ")})`;
 }
 
-/** Returns the corners of the fence's bounding box, or of the map's picture if it is no box. */
+/**
+ * Returns the corners of the fence's bounding box, or of the map's picture if it is no box.
+ * @param {Arena} arena
+ * @returns {[Point2, Point2]}
+ */
 function bounds(arena) {
-  const box = arena.fence.cuboid;
+  const box = "cuboid" in arena.fence ? arena.fence.cuboid : null;
   if (!box) return [arena.map_min_m, arena.map_max_m];
   const [c, h] = [box.center_m, box.half_m];
   return [[c[0] - h[0], c[1] - h[1]], [c[0] + h[0], c[1] + h[1]]];
 }
 
-/** Returns a canvas with one pixel per cell of the obstacles: filled, with brighter edges. */
+/**
+ * Returns a canvas with one pixel per cell of the obstacles: filled, with brighter edges.
+ * @param {Arena["obstacles"]} obstacles
+ * @param {Style} style
+ */
 function obstacleCanvas({ width, height, bits }, style) {
   const bytes = Uint8Array.from(atob(bits), (c) => c.charCodeAt(0));
-  const solid = (x, y) =>
-    x >= 0 && y >= 0 && x < width && y < height && (bytes[(y * width + x) >> 3] >> ((y * width + x) & 7)) & 1;
-  const canvas = document.createElement("canvas");
-  canvas.width = Math.max(1, width);
-  canvas.height = Math.max(1, height);
-  const g = canvas.getContext("2d");
+  const solid = (/** @type {number} */ x, /** @type {number} */ y) =>
+    x >= 0 && y >= 0 && x < width && y < height && ((bytes[(y * width + x) >> 3] >> ((y * width + x) & 7)) & 1) === 1;
+  const canvas = make("canvas", { width: Math.max(1, width), height: Math.max(1, height) });
+  const g = context2d(canvas);
   for (let y = 0; y < height; y++)
     for (let x = 0; x < width; x++) {
       if (!solid(x, y)) continue;
@@ -36,14 +62,15 @@ function obstacleCanvas({ width, height, bits }, style) {
   return canvas;
 }
 
-/** Returns the convex hull of points in the plane (Andrew's monotone chain). */
+/** Returns the convex hull of points in the plane (Andrew's monotone chain). @param {Point2[]} points */
 function hull(points) {
   const sorted = points.toSorted((a, b) => a[0] - b[0] || a[1] - b[1]);
-  const cross = (o, a, b) => (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0]);
-  const chain = (list) => {
+  const cross = (/** @type {Point2} */ o, /** @type {Point2} */ a, /** @type {Point2} */ b) => (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0]);
+  const chain = (/** @type {Point2[]} */ list) => {
+    /** @type {Point2[]} */
     const out = [];
     for (const p of list) {
-      while (out.length >= 2 && cross(out.at(-2), out.at(-1), p) <= 0) out.pop();
+      while (out.length >= 2 && cross(out[out.length - 2], out[out.length - 1], p) <= 0) out.pop();
       out.push(p);
     }
     return out.slice(0, -1);
@@ -52,20 +79,33 @@ function hull(points) {
 }
 
 export class TopView {
+  /** @param {HTMLCanvasElement} canvas in the element whose size it takes */
   constructor(canvas) {
     this.canvas = canvas;
-    this.g = canvas.getContext("2d");
-    this.trail = [];
+    this.room = /** @type {HTMLElement} */ (canvas.parentElement);
+    this.g = context2d(canvas);
+    /** @type {TrackPoint[]} */
+    this.track = [];
+    /** @type {Arena | null} */
     this.arena = null;
-    this.pose = null;
-    this.style = null;
+    /** @type {HTMLImageElement | null} */
     this.picture = null;
-    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    /** @type {HTMLCanvasElement | null} */
+    this.obstacles = null;
+    this.style = readStyle();
+    /** Device pixels per CSS pixel. */
+    this.ratio = 1;
+    /** [CSS px/m]; 0 before there is an arena. */
+    this.scale = 0;
+    /** Where the world's origin is. [CSS px] @type {Point2} */
+    this.origin = [0, 0];
+    new ResizeObserver(() => this.resize()).observe(this.room);
   }
 
+  /** @param {Arena} arena */
   setArena(arena) {
     this.arena = arena;
-    this.trail = [];
+    this.track = [];
     this.picture = null;
     const image = new Image();
     image.onload = () => (this.picture = image);
@@ -75,18 +115,12 @@ export class TopView {
   }
 
   restyle() {
-    const css = getComputedStyle(document.documentElement);
-    const read = (name) => css.getPropertyValue(name).trim();
-    this.style = {
-      text: read("--text"), muted: read("--muted"), accent: read("--accent"), good: read("--good"),
-      warn: read("--warn"), bad: read("--bad"), bg: read("--map-bg"), shade: read("--shade"),
-      obstacle: read("--obstacle"), edge: read("--obstacle-edge"),
-    };
+    this.style = readStyle();
     if (this.arena) this.obstacles = obstacleCanvas(this.arena.obstacles, this.style);
   }
 
   resize() {
-    const { clientWidth: w, clientHeight: h } = this.canvas.parentElement;
+    const { clientWidth: w, clientHeight: h } = this.room;
     const ratio = Math.min(2, window.devicePixelRatio || 1);
     this.canvas.width = Math.round(w * ratio);
     this.canvas.height = Math.round(h * ratio);
@@ -96,7 +130,7 @@ export class TopView {
     const pad = Math.min(34, w * 0.05);
     const [dx, dy] = [Math.max(0.1, hi[0] - lo[0]), Math.max(0.1, hi[1] - lo[1])];
     // Below the stage lights and above what is written at the bottom, where there is room for that.
-    const lights = this.canvas.parentElement.querySelector("#stages");
+    const lights = /** @type {HTMLElement | null} */ (this.room.querySelector("#stages"));
     const top = Math.min(lights && !lights.hidden ? lights.offsetTop + lights.offsetHeight + 8 : pad, h * 0.35);
     const bottom = Math.min(pad + 14, h * 0.25);
     this.scale = Math.min((w - 2 * pad) / dx, (h - top - bottom) / dy);
@@ -104,40 +138,49 @@ export class TopView {
     this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, middle + ((lo[1] + hi[1]) / 2) * this.scale];
   }
 
+  /** Returns where a point of the world is on the canvas. [CSS px] @param {Point} p @returns {Point2} */
   at(p) {
     return [this.origin[0] + p[0] * this.scale, this.origin[1] - p[1] * this.scale];
   }
 
+  /**
+   * Adds a point to the track.
+   * @param {[number, number, number]} p [m, world]
+   * @param {number} speed [m/s]
+   */
   addPoint(p, speed) {
-    const last = this.trail.at(-1);
+    const last = this.track.at(-1);
     if (last && Math.hypot(p[0] - last[0], p[1] - last[1]) < 0.04) return;
-    this.trail.push([p[0], p[1], p[2], speed]);
+    this.track.push([p[0], p[1], p[2], speed]);
     // Thinned as on the server, so that an hour's flight draws as fast as a minute's.
-    if (this.trail.length > 3000) this.trail = this.trail.filter((_, k) => k % 2 === 0);
+    if (this.track.length > 3000) this.track = this.track.filter((_, k) => k % 2 === 0);
   }
 
-  draw(pose, now, crashed, objects) {
-    const { g, style, arena, ratio } = this;
+  /** @param {{ pose: import("./panels/arena_view.js").ShownPose | null, now_ms: number, crashed: boolean, objects: MovingObject[], passed: Set<number> }} shown */
+  draw({ pose, now_ms, crashed, objects, passed }) {
+    const { g, arena, ratio } = this;
     if (!arena || !this.scale) return;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    this.drawGround();
-    this.drawFence(crashed);
-    for (const stage of arena.stages) this.drawStage(stage);
-    if (arena.goal_m) this.drawGoal(now);
-    for (const object of objects ?? []) this.drawObject(object);
-    this.drawTrail();
-    if (pose) this.drawVehicle(pose, now);
+    this.drawGround(arena);
+    this.drawFence(arena, crashed);
+    for (const [k, stage] of arena.stages.entries()) this.drawStage(stage, passed.has(k));
+    if (arena.goal_m) this.drawGoal(arena.goal_m, arena.goal_radius_m, now_ms);
+    for (const object of objects) this.drawObject(object);
+    this.drawTrack(arena);
+    if (pose) this.drawVehicle(arena, pose, now_ms);
     this.drawScaleBar();
   }
 
+  /** Returns left, top, width, height of a box of the world. [CSS px] @param {Point} lo @param {Point} hi @returns {[number, number, number, number]} */
   rect(lo, hi) {
     const [x0, y1] = this.at(lo), [x1, y0] = this.at(hi);
     return [x0, y0, x1 - x0, y1 - y0];
   }
 
-  drawGround() {
-    const { g, arena, style } = this;
+  /** @param {Arena} arena */
+  drawGround(arena) {
+    const { g, style } = this;
     const [lo, hi] = bounds(arena);
     g.save();
     g.beginPath();
@@ -152,14 +195,16 @@ export class TopView {
     const o = arena.obstacles;
     if (this.obstacles && o.width) {
       g.imageSmoothingEnabled = false;
+      /** @type {Point2} */
       const end = [o.origin_m[0] + o.width * o.cell_m, o.origin_m[1] + o.height * o.cell_m];
       g.drawImage(this.obstacles, ...this.rect(o.origin_m, end));
     }
     g.restore();
   }
 
-  drawFence(crashed) {
-    const { g, arena, style } = this;
+  /** @param {Arena} arena @param {boolean} crashed */
+  drawFence(arena, crashed) {
+    const { g, style } = this;
     const [lo, hi] = bounds(arena);
     g.lineWidth = crashed ? 4 : 1.5;
     g.strokeStyle = crashed ? style.bad : style.warn;
@@ -170,14 +215,15 @@ export class TopView {
     g.setLineDash([]);
   }
 
-  drawStage(stage) {
+  /** @param {Arena["stages"][number]} stage @param {boolean} passed */
+  drawStage(stage, passed) {
     const { g, style } = this;
     const n = Math.hypot(stage.normal[0], stage.normal[1]);
     if (!n) return;
     const across = [(-stage.normal[1] / n) * (stage.width_m / 2), (stage.normal[0] / n) * (stage.width_m / 2)];
     const c = stage.center_m;
     const a = this.at([c[0] + across[0], c[1] + across[1]]), b = this.at([c[0] - across[0], c[1] - across[1]]);
-    g.strokeStyle = stage.passed ? style.good : style.accent;
+    g.strokeStyle = passed ? style.good : style.accent;
     g.lineWidth = 5;
     g.lineCap = "round";
     g.beginPath();
@@ -187,10 +233,11 @@ export class TopView {
     g.lineCap = "butt";
   }
 
-  /** A moving object, as the box around it. */
+  /** A moving object, as the box around it. @param {MovingObject} object */
   drawObject({ min_m, max_m, p_world_m, q_xyzw: [x, y, z, w] }) {
     const { g, style } = this;
     // The box's corners, turned by the quaternion, seen from above: their outermost lines.
+    /** @type {Point2[]} */
     const corners = [];
     for (const a of [min_m[0], max_m[0]])
       for (const b of [min_m[1], max_m[1]])
@@ -202,17 +249,18 @@ export class TopView {
     g.strokeStyle = style.bad;
     g.lineWidth = 2;
     g.beginPath();
-    hull(corners).forEach((p, k) => (k ? g.lineTo(...this.at(p)) : g.moveTo(...this.at(p))));
+    for (const p of hull(corners)) g.lineTo(...this.at(p));
     g.closePath();
     g.stroke();
   }
 
-  drawGoal(now) {
-    const { g, arena, style } = this;
-    const [x, y] = this.at(arena.goal_m);
-    const r = Math.max(6, arena.goal_radius_m * this.scale);
+  /** @param {Point} goal_m @param {number} radius_m @param {number} now_ms */
+  drawGoal(goal_m, radius_m, now_ms) {
+    const { g, style } = this;
+    const [x, y] = this.at(goal_m);
+    const r = Math.max(6, radius_m * this.scale);
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    const beat = still ? 0.5 : (Math.sin(now / 600) + 1) / 2;
+    const beat = still ? 0.5 : (Math.sin(now_ms / 600) + 1) / 2;
     g.strokeStyle = style.good;
     g.fillStyle = style.good;
     g.globalAlpha = 0.12 + 0.12 * beat;
@@ -227,28 +275,28 @@ export class TopView {
     g.fill();
   }
 
-  drawTrail() {
-    const { g, arena, trail } = this;
+  /** @param {Arena} arena */
+  drawTrack(arena) {
+    const { g, track } = this;
+    const fastest_mps = Math.max(1, arena.max_speed_mps);
     g.lineWidth = 3;
     g.lineJoin = g.lineCap = "round";
-    for (let k = 1; k < trail.length; k++) {
-      g.strokeStyle = speedColour(trail[k][3] / this.topSpeed);
+    for (let k = 1; k < track.length; k++) {
+      g.strokeStyle = speedColour(track[k][3] / fastest_mps);
       g.beginPath();
-      g.moveTo(...this.at(trail[k - 1]));
-      g.lineTo(...this.at(trail[k]));
+      g.moveTo(...this.at(track[k - 1]));
+      g.lineTo(...this.at(track[k]));
       g.stroke();
     }
     g.lineCap = "butt";
   }
 
-  get topSpeed() {
-    return Math.max(1, this.arena.max_speed_mps);
-  }
-
-  drawVehicle(pose, now) {
-    const { g, style, arena } = this;
+  /** @param {Arena} arena @param {import("./panels/arena_view.js").ShownPose} pose @param {number} now_ms */
+  drawVehicle(arena, pose, now_ms) {
+    const { g, style } = this;
     // Between two messages the vehicle goes on at its speed: smooth at any screen rate.
-    const dt = Math.min(0.1, Math.max(0, (now - pose.received) / 1000));
+    const dt = Math.min(0.1, Math.max(0, (now_ms - pose.received_ms) / 1000));
+    /** @type {Point2} */
     const p = [pose.p_world_m[0] + pose.v_world_mps[0] * dt, pose.p_world_m[1] + pose.v_world_mps[1] * dt];
     const [x, y] = this.at(p);
     const v = this.at([p[0] + pose.v_world_mps[0] * 0.5, p[1] + pose.v_world_mps[1] * 0.5]);
@@ -265,7 +313,7 @@ export class TopView {
     g.translate(x, y);
     g.rotate(-pose.yaw_rad);
     g.fillStyle = style.accent;
-    g.strokeStyle = style.bg;
+    g.strokeStyle = style.background;
     g.lineWidth = 2;
     g.beginPath();
     g.moveTo(r * 1.35, 0);

@@ -1,0 +1,68 @@
+// The WebSocket: messages and images of one vehicle. A lost connection comes back by itself.
+
+import { $, setText } from "./dom.js";
+import { showVehicles } from "./header.js";
+import { showOutcome } from "./outcome.js";
+import { fetchSession } from "./session.js";
+
+/** The vehicle asked for; the first one, if none is. */
+const wanted = new URLSearchParams(location.search).get("vehicle");
+
+/**
+ * Connects, and connects again whenever the connection ends.
+ * @param {(message: import("./messages").Message) => void} onMessage
+ * @param {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} onImage kind: 0 colour, 1 depth, 2 objects
+ */
+export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
+  const query = wanted == null ? "" : `?vehicle=${encodeURIComponent(wanted)}`;
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${query}`);
+  let opened = false;
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => {
+    opened = true;
+    wait_ms = FIRST_WAIT_MS;
+    showLink("good", "live");
+    delete document.body.dataset.stale;
+  };
+  socket.onmessage = ({ data }) => {
+    if (typeof data === "string") return onMessage(JSON.parse(data));
+    const [kind, camera] = new Uint8Array(data, 0, 2);
+    onImage(kind, camera, new Uint8Array(data, 2));
+  };
+  socket.onclose = () => {
+    showLink("bad", "server gone, reconnecting");
+    document.body.dataset.stale = "";
+    if (!opened) explainRefusal();
+    setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MOST_WAIT_MS, wait_ms * 1.6));
+  };
+}
+
+/** Says why the server refuses the connection: no login, or no such vehicle. */
+async function explainRefusal() {
+  const { role } = await fetchSession();
+  if (!role) showLink("warn", "not logged in");
+  if (wanted == null) return;
+  try {
+    /** @type {import("./messages").VehicleLine[]} */
+    const vehicles = await (await fetch("/api/vehicles")).json();
+    const names = vehicles.map(({ name }) => name);
+    if (names.includes(wanted)) return;
+    showLink("warn", "no such vehicle");
+    showVehicles(names, null);
+    showOutcome("warn", `No vehicle '${wanted}'`, `here fly ${names.join(", ")}`);
+  } catch {
+    // The server is gone: the link says so already.
+  }
+}
+
+/**
+ * @param {string} tone
+ * @param {string} text
+ */
+function showLink(tone, text) {
+  $("link").dataset.tone = tone;
+  setText($("link-text"), text);
+}
+
+const FIRST_WAIT_MS = 250;
+const MOST_WAIT_MS = 3000;

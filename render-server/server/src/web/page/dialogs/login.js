@@ -1,0 +1,39 @@
+// Logging in with the instructor's password, and out again.
+
+import { makeFormDialog, makeLabel } from "../dialog.js";
+import { $, make } from "../dom.js";
+import { send, UNREACHABLE } from "../session.js";
+
+const password = make("input", { type: "password", id: "password", autocomplete: "current-password", required: true });
+const { dialog, form, status } = makeFormDialog("log in", "log in", "alert", makeLabel(password, "instructor's password"), password);
+
+form.addEventListener("submit", async () => {
+  status.textContent = "";
+  try {
+    // Whoever logs in has no token yet.
+    const answer = await fetch("/api/login", {
+      method: "POST",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify({ password: password.value }),
+    });
+    if (answer.ok) {
+      // What the page was refused before, it asks for again.
+      location.reload();
+      return;
+    }
+    status.textContent = await answer.text();
+  } catch {
+    status.textContent = UNREACHABLE;
+  }
+  password.value = "";
+  password.focus();
+});
+
+$("login").addEventListener("click", () => {
+  dialog.openFrom($("login"));
+  password.focus();
+});
+$("logout").addEventListener("click", async () => {
+  await send("POST", "/api/logout");
+  location.reload();
+});

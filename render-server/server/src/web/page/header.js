@@ -1,0 +1,54 @@
+// The line at the top and the one at the bottom: which vehicle, its phase and clock; who draws, who flies.
+
+import { $, clockText, setText } from "./dom.js";
+
+/** @type {Record<string, [tone: string, text: string]>} */
+const PHASES = {
+  connecting: ["idle", "connecting"], preparing: ["warn", "preparing"], taking_off: ["go", "taking off"],
+  flying: ["good", "flying"], holding: ["warn", "holding"], landing: ["warn", "landing"], landed: ["idle", "landed"],
+  waiting: ["go", "ready to start"],
+};
+const list = $("vehicles", HTMLSelectElement);
+
+/**
+ * Shows the vehicles to choose from, if there are several, or the one chosen is not there.
+ * @param {string[]} names
+ * @param {string | null} current
+ */
+export function showVehicles(names, current) {
+  const options = names.map((name) => new Option(name, name, false, name === current));
+  if (current == null) options.unshift(new Option("choose a vehicle", "", true, true));
+  list.replaceChildren(...options);
+  list.hidden = options.length < 2;
+  $("vehicle").hidden = !list.hidden;
+  $("estop-all").hidden = names.length < 2;
+  setText($("estop-what"), names.length < 2 || current == null ? "" : current);
+}
+list.addEventListener("change", () => {
+  if (list.value) location.search = `?vehicle=${encodeURIComponent(list.value)}`;
+});
+
+let time_limit_s = 0;
+
+/** @type {import("./panels.js").Part} */
+export const header = {
+  onArena(arena) {
+    ({ time_limit_s } = arena);
+    document.title = `${arena.vehicle} · ${arena.name} · VizFlyt`;
+    showVehicles(arena.vehicles, arena.vehicle);
+    setText($("arena"), arena.name);
+    setText($("vehicle"), arena.vehicle);
+  },
+  onState({ runtime, report, flight_s, landed, renderer }) {
+    const [tone, text] = runtime
+      ? PHASES[report?.phase ?? "connecting"] ?? PHASES.connecting
+      : ["idle", landed ? "landed" : "no runtime"];
+    $("phase").dataset.tone = tone;
+    setText($("phase-text"), text);
+    setText($("clock"), clockText(flight_s ?? 0));
+    const counts = time_limit_s > 0 && flight_s != null && !landed;
+    setText($("clock-left"), counts ? `${Math.ceil(Math.max(0, time_limit_s - flight_s))} s left` : "");
+    setText($("renderer"), `renderer: ${renderer.name} (${renderer.reason})`);
+    setText($("runtime"), runtime ? `${runtime.program} at ${runtime.address}` : "no runtime connected");
+  },
+};

@@ -1,0 +1,37 @@
+// The banner: what decided the flight, or what the page cannot do.
+
+import { $, setText } from "./dom.js";
+import { titleOf, toneOf } from "./event_kinds.js";
+
+/**
+ * Shows the banner.
+ * @param {string} tone
+ * @param {string} title
+ * @param {string} text
+ */
+export function showOutcome(tone, title, text) {
+  $("outcome").hidden = false;
+  $("outcome").dataset.tone = tone;
+  setText($("outcome-title"), title);
+  setText($("outcome-text"), text);
+}
+
+let boot = "", flown = false;
+
+/** @type {import("./panels.js").Part} */
+export const outcome = {
+  onArena(arena) {
+    if (arena.boot === boot) return;
+    [boot, flown] = [arena.boot, false];
+    $("outcome").hidden = true;
+  },
+  onState({ outcome, landed, flight_s }) {
+    // A new flight on the same server.
+    if (flight_s == null && flown) $("outcome").hidden = true;
+    flown = flight_s != null;
+    const tone = outcome ? toneOf(outcome.kind) || "warn" : "";
+    if (outcome) showOutcome(tone, titleOf(outcome.kind), outcome.text + (landed ? "; the vehicle has landed" : ""));
+    // The style sheet shows it to whoever looks from across the room.
+    document.body.dataset.outcome = tone;
+  },
+};

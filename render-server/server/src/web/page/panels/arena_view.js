@@ -1,0 +1,158 @@
+// Where the vehicle flies: the arena from above or in space, the stages of its course, and what the page waits for.
+
+import { make, setText } from "../dom.js";
+import { kindName } from "../event_kinds.js";
+import { theme } from "../theme.js";
+import { TopView } from "../top_view.js";
+
+/** @typedef {import("../messages").Arena} Arena */
+/** @typedef {import("../messages").State} State */
+/** The newest pose, and when it came; long ago where it is too old to go on from. @typedef {NonNullable<State["pose"]> & { received_ms: number }} ShownPose */
+
+/** A pose older than this is shown, but not moved on. [s] */
+const FRESH_S = 0.5;
+
+const top = make("canvas", { id: "map", role: "img", ariaLabel: "top view of the arena" });
+const spaceCanvas = make("canvas", {
+  id: "space", role: "img", tabIndex: 0, hidden: true,
+  ariaLabel: "view in space; arrows turn, plus and minus zoom, 0 goes back, F follows",
+});
+const stages = make("ol", { id: "stages", ariaLabel: "stages of the course", hidden: true });
+const topButton = make("button", { id: "view-top", type: "button", textContent: "top" });
+const spaceButton = make("button", { id: "view-space", type: "button", textContent: "space" });
+const fastest = make("span", { id: "speed-top", textContent: "m/s" });
+const hint = make("p", { id: "hint", className: "hint", hidden: true });
+const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
+  top, spaceCanvas, stages,
+  make("div", { className: "views", role: "group", ariaLabel: "view" }, topButton, spaceButton),
+  make("div", { className: "legend" },
+    make("span", { className: "speed" }, make("span", { textContent: "0" }), make("i"), fastest)),
+  hint,
+);
+
+const topView = new TopView(top);
+/** Made when it is first asked for. @type {import("../space_view.js").SpaceView | null} */
+let spaceView = null;
+/** @type {Arena | null} */
+let arena = null;
+/** @type {ShownPose | null} */
+let pose = null;
+/** @type {State | null} */
+let state = null;
+/** Indices of the stages passed in this flight. @type {Set<number>} */
+const passed = new Set();
+let boot = "", flown = false, inSpace = false;
+
+/** Shows the view in space, or the top view. @param {boolean} wanted */
+async function pickView(wanted) {
+  inSpace = wanted;
+  if (inSpace && arena && !spaceView) {
+    try {
+      const { SpaceView } = await import("../space_view.js");
+      spaceView ??= new SpaceView(spaceCanvas, arena, theme());
+    } catch {
+      inSpace = false;
+      spaceButton.disabled = true;
+      spaceButton.title = "this browser has no WebGL 2";
+    }
+  }
+  top.hidden = inSpace;
+  spaceCanvas.hidden = !inSpace;
+  topButton.ariaPressed = String(!inSpace);
+  spaceButton.ariaPressed = String(inSpace);
+  (inSpace ? spaceView : topView)?.resize();
+}
+
+/** What was chosen last; else space, where a graphics card draws it. */
+async function firstView() {
+  const chosen = localStorage.getItem("view");
+  pickView(chosen ? chosen === "space" : (await import("../space_view.js")).hasCard());
+}
+topButton.addEventListener("click", () => {
+  localStorage.setItem("view", "top");
+  pickView(false);
+});
+spaceButton.addEventListener("click", () => {
+  localStorage.setItem("view", "space");
+  pickView(true);
+});
+firstView();
+
+/** Shows a light for each stage of the course: passed, the next one, those after it. */
+function showStages() {
+  const course = arena?.stages ?? [];
+  const next = course.findIndex((_, k) => !passed.has(k));
+  stages.hidden = !course.length;
+  stages.replaceChildren(
+    ...course.map(({ name }, k) => {
+      const status = passed.has(k) ? "passed" : k === next ? "next" : "to come";
+      const light = make("li", { textContent: name, ariaLabel: `${name}: ${status}` });
+      light.dataset.light = status;
+      if (k === next) light.ariaCurrent = "step";
+      return light;
+    }),
+  );
+}
+
+/** Says what the page waits for; nothing, if that is empty. @param {string} text */
+export function showHint(text) {
+  hint.hidden = !text;
+  setText(hint, text);
+}
+
+/** @param {State} state */
+function hintOf({ pose, runtime, landed }) {
+  if (!pose) return "waiting for the first pose of the vehicle";
+  return runtime || landed ? "" : `waiting for a runtime: vizflyt fly PLUGIN --vehicle ${arena?.vehicle} --server …`;
+}
+
+/** @type {import("../panels.js").Panel} */
+export const arenaView = {
+  element,
+  onArena(newest) {
+    arena = newest;
+    passed.clear();
+    if (arena.boot !== boot) [boot, flown] = [arena.boot, false];
+    topView.setArena(arena);
+    spaceView?.setArena(arena, theme());
+    pickView(inSpace);
+    showStages();
+    setText(fastest, `${Math.max(1, arena.max_speed_mps)} m/s`);
+  },
+  onTrack(points) {
+    topView.track = points;
+  },
+  onEvents(entries) {
+    for (const { kind } of entries) {
+      if (typeof kind === "object" && "stage" in kind) passed.add(kind.stage.index);
+    }
+    showStages();
+  },
+  onState(newest) {
+    state = newest;
+    if (state.flight_s == null && flown) {
+      // A new flight on the same server.
+      topView.track = [];
+      passed.clear();
+      showStages();
+    }
+    flown = state.flight_s != null;
+    if (state.pose) {
+      const fresh = state.pose.age_s < FRESH_S;
+      pose = { ...state.pose, received_ms: fresh ? performance.now() : -Infinity };
+      if (fresh) topView.addPoint(pose.p_world_m, Math.hypot(...pose.v_world_mps));
+    }
+    showHint(hintOf(state));
+  },
+  onFrame(now_ms) {
+    const kind = state?.outcome && kindName(state.outcome.kind);
+    const crashed = kind === "collision" || kind === "geofence";
+    const objects = state?.objects ?? [];
+    if (spaceCanvas.hidden) topView.draw({ pose, now_ms, crashed, objects, passed });
+    else spaceView?.draw({ pose, now_ms, crashed, objects, passed, track: topView.track });
+  },
+  onTheme() {
+    topView.restyle();
+    if (arena) spaceView?.setArena(arena, theme());
+  },
+};

@@ -1,0 +1,190 @@
+// The crash card: what the last flight that failed looked like at its end. Fetched when the server has another one; its
+// images are played, or looked at one by one.
+
+import { make, makeButton } from "../dom.js";
+import { vehicleUrl } from "../session.js";
+
+/** @typedef {import("../messages").CrashCard} CrashCard */
+
+/** @type {Record<string, string>} */
+const TITLES = {
+  collided: "Collision", geofence: "Left the geofence", timeout: "Time is up", landed: "Stopped",
+  plugin_failed: "Plugin failed", error: "Flight failed",
+};
+/** How long the last image stays before it plays again. [ms] */
+const REST_MS = 1200;
+/** A card that could not be fetched is asked for again after this. [ms] */
+const RETRY_MS = 1000;
+/** @param {number} s */
+const ago = (s) => `${Math.max(0, s).toFixed(1)} s before the end`;
+
+/** The images of the last two seconds, with what plays them. */
+class Replay {
+  /**
+   * @param {string} url of the vehicle
+   * @param {CrashCard} card
+   * @param {number} camera the one shown first, by index
+   */
+  constructor(url, card, camera) {
+    this.url = url;
+    this.card = card;
+    this.timer = 0;
+    /** @type {"colour" | "depth"} */
+    this.kind = "colour";
+    /** @type {HTMLImageElement[]} */
+    this.images = [];
+    this.picture = make("img", { width: 480, height: 360 });
+    this.when = make("span");
+    this.slider = make("input", { type: "range", min: "0", step: "1", ariaLabel: "time of the image" });
+    this.slider.addEventListener("input", () => this.pause());
+    this.playButton = makeButton("", { onclick: () => (this.timer ? this.pause() : this.play()) });
+    this.kindButton = makeButton("", { onclick: () => this.showKind(this.kind === "colour" ? "depth" : "colour") });
+    this.cameras = make("select", { ariaLabel: "camera" }, ...card.images.map(({ camera }, k) => new Option(camera, String(k))));
+    this.cameras.addEventListener("change", () => this.showCamera(Number(this.cameras.value)));
+    this.cameras.hidden = card.images.length < 2;
+    this.cameras.value = String(camera);
+    const bar = make("div", { className: "bar" }, this.playButton, this.slider, this.kindButton, this.cameras);
+    this.figure = make("figure", {}, this.picture, make("figcaption", {}, this.when), bar);
+    this.camera = camera;
+    this.before_s = card.images[camera].before_s;
+    this.showCamera(camera);
+  }
+
+  /** Shows a camera's images, the last one first. @param {number} camera */
+  showCamera(camera) {
+    this.camera = camera;
+    this.before_s = this.card.images[camera].before_s;
+    this.slider.max = String(this.before_s.length - 1);
+    this.slider.value = this.slider.max;
+    this.showKind(this.kind);
+  }
+
+  /** @param {"colour" | "depth"} kind */
+  showKind(kind) {
+    this.kind = kind;
+    this.kindButton.textContent = kind === "colour" ? "show depth" : "show colour";
+    // All of them now: a replay does not wait for each.
+    this.images = this.before_s.map((_, k) => make("img", { src: `${this.url}/crash/${this.card.id}/${this.camera}/${kind}/${k}` }));
+    this.show();
+  }
+
+  show() {
+    const k = Number(this.slider.value), when = ago(this.before_s[k]);
+    this.picture.src = this.images[k].src;
+    this.picture.alt = `${this.kind} image of ${this.card.images[this.camera].camera}, ${when}`;
+    this.slider.setAttribute("aria-valuetext", when);
+    this.when.textContent = when;
+    this.playButton.textContent = this.timer ? "pause" : "play";
+  }
+
+  play() {
+    const next = () => {
+      // Whoever leaves the page, or a newer card, ends it.
+      if (!this.figure.isConnected) return this.pause();
+      const last = this.before_s.length - 1;
+      const k = Number(this.slider.value), following = k < last ? k + 1 : 0;
+      this.slider.value = String(following);
+      const wait_ms = following < last ? (this.before_s[following] - this.before_s[following + 1]) * 1000 : REST_MS;
+      this.timer = setTimeout(next, wait_ms);
+      this.show();
+    };
+    next();
+  }
+
+  pause() {
+    clearTimeout(this.timer);
+    this.timer = 0;
+    this.show();
+  }
+}
+
+/**
+ * Returns a drawing of the server's as a part of this page: its colours are the style sheet's.
+ * @param {string} svg
+ * @param {string} caption
+ */
+function drawing(svg, caption) {
+  const parsed = new DOMParser().parseFromString(svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" '), "image/svg+xml");
+  return make("figure", {}, document.importNode(parsed.documentElement, true), make("figcaption", { textContent: caption }));
+}
+
+/**
+ * @param {string} title
+ * @param {string[]} lines
+ */
+function details(title, lines) {
+  return make("details", {}, make("summary", { textContent: title }), make("pre", { textContent: lines.join("\n") }));
+}
+
+const title = make("b", { id: "crash-title" }), when = make("span", { id: "crash-when" }), body = make("div", { id: "crash-body" });
+const element = make("section", { id: "crash", hidden: true },
+  make("details", { className: "panel setup", open: true }, make("summary", {}, "crash card: ", title, " ", when), body));
+element.setAttribute("aria-labelledby", title.id);
+
+/**
+ * @param {string} url of the vehicle
+ * @param {CrashCard} card
+ */
+function show(url, card) {
+  const { verdict } = card;
+  title.textContent = TITLES[verdict.outcome] ?? verdict.outcome;
+  const time = new Date(card.ended_unix_ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+  when.textContent = `${verdict.seconds.toFixed(1)} s after take-off, ${verdict.stages_passed} of ${verdict.stages.length} stages, at ${time}`;
+  const parts = [make("p", { className: "cause", textContent: card.cause })];
+  const figures = make("div", { className: "plots" });
+  const filmed = card.images.findIndex(({ before_s }) => before_s.length);
+  const replay = filmed < 0 ? null : new Replay(url, card, filmed);
+  if (replay) figures.append(replay.figure);
+  else parts.push(make("p", { className: "muted", textContent: "No image was rendered in its last two seconds." }));
+  figures.append(
+    drawing(card.clearance_svg, "clearance of the body (blue), speed (orange)"),
+    drawing(card.top_svg, `from above, obstacles at ${card.top_height_m.toFixed(2)} m height`),
+  );
+  const story = card.events.map(({ before_s, text }) => `${(-before_s).toFixed(2).padStart(8)} s  ${text}`);
+  body.replaceChildren(...parts, figures, details("what happened", story));
+  if (card.printed.length) body.append(details("what the plugin printed", card.printed));
+  element.hidden = false;
+  if (replay && !matchMedia("(prefers-reduced-motion: reduce)").matches) replay.play();
+}
+
+let url = "";
+/** The card that is shown: its address and number. */
+let shown = "";
+
+/**
+ * Shows the vehicle's newest card by its number; none where no flight has failed.
+ * @param {number | null} id
+ */
+async function showCard(id) {
+  const wanted = id == null ? "" : `${url} ${id}`;
+  if (wanted === shown) return;
+  shown = wanted;
+  if (!wanted) {
+    element.hidden = true;
+    return;
+  }
+  try {
+    const answer = await fetch(`${url}/crash`);
+    if (!answer.ok) throw new Error(await answer.text());
+    /** @type {CrashCard} */
+    const card = await answer.json();
+    // A newer one may have come meanwhile: it is fetched by itself.
+    if (wanted === shown && card.id === id) show(url, card);
+  } catch {
+    // Asked for again with a later state.
+    setTimeout(() => {
+      if (wanted === shown) shown = "?";
+    }, RETRY_MS);
+  }
+}
+
+/** @type {import("../panels.js").Panel} */
+export const crashCard = {
+  element,
+  onArena(arena) {
+    url = vehicleUrl(arena.vehicle);
+  },
+  onState({ crash }) {
+    showCard(crash);
+  },
+};

@@ -1,0 +1,271 @@
+// The view in space: a room, and in it what moves: objects, the track, the vehicle. Drag turns, right drag or two fingers
+// shift, the wheel zooms; with the keyboard: arrows turn, + and - zoom, 0 goes back, F follows the vehicle. World x east,
+// y north, z up; [m, world] throughout.
+
+import * as THREE from "/three/three.module.min.js";
+import { joined, Room, vec } from "./space_room.js";
+import { speedColour } from "./top_view.js";
+
+/** @typedef {import("./messages").Arena} Arena */
+/** @typedef {import("./messages").State["objects"]} MovingObjects */
+/** @typedef {import("./top_view.js").TrackPoint} TrackPoint */
+
+/** The most points of the track; as many as the top view keeps. */
+const MOST_POINTS = 3000;
+/** Thirty images a second are smooth, and leave a machine without a card to the flight. [ms] */
+const EVERY_MS = 1000 / 31;
+
+/** Returns whether a graphics card draws; in software it would take the processor from the flight. */
+export function hasCard() {
+  const canvas = document.createElement("canvas");
+  const gl = canvas.getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  if (!gl) return false;
+  const renderer = gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER;
+  const name = String(gl.getParameter(renderer));
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return !/swiftshader|llvmpipe|software/i.test(name);
+}
+
+export class SpaceView {
+  /**
+   * @param {HTMLCanvasElement} canvas in the element whose size it takes
+   * @param {Arena} arena
+   * @param {string | undefined} theme
+   */
+  constructor(canvas, arena, theme) {
+    this.canvas = canvas;
+    this.parent = /** @type {HTMLElement} */ (canvas.parentElement);
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(50, 1, 0.02, 500);
+    this.camera.up.set(0, 0, 1);
+    this.scene.add(new THREE.HemisphereLight(0xffffff, 0x445566, 2.2));
+    const sun = new THREE.DirectionalLight(0xffffff, 1.6);
+    sun.position.set(-0.4, -0.7, 1);
+    this.scene.add(sun);
+    this.room = new Room(arena, theme);
+    this.moving = new THREE.Group();
+    this.scene.add(this.room.group, this.moving);
+    this.track = makeTrack();
+    this.scene.add(this.track);
+    /** The part of the track that is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
+    this.drawnTrack = { length: -1, end: undefined };
+    this.drawn_ms = -Infinity;
+    /** Where the camera looks. */
+    this.target = new THREE.Vector3();
+    /** From where: angles about z and above the floor [rad], share of the distance at which the room fits. */
+    this.turn = this.tilt = 0;
+    this.zoom = 1;
+    this.follows = false;
+    this.home();
+    this.listen();
+    new ResizeObserver(() => this.resize()).observe(this.parent);
+  }
+
+  /**
+   * @param {Arena} arena
+   * @param {string | undefined} theme
+   */
+  setArena(arena, theme) {
+    this.room.dispose();
+    this.room = new Room(arena, theme);
+    this.scene.add(this.room.group);
+    this.moving.clear();
+    this.drawnTrack.length = -1;
+    this.home();
+    this.resize();
+  }
+
+  // ---- what moves ------------------------------------------------------------------------
+  /** @param {TrackPoint[]} track */
+  showTrack(track) {
+    const { length } = track, end = track.at(-1);
+    if (length === this.drawnTrack.length && end === this.drawnTrack.end) return;
+    this.drawnTrack = { length, end };
+    const { position, color } = this.track.geometry.attributes;
+    const fastest_mps = Math.max(1, this.room.arena.max_speed_mps), colour = new THREE.Color();
+    const count = Math.min(length, MOST_POINTS);
+    for (let k = 0; k < count; k++) {
+      const [x, y, z, speed] = track[k];
+      position.setXYZ(k, x, y, z);
+      colour.setStyle(speedColour(speed / fastest_mps).replaceAll(/(\d) (?=\d)/g, "$1,"));
+      color.setXYZ(k, colour.r, colour.g, colour.b);
+    }
+    position.needsUpdate = color.needsUpdate = true;
+    this.track.geometry.setDrawRange(0, count);
+  }
+
+  /** Shows moving objects: each as the box about it in its own frame, where it is and how it is turned. @param {MovingObjects} objects */
+  showObjects(objects) {
+    for (const surplus of this.moving.children.slice(objects.length)) this.moving.remove(surplus);
+    objects.forEach((object, k) => {
+      const turn = new THREE.Quaternion(...object.q_xyzw);
+      const middle = vec(joined(object.min_m, object.max_m, (low, high) => (low + high) / 2));
+      const box = this.moving.children[k] ?? this.addBox();
+      box.scale.set(...joined(object.max_m, object.min_m, (high, low) => Math.max(0.01, high - low)));
+      box.position.copy(middle.applyQuaternion(turn)).add(vec(object.p_world_m));
+      box.quaternion.copy(turn);
+    });
+  }
+
+  /** Adds a box with sides of 1 m to what moves. */
+  addBox() {
+    const edges = new THREE.EdgesGeometry(new THREE.BoxGeometry(1, 1, 1));
+    const box = new THREE.LineSegments(edges, new THREE.LineBasicMaterial({ color: this.room.colour("--bad") }));
+    this.moving.add(box);
+    return box;
+  }
+
+  /**
+   * @param {import("./panels/arena_view.js").ShownPose} pose
+   * @param {number} now_ms
+   */
+  showVehicle(pose, now_ms) {
+    const { vehicle, shadow } = this.room;
+    const dt_s = Math.min(0.1, Math.max(0, (now_ms - pose.received_ms) / 1000));
+    const p = joined(pose.p_world_m, pose.v_world_mps, (x, v) => x + v * dt_s);
+    vehicle.position.set(...p);
+    vehicle.quaternion.set(...pose.rotation);
+    shadow.position.set(p[0], p[1], this.room.floorHeight() + 0.005);
+    if (this.follows) this.target.lerp(vehicle.position, 0.15);
+  }
+
+  /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0] & { track: TrackPoint[] }} shown */
+  draw({ pose, now_ms, crashed, track, objects, passed }) {
+    if (!this.canvas.clientWidth || now_ms - this.drawn_ms < EVERY_MS) return;
+    this.drawn_ms = now_ms;
+    const { room } = this;
+    room.fenceColour.copy(room.colour(crashed ? "--bad" : "--warn"));
+    this.showTrack(track);
+    this.showObjects(objects);
+    const next = room.stages.findIndex((_, k) => !passed.has(k));
+    for (const [k, paint] of room.stages.entries())
+      paint(room.colour(passed.has(k) ? "--good" : k === next ? "--accent" : "--muted"));
+    room.vehicle.visible = room.shadow.visible = pose != null;
+    if (pose) this.showVehicle(pose, now_ms);
+    this.placeCamera();
+    this.renderer.render(this.scene, this.camera);
+  }
+
+  // ---- the camera ------------------------------------------------------------------------
+  home() {
+    this.target.copy(this.room.middle);
+    this.target.z = this.room.lo[2] + this.room.size[2] * 0.35;
+    this.turn = -Math.PI / 2 - 0.35;
+    this.tilt = 0.62;
+    this.zoom = 1;
+    this.follows = false;
+  }
+
+  placeCamera() {
+    const [x, y, z] = this.room.size, half = Math.tan((this.camera.fov * Math.PI) / 360);
+    // So far that the room fits, in width or in height.
+    const fit = Math.max(Math.hypot(x, y) / 2 / half / this.camera.aspect, (y + z) / 2 / half) * 0.95;
+    const far = fit * this.zoom;
+    const flat = Math.cos(this.tilt) * far;
+    this.camera.position.set(
+      this.target.x + Math.cos(this.turn) * flat,
+      this.target.y + Math.sin(this.turn) * flat,
+      this.target.z + Math.sin(this.tilt) * far,
+    );
+    this.camera.lookAt(this.target);
+    this.camera.far = fit * 10 + 50;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /**
+   * @param {number} dx [rad]
+   * @param {number} dy [rad]
+   */
+  rotate(dx, dy) {
+    this.turn -= dx;
+    this.tilt = Math.min(1.55, Math.max(-0.2, this.tilt + dy));
+  }
+
+  /**
+   * @param {number} dx as a share of the distance
+   * @param {number} dy as a share of the distance
+   */
+  shift(dx, dy) {
+    const far = this.camera.position.distanceTo(this.target);
+    const right = new THREE.Vector3().setFromMatrixColumn(this.camera.matrix, 0);
+    const up = new THREE.Vector3().setFromMatrixColumn(this.camera.matrix, 1);
+    this.target.addScaledVector(right, -dx * far).addScaledVector(up, dy * far);
+    this.follows = false;
+  }
+
+  /** @param {number} factor */
+  scaleBy(factor) {
+    this.zoom = Math.min(3, Math.max(0.05, this.zoom * factor));
+  }
+
+  listen() {
+    const { canvas } = this;
+    /** The pointers that are down: a mouse, or fingers. @type {Map<number, PointerEvent>} */
+    const pointers = new Map();
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, event);
+    });
+    const up = (/** @type {PointerEvent} */ event) => pointers.delete(event.pointerId);
+    canvas.addEventListener("pointerup", up);
+    canvas.addEventListener("pointercancel", up);
+    canvas.addEventListener("pointermove", (event) => {
+      const former = pointers.get(event.pointerId);
+      if (!former) return;
+      const [dx, dy] = [event.clientX - former.clientX, event.clientY - former.clientY];
+      const size = Math.max(1, canvas.clientHeight);
+      if (pointers.size === 2) {
+        const [other] = [...pointers.values()].filter((pointer) => pointer.pointerId !== event.pointerId);
+        const span = (/** @type {PointerEvent} */ pointer) => Math.hypot(pointer.clientX - other.clientX, pointer.clientY - other.clientY);
+        this.scaleBy(span(former) / Math.max(1, span(event)));
+        this.shift(dx / 2 / size, dy / 2 / size);
+      } else if (event.buttons & 2 || event.shiftKey) this.shift(dx / size, dy / size);
+      else this.rotate((dx * 3) / size, (dy * 3) / size);
+      pointers.set(event.pointerId, event);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.scaleBy(Math.exp(Math.max(-0.3, Math.min(0.3, event.deltaY * 0.0012))));
+    }, { passive: false });
+    canvas.addEventListener("dblclick", () => this.home());
+    canvas.addEventListener("keydown", (event) => {
+      const act = this.keys[event.key];
+      if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      act();
+    });
+  }
+
+  /** @type {Record<string, () => void>} */
+  keys = {
+    ArrowLeft: () => this.rotate(-0.1, 0), ArrowRight: () => this.rotate(0.1, 0),
+    ArrowUp: () => this.rotate(0, 0.1), ArrowDown: () => this.rotate(0, -0.1),
+    "+": () => this.scaleBy(0.87), "=": () => this.scaleBy(0.87), "-": () => this.scaleBy(1.15),
+    0: () => this.home(),
+    f: () => {
+      this.follows = !this.follows;
+    },
+  };
+
+  resize() {
+    const { clientWidth: w, clientHeight: h } = this.parent;
+    if (!w || !h) return;
+    this.renderer.setPixelRatio(Math.min(2, devicePixelRatio || 1));
+    this.renderer.setSize(w, h, false);
+    this.camera.aspect = w / h;
+    this.drawn_ms = -Infinity;
+  }
+}
+
+/** Returns the track: a line with a colour for each point, none drawn yet. */
+function makeTrack() {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * MOST_POINTS), 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * MOST_POINTS), 3));
+  geometry.setDrawRange(0, 0);
+  const track = new THREE.Line(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
+  track.frustumCulled = false;
+  return track;
+}
