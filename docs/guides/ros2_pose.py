@@ -41,7 +41,7 @@ def main():
 
         def __init__(self):
             super().__init__("vizflyt_pose")
-            say = lambda name, default: self.declare_parameter(name, default).value  # noqa: E731
+            say = lambda name, default: self.declare_parameter(name, default).value
             self.object = say("object", "vizflyt")
             self.to = address(say("server", "127.0.0.1:51002"))
             self.frame, self.parent = say("frame", ""), say("parent", "map")

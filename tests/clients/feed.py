@@ -11,7 +11,7 @@ Usage: feed.py VICON_PORT CONNECTION
 import sys
 import time
 
-from lab import ORIGIN, Vicon, mavlink, mavutil, matrix, ned_euler
+from lab import ORIGIN, Vicon, matrix, mavlink, mavutil, ned_euler
 
 # As a companion computer on board: its heartbeats are no ground station's.
 SYSTEM, COMPONENT = 1, mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY

@@ -15,7 +15,7 @@ import time
 from collections import Counter
 
 os.environ["MAVLINK20"] = "1"
-from pymavlink import mavutil  # noqa: E402  (reads MAVLINK20 when it is imported)
+from pymavlink import mavutil  # reads MAVLINK20 when it is imported
 
 mavlink = mavutil.mavlink
 
@@ -89,8 +89,7 @@ class Lab:
         else:
             address = endpoint + ":127.0.0.1:0"
         self.process = subprocess.Popen(
-            [*command, "--json", "--lifeline", "--mavlink", address, "--vicon", self.vicon.address]
-            + list(options),
+            [*command, "--json", "--lifeline", "--mavlink", address, "--vicon", self.vicon.address, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -172,8 +171,7 @@ class Lab:
     def command(self, number, *params):
         """Sends COMMAND_LONG; returns the result of its acknowledgement, or None."""
         self.acks.clear()
-        params = list(params) + [0] * (7 - len(params))
-        self.link.mav.command_long_send(1, 1, number, 0, *params)
+        self.link.mav.command_long_send(1, 1, number, 0, *params, *[0] * (7 - len(params)))
         self.until(3, lambda: any(a.command == number for a in self.acks))
         return next((a.result for a in self.acks if a.command == number), None)
 

@@ -25,9 +25,9 @@ class Proxy:
         port = self.watch.port.getsockname()[1]
         program = os.path.join(os.path.dirname(sys.executable), "mavproxy.py")
         self.process = subprocess.Popen(
-            [sys.executable, "-u", program, "--master", connection]
-            + ["--out", "udpout:127.0.0.1:%d" % port, "--state-basedir", folder]
-            + ["--default-modules", "cmdlong,arm,mode,param,misc"],
+            [sys.executable, "-u", program, "--master", connection,
+             "--out", "udpout:127.0.0.1:%d" % port, "--state-basedir", folder,
+             "--default-modules", "cmdlong,arm,mode,param,misc"],
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -47,10 +47,10 @@ class Vehicle:
     def command(self, number, *params):
         """Sends a command until it is answered; returns the result."""
         self.acks.pop(number, None)
-        params = list(params) + [0] * (7 - len(params))
+        padded = [*params, *[0] * (7 - len(params))]
         system = self.newest["HEARTBEAT"].get_srcSystem()
         for confirmation in range(5):
-            self.link.mav.command_long_send(system, 1, number, confirmation, *params)
+            self.link.mav.command_long_send(system, 1, number, confirmation, *padded)
             if self.until(lambda: number in self.acks, 2):
                 return self.acks[number]
         return None

@@ -4,6 +4,7 @@ checksums and hashes by the vendor's esptool, room for settings and updates.
     image.py FOLDER PARTITIONS.csv
 """
 
+import itertools
 import struct
 import subprocess
 import sys
@@ -47,7 +48,7 @@ def main():
             start, length = int(fields[3], 0), int(fields[4], 0)
             assert parts[fields[0]][2:] == (start, length), f"{fields[0]} is elsewhere"
     ends = sorted((start, start + length, name) for name, (_, _, start, length) in parts.items())
-    for (_, end, name), (start, _, other) in zip(ends, ends[1:]):
+    for (_, end, name), (start, _, other) in itertools.pairwise(ends):
         assert end <= start, f"{name} reaches into {other}"
     assert ends[-1][1] <= 4 << 20, "more than the flash of 4 MB"
     first, second = parts["ota_0"], parts["ota_1"]

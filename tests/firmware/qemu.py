@@ -157,8 +157,7 @@ class Sender:
         if name == "target_component":
             return self.target[1]
         if kind == "char":
-            text = bytes(self.rng.randrange(1, 128) for _ in range(max(length, 1)))
-            return text
+            return bytes(self.rng.randrange(1, 128) for _ in range(max(length, 1)))
         one = {
             "float": lambda: struct.unpack("<f", struct.pack("<f", self.rng.uniform(-1e6, 1e6)))[0],
             "double": lambda: self.rng.uniform(-1e6, 1e6),
@@ -166,7 +165,7 @@ class Sender:
         if one is None:
             bits = int(kind.rstrip("_t").lstrip("uint").split("_")[0])
             low = 0 if kind.startswith("u") else -(1 << bits - 1)
-            one = lambda: self.rng.randrange(low, low + (1 << bits))  # noqa: E731
+            one = lambda: self.rng.randrange(low, low + (1 << bits))
         return [one() for _ in range(length)] if length else one()
 
     def packet(self):
@@ -275,7 +274,7 @@ def exercise(options, network, line, emulator):
     start = moved = spoke = time.monotonic()
     while any(left.values()) or any(under_way.values()):
         extra = time.monotonic() - spoke > SILENCE_S
-        if extra or left["down"] and under_way["down"] < WINDOW:
+        if extra or (left["down"] and under_way["down"] < WINDOW):
             # One to three packets a datagram, as companions batch them.
             batch = [companion.packet()
                      for _ in range(min(rng.randrange(1, 4), max(left["down"], 1)))]

@@ -10,7 +10,14 @@ Splats are matched by position and must agree within what the format's steps all
 last says how many passed. --keep copies the files the tools wrote and the known scenes, which is how
 the fixtures of render-server/splat/tests/data/formats were made.
 """
-import argparse, json, pathlib, shutil, subprocess, sys, tempfile
+import argparse
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+
 import numpy as np
 
 C0 = 0.28209479177387814
@@ -128,7 +135,7 @@ def run(*command):
 
 
 def tools(folder):
-    python, modules = folder / 'venv/bin/python', folder / 'node_modules'
+    modules = folder / 'node_modules'
 
     def splat_transform(*options):
         cli = modules / '@playcanvas/splat-transform/bin/cli.mjs'
@@ -235,8 +242,8 @@ def main():
     folder = args.tools.resolve()
     vizflyt = args.vizflyt.resolve()
     passed = failed = 0
-    with tempfile.TemporaryDirectory() as scratch:
-        scratch = pathlib.Path(scratch)
+    with tempfile.TemporaryDirectory() as temporary:
+        scratch = pathlib.Path(temporary)
 
         def compare(tool, kind, degree, way, truth, make, loss):
             nonlocal passed, failed

@@ -95,10 +95,10 @@ def main():
         times = [call() for _ in range(100)]
         ms, device_ms = (statistics.median(column) for column in zip(*times))
         first = np.fromfile(path.with_suffix(".rgb"), dtype="<f4").reshape(height, width, 3)
-        error = np.mean((host[0, ..., :3].numpy() - first) ** 2)
+        mean_square = np.mean((host[0, ..., :3].numpy() - first) ** 2)
         print(f"| {scene} | {len(seen)} | {row['call_ms']:.3f} | {ms:.3f} | {device_ms:.3f} |"
               f" {ms / row['call_ms']:.2f} | {row['images_per_s']:.0f} |"
-              f" {len(seen) * 1e3 / ms:.0f} | {-10 * np.log10(error):.1f} dB |")
+              f" {len(seen) * 1e3 / ms:.0f} | {-10 * np.log10(mean_square):.1f} dB |")
 
 
 if __name__ == "__main__":

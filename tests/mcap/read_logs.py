@@ -1,9 +1,9 @@
 """Flies with the given program and reads its logs with other people's packages.
 
 What is checked: the file is whole for a strict reader, also after SIGKILL, unless that came within
-the one write a second: then a reader that streams gets all before it; every channel has a schema; Foxglove's messages decode, by the schemas in the file; colour is a JPEG that Pillow opens,
-of the calibration's size; poses are unit quaternions; replaying twice gives the same bytes and the
-flight's own answers.
+the one write a second: then a reader that streams gets all before it; every channel has a schema; Foxglove's messages
+decode, by the schemas in the file; colour is a JPEG that Pillow opens, of the calibration's size; poses are unit
+quaternions; replaying twice gives the same bytes and the flight's own answers.
 """
 
 import filecmp
@@ -168,7 +168,7 @@ def main():
         print(f"whole: {sum(found.values())} messages, {whole.stat().st_size / 1e6:.1f} MB; "
               f"a minute at 60 Hz would be {minute:.0f} MB")
         one, first = replay(program, whole, "one")
-        two, second = replay(program, whole, "two")
+        two, _ = replay(program, whole, "two")
         check(filecmp.cmp(one, two, shallow=False), "two replays answer the same, byte by byte")
         check(first["compared"] > 100 and first["plugin_failed"] is None, str(first))
         check(first["differ"] == 0 or first["images_missing"] > 0, f"as in flight: {first}")

@@ -77,7 +77,7 @@ class Runner(threading.Thread):
     def run(self):
         try:
             vizflyt.run(self.plugin, service=self.service)
-        except BaseException as error:  # noqa: BLE001 - the test looks at it
+        except BaseException as error:
             self.error = error
 
     def ended(self):

@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+from conftest import Stage
 
 import vizflyt
-from conftest import Stage
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "docs/guides/plugin.md", "jetson/python/README.md"]

@@ -8,6 +8,7 @@ import sys
 import types
 from pathlib import Path
 from types import SimpleNamespace as Record
+from typing import Any
 
 GUIDES = Path(__file__).resolve().parents[2] / "docs" / "guides"
 
@@ -130,7 +131,7 @@ def test_the_ten_lines_of_the_guide_send_a_packet():
     host, port = address.split(":")
     code = code.replace('"192.168.1.20", 51002', f'"{host}", {port}').replace("while True:", "while seq < 1:")
     system = Record(read=lambda: (1.0, 2.0, 3.0, (0.0, 0.0, 0.0, 1.0)))
-    names = {"your_system": system}
+    names: dict[str, Any] = {"your_system": system}
     exec(compile(code, "localization.md", "exec"), names)
     with udp, names["udp"]:
         data = json.loads(udp.recv(2048))

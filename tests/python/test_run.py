@@ -7,8 +7,8 @@ import textwrap
 import time
 
 import pytest
-
 from conftest import Stage, pattern
+
 from vizflyt import Setpoint
 from vizflyt._vizflyt import waiting_services
 

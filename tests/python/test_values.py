@@ -159,7 +159,7 @@ def test_an_arena_for_tests_is_made_by_hand():
     assert info.no_fly == [table] and info.floor_z_m == 0.25
     assert info.setpoints == ["position", "attitude_rate"] and info.attitude_rate
     assert "velocity" in vizflyt.ArenaInfo().setpoints and not vizflyt.ArenaInfo().attitude_rate
-    with pytest.raises(ValueError, match="'speed' is no kind of setpoint|\"speed\" is no kind of setpoint"):
+    with pytest.raises(ValueError, match=r"['\"]speed['\"] is no kind of setpoint"):
         vizflyt.ArenaInfo(setpoints=["speed"])
     with pytest.raises(ValueError, match="at most 8 no-fly boxes"):
         vizflyt.ArenaInfo(no_fly=[table] * 9)
@@ -172,5 +172,5 @@ def test_the_course_s_map_is_every_obstacle(monkeypatch):
     (ball,) = vizflyt.course_map()
     assert ball.signed_distance_m([1, 2, 4]) == pytest.approx(0.5)
     monkeypatch.setenv("VIZFLYT_MAP", "[1]")
-    with pytest.raises(ValueError, match="map.json"):
+    with pytest.raises(ValueError, match=r"map\.json"):
         vizflyt.course_map()

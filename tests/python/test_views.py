@@ -6,9 +6,9 @@ import warnings
 import cv2
 import numpy as np
 import pytest
+from conftest import Stage, camera, pattern
 
 import vizflyt
-from conftest import Stage, camera, pattern
 
 
 def mapping_of(address):
@@ -182,7 +182,7 @@ def test_keeping_the_image_before_costs_no_copy():
 
 
 def test_opencv_takes_the_arrays_as_they_are():
-    obs, rgb, depth_mm = observation()
+    obs, rgb, _ = observation()
     front = obs.camera("front")
     grey = cv2.cvtColor(front.rgb, cv2.COLOR_RGB2GRAY)
     assert (grey == cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)).all()

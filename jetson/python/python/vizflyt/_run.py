@@ -12,9 +12,10 @@ import inspect
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from types import FunctionType
 
-from ._failure import without_our_frames, sentence
+from ._failure import sentence, without_our_frames
 from ._plugin import Plugin
 from ._vizflyt import PluginEnd, Setpoint, waiting_services
 
@@ -51,7 +52,7 @@ def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
     _prepare_output()
     try:
         plugin = _instance(plugin)
-        for where in _serve(plugin, end):
+        for where in _serve(plugin, end):  # noqa: B007 - the failure names the last one
             pass
     except (Exception, SystemExit, KeyboardInterrupt) as error:
         error.__traceback__ = without_our_frames(error.__traceback__)
@@ -63,7 +64,7 @@ def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
         raise
 
 
-def _serve(plugin: Plugin, end: PluginEnd):
+def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
     """Runs the flight; yields the name of each method before it is called."""
     started = False
     copied = False

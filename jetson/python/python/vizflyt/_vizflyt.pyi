@@ -1,8 +1,10 @@
 # Signatures are written here by hand; docstrings are copied from the compiled module by
 # tests/python/stub.py --write.
 from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any, Final, Literal, SupportsFloat, final
+
 import numpy as np
 import numpy.typing as npt
 

@@ -8,7 +8,11 @@ tests/images/oracle.rs describes them; numpy is all it needs. Writes sh0 to sh3:
 layout), and for cameras a and b of each: _a.json (camera), _a.npz (rgb, alpha, depth, depth_median;
 float32, rounded). The same numbers on every machine.
 """
-import importlib.util, json, pathlib, sys
+import importlib.util
+import json
+import pathlib
+import sys
+
 import numpy as np
 
 # Width, height: one much wider than high, so that tiles are cut on both sides.
