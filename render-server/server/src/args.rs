@@ -92,11 +92,11 @@ pub struct ServeArgs {
     #[arg(long, value_name = "METRES", value_parser = parse_scale)]
     pub scale: Option<f64>,
 
-    /// Vehicles fly in nets of their own: in the twin they neither see nor touch each other
+    /// Vehicles are isolated from each other in the twin: they neither see nor touch each other
     #[arg(long)]
     pub apart: bool,
 
-    /// Draws where in their motion objects begin of which arena.toml does not say it
+    /// Seed for the initial phase of objects that set none in arena.toml
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
 

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::Notify;
-use vizflyt_protocol::messages::{ReceivedEvents, Hello, Text};
+use vizflyt_protocol::messages::{Hello, ReceivedEvents, Text};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::lock::lock;

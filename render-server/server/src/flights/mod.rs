@@ -28,7 +28,7 @@ use self::vehicle::VehicleFlight;
 /// The flights of all vehicles.
 #[derive(Debug)]
 pub struct Flights {
-    /// Random: a runtime tells by it that the server was restarted.
+    /// Random: a runtime notices by it that the server was restarted.
     pub instance_id: u64,
     /// One for each vehicle, at its index; at least one, at most
     /// [`MAX_VEHICLES`](vizflyt_arena::config::MAX_VEHICLES).

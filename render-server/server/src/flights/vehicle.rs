@@ -36,7 +36,7 @@ pub struct VehicleFlight {
     pub index: usize,
     /// The object in the localization system.
     pub name: Name,
-    /// What the runtime is told of the arena; its cameras are those of the start.
+    /// The arena as the runtime receives it; its cameras are those of the start.
     pub arena: ArenaInfo,
     /// The events of all its flights.
     pub events: EventLog,
@@ -285,7 +285,7 @@ impl VehicleFlight {
         self.events.next_index()
     }
 
-    /// Whether a flight had begun and not ended when its runtime was last heard.
+    /// Whether a flight had begun and not ended by its runtime's newest report.
     pub fn under_way(&self) -> bool {
         use FlightPhase::{Flying, Holding, Landing, TakingOff};
         matches!(self.phase(), TakingOff | Flying | Holding | Landing)

@@ -12,7 +12,7 @@ pub type NewestPoses = [Option<Localized>; MAX_VEHICLES];
 /// Where a vehicle is, and whereto it moves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Localized {
-    /// The newest believed pose.
+    /// The newest accepted pose.
     pub sample: PoseSample,
     /// How it moves by all that was read.
     pub motion: Motion,

@@ -240,5 +240,5 @@ const PATIENCE: Duration = Duration::from_millis(100);
 const WARN_EVERY: Duration = Duration::from_secs(5);
 /// The least time between two warnings: several bad sources alternate.
 const WARN_APART: Duration = Duration::from_secs(1);
-/// The period at which the page is told of the localization's quality.
+/// The period at which the localization's quality is published.
 const QUALITY_EVERY: Duration = Duration::from_millis(100);

@@ -2,7 +2,7 @@
 //!
 //! The render thread takes the newest set at each tick, and every image keeps the camera it was
 //! drawn with: a change takes effect with the next tick, and no image is skipped or mislabelled.
-//! Sessions and pages are told of each change.
+//! Sessions and pages receive each change.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
 pub struct CameraSet {
     /// As `arena.toml` has them.
     pub configs: Vec<CameraConfig>,
-    /// As the runtime is told.
+    /// As the runtime receives them.
     pub infos: Vec<CameraInfo>,
 }
 
@@ -103,7 +103,7 @@ impl Cameras {
         self.0.borrow().clone()
     }
 
-    /// Returns what tells of every change from now on.
+    /// Returns a receiver of every change from now on.
     pub fn subscribe(&self) -> watch::Receiver<Arc<CameraSet>> {
         self.0.subscribe()
     }

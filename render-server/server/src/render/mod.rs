@@ -4,7 +4,7 @@
 //! in   the newest motions of all vehicles, from `poses`; the demand for images, from `stream`
 //! out  rendered ticks (RGB, depth, object ids), to the encode thread and then to the previews
 //! ```
-//! Imports `scene`, `poses` and `flights`; `stream` tells its wishes through [`demand::Demand`].
+//! Imports `scene`, `poses` and `flights`; `stream` states its demand through [`demand::Demand`].
 
 pub mod cameras;
 pub mod demand;

@@ -4,7 +4,7 @@
 //! arena.toml -> ArenaConfig -> its scene file -> Splats --------> renderer
 //! scene file -> upright, to size -> ArenaConfig (made up)   \---> occupancy -> referee, map
 //! ```
-//! A scene file is of any format that [`vizflyt_splat::format`] knows, told by its content.
+//! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
 //! Once, at the start; progress goes to the log.
 
 mod bake;

@@ -18,7 +18,7 @@ pub struct Connection {
     pub packets_sent: u64,
     /// Packets lost on the way; what they held was sent again.
     pub packets_lost: u64,
-    /// Times that the congestion controller was told of congestion.
+    /// Congestion events that the controller received.
     pub congestion_events: u64,
     /// Bytes sent on the network, everything included. [bytes]
     pub bytes_sent: u64,

@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! render ─ drawn ─▶ encode ─ handed ─▶ transport ─ late ─▶ .     counted here, by camera
-//! runtime ─ arrived, delivered, stale, ... ─▶ DeliveryStats             told by it once a second
+//! runtime ─ arrived, delivered, stale, ... ─▶ DeliveryStats             reported once a second
 //! ```
 //! Both sides only count up. What is handed over and has not arrived is under way, or late as far
 //! as the transport has given it up; so the sum of an account is what was drawn, at any moment.

@@ -3,7 +3,7 @@
 //! ```text
 //! every image that ends (bytes, handed, acknowledged or given up) -> capacity of the link
 //! four times a second: what each level would need of it            -> level
-//! level -> encoder's options, every how manieth image, size
+//! level -> encoder's options, frame decimation, size
 //! ```
 //! Pure: no clock, no socket. One [`RateController`] per session, for all cameras of its vehicle share one
 //! link.
@@ -114,7 +114,7 @@ impl Level {
         lowered
     }
 
-    /// Returns what a person is told: `JPEG 4:2:0 quality 80, depth within 0.001 z²`.
+    /// Returns its description for people: `JPEG 4:2:0 quality 80, depth within 0.001 z²`.
     pub fn name(&self) -> &'static str {
         self.name
     }
@@ -341,7 +341,7 @@ impl RateController {
         Change { from, to, capacity_bps }
     }
 
-    /// Returns what the link carries; `None` while that cannot be told.
+    /// Returns what the link carries; `None` while that is not known.
     fn capacity_bps(&self, now: ServerTime) -> Option<f64> {
         let silent_s = self.silent_since.map_or(0.0, |since| now.seconds_since(since));
         let is_out = silent_s > SILENT_S && silent_s < OUTAGE_S;
@@ -386,7 +386,7 @@ const OUTAGE_S: f64 = 2.5;
 const SILENT_S: f64 = 0.5;
 /// The runtime's `max_ack_delay`: not the link's doing. [s]
 const ACK_DELAY_S: f64 = 0.002;
-/// What is quicker cannot be told from the clock's and the tasks' own delays. [s]
+/// What is quicker cannot be distinguished from the clock's and the tasks' own delays. [s]
 const LEAST_SERVICE_S: f64 = 0.0002;
 
 #[cfg(test)]

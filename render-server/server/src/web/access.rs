@@ -386,7 +386,7 @@ pub(super) async fn enter(
 
 /// Returns the line that sets a cookie: out of reach of scripts, and never sent along by another
 /// site's page. `Secure` where the page was opened over TLS, as behind a proxy; what a client says
-/// of that is believed, since it is its own cookie.
+/// of that is accepted, since it is its own cookie.
 pub(super) fn cookie_line(
     name: &str,
     value: &str,

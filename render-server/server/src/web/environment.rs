@@ -1,4 +1,4 @@
-//! Light and fog from the page: `GET /api/environment` tells those of this moment and those that have
+//! Light and fog from the page: `GET /api/environment` returns those of this moment and those that have
 //! a name, `PUT /api/environment` changes them, also in flight. For the instructor alone
 //! ([`super::routes`]).
 

@@ -78,7 +78,7 @@ fn read(folder: &KeysFolder) -> Result<Option<PasswordHash>, KeyError> {
     Ok(Some(hash))
 }
 
-/// What the page is told of who looks at it.
+/// The session as the page receives it.
 #[derive(Debug, Serialize)]
 struct Standing<'a> {
     /// `instructor`, `team`, or nothing.

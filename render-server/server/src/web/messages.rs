@@ -1,4 +1,4 @@
-//! What the page is told: JSON, one type per message, tagged by `type`.
+//! Messages to the page: JSON, one type per message, tagged by `type`.
 
 use std::sync::atomic::Ordering;
 

@@ -1,4 +1,4 @@
-//! Pairing from the page: `GET /api/pairing` tells how it stands, `POST` opens one, `DELETE` closes it.
+//! Pairing from the page: `GET /api/pairing` returns its status, `POST` opens one, `DELETE` closes it.
 //! For the instructor alone ([`super::access`]).
 
 use std::sync::Arc;

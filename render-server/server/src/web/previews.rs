@@ -224,7 +224,7 @@ pub fn id_colour(id: u16, depth_mm: u16) -> [u8; 3] {
     }
 }
 
-/// Colours that are told apart with any colour vision (Okabe and Ito, 2008).
+/// Colours that can be distinguished with any colour vision (Okabe and Ito, 2008).
 const IDS: [[u8; 3]; 7] = [
     [230, 159, 0],
     [86, 180, 233],

@@ -119,7 +119,7 @@ fn order(
 }
 
 /// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
-/// flight is told.
+/// flight receives it.
 fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
     let (obey, absent): (Vec<_>, Vec<_>) =
         vehicles.iter().partition(|vehicle| vehicle.emergency_stop(BY));

@@ -95,7 +95,7 @@ pub struct RunEnd {
 /// A run as the leaderboard keeps it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Run {
-    /// Drawn by lot.
+    /// Random.
     pub id: String,
     /// Whose.
     pub team: Option<String>,

@@ -6,7 +6,7 @@ use super::*;
 use crate::flights::control_lease::MAX_WATCHERS;
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::{ReceivedEvents, Limits, PoseAges, Purpose};
+use vizflyt_protocol::messages::{Limits, PoseAges, Purpose, ReceivedEvents};
 
 pub(crate) fn named(index: usize, name: &str) -> VehicleFlight {
     let arena = ArenaInfo {

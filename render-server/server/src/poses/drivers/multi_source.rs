@@ -25,7 +25,7 @@ pub(super) struct MultiSource {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What a source's thread tells beside its poses.
+/// What a source's thread reports beside its poses.
 #[derive(Debug, Default)]
 struct Shared {
     counters: Mutex<[SourceCounters; MAX_VEHICLES]>,

@@ -58,7 +58,7 @@ pub struct SourceCounters {
     pub lost_frames: u64,
     /// Frames in which the vehicle was not seen.
     pub occluded: u64,
-    /// Poses that the referee's gate did not believe; counted by the pose thread.
+    /// Poses that the pose filter rejected; counted by the pose thread.
     pub rejected: u64,
     /// What the newest pose rests on, where it comes of tags.
     pub tags: Option<TagsSeen>,

@@ -1,5 +1,5 @@
 //! What every stream needs beside its parser: which object is which vehicle, counters, the way into
-//! the world frame, and what a person should be told. Sans-IO.
+//! the world frame, and warnings for people. Sans-IO.
 
 use std::collections::VecDeque;
 use std::fmt::Display;
@@ -176,7 +176,7 @@ impl VehicleNames {
         }
     }
 
-    /// Counts a packet that does not parse; the first one is told, with what to ask oneself.
+    /// Counts a packet that does not parse; the first one is reported, with advice.
     pub(super) fn bad(&mut self, why: &dyn Display, advice: &str) {
         self.bad_packets += 1;
         if !std::mem::replace(&mut self.warned_of_bad, true) {
@@ -187,7 +187,7 @@ impl VehicleNames {
         }
     }
 
-    /// Notes that only objects stream that are nobody's; told once, unless ours has been seen.
+    /// Notes that only objects stream that belong to no vehicle; reported once, unless ours has been seen.
     pub(super) fn others<'a>(&mut self, names: impl Iterator<Item = &'a str>, advice: &str) {
         if self.warned_of_others || self.objects.iter().any(|object| object.counters.poses > 0) {
             return;

@@ -107,7 +107,7 @@ impl fmt::Display for Units {
 pub enum UpAxis {
     /// As in the world.
     Z,
-    /// As Motive does unless told otherwise: x right, y up, z towards the viewer.
+    /// As Motive does by default: x right, y up, z towards the viewer.
     Y,
 }
 

@@ -50,7 +50,7 @@ pub fn bake(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     baked.field
 }
 
-/// Returns the obstacles of splats: from `cache`, else baked and put there. `progress` hears the
+/// Returns the obstacles of splats: from `cache`, else baked and put there. `progress` receives the
 /// share that is done, 0 to 1, from any thread.
 pub fn bake_with(
     splats: &Splats,

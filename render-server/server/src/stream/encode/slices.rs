@@ -58,7 +58,7 @@ impl SliceEncoder {
     /// if nobody has room.
     ///
     /// # Errors
-    /// If the image cannot be encoded; whoever had some of it is told to forget it.
+    /// If the image cannot be encoded; whoever had some of it resets it.
     pub fn send(
         &mut self,
         subscriptions: &Subscriptions,

@@ -1,8 +1,8 @@
 //! A connection from its first byte to its lease: who it is, preambles, `Hello`, and which vehicle,
 //! or why not.
 //!
-//! A client that is not paired is told how to pair, before a byte of it is read; one that is paired
-//! hears of no vehicle but those it may use.
+//! A client that is not paired receives instructions to pair, before a byte of it is read; one that is paired
+//! learns of no vehicle but those it may use.
 
 use std::net::IpAddr;
 use std::sync::Arc;

@@ -4,7 +4,7 @@
 //! stream whenever a newer image is ready starves an overloaded link altogether; waiting for room
 //! with the newest image, and resetting only past [`DEADLINE`], delivers what the link carries.
 //!
-//! How each image fared tells [`crate::stream::rate_control`] what the link carries.
+//! [`crate::stream::rate_control`] estimates what the link carries from how each image fared.
 //!
 //! One task per place of the subscriptions, made when the subscriber comes or its K grows: it writes an
 //! image's slices as the encoder makes them, without a copy, and none waits for another camera's.

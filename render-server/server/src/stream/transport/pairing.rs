@@ -1,6 +1,6 @@
 //! Pairing over a connection: carries [`vizflyt_trust::pairing`]'s messages.
 //!
-//! Nothing of the arena is told here, whether or not the code is right.
+//! Nothing of the arena is revealed here, whether or not the code is right.
 
 use std::time::Duration;
 

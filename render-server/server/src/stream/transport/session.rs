@@ -4,7 +4,7 @@ use quinn::{Connection, SendStream};
 use tokio::sync::{mpsc, watch as cell};
 use tracing::{debug, info};
 use vizflyt_protocol::messages::{
-    ArenaInfo, ClockReply, ClockRequest, Datagram, ReceivedEvents, Hello, PoseSample, Purpose,
+    ArenaInfo, ClockReply, ClockRequest, Datagram, Hello, PoseSample, Purpose, ReceivedEvents,
     ToRuntime, ToServer, Welcome,
 };
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
@@ -86,7 +86,8 @@ impl Session<'_> {
         let purpose = if lease.is_some() { Purpose::Fly } else { Purpose::Watch };
         let (rooms, vehicle) = (self.rooms.clone(), self.vehicle.index);
         let senders = ImageSenders::open(rooms, vehicle, self.connection.clone(), id, purpose);
-        let received_events = lease.map_or_else(ReceivedEvents::default, |lease| lease.received_events);
+        let received_events =
+            lease.map_or_else(ReceivedEvents::default, |lease| lease.received_events);
         let heard = self.hello.received_events.of(self.rooms.flights.instance_id);
         let cursor = first_event.max(heard);
         tokio::select! {
@@ -97,7 +98,7 @@ impl Session<'_> {
         }
     }
 
-    /// Server to client: events first, then what was heard of its own, changed cameras, clock
+    /// Server to client: events first, then acknowledgements of its own, changed cameras, clock
     /// replies, and the newest pose.
     async fn send(
         &self,
