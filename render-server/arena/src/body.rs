@@ -156,13 +156,13 @@ mod tests {
                     .iter()
                     .map(|ball| (p - ball.center_m).length() - ball.radius_m)
                     .fold(f64::INFINITY, f64::min);
-                // Inside, distances to a union of balls say less than the solid's.
+                // Inside, distances to a union of balls are smaller than the solid's.
                 prop_assert!(found <= truth.max(0.0) + 1e-12, "{found} {truth}");
                 prop_assert!(truth < 0.0 || found > truth - 0.04 * part.radius_m, "{found} {truth}");
             }
         }
 
-        /// No centre of a ball moves further than is said.
+        /// No centre of a ball moves further than stated.
         #[test]
         fn motion_bounds_every_ball(
             d in prop::array::uniform3(-1.0..1.0f64), turn in prop::array::uniform3(-2.0..2.0f64),

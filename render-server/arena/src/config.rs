@@ -51,10 +51,10 @@ pub struct ArenaConfig {
     /// From take-off; 0 is none. [s]
     #[serde(default)]
     pub time_limit_s: f64,
-    /// Whether plugins get the vehicle's pose and velocity; if not said, they do.
+    /// Whether plugins get the vehicle's pose and velocity; by default they do.
     #[serde(default = "yes")]
     pub ground_truth: bool,
-    /// Whether plugins may fly by attitude rates; if not said, they may not.
+    /// Whether plugins may fly by attitude rates; by default they may not.
     #[serde(default)]
     pub attitude_rate: bool,
     /// Where the vehicle stands at the start.
@@ -273,7 +273,7 @@ impl ArenaConfig {
     }
 }
 
-/// What `ground_truth` is if not said: a course withholds it on purpose.
+/// Default of `ground_truth`: a course withholds it on purpose.
 fn yes() -> bool {
     true
 }

@@ -48,7 +48,7 @@ impl DistanceField {
         self.floor_z_m
     }
 
-    /// Returns the greatest distance the field can say; further is this. [m]
+    /// Returns the greatest distance the field can hold; further is this. [m]
     pub fn max_distance_m(&self) -> f64 {
         distance_voxels(u8::MAX) * self.grid.voxel_m
     }

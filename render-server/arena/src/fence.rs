@@ -50,7 +50,7 @@ enum Boundary {
     Ceiling(f64),
 }
 
-/// Room, now or at rest, below which a person should be told. [m]
+/// Room, now or at rest, below which a person should be warned. [m]
 const NEAR_M: f64 = 0.3;
 /// The referee's tolerance over the guard's: the guard brakes with its own margin, and poses carry
 /// millimetres of noise. Only what it fails to hold is judged. [m]

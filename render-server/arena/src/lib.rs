@@ -2,11 +2,11 @@
 //! clock or threads of its own (the baker borrows rayon's).
 //!
 //! Read in this order:
-//! - [`config`]: `arena.toml` as validated types; also what the runtime is told of the arena;
+//! - [`config`]: `arena.toml` as validated types; also what the runtime gets of the arena;
 //! - [`occupancy`], [`distance`]: splats baked into voxels, and the distance to them;
 //! - [`objects`]: where what moves by itself is at any instant;
 //! - [`obstacles`], [`neighbours`]: what must not be touched: still, moving, other vehicles;
-//! - [`pose`]: which measurements are believed, and the twist;
+//! - [`pose`]: which measurements are accepted, and the twist;
 //! - [`body`], [`collision`], [`fence`], [`course`]: one rule each;
 //! - [`check`]: whether a course can be flown at all;
 //! - [`referee`]: all of it for one vehicle, as one state machine;

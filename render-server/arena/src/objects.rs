@@ -59,7 +59,7 @@ enum Motion {
 }
 
 impl MovingObjects {
-    /// Takes an arena's objects; phases that the arena does not say are drawn from the seed.
+    /// Takes an arena's objects; phases absent from the arena are random by the seed.
     ///
     /// ```
     /// use vizflyt_arena::config::{MotionConfig, ObjectConfig};

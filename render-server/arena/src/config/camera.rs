@@ -85,7 +85,7 @@ pub struct CameraConfig {
     /// When the network is short, the images of cameras with a higher number go first.
     #[serde(default, skip_serializing_if = "is_normal")]
     pub priority: i32,
-    /// Whether its images come with depth; if not said, they do. Depth that a course withholds does
+    /// Whether its images come with depth; by default they do. Depth that a course withholds does
     /// not leave the server: plugins get "no return" in every pixel.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub depth: bool,

@@ -33,7 +33,7 @@ pub struct ObjectConfig {
     /// How its frame rests: turned from the world's by this about z, counter-clockwise. [deg]
     #[serde(default)]
     pub yaw_deg: f64,
-    /// Where in its motion it is when the arena starts; drawn from the seed if it is not said. [s]
+    /// Where in its motion it is when the arena starts; random by the seed if absent. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase_s: Option<f64>,
     /// How it moves about its rest.

@@ -1,4 +1,4 @@
-//! What `arena.toml` may say. Each refusal names the key, the value and what to do.
+//! What `arena.toml` may hold. Each refusal names the key, the value and what to do.
 
 use std::collections::HashSet;
 use std::fmt::Display;

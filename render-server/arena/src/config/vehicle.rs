@@ -14,10 +14,10 @@ use super::{ArenaConfig, Spawn};
 pub struct VehicleConfig {
     /// The name of its object in the localization system; at most 24 bytes.
     pub name: String,
-    /// Where it stands at the start; the arena's `spawn` if it is not said.
+    /// Where it stands at the start; the arena's `spawn` if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub spawn: Option<Spawn>,
-    /// Names of its cameras, in the order of their index on the wire; all if it is not said.
+    /// Names of its cameras, in the order of their index on the wire; all if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<String>>,
 }

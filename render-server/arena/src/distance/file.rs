@@ -90,9 +90,9 @@ impl DistanceField {
 pub const FIELD_HEADER: usize = 72;
 /// The last is the version: raise it when bytes or codes mean something else.
 const MAGIC: &[u8; 8] = b"vzfield\x01";
-/// Well beyond what an arena may say. [m]
+/// Well beyond what an arena may hold. [m]
 const FURTHEST_M: f64 = 1e5;
-/// What an arena may say, and more. [m]
+/// What an arena may hold, and more. [m]
 const VOXELS_M: std::ops::RangeInclusive<f64> = 1e-3..=10.0;
 
 #[cfg(test)]

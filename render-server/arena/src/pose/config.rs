@@ -1,4 +1,4 @@
-//! `[pose]` of `arena.toml`: what the filter believes, when silence counts, and for which moment
+//! `[pose]` of `arena.toml`: what the filter accepts, when silence counts, and for which moment
 //! images are drawn.
 
 use glam::DVec3;
@@ -12,15 +12,15 @@ use crate::config::validate::{check_number, invalid};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PoseConfig {
-    /// Age of the newest believed pose from which the vehicle holds. [s]
+    /// Age of the newest accepted pose from which the vehicle holds. [s]
     pub hold_after_s: f64,
     /// Age from which it lands. [s]
     pub land_after_s: f64,
     /// For which moment images are drawn.
     pub predict: Predict,
-    /// Whether the autopilot's IMU takes part, as far as it is told.
+    /// Whether the autopilot's IMU takes part, as far as it is sent.
     pub imu: bool,
-    /// How far a measured position may be off where its source does not say, one standard deviation
+    /// How far a measured position may be off where its source reports none, one standard deviation
     /// an axis. [m, world]
     pub position_sigma_m: f64,
     /// The same of the attitude. [deg, body]
@@ -29,7 +29,7 @@ pub struct PoseConfig {
     pub stamp_sigma_s: f64,
     /// A measurement further from the expected than this many standard deviations is an outlier.
     pub gate_sigmas: f64,
-    /// An attitude that flipped is believed when it has stayed so for this long. Swapped markers do
+    /// An attitude that flipped is accepted when it has stayed so for this long. Swapped markers do
     /// stay, so this is longer than `land_after_s`. [s]
     pub flip_believed_after_s: f64,
 }
@@ -67,7 +67,7 @@ impl Default for PoseConfig {
 }
 
 impl PoseConfig {
-    /// Returns how far a measurement may be off whose source does not say.
+    /// Returns how far a measurement may be off whose source reports none.
     pub fn sigma(&self) -> PoseSigma {
         PoseSigma {
             position_m: DVec3::splat(self.position_sigma_m),

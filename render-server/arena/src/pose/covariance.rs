@@ -3,7 +3,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::motion::Kept;
+use super::motion::Decay;
 
 /// Blocks of the error state, in order.
 pub(super) const P: usize = 0;
@@ -73,8 +73,8 @@ impl Covariance {
 
     /// Moves on with the state: `F C F^T` of the motion model, whose `F` is the identity but for
     /// `P += dt V + twice A`, `V += once A`, `A *= share`, `R = back R + dt W`.
-    pub(super) fn advance(&mut self, dt_s: f64, kept: &Kept, back: &DMat3) {
-        let Kept { share, once_s, twice_s2 } = *kept;
+    pub(super) fn advance(&mut self, dt_s: f64, decay: &Decay, back: &DMat3) {
+        let Decay { share, once_s, twice_s2 } = *decay;
         let forth = back.transpose();
         // Each line as a row first; its diagonal then takes what the column adds, by the new row.
         self.add_block(P, P, self.block(V, P) * dt_s + self.block(A, P) * twice_s2);
@@ -247,19 +247,19 @@ mod tests {
         fn a_step_is_the_product_of_whole_matrices(
             c in any_covariance(), w in prop::array::uniform3(-0.3..0.3f64), dt_s in 1e-4..0.05f64
         ) {
-            let kept = Kept::after(dt_s);
+            let decay = Decay::after(dt_s);
             let back = DMat3::from_quat(DQuat::from_scaled_axis(DVec3::from(w)));
             let mut f: Plain = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
             let scaled = |factor: f64| DMat3::IDENTITY * factor;
             set(&mut f, P, V, scaled(dt_s));
-            set(&mut f, P, A, scaled(kept.twice_s2));
-            set(&mut f, V, A, scaled(kept.once_s));
-            set(&mut f, A, A, scaled(kept.share));
+            set(&mut f, P, A, scaled(decay.twice_s2));
+            set(&mut f, V, A, scaled(decay.once_s));
+            set(&mut f, A, A, scaled(decay.share));
             set(&mut f, R, R, back);
             set(&mut f, R, W, scaled(dt_s));
             let expected = product(&product(&f, &plain(&c)), &transposed(&f));
             let mut moved = c;
-            moved.advance(dt_s, &kept, &back);
+            moved.advance(dt_s, &decay, &back);
             assert_close(&plain(&moved), &expected);
         }
 

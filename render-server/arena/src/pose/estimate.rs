@@ -21,7 +21,7 @@ use super::PoseSigma;
 use super::covariance::{
     A, ACCEL_BIAS, Covariance, GYRO_BIAS, P, R, Reading, Slope, V, W, squares,
 };
-use super::motion::Kept;
+use super::motion::Decay;
 
 /// A drone in a room seldom accelerates harder: 30 degrees of tilt. [m/s^2]
 const ACCELERATION_SIGMA_MPS2: f64 = 5.0;
@@ -70,9 +70,9 @@ pub(super) struct Innovation {
     pub sigmas: f64,
 }
 
-/// A kink in the motion that the model does not foresee: so far off, within so long.
+/// A manoeuvre that the model does not foresee: so far off, within so long.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Doubt {
+pub(super) struct Manoeuvre {
     pub distance_m: f64,
     pub angle_rad: f64,
     pub dt_s: f64,
@@ -146,13 +146,13 @@ impl Estimate {
     }
 
     fn step(&mut self, dt_s: f64) {
-        let kept = Kept::after(dt_s);
-        self.p_world_m += self.v_world_mps * dt_s + self.a_world_mps2 * kept.twice_s2;
-        self.v_world_mps += self.a_world_mps2 * kept.once_s;
-        self.a_world_mps2 *= kept.share;
+        let decay = Decay::after(dt_s);
+        self.p_world_m += self.v_world_mps * dt_s + self.a_world_mps2 * decay.twice_s2;
+        self.v_world_mps += self.a_world_mps2 * decay.once_s;
+        self.a_world_mps2 *= decay.share;
         let turn = DQuat::from_scaled_axis(self.omega_body_radps * dt_s);
         self.rotation = (self.rotation * turn).normalize();
-        self.covariance.advance(dt_s, &kept, &DMat3::from_quat(turn.conjugate()));
+        self.covariance.advance(dt_s, &decay, &DMat3::from_quat(turn.conjugate()));
         // White jerk, and white angular acceleration, over the step.
         let jerk = 2.0 * ACCELERATION_SIGMA_MPS2.powi(2) / ACCELERATION_LASTS_S;
         let dt2 = dt_s * dt_s;
@@ -235,9 +235,9 @@ impl Estimate {
         )
     }
 
-    /// Doubts what it holds.
-    pub(super) fn doubt(&mut self, doubt: &Doubt) {
-        let Doubt { distance_m, angle_rad, dt_s } = *doubt;
+    /// Inflates the covariance for a manoeuvre.
+    pub(super) fn inflate_covariance(&mut self, manoeuvre: &Manoeuvre) {
+        let Manoeuvre { distance_m, angle_rad, dt_s } = *manoeuvre;
         for (block, sigma) in [
             (P, distance_m),
             (V, distance_m / dt_s),

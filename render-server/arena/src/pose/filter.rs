@@ -6,7 +6,7 @@ use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
 
 use super::covariance::squares;
-use super::estimate::{Doubt, Estimate};
+use super::estimate::{Estimate, Manoeuvre};
 use super::history::{History, Input, Record};
 use super::motion::Motion;
 use super::quality::{Fading, PoseQuality, Rejects};
@@ -16,7 +16,7 @@ use super::{ImuReading, MAX_SOURCES, Measured, PoseConfig, PoseSigma, Rejected};
 /// What changed about the sources of poses.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PoseChange {
-    /// No believed pose for so long [s], and why the last one was not believed, if one came.
+    /// No accepted pose for so long [s], and why the last one was rejected, if one came.
     Lost(f64, Option<Rejected>),
     /// Poses are back.
     Regained,
@@ -31,13 +31,13 @@ pub struct PoseFilter {
     history: History,
     sources: [Source; MAX_SOURCES],
     newest: Option<PoseSample>,
-    /// Why the last measurement was not believed, if it was not.
+    /// Why the last measurement was rejected, if it was.
     rejected: Option<Rejected>,
     resets: u8,
     lost: bool,
     change: Option<PoseChange>,
     imu: Imu,
-    /// Intervals of believed poses, and their innovations. [standard deviations]
+    /// Intervals of accepted poses, and their innovations. [standard deviations]
     believed: Fading,
 }
 
@@ -52,12 +52,12 @@ struct Imu {
 }
 
 /// What to make of a measurement.
-enum Verdict {
+enum GateResult {
     Fits {
         sigmas: f64,
     },
     /// A motion that the model did not foresee.
-    Kink(Doubt),
+    Manoeuvre(Manoeuvre),
     /// The pose changed for another reason than motion.
     Reset,
     Rejected(Rejected),
@@ -86,14 +86,14 @@ impl PoseFilter {
         }
     }
 
-    /// Takes a measurement; returns the newest sample if it is believed. Of a measurement of the
+    /// Takes a measurement; returns the newest sample if it is accepted. Of a measurement of the
     /// past, that is the former sample by what is now known.
     pub fn handle_pose(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
         let index = usize::from(measured.source).min(MAX_SOURCES - 1);
         match self.take(index, measured) {
             Ok(sigmas) => {
                 if let Some((_, estimate)) = self.history.newest() {
-                    self.sources[index].believe(measured, estimate, self.imu.turned);
+                    self.sources[index].accept(measured, estimate, self.imu.turned);
                 }
                 self.believed.add(measured.stamp, sigmas);
                 self.rejected = None;
@@ -115,7 +115,7 @@ impl PoseFilter {
         }
     }
 
-    /// Returns by how many standard deviations a believed measurement was off.
+    /// Returns by how many standard deviations an accepted measurement was off.
     fn take(&mut self, index: usize, measured: &Measured) -> Result<f64, Rejected> {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         if !pose.is_valid() || pose.translation_m.abs().max_element() > FURTHEST_M {
@@ -133,25 +133,25 @@ impl PoseFilter {
             return Err(Rejected::Stale);
         }
         let imu = &mut self.imu;
-        let prior = self.history.at(stamp, |estimate, record| imu.weigh(estimate, record));
+        let prior = self.history.at(stamp, |estimate, record| imu.fuse(estimate, record));
         let Some(prior) = prior else { return Err(Rejected::Stale) };
         let noise = self.sources[index].noise_factor();
-        let verdict = self.judge(index, measured, &sigma, &prior);
-        let taken = match verdict {
-            Verdict::Fits { sigmas } => {
+        let result = self.judge(index, measured, &sigma, &prior);
+        let taken = match result {
+            GateResult::Fits { sigmas } => {
                 self.put(stamp, &pose, self.variances(&sigma, &prior, noise), None);
                 Ok(sigmas)
             }
-            Verdict::Kink(doubt) => {
-                self.put(stamp, &pose, self.variances(&sigma, &prior, noise), Some(doubt));
+            GateResult::Manoeuvre(manoeuvre) => {
+                self.put(stamp, &pose, self.variances(&sigma, &prior, noise), Some(manoeuvre));
                 Ok(self.config.gate_sigmas)
             }
-            Verdict::Reset => {
+            GateResult::Reset => {
                 self.resets = self.resets.wrapping_add(1);
                 self.begin(stamp, &pose, &sigma);
                 return Ok(self.config.gate_sigmas);
             }
-            Verdict::Rejected(reason) => Err(reason),
+            GateResult::Rejected(reason) => Err(reason),
         };
         self.settle();
         if self.history.newest().is_some_and(|(_, estimate)| !estimate.is_finite()) {
@@ -164,7 +164,7 @@ impl PoseFilter {
     /// Takes in what came since a pose was last asked for.
     fn settle(&mut self) {
         let imu = &mut self.imu;
-        self.history.settle(|estimate, record| imu.weigh(estimate, record));
+        self.history.settle(|estimate, record| imu.fuse(estimate, record));
         if self.imu.read < IMU_TRIAL || self.imu.left_out {
             return;
         }
@@ -183,10 +183,10 @@ impl PoseFilter {
         measured: &Measured,
         sigma: &PoseSigma,
         prior: &Estimate,
-    ) -> Verdict {
+    ) -> GateResult {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         if let Err(frozen) = self.sources[index].check_frozen(measured, self.imu.turned) {
-            return Verdict::Rejected(frozen);
+            return GateResult::Rejected(frozen);
         }
         let noise = self.sources[index].noise_factor();
         let (variance_m2, variance_rad2) = self.variances(sigma, prior, noise);
@@ -194,14 +194,14 @@ impl PoseFilter {
         let attitude = prior.attitude_innovation(pose.rotation, variance_rad2);
         let sigmas = place.sigmas.max(attitude.sigmas);
         let gate = self.config.gate_sigmas;
-        // The longer nothing is believed, the more would fit; what did not at first must prove true.
+        // The longer nothing is accepted, the more would fit; what did not at first must prove true.
         let pending = self.sources[index].pending(measured).map(|claim| claim.kind);
         let denied = matches!(pending, Some(ClaimKind::Jump(_) | ClaimKind::Flip));
         if !denied && place.residual.length() < LEARNS_WITHIN_M {
             self.sources[index].learn(sigmas);
         }
         if sigmas <= gate && !denied {
-            return Verdict::Fits { sigmas };
+            return GateResult::Fits { sigmas };
         }
         let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
         let trusted = self.sources.iter().enumerate().find(|(other, source)| {
@@ -210,38 +210,38 @@ impl PoseFilter {
         });
         if let Some((other, _)) = trusted {
             let other = other as u8;
-            return Verdict::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
+            return GateResult::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
         }
         let newest = self.newest.map_or(stamp, |newest| newest.stamp);
         let dt_s = stamp.seconds_since(newest).abs().max(LEAST_DT_S);
         let speed_mps = distance_m / dt_s;
         // A gyroscope would have felt a turn.
         let felt = self.imu_is_fresh(stamp) && angle_rad > FELT_RAD;
-        let kind = if place.sigmas > gate && speed_mps > MOST_KINK_MPS {
+        let kind = if place.sigmas > gate && speed_mps > MOST_MANOEUVRE_MPS {
             ClaimKind::Jump(speed_mps)
         } else if attitude.sigmas > gate && (felt || angle_rad / dt_s > MOST_TURN_RADPS) {
             ClaimKind::Flip
         } else {
-            ClaimKind::Kink(dt_s)
+            ClaimKind::Manoeuvre(dt_s)
         };
         let claim = self.sources[index].claim(measured, kind);
         match claim.kind {
             ClaimKind::Jump(_)
                 if claim.count >= JUMP_CONFIRMED && claim.lasted_s() >= JUMP_LASTS_S =>
             {
-                Verdict::Reset
+                GateResult::Reset
             }
             ClaimKind::Flip if claim.lasted_s() >= self.config.flip_believed_after_s => {
-                Verdict::Reset
+                GateResult::Reset
             }
-            ClaimKind::Kink(dt_s) if claim.count >= KINK_CONFIRMED => {
-                Verdict::Kink(Doubt { distance_m, angle_rad, dt_s })
+            ClaimKind::Manoeuvre(dt_s) if claim.count >= MANOEUVRE_CONFIRMED => {
+                GateResult::Manoeuvre(Manoeuvre { distance_m, angle_rad, dt_s })
             }
             ClaimKind::Jump(speed_mps) => {
-                Verdict::Rejected(Rejected::Jump { distance_m, speed_mps })
+                GateResult::Rejected(Rejected::Jump { distance_m, speed_mps })
             }
-            ClaimKind::Flip => Verdict::Rejected(Rejected::Flip(angle_rad)),
-            ClaimKind::Kink(_) => Verdict::Rejected(Rejected::Outlier(sigmas)),
+            ClaimKind::Flip => GateResult::Rejected(Rejected::Flip(angle_rad)),
+            ClaimKind::Manoeuvre(_) => GateResult::Rejected(Rejected::Outlier(sigmas)),
         }
     }
 
@@ -257,7 +257,7 @@ impl PoseFilter {
             rotation: pose.rotation,
             variance_m2: squares(sigma.position_m),
             variance_rad2: squares(sigma.rotation_rad),
-            doubt: None,
+            manoeuvre: None,
         };
         self.history.begin(stamp, input, &estimate);
     }
@@ -267,12 +267,12 @@ impl PoseFilter {
         stamp: ServerTime,
         pose: &Pose<World, Body>,
         (variance_m2, variance_rad2): (DMat3, DMat3),
-        doubt: Option<Doubt>,
+        manoeuvre: Option<Manoeuvre>,
     ) {
         let (p_world_m, rotation) = (pose.translation_m, pose.rotation);
-        let input = Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, doubt };
+        let input = Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, manoeuvre };
         let imu = &mut self.imu;
-        self.history.put(stamp, input, |estimate, record| imu.weigh(estimate, record));
+        self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
     /// Returns the sigma to work with: what the source says, within what can be.
@@ -325,7 +325,7 @@ impl PoseFilter {
         self.imu.last = Some(stamp);
         let input = Input::Imu { accel_mps2, gyro_radps };
         let imu = &mut self.imu;
-        self.history.put(stamp, input, |estimate, record| imu.weigh(estimate, record));
+        self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
     /// Notices silence. Call at [`Self::poll_timeout`].
@@ -352,7 +352,7 @@ impl PoseFilter {
         self.change.take()
     }
 
-    /// Returns the newest believed pose.
+    /// Returns the newest accepted pose.
     pub fn newest(&self) -> Option<&PoseSample> {
         self.newest.as_ref()
     }
@@ -414,11 +414,11 @@ impl PoseFilter {
 
 impl Imu {
     /// Takes a reading in, and counts those of the IMU that come for the first time.
-    fn weigh(&mut self, estimate: &mut Estimate, record: &Record) {
+    fn fuse(&mut self, estimate: &mut Estimate, record: &Record) {
         match record.input {
-            Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, doubt } => {
-                if let Some(doubt) = &doubt {
-                    estimate.doubt(doubt);
+            Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, manoeuvre } => {
+                if let Some(manoeuvre) = &manoeuvre {
+                    estimate.inflate_covariance(manoeuvre);
                 }
                 estimate.read_position(p_world_m, variance_m2);
                 estimate.read_attitude(rotation, variance_rad2);
@@ -439,7 +439,7 @@ impl Imu {
 const FURTHEST_M: f64 = 1e4;
 /// After such a pause nothing of the former motion holds. [s]
 const BEGIN_ANEW_AFTER_S: f64 = 1.0;
-/// A source that was believed so lately is believed against another. [s]
+/// A source that was accepted so lately is accepted against another. [s]
 const TRUSTED_FOR_S: f64 = 0.15;
 /// What is further off is no noise of a localization that flies. [m]
 const LEARNS_WITHIN_M: f64 = 0.3;
@@ -447,7 +447,7 @@ const LEARNS_WITHIN_M: f64 = 0.3;
 const LEAST_DT_S: f64 = 1e-4;
 /// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
 /// [m/s]
-const MOST_KINK_MPS: f64 = 15.0;
+const MOST_MANOEUVRE_MPS: f64 = 15.0;
 /// Racing drones turn by 2000 degrees a second. [rad/s]
 const MOST_TURN_RADPS: f64 = 35.0;
 /// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
@@ -457,7 +457,7 @@ const FELT_RAD: f64 = 0.2;
 const JUMP_CONFIRMED: u32 = 10;
 const JUMP_LASTS_S: f64 = 0.02;
 /// One measurement off is an outlier, a second one like it is a motion.
-const KINK_CONFIRMED: u32 = 2;
+const MANOEUVRE_CONFIRMED: u32 = 2;
 /// Noise of a flight controller's gyroscope with the motors running. [rad/s]
 const GYRO_SIGMA_RADPS: f64 = 0.03;
 /// Noise of its accelerometer with the motors running: mostly vibration. [m/s^2]

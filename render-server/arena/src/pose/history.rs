@@ -9,18 +9,18 @@ use std::collections::VecDeque;
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::time::ServerTime;
 
-use super::estimate::{Doubt, Estimate};
+use super::estimate::{Estimate, Manoeuvre};
 
-/// One reading, as it was weighed when it came.
+/// One reading, with its covariance of that time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Input {
-    /// A believed pose, and how far what was known before it is to be doubted.
+    /// An accepted pose, and how far what was known before it is to be inflated.
     Pose {
         p_world_m: DVec3,
         rotation: DQuat,
         variance_m2: DMat3,
         variance_rad2: DMat3,
-        doubt: Option<Doubt>,
+        manoeuvre: Option<Manoeuvre>,
     },
     /// The autopilot's accelerometer and gyroscope.
     Imu { accel_mps2: DVec3, gyro_radps: DVec3 },
@@ -84,10 +84,10 @@ impl History {
     pub(super) fn at(
         &mut self,
         stamp: ServerTime,
-        weigh: impl FnMut(&mut Estimate, &Record),
+        fuse: impl FnMut(&mut Estimate, &Record),
     ) -> Option<Estimate> {
         let place = self.place(stamp);
-        self.settle_to(place, weigh);
+        self.settle_to(place, fuse);
         let index = place.checked_sub(1)?;
         let mut estimate = *self.estimates.get(index)?;
         estimate.advance(stamp.seconds_since(self.records.get(index)?.stamp));
@@ -100,10 +100,10 @@ impl History {
         &mut self,
         stamp: ServerTime,
         input: Input,
-        weigh: impl FnMut(&mut Estimate, &Record),
+        fuse: impl FnMut(&mut Estimate, &Record),
     ) {
         if self.records.len() == READINGS {
-            self.settle_to(2, weigh);
+            self.settle_to(2, fuse);
             self.records.pop_front();
             self.estimates.pop_front();
         }
@@ -117,11 +117,11 @@ impl History {
     }
 
     /// Takes in again what is not settled.
-    pub(super) fn settle(&mut self, weigh: impl FnMut(&mut Estimate, &Record)) {
-        self.settle_to(self.records.len(), weigh);
+    pub(super) fn settle(&mut self, fuse: impl FnMut(&mut Estimate, &Record)) {
+        self.settle_to(self.records.len(), fuse);
     }
 
-    fn settle_to(&mut self, count: usize, mut weigh: impl FnMut(&mut Estimate, &Record)) {
+    fn settle_to(&mut self, count: usize, mut fuse: impl FnMut(&mut Estimate, &Record)) {
         let first = self.estimates.len();
         let Some(newest) = self.estimates.back().filter(|_| first < count) else { return };
         let mut estimate = *newest;
@@ -129,7 +129,7 @@ impl History {
         for record in self.records.range_mut(first..count) {
             estimate.advance(record.stamp.seconds_since(stamp));
             stamp = record.stamp;
-            weigh(&mut estimate, record);
+            fuse(&mut estimate, record);
             record.is_known = true;
             self.estimates.push_back(estimate);
         }

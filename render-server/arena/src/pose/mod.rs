@@ -1,4 +1,4 @@
-//! From localization measurements to the pose that everything else uses: measurements are weighed
+//! From localization measurements to the pose that everything else uses: measurements are weighted
 //! by how far they may be off, what cannot be is turned away and named, the twist is estimated, and
 //! silence is noticed. The pose can be had for any moment close by.
 //!
@@ -6,7 +6,7 @@
 //! poses, 30 to 500 Hz, of one or several sources --> stamps, frozen? -> gate -\
 //! the autopilot's IMU, 100 Hz, if there is one --------------------------------> estimate
 //!       each put where its stamp says, also in the past (history)               |
-//!                                          PoseSample for each believed pose <--+--> Motion
+//!                                          PoseSample for each accepted pose <--+--> Motion
 //! ```
 //! Read in this order: [`estimate`](self) is the Kalman filter, over its [`covariance`](self), [`history`](self) lets it take
 //! readings late, [`filter`](self) judges measurements by what the filter expects, with what it
@@ -54,7 +54,7 @@ pub struct Measured {
     pub arrival: ServerTime,
     /// Where the vehicle was.
     pub world_from_body: Pose<World, Body>,
-    /// How far that may be off; `None` is as the settings say.
+    /// How far that may be off; `None` is as configured.
     pub sigma: Option<PoseSigma>,
 }
 
@@ -65,7 +65,7 @@ impl Measured {
     }
 }
 
-/// Why a measurement is not believed.
+/// Why a measurement is rejected.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Rejected {
     /// A number that is not finite, or a quaternion that is not of unit length.
@@ -83,7 +83,7 @@ pub enum Rejected {
     /// The stamps went back by so much while poses kept coming. [s]
     #[error("the stamps of the poses went back by {0:.2} s: the source's clock was set")]
     ClockJump(f64),
-    /// Beyond the gate by itself; a second one like it would be believed. [standard deviations]
+    /// Beyond the gate by itself; a second one like it would be accepted. [standard deviations]
     #[error("the pose is {0:.0} standard deviations from the expected: an outlier")]
     Outlier(f64),
     /// Further from the expected than any vehicle flies.
@@ -94,7 +94,7 @@ pub enum Rejected {
     Jump {
         /// From where it was expected. [m]
         distance_m: f64,
-        /// By the time since the last believed pose. [m/s]
+        /// By the time since the last accepted pose. [m/s]
         speed_mps: f64,
     },
     /// Turned further at once than any vehicle turns. [rad]
@@ -106,7 +106,7 @@ pub enum Rejected {
          stream is frozen"
     )]
     Frozen(f64),
-    /// Against another source that is believed at this time.
+    /// Against another source that is accepted at this time.
     #[error(
         "the pose is {distance_m:.2} m and {:.0} degrees from what source {other} says, which is \
          believed: are both in the same frame, and is it the same object?",

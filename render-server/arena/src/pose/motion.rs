@@ -9,7 +9,7 @@ use super::estimate::{ACCELERATION_LASTS_S, Estimate};
 /// Longest extrapolation; beyond it a motion model means nothing. [s]
 pub const PREDICT_MOST_S: f64 = 0.2;
 
-/// How the vehicle moves: enough to say where it is at a time close by.
+/// How the vehicle moves: enough to predict where it is at a time close by.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// When it moved so: the newest reading of any sensor. [server]
@@ -46,7 +46,7 @@ impl Motion {
         }
     }
 
-    /// Returns the time closest to `time` at which it can say the pose.
+    /// Returns the time closest to `time` at which it knows the pose.
     pub fn reach(&self, time: ServerTime) -> ServerTime {
         let dt_s = time.seconds_since(self.stamp);
         if dt_s.abs() <= PREDICT_MOST_S {
@@ -59,11 +59,11 @@ impl Motion {
     /// that end.
     pub fn at(&self, time: ServerTime) -> Pose<World, Body> {
         let dt_s = time.seconds_since(self.stamp).clamp(-PREDICT_MOST_S, PREDICT_MOST_S);
-        let kept = Kept::after(dt_s);
+        let decay = Decay::after(dt_s);
         Pose::new(
             self.world_from_body.translation_m
                 + self.v_world_mps * dt_s
-                + self.a_world_mps2 * kept.twice_s2,
+                + self.a_world_mps2 * decay.twice_s2,
             (self.world_from_body.rotation * DQuat::from_scaled_axis(self.omega_body_radps * dt_s))
                 .normalize(),
         )
@@ -71,7 +71,7 @@ impl Motion {
 }
 
 /// What an acceleration that dies away leaves after a time.
-pub(super) struct Kept {
+pub(super) struct Decay {
     /// Of itself.
     pub share: f64,
     /// Integrated once. [s]
@@ -80,7 +80,7 @@ pub(super) struct Kept {
     pub twice_s2: f64,
 }
 
-impl Kept {
+impl Decay {
     pub(super) fn after(dt_s: f64) -> Self {
         let share = (-dt_s / ACCELERATION_LASTS_S).exp();
         let once_s = ACCELERATION_LASTS_S * (1.0 - share);

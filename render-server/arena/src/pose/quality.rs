@@ -22,7 +22,7 @@ pub struct Rejects {
     pub flip: u64,
     /// The same numbers again while the vehicle moved.
     pub frozen: u64,
-    /// Against another source that is believed.
+    /// Against another source that is accepted.
     pub disagree: u64,
 }
 
@@ -65,7 +65,7 @@ impl Rejects {
 /// How good one vehicle's localization is.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PoseQuality {
-    /// Since the newest believed pose was measured; absent before the first. [ms]
+    /// Since the newest accepted pose was measured; absent before the first. [ms]
     pub age_ms: Option<f64>,
     /// Believed poses. [Hz]
     pub rate_hz: f64,
@@ -91,11 +91,11 @@ pub struct PoseQuality {
 pub struct SourceQuality {
     /// Its index, in the order in which sources were set up.
     pub source: u8,
-    /// What it is called; empty where nobody has said.
+    /// What it is called; empty if unnamed.
     pub name: String,
     /// Measurements. [Hz]
     pub rate_hz: f64,
-    /// From the measurement to its arrival, as its stamps say. [ms]
+    /// From the measurement to its arrival, by its stamps. [ms]
     pub latency_ms: f64,
     /// Believed so far.
     pub believed: u64,

@@ -1,4 +1,4 @@
-//! What is remembered of one source of poses, to tell a bad measurement from a bad guess.
+//! What is remembered of one source of poses, to distinguish a bad measurement from a bad prediction.
 
 use glam::DQuat;
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -23,14 +23,14 @@ pub(super) struct Claim {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum ClaimKind {
     /// A turn or a stop that the motion model does not foresee, over this time. [s]
-    Kink(f64),
+    Manoeuvre(f64),
     /// Flown faster than vehicles fly. [m/s]
     Jump(f64),
     /// Turned faster than vehicles turn.
     Flip,
 }
 
-/// The last believed pose, as long as it comes again and again.
+/// The last accepted pose, as long as it comes again and again.
 #[derive(Clone, Copy, Debug)]
 struct Still {
     since: ServerTime,
@@ -55,10 +55,10 @@ pub(super) struct Source {
     noise: Noise,
 }
 
-/// How its measurements scatter against what they are said to.
+/// How its measurements scatter against their stated sigmas.
 #[derive(Clone, Copy, Debug)]
 struct Noise {
-    /// Mean square of innovations in standard deviations, an axis: 1 where all is as said.
+    /// Mean square of innovations in standard deviations, an axis: 1 where all is as stated.
     square: f64,
     /// What variances are multiplied by.
     factor: f64,
@@ -126,8 +126,8 @@ impl Source {
         claim
     }
 
-    /// Takes note of a believed pose, after which the vehicle moves as `estimate` says.
-    pub(super) fn believe(&mut self, measured: &Measured, estimate: &Estimate, turned: DQuat) {
+    /// Takes note of an accepted pose, after which the vehicle moves as `estimate` says.
+    pub(super) fn accept(&mut self, measured: &Measured, estimate: &Estimate, turned: DQuat) {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         self.claim = None;
         self.believed += 1;
@@ -144,7 +144,7 @@ impl Source {
     }
 
     /// Returns what this source's variances are to be multiplied by: 1 as long as its measurements
-    /// scatter as they are said to.
+    /// scatter as their sigmas state.
     pub(super) fn noise_factor(&self) -> f64 {
         self.noise.factor
     }
@@ -206,7 +206,7 @@ const MOST_SQUARE: f64 = 36.0;
 /// Beyond this a source scatters by more than it says; a motion model that fits badly for a while
 /// does not reach it.
 const NOISY_SQUARE: f64 = 2.5;
-/// Below this it may be believed more again.
+/// Below this its weight may rise again.
 const CALM_SQUARE: f64 = 1.2;
 /// Ten times the sigma: what is worse still is no localization.
 const MOST_FACTOR: f64 = 100.0;
