@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_for_another_server_or_no_request_is_left_alone() {
+    fn requests_to_other_servers_and_other_packets_are_ignored() {
         let mut leases = Leases::new();
         let other = [SERVER, 4, 192, 168, 4, 9];
         assert_eq!(ask(&mut leases, &request(7, REQUEST, &other)), None);

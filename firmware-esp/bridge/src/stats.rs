@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn senders_are_told_apart_and_a_third_takes_a_place() {
+    fn senders_are_distinguished_and_a_third_replaces_one() {
         let mut sequences = Sequences::<2>::new();
         assert_eq!(sequences.note((1, 1), 0), 0);
         assert_eq!(sequences.note((255, 191), 9), 0);

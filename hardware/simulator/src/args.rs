@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn mavlink_goes_where_it_is_told() {
+    fn mavlink_goes_to_the_given_endpoints() {
         let check = |arguments: &[&str], expected: &[&str]| {
             let found = parse(arguments).unwrap().endpoints();
             assert_eq!(found.iter().map(ToString::to_string).collect::<Vec<_>>(), expected);
@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn what_breaks_is_understood() {
+    fn motor_faults_are_parsed() {
         let args =
             parse(&["--motor-failure", "2@5.5,30", "--reboot-after", "3", "--wifi"]).unwrap();
         let config = args.config().unwrap();

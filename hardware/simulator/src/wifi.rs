@@ -196,7 +196,7 @@ mod tests {
     proptest! {
         /// Whatever the link: packets come whole, once, in order, and no sooner than its latency.
         #[test]
-        fn what_arrives_is_what_was_sent_in_order(
+        fn packets_arrive_unchanged_and_in_order(
             seed in 0..1000u64, latency_ms in 0.0..50.0f64, jitter_ms in 0.0..20.0f64, loss in 0.0..=1.0f64,
         ) {
             let config = WifiConfig {

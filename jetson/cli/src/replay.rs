@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_found_is_told() {
+    fn findings_are_printed() {
         let mut report = ReplayReport { compared: 3, ..ReplayReport::default() };
         assert!(sentences(&report).iter().any(|text| text.contains("all 3 answers")));
         report.differ = 1;

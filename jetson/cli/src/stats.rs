@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_said() {
+    fn missing_parts_are_reported() {
         let error = get("http://127.0.0.1:1", "/").unwrap_err();
         assert!(error.to_string().contains("no server answers at http://127.0.0.1:1"), "{error}");
         let error = get("http://127.0.0.1:1/page", "/").unwrap_err();

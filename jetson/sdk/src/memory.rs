@@ -392,7 +392,7 @@ mod tests {
 
     /// What the course withholds is nowhere in the plugin's memory, not just hidden by the API.
     #[test]
-    fn what_is_withheld_is_not_in_memory() {
+    fn withheld_depth_is_not_in_memory() {
         let secret = 1234.5678_f64;
         let holds = |buffer: &ObservationBuffer| {
             let bytes = buffer.as_bytes();

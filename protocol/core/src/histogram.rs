@@ -104,7 +104,7 @@ mod tests {
     use std::vec::Vec;
 
     #[test]
-    fn nothing_counted_is_nothing_told() {
+    fn an_empty_histogram_has_no_percentiles() {
         let histogram = Histogram::default();
         assert_eq!(histogram.times(), StageTimes::default());
         assert_eq!((histogram.count(), histogram.max_ms()), (0, 0.0));

@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_client_without_certificate_or_with_anothers_is_refused() {
+    fn a_client_without_a_certificate_or_with_a_stolen_one_is_refused() {
         let [one, two, three] = [(); 3].map(|()| Identity::ephemeral().unwrap());
         let pin = Pin::to(one.fingerprint());
         let builder = || {

@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_flown_is_named_by_its_key() {
+    fn unflyable_courses_are_reported_by_key() {
         // Narrower than vehicle and margins.
         let (config, obstacles) = walled(0.3);
         let checked = check(&config, &obstacles);

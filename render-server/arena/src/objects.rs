@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn phases_come_from_the_seed_unless_they_are_said() {
+    fn phases_come_from_the_seed_unless_given() {
         let motion = MotionConfig::Rotation { axis: DVec3::X, period_s: 6.0 };
         let drawn = |seed| MovingObjects::of(&[object(motion.clone(), None)], seed);
         assert_eq!(drawn(3), drawn(3));

@@ -92,7 +92,7 @@ fn the_arena_becomes_the_autopilots_fence() {
 }
 
 #[test]
-fn nobody_there_is_said_in_words() {
+fn a_missing_peer_is_reported_in_words() {
     let (output, text) = doctor("udpin:127.0.0.1:0", &[]);
     assert_eq!(output.status.code(), Some(1));
     assert!(text.contains("no heartbeat from an autopilot"), "{text}");

@@ -223,7 +223,7 @@ fn a_plugin_that_fails_is_graded_and_explained() {
 }
 
 #[test]
-fn what_makes_no_sense_is_refused_before_anything_is_flown() {
+fn invalid_arguments_are_refused_before_any_flight() {
     let rig = Rig::new();
     rig.refused(&["avoid", "--project=p9"], "p2, p3");
     rig.refused(&["avoid", "--variants=noon"], "noon");

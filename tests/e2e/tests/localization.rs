@@ -94,7 +94,7 @@ fn the_forest_is_flown_on_natnet_and_its_log_is_a_source() {
 }
 
 #[test]
-fn a_vehicle_of_another_name_is_told() {
+fn a_vehicle_with_another_name_is_reported() {
     let (is_content, text) = doctor("json", ",objects.vizflyt=wasp", "10");
     assert!(!is_content);
     assert!(text.contains("object 'vizflyt' streams, but 'wasp' was asked for"), "{text}");

@@ -92,7 +92,7 @@ fn simulated_webcams_locate_what_the_truth_says() {
 }
 
 #[test]
-fn what_cannot_be_located_with_is_named() {
+fn impossible_localization_settings_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let check = |text: &str, part: &str| {

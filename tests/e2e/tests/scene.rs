@@ -168,7 +168,7 @@ fn pictures_are_written_as_png_and_as_arrays() {
 
 /// A door that slides: its pixels are known by their ids, and are elsewhere a second later.
 #[test]
-fn what_moves_is_drawn_where_its_clock_says() {
+fn moving_objects_are_rendered_at_their_time() {
     let rig = Rig::new();
     let (scene, camera) = (rig.at("moving"), rig.at("cam.json"));
     good(&["scene", "generate", "moving", "-o", &scene]);

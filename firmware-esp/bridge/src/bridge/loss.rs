@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn a_companion_that_ended_on_the_ground_lands_nobody_later() {
+    fn a_companion_that_ended_on_the_ground_lands_no_vehicle_later() {
         let pilot = |ms| Flight { mode: 5, armed: ms < 3000, ..GUIDED };
         let later = |ms| if ms < 7000 { pilot(ms) } else { GUIDED };
         assert_eq!(landings(later, 1000, 20, 12_000), []);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn any_packet_of_the_companion_counts_and_nobody_elses() {
+    fn only_packets_of_the_companion_count() {
         let mut loss = LinkLoss::default();
         for ms in (0..500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);

@@ -288,7 +288,7 @@ fn clients_come_stay_while_they_speak_and_go() {
 }
 
 #[test]
-fn a_slow_tcp_client_loses_its_oldest_and_nobody_elses() {
+fn a_slow_tcp_client_loses_only_its_own_oldest_packets() {
     let mut bridge = bridge(quiet());
     bridge.open_stream(at(0), 0);
     bridge.handle_datagram(at(0), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
@@ -333,7 +333,7 @@ fn until_somebody_answers_heartbeats_are_broadcast() {
 }
 
 #[test]
-fn the_companions_silence_lands_the_vehicle_and_is_told() {
+fn the_companions_silence_lands_the_vehicle_and_is_reported() {
     let mut bridge = bridge(quiet());
     let mut seen = Vec::new();
     for ms in (0..2500).step_by(10) {

@@ -110,7 +110,7 @@ fn a_single_outlier_is_dropped_and_an_announced_jump_is_followed() {
 }
 
 #[test]
-fn a_persistent_jump_is_believed_after_the_position_was_lost() {
+fn a_persistent_jump_is_accepted_after_the_position_was_lost() {
     let mut bench = Bench::new();
     bench.stand(2.1, None);
     bench.estimator.set_origin();

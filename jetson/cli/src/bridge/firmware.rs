@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_signed_is_taken_by_the_key_that_was_printed() {
+    fn a_signed_firmware_is_accepted_with_the_printed_key() {
         let (folder, key) = keys();
         let made = make_key(&key).unwrap();
         assert_eq!(read_key(&key).unwrap().unwrap().to_bytes(), made.to_bytes());

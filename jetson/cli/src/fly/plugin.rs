@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn plugins_are_told_apart() {
+    fn plugins_are_distinguished() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;

@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_camera_is_named() {
+    fn invalid_cameras_are_named() {
         refused("{}", "missing field `fx`");
         refused(&GOOD.replace("\"cx\"", "\"near\""), "unknown field `near`");
         refused(&GOOD.replace("[0, 0, 0, 1]]", "[1, 2, 3, 1]]"), "is it transposed?");

@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn faults_are_reported() {
         let check = |change: fn(&mut Splats), expected: &str| {
             let found = warnings(change);
             assert!(found.contains(expected), "'{found}' lacks '{expected}'");

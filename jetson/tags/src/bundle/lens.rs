@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_behind_is_not_seen() {
+    fn tags_behind_the_camera_are_not_seen() {
         let k = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         assert!(project(&k, DVec3::NEG_Z).is_none());
         assert!(project(&k, DVec3::splat(f64::NAN)).is_none());

@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_determined_is_not_solved() {
+    fn undetermined_systems_are_not_solved() {
         let mut flat = Symmetric::zero(2);
         flat.add(0, 0, 1.0);
         flat.add(1, 0, 1.0);

@@ -67,7 +67,7 @@ fn exact_corners_lead_back_to_the_truth() {
 }
 
 #[test]
-fn what_it_says_of_its_own_error_is_true() {
+fn the_reported_covariance_matches_the_error() {
     let (truth, mut start) = floor(0.3);
     let solution = start.solve().unwrap();
     // Two axes of 0.3 px each, less what the unknowns take up.
@@ -98,7 +98,7 @@ fn a_misread_tag_hardly_pulls() {
 }
 
 #[test]
-fn a_tag_that_nobody_sees_is_not_determined() {
+fn an_unseen_tag_is_not_determined() {
     let (_, mut start) = floor(0.1);
     start.pose(Rigid::IDENTITY, Parameter::Shared);
     assert!(start.solve().is_none());

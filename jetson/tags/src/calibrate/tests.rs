@@ -168,7 +168,7 @@ fn a_fisheye_is_found_by_its_own_model() {
 }
 
 #[test]
-fn a_bad_set_is_refused_and_what_to_add_is_said() {
+fn a_bad_set_is_refused_with_advice() {
     let refused = |calibrator: &Calibrator, parts: &[&str]| {
         let error = calibrator.finish(LensModel::BrownConrady).unwrap_err().to_string();
         for part in parts {

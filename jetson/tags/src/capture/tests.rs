@@ -103,7 +103,7 @@ fn names_of_nanoseconds_are_stamps() {
 }
 
 #[test]
-fn what_is_no_source_is_refused_by_name() {
+fn invalid_sources_are_refused_by_name() {
     let refused = |source: &str, part: &str| {
         let error = match open(source) {
             Err(error) => error.to_string(),

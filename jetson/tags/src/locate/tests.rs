@@ -28,7 +28,7 @@ fn locator(cameras: Vec<TagCamera>, layouts: &[TagLayout]) -> Locator {
 }
 
 #[test]
-fn what_cannot_be_located_is_refused_by_name() {
+fn invalid_setups_are_refused_by_name() {
     let check = |cameras: Vec<TagCamera>, layouts: &[TagLayout], part: &str| {
         let error = Locator::new(cameras, layouts, LocateSettings::default()).err();
         let error = error.expect(part).to_string();
@@ -73,7 +73,7 @@ fn one_far_face_is_open_until_it_is_decided_and_is_then_true() {
 }
 
 #[test]
-fn strangers_lead_nowhere_and_absence_is_said() {
+fn unknown_tags_are_ignored_and_absence_is_reported() {
     let camera = webcams(1).remove(0);
     let mut other = cube();
     for tag in &mut other.tags {

@@ -135,7 +135,7 @@ fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
 }
 
 #[test]
-fn what_cannot_be_printed_is_refused_by_name() {
+fn invalid_sheets_are_refused_by_name() {
     let refused = |result: Result<Printed, PrintError>, parts: &[&str]| {
         let error = result.unwrap_err().to_string();
         for part in parts {

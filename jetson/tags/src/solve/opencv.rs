@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn what_opencv_cannot_solve_is_no_start() {
+    fn opencv_failures_yield_no_start() {
         let nowhere = [DVec2::new(640.0, 360.0); 4];
         assert!(square(&webcam(), SIZE_M, &nowhere).iter().all(Pose::is_valid));
         let nan = [DVec2::NAN; 4];

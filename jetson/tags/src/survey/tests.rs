@@ -161,7 +161,7 @@ fn a_mat_is_surveyed_from_images() {
 }
 
 #[test]
-fn what_cannot_be_surveyed_is_refused_by_name() {
+fn invalid_surveys_are_refused_by_name() {
     let mut random = Random::new(2);
     let lens = webcam();
     let images = flight(&printed().tags, &lens, &mut random);

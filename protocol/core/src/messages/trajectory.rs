@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_followed_is_refused() {
+    fn invalid_trajectories_are_refused() {
         let way = |p_m, speed_mps| Trajectory {
             path: Path::Waypoints([Waypoint { p_m, speed_mps }].into_iter().collect()),
             ..Trajectory::default()

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_jpeg_is_left_alone() {
+    fn bytes_that_are_no_jpeg_are_kept() {
         let (_, pieces) = bitstream(64, 48, ColorMode::Lossless, 3);
         assert_eq!(split(&pieces), None);
         let (_, mut pieces) = bitstream(64, 48, ColorMode::Jpeg444, 3);

@@ -176,7 +176,7 @@ fn a_relay_between_two_connections_fails_with_the_right_code() {
 
 /// He plays the server to the client, with a guess of the code, and gets one proof to check it on.
 #[test]
-fn a_false_server_that_guesses_wrong_convinces_nobody() {
+fn a_false_server_that_guesses_wrong_is_rejected() {
     let seen = Binding { server: Fingerprint::of(b"middle"), ..binding(1) };
     let (client, message) = PairingClient::begin(code("123456"), "jetson", seen);
     let mut false_server = Lab::open("111111");
@@ -190,7 +190,7 @@ fn a_false_server_that_guesses_wrong_convinces_nobody() {
 }
 
 #[test]
-fn what_was_recorded_is_of_no_use_later() {
+fn recorded_messages_cannot_be_replayed() {
     let seen = binding(1);
     let mut lab = Lab::open("123456");
     let (client, begin) = PairingClient::begin(code("123456"), "jetson", seen);

@@ -233,7 +233,7 @@ fn a_plugin_that_failed_is_quoted() {
 }
 
 #[test]
-fn what_was_ahead_is_the_nearest_of_the_middle_but_single_pixels() {
+fn the_distance_ahead_is_the_nearest_of_the_middle_without_single_pixels() {
     let (width, height) = (30, 30);
     let mut depth = vec![9000_u16; width * height];
     let mut scratch = Vec::new();

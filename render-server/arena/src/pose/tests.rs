@@ -164,7 +164,7 @@ fn a_lone_outlier_is_left_out_and_a_bump_is_followed() {
 }
 
 #[test]
-fn swapped_markers_flip_the_attitude_and_are_not_believed_in_flight() {
+fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
     let mut filter = flying(1.0);
     let flipped = |t: f64| {
         Measured::new(at(t), Pose::new(DVec3::X * t, DQuat::from_rotation_z(120f64.to_radians())))
@@ -253,7 +253,7 @@ fn of_two_sources_that_disagree_the_one_is_kept_and_the_other_named() {
 }
 
 #[test]
-fn what_comes_late_is_put_where_it_belongs() {
+fn late_measurements_are_inserted_in_order() {
     // The same readings in order, and with one source 40 ms late: the same in the end.
     let truth = |t: f64| Pose::new(DVec3::new((2.0 * t).sin(), t, 1.0), DQuat::from_rotation_z(t));
     let prompt = |t: f64| Measured::new(at(t), truth(t));
@@ -331,7 +331,7 @@ fn the_error_is_as_great_as_the_filter_says() {
 }
 
 #[test]
-fn a_source_that_is_worse_than_it_says_is_believed_less_and_not_turned_away() {
+fn an_overconfident_source_gets_a_larger_covariance_and_is_not_rejected() {
     // Ten times the noise it says.
     let mut seed = 5u64;
     let mut noise = move || {

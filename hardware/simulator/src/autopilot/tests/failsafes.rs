@@ -44,7 +44,7 @@ fn points_beyond_the_fence_are_not_flown_to() {
 }
 
 #[test]
-fn a_fence_only_reports_if_told_so_and_is_switched_by_command() {
+fn a_fence_can_be_set_to_report_only_and_is_switched_by_command() {
     let mut quiet = FENCE;
     quiet[3].1 = 0.0;
     let mut c = Companion::hovering(config(&quiet), 1.2);
@@ -137,7 +137,7 @@ fn a_lost_radio_control_acts_after_its_timeout() {
 
 /// A landing goes on when more is lost, if FS_OPTIONS says so; else the later failsafe has its way.
 #[test]
-fn a_landing_goes_on_if_told_so() {
+fn a_landing_continues_if_configured() {
     for (options, expected) in [(8.0, CopterMode::Land), (0.0, CopterMode::Rtl)] {
         let params = [("FS_GCS_ENABLE", 1.0), ("FS_OPTIONS", options)];
         let mut c = Companion::hovering(config(&params), 6.0);

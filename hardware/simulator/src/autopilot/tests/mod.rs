@@ -347,7 +347,7 @@ fn parameters_are_read_and_set_by_name() {
 
 /// Messages for another vehicle on the same link.
 #[test]
-fn what_is_for_others_is_left_alone() {
+fn messages_to_other_systems_are_ignored() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
     c.send(&MavMessage::SET_MODE(SET_MODE_DATA {

@@ -158,7 +158,7 @@ fn p5_the_timeout_is_a_parameter() {
 
 /// Pitfall 6: Vision lost: `lost_vision_is_noticed_after_seven_seconds_and_lands`. No word before that.
 #[test]
-fn p6_nothing_is_said_of_lost_vision_for_seven_seconds() {
+fn p6_lost_vision_is_not_reported_for_seven_seconds() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     c.vision = false;
     c.texts.clear();
@@ -186,7 +186,7 @@ fn p7_another_system_s_heartbeats_do_not_count() {
 
 /// Pitfall 8: No radio control.
 #[test]
-fn p8_without_a_receiver_it_does_not_arm_unless_told() {
+fn p8_without_a_receiver_it_does_not_arm_by_default() {
     let armed = |throttle: f32, radio: bool| {
         let mut c =
             Companion::new(SimulationConfig { radio, ..config(&[("FS_THR_ENABLE", throttle)]) });

@@ -40,7 +40,7 @@ mod tests {
     use glam::DQuat;
 
     #[test]
-    fn a_pose_is_said_as_a_person_would() {
+    fn a_pose_is_described_in_plain_words() {
         let pose = Pose::new(DVec3::new(1.0, 2.0, 1.02), DQuat::IDENTITY);
         assert_eq!(
             pose_in_words(&pose),

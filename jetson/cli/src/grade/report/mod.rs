@@ -190,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_plugin_says_is_text() {
+    fn output_of_a_plugin_is_escaped() {
         assert_eq!(
             escape("<b onload='x'>&\"\u{7}"),
             "&lt;b onload=&#39;x&#39;&gt;&amp;&quot;\u{fffd}"

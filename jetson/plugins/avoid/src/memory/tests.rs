@@ -21,7 +21,7 @@ const AHEAD_M: DVec3 = DVec3::new(3.0, 0.0, 0.0);
 const ASIDE_M: DVec3 = DVec3::new(0.5, 2.0, 0.0);
 
 #[test]
-fn what_leaves_the_image_stays_until_it_is_old() {
+fn points_that_leave_the_image_stay_until_they_are_old() {
     let mut memory = Memory::default();
     check(&mut memory, 1.0, 0, &[ASIDE_M], 1);
     check(&mut memory, 10.0, 9000, &[], 1);
@@ -29,7 +29,7 @@ fn what_leaves_the_image_stays_until_it_is_old() {
 }
 
 #[test]
-fn what_is_seen_through_is_forgotten() {
+fn cells_seen_through_are_forgotten() {
     let mut memory = Memory::default();
     check(&mut memory, 1.0, 3000, &[AHEAD_M, ASIDE_M], 2);
     check(&mut memory, 1.1, 0, &[], 2);

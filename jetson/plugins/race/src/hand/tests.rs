@@ -51,7 +51,7 @@ fn the_way_is_clear_when_the_hand_is_elsewhere() {
 }
 
 #[test]
-fn what_is_not_known_yet_is_not_clear() {
+fn unknown_cells_are_not_clear() {
     let (hand, _) = watch(TAU / 6.0, 0.5);
     assert_eq!(hand.motion(), None);
     assert!(!hand.is_clear(DVec2::new(0.1, 1.7), 0.2, 0.5, 1.0));

@@ -66,7 +66,7 @@ fn check(stream: &str, set: &str, expected: &[(&str, &str)]) {
 }
 
 #[test]
-fn what_is_right_is_let_be() {
+fn right_values_are_left_alone() {
     for settings in [
         "vicon",
         "json",
@@ -104,7 +104,7 @@ fn the_setting_to_change_is_named() {
 }
 
 #[test]
-fn what_was_seen_is_said() {
+fn findings_are_described() {
     let found = verdict(&config("natnet,up=y"), &config("natnet"), 0.0);
     assert!(found.faults[0].starts_with("lifted, it went along +y, not up"), "{:#?}", found.faults);
     let found = verdict(&config("json,axes=x-yz"), &config("json"), 0.0);
