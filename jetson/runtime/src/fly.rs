@@ -18,7 +18,7 @@ use vizflyt_protocol::messages::{Purpose, bounded};
 
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
-use crate::control::{Control, Happening, QUEUE, print_line};
+use crate::control::{Control, ControlInput, QUEUE, print_line};
 use crate::flight::{FlightSettings, Outcome};
 use crate::link::port::Port;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
@@ -69,7 +69,7 @@ pub fn fly_command(
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
     let log = FlightLog::open(&args.log, live);
     log.flight(&args.plugin.clone().unwrap_or_default(), &args.plugin_arguments);
-    let (sender, happenings) = sync_channel(QUEUE);
+    let (sender, inputs) = sync_channel(QUEUE);
     let stop = Arc::new(AtomicBool::new(false));
     receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
     if args.lifeline {
@@ -104,7 +104,7 @@ pub fn fly_command(
             limits: args.limits,
         },
         waits_for_start: args.wait,
-        port,
+        to_autopilot: Box::new(move |bytes| port.send(bytes)),
         link: args.link_settings()?,
         shared,
         to_server: Arc::clone(&outbox),
@@ -112,7 +112,7 @@ pub fn fly_command(
         json: args.json,
         screen: Screen::default(),
     };
-    let flown = control.run(sender, &happenings);
+    let flown = control.run(sender, &inputs);
     stop.store(true, Ordering::Relaxed);
 
     let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
@@ -142,7 +142,7 @@ fn listen(tokio: &Runtime, address: SocketAddr) -> anyhow::Result<Live> {
 
 fn receive_mavlink(
     port: Arc<Port>,
-    sender: SyncSender<Happening>,
+    sender: SyncSender<ControlInput>,
     stop: Arc<AtomicBool>,
 ) -> std::io::Result<()> {
     let receive = move || {
@@ -152,7 +152,7 @@ fn receive_mavlink(
             match port.receive(&mut buffer) {
                 Ok(Some(len)) => {
                     // A full queue drops telemetry, as the network might.
-                    let _ = sender.try_send(Happening::Mavlink(buffer[..len].to_vec()));
+                    let _ = sender.try_send(ControlInput::Mavlink(buffer[..len].to_vec()));
                 }
                 Ok(None) => {}
                 Err(error) => {
@@ -167,7 +167,7 @@ fn receive_mavlink(
 }
 
 /// The first signal lands and ends; the second ends at once.
-fn watch_signals(tokio: &Runtime, sender: SyncSender<Happening>) -> std::io::Result<()> {
+fn watch_signals(tokio: &Runtime, sender: SyncSender<ControlInput>) -> std::io::Result<()> {
     let _context = tokio.enter();
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
@@ -183,36 +183,36 @@ fn watch_signals(tokio: &Runtime, sender: SyncSender<Happening>) -> std::io::Res
                 process::exit(CUT_SHORT);
             }
             tracing::info!("landing, then leaving; once more to leave at once");
-            let _ = sender.try_send(Happening::Interrupt);
+            let _ = sender.try_send(ControlInput::Interrupt);
         }
     });
     Ok(())
 }
 
 /// Ends the flight when the parent is gone.
-fn watch_stdin(sender: SyncSender<Happening>) -> std::io::Result<()> {
+fn watch_stdin(sender: SyncSender<ControlInput>) -> std::io::Result<()> {
     let watch = move || {
         let mut buffer = [0; 256];
         while matches!(std::io::stdin().read(&mut buffer), Ok(len) if len > 0) {}
-        let _ = sender.send(Happening::Interrupt);
+        let _ = sender.send(ControlInput::Interrupt);
     };
     thread::Builder::new().name("lifeline".into()).spawn(watch)?;
     Ok(())
 }
 
-fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<Happening>) -> std::io::Result<()> {
+fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<ControlInput>) -> std::io::Result<()> {
     let forward = move || {
-        while reloads.recv().is_ok() && sender.send(Happening::Reload).is_ok() {}
+        while reloads.recv().is_ok() && sender.send(ControlInput::Reload).is_ok() {}
     };
     thread::Builder::new().name("reloads".into()).spawn(forward)?;
     Ok(())
 }
 
-fn tell_stream(sender: SyncSender<Happening>) -> impl Fn(StreamEvent) -> bool + Send + Sync {
+fn tell_stream(sender: SyncSender<ControlInput>) -> impl Fn(StreamEvent) -> bool + Send + Sync {
     move |event| {
         let is_pose = matches!(event, StreamEvent::Pose(..));
         // Poses are many and stale soon. An event that finds no room is told again by the server.
-        let taken = sender.try_send(Happening::Stream(event)).is_ok();
+        let taken = sender.try_send(ControlInput::Stream(event)).is_ok();
         if !taken && !is_pose {
             tracing::error!("the control loop is stalled");
         }

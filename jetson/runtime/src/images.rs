@@ -24,27 +24,14 @@ use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{DecodeError, Decoder, ImageMut, Info};
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
-use vizflyt_sdk::{
-    Battery, ImageStamps, ImuSample, ObservationTooLarge, ObservationWriter, PlanesMut, Vehicle,
-    host_now,
-};
+use vizflyt_sdk::{ImageStamps, ObservationTooLarge, ObservationWriter, PlanesMut, host_now};
 
+use crate::companion::Senses;
 use crate::log::{ImageLog, LoggedImage, observation_head};
 use crate::stream::{Arrival, Mailbox, Step, Whole};
 use crate::waterfall::Stamps;
 
-/// What the plugin may know beside images, as of now. What the course withholds is never in it.
-#[derive(Clone, Debug, Default)]
-pub struct Senses {
-    /// The vehicle.
-    pub vehicle: Option<Vehicle>,
-    /// Its battery.
-    pub battery: Battery,
-    /// The newest IMU samples, oldest first.
-    pub imu: Vec<ImuSample>,
-}
-
-/// Who learns of it writes, who publishes images reads.
+/// The control loop writes them, the image publisher reads them.
 pub type SharedSenses = Arc<Mutex<Senses>>;
 
 /// An observation that went to the plugin.
@@ -329,12 +316,7 @@ impl ImagePublisher {
             return Ok(());
         }
         if let Ok(mut writer) = ObservationWriter::resume(done.memory.memory(), &self.cameras) {
-            let senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(vehicle) = &senses.vehicle {
-                writer.vehicle(vehicle);
-            }
-            writer.battery(&senses.battery);
-            writer.imu(&senses.imu);
+            self.senses.lock().unwrap_or_else(PoisonError::into_inner).write(&mut writer);
         }
         let logged =
             self.log.as_ref().map(|log| (log, observation_head(done.memory.bytes()).to_vec()));

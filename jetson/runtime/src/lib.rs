@@ -3,23 +3,24 @@
 //!
 //! ```text
 //! server ══QUIC══▶ stream ─▶ images ══shared memory══▶ plugin process
-//!                    │                                     │ answers
+//!                    │                                     │ replies
 //!                    ▼ poses, events                       ▼
-//!                  control (50 Hz): flight ─▶ guard ─▶ link ══MAVLink══▶ autopilot
+//!                  control ─▶ companion: flight ─▶ guard ─▶ link ══MAVLink══▶ autopilot
 //!                    └─▶ log (MCAP), report, telemetry to the server
 //! ```
 //! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
-//! [`supervisor`] (the plugin's process, its limits), [`control`] (the loop that owns the rest), [`flight`]
-//! (phases and outcome, pure), [`trajectory`] (follows paths, pure), [`guard`] (the last word,
-//! pure), [`link`] (MAVLink, sans-IO),
-//! [`steering`] (when setpoints leave), [`stats`] and [`waterfall`] (ages by stage), [`log`],
-//! [`replay`] (a log to a plugin), [`report`], [`lockstep`] (the same flight on a virtual clock, for grades). [`fly()`] starts it all. [`airframe`] stands beside: the
-//! autopilot's parameters, read, judged and written before a flight.
+//! [`supervisor`] (the plugin's process, its limits), [`companion`] (every decision, sans-IO) and its two
+//! drivers, [`control`] (wall clock) and [`lockstep`] (virtual clock, for grades). The companion joins
+//! [`flight`] (phases and outcome), [`trajectory`] (follows paths), [`guard`] (the last word),
+//! [`link`] (MAVLink) and [`steering`] (when setpoints leave), all sans-IO. Then [`stats`] and
+//! [`waterfall`] (ages by stage), [`log`], [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it
+//! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight.
 
 pub mod airframe;
 mod answers;
 pub mod args;
 pub mod clock;
+pub mod companion;
 pub mod config;
 pub mod console;
 pub mod control;

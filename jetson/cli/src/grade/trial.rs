@@ -2,8 +2,8 @@
 //! and the plugin in a process of its own that is waited for.
 //!
 //! ```text
-//! tick of 2.5 ms:  Simulation ──MAVLink──▶ Companion ──MAVLink──▶ Simulation
-//!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Companion
+//! tick of 2.5 ms:  Simulation ──MAVLink──▶ Lockstep ──MAVLink──▶ Simulation
+//!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Lockstep
 //! image is due:    Referee's motion ─▶ where the vehicle will be when it is seen ─▶ CpuRenderer
 //! image is seen:   observation ─▶ plugin ─▶ answer; it counts `answer` later
 //! ```
@@ -24,13 +24,11 @@ use vizflyt_arena::pose::Measured;
 use vizflyt_arena::verdict::{Sample, Verdict, judge};
 use vizflyt_arena::{ArenaConfig, Referee};
 use vizflyt_protocol::mavlink::MAX_PACKET;
-use vizflyt_protocol::messages::{
-    CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint, ToPlugin,
-};
+use vizflyt_protocol::messages::{CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
 use vizflyt_runtime::guard::Fix;
-use vizflyt_runtime::lockstep::{Companion, PluginProcess, ProcessError};
+use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
@@ -144,13 +142,10 @@ impl Trial<'_> {
     /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
     /// verdict.
     pub(crate) fn fly(&self) -> Result<Option<Flown>> {
-        let mut flight = Flight::new(self)?;
         let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
-        let mut process = Some(process);
-        let result = flight.run(&mut process);
-        if let Some(process) = process {
-            process.stop(&mut |_, text| keep(&mut flight.lines, text));
-        }
+        let mut flight = Flight::new(self, process)?;
+        let result = flight.run();
+        flight.lockstep.stop(&mut lines(&mut flight.lines));
         if !result? {
             return Ok(None);
         }
@@ -180,11 +175,17 @@ struct Picture {
     ahead_m: Option<f64>,
 }
 
-/// An answer on its way to the guard.
-struct Answer {
-    due: HostTime,
-    seq: u64,
-    setpoint: Option<Setpoint>,
+impl Picture {
+    fn add_to(&self, hash: &mut Sha256) {
+        hash.update(&self.rgb);
+        for depth_mm in self.depth_mm.chunks(4096) {
+            let mut bytes = [0; 2 * 4096];
+            for (pair, mm) in bytes.chunks_exact_mut(2).zip(depth_mm) {
+                pair.copy_from_slice(&mm.to_le_bytes());
+            }
+            hash.update(&bytes[..2 * depth_mm.len()]);
+        }
+    }
 }
 
 struct Flight<'a> {
@@ -192,7 +193,7 @@ struct Flight<'a> {
     arena: &'a ArenaConfig,
     cameras: Vec<CameraInfo>,
     simulation: Simulation,
-    companion: Companion,
+    lockstep: Lockstep,
     referee: Referee,
     renderer: CpuRenderer,
     images: Vec<RgbdImage>,
@@ -202,7 +203,6 @@ struct Flight<'a> {
     poses: u64,
     seq: u64,
     pending: VecDeque<Pending>,
-    answers: VecDeque<Answer>,
     hash: Sha256,
     events: Vec<Event>,
     samples: Vec<Sample>,
@@ -216,7 +216,7 @@ struct Flight<'a> {
 }
 
 impl<'a> Flight<'a> {
-    fn new(trial: &'a Trial<'a>) -> Result<Self> {
+    fn new(trial: &'a Trial<'a>, process: PluginProcess) -> Result<Self> {
         let arena = &trial.place.arena;
         let now = HostTime::from_ns(START_NS);
         let config = SimulationConfig {
@@ -242,7 +242,7 @@ impl<'a> Flight<'a> {
             arena,
             cameras: info.cameras.to_vec(),
             simulation,
-            companion: Companion::new(now, &info, settings),
+            lockstep: Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns),
             referee: Referee::new(arena, trial.place.obstacles.clone())
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
@@ -252,7 +252,6 @@ impl<'a> Flight<'a> {
             poses: 0,
             seq: 0,
             pending: VecDeque::new(),
-            answers: VecDeque::new(),
             hash,
             events: Vec::new(),
             samples: Vec::new(),
@@ -267,15 +266,15 @@ impl<'a> Flight<'a> {
     }
 
     /// Flies to the end; false if it is stopped.
-    fn run(&mut self, process: &mut Option<PluginProcess>) -> Result<bool> {
-        self.greet(process)?;
+    fn run(&mut self) -> Result<bool> {
+        self.lockstep.begin(self.now, &mut lines(&mut self.lines))?;
         loop {
             if self.trial.stop.load(Ordering::Relaxed) {
                 return Ok(false);
             }
             // Once at least: a plugin that fails at its start is an event of the flight as well.
-            self.tick(process)?;
-            if self.companion.outcome().is_some() {
+            self.tick()?;
+            if self.lockstep.companion.flight().outcome().is_some() {
                 return Ok(true);
             }
             let virtual_s = self.virtual_s();
@@ -285,43 +284,25 @@ impl<'a> Flight<'a> {
         }
     }
 
-    fn greet(&mut self, process: &mut Option<PluginProcess>) -> Result<()> {
-        let Some(start @ ToPlugin::Start(_)) = self.companion.poll_plugin() else {
-            bail!("there is no greeting for the plugin");
-        };
-        let result = process
-            .as_mut()
-            .map_or(Ok(()), |process| process.begin(&start, &mut lines(&mut self.lines)));
-        if self.heard(process, result)?.is_some() {
-            self.companion.plugin_ready(self.now);
-        }
-        Ok(())
-    }
-
-    fn tick(&mut self, process: &mut Option<PluginProcess>) -> Result<()> {
+    fn tick(&mut self) -> Result<()> {
         self.simulation.tick();
         self.now = HostTime::from_ns(START_NS + self.simulation.now().as_ns());
         let mut buffer = [0; MAX_PACKET];
         while let Some(packet) = self.simulation.poll_mavlink(&mut buffer) {
-            self.companion.handle_mavlink(self.now, packet);
+            self.lockstep.companion.handle_mavlink(self.now, packet);
         }
         self.localize();
         self.draw()?;
         while self.pending.front().is_some_and(|pending| pending.due <= self.now) {
             if let Some(pending) = self.pending.pop_front() {
-                self.show(process, &pending)?;
+                self.show(&pending)?;
             }
         }
-        while self.answers.front().is_some_and(|answer| answer.due <= self.now) {
-            if let Some(Answer { seq, setpoint, .. }) = self.answers.pop_front() {
-                self.companion.answered(self.now, seq, setpoint);
-            }
-        }
-        self.companion.handle_timeout(self.now);
-        while let Some(event) = self.companion.poll_event() {
+        self.lockstep.handle_timeout(self.now);
+        while let Some(event) = self.lockstep.companion.poll_event() {
             self.note(event);
         }
-        while let Some(datagram) = self.companion.poll_transmit() {
+        while let Some(datagram) = self.lockstep.companion.poll_transmit() {
             self.hash.update(&*datagram);
             self.simulation.handle_mavlink(0, &datagram);
         }
@@ -331,8 +312,8 @@ impl<'a> Flight<'a> {
 
     /// Poses from the motion capture through filter and rules.
     fn localize(&mut self) {
-        let referee = &mut self.referee;
-        self.companion.drain_imu(|reading| referee.handle_imu(&reading));
+        let (referee, companion) = (&mut self.referee, &mut self.lockstep.companion);
+        companion.drain_imu(|reading| referee.handle_imu(&reading));
         while let Some(sight) = self.simulation.poll_mocap() {
             let stamp = ServerTime::from_ns(START_NS + sight.at.as_ns());
             let arrival = self.server_now();
@@ -348,20 +329,21 @@ impl<'a> Flight<'a> {
             });
             self.poses += 1;
             if self.poses.is_multiple_of(POSES_PER_SENT) {
-                self.companion.handle_pose(self.now, &sample);
+                let stamp = HostTime::from_ns(sample.stamp.as_ns());
+                self.lockstep.companion.handle_pose(self.now, &sample, stamp);
             }
         }
         let now = self.server_now();
         self.referee.handle_timeout(now);
         while let Some(event) = self.referee.poll_event() {
             self.note(event.clone());
-            self.companion.handle_event(self.now, event);
+            self.lockstep.companion.handle_event(self.now, event);
         }
     }
 
     /// Draws the cameras that are due.
     fn draw(&mut self) -> Result<()> {
-        let phase = self.companion.phase();
+        let phase = self.lockstep.companion.flight().phase();
         if matches!(phase, FlightPhase::Landing | FlightPhase::Landed) {
             return Ok(());
         }
@@ -421,78 +403,40 @@ impl<'a> Flight<'a> {
         Ok(())
     }
 
-    /// Gives the plugin an image and takes its answer.
-    fn show(&mut self, process: &mut Option<PluginProcess>, pending: &Pending) -> Result<()> {
-        if process.is_none() {
-            return Ok(());
-        }
-        while let Some(message) = self.companion.poll_plugin() {
-            let Some(plugin) = process.as_mut() else { return Ok(()) };
-            let result = plugin.send(&message, &mut lines(&mut self.lines));
-            self.heard(process, result)?;
-        }
-        let Some(plugin) = process.as_mut() else { return Ok(()) };
-        let mut memory = plugin.loan(ObservationWriter::len_for(&self.cameras))?;
-        let mut writer = ObservationWriter::new(memory.memory(), pending.seq, &self.cameras)?;
-        self.companion.write(&mut writer);
+    /// Shows the plugin an image and takes its reply.
+    fn show(&mut self, pending: &Pending) -> Result<()> {
+        let (cameras, hash) = (&self.cameras, &mut self.hash);
         let ahead_ns = pending.shown.as_ns().wrapping_sub(pending.pose.as_ns()) as i32;
-        for (index, picture) in pending.drawn.iter().enumerate() {
-            let (Some(picture), camera) = (picture, &self.cameras[index]) else { continue };
-            self.hash.update(&picture.rgb);
-            for depth_mm in picture.depth_mm.chunks(4096) {
-                let mut bytes = [0; 2 * 4096];
-                for (pair, mm) in bytes.chunks_exact_mut(2).zip(depth_mm) {
-                    pair.copy_from_slice(&mm.to_le_bytes());
+        let pose = HostTime::from_ns(pending.pose.as_ns());
+        let stamps = ImageStamps { seq: pending.seq, pose, ahead_ns, ready: pending.due };
+        let write = |writer: &mut ObservationWriter<'_>| {
+            for (index, picture) in pending.drawn.iter().enumerate() {
+                let (Some(picture), camera) = (picture, &cameras[index]) else { continue };
+                picture.add_to(hash);
+                if let Some(planes) = writer.planes(index, camera) {
+                    planes.rgb.copy_from_slice(&picture.rgb);
+                    planes.depth_mm.copy_from_slice(&picture.depth_mm);
                 }
-                self.hash.update(&bytes[..2 * depth_mm.len()]);
+                writer.image_ready(index, camera, stamps);
             }
-            if let Some(planes) = writer.planes(index, camera) {
-                planes.rgb.copy_from_slice(&picture.rgb);
-                planes.depth_mm.copy_from_slice(&picture.depth_mm);
-            }
-            let pose = HostTime::from_ns(pending.pose.as_ns());
-            let ready = pending.due;
-            let stamps = ImageStamps { seq: pending.seq, pose, ahead_ns, ready };
-            writer.image_ready(index, camera, stamps);
-        }
-        self.companion.published(self.now, pending.seq);
-        let result = plugin.ask(pending.seq, memory, &mut lines(&mut self.lines));
-        let Some(setpoint) = self.heard(process, result)? else { return Ok(()) };
+        };
+        let (now, seq) = (self.now, pending.seq);
+        let reply = self.lockstep.show(now, seq, cameras, write, &mut lines(&mut self.lines))?;
+        let Some(reply) = reply else { return Ok(()) };
         self.answered += 1;
-        self.hash.update(format!("{setpoint:?}").as_bytes());
-        self.keep_for_report(pending, setpoint.as_ref());
-        let due = self.now.plus_ns(self.trial.delays.answer_ns);
-        self.answers.push_back(Answer { due, seq: pending.seq, setpoint });
+        self.hash.update(format!("{:?}", reply.setpoint).as_bytes());
+        self.keep_for_report(pending, reply.setpoint);
         Ok(())
     }
 
-    /// Passes on what the plugin said; one that has failed is told to the flight, and is no more.
-    fn heard<T>(
-        &mut self,
-        process: &mut Option<PluginProcess>,
-        result: Result<T, ProcessError>,
-    ) -> Result<Option<T>> {
-        match result {
-            Ok(value) => Ok(Some(value)),
-            Err(ProcessError::Failed(why)) => {
-                if let Some(process) = process.take() {
-                    process.stop(&mut lines(&mut self.lines));
-                }
-                self.companion.plugin_failed(self.now, why);
-                Ok(None)
-            }
-            Err(error) => Err(error.into()),
-        }
-    }
-
-    fn keep_for_report(&mut self, pending: &Pending, setpoint: Option<&Setpoint>) {
+    fn keep_for_report(&mut self, pending: &Pending, setpoint: Option<Setpoint>) {
         if self.is_decided {
             return;
         }
         let front = pending.drawn.first().and_then(Option::as_ref);
         let k = self.cameras.first().map(|camera| camera.intrinsics);
         let ahead_m = front.and_then(|picture| picture.ahead_m);
-        let (stamp, setpoint) = (self.server_now(), setpoint.cloned());
+        let stamp = self.server_now();
         self.asked.push(Asked { stamp, setpoint });
         self.seen.push(Seen { stamp, ahead_m });
         let (Some(picture), Some(k)) = (front, k) else { return };

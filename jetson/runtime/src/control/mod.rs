@@ -1,64 +1,62 @@
-//! The control loop: one thread that owns link, flight and plugin, ticks at 50 Hz, sends each answer
-//! of the plugin at once ([`crate::steering`]), and otherwise waits for what the other threads send. All safety decisions are made here, one at a time.
+//! The companion on the wall clock: one thread drives a [`Companion`], waits for what the other threads
+//! send, and passes on what comes out.
 //!
 //! ```text
-//! stream (tokio) ─┐                             ┌─▶ MAVLink socket
-//! MAVLink socket ─┤                             ├─▶ plugin (events, stop)
-//! images ─────────┼─▶ Happening queue ─▶ loop ──┼─▶ server (telemetry 10 Hz, events)
-//! plugin answers ─┤                             ├─▶ log
-//! supervisor ─────┤                             └─▶ standard output
+//! stream (tokio) ─┐                                ┌─▶ MAVLink socket
+//! MAVLink socket ─┤                                ├─▶ plugin (messages, stop)
+//! images ─────────┼─▶ ControlInput queue ─▶ loop ──┼─▶ server (telemetry 10 Hz, events)
+//! plugin replies ─┤                                ├─▶ log
+//! supervisor ─────┤                                └─▶ standard output
 //! signals ────────┘
 //! ```
-//!
-//! Why longer than most: it is where everything meets, and holds no logic of its own.
+//! It wakes when the companion wants it (ticks at 50 Hz, a setpoint after each reply at once) and for every
+//! input. What the flight does is decided in [`companion`](crate::companion); here are only what the wall
+//! clock brings: queues, the plugin's process ([`plugin`]) and reports ([`reporting`]).
 
 mod plugin;
-mod telling;
+mod reporting;
+#[cfg(test)]
+mod tests;
 
 use std::ffi::OsString;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::sync::{Arc, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use glam::DVec3;
 use serde_json::json;
 use vizflyt_protocol::messages::{
-    CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ImuReading, PoseSample, ToPlugin,
-    bounded,
+    CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ToPlugin, bounded,
 };
-use vizflyt_protocol::time::{HostTime, ServerTime};
-use vizflyt_sdk::{Battery, ImuSample, Vehicle, host_now};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::host_now;
 
-use crate::airframe::ArenaFence;
+use crate::companion::Companion;
 use crate::console::Screen;
-use crate::flight::{Flight, FlightSettings, Input, LinkView, Outcome};
-use crate::guard::Fix;
+use crate::flight::{FlightSettings, Outcome};
 use crate::images::{Published, SharedSenses};
-use crate::link::port::Port;
-use crate::link::{Link, LinkEvent, LinkSettings};
+use crate::link::{LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
 use crate::report::Counters;
 use crate::stats::ImageTimes;
-use crate::steering::Steering;
 use crate::stream::{Outbox, Shared, StreamEvent};
 use crate::supervisor::{PluginEvent, PluginLimits, Stream};
 
 use plugin::PluginSide;
-pub use telling::print_line;
+pub use reporting::print_line;
 
-/// Something another thread tells the control loop.
+/// Something another thread sends to the control loop.
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant)] // Why: the queue of 0.7 MB is there anyway; a box is one per image.
-pub enum Happening {
+pub enum ControlInput {
     /// Bytes from the autopilot.
     Mavlink(Vec<u8>),
-    /// The server's side.
+    /// From the server.
     Stream(StreamEvent),
     /// An observation is about to reach the plugin.
     Published(Published),
-    /// The plugin says something.
+    /// A message of the plugin's.
     FromPlugin(Box<FromPlugin>),
     /// The plugin's process; the first is 0, each one started after it one more.
     Plugin(u32, PluginEvent),
@@ -68,17 +66,20 @@ pub enum Happening {
     Interrupt,
 }
 
-/// Control ticks. Setpoints have a rhythm of their own.
-const TICK: Duration = Duration::from_millis(20);
 /// Reports to the server every so many ticks: 10 Hz.
 const TELEMETRY_TICKS: u64 = 5;
 /// Where images get their age, to the server every so many ticks: 1 Hz.
 const TIMING_TICKS: u64 = 50;
 /// Lines of the plugin that the page gets in a second; console and log get more.
 const PAGE_LINES_PER_SECOND: u64 = 50;
-/// Happenings waiting at most. Poses and telemetry come at some 300 a second, the loop takes them
-/// within a tick.
+/// The maximum number of inputs that wait. Poses and telemetry come at some 300 a second, the loop takes
+/// them within a tick.
 pub const QUEUE: usize = 1024;
+/// A loop without senders looks at its clock this often.
+const IDLE: Duration = Duration::from_millis(20);
+
+/// Sends a datagram to the autopilot.
+pub type SendMavlink = Box<dyn Fn(&[u8])>;
 
 /// What the loop works with.
 pub struct Control {
@@ -91,7 +92,7 @@ pub struct Control {
     /// A person must press start before it takes off.
     pub waits_for_start: bool,
     /// The way to the autopilot.
-    pub port: Arc<Port>,
+    pub to_autopilot: SendMavlink,
     /// What a person has set of the link.
     pub link: LinkSettings,
     /// Clock and mailbox of the stream.
@@ -119,11 +120,11 @@ pub struct Flown {
     pub log: FlightLog,
 }
 
-struct Loop {
+/// The loop without its clock and its queue: inputs and `now` come as arguments.
+struct ControlLoop {
     control: Control,
-    sender: SyncSender<Happening>,
-    link: Link,
-    flight: Flight,
+    sender: SyncSender<ControlInput>,
+    companion: Companion,
     plugin: Option<PluginSide>,
     senses: SharedSenses,
     times: ImageTimes,
@@ -132,33 +133,46 @@ struct Loop {
     /// The server's tick of the newest image.
     image_tick: u64,
     image_size_px: (u32, u32),
-    /// Answers that took longer than the plugin's deadline.
+    /// Replies that took longer than the plugin's deadline.
     overruns: u64,
     restarts: u32,
     /// Lines that went to the page in this second of ticks.
     page_lines: u64,
-    setpoints_sent: u64,
-    v_setpoint_mps: DVec3,
-    steering: Steering,
+    /// The companion's ticks so far.
     ticks: u64,
-    /// When the newest IMU reading was made that the server was told of.
-    imu_told: HostTime,
 }
 
 impl Control {
     /// Flies to the end. Call it on a thread that lives as long: the plugin dies with it.
-    pub fn run(self, sender: SyncSender<Happening>, happenings: &Receiver<Happening>) -> Flown {
-        let now = host_now();
-        let mut flight = Flight::new(self.settings, now);
-        if self.waits_for_start {
-            flight.wait_for_start();
+    pub fn run(self, sender: SyncSender<ControlInput>, inputs: &Receiver<ControlInput>) -> Flown {
+        let mut state = ControlLoop::new(host_now(), self, sender);
+        let outcome = loop {
+            let wait_s = state.companion.poll_timeout().seconds_since(host_now()).max(0.0);
+            match inputs.recv_timeout(Duration::from_secs_f64(wait_s)) {
+                Ok(input) => state.handle(host_now(), input),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => thread::sleep(IDLE),
+            }
+            state.handle_timeout(host_now());
+            if let Some(outcome) = state.companion.flight().outcome() {
+                break outcome.clone();
+            }
+        };
+        state.finish(host_now(), outcome, inputs)
+    }
+}
+
+impl ControlLoop {
+    fn new(now: HostTime, control: Control, sender: SyncSender<ControlInput>) -> Self {
+        let (link, clock) = (control.link.clone(), control.shared.clock.clone());
+        let mut companion = Companion::new(now, control.settings, link, clock);
+        if control.waits_for_start {
+            companion.wait_for_start();
         }
-        let link = Link::with(now, self.link.clone());
-        let mut state = Loop {
-            control: self,
+        Self {
+            control,
             sender,
-            link,
-            flight,
+            companion,
             plugin: None,
             senses: SharedSenses::default(),
             times: ImageTimes::default(),
@@ -169,73 +183,58 @@ impl Control {
             overruns: 0,
             restarts: 0,
             page_lines: 0,
-            setpoints_sent: 0,
-            v_setpoint_mps: DVec3::ZERO,
-            steering: Steering::new(now),
             ticks: 0,
-            imu_told: HostTime::ZERO,
-        };
-        let outcome = state.fly(happenings);
-        state.finish(outcome, happenings)
-    }
-}
-
-impl Loop {
-    fn fly(&mut self, happenings: &Receiver<Happening>) -> Outcome {
-        let mut next = Instant::now();
-        loop {
-            let to_steering_s = self.steering.due().seconds_since(host_now()).max(0.0);
-            let to_tick = next.saturating_duration_since(Instant::now());
-            match happenings.recv_timeout(to_tick.min(Duration::from_secs_f64(to_steering_s))) {
-                Ok(happening) => {
-                    self.take(happening);
-                    self.transmit();
-                }
-                Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => thread::sleep(TICK),
-            }
-            let now = host_now();
-            if now >= self.steering.due() {
-                self.steer(now);
-            }
-            if Instant::now() >= next {
-                next += TICK;
-                if next < Instant::now() {
-                    // The machine stalled: do not make up for lost ticks.
-                    next = Instant::now() + TICK;
-                }
-                self.tick(host_now());
-            }
-            if let Some(outcome) = self.flight.outcome() {
-                return outcome.clone();
-            }
         }
     }
 
-    /// Lets the flight decide, and sends what it orders.
-    fn steer(&mut self, now: HostTime) {
-        let orders = self.flight.tick(now, &LinkView::of(&self.link, now));
-        self.steering.done(now);
-        self.link.set_goal(now, orders.goal);
-        let Some(setpoint) = orders.setpoint else { return self.transmit() };
-        let is_sent = self.link.setpoint(now, &setpoint);
-        self.transmit();
-        if is_sent {
-            if let Some(seq) = orders.answers {
+    /// Takes an input.
+    fn handle(&mut self, now: HostTime, input: ControlInput) {
+        match input {
+            ControlInput::Mavlink(bytes) => {
+                self.companion.handle_mavlink(now, &bytes);
+                let to_server = &self.control.to_server;
+                self.companion.drain_imu(|reading| to_server.imu(reading));
+                self.share_senses();
+            }
+            ControlInput::Stream(event) => self.handle_stream(now, event),
+            ControlInput::Published(published) => self.handle_published(now, &published),
+            ControlInput::FromPlugin(message) => self.handle_message(now, *message),
+            ControlInput::Plugin(_, PluginEvent::Line(stream, line)) => {
+                self.handle_line(now, stream, &line);
+            }
+            ControlInput::Plugin(_, PluginEvent::Note(text)) => {
+                self.companion.note(now, &format!("plugin: {text}"));
+            }
+            ControlInput::Plugin(run, PluginEvent::Exited(sentence)) => {
+                self.plugin_exited(now, run, sentence);
+            }
+            ControlInput::Reload => self.replace_plugin(now, "reloading the plugin".to_owned()),
+            ControlInput::Interrupt => self.companion.interrupt(now),
+        }
+        self.pass_on(now);
+    }
+
+    /// Does what is due.
+    fn handle_timeout(&mut self, now: HostTime) {
+        let sent = self.companion.handle_timeout(now);
+        self.pass_on(now);
+        if let Some(sent) = sent {
+            if let Some(seq) = sent.replies_to {
                 self.times.sent(seq, host_now());
             }
-            self.setpoints_sent += 1;
-            self.log_sent(now, &setpoint);
+            self.log_sent(now, &sent.setpoint);
+        }
+        if self.companion.ticks() != self.ticks {
+            self.ticks = self.companion.ticks();
+            self.tick(now);
+            self.pass_on(now);
         }
     }
 
+    /// What is done every tick beside the companion's own work.
     fn tick(&mut self, now: HostTime) {
-        self.ticks += 1;
-        self.link.handle_timeout(now);
-        self.transmit();
-        self.tend_plugin();
+        self.tend_plugin(now);
         self.tend_by_hand(now);
-        self.tell_notices(now);
         if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
             self.report(now);
         }
@@ -245,189 +244,109 @@ impl Loop {
         }
     }
 
-    fn transmit(&mut self) {
-        while let Some(datagram) = self.link.poll_transmit() {
-            self.control.port.send(&datagram);
+    /// Passes on what came out of the companion.
+    fn pass_on(&mut self, now: HostTime) {
+        while let Some(datagram) = self.companion.poll_transmit() {
+            (self.control.to_autopilot)(&datagram);
         }
-        let now = host_now();
-        while let Some(event) = self.link.poll_event() {
+        while let Some(event) = self.companion.poll_link_event() {
             match &event {
                 LinkEvent::Text { text, .. } => tracing::info!("autopilot: {text}"),
                 event => tracing::info!("link: {event:?}"),
             }
-            self.flight.handle(now, Input::Link(event));
+        }
+        while let Some(event) = self.companion.poll_event() {
+            tracing::info!(target: "flight", "{}", event.text);
+            self.show_event(now, &event);
+            self.control.to_server.tell(event);
+        }
+        while let Some(message) = self.companion.poll_plugin() {
+            self.send_to_plugin(now, &message);
         }
     }
 
-    // ---- what others tell ----
+    // ---- inputs ----
 
-    fn take(&mut self, happening: Happening) {
-        let now = host_now();
-        match happening {
-            Happening::Mavlink(bytes) => {
-                self.link.handle_input(now, &bytes);
-                self.sense();
-            }
-            Happening::Stream(event) => self.take_stream(now, event),
-            Happening::Published(published) => {
-                self.published += 1;
-                (self.image_seq, self.image_tick) = (published.seq, published.tick);
-                let Published { seq, pose, ready, mut images, .. } = published.clone();
-                let clock_error_ns = self.control.shared.clock.error_bound_ns(now).unwrap_or(0);
-                for image in &mut images {
-                    image.clock_error_ns = clock_error_ns;
-                }
-                self.times.published(seq, pose, ready, images);
-                self.flight.handle(now, Input::ImagePublished { seq: published.seq });
-                self.control.log.write(
-                    Channel::Image,
-                    published.ready,
-                    &json!({
-                        "seq": published.seq, "tick": published.tick, "pose_ns": published.pose.as_ns(),
-                        "received_ns": published.received.as_ns(),
-                        "ready_ns": published.ready.as_ns()
-                    }),
-                );
-            }
-            Happening::FromPlugin(message) => self.take_plugin(now, *message),
-            Happening::Plugin(_, PluginEvent::Line(stream, line)) => {
-                self.take_line(now, stream, &line);
-            }
-            Happening::Plugin(_, PluginEvent::Note(text)) => {
-                self.tell_event(now, EventKind::Note, &format!("plugin: {text}"));
-            }
-            Happening::Plugin(run, PluginEvent::Exited(sentence)) => {
-                self.plugin_exited(now, run, sentence);
-            }
-            Happening::Reload => self.replace_plugin(now, "reloading the plugin".to_owned()),
-            Happening::Interrupt => self.flight.handle(now, Input::Interrupt),
-        }
-    }
-
-    fn take_stream(&mut self, now: HostTime, event: StreamEvent) {
+    fn handle_stream(&mut self, now: HostTime, event: StreamEvent) {
         match event {
-            StreamEvent::Welcome(mut arena) => {
-                // The plugin gets the limits that it is flown within.
-                self.control.settings.tighten(&mut arena);
+            StreamEvent::Welcome(arena) => {
                 tracing::info!("server: arena {}", arena.name);
-                self.flight.handle(now, Input::Arena(arena.clone()));
-                let fence = ArenaFence::of(&arena);
-                if let Some(gap) = fence.gap(&arena) {
-                    self.tell_event(now, EventKind::Note, &gap);
-                }
-                self.link.set_fence(now, fence.polygons);
-                if self.plugin.is_none() && self.flight.outcome().is_none() {
-                    self.start_plugin(now, arena);
+                self.companion.handle_arena(now, arena);
+                self.companion.upload_fence(now);
+                if self.plugin.is_none() && self.companion.flight().outcome().is_none() {
+                    self.start_plugin(now);
                 }
             }
-            StreamEvent::Refused(why) => self.flight.handle(now, Input::ServerRefused(why)),
+            StreamEvent::Refused(why) => self.companion.refuse(now, why),
             StreamEvent::Down(why) => tracing::warn!("{why}; trying again"),
-            StreamEvent::Pose(sample, stamp) => self.take_pose(now, &sample, stamp),
-            StreamEvent::Event(event) => {
-                self.publish_event(now, &event);
-                self.flight.handle(now, Input::Server(event));
-                // It may have ended the flight: LAND does not wait for the next setpoint's turn.
-                self.steering.hurry();
+            StreamEvent::Pose(sample, stamp) => {
+                self.companion.handle_pose(now, &sample, stamp);
+                self.share_senses();
+                self.control.log.pose(now, stamp, &sample);
             }
-            StreamEvent::Camera(index, camera) => self.take_camera(index, &camera),
+            StreamEvent::Event(event) => {
+                self.show_event(now, &event);
+                self.companion.handle_event(now, event);
+            }
+            StreamEvent::Camera(index, camera) => self.handle_camera(index, &camera),
         }
     }
 
-    /// A camera was changed. Images say themselves how they were drawn; this is for a plugin that
-    /// has not been greeted yet, and for the report.
-    fn take_camera(&mut self, index: u8, camera: &CameraInfo) {
+    fn handle_camera(&mut self, index: u8, camera: &CameraInfo) {
         let k = &camera.intrinsics;
         tracing::info!("camera {} is now {}x{} px", camera.name, k.width_px, k.height_px);
         if index == 0 {
             self.image_size_px = (k.width_px, k.height_px);
         }
-        let side = self.plugin.as_mut().filter(|side| !side.started);
-        if let Some(known) = side.and_then(|side| side.arena.cameras.get_mut(usize::from(index))) {
-            *known = camera.clone();
-        }
+        self.companion.handle_camera(index, camera);
     }
 
-    fn take_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
-        self.link.vision(now, sample, stamp);
-        self.flight.handle(now, Input::Pose(Fix::of(sample, stamp)));
-        if self.gives_ground_truth() {
-            let vehicle = Vehicle {
-                stamp,
-                attitude: sample.world_from_body.rotation,
-                omega_body_radps: sample.twist.angular_radps,
-                world_from_body: Some(sample.world_from_body),
-                v_world_mps: Some(sample.twist.linear_mps),
-            };
-            self.senses.lock().unwrap_or_else(PoisonError::into_inner).vehicle = Some(vehicle);
-        }
-        self.control.log.pose(now, stamp, sample);
-    }
-
-    /// Whether the course lets the plugin know where the vehicle is. Before it is known, nothing is
-    /// let out.
-    fn gives_ground_truth(&self) -> bool {
-        self.plugin.as_ref().is_some_and(|side| side.arena.ground_truth)
-    }
-
-    /// Passes on what the autopilot has told of battery, IMU and attitude.
-    fn sense(&mut self) {
-        let clock = &self.control.shared.clock;
-        for sample in self.link.imu().iter().filter(|sample| sample.stamp > self.imu_told) {
-            let stamp = clock.to_server(sample.stamp);
-            if stamp > ServerTime::ZERO {
-                let ImuSample { accel_mps2, gyro_radps, .. } = *sample;
-                self.control.to_server.imu(ImuReading { stamp, accel_mps2, gyro_radps });
-            }
-        }
-        self.imu_told = self.link.imu().back().map_or(self.imu_told, |newest| newest.stamp);
-        let state = self.link.state();
-        let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
-        let withheld = self.plugin.is_some() && !self.gives_ground_truth();
+    fn share_senses(&self) {
         let mut senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
-        senses.battery = Battery {
-            fraction: (fraction >= 0.0).then_some(fraction),
-            voltage_v: (voltage_v > 0.0).then_some(voltage_v),
-        };
-        let newest = |imu: Option<&ImuSample>| imu.map(|sample| sample.stamp);
-        if newest(self.link.imu().back()) != newest(senses.imu.last()) {
-            senses.imu.clear();
-            senses.imu.extend(self.link.imu());
-        }
-        // Where the course gives the pose, attitude comes with it.
-        if let (true, Some(stamp)) = (withheld, self.link.attitude_at()) {
-            senses.vehicle = Some(Vehicle {
-                stamp,
-                attitude: state.world_from_body,
-                omega_body_radps: state.omega_body_radps,
-                world_from_body: None,
-                v_world_mps: None,
-            });
-        }
+        self.companion.update_senses(&mut senses);
     }
 
-    fn take_plugin(&mut self, now: HostTime, message: FromPlugin) {
+    fn handle_published(&mut self, now: HostTime, published: &Published) {
+        self.published += 1;
+        (self.image_seq, self.image_tick) = (published.seq, published.tick);
+        let Published { seq, pose, ready, mut images, .. } = published.clone();
+        let clock_error_ns = self.control.shared.clock.error_bound_ns(now).unwrap_or(0);
+        for image in &mut images {
+            image.clock_error_ns = clock_error_ns;
+        }
+        self.times.published(seq, pose, ready, images);
+        self.companion.published(now, seq);
+        self.control.log.write(
+            Channel::Image,
+            published.ready,
+            &json!({
+                "seq": published.seq, "tick": published.tick, "pose_ns": published.pose.as_ns(),
+                "received_ns": published.received.as_ns(),
+                "ready_ns": published.ready.as_ns()
+            }),
+        );
+    }
+
+    fn handle_message(&mut self, now: HostTime, message: FromPlugin) {
         self.control.log.from_plugin(now, &message);
-        // What a process said that is gone or going counts no more.
-        let counts =
-            self.plugin.as_ref().is_some_and(|side| side.started && side.leaving.is_none());
+        // A message of a process that is gone or going counts no more.
+        let is_leaving = self.plugin.as_ref().is_none_or(|side| side.leaving.is_some());
+        let counts = self.companion.is_plugin_greeted() && !is_leaving;
         match message {
             FromPlugin::Ready { .. } | FromPlugin::Answer { .. } if !counts => {}
             FromPlugin::Ready { name } => {
                 tracing::info!("plugin {name} is ready");
-                self.flight.handle(now, Input::PluginReady);
+                self.companion.plugin_ready(now);
             }
             FromPlugin::Answer { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
                 if let Some(side) = &mut self.plugin {
-                    side.by_hand_answered = side.by_hand_answered.map(|_| now);
+                    side.by_hand_replied = side.by_hand_replied.map(|_| now);
                 }
                 self.check_deadline(now, seq, returned.seconds_since(entered) * 1e3);
                 let asked = json!({"seq": seq, "setpoint": &setpoint});
                 self.control.log.write(Channel::Asked, returned, &asked);
-                if setpoint.is_some() {
-                    self.steering.answered();
-                }
-                self.flight.handle(now, Input::Answered { seq, setpoint });
+                self.companion.replied(now, seq, setpoint);
                 self.control.log.write(
                     Channel::Image,
                     returned,
@@ -443,7 +362,7 @@ impl Loop {
         }
     }
 
-    /// Shows by how much an answer was late: the first, then ever fewer.
+    /// Reports by how much a reply was late: the first, then ever fewer.
     fn check_deadline(&mut self, now: HostTime, seq: u64, took_ms: f64) {
         let deadline_ms = self.control.plugin_limits.deadline_ms;
         if took_ms <= deadline_ms {
@@ -457,11 +376,11 @@ impl Loop {
                 "on_image took {took_ms:.0} ms for image {seq}, {over_ms:.0} ms longer than the \
                  {deadline_ms:.0} ms of deadline_ms in [plugin] ({count} so far)"
             );
-            self.tell_event(now, EventKind::Note, &text);
+            self.companion.note(now, &text);
         }
     }
 
-    fn take_line(&mut self, now: HostTime, stream: Stream, line: &str) {
+    fn handle_line(&mut self, now: HostTime, stream: Stream, line: &str) {
         let stream = match stream {
             Stream::Stdout => "stdout",
             Stream::Stderr => "stderr",
@@ -482,25 +401,16 @@ impl Loop {
         }
     }
 
-    fn tell_event(&mut self, now: HostTime, kind: EventKind, text: &str) {
-        let stamp = self.control.shared.clock.to_server(now);
-        let event = Event { stamp, kind, text: bounded(text) };
-        tracing::info!(target: "flight", "{text}");
-        self.publish_event(now, &event);
-        self.control.to_server.tell(event);
-    }
-
     // ---- the end ----
 
-    fn finish(mut self, outcome: Outcome, happenings: &Receiver<Happening>) -> Flown {
-        let now = host_now();
-        self.tell_notices(now);
+    fn finish(mut self, now: HostTime, outcome: Outcome, inputs: &Receiver<ControlInput>) -> Flown {
         self.report(now);
         self.report_timing(now);
+        self.pass_on(now);
         let (clock, arrived) = (self.control.shared.clock.state(now), self.arrived());
         let whole = self.times.whole(now, clock, &arrived);
         self.control.log.write(Channel::Timing, now, &whole);
-        debug_assert_eq!(self.flight.phase(), FlightPhase::Landed);
+        debug_assert_eq!(self.companion.flight().phase(), FlightPhase::Landed);
         if let Some(side) = self.plugin.take() {
             if side.ipc.plugin_attached() {
                 let _ = side.ipc.send(&ToPlugin::Stop);
@@ -514,16 +424,16 @@ impl Loop {
             // heard out, as they may be waiting for room in the queue.
             for thread in side.threads {
                 while !thread.is_finished() {
-                    let _ = happenings.recv_timeout(Duration::from_millis(5));
+                    let _ = inputs.recv_timeout(Duration::from_millis(5));
                 }
             }
         }
         self.control.screen.end();
         let counters = Counters {
-            seconds: self.flight.seconds(now),
+            seconds: self.companion.flight().seconds(now),
             image_size_px: self.image_size_px,
-            setpoints_sent: self.setpoints_sent,
-            mavlink_packets: self.link.packets(),
+            setpoints_sent: self.companion.setpoints_sent(),
+            mavlink_packets: self.companion.link().packets(),
             plugin_overruns: self.overruns,
             plugin_restarts: self.restarts,
             clock,

@@ -5,23 +5,21 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
 
-use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, Setpoint, ToPlugin, bounded};
+use vizflyt_protocol::messages::{CameraInfo, Setpoint, ToPlugin};
 use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::ObservationWriter;
 use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
-use vizflyt_sdk::{ObservationWriter, host_now};
 
-use super::{Happening, Loop};
+use super::{ControlInput, ControlLoop};
 use crate::answers::Answers;
-use crate::flight::Input;
 use crate::images::ImagePublisher;
 use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
 /// The plugin hears of us at least this often.
 const HEARTBEAT_TICKS: u64 = 20;
-/// A plugin that says it has failed may still print why for so long, before it is started again.
-const LAST_WORDS: Duration = Duration::from_millis(300);
+/// A plugin that says it has failed may still print why for this long, before it is started again. [s]
+const LAST_WORDS_S: f64 = 0.3;
 /// Whether a plugin that a person started still lives is looked up every 80 ms.
 const BY_HAND_TICKS: u64 = 4;
 /// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
@@ -37,28 +35,29 @@ pub(super) struct PluginSide {
     /// Stands until a plugin has come that a person started.
     pub(super) offer: Option<Offer>,
     /// When a plugin that a person started last answered, or we on its behalf.
-    pub(super) by_hand_answered: Option<HostTime>,
+    pub(super) by_hand_replied: Option<HostTime>,
     /// Number of the present process.
     pub(super) run: u32,
-    pub(super) arena: Box<ArenaInfo>,
-    /// The present process was greeted.
-    pub(super) started: bool,
     /// The present process is on its way out, and another will be started; until when it may go
     /// by itself.
-    pub(super) leaving: Option<Instant>,
+    pub(super) leaving: Option<HostTime>,
     pub(super) answers: Arc<Answers>,
     /// Ends its threads.
     pub(super) stop: Arc<AtomicBool>,
     pub(super) threads: Vec<JoinHandle<()>>,
 }
 
-impl Loop {
-    pub(super) fn start_plugin(&mut self, now: HostTime, arena: Box<ArenaInfo>) {
-        if let Some(camera) = arena.cameras.first() {
+impl ControlLoop {
+    /// Makes the plugin's shared memory and threads, and starts its process. Does nothing before the arena
+    /// is known.
+    pub(super) fn start_plugin(&mut self, now: HostTime) {
+        let Some(arena) = self.companion.arena() else { return };
+        let cameras = arena.cameras.to_vec();
+        if let Some(camera) = cameras.first() {
             self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
         let service = unique_service();
-        let len = ObservationWriter::len_for(&arena.cameras);
+        let len = ObservationWriter::len_for(&cameras);
         let mut command = self.control.plugin_command.clone();
         let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
         // Who starts a plugin by hand is its user.
@@ -67,19 +66,19 @@ impl Loop {
         let ipc = match RuntimeEnd::create_for(&service, len, owner) {
             Ok(ipc) => Arc::new(ipc),
             Err(error) => {
-                return self.flight.handle(now, Input::ServerRefused(error.to_string()));
+                return self.companion.refuse(now, error.to_string());
             }
         };
         let stop = Arc::default();
         let answers = Arc::new(Answers::new(Arc::clone(&ipc)));
-        let threads = self.start_threads(&ipc, &arena, &stop, &answers);
+        let threads = self.start_threads(&ipc, cameras, &stop, &answers);
         let mut offer = None;
         if by_hand {
             match Offer::make(&service) {
                 Ok(made) => offer = Some(made),
                 Err(error) => {
                     let sentence = format!("no plugin can find this runtime: {error}");
-                    self.flight.handle(now, Input::PluginFailed(sentence));
+                    self.companion.plugin_failed(now, sentence);
                 }
             }
         } else {
@@ -91,10 +90,8 @@ impl Loop {
             confinement,
             supervisor: None,
             offer,
-            by_hand_answered: None,
+            by_hand_replied: None,
             run: 0,
-            arena,
-            started: false,
             leaving: None,
             answers,
             stop,
@@ -102,7 +99,7 @@ impl Loop {
         });
         if by_hand {
             let text = "waiting for a plugin: start yours, as `python my_plugin.py`";
-            self.tell_event(now, EventKind::Note, text);
+            self.companion.note(now, text);
         } else {
             self.start_process(now);
         }
@@ -112,20 +109,19 @@ impl Loop {
     /// breakpoint the vehicle holds instead of landing.
     pub(super) fn tend_by_hand(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
-        let Some(answered) = side.by_hand_answered else { return };
+        let Some(answered) = side.by_hand_replied else { return };
         if self.ticks.is_multiple_of(BY_HAND_TICKS) {
             // A killed process stays subscribed until its remains are cleared away.
             side.ipc.clean_up();
             if !side.ipc.plugin_attached() {
-                side.by_hand_answered = None;
+                side.by_hand_replied = None;
                 let sentence = "the plugin that had attached has ended".to_owned();
-                return self.flight.handle(now, Input::PluginFailed(sentence));
+                return self.companion.plugin_failed(now, sentence);
             }
         }
         if now.seconds_since(answered) > BREAKPOINT_S {
-            side.by_hand_answered = Some(now);
-            let setpoint = Some(Setpoint::Hold);
-            self.flight.handle(now, Input::Answered { seq: self.image_seq, setpoint });
+            side.by_hand_replied = Some(now);
+            self.companion.replied(now, self.image_seq, Some(Setpoint::Hold));
         }
     }
 
@@ -138,17 +134,17 @@ impl Loop {
             if let PluginEvent::Exited(_) = &event {
                 // What it said comes before the news of its end: it may be why.
                 answers.drain(|message| {
-                    let _ = sender.send(Happening::FromPlugin(Box::new(message)));
+                    let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
                 });
             }
-            let _ = sender.send(Happening::Plugin(run, event));
+            let _ = sender.send(ControlInput::Plugin(run, event));
         };
         match Supervisor::start(&side.command, &side.confinement, tell) {
             Ok(supervisor) => side.supervisor = Some(supervisor),
             Err(error) => {
                 let program = side.command[0].to_string_lossy();
                 let sentence = format!("the plugin {program} cannot be started: {error}");
-                self.flight.handle(now, Input::PluginFailed(sentence));
+                self.companion.plugin_failed(now, sentence);
             }
         }
     }
@@ -162,7 +158,7 @@ impl Loop {
             self.restarts += 1;
             self.replace_plugin(now, sentence);
         } else {
-            self.flight.handle(now, Input::PluginFailed(sentence));
+            self.companion.plugin_failed(now, sentence);
         }
     }
 
@@ -176,8 +172,9 @@ impl Loop {
             self.plugin_failed(now, sentence);
         }
         let Some(side) = &mut self.plugin else { return };
-        if side.leaving.take().is_some() && self.flight.can_wait_for_plugin() {
-            (side.run, side.started) = (side.run + 1, false);
+        if side.leaving.take().is_some() && self.companion.flight().can_wait_for_plugin() {
+            side.run += 1;
+            self.companion.plugin_gone();
             side.answers.begin_anew();
             self.start_process(now);
         }
@@ -185,38 +182,37 @@ impl Loop {
 
     /// Whether a plugin that failed is started again, by the policy.
     pub(super) fn may_restart(&self) -> bool {
-        let limits = &self.control.plugin_limits;
+        let (limits, flight) = (&self.control.plugin_limits, self.companion.flight());
         let is_there = match limits.restart {
             Restart::Never => false,
-            Restart::OnGround => self.flight.is_on_ground(),
+            Restart::OnGround => flight.is_on_ground(),
             Restart::InFlight => true,
         };
         // What a person started, a person starts again.
         let ours = !self.control.plugin_command.is_empty();
-        ours && is_there && self.restarts < limits.restarts && self.flight.can_wait_for_plugin()
+        ours && is_there && self.restarts < limits.restarts && flight.can_wait_for_plugin()
     }
 
     /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
     pub(super) fn replace_plugin(&mut self, now: HostTime, why: String) {
         let Some(side) = &mut self.plugin else { return };
-        if side.leaving.is_some() || !self.flight.can_wait_for_plugin() {
+        if side.leaving.is_some() || !self.companion.flight().can_wait_for_plugin() {
             return;
         }
-        side.leaving = Some(Instant::now() + LAST_WORDS);
+        side.leaving = Some(now.plus_seconds(LAST_WORDS_S));
         if side.ipc.plugin_attached() {
             let _ = side.ipc.send(&ToPlugin::Stop);
         }
-        self.flight.handle(now, Input::PluginRestarts(why));
+        self.companion.plugin_restarts(now, why);
     }
 
     pub(super) fn start_threads(
         &self,
         ipc: &Arc<RuntimeEnd>,
-        arena: &ArenaInfo,
+        cameras: Vec<CameraInfo>,
         stop: &Arc<AtomicBool>,
         answers: &Arc<Answers>,
     ) -> Vec<JoinHandle<()>> {
-        let cameras = arena.cameras.to_vec();
         let mailbox = Arc::clone(&self.control.shared.mailbox);
         let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
             .with_log(self.control.log.images(&mailbox));
@@ -226,7 +222,7 @@ impl Loop {
                 &mailbox,
                 || stopped.load(Ordering::Relaxed),
                 |published| {
-                    let _ = sender.send(Happening::Published(published));
+                    let _ = sender.send(ControlInput::Published(published));
                 },
             );
         });
@@ -234,41 +230,40 @@ impl Loop {
             (Arc::clone(answers), self.sender.clone(), Arc::clone(stop));
         let answers = spawn("answers", move || {
             answers.read(&stopped, |message| {
-                let _ = sender.send(Happening::FromPlugin(Box::new(message)));
+                let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
             });
         });
         images.into_iter().chain(answers).collect()
     }
 
     /// Greets the plugin once it has attached; shows it that we live.
-    pub(super) fn tend_plugin(&mut self) {
+    pub(super) fn tend_plugin(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
-        if side.leaving.is_some_and(|until| Instant::now() > until)
+        if side.leaving.is_some_and(|until| now > until)
             && let Some(supervisor) = &side.supervisor
         {
             supervisor.kill();
         }
-        if !side.started && side.leaving.is_none() && side.ipc.plugin_attached() {
-            side.started = true;
+        let is_greeted = self.companion.is_plugin_greeted();
+        if !is_greeted && side.leaving.is_none() && side.ipc.plugin_attached() {
             if side.offer.take().is_some() {
-                side.by_hand_answered = Some(host_now());
+                side.by_hand_replied = Some(now);
             }
-            let start = ToPlugin::Start((*side.arena).clone());
-            self.control.log.to_plugin(host_now(), &start);
-            if let Err(error) = side.ipc.send(&start) {
-                tracing::warn!("plugin: {error}");
-            }
-            // One that comes later learns where the flight is.
-            if side.run > 0 {
-                let stamp = self.control.shared.clock.to_server(host_now());
-                let kind = EventKind::Phase(self.flight.phase());
-                let text = bounded("the plugin was started again");
-                let message = ToPlugin::Event(Event { stamp, kind, text });
-                self.control.log.to_plugin(host_now(), &message);
-                let _ = side.ipc.send(&message);
-            }
+            self.companion.greet_plugin(now);
         } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
             side.ipc.heartbeat();
+        }
+    }
+
+    /// Sends a message to the plugin, if it is attached.
+    pub(super) fn send_to_plugin(&self, now: HostTime, message: &ToPlugin) {
+        let Some(side) = self.plugin.as_ref().filter(|side| side.ipc.plugin_attached()) else {
+            return;
+        };
+        self.control.log.to_plugin(now, message);
+        if let Err(error) = side.ipc.send(message) {
+            // One that reads nothing is noticed by its silence.
+            tracing::debug!("plugin: {error}");
         }
     }
 }

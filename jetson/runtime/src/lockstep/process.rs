@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
+use vizflyt_sdk::ObservationTooLarge;
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd, SERVICE_OPTION, unique_service};
 
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
@@ -22,6 +23,9 @@ pub enum ProcessError {
     /// Shared memory failed.
     #[error(transparent)]
     Ipc(#[from] IpcError),
+    /// The observation does not fit into the memory that was lent.
+    #[error(transparent)]
+    TooLarge(#[from] ObservationTooLarge),
     /// The plugin's program cannot be started.
     #[error("the plugin {0} cannot be started: {1}")]
     Start(String, std::io::Error),
@@ -30,8 +34,8 @@ pub enum ProcessError {
     Failed(String),
 }
 
-/// Who hears what the plugin prints.
-pub type Hears<'a> = &'a mut dyn FnMut(Stream, &str);
+/// Receives the lines that the plugin prints.
+pub type LineSink<'a> = &'a mut dyn FnMut(Stream, &str);
 
 /// A plugin's process and our end of its shared memory. It dies with the thread that started it.
 #[derive(Debug)]
@@ -76,7 +80,7 @@ impl PluginProcess {
     ///
     /// # Errors
     /// [`ProcessError::Failed`] if it ends, gives up or takes longer.
-    pub fn begin(&mut self, start: &ToPlugin, line: Hears<'_>) -> Result<(), ProcessError> {
+    pub fn begin(&mut self, start: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
         let deadline = Instant::now() + READY_WITHIN;
         while !self.ipc.plugin_attached() {
             if let Some(why) = self.pass_lines(line) {
@@ -104,7 +108,7 @@ impl PluginProcess {
     ///
     /// # Errors
     /// [`ProcessError::Failed`] if it has ended, or reads nothing.
-    pub fn send(&mut self, message: &ToPlugin, line: Hears<'_>) -> Result<(), ProcessError> {
+    pub fn send(&mut self, message: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
         let deadline = Instant::now() + self.within;
         loop {
             match self.ipc.send(message) {
@@ -142,7 +146,7 @@ impl PluginProcess {
         &mut self,
         seq: u64,
         observation: LoanedObservation,
-        line: Hears<'_>,
+        line: LineSink<'_>,
     ) -> Result<Option<Setpoint>, ProcessError> {
         self.ipc.publish(observation)?;
         let deadline = Instant::now() + self.within;
@@ -167,7 +171,7 @@ impl PluginProcess {
 
     /// Shows the plugin that we live, if it has not heard of us for a while; its end is noticed when the
     /// next image is not answered.
-    pub fn tend(&mut self, line: Hears<'_>) {
+    pub fn tend(&mut self, line: LineSink<'_>) {
         if self.beaten.elapsed() >= HEARTBEAT {
             self.beaten = Instant::now();
             self.ipc.heartbeat();
@@ -176,7 +180,7 @@ impl PluginProcess {
     }
 
     /// Ends the plugin in order.
-    pub fn stop(mut self, line: Hears<'_>) {
+    pub fn stop(mut self, line: LineSink<'_>) {
         if self.ipc.plugin_attached() {
             let _ = self.ipc.send(&ToPlugin::Stop);
         }
@@ -186,7 +190,7 @@ impl PluginProcess {
     }
 
     /// Returns the plugin's next message; `None` after a while.
-    fn next(&mut self, line: Hears<'_>) -> Result<Option<FromPlugin>, ProcessError> {
+    fn next(&mut self, line: LineSink<'_>) -> Result<Option<FromPlugin>, ProcessError> {
         if let Some(message) = self.receive()? {
             return Ok(Some(message));
         }
@@ -213,7 +217,7 @@ impl PluginProcess {
     }
 
     /// Passes on what the plugin printed; returns how it ended, if it has.
-    fn pass_lines(&mut self, line: Hears<'_>) -> Option<String> {
+    fn pass_lines(&mut self, line: LineSink<'_>) -> Option<String> {
         let mut ended = None;
         for event in self.events.try_iter() {
             match event {

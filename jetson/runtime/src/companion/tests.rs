@@ -1,10 +1,9 @@
-//! The companion against what an autopilot and a server tell it, and what it lets a plugin know.
+//! The companion against inputs of an autopilot and a server, and what it lets a plugin know.
 
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_protocol::messages::{FlightPhase, Limits};
-use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::{DQuat, DVec3};
-use vizflyt_sdk::{CameraInfo, Observation, ObservationWriter};
+use vizflyt_sdk::{Observation, ObservationWriter};
 
 use super::*;
 
@@ -24,17 +23,22 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(10_000_000_000 + ms * 1_000_000)
 }
 
-fn settings() -> FlightSettings {
-    FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE }
+fn companion(ground_truth: bool) -> Companion {
+    let settings = FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let mut companion =
+        Companion::new(at(0), settings, LinkSettings::default(), ServerClock::same());
+    companion.handle_arena(at(0), Box::new(arena(ground_truth)));
+    companion
 }
 
-/// A companion that has heard of a pose and of a collision, and what its plugin has been told.
-fn told(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
-    let mut companion = Companion::new(at(0), &arena(ground_truth), settings());
+/// A companion after a pose and a collision, and what its plugin was sent.
+fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
+    let mut companion = companion(ground_truth);
+    companion.greet_plugin(at(0));
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
     let stamp = ServerTime::from_ns(at(5).as_ns());
     let pose = Pose::new(p_world_m, DQuat::IDENTITY);
-    companion.handle_pose(at(5), &PoseSample::still(stamp, pose));
+    companion.handle_pose(at(5), &PoseSample::still(stamp, pose), at(5));
     let kind = EventKind::Collision { p_world_m, clearance_m: -0.1 };
     companion.handle_event(at(6), Event { stamp, kind, text: bounded("touched") });
     let messages = std::iter::from_fn(|| companion.poll_plugin()).collect();
@@ -42,18 +46,20 @@ fn told(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
 }
 
 fn observed<T>(companion: &Companion, look: impl FnOnce(&Observation<'_>) -> T) -> T {
-    let cameras = companion.arena.cameras.to_vec();
+    let cameras = companion.arena().unwrap().cameras.to_vec();
     let mut blocks = vec![0u64; ObservationWriter::len_for(&cameras).div_ceil(8)];
     let memory = zerocopy::IntoBytes::as_mut_bytes(&mut blocks[..]);
     let mut writer = ObservationWriter::new(memory, 1, &cameras).unwrap();
-    companion.write(&mut writer);
+    let mut senses = Senses::default();
+    companion.update_senses(&mut senses);
+    senses.write(&mut writer);
     let names = [cameras[0].name.clone()];
     look(&Observation::from_bytes(memory, &names).unwrap())
 }
 
 #[test]
 fn a_plugin_is_greeted_first_and_learns_of_events_in_order() {
-    let (_, messages) = told(true);
+    let (_, messages) = after_collision(true);
     assert!(matches!(&messages[0], ToPlugin::Start(arena) if arena.name == "test"));
     assert_eq!(messages.len(), 2);
 }
@@ -64,11 +70,11 @@ fn what_the_course_withholds_is_nowhere() {
         ToPlugin::Event(Event { kind: EventKind::Collision { p_world_m, .. }, .. }) => *p_world_m,
         other => panic!("{other:?}"),
     };
-    let (companion, messages) = told(true);
+    let (companion, messages) = after_collision(true);
     assert_eq!(place(&messages), DVec3::new(1.0, 2.0, 3.0));
     observed(&companion, |observation| assert!(observation.vehicle().is_some()));
 
-    let (companion, messages) = told(false);
+    let (companion, messages) = after_collision(false);
     assert_eq!(place(&messages), DVec3::ZERO);
     // No attitude of the autopilot's has come, and the pose is not let out.
     observed(&companion, |observation| assert!(observation.vehicle().is_none()));
@@ -76,19 +82,19 @@ fn what_the_course_withholds_is_nowhere() {
 
 #[test]
 fn without_an_autopilot_the_flight_is_given_up_at_its_time() {
-    let mut companion = Companion::new(at(0), &arena(true), settings());
+    let mut companion = companion(true);
     companion.plugin_ready(at(0));
     let mut beats = 0;
     let ended = (0..100_000).map(|tick| at(tick * 5)).find(|&now| {
         companion.handle_timeout(now);
         beats += std::iter::from_fn(|| companion.poll_transmit()).count();
-        companion.outcome().is_some()
+        companion.flight().outcome().is_some()
     });
     // Nothing is in the air after 60 s, by the virtual clock alone.
     let seconds = ended.unwrap().seconds_since(at(0));
     assert!((60.0..60.1).contains(&seconds), "{seconds}");
     assert!((55..70).contains(&beats), "one heartbeat a second: {beats}");
-    let reason = &companion.outcome().unwrap().reason;
+    let reason = &companion.flight().outcome().unwrap().reason;
     assert!(reason.contains("no heartbeat from an autopilot"), "{reason}");
     let phases: Vec<_> = std::iter::from_fn(|| companion.poll_event())
         .filter(|event| matches!(event.kind, EventKind::Phase(_)))
@@ -102,7 +108,7 @@ fn without_an_autopilot_the_flight_is_given_up_at_its_time() {
 #[test]
 fn the_same_inputs_give_the_same_bytes() {
     let bytes = || {
-        let (mut companion, _) = told(true);
+        let (mut companion, _) = after_collision(true);
         let mut all = Vec::new();
         for tick in 0..2000 {
             companion.handle_timeout(at(10 + 5 * tick));
@@ -114,4 +120,35 @@ fn the_same_inputs_give_the_same_bytes() {
     };
     assert!(!bytes().is_empty());
     assert_eq!(bytes(), bytes());
+}
+
+#[test]
+fn a_plugin_that_is_not_there_gets_no_messages_and_its_successor_learns_the_phase() {
+    let (mut companion, _) = after_collision(true);
+    companion.plugin_gone();
+    companion.note(at(10), "nobody reads this");
+    assert_eq!(companion.poll_plugin(), None);
+    companion.greet_plugin(at(20));
+    let messages: Vec<_> = std::iter::from_fn(|| companion.poll_plugin()).collect();
+    let [ToPlugin::Start(_), ToPlugin::Event(event)] = &messages[..] else {
+        panic!("{messages:?}")
+    };
+    assert_eq!(event.kind, EventKind::Phase(companion.flight().phase()));
+}
+
+#[test]
+fn a_camera_that_changes_before_the_greeting_is_in_it() {
+    let mut companion = companion(true);
+    let mut camera = companion.arena().unwrap().cameras[0].clone();
+    camera.intrinsics = Intrinsics::from_horizontal_fov(16, 12, 1.5);
+    companion.handle_camera(0, &camera);
+    // There is no such camera.
+    companion.handle_camera(9, &camera);
+    companion.greet_plugin(at(0));
+    let Some(ToPlugin::Start(arena)) = companion.poll_plugin() else { panic!("no greeting") };
+    assert_eq!(arena.cameras[0], camera);
+    // Later changes are told by the images themselves.
+    camera.intrinsics = Intrinsics::from_horizontal_fov(8, 6, 1.5);
+    companion.handle_camera(0, &camera);
+    assert_eq!(companion.arena().unwrap().cameras[0].intrinsics.width_px, 16);
 }

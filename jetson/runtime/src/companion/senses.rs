@@ -1,0 +1,25 @@
+//! What a plugin may know beside images.
+
+use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle};
+
+/// The vehicle's state as the plugin may know it. What the course withholds is never in it.
+#[derive(Clone, Debug, Default)]
+pub struct Senses {
+    /// The vehicle.
+    pub vehicle: Option<Vehicle>,
+    /// Its battery.
+    pub battery: Battery,
+    /// The newest IMU samples, oldest first.
+    pub imu: Vec<ImuSample>,
+}
+
+impl Senses {
+    /// Writes them into an observation.
+    pub fn write(&self, writer: &mut ObservationWriter<'_>) {
+        if let Some(vehicle) = &self.vehicle {
+            writer.vehicle(vehicle);
+        }
+        writer.battery(&self.battery);
+        writer.imu(&self.imu);
+    }
+}

@@ -1,0 +1,253 @@
+//! The companion's two drivers side by side: the control loop and the lock-step one get the same inputs at
+//! the same times, those of a simulated flight, and must put out the same.
+
+use std::cell::RefCell;
+use std::rc::Rc;
+use std::sync::mpsc::sync_channel;
+
+use vizflyt_protocol::mavlink::MAX_PACKET;
+use vizflyt_protocol::messages::{ArenaInfo, Axes, Limits, PoseSample, Setpoint, YawTarget};
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_sdk::glam::DVec3;
+use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
+use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
+
+use super::*;
+use crate::answers::Answers;
+use crate::companion::Senses;
+use crate::lockstep::{Lockstep, Reply};
+use crate::stream::ServerClock;
+use crate::supervisor::Confinement;
+
+/// From an image until the plugin's reply to it. [ns]
+const REPLY_NS: i64 = 10_000_000;
+/// Ticks of the simulation, of 2.5 ms, from one image to the next.
+const IMAGE_TICKS: u64 = 13;
+
+/// Both drivers, and the plugin's end of the control loop's shared memory.
+struct Drivers {
+    lockstep: Lockstep,
+    control: ControlLoop,
+    plugin: PluginEnd,
+    /// What the control loop sent to the autopilot.
+    sent: Rc<RefCell<Vec<Vec<u8>>>>,
+    /// Replies on their way to the control loop.
+    replies: std::collections::VecDeque<(HostTime, Reply)>,
+    _folder: tempfile::TempDir,
+    _inputs: Receiver<ControlInput>,
+}
+
+fn at(ns: u64) -> HostTime {
+    HostTime::from_ns(10_000_000_000 + ns)
+}
+
+fn arena(ground_truth: bool) -> ArenaInfo {
+    ArenaInfo { ground_truth, ..crate::flight::tests::arena() }
+}
+
+impl Drivers {
+    /// Makes both at `now`, in the same arena, each with a plugin that is ready.
+    fn new(now: HostTime, arena: &ArenaInfo) -> Self {
+        let settings =
+            FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+        let mut lockstep = Lockstep::new(now, arena, settings, None, REPLY_NS);
+        assert!(matches!(lockstep.companion.poll_plugin(), Some(ToPlugin::Start(_))));
+        lockstep.companion.upload_fence(now);
+
+        let folder = tempfile::tempdir().unwrap();
+        let sent = Rc::new(RefCell::new(Vec::new()));
+        let into = Rc::clone(&sent);
+        let (sender, inputs) = sync_channel(QUEUE);
+        let control = Control {
+            plugin_command: Vec::new(),
+            plugin_limits: PluginLimits::default(),
+            settings,
+            waits_for_start: false,
+            to_autopilot: Box::new(move |bytes| into.borrow_mut().push(bytes.to_vec())),
+            link: LinkSettings::default(),
+            shared: Shared { clock: ServerClock::same(), mailbox: Arc::default() },
+            to_server: Arc::default(),
+            log: FlightLog::open(folder.path(), None),
+            json: false,
+            screen: Screen::default(),
+        };
+        let mut control = ControlLoop::new(now, control, sender);
+        // A plugin that has attached already, without a process of its own.
+        let service = unique_service();
+        let ipc = Arc::new(RuntimeEnd::create(&service, 1 << 16).unwrap());
+        let plugin = PluginEnd::open(&service).unwrap();
+        control.plugin = Some(PluginSide {
+            answers: Arc::new(Answers::new(Arc::clone(&ipc))),
+            ipc,
+            command: Vec::new(),
+            confinement: Confinement::prepare(&PluginLimits::default(), &[]),
+            supervisor: None,
+            offer: None,
+            by_hand_replied: None,
+            run: 0,
+            leaving: None,
+            stop: Arc::default(),
+            threads: Vec::new(),
+        });
+        let welcome = StreamEvent::Welcome(Box::new(arena.clone()));
+        control.handle(now, ControlInput::Stream(welcome));
+        let mut drivers = Self {
+            lockstep,
+            control,
+            plugin,
+            sent,
+            replies: std::collections::VecDeque::new(),
+            _folder: folder,
+            _inputs: inputs,
+        };
+        // The first turn greets the control loop's plugin.
+        drivers.turn(now);
+        drivers.lockstep.companion.plugin_ready(now);
+        drivers.message(now, FromPlugin::Ready { name: bounded("test") });
+        drivers
+    }
+
+    fn message(&mut self, now: HostTime, message: FromPlugin) {
+        self.control.handle(now, ControlInput::FromPlugin(Box::new(message)));
+    }
+
+    fn mavlink(&mut self, now: HostTime, bytes: &[u8]) {
+        self.lockstep.companion.handle_mavlink(now, bytes);
+        self.control.handle(now, ControlInput::Mavlink(bytes.to_vec()));
+    }
+
+    fn pose(&mut self, now: HostTime, sample: PoseSample) {
+        let stamp = HostTime::from_ns(sample.stamp.as_ns());
+        self.lockstep.companion.handle_pose(now, &sample, stamp);
+        self.control.handle(now, ControlInput::Stream(StreamEvent::Pose(sample, stamp)));
+    }
+
+    fn event(&mut self, now: HostTime, kind: EventKind) {
+        let stamp = ServerTime::from_ns(now.as_ns());
+        let event = Event { stamp, kind, text: bounded("of the server") };
+        self.lockstep.companion.handle_event(now, event.clone());
+        self.control.handle(now, ControlInput::Stream(StreamEvent::Event(event)));
+    }
+
+    /// The plugin is shown observation `seq`, and will ask for `setpoint`.
+    fn image(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
+        let images = heapless::Vec::new();
+        let (pose, received, ready) = (now, now, now);
+        let published = Published { seq, tick: seq, pose, received, ready, images };
+        let reply = Reply { seq, setpoint };
+        self.lockstep.companion.published(now, seq);
+        self.lockstep.take_reply(now, reply.clone());
+        self.control.handle(now, ControlInput::Published(published));
+        self.replies.push_back((now.plus_ns(REPLY_NS), reply));
+    }
+
+    /// Lets both do what is due; returns what they sent to the autopilot, which is the same.
+    fn turn(&mut self, now: HostTime) -> Vec<Vec<u8>> {
+        self.lockstep.handle_timeout(now);
+        while let Some((due, Reply { seq, setpoint })) =
+            self.replies.pop_front_if(|(due, _)| *due <= now)
+        {
+            let (entered, returned) = (due, due);
+            self.message(now, FromPlugin::Answer { seq, entered, returned, setpoint });
+        }
+        self.control.handle_timeout(now);
+
+        let companion = &mut self.lockstep.companion;
+        let sent: Vec<_> =
+            std::iter::from_fn(|| companion.poll_transmit()).map(|d| d.to_vec()).collect();
+        assert_eq!(self.sent.take(), sent, "at {now:?}");
+        assert_eq!(self.control.companion.setpoints_sent(), companion.setpoints_sent());
+        sent
+    }
+
+    /// Returns the messages that both plugins were sent since the last call, without greetings. They hold
+    /// every event, the server's and the companion's own.
+    fn take_messages(&mut self) -> Vec<ToPlugin> {
+        let companion = &mut self.lockstep.companion;
+        let lockstep: Vec<_> = std::iter::from_fn(|| companion.poll_plugin()).collect();
+        let control = std::iter::from_fn(|| self.plugin.receive().unwrap())
+            .filter(|message| !matches!(message, ToPlugin::Start(_)));
+        assert_eq!(control.collect::<Vec<_>>(), lockstep);
+        lockstep
+    }
+
+    /// Both plugins may know the same beside images.
+    fn check_senses(&self) {
+        let mut senses = Senses::default();
+        self.lockstep.companion.update_senses(&mut senses);
+        let control = self.control.senses.lock().unwrap();
+        assert_eq!(format!("{control:?}"), format!("{senses:?}"));
+    }
+}
+
+/// What the plugin asks for in reply to image `seq`: one of everything.
+fn setpoint(seq: u64) -> Option<Setpoint> {
+    let yaw = YawTarget::Keep;
+    match seq / 40 % 5 {
+        0 => None,
+        1 => Some(Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::World, yaw }),
+        2 => Some(Setpoint::Position { p_world_m: DVec3::new(1.0, -1.0, 1.5), yaw }),
+        3 => Some(Setpoint::Velocity { v_mps: DVec3::NAN, axes: Axes::World, yaw }),
+        _ => Some(Setpoint::Hold),
+    }
+}
+
+/// Flies both drivers through a simulated flight until the last one has landed; returns the events.
+fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
+    let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
+    let mut drivers = Drivers::new(at(0), &arena(ground_truth));
+    let (mut events, mut seq) = (Vec::new(), 0);
+    for tick in 1..=400 * 90 {
+        simulation.tick();
+        let now = at(simulation.now().as_ns());
+        let mut buffer = [0; MAX_PACKET];
+        while let Some(packet) = simulation.poll_mavlink(&mut buffer) {
+            drivers.mavlink(now, packet);
+        }
+        while let Some(sight) = simulation.poll_mocap() {
+            let stamp = ServerTime::from_ns(at(sight.at.as_ns()).as_ns());
+            let mut sample = PoseSample::still(stamp, sight.world_from_body);
+            sample.twist.linear_mps = simulation.state().v_world_mps;
+            drivers.pose(now, sample);
+        }
+        if tick == 400 * seconds {
+            drivers.event(now, ends_with.clone());
+        }
+        if tick.is_multiple_of(IMAGE_TICKS) {
+            seq += 1;
+            drivers.check_senses();
+            drivers.image(now, seq, setpoint(seq));
+        }
+        for datagram in drivers.turn(now) {
+            simulation.handle_mavlink(0, &datagram);
+        }
+        for message in drivers.take_messages() {
+            let ToPlugin::Event(event) = message else { panic!("{message:?}") };
+            events.push(event);
+        }
+        if let Some(outcome) = drivers.lockstep.companion.flight().outcome() {
+            assert_eq!(drivers.control.companion.flight().outcome(), Some(outcome));
+            assert!(drivers.lockstep.companion.setpoints_sent() > 400, "it has flown");
+            return events;
+        }
+    }
+    panic!("the flight does not end: {events:?}");
+}
+
+#[test]
+fn both_drivers_send_the_same_setpoints_and_events() {
+    let p_world_m = DVec3::new(1.0, 2.0, 3.0);
+    let collision = EventKind::Collision { p_world_m, clearance_m: -0.1 };
+    let events = fly(true, &collision, 30);
+    assert!(events.iter().any(|event| event.kind == collision));
+    let refused = events.iter().find(|event| event.text.starts_with("setpoint refused"));
+    assert!(refused.is_some(), "{events:?}");
+}
+
+#[test]
+fn both_drivers_withhold_the_pose_alike() {
+    let p_world_m = DVec3::new(1.0, 2.0, 3.0);
+    let outside = EventKind::Geofence { p_world_m, margin_m: -0.1 };
+    let events = fly(false, &outside, 25);
+    assert!(!events.iter().any(|event| event.kind == outside), "the place is withheld");
+}
