@@ -20,7 +20,7 @@ use anyhow::{Context, Result, bail};
 use glam::DVec3;
 use sha2::{Digest, Sha256};
 use vizflyt_arena::crash::{Asked, Flight as Record, Seen, ahead_m};
-use vizflyt_arena::pose::Measured;
+use vizflyt_arena::pose::{Measured, Predict};
 use vizflyt_arena::verdict::{Sample, Verdict, judge};
 use vizflyt_arena::{ArenaConfig, Referee};
 use vizflyt_protocol::mavlink::MAX_PACKET;
@@ -31,6 +31,9 @@ use vizflyt_runtime::guard::Fix;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
+use vizflyt_server::poses::newest::Localized;
+use vizflyt_server::render::environment::atmosphere;
+use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
@@ -198,8 +201,7 @@ struct Flight<'a> {
     renderer: CpuRenderer,
     images: Vec<RgbdImage>,
     now: HostTime,
-    /// When each camera is due.
-    camera_due: Vec<HostTime>,
+    schedule: CameraSchedule,
     poses: u64,
     seq: u64,
     pending: VecDeque<Pending>,
@@ -248,7 +250,7 @@ impl<'a> Flight<'a> {
             renderer,
             images: Vec::new(),
             now,
-            camera_due: vec![now; info.cameras.len()],
+            schedule: CameraSchedule::new(ServerTime::from_ns(START_NS)),
             poses: 0,
             seq: 0,
             pending: VecDeque::new(),
@@ -347,40 +349,33 @@ impl<'a> Flight<'a> {
         if matches!(phase, FlightPhase::Landing | FlightPhase::Landed) {
             return Ok(());
         }
-        let due: Vec<usize> =
-            (0..self.cameras.len()).filter(|&i| self.camera_due[i] <= self.now).collect();
-        let (Some(motion), Some(newest), false) =
-            (self.referee.motion(), self.referee.newest(), due.is_empty())
+        let (Some(motion), Some(sample)) = (self.referee.motion(), self.referee.newest().copied())
         else {
             return Ok(());
         };
         let on_ground = matches!(phase, FlightPhase::Connecting | FlightPhase::Preparing);
-        for &index in &due {
-            let own = self.arena.cameras[index].rate_hz.map(|hz| (1e9 / hz) as i64);
-            let period_ns = own.unwrap_or(self.trial.delays.image_period_ns);
-            let period_ns = if on_ground { period_ns.max(GROUND_PERIOD_NS) } else { period_ns };
-            let next = self.camera_due[index].plus_ns(period_ns);
-            self.camera_due[index] = if next > self.now { next } else { self.now.plus_ns(1) };
+        let Delays { image_period_ns, image_ns, .. } = self.trial.delays;
+        let periods = Periods {
+            default_ns: image_period_ns,
+            least_ns: if on_ground { GROUND_PERIOD_NS } else { 0 },
+            together_ns: 0,
+        };
+        let now = self.server_now();
+        let taken = self.schedule.take(&self.arena.cameras, &periods, now);
+        let due: Vec<usize> = (0..self.cameras.len()).filter(|&index| taken[index]).collect();
+        if due.is_empty() {
+            return Ok(());
         }
-        let seen = self.now.plus_ns(self.trial.delays.image_ns);
-        let shown = motion.reach(ServerTime::from_ns(seen.as_ns()));
-        let world_from_body = motion.at(shown);
-        let atmosphere = vizflyt_server::render::environment::atmosphere(&self.arena.environment);
-        let cameras: Vec<Camera> = due
-            .iter()
-            .map(|&index| Camera {
-                intrinsics: self.cameras[index].intrinsics,
-                world_from_cam: world_from_body * self.cameras[index].body_from_cam,
-                near_m: self.arena.cameras[index].near_m as f32,
-                background: [0.0; 3],
-                atmosphere,
-            })
-            .collect();
-        let pose = newest.stamp;
+        let newest = Localized { sample, motion };
+        let exposure = Exposure::new(Predict::Seen, Some(image_ns), &newest, now);
+        let atmosphere = atmosphere(&self.arena.environment);
+        let (configs, infos) = (&self.arena.cameras, &self.cameras);
+        let camera = |&index: &usize| exposure.camera(&configs[index], &infos[index], atmosphere);
+        let cameras: Vec<Camera> = due.iter().map(camera).collect();
         self.images.resize_with(cameras.len().max(self.images.len()), RgbdImage::default);
         let images = &mut self.images[..cameras.len()];
         // What moves is where it is at the instant that the images show, as for the referee.
-        let since_start_ns = shown.as_ns().wrapping_sub(START_NS).cast_signed();
+        let since_start_ns = exposure.at.as_ns().wrapping_sub(START_NS).cast_signed();
         let placements = self.trial.place.obstacles.objects.placements(since_start_ns);
         self.renderer
             .render(&placements, &cameras, images)
@@ -392,14 +387,15 @@ impl<'a> Flight<'a> {
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
             let k = &self.cameras[index].intrinsics;
             picture.ahead_m = ahead_m(&picture.depth_mm, k.width_px as usize, &mut self.scratch);
-            if !self.arena.cameras[index].depth {
+            if withholds_depth(&self.arena.cameras[index]) {
                 // As in flight: what the course withholds is "no return" everywhere.
                 picture.depth_mm.fill(0);
             }
             drawn[index] = Some(picture);
         }
         self.seq += 1;
-        self.pending.push_back(Pending { due: seen, seq: self.seq, pose, shown, drawn });
+        let (due, pose, shown) = (self.now.plus_ns(image_ns), sample.stamp, exposure.at);
+        self.pending.push_back(Pending { due, seq: self.seq, pose, shown, drawn });
         Ok(())
     }
 

@@ -12,6 +12,7 @@ pub mod dynamic_objects;
 pub mod environment;
 pub mod rendered;
 mod renderer;
+pub mod schedule;
 pub mod thread;
 
 use std::sync::Mutex;

@@ -17,6 +17,7 @@ use vizflyt_splat::{DepthKind, RgbdImage};
 
 use crate::clock;
 use crate::render::rendered::RenderedImage;
+use crate::render::schedule::withholds_depth;
 use crate::stream::subscriptions::{Broadcast, Subscriptions};
 
 /// Turns drawn images into bytes for [`Subscriptions`]; owns the scratch memory.
@@ -85,7 +86,7 @@ impl SliceEncoder {
         if self.broadcast.is_empty() {
             return Ok(None);
         }
-        let withheld = !set.configs[camera].depth;
+        let withheld = withholds_depth(&set.configs[camera]);
         let result = self.slices(&slot.image, withheld).context("cannot encode");
         let end = clock::now();
         subscriptions.end(&mut self.broadcast, result.is_ok().then_some(end));
