@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use serde::Deserialize;
-use vizflyt_runtime::config::parse_strict;
 use vizflyt_scenes::projects::{CourseProject, Level};
 
 /// The whole of `vizflyt.toml`.
@@ -86,7 +85,7 @@ impl PluginManifest {
 
     /// Returns what `text` says.
     fn parse(text: &str) -> Result<Self> {
-        Ok(parse_strict(text)?)
+        Ok(vizflyt_toml::parse(text)?)
     }
 }
 

@@ -19,7 +19,6 @@
 //! known one) and values that cannot work. The command line goes before the file. Nothing is
 //! resolved or opened here: a host name in the file is looked up when it is used.
 
-mod strict;
 #[cfg(test)]
 mod tests;
 
@@ -29,13 +28,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Limits;
+use vizflyt_toml::TomlErrors;
 use vizflyt_trust::Fingerprint;
 
 use crate::link::VISION_HZ;
 use crate::link::port::{self, Shape};
 use crate::supervisor::{PluginLimits, Restart};
-
-pub use strict::{StrictError, parse_strict};
 
 /// The whole of `jetson.toml`. Every section may be absent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -185,9 +183,9 @@ pub enum ConfigError {
         /// The system's reason.
         why: std::io::Error,
     },
-    /// Syntax, type, absent or unknown key.
+    /// Syntax, types, absent or unknown keys: all of them.
     #[error(transparent)]
-    Toml(#[from] StrictError),
+    Toml(#[from] TomlErrors),
     /// A value that cannot work.
     #[error("{key} = {value}: {advice}")]
     Invalid {
@@ -198,6 +196,9 @@ pub enum ConfigError {
         /// What is wrong and what to do.
         advice: String,
     },
+    /// Several of these; two at least.
+    #[error("{}", lines(.0))]
+    Several(Vec<Self>),
     /// A limit of the plugin that leaves it no room to live.
     #[error("{0}")]
     Plugin(String),
@@ -217,7 +218,7 @@ impl JetsonConfig {
     /// # Errors
     /// [`ConfigError::Toml`] with line and column, [`ConfigError::Invalid`] with the key.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let config: Self = parse_strict(text)?;
+        let config: Self = vizflyt_toml::parse(text)?;
         config.validate()?;
         Ok(config)
     }
@@ -258,29 +259,54 @@ impl JetsonConfig {
         toml::to_string(self)
     }
 
+    /// Looks at every value.
     fn validate(&self) -> Result<(), ConfigError> {
-        if let Some(server) = &self.server {
-            check_host_port("server.address", &server.address, &server.address)?;
-        }
-        if let Some(name) = &self.vehicle.name
-            && !(1..=MAX_NAME_BYTES).contains(&name.len())
-        {
-            return Err(invalid("vehicle.name", quoted(name), "give 1 to 32 bytes"));
-        }
-        if let Some(address) = &self.vehicle.mavlink {
-            match port::shape(address) {
-                None => return Err(invalid("vehicle.mavlink", quoted(address), port::SHAPES)),
-                Some(Shape::Net(_, at)) => check_host_port("vehicle.mavlink", address, at)?,
-                Some(Shape::Serial(..)) => {}
+        let Self { server, vehicle, limits, plugin } = self;
+        let address = server.as_ref().map(|server| &server.address);
+        let checks = [
+            address.map_or(Ok(()), |at| check_host_port("server.address", at, at)),
+            vehicle.name.as_deref().map_or(Ok(()), check_name),
+            vehicle.mavlink.as_deref().map_or(Ok(()), check_mavlink),
+            check("vehicle.vision_hz", vehicle.vision_hz, "Hz", VISION_HZ),
+            check("limits.max_speed_mps", limits.max_speed_mps, "m/s", 0.1..=30.0),
+            check(
+                "limits.max_acceleration_mps2",
+                limits.max_acceleration_mps2,
+                "m/s^2",
+                0.1..=50.0,
+            ),
+            check("limits.max_tilt_deg", limits.max_tilt_deg, "deg", 5.0..=80.0),
+            check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0),
+            plugin.limits().check().map_err(ConfigError::Plugin),
+        ];
+        let mut wrong: Vec<_> = checks.into_iter().filter_map(Result::err).collect();
+        match wrong.pop() {
+            None => Ok(()),
+            Some(only) if wrong.is_empty() => Err(only),
+            Some(last) => {
+                wrong.push(last);
+                Err(ConfigError::Several(wrong))
             }
         }
-        check("vehicle.vision_hz", self.vehicle.vision_hz, "Hz", VISION_HZ)?;
-        let limits = &self.limits;
-        check("limits.max_speed_mps", limits.max_speed_mps, "m/s", 0.1..=30.0)?;
-        check("limits.max_acceleration_mps2", limits.max_acceleration_mps2, "m/s^2", 0.1..=50.0)?;
-        check("limits.max_tilt_deg", limits.max_tilt_deg, "deg", 5.0..=80.0)?;
-        check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0)?;
-        self.plugin.limits().check().map_err(ConfigError::Plugin)
+    }
+}
+
+fn lines(errors: &[ConfigError]) -> String {
+    errors.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+}
+
+fn check_name(name: &str) -> Result<(), ConfigError> {
+    if (1..=MAX_NAME_BYTES).contains(&name.len()) {
+        return Ok(());
+    }
+    Err(invalid("vehicle.name", quoted(name), "give 1 to 32 bytes"))
+}
+
+fn check_mavlink(address: &str) -> Result<(), ConfigError> {
+    match port::shape(address) {
+        None => Err(invalid("vehicle.mavlink", quoted(address), port::SHAPES)),
+        Some(Shape::Net(_, at)) => check_host_port("vehicle.mavlink", address, at),
+        Some(Shape::Serial(..)) => Ok(()),
     }
 }
 

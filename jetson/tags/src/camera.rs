@@ -97,7 +97,7 @@ impl TagCamera {
     /// [`FileError::Toml`] for what is no camera, [`FileError::Invalid`] for a value that cannot
     /// work.
     pub fn parse(text: &str) -> Result<Self, FileError> {
-        let file: CameraFile = toml::from_str(text)?;
+        let file: CameraFile = vizflyt_toml::parse(text)?;
         let mounting = match (file.world_from_cam, file.body_from_cam) {
             (None, None) => Mounting::Unknown,
             (Some(pose), None) => {

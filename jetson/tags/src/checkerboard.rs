@@ -50,7 +50,7 @@ impl Checkerboard {
     /// # Errors
     /// [`FileError::Toml`] for what is none, [`FileError::Invalid`] for a value that cannot work.
     pub fn parse(text: &str) -> Result<Self, FileError> {
-        let CheckerboardFile { checkerboard } = toml::from_str(text)?;
+        let CheckerboardFile { checkerboard } = vizflyt_toml::parse(text)?;
         checkerboard.validate()?;
         Ok(checkerboard)
     }

@@ -19,11 +19,11 @@ pub enum FileError {
         /// The system's error.
         error: std::io::Error,
     },
-    /// Syntax, type, absent or unknown key; the text points at line and column.
-    #[error("{0}")]
-    Toml(#[from] toml::de::Error),
+    /// Syntax, types, absent or unknown keys: all of them, with line and column.
+    #[error(transparent)]
+    Toml(#[from] vizflyt_toml::TomlErrors),
     /// The value cannot be written as TOML.
-    #[error("{0}")]
+    #[error(transparent)]
     Unwritable(#[from] toml::ser::Error),
     /// A value that cannot work.
     #[error("{key} = {value}: {advice}")]

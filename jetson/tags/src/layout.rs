@@ -124,7 +124,7 @@ impl TagLayout {
     /// [`FileError::Toml`] for what is no layout, [`FileError::Invalid`] for a value that cannot
     /// work.
     pub fn parse(text: &str) -> Result<Self, FileError> {
-        let mut layout: Self = toml::from_str(text)?;
+        let mut layout: Self = vizflyt_toml::parse(text)?;
         layout.validate()?;
         for tag in &mut layout.tags {
             // Already unit ones stay as they are, bit for bit.

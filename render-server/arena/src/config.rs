@@ -217,7 +217,7 @@ impl ArenaConfig {
     /// [`ConfigError::Toml`] with line and column for syntax, types, absent and unknown keys;
     /// [`ConfigError::Invalid`] for values that cannot work, with the line of the key.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let config: Self = toml::from_str(text)?;
+        let config: Self = vizflyt_toml::parse(text)?;
         config.validate().map_err(|error| error.in_text(text))?;
         Ok(config)
     }

@@ -105,13 +105,16 @@ fn a_file_is_named_and_its_paths_are_its_own() {
 }
 
 #[test]
-fn distances_are_those_of_levenshtein() {
-    let check = |a, b, expected| assert_eq!(strict::distance(a, b), expected, "{a} {b}");
-    check("", "", 0);
-    check("kitten", "sitting", 3);
-    check("abc", "", 3);
-    check("", "abc", 3);
-    check("flaw", "lawn", 2);
+fn all_mistakes_are_said_at_once() {
+    let error = |text: &str| JetsonConfig::parse(text).unwrap_err().to_string();
+    let keys = error("[limit]\nx = 1\n[vehicle]\nnam = 'a'\nsystem = 'b'\n");
+    let lines: Vec<&str> = keys.lines().collect();
+    assert_eq!(lines.len(), 3, "{keys}");
+    assert!(lines[0].starts_with("line 1, column 2: unknown key 'limit'"), "{keys}");
+    assert!(lines[2].starts_with("line 5, column 10: system: invalid type"), "{keys}");
+    let values = error("[limits]\nmax_speed_mps = -1\nmax_tilt_deg = 0\n");
+    assert_eq!(values.lines().count(), 2, "{values}");
+    assert!(values.contains("limits.max_speed_mps = -1") && values.contains("limits.max_tilt_deg"));
 }
 
 fn config() -> impl Strategy<Value = JetsonConfig> {

@@ -38,7 +38,7 @@ impl Board {
     /// As [`TagLayout::read`] and [`Checkerboard::read`].
     pub fn read(path: &Path) -> Result<Self, FileError> {
         file::read(path, |text| {
-            let table: toml::Table = toml::from_str(text)?;
+            let table: toml::Table = vizflyt_toml::parse(text)?;
             if table.contains_key("checkerboard") {
                 return Checkerboard::parse(text).map(Self::Checkerboard);
             }

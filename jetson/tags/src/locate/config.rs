@@ -101,7 +101,7 @@ impl LocateConfig {
     /// # Errors
     /// [`FileError::Toml`] for what is none, [`FileError::Invalid`] for a value that cannot work.
     pub fn parse(text: &str) -> Result<Self, FileError> {
-        let config: Self = toml::from_str(text)?;
+        let config: Self = vizflyt_toml::parse(text)?;
         for (key, count, most) in [
             ("cameras", config.cameras.len(), MOST_CAMERAS),
             ("layouts", config.layouts.len(), MOST_LAYOUTS),

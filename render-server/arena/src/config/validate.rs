@@ -5,18 +5,19 @@ use std::fmt::Display;
 use std::ops::RangeInclusive;
 
 use glam::{DVec2, DVec3};
-use vizflyt_protocol::messages::MAX_CAMERAS;
+use vizflyt_protocol::messages::{Limits, MAX_CAMERAS};
+use vizflyt_toml::TomlErrors;
 
 use super::{ArenaConfig, Spawn, StageConfig};
 
 /// Why an `arena.toml` is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    /// Syntax, type, absent or unknown key; the text points at line and column.
-    #[error("{0}")]
-    Toml(#[from] toml::de::Error),
+    /// Syntax, types, absent or unknown keys: all of them, with line and column.
+    #[error(transparent)]
+    Toml(#[from] TomlErrors),
     /// The value cannot be written as TOML.
-    #[error("{0}")]
+    #[error(transparent)]
     Unwritable(#[from] toml::ser::Error),
     /// A value that cannot work.
     #[error("{key} = {value}: {advice}{}", in_line(*line))]
@@ -30,6 +31,9 @@ pub enum ConfigError {
         /// The line of the key, from 1, where the value came from a text.
         line: Option<usize>,
     },
+    /// Several of these; two at least.
+    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Several(Vec<Self>),
 }
 
 fn in_line(line: Option<usize>) -> String {
@@ -44,6 +48,9 @@ impl ConfigError {
             Self::Invalid { key, value, advice, .. } => {
                 let line = super::line_of(text, &key);
                 Self::Invalid { key, value, advice, line }
+            }
+            Self::Several(errors) => {
+                Self::Several(errors.into_iter().map(|error| error.in_text(text)).collect())
             }
             other => other,
         }
@@ -142,35 +149,56 @@ impl ArenaConfig {
     /// Checks every value, and the values against each other.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for the first value that cannot work.
+    /// [`ConfigError::Invalid`], or [`ConfigError::Several`] of them: every value that cannot work.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_name("name", &self.name, &mut HashSet::new())?;
+        let Limits { max_speed_mps, max_acceleration_mps2, max_tilt_deg, max_altitude_m } =
+            self.limits;
+        let check_limit = |key, value: Option<f64>, unit, range| {
+            value.map_or(Ok(()), |value| check_number(key, value, unit, range))
+        };
+        let checks = [
+            check_name("name", &self.name, &mut HashSet::new()),
+            self.check_scene(),
+            check_number("body_radius_m", self.body_radius_m, "m", 0.01..=2.0),
+            check_number("takeoff_height_m", self.takeoff_height_m, "m", 0.1..=100.0),
+            check_number("time_limit_s", self.time_limit_s, "s (0 is none)", 0.0..=86400.0),
+            check_number("limits.max_speed_mps", max_speed_mps, "m/s", 0.01..=30.0),
+            check_number(
+                "limits.max_acceleration_mps2",
+                max_acceleration_mps2,
+                "m/s^2",
+                0.1..=50.0,
+            ),
+            check_limit("limits.max_tilt_deg", max_tilt_deg, "degrees", 1.0..=90.0),
+            check_limit("limits.max_altitude_m", max_altitude_m, "m", 0.1..=100.0),
+            self.pose.check(),
+            self.check_fence_and_points(),
+            self.check_body(),
+            self.check_occupancy(),
+            self.check_cameras(),
+            self.check_vehicles(),
+            self.check_stages(),
+            self.check_no_fly(),
+            self.check_objects(),
+            self.check_environment(),
+            self.check_rules(),
+        ];
+        let mut wrong: Vec<_> = checks.into_iter().filter_map(Result::err).collect();
+        match wrong.pop() {
+            None => Ok(()),
+            Some(only) if wrong.is_empty() => Err(only),
+            Some(last) => {
+                wrong.push(last);
+                Err(ConfigError::Several(wrong))
+            }
+        }
+    }
+
+    fn check_scene(&self) -> Result<(), ConfigError> {
         if self.scene.trim().is_empty() {
             return Err(invalid("scene", "\"\"", "give the scene file, relative to this file"));
         }
-        check_number("body_radius_m", self.body_radius_m, "m", 0.01..=2.0)?;
-        check_number("takeoff_height_m", self.takeoff_height_m, "m", 0.1..=100.0)?;
-        check_number("time_limit_s", self.time_limit_s, "s (0 is none)", 0.0..=86400.0)?;
-        check_number("limits.max_speed_mps", self.limits.max_speed_mps, "m/s", 0.01..=30.0)?;
-        let acceleration = self.limits.max_acceleration_mps2;
-        check_number("limits.max_acceleration_mps2", acceleration, "m/s^2", 0.1..=50.0)?;
-        if let Some(tilt_deg) = self.limits.max_tilt_deg {
-            check_number("limits.max_tilt_deg", tilt_deg, "degrees", 1.0..=90.0)?;
-        }
-        if let Some(altitude_m) = self.limits.max_altitude_m {
-            check_number("limits.max_altitude_m", altitude_m, "m", 0.1..=100.0)?;
-        }
-        self.pose.check()?;
-        self.check_fence_and_points()?;
-        self.check_body()?;
-        self.check_occupancy()?;
-        self.check_cameras()?;
-        self.check_vehicles()?;
-        self.check_stages()?;
-        self.check_no_fly()?;
-        self.check_objects()?;
-        self.check_environment()?;
-        self.check_rules()
+        Ok(())
     }
 
     fn check_fence_and_points(&self) -> Result<(), ConfigError> {

@@ -561,7 +561,7 @@ struct ArenaToml {
 /// # Errors
 /// Points at the line: unknown keys, values that cannot work, more than [`MAX_SOURCES`].
 pub fn read_all(arena_toml: &str) -> Result<Vec<LocalizationConfig>, ConfigError> {
-    let ArenaToml { localization } = toml::from_str(arena_toml)?;
+    let ArenaToml { localization } = vizflyt_toml::parse(arena_toml)?;
     check_all(&localization).map_err(|error| error.in_text(arena_toml))?;
     Ok(localization)
 }

@@ -1,0 +1,314 @@
+//! TOML files that people write: what is not known is refused, and all that is wrong is said at
+//! once, each with its line, its key, and the nearest key that is known.
+//!
+//! [`parse`] takes a text and returns a value or [`TomlErrors`]. Serde stops at the first error. So
+//! what it complains of is taken out of the parsed table, and the rest is tried again, until nothing
+//! is wrong or nothing can be taken out.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::ops::Range;
+
+use serde::de::DeserializeOwned;
+use toml::Spanned;
+use toml::de::{DeArray, DeTable, DeValue, Deserializer, Error};
+
+/// Errors that are looked for at most: more do not help.
+const MAX_ERRORS: usize = 20;
+
+/// One thing that is wrong: a place and one sentence.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}, column {column}: {what}")]
+pub struct TomlError {
+    /// From 1.
+    pub line: usize,
+    /// From 1, in characters.
+    pub column: usize,
+    /// What is wrong, and what to do.
+    pub what: String,
+}
+
+/// All that is wrong with a text, in its order; one at least. Prints one line for each.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TomlErrors(pub Vec<TomlError>);
+
+impl fmt::Display for TomlErrors {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, error) in self.0.iter().enumerate() {
+            let separator = if index == 0 { "" } else { "\n" };
+            write!(f, "{separator}{error}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for TomlErrors {}
+
+/// Returns `text` as a `T`, which is to carry `serde(deny_unknown_fields)` throughout.
+///
+/// # Errors
+/// All that is wrong. Of keys that are missing, the first of each table.
+pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
+    let (mut table, syntax) = DeTable::parse_recoverable(text);
+    let mut errors: Vec<_> = syntax.iter().map(|error| describe(text, error, None)).collect();
+    if !errors.is_empty() {
+        errors.truncate(MAX_ERRORS);
+        return Err(in_order(errors));
+    }
+    let mut removed = BTreeSet::new();
+    loop {
+        let error = match T::deserialize(Deserializer::from(table.clone())) {
+            Ok(value) if errors.is_empty() => return Ok(value),
+            Ok(_) => break,
+            Err(error) => error,
+        };
+        // A key that was there and was taken out is not missing.
+        if missing_key(&error).is_some_and(|key| removed.contains(key)) {
+            break;
+        }
+        let key = error.span().and_then(|span| remove(table.get_mut(), &span));
+        errors.push(describe(text, &error, key.as_deref()));
+        match key {
+            Some(key) if errors.len() < MAX_ERRORS => removed.insert(key),
+            _ => break,
+        };
+    }
+    Err(in_order(errors))
+}
+
+fn in_order(mut errors: Vec<TomlError>) -> TomlErrors {
+    errors.sort_by_key(|error| (error.line, error.column));
+    errors.dedup();
+    TomlErrors(errors)
+}
+
+/// Takes the innermost entry that the span lies in out of a table, and returns its key.
+fn remove(table: &mut DeTable<'_>, span: &Range<usize>) -> Option<String> {
+    for (key, value) in table.iter_mut() {
+        match value.get_mut() {
+            DeValue::Table(inner) => {
+                if let Some(key) = remove(inner, span) {
+                    return Some(key);
+                }
+            }
+            DeValue::Array(array) => {
+                if let Some(key) = remove_in_array(key.get_ref(), array, span) {
+                    return Some(key);
+                }
+            }
+            _ => {}
+        }
+    }
+    let is_here = |part: Range<usize>| part.contains(&span.start);
+    let mut entries = table.iter();
+    let (key, _) = entries.find(|(key, value)| is_here(key.span()) || is_here(value.span()))?;
+    let key = key.clone();
+    table.remove(&key);
+    Some(key.into_inner().into_owned())
+}
+
+/// As [`remove`], in an array of tables of this name; a whole table has no key but that.
+fn remove_in_array(name: &str, array: &mut DeArray<'_>, span: &Range<usize>) -> Option<String> {
+    for element in array.iter_mut() {
+        if let DeValue::Table(inner) = element.get_mut()
+            && let Some(key) = remove(inner, span)
+        {
+            return Some(key);
+        }
+    }
+    let is_it = |element: &Spanned<DeValue<'_>>| {
+        element.get_ref().is_table() && element.span().contains(&span.start)
+    };
+    let at = array.iter().position(is_it)?;
+    let mut rest = DeArray::new();
+    for (index, element) in array.iter().enumerate() {
+        if index != at {
+            rest.push(element.clone());
+        }
+    }
+    *array = rest;
+    Some(name.to_owned())
+}
+
+fn describe(text: &str, error: &Error, key: Option<&str>) -> TomlError {
+    let before = text.get(..error.span().map_or(0, |span| span.start)).unwrap_or(text);
+    let start_of_line = before.rfind('\n').map_or(0, |newline| newline + 1);
+    let what = unknown_key(error.message()).unwrap_or_else(|| {
+        let message = error.message().trim().replace('\n', "; ");
+        // One that is missing is named already, and the entry is only where it belongs.
+        let key = key.filter(|_| missing_key(error).is_none());
+        key.map_or_else(|| message.clone(), |key| format!("{key}: {message}"))
+    });
+    TomlError {
+        line: before.matches('\n').count() + 1,
+        column: before[start_of_line..].chars().count() + 1,
+        what,
+    }
+}
+
+/// Returns the key that an error calls missing, in serde's wording.
+fn missing_key(error: &Error) -> Option<&str> {
+    error.message().strip_prefix("missing field `")?.split('`').next()
+}
+
+/// Returns a better sentence for an unknown key. serde names it and then the known ones, each in
+/// backquotes; should its wording change, a test fails and people read serde's own sentence.
+fn unknown_key(message: &str) -> Option<String> {
+    let (unknown, rest) = message.strip_prefix("unknown field `")?.split_once("`, expected ")?;
+    // Between backquotes: every second part.
+    let known: Vec<&str> = rest.split('`').skip(1).step_by(2).collect();
+    Some(unknown_among(unknown, &known))
+}
+
+/// Returns the sentence that refuses a key which is none of those known, with the nearest of them.
+pub fn unknown_among(unknown: &str, known: &[&str]) -> String {
+    let nearest = known.iter().min_by_key(|name| distance(unknown, name));
+    let known_all = known.join(", ");
+    match nearest {
+        // Farther than half of its letters it is another word.
+        Some(nearest) if distance(unknown, nearest) <= nearest.chars().count().div_ceil(2) => {
+            format!("unknown key '{unknown}'; did you mean '{nearest}'? known here: {known_all}")
+        }
+        _ => format!("unknown key '{unknown}'; known here: {known_all}"),
+    }
+}
+
+/// Returns how many letters must be changed, added or left out to make `a` of `b` (Levenshtein).
+fn distance(a: &str, b: &str) -> usize {
+    // A key of a megabyte must not cost its square.
+    let a: Vec<char> = a.chars().take(64).collect();
+    let mut row: Vec<usize> = (0..=a.len()).collect();
+    for (j, letter) in b.chars().take(64).enumerate() {
+        let mut diagonal = row[0];
+        row[0] = j + 1;
+        for (i, other) in a.iter().enumerate() {
+            let change = diagonal + usize::from(*other != letter);
+            diagonal = row[i + 1];
+            row[i + 1] = change.min(diagonal + 1).min(row[i] + 1);
+        }
+    }
+    row[a.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use serde::Deserialize;
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Room {
+        name: String,
+        size_m: [f64; 3],
+        #[serde(default)]
+        cameras: Vec<Camera>,
+        limits: Option<Limits>,
+    }
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Camera {
+        width_px: u32,
+        height_px: u32,
+    }
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    #[serde(deny_unknown_fields, default)]
+    #[derive(Default)]
+    struct Limits {
+        max_speed_mps: f64,
+        max_tilt_deg: f64,
+    }
+
+    /// Parses, and expects these lines of errors.
+    fn check(text: &str, expected: &[&str]) {
+        let said = parse::<Room>(text).expect_err(text).to_string();
+        let said: Vec<&str> = said.lines().collect();
+        assert_eq!(said.len(), expected.len(), "{said:#?}");
+        for (said, expected) in said.iter().zip(expected) {
+            assert!(said.contains(expected), "{said:?} does not say {expected:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_right_is_read() {
+        let text = "name = 'a'\nsize_m = [1, 2, 3]\n[[cameras]]\nwidth_px = 3\nheight_px = 2\n";
+        let room = parse::<Room>(text).unwrap();
+        assert_eq!((room.size_m, room.cameras.len()), ([1.0, 2.0, 3.0], 1));
+    }
+
+    #[test]
+    fn every_error_is_said_once_with_its_line_and_key() {
+        let text = "nam = 'a'\n\
+                    size_m = [1, 'x', 3]\n\
+                    [limits]\n\
+                    max_speed_mps = '2'\n\
+                    max_tild_deg = 3\n\
+                    [[cameras]]\n\
+                    width_px = -1\n\
+                    height_px = 2\n\
+                    [[cameras]]\n\
+                    widht_px = 3\n\
+                    height_px = 1.5\n";
+        check(
+            text,
+            &[
+                "line 1, column 1: unknown key 'nam'; did you mean 'name'?",
+                "line 2, column 14: size_m: invalid type",
+                "line 4, column 17: max_speed_mps: invalid type: string \"2\"",
+                "line 5, column 1: unknown key 'max_tild_deg'; did you mean 'max_tilt_deg'?",
+                "line 7, column 12: width_px: invalid value: integer `-1`",
+                "line 10, column 1: unknown key 'widht_px'; did you mean 'width_px'?",
+                "line 11, column 13: height_px: invalid type: floating point",
+            ],
+        );
+    }
+
+    #[test]
+    fn missing_keys_of_several_tables_are_said() {
+        let text = "name = 'a'\nsize_m = [1, 2, 3]\n[[cameras]]\nwidth_px = 1\n[[cameras]]\n\
+                    height_px = 2\n";
+        check(text, &["line 3", "line 5"]);
+        let said = parse::<Room>(text).unwrap_err().to_string();
+        assert!(
+            said.contains("missing field `height_px`") && said.contains("`width_px`"),
+            "{said}"
+        );
+        check("size_m = [1, 2, 3]\n", &["missing field `name`"]);
+        check("", &["missing field"]);
+    }
+
+    #[test]
+    fn errors_of_syntax_are_said_alone() {
+        check("name = \n[limits\nx = 1\n", &["line 1, column", "line 2"]);
+        check("name = 'a'\nname = 'b'\n", &["line 2, column 1: duplicate key"]);
+    }
+
+    #[test]
+    fn a_file_of_nonsense_says_20_errors_at_most() {
+        let text: String = (0..100).map(|n| format!("k{n} = 1\n")).collect();
+        assert_eq!(parse::<Room>(&text).unwrap_err().0.len(), MAX_ERRORS);
+    }
+
+    #[test]
+    fn distances_are_those_of_levenshtein() {
+        let check = |a, b, expected| assert_eq!(distance(a, b), expected, "{a} {b}");
+        check("", "", 0);
+        check("kitten", "sitting", 3);
+        check("abc", "", 3);
+        check("", "abc", 3);
+        check("flaw", "lawn", 2);
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_read_or_refused(
+            text in "\\PC*|((\\[\\[?(cameras|limits|[a-z]*)\\]?\\]\n)?([a-z_]+ = [0-9\"a-z.\\[\\]{}=]*\n)*)*"
+        ) {
+            if let Err(errors) = parse::<Room>(&text) {
+                prop_assert!((1..=MAX_ERRORS).contains(&errors.0.len()));
+            }
+        }
+    }
+}
