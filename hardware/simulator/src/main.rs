@@ -1,5 +1,7 @@
 //! The simulated lab as a program of its own; `vizflyt sim` is the same.
 
+use std::io::IsTerminal;
+
 use clap::Parser;
 use vizflyt_simulator::{SimArgs, run};
 
@@ -13,6 +15,10 @@ struct Command {
 fn main() -> anyhow::Result<()> {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
     run(Command::parse().args)
 }

@@ -131,16 +131,16 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
         LeaderboardCommand::Add(_) => Ok(()),
         LeaderboardCommand::Export(export) => {
             let runs = board.runs(export.course.as_deref()).await?;
-            match &export.out {
-                Some(path) => {
-                    let file = std::fs::File::create(path)
-                        .with_context(|| format!("cannot write {}", path.display()))?;
-                    write_csv(&runs, file)
-                        .with_context(|| format!("cannot write {}", path.display()))?;
-                    tell(format!("{} runs written to {}", runs.len(), path.display()));
-                }
-                None => write_csv(&runs, std::io::stdout().lock())?,
-            }
+            let Some(path) = &export.out else {
+                let mut csv = Vec::new();
+                write_csv(&runs, &mut csv)?;
+                tell(String::from_utf8_lossy(&csv).trim_end());
+                return Ok(());
+            };
+            let file = std::fs::File::create(path)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+            write_csv(&runs, file).with_context(|| format!("cannot write {}", path.display()))?;
+            tell(format!("{} runs written to {}", runs.len(), path.display()));
             Ok(())
         }
     }

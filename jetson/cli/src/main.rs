@@ -1,6 +1,9 @@
 //! `vizflyt`: the one command people type. Each subcommand is a library of its own; this file only
 //! reads the command line and starts one.
 
+// `println!` panics where its reader has gone, as `head` does.
+#![deny(clippy::print_stdout, clippy::print_stderr)]
+
 mod arena;
 mod bench;
 mod bridge;
@@ -28,6 +31,7 @@ mod tags;
 mod terminal;
 mod vehicle;
 
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -106,13 +110,13 @@ fn main() -> ExitCode {
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
-        eprintln!("error: --log-level '{log_level}': {error}");
+        terminal::tell_error(format_args!("error: --log-level '{log_level}': {error}"));
         return ExitCode::from(2);
     }
     match run(cli.command, &log_level) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            terminal::tell_error(format_args!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }
@@ -157,6 +161,13 @@ fn quiet_mesa() {
 /// Sends logs to standard error; standard output is for results.
 fn start_log(filter: &str) -> Result<()> {
     let filter = EnvFilter::builder().parse(filter)?;
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        // No colours into files and pipes.
+        .with_ansi(std::io::stderr().is_terminal())
+        // Told on standard error itself, which may be what is gone.
+        .log_internal_errors(false)
+        .init();
     Ok(())
 }

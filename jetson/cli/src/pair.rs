@@ -63,8 +63,10 @@ pub(crate) fn run(args: &PairArgs) -> Result<ExitCode> {
 
 fn ask() -> Result<Code> {
     if std::io::stdin().is_terminal() {
-        print!("code: ");
-        std::io::stdout().flush().context("cannot ask for the code; pass --code")?;
+        let mut out = std::io::stdout();
+        write!(out, "code: ")
+            .and_then(|()| out.flush())
+            .context("cannot ask for the code; pass --code")?;
     }
     let mut line = String::new();
     std::io::stdin().read_line(&mut line).context("cannot read the code; pass --code")?;

@@ -9,7 +9,7 @@ use clap::Args;
 use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
 use vizflyt_trust::KeysFolder;
 
-use crate::terminal::tell;
+use crate::terminal::{tell, tell_error};
 
 /// Sets the password by which the instructor logs in on the server's page.
 ///
@@ -44,12 +44,12 @@ pub(crate) fn run(args: &PasswordArgs) -> Result<ExitCode> {
 
 /// Asks at the terminal, which shows nothing of what is typed.
 fn ask(question: &str) -> Result<String> {
-    eprint!("{question}");
-    std::io::stderr().flush().context("cannot ask")?;
+    let mut error = std::io::stderr();
+    write!(error, "{question}").and_then(|()| error.flush()).context("cannot ask")?;
     let hidden = Hidden::begin()?;
     let password = line();
     drop(hidden);
-    eprintln!();
+    tell_error("");
     password
 }
 

@@ -14,6 +14,18 @@ pub(crate) fn tell(line: impl std::fmt::Display) {
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
+/// Prints a line on standard error; unlike `eprintln!` it does not panic when nobody reads any more.
+pub(crate) fn tell_error(line: impl std::fmt::Display) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr().lock(), "{line}");
+}
+
+/// Prints a line for people, written as for `println!`; see [`tell`].
+macro_rules! say {
+    ($($text:tt)*) => { $crate::terminal::tell(format_args!($($text)*)) };
+}
+pub(crate) use say;
+
 /// Calls `notice` on SIGINT and SIGTERM, until it returns false.
 pub(crate) fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result<()> {
     use tokio::signal::unix::{SignalKind, signal};

@@ -1,6 +1,6 @@
 //! What the command line says when used, and when used wrongly.
 
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use vizflyt_e2e::vizflyt;
 
@@ -78,5 +78,58 @@ fn mistakes_are_explained() {
     let folder = tempfile::tempdir().unwrap();
     let arena = folder.path().join("arena.toml");
     std::fs::write(&arena, "name = \"x\"\nscene = 5\n").unwrap();
-    check_refused(&["serve", arena.to_str().unwrap()], &["line 2", "scene"]);
+    let output = run(&["serve", arena.to_str().unwrap()]);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(message.contains("line 2, column 9: scene: invalid type"), "{message}");
+    assert_eq!(message.matches("invalid type").count(), 1, "once: {message}");
+    std::fs::write(&arena, "name = \"x\"\nscen = \"a\"\nbody_radius_m = \"1\"\n").unwrap();
+    check_refused(
+        &["serve", arena.to_str().unwrap()],
+        &["line 2, column 1: unknown key 'scen'; did you mean 'scene'?", "line 3", "body_radius_m"],
+    );
+    let scene = folder.path().join("room.ply");
+    std::fs::write(&scene, [0xff; 64]).unwrap();
+    check_refused(&["arena", "check", scene.to_str().unwrap()], &["room.ply is no arena.toml"]);
+}
+
+#[test]
+fn a_reader_that_leaves_is_no_panic() {
+    // What reads the first line only, as `head -1` does, with both streams.
+    for args in [["leaderboard", "--help"], ["arena", "check"], ["bench", "render"]] {
+        let arena = ["--project=p5", "--seeds=3"];
+        let more: &[&str] = if args == ["arena", "check"] { &arena } else { &[] };
+        let mut child = Command::new(vizflyt())
+            .args(args)
+            .args(more)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        // Gone before anything is written.
+        drop(child.stdout.take());
+        let output = child.wait_with_output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!message.contains("panicked"), "{args:?}: {message}");
+        assert_ne!(output.status.code(), Some(101), "{args:?}: a panic");
+        assert!(!message.contains("Broken pipe"), "{args:?}: {message}");
+    }
+}
+
+#[test]
+fn no_colours_reach_files_and_pipes() {
+    let folder = tempfile::tempdir().unwrap();
+    let arena = folder.path().join("forest");
+    let text = arena.to_str().unwrap();
+    assert!(run(&["scene", "generate", "forest", "--seed", "1", "-o", text]).status.success());
+    let output = run(&["--log-level=debug", "arena", "check", text]);
+    assert!(output.status.success());
+    assert!(!output.stderr.is_empty(), "it logs how the scene is loaded");
+    assert!(!output.stderr.contains(&0x1b), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn a_taken_port_of_the_demo_names_its_own_option() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = format!("--port={}", taken.local_addr().unwrap().port());
+    check_refused(&["demo", "--headless", &port], &["give another --port"]);
 }

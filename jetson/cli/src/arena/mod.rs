@@ -13,6 +13,8 @@ use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::poses::settings;
 use vizflyt_server::scene::{self, Up};
 
+use crate::terminal::say;
+
 /// Looks at rooms and courses before anyone flies in them.
 #[derive(Args, Debug)]
 pub(crate) struct ArenaArgs {
@@ -74,13 +76,17 @@ fn check_seed(project: &CourseProject, seed: u64) -> bool {
     let checked = check(&generated.arena, &obstacles);
     say(&format!("{} seed {seed}", project.name()), generated.arena.stages.len(), &checked);
     for finding in &checked.findings {
-        println!("  {finding}");
+        say!("  {finding}");
     }
     checked.findings.is_empty()
 }
 
 fn check_file(path: &Path) -> Result<bool> {
     let file = if path.is_dir() { path.join("arena.toml") } else { path.to_owned() };
+    let is_toml = file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("toml"));
+    if !is_toml {
+        bail!("{} is no arena.toml: a bare scene has no course to check", file.display());
+    }
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
@@ -90,7 +96,7 @@ fn check_file(path: &Path) -> Result<bool> {
     let checked = check(&scene.arena, &obstacles);
     for finding in &checked.findings {
         let line = line_of(&text, &finding.key).map_or_else(String::new, |line| format!(":{line}"));
-        println!("{}{line}: {finding}", file.display());
+        say!("{}{line}: {finding}", file.display());
     }
     say(&file.display().to_string(), scene.arena.stages.len(), &checked);
     Ok(checked.findings.is_empty())
@@ -98,7 +104,7 @@ fn check_file(path: &Path) -> Result<bool> {
 
 fn say(what: &str, stages: usize, checked: &Checked) {
     if !checked.findings.is_empty() {
-        println!("{what}: cannot be flown, {} found", checked.findings.len());
+        say!("{what}: cannot be flown, {} found", checked.findings.len());
         return;
     }
     let room = if checked.least_room_m.is_finite() {
@@ -106,5 +112,5 @@ fn say(what: &str, stages: usize, checked: &Checked) {
     } else {
         String::new()
     };
-    println!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
+    say!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
 }

@@ -14,6 +14,7 @@ use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
+use crate::terminal::say;
 
 /// Draws views of a scene and encodes them at each level that a slow link may get; prints what they
 /// need.
@@ -105,7 +106,7 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
         );
     }
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&rows)?);
+        say!("{}", serde_json::to_string_pretty(&rows)?);
     } else {
         print(&rows);
     }
@@ -170,14 +171,14 @@ fn psnr_db(a: &[u8], b: &[u8]) -> f64 {
 }
 
 fn print(rows: &[Row]) {
-    println!(
+    say!(
         "                                                           kB            Mbit/s at     dB, on a gigabit"
     );
-    println!(
+    say!(
         "size       level                                        mean  most    30    60   100 Hz least  at 60 Hz"
     );
     for row in rows {
-        println!(
+        say!(
             "{:<10} {:<43} {:>5.0} {:>5.0} {:>5.0} {:>5.0} {:>5.0}    {:>5.1}  {:>4}",
             format!("{}x{}", row.width_px, row.height_px),
             row.level,

@@ -10,6 +10,7 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
+use crate::terminal::say;
 
 /// Draws a scene many times over; prints milliseconds per image and pass.
 #[derive(Args, Debug)]
@@ -80,7 +81,7 @@ struct Work {
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let figures = measure(args)?;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&figures)?);
+        say!("{}", serde_json::to_string_pretty(&figures)?);
     } else {
         print(&figures);
     }
@@ -149,16 +150,19 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
 }
 
 fn print(f: &Figures) {
-    println!("scene       {}: {} splats", f.scene, f.splats);
-    println!("renderer    {} ({})", f.renderer, f.renderer_reason);
-    println!("prepared    in {:.0} ms", f.prepare_ms);
-    println!(
+    say!("scene       {}: {} splats", f.scene, f.splats);
+    say!("renderer    {} ({})", f.renderer, f.renderer_reason);
+    say!("prepared    in {:.0} ms", f.prepare_ms);
+    say!(
         "images      {} of {}x{} from {} cameras: RGB, alpha, expected and median depth",
-        f.images, f.width_px, f.height_px, f.cameras
+        f.images,
+        f.width_px,
+        f.height_px,
+        f.cameras
     );
-    println!("work        {} splats in sight, {} tile pairs", f.workload.visible, f.workload.pairs);
-    println!("median      {:.2} ms, {:.1} images/s", f.median_ms, 1e3 / f.median_ms);
-    println!("p99         {:.2} ms", f.p99_ms);
+    say!("work        {} splats in sight, {} tile pairs", f.workload.visible, f.workload.pairs);
+    say!("median      {:.2} ms, {:.1} images/s", f.median_ms, 1e3 / f.median_ms);
+    say!("p99         {:.2} ms", f.p99_ms);
     let passes = &f.passes;
     for (name, ms) in [
         ("cull", passes.cull_ms),
@@ -168,7 +172,7 @@ fn print(f: &Figures) {
         ("blend", passes.blend_ms),
         ("read", passes.read_ms),
     ] {
-        println!("  {name:<9} {ms:.2} ms");
+        say!("  {name:<9} {ms:.2} ms");
     }
 }
 

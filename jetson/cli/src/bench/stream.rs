@@ -42,6 +42,7 @@ use vizflyt_splat::RgbdImage;
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
 use crate::scene::camera::ImageSize;
+use crate::terminal::say;
 
 /// Streams images over loopback to a plugin; prints how long they take.
 #[derive(Args, Debug)]
@@ -107,15 +108,12 @@ pub(super) fn run(args: &StreamArgs) -> Result<()> {
         rss_end_mb: rss_mb(),
     };
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&figures)?);
+        say!("{}", serde_json::to_string_pretty(&figures)?);
         return Ok(());
     }
-    println!(
-        "{width_px}x{height_px} RGB-D at {} Hz over loopback, to the plugin's wake-up",
-        args.rate
-    );
+    say!("{width_px}x{height_px} RGB-D at {} Hz over loopback, to the plugin's wake-up", args.rate);
     for way in &figures.ways {
-        println!(
+        say!(
             "{:<7} {:>4} KB  p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} came",
             way.name,
             way.bytes / 1000,
@@ -126,8 +124,8 @@ pub(super) fn run(args: &StreamArgs) -> Result<()> {
             way.sent
         );
     }
-    println!("packet takes {:.2} times as long as tcp", figures.packet_to_tcp_p50);
-    println!("memory {:.0} MB at the start, {:.0} MB at the end", rss_start_mb, figures.rss_end_mb);
+    say!("packet takes {:.2} times as long as tcp", figures.packet_to_tcp_p50);
+    say!("memory {:.0} MB at the start, {:.0} MB at the end", rss_start_mb, figures.rss_end_mb);
     Ok(())
 }
 

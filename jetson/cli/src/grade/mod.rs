@@ -44,7 +44,7 @@ use self::document::{DelaysMs, MOST_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
 use self::trial::{Delays, Flown, Trial};
 use crate::fly::plugin::Plugin;
-use crate::terminal::{stop_flag, tell};
+use crate::terminal::{stop_flag, tell, tell_error};
 
 /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
 #[derive(Args, Clone, Debug)]
@@ -263,7 +263,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         pool::run(&flights, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
     progress.end();
     let Some(done) = done? else {
-        eprintln!("ended on request; nothing is graded");
+        tell_error("ended on request; nothing is graded");
         return Ok(ExitCode::FAILURE);
     };
     let (runs, cards): (Vec<Run>, Vec<Option<String>>) =

@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use vizflyt_splat::format::{self, Format, Progress};
 
-use crate::terminal::tell;
+use crate::terminal::{say, tell};
 
 /// Converts a scene file to another format; the files' names decide, and content where it has a mark.
 #[derive(Args, Debug)]
@@ -35,7 +35,7 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
             tell(format!("{} %", done * 100 / total));
         }
     })?;
-    println!(
+    say!(
         "{}: {} splats, degree {}, {} dropped, {:.0} ms",
         loaded.format,
         loaded.splats.len(),
@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
         start.elapsed().as_secs_f64() * 1e3
     );
     for skipped in loaded.skipped_properties.iter().chain(&loaded.skipped_elements) {
-        println!("left out: {skipped}");
+        say!("left out: {skipped}");
     }
     match (args.variant, Format::of_name(&args.to)) {
         (Some(variant), Some(format)) => {

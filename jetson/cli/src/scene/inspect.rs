@@ -10,6 +10,8 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::Loaded;
 
+use crate::terminal::say;
+
 /// Reports what a scene holds, and what looks wrong with it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -85,27 +87,27 @@ pub(super) fn run(args: &InspectArgs) -> Result<()> {
     let (path, loaded) = load_as_it_is(&args.scene)?;
     let found = inspect(&path, &loaded);
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&found)?);
+        say!("{}", serde_json::to_string_pretty(&found)?);
         return Ok(());
     }
     let corners = |[min, max]: [[f32; 3]; 2]| {
         let size = Vec3::from(max) - Vec3::from(min);
         format!("{min:.2?} to {max:.2?}, {:.2} x {:.2} x {:.2}", size.x, size.y, size.z)
     };
-    println!("file        {}: {}, {:.1} MB", found.file, found.format, found.file_mb);
-    println!("splats      {}, {} left out", found.splats, found.dropped);
-    println!("harmonics   degree {}", found.sh_degree);
-    println!("memory      {:.1} MB", found.memory_mb);
-    println!("bounds      {}", corners(found.bounds));
-    println!("core        {}", corners(found.core_bounds));
-    println!("            min       1 %       10 %      50 %      90 %      99 %      max");
-    println!("opacity     {}", found.opacity.line());
-    println!("scale       {}", found.scale.line());
+    say!("file        {}: {}, {:.1} MB", found.file, found.format, found.file_mb);
+    say!("splats      {}, {} left out", found.splats, found.dropped);
+    say!("harmonics   degree {}", found.sh_degree);
+    say!("memory      {:.1} MB", found.memory_mb);
+    say!("bounds      {}", corners(found.bounds));
+    say!("core        {}", corners(found.core_bounds));
+    say!("            min       1 %       10 %      50 %      90 %      99 %      max");
+    say!("opacity     {}", found.opacity.line());
+    say!("scale       {}", found.scale.line());
     for warning in &found.warnings {
-        println!("warning     {warning}");
+        say!("warning     {warning}");
     }
     if found.warnings.is_empty() {
-        println!("nothing looks wrong");
+        say!("nothing looks wrong");
     }
     Ok(())
 }

@@ -14,7 +14,7 @@ use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_scenes::SceneKind;
 
-use crate::terminal::{open_browser, tell};
+use crate::terminal::{open_browser, say, tell};
 
 /// Makes, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
@@ -84,8 +84,8 @@ fn generate(kind: SceneKind, seed: u64, output: &std::path::Path, force: bool) -
     }
     let scene = vizflyt_scenes::generate(kind, seed);
     let written = scene.write(output)?;
-    println!("{} splats     {}", scene.splats.len(), written.scene.display());
-    println!("arena             {}", written.arena.display());
-    println!("{} true solids   {}", scene.truth.len(), written.truth.display());
+    say!("{} splats     {}", scene.splats.len(), written.scene.display());
+    say!("arena             {}", written.arena.display());
+    say!("{} true solids   {}", scene.truth.len(), written.truth.display());
     Ok(())
 }

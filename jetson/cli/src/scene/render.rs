@@ -9,11 +9,12 @@ use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::{RendererKind, choose};
-use vizflyt_server::scene::{load_as_it_is, load_objects};
+use vizflyt_server::scene::{is_in_an_arena, load_as_it_is, load_objects};
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
 use super::npy;
+use crate::terminal::say;
 
 /// Renders a scene as it is, from cameras in its own frame, to files.
 #[derive(Args, Debug)]
@@ -75,21 +76,30 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     // Cameras first: a mistake in one is told before the scene is loaded.
     let shots = shots(args)?;
     let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let environment = args.environment.environment();
+    if environment.fog_visibility_m > 0.0 && !is_in_an_arena(&args.scene) {
+        bail!(
+            "--environment {}: fog is in metres, and nothing says how long {}'s unit is; name the \
+             arena.toml that it belongs to",
+            args.environment,
+            scene.display()
+        );
+    }
     let (objects, moving) = load_objects(&args.scene, args.seed)?;
     let start = Instant::now();
     let twin = Scene { splats: &loaded.splats, objects: &objects };
     let Chosen { mut rasterizer, reason } = choose(twin, args.renderer)?;
-    println!("scene       {}: {} splats", scene.display(), loaded.splats.len());
+    say!("scene       {}: {} splats", scene.display(), loaded.splats.len());
     if !moving.is_empty() {
         let names: Vec<_> = moving.names().collect();
-        println!("objects     {} at {} s", names.join(", "), args.at);
+        say!("objects     {} at {} s", names.join(", "), args.at);
     }
-    println!("renderer    {} ({reason})", rasterizer.name());
+    say!("renderer    {} ({reason})", rasterizer.name());
     drop((loaded, objects));
     let placements = moving.placements((args.at * 1e9).round() as i64);
-    println!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
+    say!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
-    let atmosphere = atmosphere(&args.environment.environment());
+    let atmosphere = atmosphere(&environment);
     for Shot { camera, folder } in shots {
         let camera = Camera { atmosphere, ..camera };
         let times = rasterizer.render(&placements, &[camera], &mut images)?;
@@ -101,7 +111,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
             FileFormat::Npy => write_npy(image, &folder)?,
         }
         let work = rasterizer.workload();
-        println!(
+        say!(
             "{:<11} {}x{} in {:.1} ms, {} splats in sight",
             folder.display(),
             image.width_px,

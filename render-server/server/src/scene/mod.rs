@@ -94,6 +94,11 @@ fn read_text(path: &Path) -> Result<String> {
     std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
+/// Whether a path names an arena: then its scene is in metres.
+pub fn is_in_an_arena(path: &Path) -> bool {
+    matches!(named(path), Ok(Named::Arena(_)))
+}
+
 fn named(path: &Path) -> Result<Named> {
     if !path.exists() {
         bail!(
@@ -109,6 +114,12 @@ fn named(path: &Path) -> Result<Named> {
         if path.join("meta.json").is_file() {
             // An unpacked SOG.
             return Ok(Named::Scene(path.to_owned()));
+        }
+        if path.join("lod-meta.json").is_file() {
+            bail!(
+                "{} is a streamed scene (lod-meta.json), which is not read; convert it to one .sog",
+                path.display()
+            );
         }
         bail!("{} is a folder without an arena.toml", path.display());
     }
@@ -233,6 +244,9 @@ mod tests {
         let at = |name: &str| folder.path().join(name);
         check(&at("nothing.toml"), "make a scene with: vizflyt scene generate");
         check(folder.path(), "is a folder without an arena.toml");
+        std::fs::create_dir(at("streamed")).unwrap();
+        std::fs::write(at("streamed/lod-meta.json"), "{}").unwrap();
+        check(&at("streamed"), "is a streamed scene (lod-meta.json)");
         std::fs::write(at("notes.txt"), "x").unwrap();
         check(&at("notes.txt"), "supported are");
         std::fs::write(at("bad.toml"), "name = 3").unwrap();

@@ -314,6 +314,9 @@ fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
         });
     }
     let bytes = file::map(path).map_err(io)?;
+    if let Some(what) = not_downloaded(&bytes) {
+        return Err(FormatError::Unknown { what: format!("{} is {what}", path.display()) });
+    }
     let format = Format::of_content(&bytes).or(named).ok_or_else(|| {
         let start = String::from_utf8_lossy(&bytes[..bytes.len().min(8)]).into_owned();
         FormatError::Unknown {
@@ -321,6 +324,19 @@ fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
         }
     })?;
     decode(&bytes, format, meter)
+}
+
+/// Returns what a file is that a download left in the scene's place.
+fn not_downloaded(bytes: &[u8]) -> Option<&'static str> {
+    let start = bytes.trim_ascii_start();
+    let is_html = |tag: &[u8]| start.get(..tag.len()).is_some_and(|s| s.eq_ignore_ascii_case(tag));
+    if bytes.starts_with(b"version https://git-lfs.github.com/spec/") {
+        Some("a pointer of Git LFS, not the file itself; run `git lfs pull`")
+    } else if is_html(b"<!doctype html") || is_html(b"<html") {
+        Some("a web page, not the file itself; download it by its direct address")
+    } else {
+        None
+    }
 }
 
 fn decode(bytes: &[u8], format: Format, meter: &Meter) -> Result<Loaded, FormatError> {

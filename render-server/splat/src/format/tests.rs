@@ -370,11 +370,26 @@ fn unknown_files_are_refused_with_the_list_of_formats() {
     check("a.usdz", b"PK\x05\x06", &["like no scene file"]);
     check("lod-meta.json", b"{}", &["streamed", "convert"]);
     check("a.splat", b"", &["no splats"]);
+    let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n";
+    check("b.splat", pointer, &["b.splat is a pointer of Git LFS", "git lfs pull"]);
+    check("c.splat", b"\n<!DOCTYPE html><html>", &["c.splat is a web page"]);
+    check("d.ply", b"<HTML><body>404", &["d.ply is a web page"]);
     check("a.ksplat", &[0; 5000], &["version 0.0"]);
     check("meta.json", b"{}", &["SOG, meta.json"]);
     assert!(matches!(read("/nowhere/x.spz"), Err(FormatError::Io { .. })));
     let error = write(folder.path().join("x.obj"), &some()).unwrap_err().to_string();
     assert!(error.contains("names no format to write; supported are PLY"), "{error}");
+}
+
+#[test]
+fn a_pipe_is_refused_and_not_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pipe.splat");
+    let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
+    assert!(made.success());
+    // Nobody writes to it: opening it would wait for ever.
+    let error = read(&path).unwrap_err().to_string();
+    assert!(error.contains("not a regular file"), "{error}");
 }
 
 #[test]
