@@ -3,7 +3,8 @@
 What is checked: the file is whole for a strict reader, also after SIGKILL, unless that came within
 the one write a second: then a reader that streams gets all before it; every channel has a schema; Foxglove's messages
 decode, by the schemas in the file; colour is a JPEG that Pillow opens, of the calibration's size; poses are unit
-quaternions; replaying twice gives the same bytes and the flight's own answers.
+quaternions; replaying a full log twice gives the same bytes and the flight's own answers; a reduced one stays within
+60 MB a minute and has every observation's head.
 """
 
 import filecmp
@@ -42,10 +43,10 @@ def check(condition, what):
         sys.exit(f"failed: {what}")
 
 
-def fly(program, folder, seconds, kill):
+def fly(program, folder, seconds, images, kill):
     """Flies a demo; kills its runtime in flight if asked. Returns the log."""
-    command = [program, "demo", "--headless", "--seed", "7", "--seconds", str(seconds), "--log",
-               str(folder)]
+    command = [program, "demo", "--headless", "--seed", "7", "--seconds", str(seconds),
+               f"--log={images}", f"--log-dir={folder}"]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     said = []
     for line in demo.stdout:
@@ -93,9 +94,10 @@ def messages(file, is_cut):
     sys.exit("failed: a file without an end reads to its end")
 
 
-def read(path, is_whole):
-    """Reads a log; returns the number of messages by topic, and whether its end is missing."""
-    found = {}
+def read(path, is_whole, is_full):
+    """Reads a log; returns the number of messages by topic, its seconds, and whether its end is
+    missing."""
+    found, times, with_images = {}, [], 0
     is_cut = not path.read_bytes().endswith(b"\x89MCAP0\r\n")
     check(not (is_cut and is_whole), f"a log that was closed has an end: {path}")
     if not is_cut:
@@ -103,13 +105,16 @@ def read(path, is_whole):
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
             check((summary is not None) == is_whole, f"an index if it was closed: {path}")
-            names = [record.name for record in reader.iter_metadata()]
-            check("vizflyt.flight" in names, f"the flight is named: {names}")
+            flights = [record.metadata for record in reader.iter_metadata()
+                       if record.name == "vizflyt.flight"]
+            images = "full" if is_full else "reduced"
+            check([flight["images"] for flight in flights] == [images], f"{flights}")
     size = None
     with path.open("rb") as file:
         for schema, channel, message in messages(file, is_cut):
             topic = channel.topic
             is_first = topic not in found
+            times.append(message.log_time)
             found[topic] = found.get(topic, 0) + 1
             check(schema is not None, f"{topic} has a schema")
             if topic in FOXGLOVE:
@@ -136,6 +141,8 @@ def read(path, is_whole):
             elif topic == "/observation":
                 check(decoded.head[:4] == b"VZOB", "the head is an observation's")
                 check(all(i.is_color_apart and i.bitstream for i in decoded.images), "images")
+                check(decoded.images or not is_full, "a full log leaves no image out")
+                with_images += bool(decoded.images)
             elif is_first and topic == "/event":
                 check(decoded.message != "", "an event has a sentence")
     # A file that is cut may end before what comes once a second, or with the first setpoint. A
@@ -146,8 +153,13 @@ def read(path, is_whole):
     for topic in [*FOXGLOVE, *OURS]:
         if topic not in rare:
             check(found.get(topic, 0) > 0, f"{topic} is in {path}: {found}")
-    check(found["/camera/front/image"] == found["/observation"], f"an image each: {found}")
-    return found, is_cut
+    check(found["/camera/front/image"] == with_images, f"an image each: {found}")
+    seconds = (max(times) - min(times)) / 1e9
+    if not is_full:
+        # A log begins with a second's savings, and its last image may be beyond.
+        most = 1e6 * (seconds + 1) + 300_000
+        check(path.stat().st_size <= most, f"{path.stat().st_size} bytes in {seconds} s")
+    return found, seconds, is_cut
 
 
 def replay(program, log, name):
@@ -162,10 +174,10 @@ def main():
     program = str(pathlib.Path(sys.argv[1]).resolve())
     with tempfile.TemporaryDirectory() as scratch:
         folder = pathlib.Path(scratch)
-        whole = fly(program, folder / "whole", 8, kill=False)
-        found, _ = read(whole, is_whole=True)
+        whole = fly(program, folder / "whole", 8, "full", kill=False)
+        found, _, _ = read(whole, is_whole=True, is_full=True)
         minute = whole.stat().st_size / found["/observation"] * 60 * 60 / 1e6
-        print(f"whole: {sum(found.values())} messages, {whole.stat().st_size / 1e6:.1f} MB; "
+        print(f"full: {sum(found.values())} messages, {whole.stat().st_size / 1e6:.1f} MB; "
               f"a minute at 60 Hz would be {minute:.0f} MB")
         one, first = replay(program, whole, "one")
         two, _ = replay(program, whole, "two")
@@ -174,12 +186,15 @@ def main():
         check(first["differ"] == 0 or first["images_missing"] > 0, f"as in flight: {first}")
         print(f"replayed: {first['compared']} answers, {first['differ']} differ, "
               f"{first['images_missing']} images missing")
-        killed = fly(program, folder / "killed", 60, kill=True)
-        found, is_cut = read(killed, is_whole=False)
-        print(f"killed: {sum(found.values())} messages, {killed.stat().st_size / 1e6:.1f} MB"
+        killed = fly(program, folder / "killed", 60, "reduced", kill=True)
+        found, seconds, is_cut = read(killed, is_whole=False, is_full=False)
+        print(f"reduced and killed: {sum(found.values())} messages, "
+              f"{killed.stat().st_size / 1e6:.1f} MB in {seconds:.1f} s, "
+              f"{found['/camera/front/image']} of {found['/observation']} images"
               f"{', within a write' if is_cut else ''}")
         _, report = replay(program, killed, "killed")
         check(report["compared"] > 0, str(report))
+        check(report["images_left_out"] > 0, f"a reduced log says so: {report}")
         print(f"{checks} checks passed")
 
 

@@ -19,7 +19,7 @@ class Flight:
         report = folder / "report.json"
         done = subprocess.run(
             [
-                program, "demo", "--headless", f"--plugin={plugin}", f"--log={folder}",
+                program, "demo", "--headless", f"--plugin={plugin}", f"--log-dir={folder}",
                 f"--report={report}", *arguments,
             ],
             stdout=subprocess.PIPE,
@@ -81,7 +81,7 @@ def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
     others, report = set(waiting_services()), tmp_path / "report.json"
     lab = subprocess.Popen(
         [
-            program, "fly", "--attach", "--headless", "--no-config", f"--log={tmp_path}",
+            program, "fly", "--attach", "--headless", "--no-config", f"--log-dir={tmp_path}",
             f"--report={report}",
         ],
         stdout=subprocess.PIPE,

@@ -25,7 +25,7 @@ class Flight:
         self.seen = []
         self.process = subprocess.Popen(
             [
-                program, "fly", "first", "--no-config", "--headless", "--seed=4", "--log=flights",
+                program, "fly", "first", "--no-config", "--headless", "--seed=4", "--log-dir=flights",
                 "--report=report.json", *arguments,
             ],
             cwd=self.desk,

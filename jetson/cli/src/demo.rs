@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
+use vizflyt_runtime::args::LogArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::plugins;
@@ -35,9 +36,8 @@ pub(crate) struct DemoArgs {
     /// Writes the flight's figures to this file as JSON.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Folder for the flight log.
-    #[arg(long, value_name = "DIR", default_value = "flights")]
-    log: PathBuf,
+    #[command(flatten)]
+    log: LogArgs,
 }
 
 /// Runs the demo; success only if the flight finished.

@@ -17,7 +17,7 @@ use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
 use crate::fly::plugin::Plugin;
 use crate::plugins;
-use crate::terminal::tell;
+use crate::terminal::{tell, tell_error};
 
 /// Feeds a flight's recorded images to the plugin again, or to another one, and says where the
 /// answers differ.
@@ -103,7 +103,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     }
     let line = &mut |stream: Stream, text: &str| match stream {
         Stream::Stdout => tell(format!("plugin: {text}")),
-        Stream::Stderr => eprintln!("plugin: {text}"),
+        Stream::Stderr => tell_error(format_args!("plugin: {text}")),
     };
     let report = replay(&args.log, plan, &options, line).with_context(cannot)?;
     if let Some(path) = &args.report {
@@ -143,10 +143,19 @@ fn flown(flown: Option<&FlownPlugin>) -> Result<(OsString, Vec<OsString>)> {
 /// Returns what was found, for people.
 fn sentences(report: &ReplayReport) -> Vec<String> {
     let ReplayReport { images_logged, images_fed, images_missing, compared, differ, .. } = report;
+    let ReplayReport { images_left_out, .. } = report;
     let mut found = vec![format!(
         "{images_fed} of {images_logged} images were answered in {:.1} s",
         report.seconds
     )];
+    if *images_left_out > 0 {
+        found.push(format!(
+            "a reduced log: it holds {} of {images_logged} images, each as it came. A plugin that \
+             answers every image by itself answers as in flight, one with a memory may not; fly \
+             with --log full for a replay of all",
+            images_logged.saturating_sub(*images_left_out)
+        ));
+    }
     if *images_missing > 0 {
         found.push(format!(
             "{images_missing} images that the plugin had in flight are not in the log; from there \
@@ -214,6 +223,10 @@ mod tests {
             replayed: None,
         });
         let text = sentences(&report).join("\n");
+        assert!(!text.contains("reduced"), "{text}");
+        (report.images_logged, report.images_left_out) = (40, 30);
+        let reduced = sentences(&report).join("\n");
+        assert!(reduced.contains("a reduced log: it holds 10 of 40 images"), "{reduced}");
         assert!(text.contains("image 7, 1.50 s: velocity.v_mps.0 by 2.500e-1"), "{text}");
     }
 }

@@ -6,14 +6,16 @@ use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::Args;
+use clap::builder::{OsStringValueParser, TypedValueParser};
+use clap::{Args, ValueEnum};
 
 use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
 
-use crate::config::{self, JetsonConfig, VehicleConfig};
+use crate::config::{self, JetsonConfig, LogConfig, VehicleConfig};
 use crate::link::port::MavlinkAddress;
 use crate::link::{LinkSettings, SigningFile, VISION_HZ};
+use crate::log::{LogSettings, LoggedImages};
 
 /// Flies a plugin: images from the render server to it, its setpoints through the guard to the
 /// autopilot.
@@ -49,9 +51,9 @@ pub struct FlyArgs {
     /// The map of a course whose map is known (map.json), for the plugin
     #[arg(long, value_name = "FILE")]
     pub map: Option<PathBuf>,
-    /// Folder for flight logs (MCAP)
-    #[arg(long, value_name = "DIR", default_value = "flights")]
-    pub log: PathBuf,
+    /// What is logged, and where
+    #[command(flatten)]
+    pub log: LogArgs,
     /// Shows the log's channels live to Foxglove, on this computer's port 8765 or at ADDR:PORT;
     /// whoever reaches it sees the flight
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, require_equals = true,
@@ -153,6 +155,82 @@ impl FlyArgs {
     /// Returns the vehicle's name in the localization system.
     pub fn vehicle_name(&self) -> &str {
         self.vehicle.as_deref().unwrap_or("vizflyt")
+    }
+}
+
+/// What is logged, and where.
+#[derive(Args, Clone, Debug, Default)]
+pub struct LogArgs {
+    /// Which images the flight log holds: `full` all, for a bit-exact replay; `reduced` as many as
+    /// fit into 60 MB a minute [default: `images` of [log] in jetson.toml, or else reduced]
+    #[arg(long = "log", value_name = "reduced|full",
+          value_parser = OsStringValueParser::new().map(LogOption::from))]
+    pub option: Option<LogOption>,
+    /// Folder for flight logs (MCAP) [default: flights]
+    #[arg(long, value_name = "DIR")]
+    pub log_dir: Option<PathBuf>,
+}
+
+/// The value of `--log`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LogOption {
+    /// Which images.
+    Images(LoggedImages),
+    /// Any other text is a folder: so `--log DIR` was once meant.
+    Folder(PathBuf),
+}
+
+impl LogOption {
+    fn text(&self) -> OsString {
+        match self {
+            Self::Images(LoggedImages::Reduced) => "reduced".into(),
+            Self::Images(LoggedImages::Full) => "full".into(),
+            Self::Folder(folder) => folder.into(),
+        }
+    }
+}
+
+impl From<OsString> for LogOption {
+    fn from(text: OsString) -> Self {
+        let images = text.to_str().and_then(|text| LoggedImages::from_str(text, false).ok());
+        images.map_or_else(|| Self::Folder(text.into()), Self::Images)
+    }
+}
+
+impl LogArgs {
+    /// Returns the options for another `vizflyt fly` that is to log as this one was told to.
+    pub fn to_command_line(&self) -> Vec<OsString> {
+        let pairs = [
+            ("--log", self.option.as_ref().map(LogOption::text)),
+            ("--log-dir", self.log_dir.clone().map(Into::into)),
+        ];
+        let given = pairs.into_iter().filter_map(|(name, value)| Some([name.into(), value?]));
+        given.flatten().collect()
+    }
+
+    /// Returns where and how to log; what the command line leaves out is as `config` says.
+    ///
+    /// # Errors
+    /// If two folders are given.
+    pub fn settings(&self, config: &LogConfig) -> anyhow::Result<LogSettings> {
+        let (images, folder) = match &self.option {
+            None => (None, None),
+            Some(LogOption::Images(images)) => (Some(*images), None),
+            Some(LogOption::Folder(folder)) => (None, Some(folder)),
+        };
+        if let Some(folder) = folder {
+            let folder = folder.display();
+            if self.log_dir.is_some() {
+                anyhow::bail!("--log {folder}: give `reduced` or `full`; --log-dir is the folder");
+            }
+            tracing::warn!("--log {folder}: the folder's option is now --log-dir");
+        }
+        let folder = self.log_dir.as_ref().or(folder);
+        Ok(LogSettings {
+            folder: folder.cloned().unwrap_or_else(|| "flights".into()),
+            images: images.or(config.images).unwrap_or_default(),
+            retention: config.retention(),
+        })
     }
 }
 
@@ -300,6 +378,32 @@ mod tests {
         let error = settle(&[]).err().unwrap().to_string();
         assert!(error.contains("no plugin given"), "{error}");
         assert_eq!(settle(&["mine"]).unwrap().mavlink_address().to_string(), "udpin:0.0.0.0:14550");
+    }
+
+    #[test]
+    fn the_log_is_reduced_unless_somebody_says_full() {
+        let settle = |line: &[&str], config: &str| {
+            let line = ["fly", "x"].iter().chain(line);
+            let log = Program::try_parse_from(line).unwrap().fly.log;
+            log.settings(&JetsonConfig::parse(config).unwrap().log)
+        };
+        let check = |line: &[&str], config: &str, folder: &str, images| {
+            let found = settle(line, config).unwrap();
+            assert_eq!((found.folder, found.images), (folder.into(), images), "{line:?}");
+        };
+        let full = "[log]\nimages = \"full\"\n";
+        check(&[], "", "flights", LoggedImages::Reduced);
+        check(&[], full, "flights", LoggedImages::Full);
+        check(&["--log=full"], "", "flights", LoggedImages::Full);
+        check(&["--log", "reduced", "--log-dir=d"], full, "d", LoggedImages::Reduced);
+        check(&["--log=some/folder"], full, "some/folder", LoggedImages::Full);
+        // A child that is told again does the same.
+        let line = ["fly", "x", "--log=full", "--log-dir=d"];
+        let args = Program::try_parse_from(line).unwrap().fly.log;
+        assert_eq!(args.to_command_line(), ["--log", "full", "--log-dir", "d"]);
+        assert!(LogArgs::default().to_command_line().is_empty());
+        let error = settle(&["--log=a", "--log-dir=b"], "").unwrap_err().to_string();
+        assert!(error.contains("--log a: give `reduced` or `full`"), "{error}");
     }
 
     #[test]

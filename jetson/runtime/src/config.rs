@@ -14,6 +14,9 @@
 //! [plugin]
 //! path = "/home/team/first"
 //! memory_mb = 2000                    # what it may use: docs/guides/safety.md
+//!
+//! [log]
+//! keep_gb = 20                        # when a flight begins, the oldest logs beyond it are deleted
 //! ```
 //! Text comes in through [`JetsonConfig::parse`], which refuses unknown keys (it names the nearest
 //! known one) and values that cannot work. The command line goes before the file. Nothing is
@@ -25,6 +28,7 @@ mod tests;
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Limits;
@@ -33,6 +37,7 @@ use vizflyt_trust::Fingerprint;
 
 use crate::link::VISION_HZ;
 use crate::link::port::{self, Shape};
+use crate::log::{LoggedImages, Retention};
 use crate::supervisor::{PluginLimits, Restart};
 
 /// The whole of `jetson.toml`. Every section may be absent.
@@ -48,6 +53,8 @@ pub struct JetsonConfig {
     pub limits: LimitsConfig,
     /// The plugin and what it may use.
     pub plugin: PluginConfig,
+    /// Flight logs.
+    pub log: LogConfig,
 }
 
 /// `[server]`: the render server.
@@ -172,6 +179,32 @@ impl PluginConfig {
     }
 }
 
+/// `[log]`: which images flight logs hold, and how long they are kept.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LogConfig {
+    /// `reduced` (without it) or `full`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub images: Option<LoggedImages>,
+    /// Size of all logs of a folder together, without it 20. Beyond it the oldest are deleted when a
+    /// flight begins; `inf` keeps all. [GB]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keep_gb: Option<f64>,
+    /// Age at which a log is deleted when a flight begins; without it none. [days]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keep_days: Option<f64>,
+}
+
+impl LogConfig {
+    /// Returns how long logs are kept.
+    pub fn retention(&self) -> Retention {
+        // 20 GB are five and a half hours of reduced logs.
+        let max_bytes = (self.keep_gb.unwrap_or(20.0) * 1e9) as u64;
+        let max_age = self.keep_days.map(|days| Duration::from_secs_f64(days * 86_400.0));
+        Retention { max_bytes, max_age }
+    }
+}
+
 /// Why a `jetson.toml` is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -261,7 +294,7 @@ impl JetsonConfig {
 
     /// Looks at every value.
     fn validate(&self) -> Result<(), ConfigError> {
-        let Self { server, vehicle, limits, plugin } = self;
+        let Self { server, vehicle, limits, plugin, log } = self;
         let address = server.as_ref().map(|server| &server.address);
         let checks = [
             address.map_or(Ok(()), |at| check_host_port("server.address", at, at)),
@@ -277,6 +310,8 @@ impl JetsonConfig {
             ),
             check("limits.max_tilt_deg", limits.max_tilt_deg, "deg", 5.0..=80.0),
             check("limits.max_altitude_m", limits.max_altitude_m, "m", 0.2..=1000.0),
+            check("log.keep_gb", log.keep_gb, "GB", 0.1..=f64::INFINITY),
+            check("log.keep_days", log.keep_days, "days", 0.01..=36_500.0),
             plugin.limits().check().map_err(ConfigError::Plugin),
         ];
         let mut wrong: Vec<_> = checks.into_iter().filter_map(Result::err).collect();

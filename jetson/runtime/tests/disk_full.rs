@@ -3,7 +3,7 @@
 
 use nix::sys::resource::{Resource, setrlimit};
 use vizflyt_runtime::log::read::{Entry, LogReader};
-use vizflyt_runtime::log::{Channel, FlightLog, keep_going_when_files_are_full};
+use vizflyt_runtime::log::{Channel, FlightLog, LogSettings, keep_going_when_files_are_full};
 use vizflyt_sdk::host_now;
 
 /// Largest file. [bytes]
@@ -13,7 +13,7 @@ const ROOM: u64 = 3 << 20;
 fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
     keep_going_when_files_are_full();
     let folder = tempfile::tempdir().unwrap();
-    let log = FlightLog::open(folder.path(), None);
+    let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
     setrlimit(Resource::RLIMIT_FSIZE, ROOM, ROOM).unwrap();
     let line = serde_json::json!({"text": "x".repeat(100_000)});

@@ -6,7 +6,7 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use vizflyt_runtime::log::{Channel, FlightLog, Live};
+use vizflyt_runtime::log::{Channel, FlightLog, Live, LogSettings};
 use vizflyt_sdk::host_now;
 
 struct Viewer(TcpStream);
@@ -71,7 +71,7 @@ fn a_viewer_sees_the_logs_channels_and_their_messages() {
     let live = tokio.block_on(Live::start("127.0.0.1:0".parse().unwrap())).unwrap();
     let address = live.address();
     let folder = tempfile::tempdir().unwrap();
-    let log = FlightLog::open(folder.path(), Some(live));
+    let log = FlightLog::open(&LogSettings::full(folder.path()), Some(live));
     let mut viewer = Viewer::connect(address);
     let mut channels = Vec::new();
     while !channels.iter().any(|channel: &Value| channel["topic"] == "/pose") {

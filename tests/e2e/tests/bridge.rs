@@ -331,7 +331,7 @@ fn the_demo_flies_with_every_byte_through_the_bridge() {
         "--seconds=25",
         "--report",
         report.to_str().unwrap(),
-        "--log",
+        "--log-dir",
         folder.path().join("flights").to_str().unwrap(),
     ]);
     demo.wait(Duration::from_mins(4));

@@ -37,7 +37,7 @@ impl ReportFile {
     }
     fn demo(&self, args: &[&str]) -> Demo {
         let (report, log) = (self.path(), self.log());
-        let mut all = vec!["--report", &report, "--log", &log];
+        let mut all = vec!["--report", &report, "--log-dir", &log];
         all.extend(args);
         Demo::start(&all)
     }

@@ -68,7 +68,7 @@ impl Desk {
         let mut command = self.command(&["fly", "--headless"]);
         command.arg(plugin).args(args);
         command.arg("--report").arg(self.path("report.json"));
-        command.arg("--log").arg(self.path("flights"));
+        command.arg("--log-dir").arg(self.path("flights"));
         Demo::spawn(&mut command)
     }
     fn report(&self) -> Value {

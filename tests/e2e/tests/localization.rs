@@ -68,7 +68,7 @@ fn the_forest_is_flown_on_natnet_and_its_log_is_a_source() {
         "--seconds=90",
         "--report",
         &report,
-        "--log",
+        "--log-dir",
         &log,
     ]);
     assert_eq!(demo.wait(Duration::from_mins(5)), Some(0), "{:#?}", demo.seen);

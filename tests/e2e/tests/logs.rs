@@ -26,8 +26,17 @@ fn replay(log: &str, answers: &Path, more: &[&str]) -> Value {
 fn a_flight_is_replayed_bit_by_bit() {
     let folder = tempfile::tempdir().unwrap();
     let flights = folder.path().join("flights");
-    let mut demo =
-        Demo::start(&["--seed", "7", "--seconds", "6", "--log", flights.to_str().unwrap()]);
+    let folder_of_logs = flights.to_str().unwrap();
+    let mut demo = Demo::start(&[
+        "--seed",
+        "7",
+        "--seconds",
+        "6",
+        "--log",
+        "full",
+        "--log-dir",
+        folder_of_logs,
+    ]);
     demo.wait(Duration::from_mins(4));
     let log = std::fs::read_dir(&flights).unwrap().next().unwrap().unwrap().path();
     let log = log.to_str().unwrap();
@@ -35,6 +44,7 @@ fn a_flight_is_replayed_bit_by_bit() {
     let (one, two) = (folder.path().join("one.jsonl"), folder.path().join("two.jsonl"));
     let found = replay(log, &one, &[]);
     let count = |key: &str| found[key].as_u64().unwrap();
+    assert_eq!(count("images_left_out"), 0, "{found:#}");
     assert!(count("compared") > 50 && found["plugin_failed"].is_null(), "{found:#}");
     // A log that dropped images cannot give a plugin with a memory the same past.
     assert!(count("differ") == 0 || count("images_missing") > 0, "{found:#}");

@@ -73,7 +73,7 @@ fn a_computer_is_refused_then_paired_then_let_in() {
     let log = at("flights");
     let fly = |more: &[&str]| {
         let mut args = vec!["fly", "avoid", "--server", &address, "--keys", &keys];
-        args.extend(["--mavlink", "udpin:127.0.0.1:0", "--ready-within", "3", "--log", &log]);
+        args.extend(["--mavlink", "udpin:127.0.0.1:0", "--ready-within", "3", "--log-dir", &log]);
         args.extend(more);
         let output = run(&args);
         assert!(!output.status.success(), "there is no vehicle to fly");

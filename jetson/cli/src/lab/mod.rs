@@ -23,14 +23,17 @@ mod prepare;
 mod report;
 
 use std::ffi::OsString;
-use std::path::Path;
+use std::net::TcpListener;
+use std::os::unix::process::ExitStatusExt;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use nix::sys::signal::Signal;
 use serde::Deserialize;
 use serde_json::{Value, json};
+use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
 use vizflyt_runtime::control::print_line;
 use vizflyt_server::render::RendererKind;
@@ -134,8 +137,8 @@ pub(crate) struct LabFlight<'a> {
     pub fly: Vec<OsString>,
     /// Arguments for the plugin.
     pub plugin_arguments: &'a [OsString],
-    /// Folder for the flight log.
-    pub log: &'a Path,
+    /// What is logged, and where.
+    pub log: &'a LogArgs,
     /// Prints the runtime's JSON lines instead of lines for people.
     pub json: bool,
     /// What the children log.
@@ -213,6 +216,13 @@ impl Show {
     fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<Flown> {
         let lab = flight.lab;
         let page = format!("127.0.0.1:{}", lab.port);
+        // The server would name an option of its own.
+        if let Err(error) = TcpListener::bind(&page) {
+            bail!(
+                "port {} of the page: {error}; give another --port, or 0 for a free one",
+                lab.port
+            );
+        }
         let serve: Vec<OsString> = vec![
             "serve".into(),
             stage.arena.clone().into(),
@@ -257,9 +267,9 @@ impl Show {
             keys.option(),
             "--mavlink=udpin:127.0.0.1:0".into(),
             "--vehicle=vizflyt".into(),
-            format!("--log={}", flight.log.display()).into(),
             self.log_level.clone(),
         ]);
+        fly.extend(flight.log.to_command_line());
         if let Some(map) = &stage.map {
             fly.push(format!("--map={}", map.display()).into());
         }
@@ -407,8 +417,11 @@ impl Show {
         for (_, child) in &mut self.children {
             child.ask_to_end();
         }
-        for (_, child) in &mut self.children {
-            child.wait_until(deadline);
+        for (role, child) in &mut self.children {
+            let signal = child.wait_until(deadline).and_then(|status| status.signal());
+            if let Some(Ok(signal)) = signal.map(Signal::try_from) {
+                self.parts.killed.push((*role, signal));
+            }
         }
         // Each child's reader closes behind its last line, so this ends.
         let mut open = self.children.len();

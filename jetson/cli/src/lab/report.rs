@@ -2,8 +2,11 @@
 //! object.
 
 use anyhow::{Context, Result};
+use nix::sys::signal::Signal;
 use serde::Serialize;
 use serde_json::Value;
+
+use super::child::Role;
 
 /// One flight. Written by `--report`.
 #[derive(Clone, Debug, Serialize, PartialEq)]
@@ -82,9 +85,29 @@ pub(crate) struct Parts {
     pub bridge: Value,
     /// The report of AprilTag localization, if it was flown on.
     pub localization: Value,
+    /// Which signal ended which process.
+    pub killed: Vec<(Role, Signal)>,
 }
 
 impl Parts {
+    fn why_missing(&self, role: Role) -> String {
+        let killed = self.killed.iter().find(|(killed, _)| *killed == role);
+        let name = role.name();
+        match killed {
+            // Memory that is shared has no room behind it when it is first touched.
+            Some((_, Signal::SIGBUS)) => {
+                format!(
+                    "the {name} was killed by SIGBUS, as where /dev/shm is full; free some of it"
+                )
+            }
+            Some((_, Signal::SIGKILL)) => {
+                format!("the {name} was killed by SIGKILL, as where the memory is full")
+            }
+            Some((_, signal)) => format!("the {name} was killed by {signal}"),
+            None => format!("the {name} ended without a report"),
+        }
+    }
+
     /// Joins the parts. A true collision outranks what the referee believed; a missing part is an
     /// error by name.
     pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> Report {
@@ -92,9 +115,9 @@ impl Parts {
         let count = |part: &Value, key: &str| part[key].as_u64().unwrap_or(0);
         let text = |part: &Value, key: &str| part[key].as_str().map(str::to_owned);
         let missing = [
-            ("runtime", &self.runtime),
-            ("render server", &self.server),
-            ("simulator", &self.simulator),
+            (Role::Runtime, &self.runtime),
+            (Role::Server, &self.server),
+            (Role::Simulator, &self.simulator),
         ]
         .into_iter()
         .find(|(_, part)| !part.is_object());
@@ -103,7 +126,7 @@ impl Parts {
                 "collided".to_owned(),
                 "the body touched the true geometry of the scene".to_owned(),
             ),
-            Some((name, _)) => ("error".to_owned(), format!("the {name} ended without a report")),
+            Some((role, _)) => ("error".to_owned(), self.why_missing(role)),
             None => (
                 text(&self.runtime, "outcome").unwrap_or_else(|| "error".to_owned()),
                 text(&self.runtime, "reason").unwrap_or_default(),
@@ -209,6 +232,7 @@ mod tests {
             simulator: json!({"collided": false, "min_clearance_m": 0.4}),
             bridge: Value::Null,
             localization: Value::Null,
+            killed: Vec::new(),
         }
     }
 
@@ -225,5 +249,9 @@ mod tests {
         let report = Parts { server: Value::Null, ..parts() }.join(7, 1.0, "");
         assert_eq!(report.outcome, "error");
         assert_eq!(report.reason, "the render server ended without a report");
+        let killed = vec![(Role::Runtime, Signal::SIGBUS)];
+        let report = Parts { runtime: Value::Null, killed, ..parts() }.join(7, 1.0, "");
+        assert!(report.reason.contains("the runtime was killed by SIGBUS"), "{}", report.reason);
+        assert!(report.reason.contains("/dev/shm is full"), "{}", report.reason);
     }
 }

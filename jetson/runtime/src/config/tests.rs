@@ -73,6 +73,10 @@ fn mistakes_are_explained() {
     check_refused("[plugin]\nmemory_mb = 1\n", &["plugin.memory_mb = 1", "give 64"]);
     check_refused("[plugin]\ncpus = nan\n", &["plugin.cpus = NaN"]);
     check_refused("[plugin]\nrestart = \"always\"\n", &["line 2", "on_ground"]);
+    check_refused("[log]\nimages = \"all\"\n", &["line 2", "reduced", "full"]);
+    check_refused("[log]\nkeep_gb = -1.0\n", &["log.keep_gb = -1", "from 0.1"]);
+    check_refused("[log]\nkeep_days = nan\n", &["log.keep_days = NaN"]);
+    check_refused("[log]\nkeep_mb = 5\n", &["did you mean 'keep_gb'"]);
 }
 
 #[test]
@@ -84,6 +88,18 @@ fn what_the_plugin_may_use_is_read_and_the_rest_is_fair() {
     let expected =
         PluginLimits { memory_mb: 500, restart, network: true, ..PluginLimits::default() };
     assert_eq!(found, expected);
+}
+
+#[test]
+fn logs_are_kept_by_size_and_age() {
+    let check = |text: &str, max_bytes, max_age| {
+        let found = JetsonConfig::parse(text).unwrap().log.retention();
+        assert_eq!(found, Retention { max_bytes, max_age }, "{text}");
+    };
+    check("", 20_000_000_000, None);
+    let days = Some(Duration::from_hours(48));
+    check("[log]\nkeep_gb = 0.5\nkeep_days = 2\n", 500_000_000, days);
+    check("[log]\nkeep_gb = inf\n", u64::MAX, None);
 }
 
 #[test]
@@ -112,9 +128,9 @@ fn all_mistakes_are_said_at_once() {
     assert_eq!(lines.len(), 3, "{keys}");
     assert!(lines[0].starts_with("line 1, column 2: unknown key 'limit'"), "{keys}");
     assert!(lines[2].starts_with("line 5, column 10: system: invalid type"), "{keys}");
-    let values = error("[limits]\nmax_speed_mps = -1\nmax_tilt_deg = 0\n");
+    let values = error("[limits]\nmax_speed_mps = -1\n[log]\nkeep_gb = 0\n");
     assert_eq!(values.lines().count(), 2, "{values}");
-    assert!(values.contains("limits.max_speed_mps = -1") && values.contains("limits.max_tilt_deg"));
+    assert!(values.contains("limits.max_speed_mps = -1") && values.contains("log.keep_gb"));
 }
 
 fn config() -> impl Strategy<Value = JetsonConfig> {
@@ -146,8 +162,17 @@ fn config() -> impl Strategy<Value = JetsonConfig> {
         write: vec!["data".into()],
         ..PluginConfig::default()
     });
-    (prop::option::of(server), vehicle, limits, plugin).prop_map(
-        |(server, vehicle, limits, plugin)| JetsonConfig { server, vehicle, limits, plugin },
+    let images = prop::option::of(Just(LoggedImages::Full));
+    let log = (images, prop::option::of(1.0..99.0), prop::option::of(1.0..99.0))
+        .prop_map(|(images, keep_gb, keep_days)| LogConfig { images, keep_gb, keep_days });
+    (prop::option::of(server), vehicle, limits, plugin, log).prop_map(
+        |(server, vehicle, limits, plugin, log)| JetsonConfig {
+            server,
+            vehicle,
+            limits,
+            plugin,
+            log,
+        },
     )
 }
 

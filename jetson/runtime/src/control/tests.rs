@@ -16,6 +16,7 @@ use super::*;
 use crate::answers::Answers;
 use crate::companion::Senses;
 use crate::lockstep::{Lockstep, Reply};
+use crate::log::LogSettings;
 use crate::stream::ServerClock;
 use crate::supervisor::Confinement;
 
@@ -67,7 +68,7 @@ impl Drivers {
             link: LinkSettings::default(),
             shared: Shared { clock: ServerClock::same(), mailbox: Arc::default() },
             to_server: Arc::default(),
-            log: FlightLog::open(folder.path(), None),
+            log: FlightLog::open(&LogSettings::full(folder.path()), None),
             json: false,
             screen: Screen::default(),
         };

@@ -144,7 +144,7 @@ impl Channel {
             }
             Self::Log => {
                 let properties = json!({"written_bytes": number, "dropped_images": number,
-                    "dropped_records": number, "free_bytes": number, "text": text});
+                    "dropped_records": number, "left_out_images": number, "free_bytes": number, "text": text});
                 ("vizflyt.Log", properties)
             }
             _ => {

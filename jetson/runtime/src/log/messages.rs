@@ -22,7 +22,7 @@ pub struct Observation {
     /// Shared memory up to the first image plane: `ObservationHeader` and what belongs to it.
     #[prost(bytes = "vec", tag = "4")]
     pub head: Vec<u8>,
-    /// Its images.
+    /// Its images; none where a reduced log left them out.
     #[prost(message, repeated, tag = "5")]
     pub images: Vec<ObservedImage>,
 }

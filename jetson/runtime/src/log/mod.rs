@@ -7,15 +7,19 @@
 //!                  (their memory goes back afterwards)   bounded └─▶ Live ─▶ viewers
 //! ```
 //! Nobody who flies waits for it: what finds no room is dropped, counted and said. The file is a
-//! whole one whenever the process is killed, but within the one write of a chunk ([`file`]). Images are written as they came: the log
-//! neither decodes nor encodes them. [`read`] is the way back, and [`crate::replay`] flies it.
+//! whole one whenever the process is killed, but within the one write of a chunk ([`file`]). Images are
+//! written as they came: the log neither decodes nor encodes them. A reduced log leaves some of them
+//! out whole ([`budget`]); the rest of every observation is always there. The oldest logs are deleted
+//! when a flight begins ([`retention`]). [`read`] is the way back, and [`crate::replay`] flies it.
 
+mod budget;
 mod channels;
 mod file;
 mod live;
 mod messages;
 mod queue;
 pub mod read;
+mod retention;
 #[cfg(test)]
 mod tests;
 mod writer;
@@ -27,7 +31,7 @@ use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::json;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin};
@@ -35,6 +39,7 @@ use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::HostTime;
 
+use self::budget::Budget;
 pub use self::channels::Channel;
 use self::file::RealFile;
 pub use self::file::keep_going_when_files_are_full;
@@ -43,6 +48,7 @@ pub use self::messages::{Observation, ObservedImage, PluginMessage};
 pub use self::queue::{Dropped, LoggedImage};
 use self::queue::{ObservationRecord, Queue, Record};
 pub use self::read::read_timing;
+pub use self::retention::Retention;
 use self::writer::{LogWriter, Outlet};
 use crate::stream::Mailbox;
 
@@ -57,6 +63,36 @@ pub enum Level {
     Error = 4,
 }
 
+/// Which images a log keeps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum LoggedImages {
+    /// As many as fit into 60 MB a minute, spread evenly, each as it came.
+    #[default]
+    Reduced,
+    /// Every one: a replay is bit-exact.
+    Full,
+}
+
+/// Where flights are logged, and how much of them.
+#[derive(Clone, Debug)]
+pub struct LogSettings {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Which images are kept.
+    pub images: LoggedImages,
+    /// How long logs are kept.
+    pub retention: Retention,
+}
+
+impl LogSettings {
+    /// Keeps every image and every log of `folder`.
+    pub fn full(folder: impl Into<PathBuf>) -> Self {
+        let (images, retention) = (LoggedImages::Full, Retention::FOREVER);
+        Self { folder: folder.into(), images, retention }
+    }
+}
+
 /// The log of one flight. Cheap to call from the control loop; dropping it closes the file.
 #[derive(Debug)]
 pub struct FlightLog {
@@ -66,11 +102,17 @@ pub struct FlightLog {
 }
 
 impl FlightLog {
-    /// Opens a log in `folder`, named by the time of day (UTC), and shows it to `live`'s viewers.
-    /// If it cannot be written, says so in a warning and writes nothing.
-    pub fn open(folder: &Path, live: Option<Live>) -> Self {
-        let path = folder.join(format!("{}.mcap", utc_name(SystemTime::now())));
+    /// Opens a log, named by the time of day (UTC), shows it to `live`'s viewers, and deletes logs
+    /// that are no longer to be kept. If it cannot be written, says so in a warning and writes nothing.
+    pub fn open(settings: &LogSettings, live: Option<Live>) -> Self {
+        let LogSettings { folder, images, retention } = settings;
+        let now = SystemTime::now();
+        let path = folder.join(format!("{}.mcap", utc_name(now)));
         let file = create_dir_all(folder).and_then(|()| File::create(&path));
+        let file = file.inspect(|file| {
+            // Where the file system knows no locks, being the newest protects it.
+            let _ = file.try_lock();
+        });
         let file = file.and_then(|file| Ok((file.try_clone()?, RealFile::new(file)?)));
         let disk = file.inspect_err(|error| {
             tracing::warn!("no flight log: {}: {error}", path.display());
@@ -80,8 +122,13 @@ impl FlightLog {
         }
         let path = disk.is_ok().then(|| path.clone());
         let (probe, disk) = disk.ok().unzip();
-        match Self::start(disk, probe, live) {
-            Ok((queue, writer)) => Self { queue: Some(queue), writer: Some(writer), path },
+        match Self::start(disk, probe, live, *images) {
+            Ok((queue, writer)) => {
+                // Nothing to delete from a folder that cannot be listed.
+                let deleted = retention::delete_old(folder, *retention, now).unwrap_or_default();
+                deleted.sentence(*retention).into_iter().for_each(|text| queue.complain(text));
+                Self { queue: Some(queue), writer: Some(writer), path }
+            }
             Err(error) => {
                 tracing::warn!("no flight log: {}: {error}", folder.display());
                 Self { queue: None, writer: None, path: None }
@@ -93,8 +140,10 @@ impl FlightLog {
         disk: Option<RealFile>,
         probe: Option<File>,
         live: Option<Live>,
+        images: LoggedImages,
     ) -> mcap::McapResult<(Arc<Queue>, JoinHandle<()>)> {
-        let outlet = Outlet::new(disk, live)?;
+        let budget = (images == LoggedImages::Reduced).then(Budget::default);
+        let outlet = Outlet::new(disk, live, budget)?;
         let (queue, records) = Queue::new();
         let free_bytes = move || probe.as_ref().and_then(file::free_bytes);
         let writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(free_bytes));

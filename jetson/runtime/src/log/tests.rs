@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::io::{self, Cursor, ErrorKind};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, UNIX_EPOCH};
 
 use proptest::prelude::*;
@@ -70,7 +71,7 @@ fn names_are_utc() {
 #[test]
 fn what_is_logged_is_read_back() {
     let folder = tempfile::tempdir().unwrap();
-    let log = FlightLog::open(&folder.path().join("flights"), None);
+    let log = FlightLog::open(&LogSettings::full(folder.path().join("flights")), None);
     let path = log.path().unwrap().to_owned();
     log.flight(&"avoid".into(), &["--gain=2".into()]);
     for n in 0..100 {
@@ -109,7 +110,7 @@ fn what_is_logged_is_read_back() {
 #[test]
 fn images_are_logged_as_they_came_and_their_memory_goes_back() {
     let folder = tempfile::tempdir().unwrap();
-    let log = FlightLog::open(folder.path(), None);
+    let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
     let home = Arc::new(Mailbox::default());
     let images = log.images(&home).unwrap();
@@ -177,7 +178,7 @@ fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
 #[test]
 fn the_times_of_the_whole_flight_are_read_back() {
     let folder = tempfile::tempdir().unwrap();
-    let log = FlightLog::open(folder.path(), None);
+    let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
     for (seconds, images) in [(5.0, 1), (90.0, 2), (5.0, 3)] {
         let mut timing = Timing { seconds, ..Timing::default() };
@@ -202,10 +203,118 @@ fn a_folder_that_cannot_be_written_stops_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a file");
     fs::write(&file, "x").unwrap();
-    let log = FlightLog::open(&file, None);
+    let log = FlightLog::open(&LogSettings::full(&file), None);
     assert_eq!(log.path(), None);
     log.write(Channel::Asked, host_now(), &json!({}));
     assert!(log.images(&Arc::default()).is_none());
+}
+
+/// A disk that only counts how long the file gets.
+#[derive(Clone, Default)]
+struct Counting(Arc<AtomicU64>);
+
+impl Disk for Counting {
+    fn write_at(&mut self, bytes: &[u8], offset: u64) -> io::Result<()> {
+        self.0.fetch_max(offset + bytes.len() as u64, Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn cut(&mut self, _: u64) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Returns the megabytes of a minute at 60 Hz with images of 79 kB, what the demo's take at 320x240,
+/// and all that is logged beside them.
+fn minute_mb(budget: Option<Budget>) -> f64 {
+    let disk = Counting::default();
+    let outlet = Outlet::new(Some(disk.clone()), None, budget).unwrap();
+    let mut writer = LogWriter::new(outlet, Queue::new().0, Box::new(|| None));
+    let sample = PoseSample::still(ServerTime::ZERO, Pose::IDENTITY);
+    for tick in 0..3600 {
+        let at = HostTime::from_ns(tick * 1_000_000_000 / 60);
+        for _ in 0..4 {
+            writer.take(Record::Pose { at, stamp: at, sample }).unwrap();
+        }
+        for channel in [Channel::Asked, Channel::Sent, Channel::Image] {
+            writer.take(Record::Json { channel, at, json: vec![b' '; 200] }).unwrap();
+        }
+        writer.take(Record::Plugin { at, is_to_plugin: false, body: vec![0; 60] }).unwrap();
+        let mut image = image(1, ColorMode::Jpeg444);
+        image.pieces = vec![vec![0; 79_000]];
+        let head = vec![0; size_of::<ObservationHeader>()];
+        let home = Arc::default();
+        let record = ObservationRecord { at, seq: tick, head, images: vec![image], home };
+        writer.take(Record::Observation(Box::new(record))).unwrap();
+        if tick % 60 == 59 {
+            writer.look_after().unwrap();
+            writer.outlet.flush().unwrap();
+        }
+    }
+    disk.0.load(Ordering::Relaxed) as f64 / 1e6
+}
+
+#[test]
+fn a_reduced_log_takes_at_most_60_mb_a_minute() {
+    let (reduced, full) = (minute_mb(Some(Budget::default())), minute_mb(None));
+    println!("reduced {reduced:.1} MB, full {full:.1} MB a minute");
+    assert!((50.0..60.0).contains(&reduced), "{reduced} MB");
+    assert!(full > 280.0, "{full} MB");
+}
+
+#[test]
+fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings =
+        LogSettings { images: LoggedImages::Reduced, ..LogSettings::full(folder.path()) };
+    let log = FlightLog::open(&settings, None);
+    let path = log.path().unwrap().to_owned();
+    log.flight(&"avoid".into(), &[]);
+    let images = log.images(&Arc::default()).unwrap();
+    let mut large = image(1, ColorMode::Lossless).pieces;
+    large.push(vec![7; 2 << 20]);
+    for seq in 0..10 {
+        let image = LoggedImage { pieces: large.clone(), ..image(1, ColorMode::Lossless) };
+        images.observation(HostTime::from_ns(seq), seq, vec![seq as u8; 2000], vec![image]);
+    }
+    drop((log, images));
+    let found = recorded(&path);
+    assert!(matches!(&found[0], Recorded::Flight(values) if values["images"] == "reduced"));
+    let observations: Vec<&Observation> = found
+        .iter()
+        .filter_map(|recorded| match recorded {
+            Recorded::Observation(observation) => Some(observation),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(observations.len(), 10);
+    // The first spends more than the second that a log begins with.
+    assert_eq!(observations[0].images[0].bitstream, large.concat(), "bit by bit");
+    for (seq, observation) in observations.iter().enumerate() {
+        assert_eq!(observation.head, vec![seq as u8; 2000]);
+        assert_eq!(observation.images.is_empty(), seq > 0, "{seq}");
+    }
+    let (found, _) = messages(&path);
+    let status = found.iter().rfind(|message| &*message.topic == "/log").unwrap();
+    let status: serde_json::Value = serde_json::from_slice(&status.data).unwrap();
+    assert_eq!(status["left_out_images"], 9);
+}
+
+#[test]
+fn old_logs_are_deleted_when_a_flight_begins_and_people_hear_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    for hour in 10..20 {
+        let name = format!("2026-01-01T{hour}-00-00.000Z.mcap");
+        fs::write(folder.path().join(name), vec![0; 1000]).unwrap();
+    }
+    let retention = Retention { max_bytes: 5_500, max_age: None };
+    let settings = LogSettings { retention, ..LogSettings::full(folder.path()) };
+    let log = FlightLog::open(&settings, None);
+    let said = log.poll_trouble().unwrap();
+    assert!(said.contains("deleted the ") && said.contains("[log] keeps"), "{said}");
+    let left = fs::read_dir(folder.path()).unwrap().count();
+    assert!((5..=6).contains(&left), "{left} files, this flight's among them");
+    assert!(log.path().unwrap().exists());
 }
 
 /// A disk that fails once so much is on it.
@@ -225,7 +334,7 @@ impl Disk for Failing {
 #[test]
 fn a_full_disk_ends_the_log_and_says_so_and_images_go_round() {
     let (queue, records) = Queue::of(64);
-    let outlet = Outlet::new(Some(Failing(100_000)), None).unwrap();
+    let outlet = Outlet::new(Some(Failing(100_000)), None, None).unwrap();
     let home = Arc::new(Mailbox::default());
     // More than the disk holds, of which a chunk is made at once.
     let big = "x".repeat(5 << 20).into_bytes();
@@ -248,7 +357,7 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     let path = folder.path().join("log.mcap");
     let (queue, records) = Queue::of(64);
     let disk = RealFile::new(File::create(&path).unwrap()).unwrap();
-    let outlet = Outlet::new(Some(disk), None).unwrap();
+    let outlet = Outlet::new(Some(disk), None, None).unwrap();
     let mut writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(|| Some(1 << 20)));
     writer.look_after().unwrap();
     let trouble = queue.poll_trouble().unwrap();
@@ -298,7 +407,7 @@ proptest! {
         static LOG: std::sync::OnceLock<Vec<u8>> = std::sync::OnceLock::new();
         let mut bytes = LOG.get_or_init(|| {
             let folder = tempfile::tempdir().unwrap();
-            let log = FlightLog::open(folder.path(), None);
+            let log = FlightLog::open(&LogSettings::full(folder.path()), None);
             let path = log.path().unwrap().to_owned();
             let images = log.images(&Arc::default()).unwrap();
             images.observation(host_now(), 1, vec![0; 99], vec![image(1, ColorMode::Jpeg444)]);

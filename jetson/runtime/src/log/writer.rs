@@ -22,6 +22,7 @@ use vizflyt_rgbd::split_jpeg;
 use vizflyt_sdk::host_now;
 use zerocopy::IntoBytes;
 
+use super::budget::Budget;
 use super::channels::Channel;
 use super::file::{Disk, SafeFile};
 use super::live::Live;
@@ -49,11 +50,17 @@ pub(super) struct Outlet<D: Disk> {
     /// Bytes of messages since the last chunk.
     waiting: usize,
     written_bytes: u64,
+    /// What decides which images are written; all are without it.
+    budget: Option<Budget>,
 }
 
 impl<D: Disk> Outlet<D> {
     /// Begins a file, if there is one, with all fixed channels.
-    pub(super) fn new(disk: Option<D>, live: Option<Live>) -> McapResult<Self> {
+    pub(super) fn new(
+        disk: Option<D>,
+        live: Option<Live>,
+        budget: Option<Budget>,
+    ) -> McapResult<Self> {
         let file = disk.map(|disk| {
             WriteOptions::new()
                 .compression(None)
@@ -66,8 +73,9 @@ impl<D: Disk> Outlet<D> {
                 .create(SafeFile::new(disk))
         });
         let ids = BTreeMap::new();
+        let file = file.transpose()?;
         let mut outlet =
-            Self { file: file.transpose()?, live, ids, sequence: 0, waiting: 0, written_bytes: 0 };
+            Self { file, live, ids, sequence: 0, waiting: 0, written_bytes: 0, budget };
         for channel in Channel::FIXED {
             outlet.offer(channel, "")?;
         }
@@ -93,7 +101,32 @@ impl<D: Disk> Outlet<D> {
         Ok(())
     }
 
+    /// Shows a message to viewers, and writes it.
     fn put(
+        &mut self,
+        channel: Channel,
+        camera: &str,
+        at_ns: u64,
+        message: &[u8],
+    ) -> McapResult<()> {
+        self.show(channel, camera, at_ns, message)?;
+        let Some(file) = &mut self.file else { return Ok(()) };
+        if let Some(budget) = &mut self.budget {
+            budget.spend(message.len());
+        }
+        self.sequence = self.sequence.wrapping_add(1);
+        self.waiting += message.len();
+        let header = MessageHeader {
+            channel_id: self.ids[&channel],
+            sequence: self.sequence,
+            log_time: at_ns,
+            publish_time: at_ns,
+        };
+        file.write_to_known_channel(&header, message)
+    }
+
+    /// Shows a message to viewers alone.
+    fn show(
         &mut self,
         channel: Channel,
         camera: &str,
@@ -106,16 +139,7 @@ impl<D: Disk> Outlet<D> {
         if let Some(live) = &self.live {
             live.send(channel, at_ns, message);
         }
-        let Some(file) = &mut self.file else { return Ok(()) };
-        self.sequence = self.sequence.wrapping_add(1);
-        self.waiting += message.len();
-        let header = MessageHeader {
-            channel_id: self.ids[&channel],
-            sequence: self.sequence,
-            log_time: at_ns,
-            publish_time: at_ns,
-        };
-        file.write_to_known_channel(&header, message)
+        Ok(())
     }
 
     fn metadata(&mut self, values: BTreeMap<String, String>) -> McapResult<()> {
@@ -124,7 +148,7 @@ impl<D: Disk> Outlet<D> {
     }
 
     /// Completes the chunk.
-    fn flush(&mut self) -> McapResult<()> {
+    pub(super) fn flush(&mut self) -> McapResult<()> {
         self.written_bytes += std::mem::take(&mut self.waiting) as u64;
         self.file.as_mut().map_or(Ok(()), Writer::flush)
     }
@@ -150,12 +174,14 @@ pub(super) const FLIGHT: &str = "vizflyt.flight";
 
 /// What the thread keeps besides the outlet.
 pub(super) struct LogWriter<D: Disk> {
-    outlet: Outlet<D>,
+    pub(super) outlet: Outlet<D>,
     queue: Arc<Queue>,
     /// From this computer's clock to time since 1970. [ns]
     offset_ns: u64,
     free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
     images_fit: bool,
+    /// Observations whose images were left out.
+    left_out: u64,
     /// What has been said of drops.
     told: Dropped,
     calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
@@ -178,6 +204,7 @@ impl<D: Disk> LogWriter<D> {
             offset_ns: wall_ns.wrapping_sub(host_now().as_ns()),
             free_bytes,
             images_fit: true,
+            left_out: 0,
             told: Dropped::default(),
             calibrations: BTreeMap::new(),
             rest: Vec::new(),
@@ -264,7 +291,8 @@ impl<D: Disk> LogWriter<D> {
         let Dropped { images, records } = self.queue.dropped();
         let status = json!({
             "written_bytes": self.outlet.written_bytes, "dropped_images": images,
-            "dropped_records": records, "free_bytes": (self.free_bytes)(), "text": text
+            "dropped_records": records, "left_out_images": self.left_out,
+            "free_bytes": (self.free_bytes)(), "text": text
         });
         let at_ns = self.wall_ns(host_now());
         self.outlet.put(Channel::Log, "", at_ns, status.to_string().as_bytes())
@@ -274,7 +302,7 @@ impl<D: Disk> LogWriter<D> {
         at.as_ns().wrapping_add(self.offset_ns)
     }
 
-    fn take(&mut self, record: Record) -> McapResult<()> {
+    pub(super) fn take(&mut self, record: Record) -> McapResult<()> {
         match record {
             Record::Json { channel, at, json } => {
                 self.outlet.put(channel, "", self.wall_ns(at), &json)
@@ -305,7 +333,9 @@ impl<D: Disk> LogWriter<D> {
             }
             Record::Flight(values) => {
                 let own = |(name, value): (&str, String)| (name.to_owned(), value);
-                self.outlet.metadata(values.into_iter().map(own).collect())
+                let images = if self.outlet.budget.is_some() { "reduced" } else { "full" };
+                let values = values.into_iter().chain([("images", images.to_owned())]);
+                self.outlet.metadata(values.map(own).collect())
             }
             Record::End => Ok(()),
         }
@@ -334,9 +364,16 @@ impl<D: Disk> LogWriter<D> {
 
     fn observation(&mut self, record: &ObservationRecord) -> McapResult<()> {
         let at_ns = self.wall_ns(record.at);
-        let mut images = Vec::with_capacity(record.images.len());
-        for image in &record.images {
-            images.push(self.image(at_ns, image)?);
+        let is_kept =
+            self.outlet.budget.as_mut().is_none_or(|budget| budget.allows_image(record.at));
+        let mut images = Vec::new();
+        if is_kept {
+            for image in &record.images {
+                images.push(self.image(at_ns, image)?);
+            }
+        } else {
+            self.left_out += 1;
+            self.show_images(at_ns, &record.images)?;
         }
         let observation = Observation {
             seq: record.seq,
@@ -348,25 +385,33 @@ impl<D: Disk> LogWriter<D> {
         self.outlet.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
     }
 
+    /// Shows images that are not written to viewers.
+    fn show_images(&mut self, at_ns: u64, images: &[LoggedImage]) -> McapResult<()> {
+        if self.outlet.live.is_none() {
+            return Ok(());
+        }
+        for image in images {
+            self.calibration(at_ns, image)?;
+            if let Some(color) = self.color(image) {
+                let channel = Channel::Color(image.camera as u8);
+                self.outlet.show(channel, &image.name, at_ns, &color)?;
+            }
+        }
+        Ok(())
+    }
+
     /// Writes an image's colour and calibration; returns what is left of it.
     fn image(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<ObservedImage> {
         self.calibration(at_ns, image)?;
-        let mut jpeg = Vec::with_capacity(image.pieces.iter().map(Vec::len).sum());
-        self.rest.clear();
-        let pieces = image.pieces.iter().map(Vec::as_slice);
-        let is_color_apart = split_jpeg(pieces, &mut jpeg, &mut self.rest);
-        let bitstream = if is_color_apart {
-            let color = fox::CompressedImage {
-                timestamp: Some(timestamp(self.wall_ns(image.pose))),
-                frame_id: image.name.clone(),
-                data: jpeg.into(),
-                format: "jpeg".into(),
-            };
-            let channel = Channel::Color(image.camera as u8);
-            self.outlet.put(channel, &image.name, at_ns, &color.encode_to_vec())?;
-            self.rest.clone()
-        } else {
-            image.pieces.concat()
+        let color = self.color(image);
+        let is_color_apart = color.is_some();
+        let bitstream = match color {
+            Some(color) => {
+                let channel = Channel::Color(image.camera as u8);
+                self.outlet.put(channel, &image.name, at_ns, &color)?;
+                self.rest.clone()
+            }
+            None => image.pieces.concat(),
         };
         Ok(ObservedImage {
             camera: image.camera as u32,
@@ -376,6 +421,24 @@ impl<D: Disk> LogWriter<D> {
             bitstream,
             is_color_apart,
         })
+    }
+
+    /// Returns an image's colour as viewers open it, and leaves what else it holds in `rest`; `None`
+    /// if its colour is no JPEG.
+    fn color(&mut self, image: &LoggedImage) -> Option<Vec<u8>> {
+        let mut jpeg = Vec::with_capacity(image.pieces.iter().map(Vec::len).sum());
+        self.rest.clear();
+        let pieces = image.pieces.iter().map(Vec::as_slice);
+        if !split_jpeg(pieces, &mut jpeg, &mut self.rest) {
+            return None;
+        }
+        let color = fox::CompressedImage {
+            timestamp: Some(timestamp(self.wall_ns(image.pose))),
+            frame_id: image.name.clone(),
+            data: jpeg.into(),
+            format: "jpeg".into(),
+        };
+        Some(color.encode_to_vec())
     }
 
     /// Tells how a camera's images are drawn, when that has changed and now and then.

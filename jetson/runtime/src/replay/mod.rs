@@ -9,7 +9,8 @@
 //! ```
 //! The plugin sees what it saw in flight, bit by bit: the same bytes are decoded by the same code
 //! into the same layout, and the observation's head (vehicle, stamps, numbers) is the recorded one.
-//! In lock-step nothing depends on how fast this computer is, so a deterministic plugin answers
+//! A reduced log holds the images of some observations only: those are fed, bit by bit, and the report
+//! counts the others. In lock-step nothing depends on how fast this computer is, so a deterministic plugin answers
 //! the same every time. Nothing is flown: there is no link here.
 
 mod compare;
@@ -108,6 +109,8 @@ pub struct Differs {
 pub struct ReplayReport {
     /// Observations in the log.
     pub images_logged: u64,
+    /// Those whose images are not in it, as it is a reduced log.
+    pub images_left_out: u64,
     /// Those that the plugin got.
     pub images_fed: u64,
     /// Those that the plugin answered in flight, but whose images the log lacks: dropped, or
@@ -171,6 +174,7 @@ pub fn replay(
     let started = Instant::now();
     let mut report = ReplayReport {
         images_logged: plan.observations,
+        images_left_out: plan.without_images,
         log_is_cut: plan.is_cut,
         ..ReplayReport::default()
     };
@@ -198,6 +202,10 @@ fn run(
         let Feed::After(time, answer) = plan.feed(observation.seq, published, options.all) else {
             continue;
         };
+        if observation.images.is_empty() {
+            // Left out of a reduced log, as the report says.
+            continue;
+        }
         while let Some((_, message)) = plan.messages.pop_front_if(|(sent, _)| *sent < time) {
             if let Err(why) = feeder.send(&message, line)? {
                 return Ok(Some(why));

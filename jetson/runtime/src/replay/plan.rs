@@ -41,6 +41,8 @@ pub struct Plan {
     pub flown: Option<FlownPlugin>,
     /// Observations in the log.
     pub observations: u64,
+    /// Those of them whose images a reduced log left out.
+    pub without_images: u64,
     /// Whether the log ends early.
     pub is_cut: bool,
     /// Messages to the plugin, and when they were sent. [host]
@@ -84,12 +86,13 @@ impl Plan {
                 Recorded::Observation(observation) => {
                     same_protocol(observation.protocol, program.as_deref())?;
                     plan.observations += 1;
+                    plan.without_images += u64::from(observation.images.is_empty());
                 }
                 Recorded::Broken(_) => plan.observations += 1,
             }
         }
         plan.is_cut = flight.is_cut();
-        if plan.observations == 0 {
+        if plan.observations == plan.without_images {
             return Err(ReplayError::NoImages);
         }
         if !plan.messages.iter().any(|(_, message)| matches!(message, ToPlugin::Start(_))) {

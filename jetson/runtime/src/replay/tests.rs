@@ -17,7 +17,7 @@ use vizflyt_sdk::{CameraInfo, ImageStamps, ObservationBuffer};
 use prost::Message as _;
 
 use super::*;
-use crate::log::{FlightLog, LoggedImage, PluginMessage, observation_head};
+use crate::log::{FlightLog, LogSettings, LoggedImage, PluginMessage, observation_head};
 
 fn camera() -> CameraInfo {
     CameraInfo {
@@ -40,7 +40,7 @@ struct Flight {
 impl Flight {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        Self { log: FlightLog::open(folder.path(), None), folder }
+        Self { log: FlightLog::open(&LogSettings::full(folder.path()), None), folder }
     }
 
     fn start(&self, ms: u64) {
@@ -86,6 +86,14 @@ impl Flight {
         };
         let images = self.log.images(&Arc::default()).unwrap();
         images.observation(at(ms), seq, observation_head(buffer.as_bytes()).to_vec(), vec![image]);
+    }
+
+    /// An image as a reduced log has it that left it out.
+    fn left_out(&self, seq: u64, ms: u64) {
+        let mut buffer = ObservationBuffer::new(&[camera()]);
+        buffer.clear(seq);
+        let images = self.log.images(&Arc::default()).unwrap();
+        images.observation(at(ms), seq, observation_head(buffer.as_bytes()).to_vec(), vec![]);
     }
 
     fn answer(&self, seq: u64, ms: u64, setpoint: Option<Setpoint>) {
@@ -299,6 +307,34 @@ fn the_same_plugin_answers_the_same_and_another_one_differs() {
     let (report, _) = replay_to(&path, misbehave("hover"), "three");
     assert_eq!((report.compared, report.differ), (28, 28));
     assert_eq!(report.largest.unwrap().difference.amount, f64::INFINITY);
+}
+
+#[test]
+fn of_a_reduced_log_the_images_that_it_holds_are_replayed() {
+    let flight = Flight::new();
+    flight.start(5);
+    flight.event(6);
+    for seq in 1..=40 {
+        if seq % 4 == 1 {
+            flight.image(seq, 10 * seq);
+        } else {
+            flight.left_out(seq, 10 * seq);
+        }
+        flight.answer(seq, 10 * seq + 2, Some(forward(0.5)));
+    }
+    let (path, _folder) = flight.close();
+    assert_eq!(plan(&path).unwrap().without_images, 30);
+    let (report, lines) = replay_to(&path, misbehave("forward"), "reduced");
+    assert_eq!(report.plugin_failed, None, "{lines:?}");
+    assert_eq!((report.images_logged, report.images_left_out), (40, 30));
+    assert_eq!((report.images_fed, report.compared, report.differ), (10, 10, 0));
+    assert_eq!(report.images_missing, 0, "left out is not missing");
+    // All left out is as good as none.
+    let flight = Flight::new();
+    flight.start(5);
+    flight.left_out(1, 10);
+    let (path, _folder) = flight.close();
+    assert!(plan(&path).unwrap_err().to_string().contains("no images"));
 }
 
 #[test]

@@ -250,7 +250,7 @@ impl Lab {
         args.push(format!("--vehicle={name}"));
         args.push(format!("--config={}", config.display()));
         args.push(format!("--report={}", at("report").display()));
-        args.push(format!("--log={}", at("log").display()));
+        args.push(format!("--log-dir={}", at("log").display()));
         args.extend(more.iter().map(|&text| text.to_owned()));
         args.push(plugin.to_str().unwrap().to_owned());
         args.extend(["--".to_owned(), how.to_owned()]);

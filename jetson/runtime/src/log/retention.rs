@@ -1,0 +1,194 @@
+//! How long flight logs are kept: the oldest are deleted, when a flight begins, until the rest is
+//! within a size and an age.
+//!
+//! Only files that carry the name of a log are looked at (`2026-11-21T04-09-21.123Z.mcap`): a flight
+//! that is to stay gets another name. A log that is being written is locked, and stays.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+/// How long flight logs are kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Retention {
+    /// Size of all of them together. [bytes]
+    pub max_bytes: u64,
+    /// Age since the flight's end; `None` for any.
+    pub max_age: Option<Duration>,
+}
+
+impl Retention {
+    /// Every log is kept.
+    pub const FOREVER: Self = Self { max_bytes: u64::MAX, max_age: None };
+}
+
+/// What was deleted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Deleted {
+    pub(super) logs: u64,
+    pub(super) bytes: u64,
+}
+
+impl Deleted {
+    /// Returns a sentence for people; `None` if nothing was deleted.
+    pub(super) fn sentence(self, retention: Retention) -> Option<String> {
+        let Self { logs, bytes } = self;
+        if logs == 0 {
+            return None;
+        }
+        let age =
+            retention.max_age.map(|age| format!(" and {:.0} days", age.as_secs_f64() / DAY_S));
+        Some(format!(
+            "deleted the {logs} oldest flight logs, {:.1} GB: [log] keeps {:.1} GB{}",
+            bytes as f64 / 1e9,
+            retention.max_bytes as f64 / 1e9,
+            age.unwrap_or_default()
+        ))
+    }
+}
+
+/// [s]
+const DAY_S: f64 = 86_400.0;
+
+/// A log on disk.
+struct Log {
+    path: PathBuf,
+    bytes: u64,
+    ended: SystemTime,
+}
+
+/// Deletes the oldest logs of `folder` beyond `retention`.
+///
+/// # Errors
+/// If the folder cannot be listed. A log that cannot be deleted is left.
+pub(super) fn delete_old(
+    folder: &Path,
+    retention: Retention,
+    now: SystemTime,
+) -> io::Result<Deleted> {
+    let mut logs = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        let is_log = path.file_name().and_then(|name| name.to_str()).is_some_and(is_log_name);
+        let metadata = path.symlink_metadata().ok().filter(fs::Metadata::is_file);
+        if let (true, Some(metadata)) = (is_log, metadata) {
+            logs.push(Log { path, bytes: metadata.len(), ended: metadata.modified()? });
+        }
+    }
+    // Their names sort by time.
+    logs.sort_by(|a, b| a.path.cmp(&b.path));
+    let mut total: u64 = logs.iter().map(|log| log.bytes).sum();
+    let mut deleted = Deleted::default();
+    for log in logs {
+        let age = now.duration_since(log.ended).unwrap_or_default();
+        let is_old = retention.max_age.is_some_and(|max_age| age > max_age);
+        if (is_old || total > retention.max_bytes) && delete_unless_in_use(&log.path) {
+            total -= log.bytes;
+            deleted.logs += 1;
+            deleted.bytes += log.bytes;
+        }
+    }
+    Ok(deleted)
+}
+
+/// Whether it was deleted.
+fn delete_unless_in_use(path: &Path) -> bool {
+    let is_free = File::open(path).is_ok_and(|file| file.try_lock().is_ok());
+    is_free && fs::remove_file(path).is_ok()
+}
+
+/// Whether a file of this name is a log that has not been renamed.
+fn is_log_name(name: &str) -> bool {
+    const SHAPE: &[u8] = b"0000-00-00T00-00-00.000Z.mcap";
+    name.len() == SHAPE.len()
+        && name.bytes().zip(SHAPE).all(|(byte, shape)| match shape {
+            b'0' => byte.is_ascii_digit(),
+            other => byte == *other,
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(hour: u32) -> String {
+        format!("2026-11-21T{hour:02}-00-00.000Z.mcap")
+    }
+
+    /// A folder of logs of 1000 bytes that ended at these hours.
+    fn folder(hours: std::ops::Range<u32>) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for hour in hours {
+            let path = folder.path().join(name(hour));
+            fs::write(&path, [0; 1000]).unwrap();
+            File::open(path).unwrap().set_modified(at(hour)).unwrap();
+        }
+        folder
+    }
+
+    fn at(hour: u32) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_hours(500_000 + u64::from(hour))
+    }
+
+    fn left(folder: &tempfile::TempDir) -> Vec<String> {
+        let entries = fs::read_dir(folder.path()).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn the_oldest_go_until_the_rest_fits() {
+        let folder = folder(0..6);
+        let retention = Retention { max_bytes: 3500, max_age: None };
+        let deleted = delete_old(folder.path(), retention, at(6)).unwrap();
+        assert_eq!(deleted, Deleted { logs: 3, bytes: 3000 });
+        assert_eq!(left(&folder), [name(3), name(4), name(5)]);
+        let sentence = deleted.sentence(retention).unwrap();
+        assert!(sentence.contains("the 3 oldest flight logs"), "{sentence}");
+        let again = delete_old(folder.path(), retention, at(6)).unwrap();
+        assert_eq!((again, again.sentence(retention)), (Deleted::default(), None));
+    }
+
+    #[test]
+    fn what_is_too_old_goes_whatever_its_size() {
+        let folder = folder(0..6);
+        let retention = Retention { max_age: Some(Duration::from_hours(3)), ..Retention::FOREVER };
+        assert_eq!(delete_old(folder.path(), retention, at(6)).unwrap().logs, 3);
+        assert_eq!(left(&folder), [name(3), name(4), name(5)]);
+        // A clock that stands before the logs makes none old.
+        assert_eq!(delete_old(folder.path(), retention, at(0)).unwrap().logs, 0);
+    }
+
+    #[test]
+    fn only_logs_that_nobody_writes_or_renamed_are_deleted() {
+        let folder = folder(0..2);
+        let kept = ["the best.mcap", "2026-11-21T04-09-21.123Z.answers.jsonl", "notes.txt"];
+        for name in kept {
+            fs::write(folder.path().join(name), [0; 9000]).unwrap();
+        }
+        fs::create_dir(folder.path().join(name(7))).unwrap();
+        std::os::unix::fs::symlink("/etc/hostname", folder.path().join(name(8))).unwrap();
+        let open = File::open(folder.path().join(name(0))).unwrap();
+        open.lock().unwrap();
+        let nothing = Retention { max_bytes: 0, max_age: Some(Duration::ZERO) };
+        let deleted = delete_old(folder.path(), nothing, at(9)).unwrap();
+        assert_eq!(deleted, Deleted { logs: 1, bytes: 1000 });
+        assert_eq!(left(&folder).len(), kept.len() + 3);
+        assert!(folder.path().join(name(0)).exists(), "it is being written");
+        assert!(delete_old(Path::new("/no/such/folder"), nothing, at(0)).is_err());
+    }
+
+    #[test]
+    fn names_of_logs_are_told_from_others() {
+        assert!(is_log_name(&name(3)));
+        assert!(is_log_name(&format!("{}.mcap", super::super::utc_name(SystemTime::now()))));
+        for other in
+            ["", "a.mcap", "2026-11-21T04-09-21.123Z.mcap2", "2026-11-21T04:09:21.123Z.mcap"]
+        {
+            assert!(!is_log_name(other), "{other}");
+        }
+    }
+}
