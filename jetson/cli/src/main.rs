@@ -35,8 +35,9 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
+use vizflyt_server::settings;
 
 /// A drone flies in an empty net while its cameras see a photorealistic world.
 #[derive(Parser, Debug)]
@@ -99,7 +100,14 @@ enum Command {
 
 fn main() -> ExitCode {
     quiet_mesa();
-    let cli = Cli::parse();
+    let cli = match command_line() {
+        Ok(Some(cli)) => cli,
+        Ok(None) => return ExitCode::SUCCESS,
+        Err(error) => {
+            terminal::tell_error(format_args!("error: {error:#}"));
+            return ExitCode::from(2);
+        }
+    };
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
         // These tell their own story; logs would drown it.
         Command::Demo(_) | Command::Fly(_) | Command::Replay(_) | Command::Grade(_) => {
@@ -120,6 +128,23 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Reads the command line, with what the file of `serve --config` adds; `None` if the settings were
+/// only to be printed.
+fn command_line() -> Result<Option<Cli>> {
+    let mut matches = Cli::command().get_matches();
+    if let Some(("serve", serve)) = matches.subcommand() {
+        let line = settings::with_file(std::env::args_os().collect(), serve)?;
+        matches = Cli::command().get_matches_from(line);
+    }
+    if let Some(("serve", serve)) = matches.subcommand()
+        && serve.get_flag("print_config")
+    {
+        terminal::tell(settings::to_toml(serve).trim_end());
+        return Ok(None);
+    }
+    Ok(Some(Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())))
 }
 
 fn run(command: Command, log_level: &str) -> Result<ExitCode> {

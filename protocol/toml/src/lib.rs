@@ -44,6 +44,23 @@ impl fmt::Display for TomlErrors {
 
 impl std::error::Error for TomlErrors {}
 
+impl TomlErrors {
+    /// Returns them in the text's order, each once.
+    pub fn in_order(mut errors: Vec<TomlError>) -> Self {
+        errors.sort_by_key(|error| (error.line, error.column));
+        errors.dedup();
+        Self(errors)
+    }
+}
+
+/// Returns an error at this byte of a text.
+pub fn error_at(text: &str, at: usize, what: String) -> TomlError {
+    let before = text.get(..at).unwrap_or(text);
+    let start_of_line = before.rfind('\n').map_or(0, |newline| newline + 1);
+    let line = before.matches('\n').count() + 1;
+    TomlError { line, column: before[start_of_line..].chars().count() + 1, what }
+}
+
 /// Returns `text` as a `T`, which is to carry `serde(deny_unknown_fields)` throughout.
 ///
 /// # Errors
@@ -53,7 +70,7 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
     let mut errors: Vec<_> = syntax.iter().map(|error| describe(text, error, None)).collect();
     if !errors.is_empty() {
         errors.truncate(MAX_ERRORS);
-        return Err(in_order(errors));
+        return Err(TomlErrors::in_order(errors));
     }
     let mut removed = BTreeSet::new();
     loop {
@@ -73,13 +90,7 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
             _ => break,
         };
     }
-    Err(in_order(errors))
-}
-
-fn in_order(mut errors: Vec<TomlError>) -> TomlErrors {
-    errors.sort_by_key(|error| (error.line, error.column));
-    errors.dedup();
-    TomlErrors(errors)
+    Err(TomlErrors::in_order(errors))
 }
 
 /// Takes the innermost entry that the span lies in out of a table, and returns its key.
@@ -131,19 +142,13 @@ fn remove_in_array(name: &str, array: &mut DeArray<'_>, span: &Range<usize>) -> 
 }
 
 fn describe(text: &str, error: &Error, key: Option<&str>) -> TomlError {
-    let before = text.get(..error.span().map_or(0, |span| span.start)).unwrap_or(text);
-    let start_of_line = before.rfind('\n').map_or(0, |newline| newline + 1);
     let what = unknown_key(error.message()).unwrap_or_else(|| {
         let message = error.message().trim().replace('\n', "; ");
         // One that is missing is named already, and the entry is only where it belongs.
         let key = key.filter(|_| missing_key(error).is_none());
         key.map_or_else(|| message.clone(), |key| format!("{key}: {message}"))
     });
-    TomlError {
-        line: before.matches('\n').count() + 1,
-        column: before[start_of_line..].chars().count() + 1,
-        what,
-    }
+    error_at(text, error.span().map_or(0, |span| span.start), what)
 }
 
 /// Returns the key that an error calls missing, in serde's wording.

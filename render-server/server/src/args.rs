@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{Args, ValueHint};
 use vizflyt_protocol::messages::Grant;
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
@@ -22,7 +22,16 @@ use crate::web::Login;
 #[derive(Args, Clone, Debug)]
 pub struct ServeArgs {
     /// arena.toml, its folder, or a bare scene file, for which an arena is made up
+    #[arg(required_unless_present_any = ["config", "print_config"])]
     pub arena: PathBuf,
+
+    /// A file that says what these flags say: each is a key of its name, with `_` for `-`; flags go before it
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+
+    /// Print the settings in effect as such a file, and end
+    #[arg(long)]
+    pub print_config: bool,
 
     /// Folder of scenes, each a folder with an arena.toml, among which the instructor chooses on the page
     #[arg(long, value_name = "DIR")]
@@ -120,7 +129,7 @@ pub struct ServeArgs {
 
     /// Where flights are written down: a file, postgres://USER:PASSWORD@HOST/NAME, or none
     /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite]
-    #[arg(long, value_name = "FILE|URL|none", value_parser = kept)]
+    #[arg(long, value_name = "FILE|URL|none", value_parser = kept, value_hint = ValueHint::FilePath)]
     pub leaderboard: Option<Kept>,
 
     /// A team's official runs on a course, at most; further ones are practice [default: as many as it likes]

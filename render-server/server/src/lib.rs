@@ -27,6 +27,7 @@ mod rate_limit;
 pub mod render;
 pub mod scene;
 mod serve;
+pub mod settings;
 pub mod stop;
 pub mod stream;
 pub mod timing;

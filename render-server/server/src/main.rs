@@ -1,9 +1,10 @@
 //! `vizflyt-server`: the render server alone, without the rest of `vizflyt`.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 
-use clap::Parser;
+use clap::{CommandFactory, FromArgMatches, Parser};
 use tracing_subscriber::EnvFilter;
+use vizflyt_server::settings;
 
 #[derive(Parser)]
 #[command(version, about)]
@@ -21,5 +22,13 @@ fn main() -> anyhow::Result<()> {
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
-    vizflyt_server::serve(Cli::parse().serve)
+    let matches = Cli::command().get_matches();
+    let line = settings::with_file(std::env::args_os().collect(), &matches)?;
+    let matches = Cli::command().get_matches_from(line);
+    if matches.get_flag("print_config") {
+        // A reader that has gone needs no more of it.
+        let _ = std::io::stdout().write_all(settings::to_toml(&matches).as_bytes());
+        return Ok(());
+    }
+    vizflyt_server::serve(Cli::from_arg_matches(&matches)?.serve)
 }
