@@ -21,6 +21,8 @@ use crate::world::{World, lock};
 pub(crate) struct Case {
     pub(crate) name: String,
     pub(crate) congestion: Congestion,
+    /// The runtime's address.
+    host: &'static str,
     /// The same both ways.
     pub(crate) path: Impairment,
     pub(crate) script: Script,
@@ -97,7 +99,7 @@ impl Case {
         let serve = || Server::start(&network, &keys, self.congestion, &self.source, &notes);
         let fly = |address: &str| Runtime::start(&network, &keys, address.parse().unwrap(), &notes);
         let mut server = serve();
-        let mut runtime = fly("10.0.0.2:5000");
+        let mut runtime = fly(&format!("{}:5000", self.host));
         sleep_until(start + FAULT).await;
         match self.script {
             Script::Nothing | Script::Blackout => {}
@@ -108,7 +110,7 @@ impl Case {
         sleep_until(start + back).await;
         match self.script {
             Script::ServerRestart => server = serve(),
-            Script::RuntimeRestart => runtime = fly("10.0.0.2:5100"),
+            Script::RuntimeRestart => runtime = fly(&format!("{}:5100", self.host)),
             Script::Nothing | Script::Blackout | Script::Move => {}
         }
         sleep_until(start + LASTS).await;
@@ -267,28 +269,36 @@ fn ms(ms: u64) -> Duration {
     Duration::from_millis(ms)
 }
 
+/// An address of the lab's own network, and a public one (TEST-NET-3, RFC 5737).
+const NEAR: &str = "10.0.0.2";
+const PUBLIC: &str = "203.0.113.2";
+
 /// Returns all cases.
 pub(crate) fn cases() -> Vec<Case> {
-    use Congestion::{Bbr, Cubic, Lan};
+    use Congestion::{Auto, Bbr, Cubic, Lan};
     let near = || Impairment { delay: ms(1), ..Impairment::default() };
     let source = Source::vga();
     let mut all = Vec::new();
     let mut add = |name: &str, congestion, path: Impairment, script| {
         let name = format!("{name}, {}", format!("{congestion:?}").to_lowercase());
-        all.push(Case { name, congestion, path, script, source: source.clone() });
+        let host = if congestion == Auto { PUBLIC } else { NEAR };
+        all.push(Case { name, congestion, host, path, script, source: source.clone() });
     };
     add("cable", Lan, Impairment::default(), Script::Nothing);
     for loss in [0, 1, 5, 10, 20] {
-        let path = Impairment { loss: f64::from(loss) / 100.0, ..near() };
-        add(&format!("1 ms, {loss} % lost"), Lan, path, Script::Nothing);
+        for congestion in [Lan, Cubic, Bbr] {
+            let path = Impairment { loss: f64::from(loss) / 100.0, ..near() };
+            add(&format!("1 ms, {loss} % lost"), congestion, path, Script::Nothing);
+        }
     }
     for delay in [5, 20, 50] {
         let path = Impairment { delay: ms(delay), ..near() };
         add(&format!("{delay} ms"), Lan, path, Script::Nothing);
     }
-    for congestion in [Lan, Cubic, Bbr] {
+    for congestion in [Lan, Cubic, Bbr, Auto] {
         let path = Impairment { delay: ms(20), loss: 0.01, ..near() };
-        add("20 ms, 1 % lost", congestion, path, Script::Nothing);
+        let what = if congestion == Auto { "20 ms, 1 % lost, public" } else { "20 ms, 1 % lost" };
+        add(what, congestion, path, Script::Nothing);
     }
     let path = Impairment { delay: ms(5), jitter: ms(10), ..near() };
     add("5 ms, jitter 10 ms", Lan, path, Script::Nothing);
@@ -333,7 +343,7 @@ pub(crate) fn cases() -> Vec<Case> {
         let path = Impairment { bandwidth_bps: mbit * 1_000_000, queue: 256 << 10, ..near() };
         let source = Source { adapt, ..source.clone() };
         let (name, script) = (format!("{what}, lan"), Script::Nothing);
-        all.push(Case { name, congestion: Lan, path, script, source });
+        all.push(Case { name, congestion: Lan, host: NEAR, path, script, source });
     }
     all
 }

@@ -47,7 +47,7 @@ use crate::stream::rate_control::is_near;
 /// Who decides how fast to send.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Congestion {
-    /// `lan` to private and loopback addresses, `cubic` to all others.
+    /// `lan` to private and loopback addresses, `bbr` to all others.
     #[default]
     Auto,
     /// A constant window that ignores loss; for a cable of our own.
@@ -63,7 +63,7 @@ impl Congestion {
     fn toward(self, address: IpAddr) -> Self {
         match self {
             Self::Auto if is_near(address) => Self::Lan,
-            Self::Auto => Self::Cubic,
+            Self::Auto => Self::Bbr,
             chosen => chosen,
         }
     }
@@ -318,7 +318,7 @@ mod tests {
         check("192.168.10.7", Congestion::Lan);
         check("::ffff:10.0.0.1", Congestion::Lan);
         check("fe80::1", Congestion::Lan);
-        check("8.8.8.8", Congestion::Cubic);
+        check("8.8.8.8", Congestion::Bbr);
         check("2001:db8::1", Congestion::Cubic);
         assert_eq!(Congestion::Bbr.toward("127.0.0.1".parse().unwrap()), Congestion::Bbr);
     }
