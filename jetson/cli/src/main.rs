@@ -36,7 +36,8 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::prelude::*;
 use vizflyt_server::settings;
 
 /// A drone flies in an empty net while its cameras see a photorealistic world.
@@ -185,14 +186,12 @@ fn quiet_mesa() {
 
 /// Sends logs to standard error; standard output is for results.
 fn start_log(filter: &str) -> Result<()> {
-    let filter = EnvFilter::builder().parse(filter)?;
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let printed = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         // No colours into files and pipes.
         .with_ansi(std::io::stderr().is_terminal())
         // Told on standard error itself, which may be what is gone.
-        .log_internal_errors(false)
-        .init();
+        .log_internal_errors(false);
+    tracing_subscriber::registry().with(printed).with(filter.parse::<Targets>()?).init();
     Ok(())
 }

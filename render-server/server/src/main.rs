@@ -3,7 +3,6 @@
 use std::io::{IsTerminal, Write};
 
 use clap::{CommandFactory, FromArgMatches, Parser};
-use tracing_subscriber::EnvFilter;
 use vizflyt_server::settings;
 
 #[derive(Parser)]
@@ -14,11 +13,7 @@ struct Cli {
 }
 
 fn main() -> anyhow::Result<()> {
-    let filter = EnvFilter::builder()
-        .with_default_directive(tracing::level_filters::LevelFilter::INFO.into())
-        .from_env_lossy();
     tracing_subscriber::fmt()
-        .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .init();

@@ -59,6 +59,21 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-e2e", &[]),
     // For tests alone: dev-dependencies are no arrows.
     ("vizflyt-fixtures", &[]),
+    (
+        "vizflyt-fuzz",
+        &[
+            "vizflyt-protocol",
+            "vizflyt-rgbd",
+            "vizflyt-trust",
+            "vizflyt-splat",
+            "vizflyt-arena",
+            "vizflyt-server",
+            "vizflyt-runtime",
+            "vizflyt-simulator",
+            "vizflyt-bridge",
+            "vizflyt-tags",
+        ],
+    ),
 ];
 
 #[test]

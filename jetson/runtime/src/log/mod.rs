@@ -15,6 +15,10 @@
 mod budget;
 mod channels;
 mod file;
+#[cfg(feature = "foxglove")]
+mod live;
+#[cfg(not(feature = "foxglove"))]
+#[path = "live_absent.rs"]
 mod live;
 mod messages;
 mod queue;

@@ -23,6 +23,12 @@ pub enum LeaderboardError {
     /// It cannot be opened.
     #[error("cannot open the leaderboard {0}: {1}; give another with --leaderboard")]
     Open(Database, sqlx::Error),
+    /// It is on a server that this program cannot speak to.
+    #[error(
+        "this program was built without PostgreSQL, where the leaderboard {0} is; build it with \
+         `cargo build --release --features postgres`"
+    )]
+    NoPostgres(Database),
     /// Its tables are of a later version, or another program's.
     #[error("cannot use the leaderboard {0}: {1}; was it made by a later version of this program?")]
     Migrate(Database, sqlx::migrate::MigrateError),
@@ -72,6 +78,9 @@ impl Leaderboard {
     /// # Errors
     /// A file or server that cannot be used.
     pub async fn open(database: &Database) -> Result<Self, LeaderboardError> {
+        if matches!(database, Database::Postgres(_)) && !cfg!(feature = "postgres") {
+            return Err(LeaderboardError::NoPostgres(database.clone()));
+        }
         sqlx::any::install_default_drivers();
         if let Database::File(path) = database
             && let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty())

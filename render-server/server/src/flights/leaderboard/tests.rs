@@ -162,6 +162,14 @@ async fn a_postgres_server_keeps_them_alike() {
     behaves(&board).await;
 }
 
+#[cfg(not(feature = "postgres"))]
+#[tokio::test]
+async fn a_program_without_postgres_says_how_to_build_one() {
+    let database = "postgres://me:secret@db.example/runs".parse().unwrap();
+    let error = Leaderboard::open(&database).await.unwrap_err().to_string();
+    assert!(error.contains("--features postgres") && !error.contains("secret"), "{error}");
+}
+
 #[tokio::test]
 async fn two_programs_share_a_file() {
     let (_folder, board) = file().await;
