@@ -269,6 +269,22 @@ fn is_understood(rig: &Rig, called: &str) -> bool {
     String::from_utf8_lossy(&output.stderr).contains("there is no project 'p9'")
 }
 
+/// The example plugin's acceptance: at least 18 of 20 generated forests are flown without touching the true
+/// geometry, at 2 m/s or more on the mean.
+#[test]
+fn the_example_flies_twenty_forests() {
+    let grade = Rig::new().grade(&["avoid", "--project=forest", "--seeds=20", "--json"]);
+    let runs = grade["runs"].as_array().unwrap();
+    assert_eq!(runs.len(), 20);
+    let touched = |run: &Value| run["min_clearance_m"].as_f64().unwrap() <= 0.0;
+    let (finished, failed): (Vec<_>, Vec<_>) =
+        runs.iter().partition(|run| run["outcome"] == "finished" && !touched(run));
+    assert!(failed.len() <= 2, "{failed:#?}");
+    let speeds = finished.iter().map(|run| run["mean_speed_mps"].as_f64().unwrap());
+    let mean_mps = speeds.sum::<f64>() / finished.len() as f64;
+    assert!(mean_mps >= 2.0, "mean speed {mean_mps:.2} m/s");
+}
+
 #[test]
 fn the_array_script_of_the_guide_flies_its_part() {
     let rig = Rig::new();
