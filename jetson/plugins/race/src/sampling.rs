@@ -106,7 +106,8 @@ impl PixelGrid {
         if view.rgb.len() < 3 * width * height || view.depth_mm.len() < width * height {
             (self.columns, self.rows) = (0, 0);
         }
-        self.camera = Some(SampleCamera { intrinsics: k, stride, home_from_cam: view.home_from_cam });
+        self.camera =
+            Some(SampleCamera { intrinsics: k, stride, home_from_cam: view.home_from_cam });
         self.lay_out(k, stride);
         for row in 0..self.rows {
             for column in 0..self.columns {

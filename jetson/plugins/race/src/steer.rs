@@ -2,7 +2,7 @@
 
 use vizflyt_sdk::glam::DVec3;
 
-use crate::planar_obstacle::{Opening, Plane, PlanarObstacle};
+use crate::planar_obstacle::{Opening, PlanarObstacle, Plane};
 
 /// How far it is to an obstacle and how far off the line through its opening.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,7 +45,11 @@ pub fn through(aim: &Aim, plane: &Plane, held: bool) -> DVec3 {
 
 /// Returns `v_mps` without what would bring the vehicle near to anything solid of the obstacles, and
 /// with a push away from it. [m/s, home]
-pub fn clear_of<'a>(v_mps: DVec3, p_m: DVec3, obstacles: impl Iterator<Item = &'a PlanarObstacle>) -> DVec3 {
+pub fn clear_of<'a>(
+    v_mps: DVec3,
+    p_m: DVec3,
+    obstacles: impl Iterator<Item = &'a PlanarObstacle>,
+) -> DVec3 {
     let mut v_mps = v_mps;
     for obstacle in obstacles {
         let Some(solid_m) = obstacle.nearest_solid_m(p_m, KEEP_M) else { continue };

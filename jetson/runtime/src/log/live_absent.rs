@@ -10,7 +10,9 @@ pub enum Live {}
 
 /// Why there is none.
 #[derive(Debug, thiserror::Error)]
-#[error("this program was built without it; build it with `cargo build --release --features foxglove`")]
+#[error(
+    "this program was built without it; build it with `cargo build --release --features foxglove`"
+)]
 pub struct Absent;
 
 impl Live {

@@ -17,7 +17,8 @@ fn the_middle_of_a_window_is_its_opening() {
     let middle_m = DVec3::new(2.0, 0.3, 1.5);
     let mut bricks = room();
     bricks.extend(window(middle_m, 0.55, BLUE));
-    let obstacle = watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.2, 0.0, 1.3));
+    let obstacle =
+        watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.2, 0.0, 1.3));
     let opening = obstacle.opening.expect("an opening");
     assert!(opening.center_m.distance(middle_m) < 0.06, "{opening:?}");
     assert!((opening.radius_m - 0.55).abs() < 0.08, "{opening:?}");
@@ -28,8 +29,13 @@ fn the_middle_of_a_window_is_its_opening() {
 fn between_the_legs_is_no_opening() {
     let mut bricks = room();
     bricks.extend(window(DVec3::new(2.0, 0.0, 2.6), 0.5, BLUE));
-    let obstacle = watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.0, 0.0, 0.8));
-    assert!(obstacle.opening.is_none_or(|opening| opening.center_m.z > 2.0), "{:?}", obstacle.opening);
+    let obstacle =
+        watched(&bricks, ObstacleKind::Window(ColorClass::Blue), 2.0, DVec3::new(0.0, 0.0, 0.8));
+    assert!(
+        obstacle.opening.is_none_or(|opening| opening.center_m.z > 2.0),
+        "{:?}",
+        obstacle.opening
+    );
 }
 
 #[test]

@@ -27,7 +27,8 @@ fn of_the_same_paint_the_frame_counts_and_not_the_wall_behind() {
         rgb: MAGENTA,
     });
     let camera_m = DVec3::new(0.0, 0.2, 1.2);
-    let found = window(&picture(&bricks, camera_m, 0.0), camera_m, ColorClass::Magenta).expect("found");
+    let found =
+        window(&picture(&bricks, camera_m, 0.0), camera_m, ColorClass::Magenta).expect("found");
     assert!((found.plane.origin_m.x - 2.0).abs() < 0.06, "{found:?}");
 }
 

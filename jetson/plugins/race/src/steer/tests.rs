@@ -1,7 +1,7 @@
 use super::*;
-use crate::test_scene::{Brick, clearance_m, picture, room, window};
 use crate::color_class::ColorClass;
 use crate::planar_obstacle::ObstacleKind;
+use crate::test_scene::{Brick, clearance_m, picture, room, window};
 
 fn ahead() -> (Plane, Opening) {
     let plane = Plane { origin_m: DVec3::new(2.0, 0.0, 0.0), yaw_rad: 0.0 };
