@@ -292,7 +292,8 @@ mod tests {
 
     #[test]
     fn a_file_of_nonsense_says_20_errors_at_most() {
-        let text: String = (0..100).map(|n| format!("k{n} = 1\n")).collect();
+        let lines: Vec<String> = (0..100).map(|n| format!("k{n} = 1")).collect();
+        let text = lines.join("\n");
         assert_eq!(parse::<Room>(&text).unwrap_err().0.len(), MAX_ERRORS);
     }
 
