@@ -319,7 +319,7 @@ mod tests {
         check("::ffff:10.0.0.1", Congestion::Lan);
         check("fe80::1", Congestion::Lan);
         check("8.8.8.8", Congestion::Bbr);
-        check("2001:db8::1", Congestion::Cubic);
+        check("2001:db8::1", Congestion::Bbr);
         assert_eq!(Congestion::Bbr.toward("127.0.0.1".parse().unwrap()), Congestion::Bbr);
     }
 }
