@@ -12,7 +12,7 @@ use super::*;
 use crate::flights::crash_card;
 use crate::poses::drivers::TagsSeen;
 use crate::stream::connection::Connection;
-use crate::stream::delivery::CameraDelivery;
+use crate::stream::delivery::{CameraDelivery, Delivery};
 use crate::web;
 
 /// Returns the examples of every message by the name that the page's scripts know it by.
@@ -224,7 +224,7 @@ fn stats_examples() -> Vec<Value> {
     let full = web::stats::VehicleStats {
         runtime: Some("vizflyt at 127.0.0.1:1".to_owned()),
         timing: Some(timing.clone()),
-        images: vec![CameraDelivery { camera: "front".to_owned(), account: Default::default() }],
+        images: vec![CameraDelivery { camera: "front".to_owned(), account: Delivery::default() }],
         connection: Some(Connection::default()),
         pose: PoseQuality {
             age_ms: Some(1.0),
