@@ -26,7 +26,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 /// Returns the modules of this crate that a file names: `crate::NAME` and `crate::{NAME, ...}`.
 fn imports(text: &str) -> Vec<String> {
     let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
-    let code: String = code.map(|line| format!("{line}\n")).collect();
+    let code = code.collect::<Vec<_>>().join("\n");
     let mut found = Vec::new();
     for (at, _) in code.match_indices("crate::") {
         let rest = &code[at + "crate::".len()..];
