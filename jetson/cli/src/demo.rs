@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
+use vizflyt_protocol::messages::OutcomeKind;
 use vizflyt_runtime::args::LogArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
@@ -64,5 +65,5 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
         report.write(path)?;
     }
     tell(report.summary());
-    Ok(if report.outcome == "finished" { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(if report.outcome == OutcomeKind::Finished { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

@@ -14,12 +14,13 @@ use anyhow::Context;
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{SignalKind, signal};
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{Purpose, bounded};
 
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
 use crate::control::{Control, ControlInput, QUEUE, print_line};
-use crate::flight::{FlightSettings, Outcome};
+use crate::flight::FlightSettings;
 use crate::link::port::Port;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
@@ -30,13 +31,13 @@ const GOODBYE: Duration = Duration::from_millis(500);
 /// Exit status when a second signal cuts the landing short: 128 + SIGINT, as shells have it.
 const CUT_SHORT: i32 = 130;
 
-/// Flies one flight to its end; returns how it ended. Blocks; call it on a thread that lives as
+/// Flies one flight to its end; returns why it ended. Blocks; call it on a thread that lives as
 /// long as the flight, as the plugin dies with it.
 ///
 /// # Errors
 /// If sockets or threads cannot be made, or the report cannot be written. Everything that goes
-/// wrong later is an [`Outcome`].
-pub fn fly(mut args: FlyArgs) -> anyhow::Result<Outcome> {
+/// wrong later is an [`EndReason`].
+pub fn fly(mut args: FlyArgs) -> anyhow::Result<EndReason> {
     args.settle()?;
     let command = args.plugin_command();
     fly_command(&args, command, None)
@@ -52,7 +53,7 @@ pub fn fly_command(
     args: &FlyArgs,
     plugin_command: Vec<std::ffi::OsString>,
     reloads: Option<Receiver<()>>,
-) -> anyhow::Result<Outcome> {
+) -> anyhow::Result<EndReason> {
     keep_going_when_files_are_full();
     let mut plugin_limits = args.jetson.plugin.limits();
     if let Some(path) = &args.map {

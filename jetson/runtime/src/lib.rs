@@ -41,6 +41,5 @@ pub mod trajectory;
 pub mod waterfall;
 
 pub use args::FlyArgs;
-pub use flight::Outcome;
 pub use fly::{fly, fly_command};
 pub use stream::pair;

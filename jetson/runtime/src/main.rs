@@ -19,7 +19,7 @@ fn main() -> ExitCode {
         .with_ansi(std::io::stderr().is_terminal())
         .init();
     match fly(Program::parse().fly) {
-        Ok(outcome) if outcome.is_good() => ExitCode::SUCCESS,
+        Ok(end) if end.outcome().is_good() => ExitCode::SUCCESS,
         Ok(_) => ExitCode::from(3),
         Err(error) => {
             eprintln!("vizflyt-jetson: {error:#}");

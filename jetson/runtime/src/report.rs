@@ -3,11 +3,11 @@
 use std::fs;
 
 use serde::{Deserialize, Serialize};
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{
     Arrivals, ClockState, Intervals, OutcomeKind, StageTimes, Stages,
 };
 
-use crate::flight::Outcome;
 use crate::stats::ImageTimes;
 
 /// The report. Field names carry their units.
@@ -59,7 +59,7 @@ pub struct Report {
     pub log: Option<String>,
 }
 
-/// Counters that the report adds to the outcome.
+/// Counters that the report adds to the end.
 #[derive(Clone, Debug, Default)]
 pub struct Counters {
     /// From take-off to the end. [s]
@@ -82,11 +82,11 @@ pub struct Counters {
 
 impl Report {
     /// Makes the report.
-    pub fn new(outcome: &Outcome, times: &ImageTimes, counters: &Counters) -> Self {
+    pub fn new(end: &EndReason, times: &ImageTimes, counters: &Counters) -> Self {
         let (waterfall, intervals) = times.flight();
         Self {
-            outcome: outcome.kind,
-            reason: outcome.reason.clone(),
+            outcome: end.outcome(),
+            reason: end.to_string(),
             seconds: counters.seconds,
             images_delivered: times.delivered(),
             image_hz: times.rate_hz(),
@@ -122,6 +122,8 @@ pub fn peak_rss_mb() -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use vizflyt_protocol::flight_end::PluginFault;
+
     use super::*;
 
     #[test]
@@ -132,8 +134,8 @@ mod tests {
 
     #[test]
     fn names_are_those_agreed_on() {
-        let outcome = Outcome { kind: OutcomeKind::PluginFailed, reason: "why".into() };
-        let report = Report::new(&outcome, &ImageTimes::default(), &Counters::default());
+        let end = EndReason::Plugin(PluginFault::NoSetpoint);
+        let report = Report::new(&end, &ImageTimes::default(), &Counters::default());
         let json = serde_json::to_value(&report).unwrap();
         assert_eq!(json["outcome"], "plugin_failed");
         for key in ["age_ms_p99", "image_hz", "setpoints_sent", "mavlink_packets", "peak_rss_mb"] {

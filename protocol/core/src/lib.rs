@@ -6,6 +6,7 @@
 //!   [`geometry::Volume`], the solids that geofence, truth and tests are made of;
 //! - [`time`]: one stamp type per clock, and the filter that relates two clocks;
 //! - [`histogram`]: durations counted, the same way at both ends;
+//! - [`flight_end`]: how a flight ended, and why: reasons as data, and the one rule that decides;
 //! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
@@ -15,6 +16,7 @@
 
 #![no_std]
 
+pub mod flight_end;
 pub mod geometry;
 pub mod histogram;
 pub mod mavlink;
@@ -26,4 +28,4 @@ pub mod time;
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first
 /// ([`packet::Preamble`]) and refuse a mismatch by name.
-pub const PROTOCOL_VERSION: u16 = 6;
+pub const PROTOCOL_VERSION: u16 = 7;

@@ -2,8 +2,8 @@
 //! Pure; the autograder's report and the page's crash card say and draw the same.
 //!
 //! ```text
-//! verdict, events, samples, answers --> probable_cause --> a sentence
-//! samples, obstacles at its height  --> plot           --> SVG
+//! verdict, samples, answers, images   --> probable_cause --> a sentence
+//! samples, obstacles at its height    --> plot           --> SVG
 //! ```
 
 mod cause;
@@ -13,7 +13,7 @@ mod tests;
 
 pub use cause::probable_cause;
 
-use vizflyt_protocol::messages::{Event, EventKind, Setpoint};
+use vizflyt_protocol::messages::Setpoint;
 use vizflyt_protocol::time::ServerTime;
 
 use crate::verdict::{Sample, Verdict};
@@ -41,8 +41,6 @@ pub struct Seen {
 pub struct Flight<'a> {
     /// What it was worth.
     pub verdict: &'a Verdict,
-    /// All that happened, in order.
-    pub events: &'a [Event],
     /// Where it was, in order.
     pub samples: &'a [Sample],
     /// What the plugin answered, in order; `None` where nobody wrote it down, as in a lab.
@@ -53,22 +51,6 @@ pub struct Flight<'a> {
     pub last_line: Option<&'a str>,
     /// From when an image is drawn until its answer counts. [s]
     pub delay_s: f64,
-}
-
-/// Returns when a flight was decided: by the event that ended it, else by its last sample.
-pub fn end_of(events: &[Event], samples: &[Sample]) -> Option<ServerTime> {
-    let decided = events.iter().find(|event| {
-        matches!(
-            event.kind,
-            EventKind::Collision { .. }
-                | EventKind::Geofence { .. }
-                | EventKind::Finished { .. }
-                | EventKind::TimeLimit
-                | EventKind::EmergencyStop
-                | EventKind::PluginFailed
-        )
-    });
-    decided.map(|event| event.stamp).or_else(|| samples.last().map(|sample| sample.stamp))
 }
 
 /// Returns the samples of the last `seconds` until `at`.

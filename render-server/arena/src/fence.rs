@@ -2,8 +2,9 @@
 //! vehicle that can no longer stop before them is as good as beyond.
 
 use glam::DVec3;
+use vizflyt_protocol::flight_end::Boundary;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::Limits;
+use vizflyt_protocol::messages::{Limits, bounded};
 
 use crate::config::ArenaConfig;
 
@@ -21,8 +22,8 @@ pub enum FenceVerdict {
 /// The verdict of the boundary that matters most, with its numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FenceCheck<'a> {
-    /// Which boundary: `the geofence`, `the ceiling`, a no-fly box's name.
-    pub boundary: &'a str,
+    /// Which boundary.
+    pub boundary: &'a Boundary,
     /// What to think of it.
     pub verdict: FenceVerdict,
     /// From the body's surface to the boundary; negative is beyond. [m]
@@ -35,13 +36,14 @@ pub struct FenceCheck<'a> {
 /// All that bounds where a vehicle may be.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Boundaries {
-    all: Vec<(String, Boundary)>,
+    all: Vec<(Boundary, Rule)>,
     radius_m: f64,
     limits: Limits,
 }
 
+/// What a boundary asks for.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Boundary {
+enum Rule {
     /// The body's surface stays inside: net, walls.
     KeepIn(Volume),
     /// The body's surface stays outside.
@@ -59,15 +61,11 @@ const TOLERANCE_M: f64 = 0.1;
 impl Boundaries {
     /// Returns those of an arena.
     pub fn of(config: &ArenaConfig) -> Self {
-        let mut all = vec![("the geofence".to_owned(), Boundary::KeepIn(config.geofence()))];
-        all.extend(
-            config
-                .limits
-                .max_altitude_m
-                .map(|z_m| ("the ceiling".to_owned(), Boundary::Ceiling(z_m))),
-        );
+        let mut all = vec![(Boundary::Geofence, Rule::KeepIn(config.geofence()))];
+        let ceiling = |z_m| (Boundary::Ceiling, Rule::Ceiling(z_m));
+        all.extend(config.limits.max_altitude_m.map(ceiling));
         all.extend(config.no_fly.iter().map(|keep_out| {
-            (format!("the no-fly box {}", keep_out.name), Boundary::KeepOut(keep_out.volume()))
+            (Boundary::NoFly(bounded(&keep_out.name)), Rule::KeepOut(keep_out.volume()))
         }));
         Self { all, radius_m: config.body_radius_m, limits: config.limits }
     }
@@ -77,11 +75,11 @@ impl Boundaries {
     /// its floor is where vehicles land.
     pub fn check(&self, from_m: DVec3, to_m: DVec3, v_world_mps: DVec3) -> FenceCheck<'_> {
         let least_m = |check: &FenceCheck<'_>| check.margin_m.min(check.margin_at_rest_m);
-        let check = |(name, boundary)| self.check_one(name, boundary, from_m, to_m, v_world_mps);
+        let check = |(boundary, rule)| self.check_one(boundary, rule, from_m, to_m, v_world_mps);
         let (first, others) = self.all.split_first().expect("there is a geofence");
         let mut worst = check((&first.0, &first.1));
-        for (name, boundary) in others {
-            let other = check((name, boundary));
+        for (boundary, rule) in others {
+            let other = check((boundary, rule));
             let nearer = other.verdict == worst.verdict && least_m(&other) < least_m(&worst);
             if other.verdict > worst.verdict || nearer {
                 worst = other;
@@ -92,8 +90,8 @@ impl Boundaries {
 
     fn check_one<'a>(
         &self,
-        name: &'a str,
-        boundary: &Boundary,
+        boundary: &'a Boundary,
+        rule: &Rule,
         from_m: DVec3,
         to_m: DVec3,
         v_world_mps: DVec3,
@@ -104,14 +102,14 @@ impl Boundaries {
             to_m + v_mps * (v_mps.length() / (2.0 * self.limits.max_acceleration_mps2))
         };
         let level_mps = v_world_mps.with_z(v_world_mps.z.max(0.0));
-        let (margin_m, margin_at_rest_m) = match boundary {
-            Boundary::KeepIn(volume) => {
+        let (margin_m, margin_at_rest_m) = match rule {
+            Rule::KeepIn(volume) => {
                 let margin_at = |p_m| -volume.signed_distance_m(p_m) - self.radius_m;
                 (margin_at(to_m), margin_at(rest_m(level_mps)))
             }
-            Boundary::Ceiling(z_m) => (z_m - to_m.z, z_m - rest_m(level_mps).z),
+            Rule::Ceiling(z_m) => (z_m - to_m.z, z_m - rest_m(level_mps).z),
             // A box may lie between two poses, or between here and the place of rest.
-            Boundary::KeepOut(volume) => {
+            Rule::KeepOut(volume) => {
                 let nearest = |a, b| least_distance_m(volume, a, b) - self.radius_m;
                 (nearest(from_m, to_m), nearest(to_m, rest_m(v_world_mps)))
             }
@@ -125,7 +123,7 @@ impl Boundaries {
         } else {
             FenceVerdict::Inside
         };
-        FenceCheck { boundary: name, verdict, margin_m, margin_at_rest_m }
+        FenceCheck { boundary, verdict, margin_m, margin_at_rest_m }
     }
 }
 
@@ -157,9 +155,9 @@ mod tests {
         let room = Volume::aabb(DVec3::ZERO, DVec3::new(10.0, 4.0, 3.0));
         let table = Volume::aabb(DVec3::new(4.0, 1.0, 0.0), DVec3::new(4.1, 3.0, 1.0));
         let all = vec![
-            ("the geofence".to_owned(), Boundary::KeepIn(room)),
-            ("the ceiling".to_owned(), Boundary::Ceiling(2.5)),
-            ("the no-fly box shelf".to_owned(), Boundary::KeepOut(table)),
+            (Boundary::Geofence, Rule::KeepIn(room)),
+            (Boundary::Ceiling, Rule::Ceiling(2.5)),
+            (Boundary::NoFly(bounded("shelf")), Rule::KeepOut(table)),
         ];
         Boundaries { all, radius_m: 0.1, limits: Limits::new(6.0, 8.0) }
     }
@@ -169,7 +167,7 @@ mod tests {
         let found = boundaries.check(p.into(), p.into(), v.into());
         assert_eq!(found.verdict, expected, "{found:?}");
         if expected != FenceVerdict::Inside {
-            assert_eq!(found.boundary, boundary, "{found:?}");
+            assert_eq!(found.boundary.to_string(), boundary, "{found:?}");
         }
     }
 
@@ -214,6 +212,7 @@ mod tests {
         check([4.05, 2.0, 1.05], [0.0, 0.0, 0.0], shelf, FenceVerdict::Breach);
         let boundaries = boundaries();
         let jump = boundaries.check([3.5, 2.0, 0.5].into(), [4.5, 2.0, 0.5].into(), DVec3::ZERO);
-        assert_eq!((jump.boundary, jump.verdict), (shelf, FenceVerdict::Breach), "{jump:?}");
+        assert_eq!(jump.boundary.to_string(), shelf, "{jump:?}");
+        assert_eq!(jump.verdict, FenceVerdict::Breach, "{jump:?}");
     }
 }

@@ -5,14 +5,17 @@
 //! measurement -> pose filter -> on the floor?  -> nothing is judged
 //!                             in the air     -> collision, fence, course, time -> events
 //! ```
-//! A flight begins when the body's centre rises 0.3 m above the start. Each thing that ends a
-//! flight is said once; after it nothing more is judged until [`Referee::restart`].
+//! A flight begins when the body's centre rises 0.3 m above the start. The first thing seen that ends a
+//! flight is said; after it nothing more is judged until [`Referee::restart`]. Where someone else ends
+//! the flight ([`Referee::handle_event`]), course and time stop, and only a touch or a breach on the
+//! way down is still said. What a flight's end is, [`vizflyt_protocol::flight_end`] decides.
 
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use vizflyt_protocol::flight_end::{Collision, EndReason, FenceBreach, Obstacle};
 use vizflyt_protocol::geometry::{Body, Pose, World};
-use vizflyt_protocol::messages::{Event, EventKind, PoseSample, bounded};
+use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, PoseSample, bounded};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::body::BodyShape;
@@ -55,7 +58,10 @@ pub struct Referee {
     course: Course,
     last: Option<(ServerTime, Pose<World, Body>)>,
     took_off: Option<ServerTime>,
+    /// Its end was said, or the vehicle has landed: nothing is judged.
     over: bool,
+    /// Someone else ended the flight: course and time are not judged.
+    ended: bool,
     near_fence: bool,
     least_clearance_m: f64,
     events: VecDeque<Event>,
@@ -78,6 +84,7 @@ impl Referee {
             last: None,
             took_off: None,
             over: false,
+            ended: false,
             near_fence: false,
             least_clearance_m: f64::INFINITY,
             events: VecDeque::new(),
@@ -105,6 +112,7 @@ impl Referee {
         self.course = Course::new(&self.config);
         self.took_off = None;
         self.over = false;
+        self.ended = false;
         self.near_fence = false;
         self.least_clearance_m = f64::INFINITY;
     }
@@ -132,6 +140,16 @@ impl Referee {
         self.filter.handle_imu(reading);
     }
 
+    /// Takes what runtime or people did to the flight.
+    pub fn handle_event(&mut self, event: &Event) {
+        match event.kind {
+            // What a hand did with the vehicle before was no flight.
+            EventKind::Phase(FlightPhase::TakingOff) => self.restart(),
+            EventKind::Phase(FlightPhase::Landed) => self.over = true,
+            _ => self.ended |= event.kind.end_reason().is_some(),
+        }
+    }
+
     /// Returns how the vehicle moves by all that was measured.
     pub fn motion(&mut self) -> Option<Motion> {
         self.filter.motion()
@@ -146,15 +164,14 @@ impl Referee {
     pub fn handle_timeout(&mut self, now: ServerTime) {
         self.filter.handle_timeout(now);
         self.report_change(now);
+        self.judge_silence(now);
         self.judge_time(now);
     }
 
     /// Returns when [`Self::handle_timeout`] has something to do.
     pub fn poll_timeout(&self) -> Option<ServerTime> {
-        match (self.filter.poll_timeout(), self.time_limit()) {
-            (Some(a), Some(b)) => Some(a.min(b)),
-            (a, b) => a.or(b),
-        }
+        let dues = [self.filter.poll_timeout(), self.silence_limit(), self.time_limit()];
+        dues.into_iter().flatten().min()
     }
 
     /// Returns the next event.
@@ -251,29 +268,24 @@ impl Referee {
             None => None,
         };
         if let Some((p_world_m, clearance_m, met)) = contact {
-            let what = self.describe(met);
-            let p = p_world_m;
-            let text = format!(
-                "collision with {what} at ({:.2}, {:.2}, {:.2}) m, at {:.1} m/s",
-                p.x,
-                p.y,
-                p.z,
-                sample.twist.linear_mps.length()
-            );
-            self.end(sample.stamp, EventKind::Collision { p_world_m, clearance_m }, &text);
+            let speed_mps = sample.twist.linear_mps.length();
+            let collision =
+                Collision { p_world_m, clearance_m, with: self.obstacle(met), speed_mps };
+            self.end(sample.stamp, EventKind::Collision(collision));
         }
     }
 
-    fn describe(&self, met: Met) -> String {
+    fn obstacle(&self, met: Met) -> Obstacle {
         match met {
-            Met::Still => "an obstacle".to_owned(),
-            Met::Floor => "the floor".to_owned(),
+            Met::Still => Obstacle::Scene,
+            Met::Floor => Obstacle::Floor,
             Met::Object(index) => {
-                format!("'{}'", self.obstacles.objects.names().nth(index).unwrap_or_default())
+                let name = self.obstacles.objects.names().nth(index);
+                Obstacle::Object(bounded(name.unwrap_or_default()))
             }
             Met::Vehicle(number) => {
                 let neighbour = self.neighbours.get(number).and_then(Option::as_ref);
-                format!("vehicle '{}'", neighbour.map_or("", |neighbour| &neighbour.name))
+                Obstacle::Vehicle(neighbour.map(|it| it.name.clone()).unwrap_or_default())
             }
         }
     }
@@ -281,9 +293,9 @@ impl Referee {
     fn judge_fence(&mut self, sample: &PoseSample, from_m: DVec3, p_world_m: DVec3) {
         let v_mps = sample.twist.linear_mps;
         let found = self.boundaries.check(from_m, p_world_m, v_mps);
-        let (boundary, verdict) = (found.boundary, found.verdict);
-        let margin_m = found.margin_m;
-        match verdict {
+        let (boundary, margin_m) = (found.boundary.clone(), found.margin_m);
+        let overshoot_m = -found.margin_at_rest_m;
+        match found.verdict {
             FenceVerdict::Inside => self.near_fence = false,
             FenceVerdict::Near => {
                 if !std::mem::replace(&mut self.near_fence, true) {
@@ -292,22 +304,17 @@ impl Referee {
                 }
             }
             FenceVerdict::Breach => {
-                let text = if margin_m < 0.0 {
-                    format!("beyond {boundary} by {:.2} m", -margin_m)
-                } else {
-                    format!(
-                        "cannot stop before {boundary}: {margin_m:.2} m left, and at {:.1} m/s it \
-                         would go {:.2} m beyond",
-                        v_mps.length(),
-                        -found.margin_at_rest_m
-                    )
-                };
-                self.end(sample.stamp, EventKind::Geofence { p_world_m, margin_m }, &text);
+                let speed_mps = v_mps.length();
+                let breach = FenceBreach { p_world_m, margin_m, boundary, speed_mps, overshoot_m };
+                self.end(sample.stamp, EventKind::Geofence(breach));
             }
         }
     }
 
     fn judge_course(&mut self, sample: &PoseSample, from_m: DVec3, to_m: DVec3) {
+        if self.ended {
+            return;
+        }
         let seconds = self.seconds(sample.stamp);
         while let Some(progress) = self.course.advance(from_m, to_m) {
             match progress {
@@ -316,12 +323,7 @@ impl Referee {
                     let kind = EventKind::Stage { index: index as u8, name: bounded(&name) };
                     self.tell(sample.stamp, kind, &format!("passed {name} after {seconds:.1} s"));
                 }
-                Progress::Finished => {
-                    let what =
-                        if self.config.goal.is_some() { "reached the goal" } else { "finished" };
-                    let text = format!("{what} after {seconds:.1} s");
-                    self.end(sample.stamp, EventKind::Finished { seconds }, &text);
-                }
+                Progress::Finished => self.end(sample.stamp, EventKind::Finished { seconds }),
                 Progress::GoalTooEarly(index) => {
                     let name = &self.config.stages[index].name;
                     let text = format!("at the goal, but {name} is not passed yet");
@@ -332,15 +334,30 @@ impl Referee {
     }
 
     fn judge_time(&mut self, now: ServerTime) {
-        if self.is_judging() && self.time_limit().is_some_and(|limit| now >= limit) {
-            let text = format!("the course's {} s are over", self.config.time_limit_s);
-            self.end(now, EventKind::TimeLimit, &text);
+        if self.time_limit().is_some_and(|limit| now >= limit) {
+            self.end(now, EventKind::TimeLimit { limit_s: self.config.time_limit_s });
         }
+    }
+
+    /// A vehicle without a pose is landed by its guard: its run is over.
+    fn judge_silence(&mut self, now: ServerTime) {
+        if let Some(limit) = self.silence_limit()
+            && now >= limit
+        {
+            let age_s = self.newest().map_or(0.0, |newest| now.seconds_since(newest.stamp));
+            self.end(now, EventKind::Ended(EndReason::PoseLost { age_s }));
+        }
+    }
+
+    fn silence_limit(&self) -> Option<ServerTime> {
+        let newest = self.newest().filter(|_| self.is_judging() && !self.ended)?;
+        // A nanosecond later: the sum is rounded.
+        Some(newest.stamp.plus_seconds(self.config.pose.land_after_s).plus_ns(1))
     }
 
     fn time_limit(&self) -> Option<ServerTime> {
         let limit_s = self.config.time_limit_s;
-        let took_off = self.took_off.filter(|_| !self.over && limit_s > 0.0)?;
+        let took_off = self.took_off.filter(|_| !self.over && !self.ended && limit_s > 0.0)?;
         Some(took_off.plus_seconds(limit_s))
     }
 
@@ -368,9 +385,9 @@ impl Referee {
     }
 
     /// Reports what ends the flight; of several in one pose the first counts.
-    fn end(&mut self, stamp: ServerTime, kind: EventKind, text: &str) {
+    fn end(&mut self, stamp: ServerTime, kind: EventKind) {
         if !std::mem::replace(&mut self.over, true) {
-            self.tell(stamp, kind, text);
+            self.events.push_back(Event::ending(stamp, kind));
         }
     }
 

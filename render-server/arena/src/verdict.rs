@@ -2,7 +2,7 @@
 //! verdict. Pure: graded and live flights are judged by the same code.
 //!
 //! ```text
-//! events (referee, runtime) --> the first that ends the flight --> outcome, time
+//! events (referee, runtime) --> the flight's end (vizflyt_protocol::flight_end) --> outcome, time
 //!                           \-> stages passed, and when
 //! samples (pose, clearance) --> take-off, least clearance, top speed, way
 //! ```
@@ -12,7 +12,8 @@
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, OutcomeKind};
+use vizflyt_protocol::flight_end::{EndReason, FlightEnd};
+use vizflyt_protocol::messages::{Event, EventKind, OutcomeKind};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::config::ArenaConfig;
@@ -49,6 +50,11 @@ pub struct Verdict {
     pub outcome: OutcomeKind,
     /// Why, in one sentence.
     pub reason: String,
+    /// Why, as data.
+    pub end: EndReason,
+    /// When; `None` of a flight of which nothing is known.
+    #[serde(skip)]
+    pub ended: Option<ServerTime>,
     /// How many stages were passed.
     pub stages_passed: usize,
     /// The stages in order.
@@ -92,19 +98,27 @@ pub struct Verdict {
 /// assert_eq!((verdict.outcome, verdict.score), (OutcomeKind::Error, 0.0));
 /// ```
 pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdict {
+    judge_ended(arena, &FlightEnd::of(events), events, samples)
+}
+
+/// Judges a flight of which the end is known already, while `events` may lack its oldest.
+pub fn judge_ended(
+    arena: &ArenaConfig,
+    end: &FlightEnd,
+    events: &[Event],
+    samples: &[Sample],
+) -> Verdict {
     let airborne_m = arena.spawn.position_m.z + AIRBORNE_M;
     let took_off = samples.iter().find(|sample| sample.p_world_m.z > airborne_m);
     let took_off_m = took_off.map(|sample| sample.p_world_m);
     let took_off = took_off.map(|sample| sample.stamp);
-    let end = events.iter().find_map(|event| Some((ending(event)?, event)));
-    let (outcome, reason) = match (end, took_off) {
-        (Some((outcome, event)), _) => (outcome, event.text.as_str().to_owned()),
-        (None, Some(_)) => landed(events),
-        (None, None) => (OutcomeKind::Error, "the vehicle never took off".to_owned()),
-    };
     let last = samples.last().map(|sample| sample.stamp);
-    let landing = || events.iter().find(|event| is_landing(event)).map(|event| event.stamp);
-    let ended = end.map(|(_, event)| event.stamp).or_else(landing).or(last);
+    let (ended, end) = match (end.decided(), took_off) {
+        (Some((stamp, reason)), _) => (Some(stamp), reason.clone()),
+        (None, Some(_)) => (last, EndReason::RecordEnds),
+        (None, None) => (last, EndReason::NeverTookOff),
+    };
+    let outcome = end.outcome();
     let since = |stamp: ServerTime| took_off.map_or(0.0, |at| stamp.seconds_since(at).max(0.0));
 
     let mut stages: Vec<StageVerdict> = (arena.stages.iter())
@@ -129,7 +143,9 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
     let passed = stages_passed + usize::from(has_goal && outcome == OutcomeKind::Finished);
     Verdict {
         outcome,
-        reason,
+        reason: end.to_string(),
+        end,
+        ended,
         stages_passed,
         stages,
         seconds: ended.map_or(0.0, since),
@@ -141,56 +157,32 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
     }
 }
 
-/// Returns how a flight ended that only its landing ended, and why.
-fn landed(events: &[Event]) -> (OutcomeKind, String) {
-    let landing = events.iter().position(is_landing);
-    let before = &events[..landing.unwrap_or(events.len())];
-    let lost = before.iter().rev().find_map(|event| match event.kind {
-        EventKind::PoseLost { .. } => Some(Some(event)),
-        EventKind::PoseRegained => Some(None),
-        _ => None,
-    });
-    match (lost.flatten(), landing) {
-        // That the pose is lost is no choice of the plugin's.
-        (Some(lost), _) => (OutcomeKind::Error, lost.text.as_str().to_owned()),
-        (None, Some(landing)) => {
-            let text = events[landing].text.as_str();
-            (OutcomeKind::Landed, text.strip_prefix("landing: ").unwrap_or(text).to_owned())
-        }
-        (None, None) => (OutcomeKind::Landed, "not over when its record ends".to_owned()),
-    }
-}
-
-/// Returns the outcome of a flight that this event ends.
-fn ending(event: &Event) -> Option<OutcomeKind> {
-    match event.kind {
-        EventKind::Collision { .. } => Some(OutcomeKind::Collided),
-        EventKind::Geofence { .. } => Some(OutcomeKind::Geofence),
-        EventKind::Finished { .. } => Some(OutcomeKind::Finished),
-        EventKind::TimeLimit => Some(OutcomeKind::Timeout),
-        EventKind::EmergencyStop => Some(OutcomeKind::Landed),
-        EventKind::PluginFailed => Some(OutcomeKind::PluginFailed),
-        _ => None,
-    }
-}
-
-fn is_landing(event: &Event) -> bool {
-    matches!(event.kind, EventKind::Phase(FlightPhase::Landing | FlightPhase::Landed))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::StageConfig;
     use crate::referee::tests::arena;
-    use vizflyt_protocol::messages::bounded;
+    use vizflyt_protocol::flight_end::{Collision, Obstacle, PluginFault};
+    use vizflyt_protocol::messages::{FlightPhase, bounded};
 
     fn at(s: f64) -> ServerTime {
         ServerTime::ZERO.plus_seconds(1.0 + s)
     }
 
     fn event(s: f64, kind: EventKind) -> Event {
-        Event { stamp: at(s), kind, text: bounded("why") }
+        Event { stamp: at(s), kind, text: bounded("") }
+    }
+
+    fn ended(s: f64, reason: EndReason) -> Event {
+        event(s, EventKind::Ended(reason))
+    }
+
+    fn take_off() -> Event {
+        event(0.0, EventKind::Phase(FlightPhase::TakingOff))
+    }
+
+    fn crashed() -> EndReason {
+        EndReason::Plugin(PluginFault::ended("exit status 3"))
     }
 
     fn stage(s: f64, index: u8) -> Event {
@@ -229,11 +221,17 @@ mod tests {
 
     #[test]
     fn the_first_thing_that_ends_a_flight_is_its_outcome() {
-        let p_world_m = DVec3::ZERO;
-        let hit = EventKind::Collision { p_world_m, clearance_m: -0.01 };
-        let events = [stage(2.0, 0), event(3.4, hit), event(3.5, EventKind::PluginFailed)];
+        let hit = EventKind::Collision(Collision {
+            p_world_m: DVec3::ZERO,
+            clearance_m: -0.01,
+            with: Obstacle::Object(bounded("door")),
+            speed_mps: 2.0,
+        });
+        let events = [take_off(), stage(2.0, 0), event(3.4, hit), ended(3.5, crashed())];
         let verdict = judge(&course(), &events, &samples(6));
-        assert_eq!((verdict.outcome, verdict.reason.as_str()), (OutcomeKind::Collided, "why"));
+        let reason = "collision with 'door' at (0.00, 0.00, 0.00) m, at 2.0 m/s";
+        assert_eq!((verdict.outcome, verdict.reason.as_str()), (OutcomeKind::Collided, reason));
+        assert_eq!(verdict.ended, Some(at(3.4)));
         // Off the ground 0.4 s after the first sample; what came after the contact does not count.
         assert!((verdict.seconds - 3.0).abs() < 1e-6, "{}", verdict.seconds);
         assert_eq!((verdict.stages_passed, verdict.score), (1, 25.0));
@@ -246,29 +244,33 @@ mod tests {
     #[test]
     fn a_finish_is_the_last_part_of_the_score() {
         let finished = EventKind::Finished { seconds: 4.6 };
-        let mut events = vec![stage(2.0, 0), stage(3.0, 1), stage(4.0, 2)];
+        let mut events = vec![take_off(), stage(2.0, 0), stage(3.0, 1), stage(4.0, 2)];
         events.push(event(5.0, finished));
         let verdict = judge(&course(), &events, &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Finished, 3));
         assert_eq!(verdict.score, 100.0);
         // A stage after the end is none.
-        let late = [event(3.0, EventKind::TimeLimit), stage(3.5, 0)];
+        let late = [take_off(), event(3.0, EventKind::TimeLimit { limit_s: 3.0 }), stage(3.5, 0)];
         let verdict = judge(&course(), &late, &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Timeout, 0));
     }
 
     #[test]
     fn landing_early_ends_the_time() {
-        let landing = event(2.4, EventKind::Phase(FlightPhase::Landing));
-        let verdict = judge(&course(), std::slice::from_ref(&landing), &samples(6));
+        let asked = ended(2.4, EndReason::PluginLanded);
+        let verdict = judge(&course(), &[take_off(), asked.clone()], &samples(6));
         assert_eq!(verdict.outcome, OutcomeKind::Landed);
         assert!((verdict.seconds - 2.0).abs() < 1e-6);
         // For want of a pose it is nobody's choice; one that came back does not count.
         let lost = event(2.0, EventKind::PoseLost { age_s: 0.2 });
+        let blind = ended(2.3, EndReason::PoseLost { age_s: 0.5 });
+        let blind = judge(&course(), &[take_off(), lost.clone(), blind], &samples(6));
+        assert_eq!(
+            (blind.outcome, blind.reason.as_str()),
+            (OutcomeKind::Error, "pose lost for 0.5 s")
+        );
         let back = event(2.1, EventKind::PoseRegained);
-        let blind = judge(&course(), &[lost.clone(), landing.clone()], &samples(6));
-        assert_eq!(blind.outcome, OutcomeKind::Error);
-        let seen = judge(&course(), &[lost, back, landing], &samples(6));
+        let seen = judge(&course(), &[take_off(), lost, back, asked], &samples(6));
         assert_eq!(seen.outcome, OutcomeKind::Landed);
     }
 
@@ -276,7 +278,14 @@ mod tests {
     fn on_the_ground_there_is_nothing_to_judge() {
         let verdict = judge(&course(), &[], &samples(0));
         assert_eq!((verdict.outcome, verdict.min_clearance_m), (OutcomeKind::Error, None));
-        let failed = judge(&course(), &[event(0.0, EventKind::PluginFailed)], &[]);
+        let failed = judge(&course(), &[ended(0.0, crashed())], &[]);
         assert_eq!((failed.outcome, failed.seconds), (OutcomeKind::PluginFailed, 0.0));
+    }
+
+    #[test]
+    fn a_record_that_stops_in_flight_is_no_landing() {
+        let verdict = judge(&course(), &[take_off(), stage(2.0, 0)], &samples(6));
+        assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Error, 1));
+        assert_eq!(verdict.reason, "not over when its record ends");
     }
 }

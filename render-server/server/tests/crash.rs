@@ -5,7 +5,8 @@ mod support;
 use quinn::TransportConfig;
 use serde_json::Value;
 use support::{Client, Emitter, Server, Socket, http, write_arena};
-use vizflyt_protocol::messages::{FlightPhase, Telemetry, ToServer};
+use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, Telemetry, ToServer, bounded};
+use vizflyt_protocol::time::ServerTime;
 
 /// Asks for the card until there is one.
 async fn card(server: &Server) -> Value {
@@ -30,13 +31,17 @@ async fn a_flight_into_a_wall_leaves_a_card() {
     let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
     let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
     client.say(&ToServer::Telemetry(flying)).await;
+    let kind = EventKind::Phase(FlightPhase::TakingOff);
+    let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
+    client.say(&ToServer::Event { seq: 1, event }).await;
     // Three seconds at 0.6 m/s, until the body touches the wall at x = 5 m.
     let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| {
         3.0 + f64::from(frame.clamp(100, 750) - 100) * 0.003
     });
     let card = card(&server).await;
     assert_eq!((&card["id"], &card["vehicle"]), (&1.into(), &"vizflyt".into()));
-    assert!(card["event"]["kind"].get("collision").is_some(), "{}", card["event"]);
+    assert_eq!(card["title"], "Collision");
+    assert!(card["verdict"]["end"].get("collision").is_some(), "{}", card["verdict"]);
     assert_eq!(card["verdict"]["outcome"], "collided");
     // Which of the rules depends on how evenly a loaded machine sent the poses.
     assert!(card["cause"].as_str().unwrap().starts_with("it "), "{}", card["cause"]);

@@ -43,7 +43,7 @@ async fn two_vehicles_see_each_other_and_collide() {
     });
     let collision = |message| match message {
         ToRuntime::Event { event, .. } => match event.kind {
-            EventKind::Collision { p_world_m, .. } => Some((p_world_m, event.text)),
+            EventKind::Collision(it) => Some((it.p_world_m, event.text)),
             _ => None,
         },
         _ => None,

@@ -192,7 +192,10 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
     // A page that opens afterwards shows what decided the flight.
     let mut socket = Socket::open(server.http, &own).ok().unwrap();
     let state = socket.message("state");
-    assert_eq!(state["outcome"]["kind"], "emergency_stop");
+    assert_eq!(state["outcome"]["outcome"], "landed");
+    assert_eq!(state["outcome"]["title"], "Stopped by hand");
+    assert_eq!(state["outcome"]["text"], "the stop button was pressed");
+    assert_eq!(state["outcome"]["tone"], "bad");
 }
 
 // Two threads: the page's socket is read blocking, and the client's packets must leave meanwhile.

@@ -424,7 +424,7 @@ async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
     });
     let collision = |message| match message {
         ToRuntime::Event { event, .. } => match event.kind {
-            EventKind::Collision { p_world_m, clearance_m } => Some((p_world_m, clearance_m)),
+            EventKind::Collision(it) => Some((it.p_world_m, it.clearance_m)),
             _ => None,
         },
         _ => None,

@@ -86,8 +86,8 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
         Some(plugin) if args.watch => Some(watch::watch(plugin.clone())?),
         _ => None,
     };
-    let outcome = vizflyt_runtime::fly_command(runtime, command, reloads)?;
-    Ok(if outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    let end = vizflyt_runtime::fly_command(runtime, command, reloads)?;
+    Ok(if end.outcome().is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 fn fly_simulated(
@@ -157,8 +157,7 @@ fn fly_simulated(
     } else {
         tell(report.summary());
     }
-    let is_good = matches!(report.outcome.as_str(), "finished" | "landed");
-    Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(if report.outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// The one line that says which of the two labs it is.

@@ -21,10 +21,11 @@ use glam::DVec3;
 use sha2::{Digest, Sha256};
 use vizflyt_arena::crash::{Asked, Flight as Record, Seen, ahead_m};
 use vizflyt_arena::pose::{Measured, Predict};
-use vizflyt_arena::verdict::{Sample, Verdict, judge};
+use vizflyt_arena::verdict::{Sample, Verdict, judge_ended};
 use vizflyt_arena::{ArenaConfig, Referee};
+use vizflyt_protocol::flight_end::FlightEnd;
 use vizflyt_protocol::mavlink::MAX_PACKET;
-use vizflyt_protocol::messages::{CameraInfo, Event, EventKind, FlightPhase, Limits, Setpoint};
+use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Setpoint};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
 use vizflyt_runtime::guard::Fix;
@@ -110,7 +111,6 @@ impl Flown {
     pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
         Record {
             verdict: &self.verdict,
-            events: &self.events,
             samples: &self.samples,
             asked: Some(&self.asked),
             seen: &self.seen,
@@ -214,7 +214,8 @@ struct Flight<'a> {
     shots: VecDeque<Shot>,
     lines: VecDeque<String>,
     answered: u64,
-    is_decided: bool,
+    /// How it ends, by all that happened so far.
+    end: FlightEnd,
 }
 
 impl<'a> Flight<'a> {
@@ -263,7 +264,7 @@ impl<'a> Flight<'a> {
             shots: VecDeque::new(),
             lines: VecDeque::new(),
             answered: 0,
-            is_decided: false,
+            end: FlightEnd::default(),
         })
     }
 
@@ -302,6 +303,7 @@ impl<'a> Flight<'a> {
         }
         self.lockstep.handle_timeout(self.now);
         while let Some(event) = self.lockstep.companion.poll_event() {
+            self.referee.handle_event(&event);
             self.note(event);
         }
         while let Some(datagram) = self.lockstep.companion.poll_transmit() {
@@ -426,7 +428,7 @@ impl<'a> Flight<'a> {
     }
 
     fn keep_for_report(&mut self, pending: &Pending, setpoint: Option<Setpoint>) {
-        if self.is_decided {
+        if self.end.reason().is_some() {
             return;
         }
         let front = pending.drawn.first().and_then(Option::as_ref);
@@ -452,14 +454,7 @@ impl<'a> Flight<'a> {
     }
 
     fn note(&mut self, event: Event) {
-        self.is_decided |= matches!(
-            event.kind,
-            EventKind::Collision { .. }
-                | EventKind::Geofence { .. }
-                | EventKind::Finished { .. }
-                | EventKind::TimeLimit
-                | EventKind::PluginFailed
-        );
+        self.end.handle(event.stamp, &event.kind);
         self.hash.update(event.stamp.as_ns().to_le_bytes());
         self.hash.update(format!("{:?}", event.kind).as_bytes());
         self.hash.update(event.text.as_bytes());
@@ -493,7 +488,7 @@ impl<'a> Flight<'a> {
         // Server's and runtime's, each in order, become one story.
         self.events.sort_by_key(|event| event.stamp);
         Flown {
-            verdict: judge(self.arena, &self.events, &self.samples),
+            verdict: judge_ended(self.arena, &self.end, &self.events, &self.samples),
             hash: self.hash.finalize().into(),
             events: self.events,
             samples: self.samples,

@@ -3,16 +3,17 @@
 
 use anyhow::{Context, Result};
 use nix::sys::signal::Signal;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use vizflyt_protocol::messages::OutcomeKind;
 
 use super::child::Role;
 
 /// One flight. Written by `--report`.
 #[derive(Clone, Debug, Serialize, PartialEq)]
 pub(crate) struct Report {
-    /// `finished`, `collided`, `geofence`, `timeout`, `landed`, `plugin_failed` or `error`.
-    pub outcome: String,
+    /// How it ended.
+    pub outcome: OutcomeKind,
     /// Why, in a sentence.
     pub reason: String,
     /// The seed of scene and simulator.
@@ -123,12 +124,12 @@ impl Parts {
         .find(|(_, part)| !part.is_object());
         let (outcome, reason) = match missing {
             _ if self.simulator["collided"] == Value::Bool(true) => (
-                "collided".to_owned(),
+                OutcomeKind::Collided,
                 "the body touched the true geometry of the scene".to_owned(),
             ),
-            Some((role, _)) => ("error".to_owned(), self.why_missing(role)),
+            Some((role, _)) => (OutcomeKind::Error, self.why_missing(role)),
             None => (
-                text(&self.runtime, "outcome").unwrap_or_else(|| "error".to_owned()),
+                OutcomeKind::deserialize(&self.runtime["outcome"]).unwrap_or(OutcomeKind::Error),
                 text(&self.runtime, "reason").unwrap_or_default(),
             ),
         };
@@ -239,15 +240,15 @@ mod tests {
     #[test]
     fn the_truth_outranks_the_referee() {
         let mut parts = parts();
-        assert_eq!(parts.join(7, 1.0, "").outcome, "finished");
+        assert_eq!(parts.join(7, 1.0, "").outcome, OutcomeKind::Finished);
         parts.simulator["collided"] = json!(true);
-        assert_eq!(parts.join(7, 1.0, "").outcome, "collided");
+        assert_eq!(parts.join(7, 1.0, "").outcome, OutcomeKind::Collided);
     }
 
     #[test]
     fn a_missing_part_is_an_error_by_name() {
         let report = Parts { server: Value::Null, ..parts() }.join(7, 1.0, "");
-        assert_eq!(report.outcome, "error");
+        assert_eq!(report.outcome, OutcomeKind::Error);
         assert_eq!(report.reason, "the render server ended without a report");
         let killed = vec![(Role::Runtime, Signal::SIGBUS)];
         let report = Parts { runtime: Value::Null, killed, ..parts() }.join(7, 1.0, "");

@@ -19,6 +19,7 @@ mod tests;
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, Event, EventKind, ImuReading, PoseSample, Setpoint, ToPlugin, bounded,
@@ -174,7 +175,8 @@ impl Companion {
     /// Handles an event of the server's, such as one of the referee.
     pub fn handle_event(&mut self, now: HostTime, event: Event) {
         self.send_to_plugin(&event);
-        self.flight.handle(now, Input::Server(event));
+        let at = self.clock.to_host(event.stamp).unwrap_or(now);
+        self.flight.handle(now, Input::Server(event, at));
         // It may have ended the flight: LAND does not wait for the next setpoint's turn.
         self.steering.hurry();
     }
@@ -230,9 +232,9 @@ impl Companion {
         self.flight.handle(now, Input::Answered { seq, setpoint });
     }
 
-    /// The plugin has failed for good; `why` in a sentence.
-    pub fn plugin_failed(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, Input::PluginFailed(why));
+    /// The plugin has failed for good.
+    pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
+        self.flight.handle(now, Input::PluginFailed(fault));
     }
 
     /// The plugin is being started again, and the vehicle holds until it replies; `why` in a sentence.
@@ -321,7 +323,7 @@ impl Companion {
         }
     }
 
-    /// Returns the flight, for its phase and outcome.
+    /// Returns the flight, for its phase and its end.
     pub fn flight(&self) -> &Flight {
         &self.flight
     }
@@ -411,8 +413,7 @@ impl std::fmt::Debug for Companion {
 fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
     let mut event = event.clone();
     if !arena.ground_truth
-        && let EventKind::Collision { p_world_m, .. } | EventKind::Geofence { p_world_m, .. } =
-            &mut event.kind
+        && let Some(p_world_m) = event.kind.place_mut()
     {
         *p_world_m = DVec3::ZERO;
     }

@@ -1,5 +1,6 @@
 //! The companion against inputs of an autopilot and a server, and what it lets a plugin know.
 
+use vizflyt_protocol::flight_end::{Collision, Obstacle};
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_protocol::messages::{FlightPhase, Limits};
 use vizflyt_sdk::glam::{DQuat, DVec3};
@@ -39,8 +40,9 @@ fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
     let stamp = ServerTime::from_ns(at(5).as_ns());
     let pose = Pose::new(p_world_m, DQuat::IDENTITY);
     companion.handle_pose(at(5), &PoseSample::still(stamp, pose), at(5));
-    let kind = EventKind::Collision { p_world_m, clearance_m: -0.1 };
-    companion.handle_event(at(6), Event { stamp, kind, text: bounded("touched") });
+    let (clearance_m, with, speed_mps) = (-0.1, Obstacle::Scene, 1.0);
+    let hit = Collision { p_world_m, clearance_m, with, speed_mps };
+    companion.handle_event(at(6), Event::ending(stamp, EventKind::Collision(hit)));
     let messages = std::iter::from_fn(|| companion.poll_plugin()).collect();
     (companion, messages)
 }
@@ -67,7 +69,7 @@ fn a_plugin_is_greeted_first_and_learns_of_events_in_order() {
 #[test]
 fn what_the_course_withholds_is_nowhere() {
     let place = |messages: &[ToPlugin]| match &messages[1] {
-        ToPlugin::Event(Event { kind: EventKind::Collision { p_world_m, .. }, .. }) => *p_world_m,
+        ToPlugin::Event(Event { kind: EventKind::Collision(it), .. }) => it.p_world_m,
         other => panic!("{other:?}"),
     };
     let (companion, messages) = after_collision(true);
@@ -94,7 +96,7 @@ fn without_an_autopilot_the_flight_is_given_up_at_its_time() {
     let seconds = ended.unwrap().seconds_since(at(0));
     assert!((60.0..60.1).contains(&seconds), "{seconds}");
     assert!((55..70).contains(&beats), "one heartbeat a second: {beats}");
-    let reason = &companion.flight().outcome().unwrap().reason;
+    let reason = companion.flight().outcome().unwrap().to_string();
     assert!(reason.contains("no heartbeat from an autopilot"), "{reason}");
     let phases: Vec<_> = std::iter::from_fn(|| companion.poll_event())
         .filter(|event| matches!(event.kind, EventKind::Phase(_)))

@@ -26,6 +26,7 @@ use std::thread;
 use std::time::Duration;
 
 use serde_json::json;
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{
     CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ToPlugin, bounded,
 };
@@ -34,7 +35,7 @@ use vizflyt_sdk::host_now;
 
 use crate::companion::Companion;
 use crate::console::Screen;
-use crate::flight::{FlightSettings, Outcome};
+use crate::flight::FlightSettings;
 use crate::images::{Published, SharedSenses};
 use crate::link::{LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
@@ -111,7 +112,7 @@ pub struct Control {
 #[derive(Debug)]
 pub struct Flown {
     /// How it ended.
-    pub outcome: Outcome,
+    pub outcome: EndReason,
     /// The images.
     pub times: ImageTimes,
     /// The counters.
@@ -403,7 +404,12 @@ impl ControlLoop {
 
     // ---- the end ----
 
-    fn finish(mut self, now: HostTime, outcome: Outcome, inputs: &Receiver<ControlInput>) -> Flown {
+    fn finish(
+        mut self,
+        now: HostTime,
+        outcome: EndReason,
+        inputs: &Receiver<ControlInput>,
+    ) -> Flown {
         self.report(now);
         self.report_timing(now);
         self.pass_on(now);

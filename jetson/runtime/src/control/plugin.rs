@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 
+use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{CameraInfo, Setpoint, ToPlugin};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
@@ -78,7 +79,7 @@ impl ControlLoop {
                 Ok(made) => offer = Some(made),
                 Err(error) => {
                     let sentence = format!("no plugin can find this runtime: {error}");
-                    self.companion.plugin_failed(now, sentence);
+                    self.companion.plugin_failed(now, PluginFault::ended(&sentence));
                 }
             }
         } else {
@@ -116,7 +117,7 @@ impl ControlLoop {
             if !side.ipc.plugin_attached() {
                 side.by_hand_replied = None;
                 let sentence = "the plugin that had attached has ended".to_owned();
-                return self.companion.plugin_failed(now, sentence);
+                return self.companion.plugin_failed(now, PluginFault::ended(&sentence));
             }
         }
         if now.seconds_since(answered) > BREAKPOINT_S {
@@ -144,7 +145,7 @@ impl ControlLoop {
             Err(error) => {
                 let program = side.command[0].to_string_lossy();
                 let sentence = format!("the plugin {program} cannot be started: {error}");
-                self.companion.plugin_failed(now, sentence);
+                self.companion.plugin_failed(now, PluginFault::ended(&sentence));
             }
         }
     }
@@ -158,7 +159,7 @@ impl ControlLoop {
             self.restarts += 1;
             self.replace_plugin(now, sentence);
         } else {
-            self.companion.plugin_failed(now, sentence);
+            self.companion.plugin_failed(now, PluginFault::ended(&sentence));
         }
     }
 

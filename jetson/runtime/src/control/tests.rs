@@ -5,6 +5,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 use std::sync::mpsc::sync_channel;
 
+use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{ArenaInfo, Axes, Limits, PoseSample, Setpoint, YawTarget};
 use vizflyt_protocol::time::ServerTime;
@@ -238,7 +239,8 @@ fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
 #[test]
 fn both_drivers_send_the_same_setpoints_and_events() {
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
-    let collision = EventKind::Collision { p_world_m, clearance_m: -0.1 };
+    let (clearance_m, with, speed_mps) = (-0.1, Obstacle::Scene, 1.0);
+    let collision = EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps });
     let events = fly(true, &collision, 30);
     assert!(events.iter().any(|event| event.kind == collision));
     let refused = events.iter().find(|event| event.text.starts_with("setpoint refused"));
@@ -248,7 +250,13 @@ fn both_drivers_send_the_same_setpoints_and_events() {
 #[test]
 fn both_drivers_withhold_the_pose_alike() {
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
-    let outside = EventKind::Geofence { p_world_m, margin_m: -0.1 };
+    let outside = EventKind::Geofence(FenceBreach {
+        p_world_m,
+        margin_m: -0.1,
+        boundary: Boundary::Geofence,
+        speed_mps: 1.0,
+        overshoot_m: 0.2,
+    });
     let events = fly(false, &outside, 25);
     assert!(!events.iter().any(|event| event.kind == outside), "the place is withheld");
 }

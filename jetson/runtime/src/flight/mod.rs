@@ -10,29 +10,31 @@
 //! ```
 //! Where a person is to start it ([`Flight::wait_for_start`]), the flight stays `Waiting` between
 //! preparing and taking off, for as long as everything is ready.
-//! The first cause of a landing is the flight's [`Outcome`]; landing is never taken back.
+//! What ends the flight, and what its outcome is, [`vizflyt_protocol::flight_end`] decides; landing is
+//! never taken back.
 //!
 //! Why longer than most: one state machine, read best in one place.
 
-mod outcome;
 #[cfg(test)]
 pub(crate) mod tests;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
+use vizflyt_protocol::flight_end::{
+    Boundary, EndReason, FenceBreach, FlightEnd, Missing, PluginFault,
+};
 use vizflyt_protocol::mavlink::{CopterMode, GuidedSetpoint};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, OutcomeKind, PoseAges,
-    Setpoint,
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, Name, PoseAges, Setpoint,
+    bounded,
 };
-use vizflyt_protocol::time::HostTime;
+use vizflyt_protocol::time::{Host, HostTime};
 
 use crate::guard::{
     Fix, Guard, HoldReason, LandReason, Passed, RESTART_WITHIN_S, SETPOINT_HOLD_S, Stance,
 };
-use crate::link::{Goal, Link, LinkEvent};
-pub use outcome::Outcome;
+use crate::link::{Goal, LOST_AFTER_S, Link, LinkEvent};
 
 /// What a person may set.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,8 +62,8 @@ pub enum Input {
     Arena(Box<ArenaInfo>),
     /// The vehicle was localized.
     Pose(Fix),
-    /// The server tells of something.
-    Server(Event),
+    /// The server tells of something; when it was, by our clock.
+    Server(Event, HostTime),
     /// The autopilot's side.
     Link(LinkEvent),
     /// The plugin waits for images.
@@ -80,8 +82,8 @@ pub enum Input {
     },
     /// The server will not have us, and trying again will not help; why, in a sentence.
     ServerRefused(String),
-    /// The plugin is no more; why, in a sentence.
-    PluginFailed(String),
+    /// The plugin is no more.
+    PluginFailed(PluginFault),
     /// The plugin is being started again; why, in a sentence. The vehicle holds until it answers.
     PluginRestarts(String),
     /// A person ends the flight.
@@ -173,7 +175,7 @@ pub struct Flight {
     unanswered: Option<(u64, HostTime)>,
     guard: Option<Guard>,
     stance: Option<Stance>,
-    outcome: Option<Outcome>,
+    end: FlightEnd<Host>,
     /// A pilot flies: nothing is sent any more.
     hands_off: bool,
     interrupted_at: Option<HostTime>,
@@ -210,7 +212,7 @@ impl Flight {
             unanswered: None,
             guard: None,
             stance: None,
-            outcome: None,
+            end: FlightEnd::default(),
             hands_off: false,
             interrupted_at: None,
             disarmed_at: None,
@@ -235,9 +237,9 @@ impl Flight {
         self.phase
     }
 
-    /// Returns the outcome once the flight is over.
-    pub fn outcome(&self) -> Option<&Outcome> {
-        if self.phase == FlightPhase::Landed { self.outcome.as_ref() } else { None }
+    /// Returns why the flight ended, once it is over.
+    pub fn outcome(&self) -> Option<&EndReason> {
+        if self.phase == FlightPhase::Landed { self.end.reason() } else { None }
     }
 
     /// Returns the newest fix.
@@ -265,21 +267,19 @@ impl Flight {
                     self.fix = Some(fix);
                 }
             }
-            Input::Server(event) => self.handle_server(now, &event),
+            Input::Server(event, at) => self.handle_server(now, at.min(now), &event),
             Input::Link(event) => self.handle_link(now, event),
-            Input::ServerRefused(why) => self.end_now(now, OutcomeKind::Error, why),
+            Input::ServerRefused(why) => self.end_for(now, EndReason::ServerRefused(bounded(&why))),
             Input::PluginReady => self.plugin_ready = true,
             Input::ImagePublished { seq } => {
                 self.unanswered.get_or_insert((seq, now));
             }
             Input::Answered { seq, setpoint } => self.handle_answer(now, seq, setpoint),
-            Input::PluginFailed(reason) => {
-                self.end_in_order(now, OutcomeKind::PluginFailed, reason);
-            }
+            Input::PluginFailed(fault) => self.end_for(now, EndReason::Plugin(fault)),
             Input::PluginRestarts(why) => self.handle_restart(now, why),
             Input::Interrupt => {
                 self.interrupted_at.get_or_insert(now);
-                self.end_now(now, OutcomeKind::Landed, "stopped by a person".into());
+                self.end_for(now, EndReason::Interrupted);
             }
         }
     }
@@ -319,33 +319,20 @@ impl Flight {
     fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
         self.settings.tighten(&mut arena);
         if let Err(why) = crate::guard::check_arena(&arena) {
-            return self.end_now(now, OutcomeKind::Error, why);
+            return self.end_for(now, EndReason::ArenaRefused(bounded(&why)));
         }
         match &self.arena {
             Some(known) if **known != *arena => {
                 // The guard must not keep a fence that is no longer the room's.
-                let why = format!("the server came back with another arena, {}", arena.name);
-                self.end_now(now, OutcomeKind::Error, why);
+                self.end_for(now, EndReason::ArenaChanged { name: arena.name.clone() });
             }
             _ => self.arena = Some(arena),
         }
     }
 
-    fn handle_server(&mut self, now: HostTime, event: &Event) {
-        let text = event.text.as_str().to_owned();
+    fn handle_server(&mut self, now: HostTime, at: HostTime, event: &Event) {
+        self.end.handle(at, &event.kind);
         match event.kind {
-            EventKind::Collision { .. } if self.is_airborne() => {
-                self.end_now(now, OutcomeKind::Collided, text);
-            }
-            EventKind::Geofence { .. } if self.is_airborne() => {
-                self.end_now(now, OutcomeKind::Geofence, text);
-            }
-            EventKind::EmergencyStop => {
-                self.end_now(now, OutcomeKind::Landed, "the stop button was pressed".into());
-            }
-            EventKind::Land => {
-                self.end_in_order(now, OutcomeKind::Landed, "the land button was pressed".into());
-            }
             EventKind::Start if self.phase == FlightPhase::Waiting => {
                 self.waits_for_start = false;
             }
@@ -354,25 +341,25 @@ impl Flight {
                 let why = "start was pressed before the vehicle was ready; press it again then";
                 self.notice(EventKind::Note, why.to_owned());
             }
-            EventKind::Finished { .. } if self.is_airborne() => {
-                self.end_in_order(now, OutcomeKind::Finished, text);
+            _ => {
+                // What cannot end it on the ground does not.
+                if let (Some(reason), Some(_)) = (event.kind.end_reason(), self.end.reason()) {
+                    self.come_down(now, reason.brakes_first());
+                }
             }
-            EventKind::TimeLimit if self.is_airborne() => {
-                self.end_in_order(now, OutcomeKind::Timeout, text);
-            }
-            _ => {}
         }
     }
 
     fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
         match event {
-            LinkEvent::Refused(why) => self.end_now(now, OutcomeKind::Error, why),
+            LinkEvent::Refused(why) => {
+                self.end_for(now, EndReason::AutopilotRefused(bounded(&why)));
+            }
             LinkEvent::Lost if self.is_airborne() => {
-                let why = "the autopilot has been silent for 3 s".to_owned();
-                self.end_now(now, OutcomeKind::Error, why);
+                self.end_for(now, EndReason::AutopilotSilent { silent_s: LOST_AFTER_S });
             }
             LinkEvent::Rebooted if self.is_airborne() => {
-                self.end_now(now, OutcomeKind::Error, "the autopilot restarted in flight".into());
+                self.end_for(now, EndReason::AutopilotRestarted);
             }
             LinkEvent::Text { severity, text } if severity <= SEVERITY_WARNING => {
                 self.notice(EventKind::Note, format!("autopilot: {text}"));
@@ -390,7 +377,7 @@ impl Flight {
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
             self.unanswered = None;
         }
-        let (Some(guard), None) = (&mut self.guard, &self.outcome) else { return };
+        let (Some(guard), None) = (&mut self.guard, self.end.reason()) else { return };
         let Some(setpoint) = setpoint else { return guard.answered(now) };
         match guard.ask(now, setpoint) {
             Ok(()) => {
@@ -431,7 +418,7 @@ impl Flight {
 
     /// Whether the flight can go on without a plugin for a while.
     pub fn can_wait_for_plugin(&self) -> bool {
-        self.outcome.is_none() && (self.is_on_ground() || self.is_airborne())
+        self.end.reason().is_none() && (self.is_on_ground() || self.is_airborne())
     }
 
     // ---- phases ----
@@ -441,10 +428,8 @@ impl Flight {
     fn is_left_over(&mut self, now: HostTime, link: &LinkView) -> bool {
         let left = link.connected && link.armed && link.mode == CopterMode::Guided as u32;
         if left {
-            let why = "the vehicle is armed and in GUIDED with nobody to guide it, as a former runtime \
-                       left it; landing";
-            let reason = self.decide(OutcomeKind::Error, why.into());
-            self.enter(now, FlightPhase::Landing, &reason);
+            self.decide(now, EndReason::LeftInAir);
+            self.enter(now, FlightPhase::Landing, &self.landing_text());
         }
         left
     }
@@ -454,11 +439,11 @@ impl Flight {
             return;
         }
         let missing = if self.arena.is_none() {
-            Some("no answer from the server; check --server")
+            Some(Missing::Server)
         } else if !self.plugin_ready {
-            Some("the plugin is not ready yet (`on_start` runs)")
+            Some(Missing::Plugin)
         } else if !link.connected {
-            Some("no heartbeat from an autopilot; check power, link and --mavlink")
+            Some(Missing::Heartbeat)
         } else {
             None
         };
@@ -475,13 +460,13 @@ impl Flight {
         let pose_age_s = self.fix.map(|fix| now.seconds_since(fix.stamp));
         let hold_after_s = self.pose_ages().hold_after_s;
         let missing = if link.armed {
-            Some("the vehicle is armed already; disarm it first")
+            Some(Missing::Disarmed)
         } else if pose_age_s.is_none_or(|age_s| age_s > hold_after_s) {
-            Some("the server has no pose of the vehicle; check the localization and --vehicle")
+            Some(Missing::Pose)
         } else if self.answered_at.is_none() {
-            Some("the plugin has not answered an image yet")
+            Some(Missing::Answer)
         } else {
-            link.ready_to_arm.as_ref().err().map(AsRef::as_ref)
+            link.ready_to_arm.as_ref().err().map(|words| Missing::PreArm(bounded(words)))
         };
         match (missing, self.fix) {
             (None, Some(_)) if self.waits_for_start => {
@@ -494,14 +479,14 @@ impl Flight {
                 self.enter(now, FlightPhase::TakingOff, "pre-arm checks passed; taking off");
             }
             (missing, _) => {
-                let missing = missing.unwrap_or("waiting for a pose").to_owned();
+                let missing = missing.unwrap_or(Missing::Pose);
                 if self.phase == FlightPhase::Waiting {
                     // The time to get ready counts anew: it was ready.
                     self.started_at = now;
                     let why = format!("no longer ready: {missing}");
                     self.enter(now, FlightPhase::Preparing, &why);
                 }
-                self.wait_for(now, &missing);
+                self.wait_for(now, missing);
             }
         }
     }
@@ -513,8 +498,7 @@ impl Flight {
         }
         let pose_age_s = now.seconds_since(fix.stamp);
         if pose_age_s > arena.pose_ages.land_after_s {
-            let why = format!("pose lost for {pose_age_s:.1} s during take-off");
-            return self.end_now(now, OutcomeKind::Error, why);
+            return self.end_for(now, EndReason::PoseLost { age_s: pose_age_s });
         }
         let Some(took_off_at) = self.took_off_at else { return };
         let risen_m = fix.p_world_m.z - self.start_z_m;
@@ -523,24 +507,22 @@ impl Flight {
             self.unanswered = None;
             self.enter(now, FlightPhase::Flying, "the plugin flies");
         } else if now.seconds_since(took_off_at) > CLIMB_WITHIN_S {
-            let why =
-                format!("take-off rose {risen_m:.2} m in {CLIMB_WITHIN_S} s, not the height asked");
-            self.end_now(now, OutcomeKind::Error, why);
+            self.end_for(now, EndReason::ClimbFailed { risen_m, within_s: CLIMB_WITHIN_S });
         }
     }
 
     fn flying(&mut self, now: HostTime, link: &LinkView) -> Orders {
         let (asked_s, arena_s) = self.time_limits_s();
         if self.seconds(now) > asked_s.min(arena_s) {
-            let (kind, why) = if asked_s < arena_s {
-                (OutcomeKind::Landed, format!("the {asked_s} s asked for are over"))
+            let reason = if asked_s < arena_s {
+                EndReason::TimeAsked { seconds: asked_s }
             } else {
-                (OutcomeKind::Timeout, format!("time limit of {arena_s} s reached"))
+                EndReason::TimeLimit { limit_s: arena_s }
             };
-            self.end_in_order(now, kind, why);
+            self.end_for(now, reason);
         }
         if link.connected && !link.armed {
-            self.end_now(now, OutcomeKind::Error, "the vehicle disarmed in flight".into());
+            self.end_for(now, EndReason::Disarmed);
         } else if link.connected && link.mode != CopterMode::Guided as u32 {
             self.taken_over(now, link.mode);
         }
@@ -610,6 +592,7 @@ impl Flight {
         self.phase = phase;
         self.phase_at = now;
         self.reminded_at = None;
+        self.end.handle(now, &EventKind::Phase(phase));
         self.notice(EventKind::Phase(phase), why.to_owned());
     }
 
@@ -618,11 +601,10 @@ impl Flight {
     }
 
     /// Says now and then what is being waited for, and gives up in the end.
-    fn wait_for(&mut self, now: HostTime, missing: &str) {
+    fn wait_for(&mut self, now: HostTime, missing: Missing) {
         let limit_s = self.settings.ready_within_s;
         if limit_s > 0.0 && now.seconds_since(self.started_at) > limit_s {
-            let why = format!("not in the air after {limit_s:.0} s: {missing}");
-            return self.end_now(now, OutcomeKind::Error, why);
+            return self.end_for(now, EndReason::NotReady { within_s: limit_s, missing });
         }
         let due = self.reminded_at.unwrap_or(self.phase_at).plus_seconds(REMIND_S);
         if now >= due {
@@ -631,46 +613,45 @@ impl Flight {
         }
     }
 
-    /// Sets the outcome, if it is not set yet; returns its reason.
-    fn decide(&mut self, kind: OutcomeKind, reason: String) -> String {
-        if let Some(outcome) = &self.outcome {
-            return outcome.reason.clone();
+    /// Tells why the flight ends, if nothing has ended it yet.
+    fn decide(&mut self, now: HostTime, reason: EndReason) {
+        if self.end.reason().is_none() {
+            let text = reason.to_string();
+            let kind = EventKind::Ended(reason);
+            self.end.handle(now, &kind);
+            self.notice(kind, text);
         }
-        if kind == OutcomeKind::PluginFailed {
-            self.notice(EventKind::PluginFailed, reason.clone());
-        }
-        self.outcome = Some(Outcome { kind, reason: reason.clone() });
-        reason
     }
 
-    /// Ends the flight: at once on the ground, by LAND in the air.
-    fn end_now(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
-        let reason = self.decide(kind, reason);
+    /// Ends the flight, for a reason of our own.
+    fn end_for(&mut self, now: HostTime, reason: EndReason) {
+        let brakes_first = reason.brakes_first();
+        self.decide(now, reason);
+        self.come_down(now, brakes_first);
+    }
+
+    /// Lands, by LAND or after braking; on the ground the flight is over.
+    fn come_down(&mut self, now: HostTime, brakes_first: bool) {
         match self.phase {
             FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting => {
                 self.landed_at = Some(now);
-                self.enter(now, FlightPhase::Landed, &reason);
+                let why = self.end.reason().map_or(String::new(), ToString::to_string);
+                self.enter(now, FlightPhase::Landed, &why);
             }
             FlightPhase::TakingOff | FlightPhase::Flying | FlightPhase::Holding => {
-                if let Some(guard) = &mut self.guard {
-                    guard.land();
+                match &mut self.guard {
+                    Some(guard) if brakes_first => return guard.brake_and_land(now),
+                    Some(guard) => guard.land(),
+                    None => {}
                 }
-                self.enter(now, FlightPhase::Landing, &format!("landing: {reason}"));
+                self.enter(now, FlightPhase::Landing, &self.landing_text());
             }
             FlightPhase::Landing | FlightPhase::Landed => {}
         }
     }
 
-    /// Ends the flight: brakes first if the guard flies.
-    fn end_in_order(&mut self, now: HostTime, kind: OutcomeKind, reason: String) {
-        match &mut self.guard {
-            Some(guard) if self.outcome.is_none() && self.phase != FlightPhase::Landing => {
-                guard.brake_and_land(now);
-                self.decide(kind, reason);
-            }
-            Some(_) => {}
-            None => self.end_now(now, kind, reason),
-        }
+    fn landing_text(&self) -> String {
+        self.end.reason().map_or("landing".to_owned(), |reason| format!("landing: {reason}"))
     }
 
     /// Says that the fence stops the vehicle; once, until it has not for a while.
@@ -684,14 +665,11 @@ impl Flight {
 
     /// Someone else changed the mode: a failsafe of the autopilot, or a pilot.
     fn taken_over(&mut self, now: HostTime, mode: u32) {
-        let mode = CopterMode::from_number(mode);
-        if mode != Some(CopterMode::Land) {
+        if CopterMode::from_number(mode) != Some(CopterMode::Land) {
             // The pilot's will goes before ours.
             self.hands_off = true;
         }
-        let name = mode.map_or("another mode".to_owned(), |mode| format!("{mode:?}"));
-        let why = format!("the autopilot was switched to {name}, not by this runtime");
-        self.end_now(now, OutcomeKind::Error, why);
+        self.end_for(now, EndReason::TakenOver { mode });
     }
 
     /// Follows the guard: its holds and landings are the flight's.
@@ -699,8 +677,12 @@ impl Flight {
         let former = self.stance.replace(stance);
         match stance {
             Stance::Landing(reason) => {
-                let (kind, why) = self.verdict(now, reason);
-                self.end_now(now, kind, why);
+                if let Some(reason) = self.reason_of(now, reason) {
+                    self.decide(now, reason);
+                }
+                if self.phase != FlightPhase::Landing {
+                    self.enter(now, FlightPhase::Landing, &self.landing_text());
+                }
             }
             Stance::Holding(HoldReason::Asked) | Stance::Passing => {
                 if self.phase == FlightPhase::Holding {
@@ -711,13 +693,13 @@ impl Flight {
                 if former != Some(stance) {
                     let why = match reason {
                         HoldReason::Asked => "the plugin asks to hold".to_owned(),
-                        HoldReason::NoSetpoint => self.why_silent(now),
+                        HoldReason::NoSetpoint => self.why_silent(now).to_string(),
                         HoldReason::Restarting => "the plugin is being started again".to_owned(),
                         HoldReason::PoseStale => {
                             format!("the pose is older than {} s", self.pose_ages().hold_after_s)
                         }
                         HoldReason::Ending => {
-                            self.outcome.as_ref().map_or(String::new(), |o| o.reason.clone())
+                            self.end.reason().map_or(String::new(), ToString::to_string)
                         }
                     };
                     self.enter(now, FlightPhase::Holding, &format!("holding: {why}"));
@@ -726,30 +708,31 @@ impl Flight {
         }
     }
 
-    fn verdict(&self, now: HostTime, reason: LandReason) -> (OutcomeKind, String) {
-        match reason {
-            LandReason::Asked => (OutcomeKind::Landed, "the plugin asked to land".into()),
+    /// Returns why the guard lands; `None` where it was told to.
+    fn reason_of(&self, now: HostTime, reason: LandReason) -> Option<EndReason> {
+        let breach = |beyond_m: f64, boundary| {
+            let fix = self.fix.as_ref();
+            EndReason::Geofence(FenceBreach {
+                p_world_m: fix.map(|fix| fix.p_world_m).unwrap_or_default(),
+                margin_m: -beyond_m,
+                boundary,
+                speed_mps: fix.map_or(0.0, |fix| fix.v_world_mps.length()),
+                overshoot_m: beyond_m,
+            })
+        };
+        Some(match reason {
+            LandReason::Asked => EndReason::PluginLanded,
             LandReason::NoPlugin => {
                 let why = self.restart_reason.as_deref().unwrap_or("it was to be started again");
-                let within_s = RESTART_WITHIN_S;
-                let text = format!("the plugin did not come back within {within_s} s; {why}");
-                (OutcomeKind::PluginFailed, text)
+                let why = bounded(why);
+                EndReason::Plugin(PluginFault::NotBack { within_s: RESTART_WITHIN_S, why })
             }
-            LandReason::NoSetpoint(_) if self.sees_nothing(now) => {
-                (OutcomeKind::Error, self.why_silent(now))
-            }
-            LandReason::NoSetpoint(_) => (OutcomeKind::PluginFailed, self.why_silent(now)),
-            LandReason::PoseLost(age_s) => {
-                (OutcomeKind::Error, format!("pose lost for {age_s:.1} s"))
-            }
-            LandReason::OutsideFence(outside_m) => {
-                (OutcomeKind::Geofence, format!("{outside_m:.2} m outside the geofence"))
-            }
-            LandReason::InNoFly(inside_m) => {
-                (OutcomeKind::Geofence, format!("{inside_m:.2} m inside a no-fly box"))
-            }
-            LandReason::Ordered => (OutcomeKind::Landed, "landing was ordered".into()),
-        }
+            LandReason::NoSetpoint(_) => self.why_silent(now),
+            LandReason::PoseLost(age_s) => EndReason::PoseLost { age_s },
+            LandReason::OutsideFence(outside_m) => breach(outside_m, Boundary::Geofence),
+            LandReason::InNoFly(inside_m) => breach(inside_m, Boundary::NoFly(Name::new())),
+            LandReason::Ordered => return None,
+        })
     }
 
     /// Ages of a pose that the arena allows.
@@ -764,18 +747,13 @@ impl Flight {
     }
 
     /// Why no setpoint comes: the plugin, or nothing for it to see.
-    fn why_silent(&self, now: HostTime) -> String {
-        match self.unanswered {
-            Some((seq, at)) => {
-                let silent_s = now.seconds_since(at);
-                format!("the plugin has not answered image {seq} for {silent_s:.1} s")
-            }
-            None if self.sees_nothing(now) => "no image has come from the server".into(),
-            None if let Some(fault) = self.refused => {
-                format!("the plugin's setpoints are refused: {fault}")
-            }
-            None => "the plugin answers images without a setpoint".into(),
-        }
+    fn why_silent(&self, now: HostTime) -> EndReason {
+        EndReason::Plugin(match self.unanswered {
+            Some((image, at)) => PluginFault::NoAnswer { image, silent_s: now.seconds_since(at) },
+            None if self.sees_nothing(now) => return EndReason::NoImage,
+            None if let Some(fault) = self.refused => PluginFault::Refused(fault),
+            None => PluginFault::NoSetpoint,
+        })
     }
 }
 

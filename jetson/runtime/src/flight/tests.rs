@@ -1,8 +1,9 @@
 //! The flight on a virtual clock, with a vehicle that does as it is told.
 
 use glam::{DQuat, DVec3};
+use vizflyt_protocol::flight_end::{Collision, Obstacle};
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::{Limits, PoseAges, YawTarget, bounded};
+use vizflyt_protocol::messages::{Limits, OutcomeKind, PoseAges, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
 
 use vizflyt_protocol::mavlink::GuidedMotion;
@@ -166,7 +167,7 @@ impl Script {
 
     fn server(&mut self, kind: EventKind, text: &str) {
         let event = Event { stamp: ServerTime::ZERO, kind, text: bounded(text) };
-        self.flight.handle(self.now, Input::Server(event));
+        self.flight.handle(self.now, Input::Server(event, self.now));
     }
 
     fn phases(&self) -> Vec<FlightPhase> {
@@ -181,8 +182,8 @@ impl Script {
     fn check_end(&mut self, kind: OutcomeKind, reason: &str) {
         self.run(15.0);
         let outcome = self.flight.outcome().unwrap_or_else(|| panic!("{:?}", self.notices));
-        assert_eq!(outcome.kind, kind, "{outcome:?}");
-        assert!(outcome.reason.contains(reason), "{outcome:?}");
+        assert_eq!(outcome.outcome(), kind, "{outcome:?}");
+        assert!(outcome.to_string().contains(reason), "{outcome:?}");
         assert!(!self.link.armed, "it is on the ground");
     }
 }
@@ -193,7 +194,7 @@ fn from_contact_to_the_goal_to_the_ground() {
     script.run(3.0);
     assert!(script.orders.setpoint.is_some() && script.orders.goal == Goal::Fly);
     script.server(EventKind::Finished { seconds: 5.0 }, "goal reached in 5.0 s");
-    script.check_end(OutcomeKind::Finished, "goal reached");
+    script.check_end(OutcomeKind::Finished, "finished after 5.0 s");
     let phases = script.phases();
     assert_eq!(phases[..3], [Preparing, TakingOff, Flying]);
     assert_eq!(phases[phases.len() - 2..], [Landing, Landed]);
@@ -226,8 +227,8 @@ fn nothing_is_armed_before_all_are_ready() {
         assert!(reminders.len() >= 3, "{expected}: {:?}", script.notices);
         script.run(3.0);
         let outcome = script.flight.outcome().unwrap();
-        assert_eq!(outcome.kind, OutcomeKind::Error);
-        assert!(outcome.reason.starts_with("not in the air after 20 s"), "{outcome:?}");
+        assert_eq!(outcome.outcome(), OutcomeKind::Error);
+        assert!(outcome.to_string().starts_with("not in the air after 20 s"), "{outcome:?}");
     }
 }
 
@@ -244,7 +245,6 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
 
 #[test]
 fn each_event_has_its_outcome() {
-    let (p_world_m, clearance_m) = (DVec3::ONE, -0.1);
     let check = |kind: EventKind, outcome| {
         let mut script = Script::flying();
         script.server(kind, "the server says so");
@@ -253,10 +253,23 @@ fn each_event_has_its_outcome() {
         assert!(brakes || script.orders.goal == Goal::Land, "lands at once");
         script.check_end(outcome, "");
     };
-    check(EventKind::Collision { p_world_m, clearance_m }, OutcomeKind::Collided);
-    check(EventKind::Geofence { p_world_m, margin_m: 0.0 }, OutcomeKind::Geofence);
-    check(EventKind::TimeLimit, OutcomeKind::Timeout);
+    check(EventKind::Collision(touch()), OutcomeKind::Collided);
+    let breach = FenceBreach {
+        p_world_m: DVec3::ONE,
+        margin_m: 0.0,
+        boundary: Boundary::Geofence,
+        speed_mps: 1.0,
+        overshoot_m: 0.1,
+    };
+    check(EventKind::Geofence(breach), OutcomeKind::Geofence);
+    check(EventKind::TimeLimit { limit_s: 30.0 }, OutcomeKind::Timeout);
+    check(EventKind::Ended(EndReason::PoseLost { age_s: 2.0 }), OutcomeKind::Error);
     check(EventKind::EmergencyStop, OutcomeKind::Landed);
+}
+
+fn touch() -> Collision {
+    let (p_world_m, clearance_m, speed_mps) = (DVec3::ONE, -0.1, 1.0);
+    Collision { p_world_m, clearance_m, with: Obstacle::Scene, speed_mps }
 }
 
 #[test]
@@ -264,6 +277,35 @@ fn the_land_button_brakes_then_lands() {
     let mut script = Script::flying();
     script.server(EventKind::Land, "land");
     script.check_end(OutcomeKind::Landed, "the land button was pressed");
+}
+
+#[test]
+fn a_touch_after_land_was_ordered_lands_at_once_and_changes_no_outcome() {
+    let mut script = Script::flying();
+    script.run(3.0);
+    script.server(EventKind::Land, "land");
+    assert_eq!(script.flight.phase(), FlightPhase::Flying, "it brakes");
+    script.run(0.02);
+    script.server(EventKind::Collision(touch()), "touch");
+    assert_eq!(script.flight.phase(), FlightPhase::Landing);
+    script.check_end(OutcomeKind::Landed, "the land button was pressed");
+}
+
+#[test]
+fn what_happened_first_is_the_outcome_though_it_is_heard_of_later() {
+    let mut script = Script::flying();
+    script.run(1.0);
+    let touched_at = script.now;
+    script.run(0.1);
+    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("exit status 3")));
+    script.run(0.1);
+    let kind = EventKind::Collision(touch());
+    let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
+    script.flight.handle(script.now, Input::Server(event, touched_at));
+    script.check_end(OutcomeKind::Collided, "collision with an obstacle");
+    // The server hears of what the runtime saw; the earlier stamp wins there as well.
+    let told = script.notices.iter().filter(|n| matches!(n.kind, EventKind::Ended(_))).count();
+    assert_eq!(told, 1);
 }
 
 #[test]
@@ -292,34 +334,36 @@ fn a_flight_that_waits_ends_at_once_by_either_button() {
     for kind in [EventKind::Land, EventKind::EmergencyStop] {
         let mut script = Script::waiting();
         script.server(kind, "over");
-        assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+        assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Landed);
     }
 }
 
 #[test]
 fn on_the_ground_only_the_stop_button_ends_it() {
     let mut script = Script::new();
-    script.server(EventKind::TimeLimit, "time");
-    script.server(EventKind::Collision { p_world_m: DVec3::ZERO, clearance_m: 0.0 }, "floor");
+    script.server(EventKind::TimeLimit { limit_s: 30.0 }, "time");
+    script.server(EventKind::Collision(touch()), "floor");
     script.run(1.0);
     assert_eq!(script.flight.phase(), FlightPhase::Connecting);
     script.server(EventKind::EmergencyStop, "stop");
-    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+    assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Landed);
 }
 
 #[test]
 fn a_failed_plugin_lands_the_vehicle_and_says_why() {
     let mut script = Script::flying();
     script.answers = Answers::Never;
-    script.flight.handle(script.now, Input::PluginFailed("killed by SIGSEGV".into()));
+    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("killed by SIGSEGV")));
     script.check_end(OutcomeKind::PluginFailed, "killed by SIGSEGV");
-    let failures =
-        script.notices.iter().filter(|notice| notice.kind == EventKind::PluginFailed).count();
-    assert_eq!(failures, 1);
+    let is_failure = |notice: &&Notice| {
+        matches!(notice.kind, EventKind::Ended(EndReason::Plugin(_)))
+            && notice.text == "killed by SIGSEGV"
+    };
+    assert_eq!(script.notices.iter().filter(is_failure).count(), 1);
 
     let mut script = Script::new();
-    script.flight.handle(script.now, Input::PluginFailed("exit status 1".into()));
-    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::PluginFailed);
+    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("exit status 1")));
+    assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::PluginFailed);
 }
 
 #[test]
@@ -385,7 +429,7 @@ fn a_lost_link_or_a_restart_ends_the_flight() {
     script.link.connected = false;
     script.flight.handle(script.now, Input::Link(LinkEvent::Lost));
     script.run(12.0);
-    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Error);
+    assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Error);
 }
 
 #[test]
@@ -406,7 +450,7 @@ fn an_interrupt_lands_first_and_leaves_soon() {
     script.run(0.02);
     assert_eq!(script.orders.goal, Goal::Land);
     script.run(1.2);
-    assert_eq!(script.flight.outcome().unwrap().kind, OutcomeKind::Landed);
+    assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Landed);
     assert!(script.link.armed, "it is still coming down, in LAND");
     assert_eq!(script.link.mode, 9);
 }
@@ -438,7 +482,7 @@ fn a_server_that_comes_back_with_another_arena_ends_it() {
     let mut script = Script::new();
     let broken = ArenaInfo { takeoff_height_m: f64::NAN, ..arena() };
     script.flight.handle(script.now, Input::Arena(Box::new(broken)));
-    assert!(script.flight.outcome().unwrap().reason.contains("takeoff_height_m"));
+    assert!(script.flight.outcome().unwrap().to_string().contains("takeoff_height_m"));
 }
 
 #[test]
@@ -525,7 +569,7 @@ fn one_that_fails_on_the_ground_does_so_before_arming() {
     script.run(4.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
     // Once the flight is over, there is nothing to be started for.
-    script.flight.handle(script.now, Input::PluginFailed("it is broken".into()));
+    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("it is broken")));
     assert!(!script.flight.can_wait_for_plugin());
     script.restart("no");
     script.check_end(OutcomeKind::PluginFailed, "it is broken");

@@ -135,7 +135,7 @@ pub const COMPONENT_ID: u8 = 191;
 /// Heartbeats, origin and clock requests. [s]
 const SECOND_S: f64 = 1.0;
 /// An autopilot silent for this long is lost: three heartbeats. [s]
-const LOST_AFTER_S: f64 = 3.0;
+pub(crate) const LOST_AFTER_S: f64 = 3.0;
 /// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
 /// the autopilot's filter takes for independent. [m]
 const VISION_SIGMA_M: DVec3 = DVec3::splat(0.02);

@@ -148,9 +148,9 @@ impl Lockstep {
         line: LineSink<'_>,
     ) -> Result<Option<T>, ProcessError> {
         match result {
-            Err(ProcessError::Failed(why)) => {
+            Err(ProcessError::Failed(fault)) => {
                 self.stop(line);
-                self.companion.plugin_failed(now, why);
+                self.companion.plugin_failed(now, *fault);
                 Ok(None)
             }
             result => result.map(Some),

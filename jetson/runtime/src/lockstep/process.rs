@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_sdk::ObservationTooLarge;
@@ -29,9 +30,9 @@ pub enum ProcessError {
     /// The plugin's program cannot be started.
     #[error("the plugin {0} cannot be started: {1}")]
     Start(String, std::io::Error),
-    /// The plugin failed: how, in a sentence.
+    /// The plugin failed.
     #[error("{0}")]
-    Failed(String),
+    Failed(Box<PluginFault>),
 }
 
 /// Receives the lines that the plugin prints.
@@ -84,7 +85,7 @@ impl PluginProcess {
         let deadline = Instant::now() + READY_WITHIN;
         while !self.ipc.plugin_attached() {
             if let Some(why) = self.pass_lines(line) {
-                return Err(ProcessError::Failed(why));
+                return Err(failed(&why));
             }
             if Instant::now() > deadline {
                 return Err(failed("the plugin did not attach within five minutes"));
@@ -116,14 +117,14 @@ impl PluginProcess {
                 Err(IpcError::QueueFull(_)) if Instant::now() < deadline => {
                     self.ipc.heartbeat();
                     if let Some(why) = self.pass_lines(line) {
-                        return Err(ProcessError::Failed(why));
+                        return Err(failed(&why));
                     }
                     thread::sleep(Duration::from_millis(2));
                 }
                 Err(IpcError::QueueFull(_)) => {
                     let seconds = self.within.as_secs_f64();
                     let why = format!("the plugin has read no event for {seconds:.0} s");
-                    return Err(ProcessError::Failed(why));
+                    return Err(failed(&why));
                 }
                 Err(error) => return Err(error.into()),
             }
@@ -156,13 +157,12 @@ impl PluginProcess {
                     return Ok(setpoint);
                 }
                 Some(FromPlugin::Failed { reason }) => {
-                    return Err(ProcessError::Failed(format!("the plugin failed: {reason}")));
+                    return Err(failed(&format!("the plugin failed: {reason}")));
                 }
                 None if Instant::now() > deadline => {
-                    let seconds = self.within.as_secs_f64();
-                    return Err(ProcessError::Failed(format!(
-                        "the plugin has not answered image {seq} for {seconds:.0} s"
-                    )));
+                    let silent_s = self.within.as_secs_f64();
+                    let fault = PluginFault::NoAnswer { image: seq, silent_s };
+                    return Err(ProcessError::Failed(Box::new(fault)));
                 }
                 Some(_) | None => {}
             }
@@ -203,7 +203,7 @@ impl PluginProcess {
         // What it said before it ended counts.
         match (self.receive()?, ended) {
             (Some(message), _) => Ok(Some(message)),
-            (None, Some(why)) => Err(ProcessError::Failed(why)),
+            (None, Some(why)) => Err(failed(&why)),
             (None, None) => Ok(None),
         }
     }
@@ -231,5 +231,5 @@ impl PluginProcess {
 }
 
 fn failed(why: &str) -> ProcessError {
-    ProcessError::Failed(why.to_owned())
+    ProcessError::Failed(Box::new(PluginFault::ended(why)))
 }

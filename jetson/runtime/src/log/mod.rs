@@ -38,6 +38,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use vizflyt_protocol::PROTOCOL_VERSION;
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
@@ -198,15 +199,17 @@ impl FlightLog {
 
     /// Logs an event.
     pub fn event(&self, at: HostTime, event: &Event) {
-        let (name, level) = match event.kind {
-            EventKind::Collision { .. } => ("collision", Level::Error),
-            EventKind::Geofence { .. } => ("geofence", Level::Error),
+        let (name, level) = match &event.kind {
+            EventKind::Collision(_) => ("collision", Level::Error),
+            EventKind::Geofence(_) => ("geofence", Level::Error),
             EventKind::EmergencyStop => ("stop button", Level::Error),
-            EventKind::PluginFailed => ("plugin", Level::Error),
+            EventKind::Ended(EndReason::Plugin(_)) => ("plugin", Level::Error),
+            EventKind::Ended(reason) if reason.is_failure() => ("end", Level::Error),
+            EventKind::Ended(_) => ("end", Level::Info),
             EventKind::PoseLost { .. } => ("pose", Level::Warning),
             EventKind::PoseRegained => ("pose", Level::Info),
             EventKind::Stage { .. } | EventKind::Finished { .. } => ("course", Level::Info),
-            EventKind::TimeLimit => ("course", Level::Warning),
+            EventKind::TimeLimit { .. } => ("course", Level::Warning),
             EventKind::Phase(_) => ("phase", Level::Info),
             EventKind::Start => ("start button", Level::Info),
             EventKind::Land => ("land button", Level::Warning),

@@ -112,7 +112,7 @@ impl<'a> Feeder<'a> {
 fn apart<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>, ReplayError> {
     match result {
         Ok(value) => Ok(Ok(value)),
-        Err(ProcessError::Failed(why)) => Ok(Err(why)),
+        Err(ProcessError::Failed(fault)) => Ok(Err(fault.to_string())),
         Err(error) => Err(error.into()),
     }
 }

@@ -55,6 +55,7 @@ pub struct StreamSettings {
 
 /// What the server's side tells the control loop.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)] // Why: handed on by value at once, never stored.
 pub enum StreamEvent {
     /// The conversation began.
     Welcome(Box<ArenaInfo>),

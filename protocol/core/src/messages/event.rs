@@ -3,7 +3,8 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use super::{Name, Text};
+use super::{Name, Text, displayed};
+use crate::flight_end::{Collision, EndReason, FenceBreach};
 use crate::time::ServerTime;
 
 /// One occurrence. Events travel in order and are never lost.
@@ -17,24 +18,23 @@ pub struct Event {
     pub text: Text,
 }
 
+impl Event {
+    /// Makes an event that ends a flight, with the sentence that says why.
+    pub fn ending(stamp: ServerTime, kind: EventKind) -> Self {
+        let text = kind.end_reason().as_ref().map(displayed).unwrap_or_default();
+        Self { stamp, kind, text }
+    }
+}
+
 /// The kinds of [`Event`]. New kinds go at the end; a change raises the protocol version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[allow(clippy::large_enum_variant)] // Why: there is no heap to box a reason on.
 pub enum EventKind {
     /// The vehicle's body touched an obstacle of the twin. The guard lands.
-    Collision {
-        /// Where the body's centre was. [m, world]
-        p_world_m: DVec3,
-        /// Distance from the body's surface to the obstacle; negative is penetration. [m]
-        clearance_m: f64,
-    },
+    Collision(Collision),
     /// The vehicle left the geofence, or can no longer stop inside. The guard lands.
-    Geofence {
-        /// Where. [m, world]
-        p_world_m: DVec3,
-        /// Distance left to the fence; negative is outside. [m]
-        margin_m: f64,
-    },
+    Geofence(FenceBreach),
     /// A stage of the course was passed.
     Stage {
         /// Index in the course, from 0.
@@ -48,8 +48,12 @@ pub enum EventKind {
         seconds: f64,
     },
     /// The course's time is up.
-    TimeLimit,
-    /// No pose has come for longer than allowed.
+    TimeLimit {
+        /// What the course allows from take-off. [s]
+        limit_s: f64,
+    },
+    /// No pose has come for longer than the arena's `hold_after_s`: the guard holds. The flight goes on
+    /// if one comes before `land_after_s`.
     PoseLost {
         /// Age of the newest pose. [s]
         age_s: f64,
@@ -60,8 +64,8 @@ pub enum EventKind {
     EmergencyStop,
     /// The vehicle's phase of flight changed.
     Phase(super::FlightPhase),
-    /// The plugin ended, crashed or hung.
-    PluginFailed,
+    /// Something else ended the flight: plugin, autopilot, localization, the runtime's own limits.
+    Ended(EndReason),
     /// A line the plugin printed.
     PluginOutput,
     /// Anything else worth a person's attention.
@@ -70,4 +74,33 @@ pub enum EventKind {
     Start,
     /// A person ends the flight: it brakes, then lands.
     Land,
+}
+
+impl EventKind {
+    /// Returns why a flight ends with this; `None` if it does not.
+    pub fn end_reason(&self) -> Option<EndReason> {
+        Some(match self {
+            Self::Collision(collision) => EndReason::Collision(collision.clone()),
+            Self::Geofence(breach) => EndReason::Geofence(breach.clone()),
+            Self::Finished { seconds } => EndReason::Finished { seconds: *seconds },
+            Self::TimeLimit { limit_s } => EndReason::TimeLimit { limit_s: *limit_s },
+            Self::EmergencyStop => EndReason::StopButton,
+            Self::Land => EndReason::LandButton,
+            Self::Ended(reason) => reason.clone(),
+            _ => return None,
+        })
+    }
+
+    /// Returns the vehicle's place, where the event has one. [m, world]
+    pub fn place_mut(&mut self) -> Option<&mut DVec3> {
+        match self {
+            Self::Collision(collision) | Self::Ended(EndReason::Collision(collision)) => {
+                Some(&mut collision.p_world_m)
+            }
+            Self::Geofence(breach) | Self::Ended(EndReason::Geofence(breach)) => {
+                Some(&mut breach.p_world_m)
+            }
+            _ => None,
+        }
+    }
 }

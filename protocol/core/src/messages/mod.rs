@@ -17,6 +17,8 @@
 //! Each message is framed by [`crate::packet::framing`]. Plugin messages ([`ToPlugin`],
 //! [`FromPlugin`]) use the same encoding over shared-memory queues.
 
+use core::fmt;
+
 mod event;
 mod kinds;
 mod pairing;
@@ -63,11 +65,19 @@ pub const MAX_NO_FLY: usize = 8;
 
 /// Returns `text` cut to what a bounded string holds, at a character boundary.
 pub fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
-    let mut out = heapless::String::new();
-    for c in text.chars() {
-        if out.push(c).is_err() {
-            break;
+    displayed(&text)
+}
+
+/// Returns what `value` displays, cut to what a bounded string holds, at a character boundary.
+pub fn displayed<const N: usize>(value: &impl fmt::Display) -> heapless::String<N> {
+    struct Cut<const N: usize>(heapless::String<N>);
+    impl<const N: usize> fmt::Write for Cut<N> {
+        fn write_str(&mut self, text: &str) -> fmt::Result {
+            text.chars().try_for_each(|c| self.0.push(c)).map_err(|_| fmt::Error)
         }
     }
-    out
+    let mut out = Cut(heapless::String::new());
+    // The only error is that no more fits.
+    let _ = fmt::Write::write_fmt(&mut out, format_args!("{value}"));
+    out.0
 }

@@ -107,7 +107,8 @@ pub enum Setpoint {
 }
 
 /// Why a setpoint is refused, in words for the plugin's author.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, thiserror::Error)]
+#[serde(rename_all = "snake_case")]
 pub enum InvalidSetpoint {
     /// A NaN or an infinity.
     #[error("a number in it is not finite")]

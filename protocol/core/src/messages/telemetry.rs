@@ -60,6 +60,11 @@ impl OutcomeKind {
             Self::Error => "error",
         }
     }
+
+    /// Whether the flight ended as wished: at the end of the course, or landed on purpose.
+    pub fn is_good(self) -> bool {
+        matches!(self, Self::Finished | Self::Landed)
+    }
 }
 
 impl core::fmt::Display for OutcomeKind {

@@ -148,7 +148,7 @@ mod tests {
                 seq: u64::MAX,
                 event: Event {
                     stamp: ServerTime::from_ns(8),
-                    kind: EventKind::Collision { p_world_m: DVec3::ONE, clearance_m: -0.01 },
+                    kind: EventKind::TimeLimit { limit_s: 20.0 },
                     text: bounded("collision"),
                 },
             },

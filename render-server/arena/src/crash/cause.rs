@@ -2,11 +2,14 @@
 //! holds. They say what to look at first; they prove nothing.
 
 use glam::{DVec2, DVec3};
+use vizflyt_protocol::flight_end::{Collision, EndReason, Obstacle, PluginFault};
 use vizflyt_protocol::geometry::wrap_pi;
-use vizflyt_protocol::messages::{EventKind, OutcomeKind, Setpoint};
+use vizflyt_protocol::messages::{OutcomeKind, Setpoint};
+use vizflyt_protocol::time::ServerTime;
 
-use super::{Flight, end_of, since};
+use super::{Flight, since};
 use crate::config::CameraConfig;
+use crate::verdict::Sample;
 use crate::{ArenaConfig, DistanceField};
 
 /// Returns what a flight that did not finish probably failed of; `None` if it finished.
@@ -16,37 +19,29 @@ pub fn probable_cause(
     flight: &Flight<'_>,
 ) -> Option<String> {
     let reason = &flight.verdict.reason;
-    match flight.verdict.outcome {
-        OutcomeKind::Finished => None,
-        OutcomeKind::Collided => Some(of_collision(arena, field, flight)),
-        OutcomeKind::Geofence => Some(of_fence(arena, flight)),
-        OutcomeKind::Timeout => Some(of_timeout(flight)),
-        OutcomeKind::Landed if is_stopped(flight) => Some(format!("stopped by hand: {reason}")),
-        OutcomeKind::Landed => Some(format!("it gave up: {reason}")),
-        OutcomeKind::PluginFailed => Some(of_plugin(flight)),
-        OutcomeKind::Error if flight.asked.is_some_and(<[_]>::is_empty) => {
+    match &flight.verdict.end {
+        EndReason::Finished { .. } => None,
+        EndReason::Collision(collision) => Some(of_collision(arena, field, flight, collision)),
+        EndReason::Geofence(_) => Some(of_fence(arena, flight)),
+        EndReason::TimeLimit { .. } => Some(of_timeout(flight)),
+        EndReason::Plugin(fault) => Some(of_plugin(flight, fault)),
+        end if end.is_by_person() => Some(format!("stopped by hand: {reason}")),
+        end if end.outcome() == OutcomeKind::Landed => Some(format!("it gave up: {reason}")),
+        _ if flight.asked.is_some_and(<[_]>::is_empty) => {
             Some("no image was ever answered: is `on_image` there, and does it return?".to_owned())
         }
-        OutcomeKind::Error => Some(format!("not the plugin: {reason}")),
+        _ => Some(format!("not the plugin: {reason}")),
     }
 }
 
-/// Whether a person ended the flight.
-fn is_stopped(flight: &Flight<'_>) -> bool {
-    flight
-        .events
-        .iter()
-        .any(|event| matches!(event.kind, EventKind::EmergencyStop | EventKind::Land))
-}
-
-fn of_plugin(flight: &Flight<'_>) -> String {
+fn of_plugin(flight: &Flight<'_>, fault: &PluginFault) -> String {
     let reason = &flight.verdict.reason;
     // Two seconds without a setpoint end a flight; were there answers meanwhile?
     let answers = flight.asked.unwrap_or_default();
-    let newest = answers.last().zip(end_of(flight.events, flight.samples));
+    let newest = answers.last().zip(flight.verdict.ended);
     if let Some((asked, at)) = newest
         && at.seconds_since(asked.stamp) < SILENT_S
-        && (reason.contains("without a setpoint") || reason.contains("has not answered"))
+        && matches!(fault, PluginFault::NoSetpoint | PluginFault::NoAnswer { .. })
     {
         let since = answers.iter().rev().find(|asked| asked.setpoint.is_some());
         return match since {
@@ -60,37 +55,46 @@ fn of_plugin(flight: &Flight<'_>) -> String {
             }
         };
     }
-    if reason.contains("has not answered image") {
-        return format!("no answer: {reason}; does `on_image` wait for something, or loop?");
-    }
-    if reason.contains("setpoints are refused") {
-        return format!("its setpoints are no numbers to fly by: {reason}");
-    }
-    match flight.last_line {
-        Some(line) if !reason.contains(line) => {
+    match (fault, flight.last_line) {
+        (PluginFault::NoAnswer { .. }, _) => {
+            format!("no answer: {reason}; does `on_image` wait for something, or loop?")
+        }
+        (PluginFault::Refused(_), _) => {
+            format!("its setpoints are no numbers to fly by: {reason}")
+        }
+        // What it said is not said twice.
+        (_, Some(line)) if !reason.contains(line) => {
             format!("{reason}; the last it printed: {line}")
         }
         _ => reason.clone(),
     }
 }
 
-fn of_collision(arena: &ArenaConfig, field: &DistanceField, flight: &Flight<'_>) -> String {
+fn of_collision(
+    arena: &ArenaConfig,
+    field: &DistanceField,
+    flight: &Flight<'_>,
+    collision: &Collision,
+) -> String {
     let reason = &flight.verdict.reason;
-    let Some(at) = end_of(flight.events, flight.samples) else { return reason.clone() };
+    let Some(at) = flight.verdict.ended else { return reason.clone() };
     let before = since(flight.samples, at, BEFORE_S);
     let (Some(first), Some(last)) = (before.first(), before.last()) else {
         return reason.clone();
     };
     let speed_mps = last.v_world_mps.length();
-    if reason.contains("the floor") {
-        let down_mps = -last.v_world_mps.z;
-        return format!("it came down onto the floor at {down_mps:.1} m/s");
-    }
-    if let Some(name) = reason.split('\'').nth(1) {
-        return format!(
-            "it met '{name}', which moves, at {speed_mps:.1} m/s: when it was seen clear, it was not yet \
-             where it would be"
-        );
+    match &collision.with {
+        Obstacle::Floor => {
+            let down_mps = -last.v_world_mps.z;
+            return format!("it came down onto the floor at {down_mps:.1} m/s");
+        }
+        Obstacle::Object(name) | Obstacle::Vehicle(name) => {
+            return format!(
+                "it met '{name}', which moves, at {speed_mps:.1} m/s: when it was seen clear, it was \
+                 not yet where it would be"
+            );
+        }
+        Obstacle::Scene => {}
     }
     let asked = flight.asked.unwrap_or_default();
     let newest = asked.iter().rev().find(|asked| asked.stamp <= at);
@@ -138,16 +142,16 @@ fn of_collision(arena: &ArenaConfig, field: &DistanceField, flight: &Flight<'_>)
             );
         }
     }
-    let stop_m = speed_mps * flight.delay_s
-        + speed_mps * speed_mps / (2.0 * arena.limits.max_acceleration_mps2.max(0.1));
-    // What it saw ahead a second before, when there was room yet.
-    let earlier = flight.seen.iter().rev().find(|seen| at.seconds_since(seen.stamp) >= 1.0);
-    if let Some(seen_m) = earlier.and_then(|seen| seen.ahead_m)
-        && seen_m - speed_mps < stop_m
+    let braking_mps2 = arena.limits.max_acceleration_mps2.max(0.1);
+    let stop_m = |v_mps: f64| v_mps * flight.delay_s + v_mps * v_mps / (2.0 * braking_mps2);
+    if let Some(sighting) = sighting(flight, arena.body_radius_m, at)
+        && sighting.room_m < stop_m(sighting.speed_mps)
     {
+        let Sighting { room_m, speed_mps } = sighting;
         return format!(
-            "too fast for its depth horizon: at {speed_mps:.1} m/s it needs {stop_m:.1} m to stop, and a \
-             second before the contact it saw {seen_m:.1} m ahead"
+            "too fast for its depth horizon: at {speed_mps:.1} m/s it needs {:.1} m to stop, and it first \
+             saw the obstacle {room_m:.1} m ahead",
+            stop_m(speed_mps)
         );
     }
     let asked_mps = newest.and_then(|asked| speed_of(asked.setpoint.as_ref()));
@@ -159,12 +163,50 @@ fn of_collision(arena: &ArenaConfig, field: &DistanceField, flight: &Flight<'_>)
         _ if speed_mps > SLOWED * first.v_world_mps.length() => {
             format!("it did not brake: it flew on at {speed_mps:.1} m/s until the contact")
         }
-        _ => format!("it braked too late: at {speed_mps:.1} m/s it needs {stop_m:.2} m to stop"),
+        _ => format!(
+            "it braked too late: at {speed_mps:.1} m/s it needs {:.2} m to stop",
+            stop_m(speed_mps)
+        ),
     }
 }
 
+/// The moment from which on an obstacle was seen ahead.
+struct Sighting {
+    /// From the body's surface to the contact then. [m]
+    room_m: f64,
+    /// [m/s]
+    speed_mps: f64,
+}
+
+/// Returns when what was met at `at` came into sight, by the images before the contact: in each of them,
+/// but single ones, what was ahead was no farther than the contact; `None` if it never was, or was in
+/// sight as far back as images are kept.
+fn sighting(flight: &Flight<'_>, radius_m: f64, at: ServerTime) -> Option<Sighting> {
+    let sample_at = |stamp: ServerTime| -> Option<&Sample> {
+        let after = flight.samples.partition_point(|sample| sample.stamp <= stamp);
+        flight.samples.get(after.checked_sub(1)?)
+    };
+    let contact_m = sample_at(at)?.p_world_m;
+    let (mut first, mut unseen) = (None, 0);
+    for seen in flight.seen.iter().rev().filter(|seen| seen.stamp <= at) {
+        let Some(then) = sample_at(seen.stamp) else { break };
+        let left_m = then.p_world_m.distance(contact_m) + radius_m;
+        if seen.ahead_m.is_some_and(|ahead_m| ahead_m <= left_m * (1.0 + FARTHER) + FARTHER_M) {
+            let room_m = left_m - radius_m;
+            first = Some(Sighting { room_m, speed_mps: then.v_world_mps.length() });
+            unseen = 0;
+        } else {
+            unseen += 1;
+        }
+        if unseen == UNSEEN {
+            return first;
+        }
+    }
+    None
+}
+
 fn of_fence(arena: &ArenaConfig, flight: &Flight<'_>) -> String {
-    let at = end_of(flight.events, flight.samples);
+    let at = flight.verdict.ended;
     let last = at.and_then(|at| since(flight.samples, at, BEFORE_S).last());
     let Some(last) = last else { return flight.verdict.reason.clone() };
     let (p, fence) = (last.p_world_m, &arena.geofence);
@@ -186,7 +228,7 @@ fn of_fence(arena: &ArenaConfig, flight: &Flight<'_>) -> String {
 
 fn of_timeout(flight: &Flight<'_>) -> String {
     let verdict = flight.verdict;
-    let Some(at) = end_of(flight.events, flight.samples) else { return verdict.reason.clone() };
+    let Some(at) = verdict.ended else { return verdict.reason.clone() };
     let window = since(flight.samples, at, STUCK_S);
     let first = window.first().map_or(DVec3::ZERO, |sample| sample.p_world_m);
     let moved_m = window.iter().map(|s| s.p_world_m.distance(first)).fold(0.0, f64::max);
@@ -243,3 +285,10 @@ const STUCK_S: f64 = 10.0;
 const SLOWED: f64 = 0.8;
 /// Along the contact's direction, less than this share of the speed is a graze.
 const GRAZE: f64 = 0.35;
+/// In so many images on end it is not seen: it is not in sight yet. Single ones are missed.
+const UNSEEN: usize = 2;
+/// What is ahead counts as what was met up to this much farther: of its distance, as the way was not
+/// quite straight...
+const FARTHER: f64 = 0.1;
+/// ...and in all cases. [m]
+const FARTHER_M: f64 = 0.3;

@@ -1,7 +1,12 @@
 //! Each rule that names a probable cause, by a flight that it is made for; and what is drawn of one.
 
 use glam::{DVec3, Quat, Vec3};
-use vizflyt_protocol::messages::{Axes, Event, EventKind, Setpoint, YawTarget, bounded};
+use vizflyt_protocol::flight_end::{
+    Boundary, Collision, EndReason, FenceBreach, Obstacle, PluginFault,
+};
+use vizflyt_protocol::messages::{
+    Axes, Event, EventKind, FlightPhase, InvalidSetpoint, Setpoint, YawTarget, bounded,
+};
 use vizflyt_protocol::time::ServerTime;
 
 use super::*;
@@ -51,11 +56,12 @@ struct Case {
     /// At the end. [rad]
     yaw_rad: f64,
     turn_radps: f64,
-    event: Option<(EventKind, &'static str)>,
+    end: Option<EndReason>,
     /// Seconds before the end at which images were answered; `None` where nobody wrote it down.
     asked_before_s: Option<Vec<f64>>,
     setpoint: Option<Setpoint>,
-    ahead_m: Option<f64>,
+    /// The obstacle is in sight from so far on; from anywhere farther the image shows 20 m. [m]
+    in_sight_m: f64,
     last_line: Option<&'static str>,
 }
 
@@ -63,19 +69,23 @@ fn towards(v_mps: DVec3) -> Setpoint {
     Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw: YawTarget::Keep }
 }
 
-/// It hit the wall head on at 2 m/s, its plugin awake and the room behind it clear.
+fn hit(with: Obstacle) -> EndReason {
+    let (p_world_m, clearance_m, speed_mps) = (DVec3::ZERO, -0.01, 2.0);
+    EndReason::Collision(Collision { p_world_m, clearance_m, with, speed_mps })
+}
+
+/// It hit the wall head on at 2 m/s, its plugin awake and the wall in sight from 10 m on.
 fn head_on() -> Case {
-    let kind = EventKind::Collision { p_world_m: DVec3::ZERO, clearance_m: -0.01 };
     Case {
         end_m: DVec3::new(3.8, 0.0, 1.0),
         v_mps: DVec3::X * 2.0,
         braking_mps2: 0.0,
         yaw_rad: 0.0,
         turn_radps: 0.0,
-        event: Some((kind, "touched an obstacle")),
+        end: Some(hit(Obstacle::Scene)),
         asked_before_s: Some(vec![1.1, 0.1, 0.03]),
         setpoint: Some(Setpoint::Hold),
-        ahead_m: Some(20.0),
+        in_sight_m: 10.0,
         last_line: None,
     }
 }
@@ -94,20 +104,24 @@ fn cause_of(case: &Case) -> Option<String> {
         }
     };
     let samples: Vec<Sample> = (0..=600).map(sample).collect();
-    let ended = case.event.clone().map(|(kind, text)| Event {
-        stamp: at(END_S),
-        kind,
-        text: bounded(text),
-    });
-    let events: Vec<Event> = ended.into_iter().collect();
+    let took_off =
+        Event { stamp: at(0.0), kind: EventKind::Phase(FlightPhase::TakingOff), text: bounded("") };
+    let ended = case.end.clone().map(|end| Event::ending(at(END_S), EventKind::Ended(end)));
+    let events: Vec<Event> = [took_off].into_iter().chain(ended).collect();
     let verdict = judge(&arena, &events, &samples);
     let answer = |&s: &f64| Asked { stamp: at(END_S - s), setpoint: case.setpoint.clone() };
     let asked: Option<Vec<Asked>> =
         case.asked_before_s.as_ref().map(|times| times.iter().map(answer).collect());
-    let seen = [Seen { stamp: at(END_S - 1.05), ahead_m: case.ahead_m }];
+    // Two seconds of images at 30 Hz, oldest first.
+    let image = |number: u32| {
+        let before_s = f64::from(number) / 30.0;
+        let left_m = case.v_mps.length() * before_s;
+        let ahead_m = if left_m <= case.in_sight_m { left_m + arena.body_radius_m } else { 20.0 };
+        Seen { stamp: at(END_S - before_s), ahead_m: Some(ahead_m) }
+    };
+    let seen: Vec<Seen> = (0..=60).rev().map(image).collect();
     let flight = Flight {
         verdict: &verdict,
-        events: &events,
         samples: &samples,
         asked: asked.as_deref(),
         seen: &seen,
@@ -137,8 +151,8 @@ fn a_collision_is_named_by_the_first_rule_that_holds() {
         "flew on: 1.5 m/s was asked for 0.03 s before",
     );
     check(
-        &Case { ahead_m: Some(2.1), ..case.clone() },
-        "too fast for its depth horizon: at 2.0 m/s",
+        &Case { in_sight_m: 0.2, ..case.clone() },
+        "too fast for its depth horizon: at 2.0 m/s it needs 0.3 m to stop, and it first saw",
     );
     // Fast enough sideways along the wall that it only grazed it.
     let graze = DVec3::new(0.3, 2.0, 0.0);
@@ -161,11 +175,11 @@ fn a_collision_is_named_by_the_first_rule_that_holds() {
         &Case { asked_before_s: Some(vec![]), ..case.clone() },
         "not one setpoint had come before",
     );
-    let (kind, _) = case.event.clone().unwrap();
-    let door = Some((kind.clone(), "touched 'door' at 1.0 m"));
-    check(&Case { event: door, ..case.clone() }, "it met 'door', which moves, at 2.0 m/s");
-    let floor = Some((kind, "touched the floor"));
-    let fell = Case { event: floor, v_mps: DVec3::Z * -2.5, ..case };
+    let door = Some(hit(Obstacle::Object(bounded("door"))));
+    check(&Case { end: door, ..case.clone() }, "it met 'door', which moves, at 2.0 m/s");
+    let bee = Some(hit(Obstacle::Vehicle(bounded("bee"))));
+    check(&Case { end: bee, ..case.clone() }, "it met 'bee', which moves, at 2.0 m/s");
+    let fell = Case { end: Some(hit(Obstacle::Floor)), v_mps: DVec3::Z * -2.5, ..case };
     check(&fell, "came down onto the floor at 2.5 m/s");
 }
 
@@ -174,36 +188,58 @@ fn without_its_answers_a_collision_is_not_laid_on_them() {
     // In a lab nobody has written down what the plugin asked for.
     let live = Case { asked_before_s: None, ..head_on() };
     check(&live, "it did not brake");
-    check(&Case { ahead_m: Some(2.1), ..live.clone() }, "too fast for its depth horizon");
-    let nothing_seen = Case { ahead_m: None, ..live };
-    check(&nothing_seen, "it did not brake");
+    check(&Case { in_sight_m: 0.2, ..live.clone() }, "too fast for its depth horizon");
+    let never_in_sight = Case { in_sight_m: -1.0, ..live };
+    check(&never_in_sight, "it did not brake");
+}
+
+#[test]
+fn too_fast_is_what_could_not_have_stopped_from_where_it_first_saw_the_obstacle() {
+    for speed_mps in [0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0] {
+        let stop_m = speed_mps * 0.04 + speed_mps * speed_mps / (2.0 * 8.0);
+        let head_on = Case { v_mps: DVec3::X * speed_mps, ..head_on() };
+        let late = Case { in_sight_m: 0.7 * stop_m, ..head_on.clone() };
+        check(&late, "too fast for its depth horizon");
+        // There was room; and what was in sight all the time was in sight early enough.
+        for in_sight_m in [1.3 * stop_m + speed_mps / 30.0, 100.0] {
+            check(&Case { in_sight_m, ..head_on.clone() }, "it did not brake");
+        }
+    }
 }
 
 #[test]
 fn other_ends_have_their_own_causes() {
-    let case = Case { event: None, ..head_on() };
-    let fence = EventKind::Geofence { p_world_m: DVec3::ZERO, margin_m: 0.1 };
+    let case = Case { end: None, ..head_on() };
+    let fence = FenceBreach {
+        p_world_m: DVec3::ZERO,
+        margin_m: -0.1,
+        boundary: Boundary::Geofence,
+        speed_mps: 3.0,
+        overshoot_m: 0.5,
+    };
     let outside = Case {
         end_m: DVec3::new(1.0, 2.8, 1.0),
         v_mps: DVec3::Y * 3.0,
-        event: Some((fence, "beyond the fence")),
+        end: Some(EndReason::Geofence(fence)),
         ..case.clone()
     };
     check(&outside, "at the north face of the geofence with 3.0 m/s, 0.20 m from it");
     let above = Case { end_m: DVec3::new(1.0, 0.0, 3.9), v_mps: DVec3::Z, ..outside };
     check(&above, "at the upper face of the geofence with 1.0 m/s, 0.10 m from it");
 
-    let time = Some((EventKind::TimeLimit, "the course's time is over"));
-    let stuck = Case { v_mps: DVec3::ZERO, event: time.clone(), ..case.clone() };
+    let time = Some(EndReason::TimeLimit { limit_s: 12.0 });
+    let stuck = Case { v_mps: DVec3::ZERO, end: time.clone(), ..case.clone() };
     check(&stuck, "stuck before window: it moved 0.0 m in its last 10 s");
-    let astray = Case { v_mps: DVec3::Y * 0.5, event: time, ..case.clone() };
+    let astray = Case { v_mps: DVec3::Y * 0.5, end: time, ..case.clone() };
     check(&astray, "astray before window: 6 m in 12 s, 0.5 m/s");
 
-    let stop = Some((EventKind::EmergencyStop, "emergency stop pressed"));
-    check(&Case { event: stop, ..case.clone() }, "stopped by hand: emergency stop pressed");
-    check(&case, "it gave up: not over when its record ends");
-    let finished = Some((EventKind::Finished { seconds: 12.0 }, "at the goal"));
-    assert_eq!(cause_of(&Case { event: finished, ..case.clone() }), None);
+    let end = |reason| Case { end: Some(reason), ..case.clone() };
+    check(&end(EndReason::StopButton), "stopped by hand: the stop button was pressed");
+    check(&end(EndReason::Interrupted), "stopped by hand: stopped by a person");
+    check(&end(EndReason::PluginLanded), "it gave up: the plugin asked to land");
+    check(&end(EndReason::PoseLost { age_s: 0.5 }), "not the plugin: pose lost for 0.5 s");
+    check(&case, "not the plugin: not over when its record ends");
+    assert_eq!(cause_of(&end(EndReason::Finished { seconds: 12.0 })), None);
 
     // It never rose from the floor.
     let ground = Case { end_m: DVec3::ZERO, v_mps: DVec3::ZERO, ..case };
@@ -213,23 +249,26 @@ fn other_ends_have_their_own_causes() {
 
 #[test]
 fn a_plugin_that_failed_is_quoted() {
-    let failed =
-        |text: &'static str| Case { event: Some((EventKind::PluginFailed, text)), ..head_on() };
-    let said = Case { last_line: Some("no such model"), ..failed("ended with exit status 3") };
+    let failed = |fault| Case { end: Some(EndReason::Plugin(fault)), ..head_on() };
+    let ended = failed(PluginFault::ended("ended with exit status 3"));
+    let said = Case { last_line: Some("no such model"), ..ended.clone() };
     check(&said, "ended with exit status 3; the last it printed: no such model");
-    check(&failed("ended with exit status 3"), "ended with exit status 3");
+    check(&ended, "ended with exit status 3");
+    let hung = failed(PluginFault::NoAnswer { image: 7, silent_s: 2.0 });
+    check(&hung, "it answers images, but for 0.0 s without a setpoint");
+    let never = Case { setpoint: None, ..failed(PluginFault::NoSetpoint) };
+    check(&never, "but never with a setpoint");
     check(
-        &failed("has not answered image 7"),
-        "it answers images, but for 0.0 s without a setpoint",
+        &Case { asked_before_s: Some(vec![3.0]), ..hung },
+        "does `on_image` wait for something, or loop?",
     );
-    let silent = "2.0 s without a setpoint";
-    check(&Case { setpoint: None, ..failed(silent) }, "but never with a setpoint");
-    let hung = Case { asked_before_s: Some(vec![3.0]), ..failed("has not answered image 7") };
-    check(&hung, "does `on_image` wait for something, or loop?");
-    check(&failed("its setpoints are refused: NaN"), "no numbers to fly by");
+    check(&failed(PluginFault::Refused(InvalidSetpoint::NotFinite)), "no numbers to fly by");
     // What it said is not said twice.
-    let once = Case { last_line: Some("exit status 3"), ..failed("ended with exit status 3") };
+    let once = Case { last_line: Some("exit status 3"), ..ended };
     assert_eq!(cause_of(&once).as_deref(), Some("ended with exit status 3"));
+    // Nor is a sentence that only reads like another fault taken for one.
+    let quoted = failed(PluginFault::ended("it has not answered image 7 without a setpoint"));
+    check(&quoted, "it has not answered image 7 without a setpoint");
 }
 
 #[test]

@@ -102,9 +102,10 @@ fn a_clean_flight_finishes_once() {
 fn the_post_is_hit_and_nothing_after_it_counts() {
     let way = [[0., 0., 0.], [0., 1., 1.], [7.5, 1., 1.], [8., 0., 1.]];
     check(&way, 3.0, |events| {
-        let [Event { kind: EventKind::Collision { p_world_m, .. }, text, .. }] = events else {
+        let [Event { kind: EventKind::Collision(collision), text, .. }] = events else {
             return false;
         };
+        let Collision { p_world_m, with: Obstacle::Scene, .. } = collision else { return false };
         // Post radius and body together, to a voxel and a half.
         text.contains("collision") && ((4.0 - 0.23 - 0.12) - p_world_m.x).abs() < 0.15
     });
@@ -114,7 +115,7 @@ fn the_post_is_hit_and_nothing_after_it_counts() {
 fn the_fence_is_left_or_cannot_be_held() {
     let way = [[0., 0., 0.], [0., 0., 1.], [0., -3.5, 1.]];
     let breach = |events: &[Event]| {
-        matches!(events.last(), Some(Event { kind: EventKind::Geofence { .. }, .. }))
+        matches!(events.last(), Some(Event { kind: EventKind::Geofence(_), .. }))
     };
     check(&way, 0.5, |events| {
         breach(events) && events.iter().any(|event| event.text.contains("close to the geofence"))
@@ -133,11 +134,10 @@ fn a_no_fly_box_is_flown_into_or_at() {
     for (speed_mps, expected) in [(0.5, "beyond the no-fly box shelf"), (3.0, "cannot stop before")]
     {
         let events = fly(&mut referee(&config), &way, speed_mps, 1.0);
-        let Some(Event { kind: EventKind::Geofence { p_world_m, .. }, text, .. }) = events.last()
-        else {
+        let Some(Event { kind: EventKind::Geofence(breach), text, .. }) = events.last() else {
             panic!("{events:?}")
         };
-        assert!(text.contains(expected) && p_world_m.x < 3.0, "{text}");
+        assert!(text.contains(expected) && breach.p_world_m.x < 3.0, "{text}");
     }
     config.limits.max_altitude_m = Some(1.5);
     let events = fly(&mut referee(&config), &[[0., 0., 0.], [0., 0., 2.]], 0.5, 1.0);
@@ -174,18 +174,24 @@ fn nothing_is_judged_on_the_floor() {
 }
 
 #[test]
-fn time_is_up_even_without_poses_and_a_restart_begins_anew() {
+fn a_lost_pose_ends_the_run_at_once_and_a_restart_begins_anew() {
     let mut referee = referee(&arena());
     assert!(fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [1., 0., 1.]], 2.0, 1.0).is_empty());
-    // The pose is lost first, then the time is over.
+    // A warning first; then the run is over, and its time with it.
     let due = referee.poll_timeout().unwrap();
     referee.handle_timeout(due);
     let lost = referee.poll_event().unwrap();
     assert!(matches!(lost.kind, EventKind::PoseLost { .. }), "{lost:?}");
     let due = referee.poll_timeout().unwrap();
     referee.handle_timeout(due);
-    assert_eq!(referee.poll_event().unwrap().kind, EventKind::TimeLimit);
+    let ended = referee.poll_event().unwrap();
+    assert!(
+        matches!(ended.kind, EventKind::Ended(EndReason::PoseLost { age_s }) if age_s >= 0.5),
+        "{ended:?}"
+    );
     assert_eq!(referee.poll_timeout(), None);
+    referee.handle_timeout(due.plus_seconds(60.0));
+    assert_eq!(referee.poll_event(), None, "no clock runs out on the ground");
     referee.restart();
     let way = [[1., 0., 0.], [1., 0., 1.], [8., 0., 1.]];
     let events = fly(&mut referee, &way, 2.0, 40.0);
@@ -194,6 +200,57 @@ fn time_is_up_even_without_poses_and_a_restart_begins_anew() {
         matches!(kinds[..], [EventKind::PoseRegained, EventKind::Finished { .. }]),
         "{events:?}"
     );
+}
+
+fn told(kind: EventKind) -> Event {
+    Event { stamp: ServerTime::ZERO, kind, text: bounded("") }
+}
+
+const UP: [[f64; 3]; 3] = [[0., 0., 0.], [0., 0., 1.], [1., 0., 1.]];
+
+#[test]
+fn time_is_up_after_the_time_limit() {
+    let mut referee = referee(&arena());
+    let hover = [[0., 0., 0.], [0., 0., 1.], [1., 0., 1.], [-1., 0., 1.], [1., 0., 1.]];
+    let events = fly(&mut referee, &hover, 0.25, 1.0);
+    let [Event { kind: EventKind::TimeLimit { limit_s }, text, .. }] = &events[..] else {
+        panic!("{events:?}")
+    };
+    assert_eq!((*limit_s, text.as_str()), (20.0, "the course's 20 s are over"));
+}
+
+#[test]
+fn after_land_was_ordered_neither_course_nor_clock_runs_and_a_touch_is_still_said() {
+    for order in
+        [EventKind::Land, EventKind::EmergencyStop, EventKind::Ended(EndReason::PluginLanded)]
+    {
+        let mut referee = referee(&arena());
+        fly(&mut referee, &UP, 2.0, 1.0);
+        referee.handle_event(&told(order));
+        assert!(fly(&mut referee, &[[1., 0., 1.], [8., 0., 1.]], 2.0, 2.0).is_empty(), "no finish");
+        let post = [[8., 0., 1.], [8., 1., 1.], [3., 1., 1.]];
+        let events = fly(&mut referee, &post, 2.0, 5.6);
+        assert!(matches!(&events[..], [Event { kind: EventKind::Collision(_), .. }]), "{events:?}");
+    }
+    // On the ground nothing is judged any more, wherever the vehicle is carried.
+    let mut referee = referee(&arena());
+    fly(&mut referee, &UP, 2.0, 1.0);
+    referee.handle_event(&told(EventKind::Phase(FlightPhase::Landed)));
+    assert!(fly(&mut referee, &[[1., 0., 1.], [1., -4., 1.]], 2.0, 2.0).is_empty());
+    referee.handle_timeout(ServerTime::ZERO.plus_seconds(99.0));
+    let after: Vec<_> = std::iter::from_fn(|| referee.poll_event()).collect();
+    assert!(matches!(&after[..], [Event { kind: EventKind::PoseLost { .. }, .. }]), "{after:?}");
+}
+
+#[test]
+fn what_a_hand_did_before_the_take_off_is_no_flight() {
+    let mut referee = referee(&arena());
+    // Carried into the post.
+    let events = fly(&mut referee, &[[0., 1., 0.], [0., 1., 1.], [4., 1., 1.]], 2.0, 1.0);
+    assert!(matches!(&events[..], [Event { kind: EventKind::Collision(_), .. }]), "{events:?}");
+    referee.handle_event(&told(EventKind::Phase(FlightPhase::TakingOff)));
+    let events = fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [8., 0., 1.]], 2.0, 10.0);
+    assert!(matches!(events.last().unwrap().kind, EventKind::Finished { .. }), "{events:?}");
 }
 
 #[test]
@@ -253,7 +310,7 @@ fn a_door_is_where_its_clock_says() {
     for (start_s, meets) in [(1.0, true), (3.0, true), (2.0, false), (4.0, false)] {
         let mut referee = with_door(&mut arena());
         let events = fly(&mut referee, &way, 2.5, start_s);
-        let hit = events.iter().find(|e| matches!(e.kind, EventKind::Collision { .. }));
+        let hit = events.iter().find(|e| matches!(e.kind, EventKind::Collision(_)));
         assert_eq!(hit.is_some(), meets, "start {start_s} s: {events:?}");
         if let Some(hit) = hit {
             assert!(hit.text.contains("collision with 'door' at (3.8"), "{}", hit.text);
@@ -270,7 +327,7 @@ fn another_vehicle_in_the_way_is_an_obstacle() {
     let bee = Neighbour { name: bounded("bee"), motion, radius_m: 0.12 };
     referee.handle_neighbour(1, Some(bee));
     let events = fly(&mut referee, &[[0., -1., 0.], [0., -1., 1.], [8., -1., 1.]], 2.0, 0.0);
-    let hit = events.iter().find(|event| matches!(event.kind, EventKind::Collision { .. }));
+    let hit = events.iter().find(|event| matches!(event.kind, EventKind::Collision(_)));
     let text = &hit.expect("the bee").text;
     assert!(text.contains("collision with vehicle 'bee' at (4.7"), "{text}");
 }

@@ -31,58 +31,47 @@ pub(crate) async fn follow(
     let (arena, mut count) = (Arc::new(arena), 0);
     let mut log = vehicle.events.subscribe();
     let mut telemetry = vehicle.telemetry.subscribe();
-    // The end that was dealt with last, and its card while it may still be taken back.
-    let (mut known, mut waiting) = (None, None);
+    // The flight and the end that were dealt with last; an earlier end that is heard of later has a card
+    // of its own.
+    let mut known: Option<(u64, ServerTime)> = None;
     loop {
         tokio::select! {
             _ = log.changed() => log.mark_unchanged(),
             _ = telemetry.changed() => telemetry.mark_unchanged(),
         }
         let flight = vehicle.flight();
-        let Some(event) =
-            flight.outcome.filter(|event| flight.took_off.is_some() && is_failure(event))
+        let Some((at, _)) = flight
+            .end
+            .decided()
+            .filter(|(_, reason)| flight.took_off.is_some() && reason.is_failure())
         else {
-            waiting = None;
+            // Something earlier, heard of later, was no failure.
+            if known.take_if(|(flight, _)| *flight == vehicle.flights()).is_some() {
+                vehicle.crash.send_replace(None);
+            }
             continue;
         };
-        let end = (vehicle.flights(), event.stamp);
-        if known != Some(end) {
-            known = Some(end);
-            tokio::time::sleep(IMAGES_LATE).await;
-            if vehicle.flights() != end.0 {
-                // The next flight has begun: nothing of this one is left.
-                continue;
-            }
-            count += 1;
-            let (vehicle, arena, field) = (vehicle.clone(), arena.clone(), field.clone());
-            let event = event.clone();
-            let made = move || card(count, &vehicle, &arena, &field, event);
-            waiting = tokio::task::spawn_blocking(made).await.ok();
-            if waiting.is_none() {
-                warn!("a crash card could not be made");
-            }
+        let end = (vehicle.flights(), at);
+        if known == Some(end) {
+            continue;
         }
-        // A pose that comes back before the landing decides nothing.
-        let is_settled =
-            !matches!(event.kind, EventKind::PoseLost { .. }) || vehicle.flight().landed.is_some();
-        if is_settled && let Some(card) = waiting.take() {
+        known = Some(end);
+        tokio::time::sleep(IMAGES_LATE).await;
+        if vehicle.flights() != end.0 {
+            // The next flight has begun: nothing of this one is left.
+            continue;
+        }
+        count += 1;
+        let made = {
+            let (vehicle, arena, field) = (vehicle.clone(), arena.clone(), field.clone());
+            move || card(count, &vehicle, &arena, &field, at)
+        };
+        if let Ok(card) = tokio::task::spawn_blocking(made).await {
             vehicle.crash.send_replace(Some(Arc::new(card)));
+        } else {
+            warn!("a crash card could not be made");
         }
     }
-}
-
-/// Whether a flight that this decided wants a card.
-fn is_failure(event: &Event) -> bool {
-    use EventKind::{Collision, EmergencyStop, Geofence, PluginFailed, PoseLost, TimeLimit};
-    matches!(
-        event.kind,
-        Collision { .. }
-            | Geofence { .. }
-            | PoseLost { .. }
-            | EmergencyStop
-            | PluginFailed
-            | TimeLimit
-    )
 }
 
 fn card(
@@ -90,9 +79,8 @@ fn card(
     vehicle: &VehicleFlight,
     arena: &ArenaConfig,
     field: &DistanceField,
-    event: Event,
+    at: ServerTime,
 ) -> CrashCard {
-    let at = event.stamp;
     let shots = lock(&vehicle.previews).until(at);
     let samples = lock(&vehicle.samples).kept().to_vec();
     let events = vehicle.events_of_flight();
@@ -109,7 +97,6 @@ fn card(
     let delay_s = delay_s.filter(|images| images.delivered > 0);
     let flight = Flight {
         verdict: &verdict,
-        events: &events,
         samples: &samples,
         asked: None,
         seen: &seen,
@@ -156,7 +143,7 @@ fn card(
             .iter()
             .map(|event| event.text.as_str().to_owned())
             .collect(),
-        event,
+        title: verdict.end.title(),
         verdict,
         shots,
     }

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use serde::Serialize;
 use vizflyt_arena::verdict::Verdict;
-use vizflyt_protocol::messages::Event;
 
 use super::recent_previews::{Preview, Shot};
 
@@ -19,8 +18,8 @@ pub struct CrashCard {
     pub(super) course: String,
     /// The end, UTC. [ms since 1970]
     pub(super) ended_unix_ms: u64,
-    /// What decided the flight.
-    pub(super) event: Event,
+    /// What decided the flight, in a few words.
+    pub(super) title: &'static str,
     /// What the flight was worth.
     pub(super) verdict: Verdict,
     /// What it probably failed of, in words.
@@ -83,9 +82,12 @@ impl CrashCard {
 /// Returns what the page reads of cards, for the check of its scripts.
 #[cfg(test)]
 pub(crate) fn examples() -> Vec<serde_json::Value> {
-    let verdict = |passed_s| Verdict {
-        outcome: vizflyt_protocol::messages::OutcomeKind::Collided,
-        reason: "a sentence".to_owned(),
+    use vizflyt_protocol::flight_end::EndReason;
+    let verdict = |end: EndReason, passed_s| Verdict {
+        outcome: end.outcome(),
+        reason: end.to_string(),
+        end,
+        ended: None,
         stages_passed: 0,
         stages: vec![vizflyt_arena::verdict::StageVerdict { name: "gate".to_owned(), passed_s }],
         seconds: 9.0,
@@ -102,17 +104,13 @@ pub(crate) fn examples() -> Vec<serde_json::Value> {
         yaw_rad: 0.0,
         clearance_m,
     };
-    let card = |some: Option<f64>| CrashCard {
+    let card = |end: EndReason, some: Option<f64>| CrashCard {
         id: 1,
         vehicle: "vizflyt".to_owned(),
         course: "race".to_owned(),
         ended_unix_ms: 0,
-        event: Event {
-            stamp: vizflyt_protocol::time::ServerTime::from_ns(1),
-            kind: vizflyt_protocol::messages::EventKind::TimeLimit,
-            text: "a sentence".try_into().unwrap(),
-        },
-        verdict: verdict(some),
+        title: end.title(),
+        verdict: verdict(end, some),
         cause: "a sentence".to_owned(),
         images: vec![CardImages { camera: "front".to_owned(), before_s: vec![0.1] }],
         samples: vec![sample(some)],
@@ -123,5 +121,6 @@ pub(crate) fn examples() -> Vec<serde_json::Value> {
         printed: vec!["a line".to_owned()],
         shots: Vec::new(),
     };
-    vec![serde_json::json!(card(Some(1.0))), serde_json::json!(card(None))]
+    let (full, sparse) = (EndReason::TimeLimit { limit_s: 60.0 }, EndReason::StopButton);
+    vec![serde_json::json!(card(full, Some(1.0))), serde_json::json!(card(sparse, None))]
 }

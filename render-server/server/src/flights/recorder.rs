@@ -12,6 +12,7 @@ use tracing::warn;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::verdict::Verdict;
 use vizflyt_protocol::messages::OutcomeKind;
+use vizflyt_protocol::time::ServerTime;
 
 use super::leaderboard::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
 use super::vehicle::VehicleFlight;
@@ -62,8 +63,9 @@ struct Running {
     id: String,
     /// Number of its flight.
     flight: u64,
-    /// Told once when decided, once when landed.
-    decided: bool,
+    /// When it was decided, by what was written down: told then, when it is decided otherwise by
+    /// something earlier, and when landed.
+    decided: Option<ServerTime>,
 }
 
 impl Recorder {
@@ -76,18 +78,19 @@ impl Recorder {
         if self.run.is_none() && flight.took_off.is_some() && self.last != Some(number) {
             let id = self.begin().await?;
             self.last = Some(number);
-            self.run = Some(Running { id, flight: number, decided: false });
+            self.run = Some(Running { id, flight: number, decided: None });
         }
         let Some(run) = &mut self.run else { return Ok(()) };
         let landed = flight.landed.is_some();
-        if landed || (flight.outcome.is_some() && !run.decided) {
+        let decided = flight.end.decided().map(|(at, _)| at);
+        if landed || decided != run.decided {
             let verdict = self.vehicle.verdict(&self.arena);
             self.board.end(&run.id, &end(&verdict, &self.arena)).await?;
-            run.decided = true;
+            run.decided = decided;
             if landed {
                 self.run = None;
             }
-        } else if is_beat && !run.decided {
+        } else if is_beat && run.decided.is_none() {
             self.board.heard(&run.id).await?;
         }
         Ok(())

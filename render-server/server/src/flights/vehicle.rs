@@ -13,7 +13,8 @@ use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::verdict::{Verdict, judge};
+use vizflyt_arena::verdict::{Verdict, judge_ended};
+use vizflyt_protocol::flight_end::FlightEnd;
 use vizflyt_protocol::messages::{
     ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, Telemetry, bounded,
 };
@@ -72,8 +73,8 @@ pub struct Flight {
     pub took_off: Option<ServerTime>,
     /// When it first reported having landed.
     pub landed: Option<ServerTime>,
-    /// The event that decided it: the first that makes the guard land.
-    pub outcome: Option<Event>,
+    /// How it ends, by all that happened so far.
+    pub end: FlightEnd,
 }
 
 impl VehicleFlight {
@@ -115,39 +116,8 @@ impl VehicleFlight {
 
     /// Appends to the log what the server or the runtime noticed.
     pub fn log(&self, origin: Origin, event: Event) {
-        self.judge(&event);
+        lock(&self.flight).end.handle(event.stamp, &event.kind);
         self.events.push(origin, event);
-    }
-
-    /// Notes what decides the flight: the first event of those that end one. A lost pose decides
-    /// only if nothing else does and it does not come back before the guard lands.
-    fn judge(&self, event: &Event) {
-        let phase = self.phase();
-        let under_way = self.under_way();
-        let mut flight = lock(&self.flight);
-        let provisional =
-            flight.outcome.as_ref().is_none_or(|e| matches!(e.kind, EventKind::PoseLost { .. }));
-        match event.kind {
-            EventKind::Collision { .. }
-            | EventKind::Geofence { .. }
-            | EventKind::Finished { .. }
-            | EventKind::TimeLimit
-            | EventKind::EmergencyStop
-            | EventKind::PluginFailed
-            | EventKind::Land
-                if provisional =>
-            {
-                flight.outcome = Some(event.clone());
-            }
-            // On the ground a pose may come and go.
-            EventKind::PoseLost { .. } if under_way => {
-                flight.outcome.get_or_insert_with(|| event.clone());
-            }
-            EventKind::PoseRegained if provisional && phase != FlightPhase::Landing => {
-                flight.outcome = None;
-            }
-            _ => {}
-        }
     }
 
     /// Takes the runtime's report.
@@ -182,7 +152,7 @@ impl VehicleFlight {
     pub fn verdict(&self, arena: &ArenaConfig) -> Verdict {
         let events = self.events_of_flight();
         let samples = lock(&self.samples);
-        let mut verdict = judge(arena, &events, samples.kept());
+        let mut verdict = judge_ended(arena, &self.flight().end, &events, samples.kept());
         // Samples are 20 ms apart; what lay between them was swept.
         if let (Some(sampled_m), Some(swept_m)) =
             (verdict.min_clearance_m, samples.least_clearance_m())

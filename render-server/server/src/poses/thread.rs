@@ -53,7 +53,7 @@ impl PoseThread {
                 Duration::from_secs_f64(due.seconds_since(clock::now()).clamp(0.0, 1.0))
             });
             let measured = source.receive(due.min(PATIENCE));
-            self.restart_referees(&mut watches);
+            self.follow_flights(&mut watches);
             self.take_imu();
             // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
             // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
@@ -80,14 +80,23 @@ impl PoseThread {
         }
     }
 
-    /// Restarts course and timer where a new flight has begun: a new runtime on the ground.
-    fn restart_referees(&mut self, watches: &mut [VehicleWatch]) {
+    /// Restarts course and timer where a new flight has begun, a new runtime on the ground; passes on
+    /// what runtime and people do to the flight.
+    fn follow_flights(&mut self, watches: &mut [VehicleWatch]) {
         let vehicles = self.flights.vehicles.iter().zip(&mut self.referees).zip(watches);
         for ((vehicle, referee), watch) in vehicles {
             let flights = vehicle.flights();
             if flights != watch.flights {
                 watch.flights = flights;
                 referee.restart();
+            }
+            // What is no longer kept is a plugin's lines.
+            let events = vehicle.events.read(&mut watch.event).unwrap_or_else(|lagged| {
+                watch.event = lagged.oldest;
+                vehicle.events.read(&mut watch.event).unwrap_or_default()
+            });
+            for entry in &events {
+                referee.handle_event(&entry.event);
             }
         }
     }
@@ -207,13 +216,16 @@ impl PoseThread {
 #[derive(Debug, Default)]
 struct VehicleWatch {
     flights: u64,
+    /// Index of the first event that its referee has not seen.
+    event: u64,
     rejected: u64,
     warned: Option<(Instant, std::mem::Discriminant<Rejected>)>,
 }
 
 impl VehicleWatch {
     fn of(vehicle: &VehicleFlight) -> Self {
-        Self { flights: vehicle.flights(), ..Self::default() }
+        let event = vehicle.events.next_index();
+        Self { flights: vehicle.flights(), event, ..Self::default() }
     }
 
     /// Counts a rejected measurement, and warns of it at a bounded rate.

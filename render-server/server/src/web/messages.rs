@@ -6,8 +6,9 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use vizflyt_arena::config::{CameraConfig, StageConfig};
 use vizflyt_arena::pose::PoseQuality;
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
-use vizflyt_protocol::messages::{Event, StageTimes, Telemetry};
+use vizflyt_protocol::messages::{Event, OutcomeKind, StageTimes, Telemetry};
 use vizflyt_protocol::time::ServerTime;
 
 use super::Page;
@@ -79,6 +80,8 @@ pub(super) struct Line {
     origin: &'static str,
     #[serde(flatten)]
     event: Event,
+    /// The colour of an event that ends a flight; see [`tone`].
+    tone: Option<&'static str>,
     /// Seconds since the server started. [s]
     at_s: f64,
 }
@@ -125,8 +128,14 @@ struct ObjectLine {
 
 #[derive(Debug, Serialize)]
 struct OutcomeLine {
-    #[serde(flatten)]
-    event: Event,
+    outcome: OutcomeKind,
+    /// In a few words.
+    title: &'static str,
+    /// In a sentence.
+    text: String,
+    /// Its colour; see [`tone`].
+    tone: &'static str,
+    /// Since the server started. [s]
     at_s: f64,
 }
 
@@ -223,6 +232,7 @@ pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
             Origin::Server => "server",
             Origin::Page => "runtime",
         },
+        tone: entry.event.kind.end_reason().as_ref().map(tone),
         at_s: since_start_s(page, entry.event.stamp),
         event: entry.event,
     };
@@ -264,12 +274,26 @@ pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
         source_hz: rates.poses.of(source.poses, now),
         flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
         landed: flight.landed.is_some(),
-        outcome: flight
-            .outcome
-            .map(|event| OutcomeLine { at_s: since_start_s(page, event.stamp), event }),
+        outcome: flight.end.decided().map(|(at, reason)| OutcomeLine {
+            outcome: reason.outcome(),
+            title: reason.title(),
+            text: reason.to_string(),
+            tone: tone(reason),
+            at_s: since_start_s(page, at),
+        }),
         crash: vehicle.crash.borrow().as_ref().map(|card| card.id),
         objects: objects(&rendering.dynamic_objects, now),
     }))
+}
+
+/// Returns the colour that the page shows an end in, by the name that its style sheet has for it.
+fn tone(reason: &EndReason) -> &'static str {
+    match reason.outcome() {
+        OutcomeKind::Finished => "good",
+        OutcomeKind::Timeout => "warn",
+        _ if reason.is_failure() => "bad",
+        _ => "warn",
+    }
 }
 
 fn objects(moving: &DynamicObjects, now: ServerTime) -> Vec<ObjectLine> {

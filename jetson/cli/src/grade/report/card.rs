@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use jpeg_encoder::{ColorType, Encoder};
-use vizflyt_arena::crash::{end_of, plot, since};
+use vizflyt_arena::crash::{plot, since};
 use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::messages::EventKind;
 
@@ -32,7 +32,7 @@ pub(crate) fn write(
     flown: &Flown,
 ) -> Result<String> {
     let mut card = head(run);
-    let at = end_of(&flown.events, &flown.samples);
+    let at = flown.verdict.ended;
     if let Some(at) = at {
         card += &strip(folder, run, flown, |stamp| at.seconds_since(stamp))?;
         let last = since(&flown.samples, at, PLOTTED_S);

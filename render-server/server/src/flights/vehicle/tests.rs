@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use super::*;
 use crate::flights::control_lease::MAX_WATCHERS;
 use glam::DVec3;
+use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{Limits, PoseAges, Purpose, ReceivedEvents};
 
@@ -77,11 +78,11 @@ async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_even
     assert_eq!(vehicle.runtime().map(|runtime| runtime.id), Some(second.info.id));
     drop(second);
     // After the landing the next runtime begins a new flight.
-    assert!(vehicle.flight().outcome.is_some_and(|event| event.text == "stop"));
+    assert_eq!(vehicle.flight().end.reason(), Some(&EndReason::StopButton));
     vehicle.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
     let third = vehicle.take_control(&hello(6), address()).unwrap();
     assert_eq!((third.first_event, third.resumed, vehicle.flights()), (2, false, 2));
-    assert!(vehicle.flight().outcome.is_none() && vehicle.telemetry.borrow().is_none());
+    assert!(vehicle.flight().end.decided().is_none() && vehicle.telemetry.borrow().is_none());
 }
 
 #[test]
@@ -121,12 +122,12 @@ fn only_a_vehicle_that_waits_is_started_and_only_one_on_the_ground_reset() {
     phase(FlightPhase::Flying);
     assert_eq!(vehicle.reset("x").unwrap_err(), "'vizflyt' is flying; land it first");
     assert_eq!(vehicle.land("x"), Ok(()));
-    assert!(vehicle.flight().outcome.is_some_and(|event| event.kind == EventKind::Land));
+    assert_eq!(vehicle.flight().end.reason(), Some(&EndReason::LandButton));
     phase(FlightPhase::Landed);
     let flights = vehicle.flights();
     assert_eq!(vehicle.reset("x"), Ok(()));
     assert_eq!(vehicle.flights(), flights + 1);
-    assert!(vehicle.flight().took_off.is_none() && vehicle.flight().outcome.is_none());
+    assert!(vehicle.flight().took_off.is_none() && vehicle.flight().end.decided().is_none());
     drop(lease);
 }
 
@@ -142,20 +143,15 @@ fn watchers_are_bounded_and_leave_room_behind() {
 }
 
 #[test]
-fn the_first_decisive_event_is_the_outcome_and_a_lost_pose_only_if_it_stays_lost() {
+fn a_pose_that_comes_back_ends_nothing_and_the_first_end_is_the_outcome() {
     let vehicle = vehicle();
-    let outcome = || vehicle.flight().outcome.map(|event| event.text.as_str().to_owned());
-    let lost = EventKind::PoseLost { age_s: 0.2 };
-    vehicle.publish(lost.clone(), "on the ground");
-    assert_eq!(outcome(), None);
-    vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
-    vehicle.publish(lost.clone(), "a hiccup");
-    assert_eq!(outcome().as_deref(), Some("a hiccup"));
+    let outcome = || vehicle.flight().end.reason().cloned();
+    vehicle.publish(EventKind::Phase(FlightPhase::TakingOff), "up");
+    vehicle.publish(EventKind::PoseLost { age_s: 0.2 }, "a hiccup");
     vehicle.publish(EventKind::PoseRegained, "back");
     assert_eq!(outcome(), None);
-    vehicle.publish(lost.clone(), "lost");
     vehicle.publish(EventKind::Finished { seconds: 9.0 }, "goal");
     vehicle.publish(EventKind::EmergencyStop, "later");
-    vehicle.publish(lost, "later still");
-    assert_eq!(outcome().as_deref(), Some("goal"));
+    vehicle.publish(EventKind::Ended(EndReason::PoseLost { age_s: 0.5 }), "later still");
+    assert_eq!(outcome(), Some(EndReason::Finished { seconds: 9.0 }));
 }

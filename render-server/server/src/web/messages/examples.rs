@@ -5,8 +5,9 @@ use serde::Serialize;
 use serde_json::Value;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_arena::pose::SourceQuality;
+use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
 use vizflyt_protocol::geometry::LensConfig;
-use vizflyt_protocol::messages::{Arrivals, ClockState, EventKind, FlightPhase, Timing};
+use vizflyt_protocol::messages::{Arrivals, ClockState, EventKind, FlightPhase, Timing, bounded};
 
 use super::*;
 use crate::flights::crash_card;
@@ -120,17 +121,36 @@ fn camera_examples() -> Vec<CameraLine> {
 }
 
 fn event_examples() -> Vec<Line> {
-    let p_world_m = DVec3::ZERO;
+    let (p_world_m, speed_mps) = (DVec3::ZERO, 1.0);
+    let touch =
+        |with| EventKind::Collision(Collision { p_world_m, clearance_m: -0.1, with, speed_mps });
+    let breach = |boundary| {
+        let (margin_m, overshoot_m) = (-0.1, 0.2);
+        EventKind::Geofence(FenceBreach { p_world_m, margin_m, boundary, speed_mps, overshoot_m })
+    };
     let kinds = [
-        EventKind::Collision { p_world_m, clearance_m: -0.1 },
-        EventKind::Geofence { p_world_m, margin_m: -0.1 },
+        touch(Obstacle::Scene),
+        touch(Obstacle::Object(bounded("door"))),
+        touch(Obstacle::Vehicle(bounded("other"))),
+        breach(Boundary::Ceiling),
+        breach(Boundary::NoFly(bounded("box"))),
         EventKind::Stage { index: 0, name: "gate".try_into().unwrap() },
         EventKind::Finished { seconds: 9.0 },
+        EventKind::TimeLimit { limit_s: 60.0 },
         EventKind::PoseLost { age_s: 0.6 },
+        EventKind::Ended(EndReason::PluginLanded),
+        EventKind::Ended(EndReason::PoseLost { age_s: 0.6 }),
         EventKind::Phase(FlightPhase::Flying),
         EventKind::Note,
     ];
-    kinds.map(|kind| Line { index: 0, origin: "server", event: event(kind), at_s: 1.0 }).into()
+    let line = |kind: EventKind| Line {
+        index: 0,
+        origin: "server",
+        tone: kind.end_reason().as_ref().map(tone),
+        event: event(kind),
+        at_s: 1.0,
+    };
+    kinds.map(line).into()
 }
 
 fn event(kind: EventKind) -> Event {
@@ -168,7 +188,13 @@ fn full_state() -> Message<'static> {
         source: SourceCounters { tags: Some(tags), ..sparse.source },
         quality,
         flight_s: Some(1.0),
-        outcome: Some(OutcomeLine { event: event(EventKind::Note), at_s: 1.0 }),
+        outcome: Some(OutcomeLine {
+            outcome: OutcomeKind::Collided,
+            title: "Collision",
+            text: "a sentence".to_owned(),
+            tone: "bad",
+            at_s: 1.0,
+        }),
         crash: Some(1),
         objects: vec![ObjectLine {
             name: "hand".to_owned(),

@@ -1,39 +1,25 @@
-// The kinds of events: how the page colours and titles them.
+// The kinds of events: how the page names and colours them.
 
-/** @typedef {import("./messages").EventLine["kind"]} Kind */
+/** @typedef {import("./messages").EventLine} EventLine */
 
-/** @type {Record<string, { tone: string, title?: string }>} */
-const KINDS = {
-  collision: { tone: "bad", title: "Collision" },
-  geofence: { tone: "bad", title: "Left the geofence" },
-  emergency_stop: { tone: "bad", title: "Stopped by hand" },
-  plugin_failed: { tone: "bad", title: "Plugin failed" },
-  pose_lost: { tone: "bad", title: "Pose lost" },
-  pose_regained: { tone: "good" },
-  finished: { tone: "good", title: "Finished" },
-  stage: { tone: "good" },
-  time_limit: { tone: "warn", title: "Time is up" },
-  land: { tone: "warn", title: "Landed by hand" },
-  phase: { tone: "go" },
-  start: { tone: "go" },
-  plugin_output: { tone: "code" },
-  note: { tone: "" },
+/** The colours of the kinds that end no flight; of those that do, the server says it. @type {Record<string, string>} */
+const TONES = {
+  pose_lost: "bad",
+  pose_regained: "good",
+  stage: "good",
+  phase: "go",
+  start: "go",
+  plugin_output: "code",
 };
 
 /**
  * Returns the name of an event's kind, without what the kind carries.
- * @param {Kind} kind
+ * @param {EventLine["kind"]} kind
  */
 export const kindName = (kind) => (typeof kind === "string" ? kind : Object.keys(kind)[0]);
 
 /**
  * Returns an event's colour, by name; empty for none.
- * @param {Kind} kind
+ * @param {EventLine} event
  */
-export const toneOf = (kind) => KINDS[kindName(kind)]?.tone ?? "";
-
-/**
- * Returns the title of the banner for a flight that ended so.
- * @param {Kind} kind
- */
-export const titleOf = (kind) => KINDS[kindName(kind)]?.title ?? kindName(kind);
+export const toneOf = ({ kind, tone }) => tone ?? TONES[kindName(kind)] ?? "";

@@ -103,10 +103,26 @@ export type Events = {
   events: {
     at_s: number;
     index: number;
-    kind: string | { collision: { clearance_m: number; p_world_m: [number, number, number] } } | { finished: { seconds: number } } | { geofence: { margin_m: number; p_world_m: [number, number, number] } } | { phase: string } | { pose_lost: { age_s: number } } | { stage: { index: number; name: string } };
+    kind: string | {
+      collision: {
+        clearance_m: number;
+        p_world_m: [number, number, number];
+        speed_mps: number;
+        with: string | { object: string } | { vehicle: string };
+      };
+    } | {
+      geofence: {
+        boundary: string | { no_fly: string };
+        margin_m: number;
+        overshoot_m: number;
+        p_world_m: [number, number, number];
+        speed_mps: number;
+      };
+    } | { ended: string | { pose_lost: { age_s: number } } } | { finished: { seconds: number } } | { phase: string } | { pose_lost: { age_s: number } } | { stage: { index: number; name: string } } | { time_limit: { limit_s: number } };
     origin: string;
     stamp: number;
     text: string;
+    tone: string | null;
   }[];
   type: "events";
 };
@@ -125,7 +141,7 @@ export type State = {
     p_world_m: [number, number, number];
     q_xyzw: [number, number, number, number];
   }[];
-  outcome: { at_s: number; kind: string; stamp: number; text: string } | null;
+  outcome: { at_s: number; outcome: string; text: string; title: string; tone: string } | null;
   pose: {
     age_s: number;
     p_world_m: [number, number, number];
@@ -303,7 +319,6 @@ export type CrashCard = {
   clearance_svg: string;
   course: string;
   ended_unix_ms: number;
-  event: { kind: string; stamp: number; text: string };
   events: { before_s: number; text: string }[];
   id: number;
   images: { before_s: number[]; camera: string }[];
@@ -315,10 +330,12 @@ export type CrashCard = {
     v_world_mps: [number, number, number];
     yaw_rad: number;
   }[];
+  title: string;
   top_height_m: number;
   top_svg: string;
   vehicle: string;
   verdict: {
+    end: string | { time_limit: { limit_s: number } };
     max_speed_mps: number;
     min_clearance_m: number | null;
     outcome: string;

@@ -1,7 +1,6 @@
 // The banner: what decided the flight, or what the page cannot do.
 
 import { $, setText } from "./dom.js";
-import { titleOf, toneOf } from "./event_kinds.js";
 
 /**
  * Shows the banner.
@@ -29,9 +28,8 @@ export const outcome = {
     // A new flight on the same server.
     if (flight_s == null && flown) $("outcome").hidden = true;
     flown = flight_s != null;
-    const tone = outcome ? toneOf(outcome.kind) || "warn" : "";
-    if (outcome) showOutcome(tone, titleOf(outcome.kind), outcome.text + (landed ? "; the vehicle has landed" : ""));
+    if (outcome) showOutcome(outcome.tone, outcome.title, outcome.text + (landed ? "; the vehicle has landed" : ""));
     // The style sheet shows it to whoever looks from across the room.
-    document.body.dataset.outcome = tone;
+    document.body.dataset.outcome = outcome?.tone ?? "";
   },
 };

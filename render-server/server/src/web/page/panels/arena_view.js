@@ -1,7 +1,6 @@
 // Where the vehicle flies: the arena from above or in space, the stages of its course, and what the page waits for.
 
 import { make, setText } from "../dom.js";
-import { kindName } from "../event_kinds.js";
 import { theme } from "../theme.js";
 import { TopView } from "../top_view.js";
 
@@ -145,8 +144,7 @@ export const arenaView = {
     showHint(hintOf(state));
   },
   onFrame(now_ms) {
-    const kind = state?.outcome && kindName(state.outcome.kind);
-    const crashed = kind === "collision" || kind === "geofence";
+    const crashed = ["collided", "geofence"].includes(state?.outcome?.outcome ?? "");
     const objects = state?.objects ?? [];
     if (spaceCanvas.hidden) topView.draw({ pose, now_ms, crashed, objects, passed });
     else spaceView?.draw({ pose, now_ms, crashed, objects, passed, track: topView.track });

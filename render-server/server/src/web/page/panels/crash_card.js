@@ -6,11 +6,6 @@ import { vehicleUrl } from "../session.js";
 
 /** @typedef {import("../messages").CrashCard} CrashCard */
 
-/** @type {Record<string, string>} */
-const TITLES = {
-  collided: "Collision", geofence: "Left the geofence", timeout: "Time is up", landed: "Stopped",
-  plugin_failed: "Plugin failed", error: "Flight failed",
-};
 /** How long the last image stays before it plays again. [ms] */
 const REST_MS = 1200;
 /** A card that could not be fetched is asked for again after this. [ms] */
@@ -127,7 +122,7 @@ element.setAttribute("aria-labelledby", title.id);
  */
 function show(url, card) {
   const { verdict } = card;
-  title.textContent = TITLES[verdict.outcome] ?? verdict.outcome;
+  title.textContent = card.title;
   const time = new Date(card.ended_unix_ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
   when.textContent = `${verdict.seconds.toFixed(1)} s after take-off, ${verdict.stages_passed} of ${verdict.stages.length} stages, at ${time}`;
   const parts = [make("p", { className: "cause", textContent: card.cause })];

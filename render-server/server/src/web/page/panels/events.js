@@ -48,12 +48,13 @@ export const events = {
     list.replaceChildren();
   },
   onEvents(entries) {
-    for (const { index, kind, text, at_s } of entries) {
+    for (const entry of entries) {
+      const { index, kind, text, at_s } = entry;
       if (shown.has(index)) continue;
       shown.add(index);
       const said = text || kindName(kind).replaceAll("_", " ");
       const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: said }));
-      line.dataset.tone = toneOf(kind);
+      line.dataset.tone = toneOf(entry);
       list.append(line);
     }
     while (list.childElementCount > MOST_LINES) list.firstChild?.remove();

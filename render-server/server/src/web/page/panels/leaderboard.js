@@ -61,7 +61,7 @@ export const leaderboard = {
   },
   onState({ outcome, landed }) {
     // When the vehicle changes, a flight is decided, and when it has landed: the standings may be others.
-    const now = `${vehicle} ${outcome?.stamp} ${landed}`;
+    const now = `${vehicle} ${outcome?.at_s} ${outcome?.text} ${landed}`;
     if (now !== decided) refresh();
     decided = now;
   },

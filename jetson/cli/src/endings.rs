@@ -1,0 +1,263 @@
+//! One flight has one end: whatever happens in it, and however late each side hears of the other, runtime,
+//! server, page, crash card, leaderboard and grade say the same of it.
+
+use glam::{DQuat, DVec3};
+use proptest::prelude::*;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_arena::verdict::judge;
+use vizflyt_protocol::flight_end::{
+    Boundary, Collision, EndReason, FenceBreach, Obstacle, PluginFault,
+};
+use vizflyt_protocol::mavlink::CopterMode;
+use vizflyt_protocol::messages::{Event, EventKind, Limits, OutcomeKind, Setpoint, bounded};
+use vizflyt_protocol::time::{HostTime, ServerTime};
+use vizflyt_runtime::flight::{Flight, FlightSettings, Input, LinkView};
+use vizflyt_runtime::guard::Fix;
+use vizflyt_runtime::link::{Goal, LinkEvent};
+use vizflyt_server::flights::events::Origin;
+use vizflyt_server::flights::vehicle::VehicleFlight;
+
+/// What the server's clock is ahead of the runtime's. [ns]
+const AHEAD_NS: u64 = 5_000_000_000;
+const TICK_NS: u64 = 20_000_000;
+
+/// Something that happens, and who sees it first.
+#[derive(Clone, Debug)]
+enum Happening {
+    Server(Box<EventKind>),
+    PluginFails,
+    PluginLands,
+    PluginHangs,
+    PilotTakesOver,
+    AutopilotRestarts,
+    AutopilotRefuses,
+    Interrupt,
+    PosesStop,
+}
+
+fn arena() -> ArenaConfig {
+    ArenaConfig::parse(
+        r#"
+        name = "room"
+        scene = "scene.ply"
+        body_radius_m = 0.12
+        takeoff_height_m = 1.0
+        time_limit_s = 9.0
+        spawn = { position_m = [1, 2, 0] }
+        geofence = { min_m = [0, 0, -0.5], max_m = [11, 4.5, 3.65] }
+        limits = { max_speed_mps = 3.0, max_acceleration_mps2 = 6.0 }
+        [[cameras]]
+        name = "front"
+        width_px = 320
+        height_px = 240
+        horizontal_fov_deg = 90.0
+        position_m = [0.06, 0, 0.02]
+        "#,
+    )
+    .unwrap()
+}
+
+fn touch() -> EventKind {
+    let (p_world_m, clearance_m, speed_mps) = (DVec3::ONE, -0.01, 1.5);
+    let with = Obstacle::Object(bounded("door"));
+    EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps })
+}
+
+/// What a flight came to, by each who says so.
+#[derive(Debug)]
+struct Said {
+    runtime: EndReason,
+    server: Option<EndReason>,
+    /// Written to leaderboard and crash card.
+    verdict: (OutcomeKind, String),
+    grade: EndReason,
+}
+
+impl Said {
+    #[track_caller]
+    fn check(&self, expected: &EndReason) {
+        assert_eq!(&self.runtime, expected, "{self:?}");
+        assert_eq!(self.server.as_ref(), Some(expected), "{self:?}");
+        assert_eq!(self.verdict, (expected.outcome(), expected.to_string()), "{self:?}");
+        assert_eq!(&self.grade, expected, "{self:?}");
+    }
+}
+
+/// Flies until the vehicle has landed and both sides have heard all; `delays_ms` are to the runtime and
+/// to the server.
+fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
+    let arena = arena();
+    let info = arena.info();
+    let vehicle = VehicleFlight::new(0, "vizflyt", info.clone());
+    let at = |ns: u64| HostTime::from_ns(ns);
+    let stamp = |ns: u64| ServerTime::from_ns(ns + AHEAD_NS);
+    let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let mut flight = Flight::new(settings, at(0));
+    flight.handle(at(0), Input::Arena(Box::new(info)));
+    flight.handle(at(0), Input::PluginReady);
+    let mut link =
+        LinkView { connected: true, armed: false, mode: 0, took_off: false, ready_to_arm: Ok(()) };
+    let (mut p_m, mut answer, mut poses) = (DVec3::new(1.0, 2.0, 0.0), Some(Setpoint::Hold), true);
+    // Each is a nanosecond off the runtime's ticks, and apart from the others.
+    let mut waiting: Vec<(u64, Happening)> = happenings
+        .iter()
+        .zip(1..)
+        .map(|((ms, happening), k)| (ms * 1_000_000 + k, happening.clone()))
+        .collect();
+    waiting.sort_by_key(|(ns, _)| *ns);
+    let mut waiting = std::collections::VecDeque::from(waiting);
+    let (mut to_runtime, mut to_server) = (Vec::new(), Vec::new());
+    let mut all = Vec::new();
+    for tick in 1..2000 {
+        let now = tick * TICK_NS;
+        while waiting.front().is_some_and(|(ns, _)| *ns <= now) {
+            let Some((ns, happening)) = waiting.pop_front() else { break };
+            match happening {
+                Happening::Server(kind) => {
+                    let event = Event { stamp: stamp(ns), kind: *kind, text: bounded("") };
+                    vehicle.log(Origin::Server, event.clone());
+                    all.push(event.clone());
+                    to_runtime.push((ns + delays_ms.0 * 1_000_000, event));
+                }
+                Happening::PluginFails => {
+                    let fault = PluginFault::ended("exit status 3");
+                    flight.handle(at(now), Input::PluginFailed(fault));
+                }
+                Happening::PluginLands => answer = Some(Setpoint::Land),
+                Happening::PluginHangs => answer = None,
+                Happening::PilotTakesOver if link.armed => link.mode = CopterMode::Loiter as u32,
+                Happening::PilotTakesOver => {}
+                Happening::AutopilotRestarts => {
+                    flight.handle(at(now), Input::Link(LinkEvent::Rebooted));
+                }
+                Happening::AutopilotRefuses => {
+                    flight.handle(at(now), Input::Link(LinkEvent::Refused("denied".into())));
+                }
+                Happening::Interrupt => flight.handle(at(now), Input::Interrupt),
+                Happening::PosesStop => poses = false,
+            }
+        }
+        let due = |(ns, _): &mut (u64, Event)| *ns <= now;
+        for (_, event) in to_runtime.extract_if(.., due) {
+            let seen = at(event.stamp.as_ns() - AHEAD_NS);
+            flight.handle(at(now), Input::Server(event, seen));
+        }
+        if poses {
+            let rotation = DQuat::IDENTITY;
+            let fix = Fix { stamp: at(now), p_world_m: p_m, v_world_mps: DVec3::ZERO, rotation };
+            flight.handle(at(now), Input::Pose(fix));
+        }
+        flight.handle(at(now), Input::ImagePublished { seq: tick });
+        if let Some(setpoint) = answer.clone() {
+            flight.handle(at(now), Input::Answered { seq: tick, setpoint: Some(setpoint) });
+        }
+        let orders = flight.tick(at(now), &link);
+        match orders.goal {
+            Goal::TakeOff(_) => {
+                (link.mode, link.armed, link.took_off) = (CopterMode::Guided as u32, true, true);
+                p_m.z += 0.02;
+            }
+            Goal::Land if p_m.z > 0.0 => {
+                link.mode = CopterMode::Land as u32;
+                p_m.z -= 0.02;
+            }
+            // A pilot lands it as well.
+            Goal::Prepare if link.armed && p_m.z > 0.0 => p_m.z -= 0.02,
+            Goal::Land | Goal::Prepare => link.armed = false,
+            Goal::Fly => {}
+        }
+        while let Some(notice) = flight.poll_notice() {
+            let event = Event { stamp: stamp(now), kind: notice.kind, text: bounded("") };
+            all.push(event.clone());
+            to_server.push((now + delays_ms.1 * 1_000_000, event));
+        }
+        for (_, event) in to_server.extract_if(.., due) {
+            vehicle.log(Origin::Page, event);
+        }
+        let heard = waiting.is_empty() && to_runtime.is_empty() && to_server.is_empty();
+        if heard && flight.outcome().is_some() {
+            break;
+        }
+    }
+    all.sort_by_key(|event| event.stamp);
+    let verdict = vehicle.verdict(&arena);
+    Said {
+        runtime: flight.outcome().expect("it has landed").clone(),
+        server: vehicle.flight().end.reason().cloned(),
+        verdict: (verdict.outcome, verdict.reason),
+        grade: judge(&arena, &all, &[]).end,
+    }
+}
+
+fn happening() -> impl Strategy<Value = Happening> {
+    let breach = FenceBreach {
+        p_world_m: DVec3::ONE,
+        margin_m: -0.1,
+        boundary: Boundary::Ceiling,
+        speed_mps: 2.0,
+        overshoot_m: 0.3,
+    };
+    let server = prop::sample::select(vec![
+        touch(),
+        EventKind::Geofence(breach),
+        EventKind::Finished { seconds: 5.0 },
+        EventKind::TimeLimit { limit_s: 9.0 },
+        EventKind::Ended(EndReason::PoseLost { age_s: 0.5 }),
+        EventKind::PoseLost { age_s: 0.2 },
+        EventKind::PoseRegained,
+        EventKind::EmergencyStop,
+        EventKind::Land,
+        EventKind::Note,
+    ]);
+    prop_oneof![
+        3 => server.prop_map(|kind| Happening::Server(Box::new(kind))),
+        2 => prop::sample::select(vec![
+            Happening::PluginFails,
+            Happening::PluginLands,
+            Happening::PluginHangs,
+            Happening::PilotTakesOver,
+            Happening::AutopilotRestarts,
+            Happening::AutopilotRefuses,
+            Happening::Interrupt,
+            Happening::PosesStop,
+        ]),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(128))]
+
+    #[test]
+    fn everyone_says_the_same_of_any_flight(
+        happenings in prop::collection::vec((2500..11_000_u64, happening()), 0..6),
+        delays_ms in (0..400_u64, 0..400_u64),
+    ) {
+        let said = fly(&happenings, delays_ms);
+        said.check(&said.runtime);
+    }
+}
+
+#[test]
+fn a_touch_on_the_way_down_after_land_was_pressed_is_a_landing_to_everyone() {
+    for delays_ms in [(0, 0), (300, 10), (10, 300)] {
+        let landed = [(4000, EventKind::Land), (4600, touch())];
+        let said =
+            fly(&landed.map(|(ms, kind)| (ms, Happening::Server(Box::new(kind)))), delays_ms);
+        said.check(&EndReason::LandButton);
+        // Pressed too late, it is a collision.
+        let touched = [(4001, EventKind::Land), (4000, touch())];
+        let said =
+            fly(&touched.map(|(ms, kind)| (ms, Happening::Server(Box::new(kind)))), delays_ms);
+        assert_eq!(said.runtime.outcome(), OutcomeKind::Collided);
+        said.check(&said.runtime);
+    }
+}
+
+#[test]
+fn after_a_landing_for_a_lost_pose_no_time_runs_out_to_anyone() {
+    let late = Happening::Server(Box::new(EventKind::TimeLimit { limit_s: 9.0 }));
+    let said = fly(&[(4000, Happening::PosesStop), (20_000, late)], (20, 20));
+    assert!(matches!(said.runtime, EndReason::PoseLost { .. }), "{said:?}");
+    assert!(said.runtime.is_failure() && said.runtime.title() == "Pose lost");
+    said.check(&said.runtime);
+}
