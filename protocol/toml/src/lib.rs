@@ -79,9 +79,12 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
             Ok(_) => break,
             Err(error) => error,
         };
-        // A key that was there and was taken out is not missing.
-        if missing_key(&error).is_some_and(|key| removed.contains(key)) {
-            break;
+        // A key that was there and was taken out is not missing, nor is one that was misspelt.
+        if let Some(key) = missing_key(&error) {
+            let meant = format!("did you mean '{key}'");
+            if removed.contains(key) || errors.iter().any(|error| error.what.contains(&meant)) {
+                break;
+            }
         }
         let key = error.span().and_then(|span| remove(table.get_mut(), &span));
         errors.push(describe(text, &error, key.as_deref()));

@@ -22,7 +22,7 @@ use crate::web::Login;
 #[derive(Args, Clone, Debug)]
 pub struct ServeArgs {
     /// arena.toml, its folder, or a bare scene file, for which an arena is made up
-    #[arg(required_unless_present_any = ["config", "print_config"])]
+    #[arg(required = false, required_unless_present_any = ["config", "print_config"])]
     pub arena: PathBuf,
 
     /// A file that says what these flags say: each is a key of its name, with `_` for `-`; flags go before it

@@ -8,7 +8,7 @@ const ROOMS: [&str; 6] = ["web", "stream", "render", "poses", "flights", "scene"
 /// Rooms beside each other, that import none of each other.
 const APART: [(&str, &str); 1] = [("flights", "scene")];
 /// Files that stand above all rooms.
-const ABOVE: [&str; 4] = ["main", "lib", "serve", "args"];
+const ABOVE: [&str; 5] = ["main", "lib", "serve", "settings", "args"];
 
 fn files(folder: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();

@@ -17,8 +17,8 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
         ("/", "text/html"),
         ("/style.css", "text/css"),
         ("/app.js", "text/javascript"),
-        ("/cameras.js", "text/javascript"),
-        ("/map.js", "text/javascript"),
+        ("/panels/camera_images.js", "text/javascript"),
+        ("/top_view.js", "text/javascript"),
         ("/icon.svg", "image/svg+xml"),
         ("/api/map", "image/jpeg"),
     ] {
@@ -46,7 +46,7 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
     let arena = socket.message("arena");
     assert_eq!((&arena["name"], &arena["cameras"][0]["name"]), (&"wall".into(), &"front".into()));
     assert_eq!(arena["fence"]["cuboid"]["half_m"][1], 4.0);
-    assert!(socket.message("trail")["points"].as_array().unwrap().is_empty());
+    assert!(socket.message("track")["points"].as_array().unwrap().is_empty());
     assert!(socket.message("state")["pose"].is_null());
     let _emitter = Emitter::start(server.vicon, "vizflyt");
     assert!((0..MANY).any(|_| !socket.message("state")["pose"].is_null()));
@@ -65,7 +65,7 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
     assert_eq!(seen, [true; 2], "colour and depth");
     // One that opens later is told the way so far.
     let mut late = Socket::open(server.http, &own).ok().unwrap();
-    assert!(!late.message("trail")["points"].as_array().unwrap().is_empty());
+    assert!(!late.message("track")["points"].as_array().unwrap().is_empty());
 }
 
 #[test]

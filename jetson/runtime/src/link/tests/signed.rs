@@ -54,7 +54,7 @@ fn only_what_is_signed_anew_is_believed() {
     assert!(!link.is_connected());
     let faults: Vec<_> =
         std::iter::from_fn(|| link.poll_event()).filter_map(|event| event.warning()).collect();
-    assert!(faults.iter().any(|text| text.contains("heard before")), "{faults:?}");
+    assert!(faults.iter().any(|text| text.contains("a replay")), "{faults:?}");
 }
 
 #[test]
