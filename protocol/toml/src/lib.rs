@@ -79,15 +79,16 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
             Ok(_) => break,
             Err(error) => error,
         };
-        // A key that was there and was taken out is not missing, nor is one that was misspelt.
-        if let Some(key) = missing_key(&error) {
+        // A key that was there and was taken out is not missing, nor is one that was misspelt: its table goes,
+        // of which all else has been looked at.
+        let is_said = missing_key(&error).is_some_and(|key| {
             let meant = format!("did you mean '{key}'");
-            if removed.contains(key) || errors.iter().any(|error| error.what.contains(&meant)) {
-                break;
-            }
-        }
+            removed.contains(key) || errors.iter().any(|error| error.what.contains(&meant))
+        });
         let key = error.span().and_then(|span| remove(table.get_mut(), &span));
-        errors.push(describe(text, &error, key.as_deref()));
+        if !is_said {
+            errors.push(describe(text, &error, key.as_deref()));
+        }
         match key {
             Some(key) if errors.len() < MAX_ERRORS => removed.insert(key),
             _ => break,
