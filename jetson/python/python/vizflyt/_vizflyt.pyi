@@ -414,7 +414,7 @@ class Setpoint:
         or one per point for the way to it) [m/s], and stay at the last.
 
         The runtime follows it as long as the plugin answers images, with None or the same path again. A
-        path of another `id` starts anew. With axes 'heading' or 'body' the points count from where the
+        path of another `id` starts again. With axes 'heading' or 'body' the points count from where the
         vehicle is when the runtime takes the path.
         """
     @staticmethod
@@ -650,7 +650,7 @@ class Rehearsal:
         """Whether a plugin has attached: from then on messages reach it."""
 
     def start(self, info: ArenaInfo) -> None:
-        """Tells the plugin what it flies in."""
+        """Sends the plugin its arena."""
 
     def note(self, text: str) -> None:
         """Tells it an event of kind 'note'."""
@@ -691,13 +691,13 @@ class PluginEnd:
         """Returns the newest observation, if there is one not taken yet."""
 
     def ready(self, name: str) -> None:
-        """Tells that `on_start` has returned."""
+        """Reports that `on_start` has returned."""
 
     def answer(self, seq: int, entered_ns: int, setpoint: Setpoint | None) -> None:
         """Sends the answer to one observation."""
 
     def failed(self, reason: str) -> None:
-        """Tells that the plugin gives up, and why; leaves the runtime a moment to read it."""
+        """Reports that the plugin has failed, with the reason; leaves the runtime a moment to read it."""
 
 def waiting_services() -> list[str]:
     """Returns the services of this user's runtimes that wait for a plugin, the longest waiting first."""
