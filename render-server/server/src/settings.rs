@@ -274,7 +274,7 @@ mod tests {
     fn the_shipped_file_is_read() {
         let text = include_str!("../server.toml");
         let line = settled(text, &[]).unwrap();
-        assert!(line.last().unwrap().starts_with("HERE/"), "{line:?}");
+        assert!(line.iter().any(|word| word == "HERE/hall/arena.toml"), "{line:?}");
         // Every key is in it, if only as a comment.
         for argument in command().get_arguments().filter(|argument| is_setting(argument)) {
             let key = key(argument);
