@@ -114,7 +114,7 @@ impl MavlinkStream {
                 let Some(attitude) = system.attitude else { return };
                 let dt_ms = message.time_boot_ms.wrapping_sub(attitude.boot_ms).cast_signed();
                 // An attitude of another moment is none.
-                if dt_ms.abs() > OLDEST_ATTITUDE_MS {
+                if dt_ms.unsigned_abs() > OLDEST_ATTITUDE_MS {
                     return;
                 }
                 let turned = attitude.omega_body_radps * (f64::from(dt_ms) * 1e-3);
@@ -290,7 +290,7 @@ const INTERVAL_US: f32 = 20_000.0;
 /// A request may be lost, and a rebooted autopilot has forgotten it. [s]
 const ASK_EVERY_S: f64 = 5.0;
 /// Attitudes turn on evenly for so long. [ms]
-const OLDEST_ATTITUDE_MS: i32 = 100;
+const OLDEST_ATTITUDE_MS: u32 = 100;
 /// No room is wider. [m]
 const MOST: f64 = 1e6;
 
