@@ -275,7 +275,7 @@ const PUBLIC: &str = "203.0.113.2";
 
 /// Returns all cases.
 pub(crate) fn cases() -> Vec<Case> {
-    use Congestion::{Auto, Bbr, Cubic, Lan};
+    use Congestion::{Auto, Bbr, Lan};
     let near = || Impairment { delay: ms(1), ..Impairment::default() };
     let source = Source::vga();
     let mut all = Vec::new();
@@ -286,7 +286,7 @@ pub(crate) fn cases() -> Vec<Case> {
     };
     add("cable", Lan, Impairment::default(), Script::Nothing);
     for loss in [0, 1, 5, 10, 20] {
-        for congestion in [Lan, Cubic, Bbr] {
+        for congestion in [Lan, Bbr] {
             let path = Impairment { loss: f64::from(loss) / 100.0, ..near() };
             add(&format!("1 ms, {loss} % lost"), congestion, path, Script::Nothing);
         }
@@ -295,7 +295,7 @@ pub(crate) fn cases() -> Vec<Case> {
         let path = Impairment { delay: ms(delay), ..near() };
         add(&format!("{delay} ms"), Lan, path, Script::Nothing);
     }
-    for congestion in [Lan, Cubic, Bbr, Auto] {
+    for congestion in [Lan, Bbr, Auto] {
         let path = Impairment { delay: ms(20), loss: 0.01, ..near() };
         let what = if congestion == Auto { "20 ms, 1 % lost, public" } else { "20 ms, 1 % lost" };
         add(what, congestion, path, Script::Nothing);
@@ -314,20 +314,20 @@ pub(crate) fn cases() -> Vec<Case> {
         reorder: 0.02,
         ..near()
     };
-    for congestion in [Lan, Cubic, Bbr] {
+    for congestion in [Lan, Bbr] {
         add("10 ms, all at once", congestion, path.clone(), Script::Nothing);
     }
     for mtu in [1228, 1500, 9000] {
         add(&format!("MTU {mtu}"), Lan, Impairment { mtu, ..near() }, Script::Nothing);
     }
-    for congestion in [Lan, Cubic, Bbr] {
+    for congestion in [Lan, Bbr] {
         add("blackout 2 s", congestion, near(), Script::Blackout);
     }
     add("server restarts in 1 s", Lan, near(), Script::ServerRestart);
     add("runtime restarts in 0.5 s", Lan, near(), Script::RuntimeRestart);
     add("runtime changes its address", Lan, near(), Script::Move);
     for mbit in [100, 20] {
-        for congestion in [Lan, Cubic, Bbr] {
+        for congestion in [Lan, Bbr] {
             let bandwidth_bps = mbit * 1_000_000;
             let path = Impairment { bandwidth_bps, queue: 256 << 10, ..near() };
             add(&format!("{mbit} Mbit/s"), congestion, path, Script::Nothing);

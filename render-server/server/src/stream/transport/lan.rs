@@ -10,7 +10,7 @@
 //! [`GROWTH`] for every [`GROWTH_EVERY`] without an acknowledgement: the newest image goes out
 //! within 100 ms of the link's return.
 //!
-//! Overloading a 100 Mbit link with it loses a quarter of the packets: use `cubic` or `bbr` on
+//! Overloading a 100 Mbit link with it loses a quarter of the packets: use `bbr` on
 //! networks that others share.
 
 use std::any::Any;
