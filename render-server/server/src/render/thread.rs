@@ -16,7 +16,7 @@ use tracing::{trace_span, warn};
 use vizflyt_arena::config::{MAX_OBJECTS, MAX_VEHICLES};
 use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_splat::{Camera, Placement, Rasterizer, RgbdImage};
+use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
 use crate::flights::Flights;
@@ -26,86 +26,156 @@ use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
 use crate::render::environment::atmosphere;
-use crate::render::rendered::RenderQueue;
+use crate::render::rendered::{RenderQueue, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
 use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
 
-/// Draws the newest poses until the server stops: each tick the cameras that are due of the
+/// Renders the newest poses until the server stops: each tick the cameras that are due of the
 /// vehicles that someone wants images of.
 ///
 /// # Errors
 /// None; a camera that the renderer refuses is logged once and the tick left out.
-pub fn run(
-    (rendering, flights, demand): (&Rendering, &Flights, &impl Demand),
+pub fn run<D: Demand>(
+    (rendering, flights, demand): (&Rendering, &Flights, &D),
     renderer: &mut dyn Rasterizer,
     newest: &Mailbox<NewestPoses>,
     ticks: &RenderQueue,
     max_rate_hz: f64,
     stop: &Stop,
 ) {
-    let least_ns = (1e9 / max_rate_hz) as i64;
-    let periods = Periods { default_ns: least_ns, least_ns, together_ns: TOGETHER_NS };
-    let mut schedules = vec![CameraSchedule::new(clock::now()); rendering.cameras.len()];
-    let mut sets: Vec<Arc<CameraSet>> = Vec::with_capacity(MAX_VEHICLES);
-    let mut rendered_cameras: [RenderedCameras; MAX_VEHICLES] = Default::default();
-    let mut cameras: Vec<Camera> = Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS);
-    // The renderer wants the images of the cameras that are due side by side.
-    let mut images: Vec<RgbdImage> = Vec::new();
-    // Poses that nothing was rendered from yet; and the newest of each vehicle, for the others' images.
-    let (mut poses, mut known) = (NewestPoses::default(), NewestPoses::default());
-    let mut placements: Vec<Placement> = Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES);
-    let (mut seq, mut refused) = (0u64, false);
+    let mut render = RenderLoop::new(rendering, flights, demand, max_rate_hz);
     while !stop.is_set() {
         let wanted = demand.wait_for_interest(PATIENCE);
         if !wanted.contains(&true) {
             continue;
         }
-        sets.clear();
-        let vehicles = rendering.cameras.iter().zip(&mut rendered_cameras).enumerate();
-        sets.extend(vehicles.map(|(vehicle, (cameras, rendered))| {
-            rendered.follow(cameras.newest(), demand.shrink(vehicle))
-        }));
-        let now = clock::now();
-        let ready = (0..sets.len()).filter(|&index| wanted[index] && poses[index].is_some());
-        let next = ready.filter_map(|index| {
-            schedules[index].hasten(&sets[index].configs, &periods, now);
-            schedules[index].next(&sets[index].configs)
-        });
-        // Where nothing is due, a newer pose is worth waking up for: it may be another vehicle's.
-        let wait = next.min().map_or(PATIENCE, |next| {
-            Duration::from_nanos(next.as_ns().saturating_sub(now.as_ns())).min(PATIENCE)
-        });
+        render.follow_cameras();
+        let wait = render.until_due(&wanted);
         if let Some(newer) = newest.take(wait) {
-            merge(&newer, &mut poses);
-            merge(&newer, &mut known);
+            merge(&newer, &mut render.poses);
+            merge(&newer, &mut render.known);
         }
         if !wait.is_zero() {
             continue;
         }
-        seq += 1;
         let mut tick = ticks.spare();
-        let slots = sets.iter().map(|set| set.configs.len()).sum();
+        let stamp = render.expose(&wanted, &mut tick);
+        match render.rasterize(renderer, stamp, &mut tick) {
+            Ok(()) => render.publish(tick, ticks, renderer),
+            Err(error) => {
+                render.report_refused(&error);
+                ticks.recycle(tick);
+            }
+        }
+    }
+}
+
+/// The loop's state; every buffer is used again.
+struct RenderLoop<'a, D> {
+    rendering: &'a Rendering,
+    flights: &'a Flights,
+    demand: &'a D,
+    periods: Periods,
+    /// When each vehicle's cameras are due.
+    schedules: Vec<CameraSchedule>,
+    /// Each vehicle's cameras, at the size that its link asks for.
+    sets: Vec<Arc<CameraSet>>,
+    rendered_cameras: [RenderedCameras; MAX_VEHICLES],
+    /// Poses that nothing was rendered from yet.
+    poses: NewestPoses,
+    /// The newest of each vehicle, for the others' images.
+    known: NewestPoses,
+    /// The cameras of one tick, all vehicles'; which of them are whose.
+    cameras: Vec<Camera>,
+    views: [View; MAX_VEHICLES],
+    /// Their images side by side, as the renderer wants them.
+    images: Vec<RgbdImage>,
+    placements: Vec<Placement>,
+    seq: u64,
+    refused: bool,
+}
+
+impl<'a, D: Demand> RenderLoop<'a, D> {
+    fn new(
+        rendering: &'a Rendering,
+        flights: &'a Flights,
+        demand: &'a D,
+        max_rate_hz: f64,
+    ) -> Self {
+        let least_ns = (1e9 / max_rate_hz) as i64;
+        Self {
+            rendering,
+            flights,
+            demand,
+            periods: Periods { default_ns: least_ns, least_ns, together_ns: TOGETHER_NS },
+            schedules: vec![CameraSchedule::new(clock::now()); rendering.cameras.len()],
+            sets: Vec::with_capacity(MAX_VEHICLES),
+            rendered_cameras: Default::default(),
+            poses: NewestPoses::default(),
+            known: NewestPoses::default(),
+            cameras: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
+            views: Default::default(),
+            images: Vec::new(),
+            placements: Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES),
+            seq: 0,
+            refused: false,
+        }
+    }
+
+    /// Takes over what runtimes have changed of their cameras, and the sizes that links ask for.
+    fn follow_cameras(&mut self) {
+        self.sets.clear();
+        let vehicles = self.rendering.cameras.iter().zip(&mut self.rendered_cameras).enumerate();
+        self.sets.extend(vehicles.map(|(vehicle, (cameras, rendered))| {
+            rendered.follow(cameras.newest(), self.demand.shrink(vehicle))
+        }));
+    }
+
+    /// Returns how long no camera is due. Where nothing can be rendered, a newer pose is worth
+    /// waking up for: it may be another vehicle's.
+    fn until_due(&mut self, wanted: &[bool; MAX_VEHICLES]) -> Duration {
+        let now = clock::now();
+        let mut next: Option<ServerTime> = None;
+        for (vehicle, set) in self.sets.iter().enumerate() {
+            if !wanted[vehicle] || self.poses[vehicle].is_none() {
+                continue;
+            }
+            let schedule = &mut self.schedules[vehicle];
+            schedule.hasten(&set.configs, &self.periods, now);
+            next = next.into_iter().chain(schedule.next(&set.configs)).min();
+        }
+        next.map_or(PATIENCE, |next| {
+            Duration::from_nanos(next.as_ns().saturating_sub(now.as_ns())).min(PATIENCE)
+        })
+    }
+
+    /// Collects the cameras that are due, each where its vehicle will be when the image is seen, and
+    /// fills in what `tick` says of their images. Returns the newest pose's stamp.
+    fn expose(&mut self, wanted: &[bool; MAX_VEHICLES], tick: &mut RenderedTick) -> ServerTime {
+        self.seq += 1;
+        let slots = self.sets.iter().map(|set| set.configs.len()).sum();
         tick.slots.resize_with(slots, Default::default);
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
-        cameras.clear();
-        let atmosphere = atmosphere(&rendering.environment.now());
-        let mut views = [View::default(); MAX_VEHICLES];
-        for (vehicle, set) in sets.iter().enumerate() {
+        self.cameras.clear();
+        let atmosphere = atmosphere(&self.rendering.environment.now());
+        self.views = Default::default();
+        for (vehicle, set) in self.sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
             // A vehicle's pose is kept until a camera of it is due.
-            let sample = poses[vehicle].filter(|_| wanted[vehicle]).inspect(|_| {
-                due = schedules[vehicle].take(&set.configs, &periods, clock::now());
+            let sample = self.poses[vehicle].filter(|_| wanted[vehicle]).inspect(|_| {
+                due = self.schedules[vehicle].take(&set.configs, &self.periods, clock::now());
             });
             if due.contains(&true) {
-                poses[vehicle] = None;
+                self.poses[vehicle] = None;
             }
-            let after_ns = demand.seen_after_s(vehicle).map(|s| (s * 1e9) as i64);
-            let shown = sample
-                .map(|newest| Exposure::new(rendering.predict, after_ns, &newest, clock::now()));
-            let flies = flights.vehicles[vehicle].runtime().is_some();
-            let first = cameras.len();
+            let after_ns = self.demand.seen_after_s(vehicle).map(|s| (s * 1e9) as i64);
+            let shown = sample.map(|newest| {
+                Exposure::new(self.rendering.predict, after_ns, &newest, clock::now())
+            });
+            let flies = self.flights.vehicles[vehicle].runtime().is_some();
+            let first = self.cameras.len();
             for (camera, slot) in slots.by_ref().take(set.configs.len()).enumerate() {
                 slot.fresh = due[camera];
                 let (true, Some(Localized { sample, .. }), Some(exposure)) =
@@ -114,34 +184,46 @@ pub fn run(
                     continue;
                 };
                 let (config, info) = (&set.configs[camera], &set.infos[camera]);
-                cameras.push(exposure.camera(config, info, atmosphere));
+                self.cameras.push(exposure.camera(config, info, atmosphere));
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);
                 slot.counted = flies;
-                slot.seq = seq;
+                slot.seq = self.seq;
                 (slot.pose, slot.shown) = (sample.stamp, exposure.at);
                 slot.world_from_body = Some(exposure.world_from_body);
                 slot.set = Some(set.clone());
-                images.resize_with(images.len().max(cameras.len()), Default::default);
-                std::mem::swap(&mut images[cameras.len() - 1], &mut slot.image);
+                let images = &mut self.images;
+                images.resize_with(images.len().max(self.cameras.len()), Default::default);
+                std::mem::swap(&mut images[self.cameras.len() - 1], &mut slot.image);
             }
             let at = shown.map_or(ServerTime::ZERO, |exposure| exposure.at);
-            views[vehicle] = View { first, end: cameras.len(), at };
+            self.views[vehicle] = View { first, end: self.cameras.len(), at };
         }
-        let span = trace_span!("tick", seq, stamp_ns = stamp.as_ns()).entered();
-        let images = &mut images[..cameras.len()];
+        stamp
+    }
+
+    /// Renders the collected cameras and puts their images into `tick`.
+    fn rasterize(
+        &mut self,
+        renderer: &mut dyn Rasterizer,
+        stamp: ServerTime,
+        tick: &mut RenderedTick,
+    ) -> Result<(), RenderError> {
+        let span = trace_span!("tick", seq = self.seq, stamp_ns = stamp.as_ns()).entered();
+        let Self { rendering, cameras, placements, known, .. } = self;
+        let images = &mut self.images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| {
             if rendering.dynamic_objects.is_empty() {
-                return renderer.render(&[], &cameras, images).map(|_| ());
+                return renderer.render(&[], cameras, images).map(|_| ());
             }
             // Each vehicle sees the moment that its images show, and not itself.
-            let drawn = views.iter().enumerate().filter(|(_, view)| view.first < view.end);
-            drawn.into_iter().try_for_each(|(vehicle, &View { first, end, at })| {
+            let mut views = self.views.iter().enumerate().filter(|(_, view)| view.first < view.end);
+            views.try_for_each(|(vehicle, &View { first, end, at })| {
                 placements.clear();
-                rendering.dynamic_objects.place(at, vehicle, &known, &mut placements);
+                rendering.dynamic_objects.place(at, vehicle, known, placements);
                 let images = &mut images[first..end];
-                renderer.render(&placements, &cameras[first..end], images).map(|_| ())
+                renderer.render(placements, &cameras[first..end], images).map(|_| ())
             })
         });
         let end = clock::now();
@@ -150,25 +232,27 @@ pub fn run(
             std::mem::swap(image, &mut slot.image);
             (slot.render_start, slot.render_end) = (start, end);
         }
-        match result {
-            Ok(()) => {
-                rendering.durations.add(start, end);
-                if seq.is_multiple_of(NAME_TICKS) {
-                    note_renderer(rendering, flights, renderer);
-                }
-                for slot in tick.slots.iter().filter(|slot| slot.fresh && slot.counted) {
-                    demand.count_rendered(slot.vehicle, slot.camera);
-                }
-                let skipped = ticks.publish(tick, demand.has_viewers() || flights.any_under_way());
-                rendering.ticks.fetch_add(1, Ordering::Relaxed);
-                rendering.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
-            }
-            Err(error) => {
-                if !std::mem::replace(&mut refused, true) {
-                    warn!("tick {seq} is not drawn: {error}; more of these go unsaid");
-                }
-                ticks.recycle(tick);
-            }
+        result.inspect(|()| rendering.durations.add(start, end))
+    }
+
+    /// Hands the tick to the encoder, and counts it.
+    fn publish(&self, tick: RenderedTick, ticks: &RenderQueue, renderer: &dyn Rasterizer) {
+        if self.seq.is_multiple_of(NAME_TICKS) {
+            note_renderer(self.rendering, self.flights, renderer);
+        }
+        for slot in tick.slots.iter().filter(|slot| slot.fresh && slot.counted) {
+            self.demand.count_rendered(slot.vehicle, slot.camera);
+        }
+        let watched = self.demand.has_viewers() || self.flights.any_under_way();
+        let skipped = ticks.publish(tick, watched);
+        self.rendering.ticks.fetch_add(1, Ordering::Relaxed);
+        self.rendering.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
+    }
+
+    /// Logs the first tick that the renderer refuses.
+    fn report_refused(&mut self, error: &RenderError) {
+        if !std::mem::replace(&mut self.refused, true) {
+            warn!("tick {} is not rendered: {error}; more of these are not logged", self.seq);
         }
     }
 }
