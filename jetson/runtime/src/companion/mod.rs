@@ -27,7 +27,7 @@ use vizflyt_protocol::messages::{
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle};
 
-use crate::airframe::ArenaFence;
+use crate::airframe::AutopilotFence;
 use crate::flight::{Flight, FlightSettings, Input, LinkView};
 use crate::guard::Fix;
 use crate::link::{Datagram, Link, LinkEvent, LinkSettings};
@@ -125,15 +125,15 @@ impl Companion {
         }
     }
 
-    /// Has the arena's fence uploaded to the autopilot, once the arena is known; reports what a fence of
-    /// polygons cannot express.
+    /// Uploads the arena's fence to the autopilot, once the arena is known; reports what polygons cannot
+    /// express.
     pub fn upload_fence(&mut self, now: HostTime) {
         let Some(arena) = &self.arena else { return };
-        let fence = ArenaFence::of(arena);
-        let gap = fence.gap(arena);
+        let fence = AutopilotFence::of(arena);
+        let warning = fence.warning(arena);
         self.link.set_fence(now, fence.polygons);
-        if let Some(gap) = gap {
-            self.note(now, &gap);
+        if let Some(warning) = warning {
+            self.note(now, &warning);
         }
     }
 
