@@ -12,7 +12,9 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
 use vizflyt_runtime::log::read::{LogReader, RecordedFlight, RecordedPoses};
-use vizflyt_runtime::replay::{Differs, FlownPlugin, Plan, ReplayOptions, ReplayReport, replay};
+use vizflyt_runtime::replay::{
+    Differs, FlownPlugin, ReplayOptions, ReplayPlan, ReplayReport, replay,
+};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
 use crate::fly::plugin::Plugin;
@@ -77,7 +79,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         tell(format!("{sent} poses sent to {to}"));
         return Ok(ExitCode::SUCCESS);
     }
-    let plan = Plan::read(RecordedFlight::new(reader, false)).with_context(cannot)?;
+    let plan = ReplayPlan::read(RecordedFlight::new(reader, false)).with_context(cannot)?;
     let (plugin, arguments) = match &args.plugin {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),
         None => flown(plan.flown.as_ref())?,

@@ -123,7 +123,7 @@ impl Rehearsal {
 fn said(py: Python<'_>, message: FromPlugin) -> PyResult<Said> {
     Ok(match message {
         FromPlugin::Ready { name } => ("ready", 0, name.into_pyobject(py)?.into_any().unbind(), 0),
-        FromPlugin::Answer { seq, entered, setpoint, .. } => {
+        FromPlugin::Reply { seq, entered, setpoint, .. } => {
             let setpoint = match setpoint {
                 Some(setpoint) => Py::new(py, Setpoint(setpoint))?.into_any(),
                 None => py.None(),

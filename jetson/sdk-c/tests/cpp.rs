@@ -133,7 +133,7 @@ impl Rig {
             writer.image_ready(1, &cameras[1], ImageStamps::default());
         }
         self.ipc.publish(loan).unwrap();
-        let FromPlugin::Answer { seq, setpoint, .. } = self.next() else { panic!("no answer") };
+        let FromPlugin::Reply { seq, setpoint, .. } = self.next() else { panic!("no answer") };
         assert_eq!(seq, self.seq);
         setpoint
     }

@@ -129,7 +129,7 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
         let setpoint = plugin.on_image(&observation.with_imu_after(imu_had));
         imu_had = observation.newest_imu().unwrap_or(imu_had);
         let seq = observation.seq();
-        end.send(&FromPlugin::Answer { seq, entered, returned: host_now(), setpoint })?;
+        end.send(&FromPlugin::Reply { seq, entered, returned: host_now(), setpoint })?;
     }
 }
 

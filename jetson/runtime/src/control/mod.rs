@@ -334,12 +334,12 @@ impl ControlLoop {
         let is_leaving = self.plugin.as_ref().is_none_or(|side| side.leaving.is_some());
         let counts = self.companion.is_plugin_greeted() && !is_leaving;
         match message {
-            FromPlugin::Ready { .. } | FromPlugin::Answer { .. } if !counts => {}
+            FromPlugin::Ready { .. } | FromPlugin::Reply { .. } if !counts => {}
             FromPlugin::Ready { name } => {
                 tracing::info!("plugin {name} is ready");
                 self.companion.plugin_ready(now);
             }
-            FromPlugin::Answer { seq, entered, returned, setpoint } => {
+            FromPlugin::Reply { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
                 if let Some(side) = &mut self.plugin {
                     side.by_hand_replied = side.by_hand_replied.map(|_| now);

@@ -15,7 +15,7 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, GuidedSetpoint, guided
 use vizflyt_protocol::messages::YawTarget;
 use vizflyt_protocol::time::HostTime;
 
-use super::commands::{Answer, Command, Patience};
+use super::commands::{Command, CommandOutcome, Patience};
 use super::companions::ANNOUNCES;
 use super::dialect::Rise;
 use super::params::Request;
@@ -39,7 +39,7 @@ impl Link {
     /// Sends the command that the goal needs next, or repeats the one under way.
     pub(super) fn advance(&mut self, now: HostTime) {
         let Some(target) = self.autopilot else { return };
-        if let Answer::GivenUp { command, why } = self.commands.handle_timeout(now) {
+        if let CommandOutcome::GivenUp { command, why } = self.commands.handle_timeout(now) {
             self.given_up(now, command, &why);
         }
         self.advance_params(now, target);

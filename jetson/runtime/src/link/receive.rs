@@ -19,7 +19,7 @@ use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{AutopilotTime, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
-use super::commands::{Answer, Command};
+use super::commands::{Command, CommandOutcome};
 use super::params::ParamEvent;
 use super::{
     COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect, words,
@@ -303,9 +303,9 @@ impl Link {
             return;
         }
         match self.commands.handle_ack(now, ack.command, ack.result) {
-            Answer::Nothing => {}
-            Answer::Accepted(command) => self.accepted(now, command),
-            Answer::GivenUp { command, why } => self.given_up(now, command, &why),
+            CommandOutcome::Pending => {}
+            CommandOutcome::Accepted(command) => self.accepted(now, command),
+            CommandOutcome::GivenUp { command, why } => self.given_up(now, command, &why),
         }
     }
 

@@ -100,7 +100,7 @@ impl PluginProcess {
                 None if Instant::now() > deadline => {
                     return Err(failed("`on_start` did not return within five minutes"));
                 }
-                Some(FromPlugin::Answer { .. }) | None => {}
+                Some(FromPlugin::Reply { .. }) | None => {}
             }
         }
     }
@@ -153,7 +153,7 @@ impl PluginProcess {
         let deadline = Instant::now() + self.within;
         loop {
             match self.next(line)? {
-                Some(FromPlugin::Answer { seq: found, setpoint, .. }) if found == seq => {
+                Some(FromPlugin::Reply { seq: found, setpoint, .. }) if found == seq => {
                     return Ok(setpoint);
                 }
                 Some(FromPlugin::Failed { reason }) => {

@@ -78,7 +78,7 @@ fn what_is_logged_is_read_back() {
         log.write(Channel::Asked, host_now(), &json!({"seq": n}));
     }
     log.line(host_now(), "stdout", "hello", 7);
-    let answer = FromPlugin::Answer {
+    let answer = FromPlugin::Reply {
         seq: 3,
         entered: HostTime::from_ns(1),
         returned: HostTime::from_ns(2),

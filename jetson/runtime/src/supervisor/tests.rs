@@ -387,7 +387,7 @@ fn a_good_plugin_answers_each_image_and_stops_when_told() {
     let mut rig = Rig::start("hover");
     for _ in 0..50 {
         rig.publish();
-        let Some(FromPlugin::Answer { seq, entered, returned, setpoint }) = rig.next() else {
+        let Some(FromPlugin::Reply { seq, entered, returned, setpoint }) = rig.next() else {
             panic!("no answer")
         };
         assert_eq!((seq, setpoint), (rig.seq, Some(Setpoint::Hold)));

@@ -26,8 +26,8 @@ pub enum FromPlugin {
         /// The plugin's name for people.
         name: Text,
     },
-    /// The answer to one image.
-    Answer {
+    /// The reply to one image.
+    Reply {
         /// The image's sequence number.
         seq: u64,
         /// When `on_image` was entered.
