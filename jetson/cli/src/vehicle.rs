@@ -39,7 +39,7 @@ impl AutopilotArgs {
     fn open_wired_session(&self) -> Result<ParamSession> {
         self.open_session_with(|settings| {
             if let Some(signing) = &mut settings.signing {
-                signing.trusts_wire = true;
+                signing.accepts_unsigned = true;
             }
         })
     }

@@ -186,8 +186,8 @@ impl ParamSession {
         }
         self.link.set_fence(host_now(), polygons);
         let done = self.until(FENCE_WITHIN_S, |event, _| match event {
-            Some(LinkEvent::Fence(FenceEvent::Kept(polygons))) => Some(Ok(*polygons)),
-            Some(LinkEvent::Fence(FenceEvent::NotKept(why))) => Some(Err(why.clone())),
+            Some(LinkEvent::Fence(FenceEvent::Accepted(polygons))) => Some(Ok(*polygons)),
+            Some(LinkEvent::Fence(FenceEvent::Rejected(why))) => Some(Err(why.clone())),
             _ => None,
         });
         let silent = "it has no origin yet; start it in its localization, and try again";

@@ -5,7 +5,7 @@ use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
 use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
 use vizflyt_protocol::time::HostTime;
 
-use super::words::is_final;
+use super::messages::is_final;
 
 /// A command to the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
