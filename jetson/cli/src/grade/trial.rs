@@ -28,7 +28,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Setpoint};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
-use vizflyt_runtime::guard::Fix;
+use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
@@ -328,7 +328,7 @@ impl<'a> Flight<'a> {
                 stamp: sample.stamp,
                 p_world_m,
                 v_world_mps: sample.twist.linear_mps,
-                yaw_rad: Fix::of(&sample, self.now).yaw_rad(),
+                yaw_rad: VehicleMotion::of(&sample, self.now).yaw_rad(),
                 clearance_m: self.referee.clearance_m(p_world_m),
             });
             self.poses += 1;
