@@ -1,6 +1,6 @@
 //! Follows a plugin's trajectory: where the reference is, and how it moves. Pure: the vehicle's
 //! place and `dt` in, a moving point out, at the guard's rate (50 to 200 Hz). The guard steers
-//! towards that point and has the last word.
+//! towards that point and keeps all limits.
 //!
 //! The reference waits for the vehicle: its pace falls with the distance between the two. So a
 //! vehicle that the guard slows down, or that starts away from the path, loses nothing of it.
@@ -32,7 +32,7 @@ pub struct Start {
 /// Up to this far behind, the reference keeps its pace: what a vehicle lags at 3 m/s. [m]
 const FREE_LAG_M: f64 = 0.5;
 /// This far behind, it stands. [m]
-const MOST_LAG_M: f64 = 1.5;
+const MAX_LAG_M: f64 = 1.5;
 /// Share of the acceleration limit that waypoints are flown with; the rest is for corrections.
 const SHARE: f64 = 0.5;
 /// A corner may change the velocity by what this time and that acceleration allow. [s]
@@ -120,7 +120,7 @@ impl Follower {
         dt_s: f64,
     ) -> Reference {
         let lag_m = (self.place().0 - p_world_m).length();
-        let pace = ((MOST_LAG_M - lag_m) / (MOST_LAG_M - FREE_LAG_M)).clamp(0.0, 1.0);
+        let pace = ((MAX_LAG_M - lag_m) / (MAX_LAG_M - FREE_LAG_M)).clamp(0.0, 1.0);
         match &mut self.progress {
             Progress::Legs { legs, at, way_m, speed_mps } => {
                 let acceleration_mps2 = SHARE * max_acceleration_mps2;

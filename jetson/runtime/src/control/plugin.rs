@@ -17,9 +17,9 @@ use crate::images::ImagePublisher;
 use crate::replies::PluginReplies;
 use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
-/// The plugin hears of us at least this often.
+/// Maximum time between two messages to the plugin.
 const HEARTBEAT_TICKS: u64 = 20;
-/// A plugin that says it has failed may still print why for this long, before it is started again. [s]
+/// A plugin that has reported a failure may still print why for this long, before it is started again. [s]
 const LAST_WORDS_S: f64 = 0.3;
 /// Whether a plugin that a person started still lives is looked up every 80 ms.
 const BY_HAND_TICKS: u64 = 4;
@@ -131,16 +131,16 @@ impl ControlLoop {
         let Some(side) = &mut self.plugin else { return };
         let (sender, replies, run) = (self.sender.clone(), Arc::clone(&side.replies), side.run);
         // Lines and the end are never dropped: the loop always reads.
-        let tell = move |event| {
+        let handle = move |event| {
             if let PluginEvent::Exited(_) = &event {
-                // What it said comes before the news of its end: it may be why.
+                // Its last messages are handled before its exit: they may have the reason.
                 replies.drain(|message| {
                     let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
                 });
             }
             let _ = sender.send(ControlInput::Plugin(run, event));
         };
-        match Supervisor::start(&side.command, &side.confinement, tell) {
+        match Supervisor::start(&side.command, &side.confinement, handle) {
             Ok(supervisor) => side.supervisor = Some(supervisor),
             Err(error) => {
                 let program = side.command[0].to_string_lossy();
@@ -150,7 +150,7 @@ impl ControlLoop {
         }
     }
 
-    /// The plugin says that it has failed; its process ends soon after.
+    /// The plugin reports that it has failed; its process ends soon after.
     pub(super) fn plugin_failed(&mut self, now: HostTime, sentence: String) {
         if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
             return;

@@ -1,4 +1,4 @@
-//! What a plugin may use, and what happens when it ends: the settings, from `[plugin]` in
+//! Limits of a plugin, and what happens when it ends: the settings, from `[plugin]` in
 //! `jetson.toml`.
 
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ pub enum Restart {
     InFlight,
 }
 
-/// What a plugin may use. Memory, processors and processes count for it and all it starts.
+/// Limits of a plugin. Memory, processors and processes count for it and all it starts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PluginLimits {
     /// Memory. [MB]
@@ -75,22 +75,22 @@ impl Default for PluginLimits {
 pub const LEAST_MEMORY_MB: u64 = 64;
 
 /// Linux takes environment variables of 128 KiB: some thousand obstacles.
-const MOST_MAP: usize = 120 * 1024;
+const MAX_MAP: usize = 120 * 1024;
 
 impl PluginLimits {
     /// Hands the plugin a map, if it is one.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The fault.
     pub fn hand_map(&mut self, text: &str) -> Result<(), String> {
         let volumes = vizflyt_sdk::parse_map(text).map_err(|error| error.to_string())?;
         let text = text.trim().to_owned();
-        if text.len() > MOST_MAP {
+        if text.len() > MAX_MAP {
             return Err(format!(
                 "the map of {} obstacles has {} kB, more than the {} kB that a plugin can be handed",
                 volumes.len(),
                 text.len() / 1024,
-                MOST_MAP / 1024
+                MAX_MAP / 1024
             ));
         }
         self.map = Some(text);
@@ -100,7 +100,7 @@ impl PluginLimits {
     /// As [`Self::hand_map`], of a file.
     ///
     /// # Errors
-    /// What is wrong with it, and its name.
+    /// The fault, and the name.
     pub fn hand_map_file(&mut self, path: &Path) -> anyhow::Result<()> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("the map {} cannot be read", path.display()))?;
@@ -132,7 +132,7 @@ impl PluginLimits {
     }
 }
 
-/// Returns this computer's memory; 4 GB where the system does not tell. [MB]
+/// Returns this computer's memory; 4 GB where the system does not report it. [MB]
 fn memory_total_mb() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let kib = text.lines().find_map(|line| line.strip_prefix("MemTotal:"));

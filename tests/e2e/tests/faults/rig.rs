@@ -440,7 +440,7 @@ async fn report(outbox: Arc<Outbox>, notes: Arc<Mutex<Notes>>) {
                 notes.told_up - 1
             };
             let (stamp, text) = (clock::now(), bounded(&text(number)));
-            outbox.tell(Event { stamp, kind: EventKind::Note, text });
+            outbox.send_event(Event { stamp, kind: EventKind::Note, text });
         }
     }
 }
