@@ -129,7 +129,7 @@ fn get(url: &str, path: &str) -> Result<(u16, String)> {
     write!(stream, "GET {path} HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n")
         .with_context(no_server)?;
     let mut answer = String::new();
-    stream.take(MOST_BYTES).read_to_string(&mut answer).with_context(no_server)?;
+    stream.take(MAX_BYTES).read_to_string(&mut answer).with_context(no_server)?;
     let (head, body) = answer.split_once("\r\n\r\n").with_context(no_server)?;
     let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
     Ok((status.with_context(no_server)?, body.to_owned()))
@@ -361,7 +361,7 @@ const BAR: f32 = 40.0;
 /// A server on the other side of the lab answers within this.
 const PATIENCE: Duration = Duration::from_secs(3);
 /// An answer has some 10 KB. [bytes]
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {

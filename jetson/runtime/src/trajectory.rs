@@ -38,9 +38,9 @@ const SHARE: f64 = 0.5;
 /// A corner may change the velocity by what this time and that acceleration allow. [s]
 const CORNER_S: f64 = 0.25;
 /// A path shorter than this has no direction. [m]
-const LEAST_M: f64 = 1e-6;
+const MIN_M: f64 = 1e-6;
 /// Slower than this, level, there is no direction of travel for the nose. [m/s]
-const LEAST_MPS: f64 = 0.05;
+const MIN_MPS: f64 = 0.05;
 
 /// Follows one trajectory. See the module.
 #[derive(Clone, Debug)]
@@ -86,7 +86,7 @@ impl Follower {
                     let to_m = origin_m + world_from_axes * point.p_m;
                     let way_m = to_m - from_m;
                     let length_m = way_m.length();
-                    (length_m > LEAST_M).then(|| {
+                    (length_m > MIN_M).then(|| {
                         let direction = way_m / length_m;
                         let leg = Leg { from_m, direction, length_m, speed_mps: point.speed_mps };
                         from_m = to_m;
@@ -128,7 +128,7 @@ impl Follower {
                 *speed_mps = wanted_mps.min(*speed_mps + acceleration_mps2 * dt_s);
                 *way_m += *speed_mps * pace * dt_s;
                 while let Some(leg) = legs.get(*at)
-                    && *way_m >= leg.length_m - LEAST_M
+                    && *way_m >= leg.length_m - MIN_M
                 {
                     (*way_m, *at) = ((*way_m - leg.length_m).max(0.0), *at + 1);
                 }
@@ -146,7 +146,7 @@ impl Follower {
             }
         }
         let (p_world_m, v_world_mps) = self.place();
-        if v_world_mps.truncate().length() > LEAST_MPS {
+        if v_world_mps.truncate().length() > MIN_MPS {
             self.ahead = YawTarget::Angle(v_world_mps.y.atan2(v_world_mps.x));
         }
         let yaw = match self.trajectory.yaw {
@@ -195,7 +195,7 @@ fn most_mps(legs: &[Leg], way_m: f64, max_speed_mps: f64, acceleration_mps2: f64
         let corner_mps = legs.get(index + 1).map_or(0.0, |next| {
             // v turned by an angle changes by 2 v sin(angle / 2) = v |d1 - d2|.
             let turn = (next.direction - leg.direction).length();
-            next.speed_mps.min(acceleration_mps2 * CORNER_S / turn.max(LEAST_M))
+            next.speed_mps.min(acceleration_mps2 * CORNER_S / turn.max(MIN_M))
         });
         let braking_mps =
             (corner_mps * corner_mps + 2.0 * acceleration_mps2 * to_corner_m.max(0.0)).sqrt();

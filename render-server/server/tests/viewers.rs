@@ -21,7 +21,7 @@ use vizflyt_protocol::messages::ToRuntime;
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
 const VIEWERS: usize = 20;
 /// In the second half of the watched time. [MB]
-const MOST_MEMORY_GROWTH_MB: f64 = 12.0;
+const MAX_MEMORY_GROWTH_MB: f64 = 12.0;
 
 /// What one vehicle's runtime has got.
 #[derive(Debug, Default)]
@@ -113,7 +113,7 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         pictures as f64 / VIEWERS as f64 / seconds as f64,
         states as f64 / VIEWERS as f64 / seconds as f64,
     );
-    assert!(tenths[10] - tenths[5] < MOST_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
+    assert!(tenths[10] - tenths[5] < MAX_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
 }
 
 /// Counts a runtime's images.

@@ -16,7 +16,7 @@ use super::dialect::{
 };
 
 /// Corners kept at most; ArduCopter's storage holds about as many.
-const MOST_CORNERS: u16 = 70;
+const MAX_CORNERS: u16 = 70;
 /// An item that does not come is asked for again after this. [s]
 const REPEAT_S: f64 = 1.0;
 /// A sender silent for this long has given up. [s]
@@ -160,8 +160,8 @@ impl Autopilot {
             return self.answer(from, MavMissionResult::MAV_MISSION_DENIED);
         }
         self.polygons.upload = None;
-        if count > MOST_CORNERS {
-            let text = format!("Only {MOST_CORNERS} items are supported");
+        if count > MAX_CORNERS {
+            let text = format!("Only {MAX_CORNERS} items are supported");
             self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return self.answer(from, MavMissionResult::MAV_MISSION_NO_SPACE);
         }

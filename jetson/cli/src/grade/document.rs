@@ -16,9 +16,9 @@ use super::statistics::{Interval, mean_interval, share_interval};
 pub(crate) const FORMAT: &str = "vizflyt-grade-1";
 
 /// Seeds that are flown at most, and parts of a grade.
-pub(crate) const MOST_SEEDS: u64 = 100_000;
+pub(crate) const MAX_SEEDS: u64 = 100_000;
 /// Variants that there are at most, in this version and those to come.
-const MOST_VARIANTS: usize = 64;
+const MAX_VARIANTS: usize = 64;
 
 /// A grade.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -176,7 +176,7 @@ impl Subject {
 impl Shard {
     /// Whether there is such a part.
     fn is_one(index: u64, count: u64) -> bool {
-        1 <= index && index <= count && count <= MOST_SEEDS
+        1 <= index && index <= count && count <= MAX_SEEDS
     }
 
     /// Whether the flight at this place of the order belongs to it.
@@ -286,8 +286,8 @@ impl Grade {
         let grade: Self = serde_json::from_str(text)?;
         let Subject { seeds, variants, .. } = &grade.subject;
         ensure!(
-            *seeds <= MOST_SEEDS && variants.len() <= MOST_VARIANTS,
-            "{seeds} seeds in {} variants: at most {MOST_SEEDS} and {MOST_VARIANTS}",
+            *seeds <= MAX_SEEDS && variants.len() <= MAX_VARIANTS,
+            "{seeds} seeds in {} variants: at most {MAX_SEEDS} and {MAX_VARIANTS}",
             variants.len()
         );
         if let Some(Shard { index, count }) = grade.shard {

@@ -40,7 +40,7 @@ use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
-use self::document::{DelaysMs, MOST_SEEDS, Run, Shard, Subject, hex};
+use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
 use self::trial::{Delays, Flown, Trial};
 use crate::fly::plugin::Plugin;
@@ -297,11 +297,7 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     ensure!(within(image_rate, 1.0, 200.0), "--image-rate {image_rate}: give 1 to 200 Hz");
     ensure!(within(image_delay, 0.0, 200.0), "--image-delay {image_delay}: give 0 to 200 ms");
     ensure!(within(answer_delay, 0.0, 1000.0), "--answer-delay {answer_delay}: give 0 to 1000 ms");
-    ensure!(
-        (1..=MOST_SEEDS).contains(&args.seeds),
-        "--seeds {}: give 1 to {MOST_SEEDS}",
-        args.seeds
-    );
+    ensure!((1..=MAX_SEEDS).contains(&args.seeds), "--seeds {}: give 1 to {MAX_SEEDS}", args.seeds);
     Ok(Delays {
         image_period_ns: (1e9 / image_rate) as i64,
         image_ns: (image_delay * 1e6) as i64,

@@ -259,7 +259,7 @@ fn warnings_of_splats(splats: &Splats, [low, high]: [Vec3; 2]) -> Vec<String> {
         ));
     }
     let extent = size.max_element();
-    if !(LEAST_EXTENT..=MOST_EXTENT).contains(&extent) {
+    if !(MIN_EXTENT..=MAX_EXTENT).contains(&extent) {
         warnings.push(format!(
             "the core is {extent:.3} units wide: the unit is hardly a metre; \
              `vizflyt serve` takes --scale METRES_PER_UNIT"
@@ -273,8 +273,8 @@ const EDGE: f64 = 0.02;
 /// Trained scenes have few beyond.
 const NEEDLE: f32 = 50.0;
 /// A table top, and a campus. [m]
-const LEAST_EXTENT: f32 = 1.0;
-const MOST_EXTENT: f32 = 500.0;
+const MIN_EXTENT: f32 = 1.0;
+const MAX_EXTENT: f32 = 500.0;
 
 #[cfg(test)]
 mod tests {

@@ -307,7 +307,7 @@ impl Figures {
         ] {
             mine.extend(theirs);
             // Hours of flight are told by their last part.
-            let old = mine.len().saturating_sub(MOST_FIGURES);
+            let old = mine.len().saturating_sub(MAX_FIGURES);
             mine.drain(..old);
         }
     }
@@ -374,7 +374,7 @@ const WAIT: Duration = Duration::from_millis(100);
 /// Exposures closer than this are located as one. [s]
 const TOGETHER_S: f64 = 0.002;
 /// Figures of the report rest on so many sets at most: an hour of two cameras at 30 Hz.
-const MOST_FIGURES: usize = 216_000;
+const MAX_FIGURES: usize = 216_000;
 
 #[cfg(test)]
 mod tests {

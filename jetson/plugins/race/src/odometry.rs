@@ -125,7 +125,7 @@ impl Odometry {
         grid.turn(DQuat::from_scaled_axis(self.turn_rad));
         let Found { mut p_m, turn_rad, overlap } = key.locate(expected_m, grid);
         grid.turn(DQuat::from_scaled_axis(turn_rad));
-        self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MOST_TURN_RAD);
+        self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MAX_TURN_RAD);
         p_m.z -= floor_error_m(grid, p_m.z);
         if dt_s > 0.0 {
             let v_mps = ((p_m - self.p_m) / dt_s).clamp_length_max(MAX_SPEED_MPS);
@@ -338,7 +338,7 @@ const MOTION_M: f64 = 0.03;
 const ATTITUDE_RAD: f64 = 0.002;
 /// Share of the found error that is kept from image to image: in the long run the attitude is right.
 const STEADY: f64 = 0.995;
-const MOST_TURN_RAD: f64 = 0.05;
+const MAX_TURN_RAD: f64 = 0.05;
 const MAX_DT_S: f64 = 0.2;
 /// Of the velocity's smoothing. [s]
 const VELOCITY_LAG_S: f64 = 0.08;

@@ -35,7 +35,7 @@ const CHUNK_PERIOD: Duration = Duration::from_secs(1);
 const CHUNK_BYTES: usize = 4 << 20;
 /// Below so much room on disk images are left out, so that the flight's figures still fit, and the
 /// rest of the computer works. [bytes]
-const LEAST_FREE: u64 = 256 << 20;
+const MIN_FREE: u64 = 256 << 20;
 /// Above so much they come back. [bytes]
 const ENOUGH_FREE: u64 = 512 << 20;
 /// A camera's calibration is written this often, for viewers that connect later.
@@ -469,7 +469,7 @@ const BODY: &str = "body";
 
 /// Whether images are to be logged with so much room on the disk.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
-    free.is_none_or(|free| free >= if they_did { LEAST_FREE } else { ENOUGH_FREE })
+    free.is_none_or(|free| free >= if they_did { MIN_FREE } else { ENOUGH_FREE })
 }
 
 fn timestamp(at_ns: u64) -> fox::Timestamp {

@@ -53,7 +53,7 @@ impl Default for PluginLimits {
         Self {
             // Half of what there is: the other half is for the runtime, and on one computer for
             // the server.
-            memory_mb: (memory_total_mb() / 2).max(LEAST_MEMORY_MB),
+            memory_mb: (memory_total_mb() / 2).max(MIN_MEMORY_MB),
             // One is left for the runtime, so that setpoints leave in time.
             cpus: available_parallelism().map_or(1.0, |n| (n.get() as f64 - 1.0).max(1.0)),
             // numpy, OpenCV and torch start one to two threads per processor each.
@@ -72,7 +72,7 @@ impl Default for PluginLimits {
 }
 
 /// Less than this, no interpreter starts. [MB]
-pub const LEAST_MEMORY_MB: u64 = 64;
+pub const MIN_MEMORY_MB: u64 = 64;
 
 /// Linux takes environment variables of 128 KiB: some thousand obstacles.
 const MAX_MAP: usize = 120 * 1024;
@@ -113,9 +113,9 @@ impl PluginLimits {
     /// # Errors
     /// One sentence that names the setting.
     pub fn check(&self) -> Result<(), String> {
-        if self.memory_mb < LEAST_MEMORY_MB {
+        if self.memory_mb < MIN_MEMORY_MB {
             return Err(format!(
-                "plugin.memory_mb = {}: give {LEAST_MEMORY_MB} or more",
+                "plugin.memory_mb = {}: give {MIN_MEMORY_MB} or more",
                 self.memory_mb
             ));
         }

@@ -29,7 +29,7 @@ use confine::Bounds;
 use output::{Tracebacks, read_lines};
 
 pub use confine::Confinement;
-pub use limits::{LEAST_MEMORY_MB, PluginLimits, Restart};
+pub use limits::{MIN_MEMORY_MB, PluginLimits, Restart};
 pub use output::LINE_BYTES;
 
 /// Which of the two outputs a line came from.

@@ -56,7 +56,7 @@ pub(super) fn expect<'a>(
         // The room moves through a carried camera's image when the vehicle turns.
         margin_px += TURN_DOUBT_RAD * k.fx_px;
     }
-    let margin = DVec2::splat(margin_px + LEAST_MARGIN_PX);
+    let margin = DVec2::splat(margin_px + MIN_MARGIN_PX);
     Expected::Within(Region {
         least_px: low - margin,
         most_px: high + margin,
@@ -71,4 +71,4 @@ const WITH_RIM: f64 = 1.4;
 /// What the attitude may turn unforeseen between two images. [rad]
 const TURN_DOUBT_RAD: f64 = 0.03;
 /// What is added around in any case. [px]
-const LEAST_MARGIN_PX: f64 = 8.0;
+const MIN_MARGIN_PX: f64 = 8.0;

@@ -42,7 +42,7 @@ impl Track {
     pub(super) fn doubt_m(&self, stamp: HostTime) -> f64 {
         let Some(newest) = self.newest() else { return f64::INFINITY };
         let dt_s = stamp.seconds_since(newest).abs();
-        LEAST_DOUBT_M + SPEED_DOUBT_MPS * dt_s + 0.5 * ACCELERATION_DOUBT_MPS2 * dt_s * dt_s
+        MIN_DOUBT_M + SPEED_DOUBT_MPS * dt_s + 0.5 * ACCELERATION_DOUBT_MPS2 * dt_s * dt_s
     }
 
     /// Returns how it moves; `None` before some poses tell.
@@ -105,7 +105,7 @@ impl Hypothesis {
     fn push(&mut self, stamp: HostTime, pose: Pose<World, Body>) {
         self.past.push_back((stamp, pose));
         while self.past.front().is_some_and(|(old, _)| stamp.seconds_since(*old) > MOTION_SPAN_S)
-            || self.past.len() > MOST_KEPT
+            || self.past.len() > MAX_KEPT
         {
             self.past.pop_front();
         }
@@ -142,12 +142,12 @@ impl Hypothesis {
     /// Returns what a pose costs as the next of this one's.
     fn surprise(&self, stamp: HostTime, pose: &Pose<World, Body>) -> f64 {
         let (Some(expected), Some((newest, _))) = (self.predict(stamp), self.newest()) else {
-            return MOST_SURPRISE;
+            return MAX_SURPRISE;
         };
         let dt_s = stamp.seconds_since(newest).abs();
         let sigma_rad = TURN_SIGMA_RAD + TURN_SIGMA_RADPS * dt_s;
         let angle = expected.rotation.angle_between(pose.rotation);
-        (0.5 * (angle / sigma_rad).powi(2)).min(MOST_SURPRISE)
+        (0.5 * (angle / sigma_rad).powi(2)).min(MAX_SURPRISE)
     }
 }
 
@@ -161,11 +161,11 @@ fn turn(from: DQuat, to: DQuat) -> DVec3 {
 /// Poses of this span make the motion: at 30 Hz five of them. [s]
 const MOTION_SPAN_S: f64 = 0.14;
 /// And no more than this many.
-const MOST_KEPT: usize = 32;
+const MAX_KEPT: usize = 32;
 /// After this long a vehicle can be anywhere. [s]
 const FORGET_AFTER_S: f64 = 0.4;
 /// Noise of the prediction from one image to the next. [m]
-const LEAST_DOUBT_M: f64 = 0.04;
+const MIN_DOUBT_M: f64 = 0.04;
 /// What its velocity may be off. [m/s]
 const SPEED_DOUBT_MPS: f64 = 0.5;
 /// What it may accelerate unforeseen. [m/s^2]
@@ -175,7 +175,7 @@ const TURN_SIGMA_RAD: f64 = 0.05;
 /// And for what the vehicle may turn unforeseen. [rad/s]
 const TURN_SIGMA_RADPS: f64 = 1.0;
 /// One image decides little against motion: it may have been misread.
-const MOST_SURPRISE: f64 = 10.0;
+const MAX_SURPRISE: f64 = 10.0;
 /// Of what was learnt before, how much stays from image to image.
 const KEPT: f64 = 0.97;
 /// An answer that is e^4 times likelier is believed.

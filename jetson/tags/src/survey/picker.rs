@@ -41,14 +41,14 @@ impl Picker {
 
     /// Whether more images would not help any more.
     pub fn is_full(&self) -> bool {
-        self.images.len() >= MOST_IMAGES
+        self.images.len() >= MAX_IMAGES
     }
 }
 
 /// A tag must have moved by so much. [share of the image's width]
 const MOVED: f64 = 0.03;
 /// Some seconds of computing for a mat of a hundred tags.
-const MOST_IMAGES: usize = 300;
+const MAX_IMAGES: usize = 300;
 
 #[cfg(test)]
 mod tests {

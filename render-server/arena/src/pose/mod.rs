@@ -27,7 +27,7 @@ use vizflyt_protocol::time::ServerTime;
 
 pub use config::{PoseConfig, Predict};
 pub use filter::{PoseChange, PoseFilter};
-pub use motion::{Motion, PREDICT_MOST_S};
+pub use motion::{MAX_PREDICT_S, Motion};
 pub use quality::{PoseQuality, Rejects, SourceQuality};
 pub use vizflyt_protocol::messages::ImuReading;
 

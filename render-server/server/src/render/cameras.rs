@@ -87,7 +87,7 @@ pub enum ChangeError {
     /// It would take so long to draw that the vehicle flies blind.
     #[error(
         "width_px x height_px = {0}x{1}: too large to change to while flying; give at most \
-         {MOST_PIXELS} pixels, as 3840x2160"
+         {MAX_PIXELS} pixels, as 3840x2160"
     )]
     Pixels(u32, u32),
 }
@@ -178,7 +178,7 @@ fn changed(
         return Err(ChangeError::Renamed(new.name));
     }
     new.validate()?;
-    if u64::from(new.width_px) * u64::from(new.height_px) > MOST_PIXELS {
+    if u64::from(new.width_px) * u64::from(new.height_px) > MAX_PIXELS {
         return Err(ChangeError::Pixels(new.width_px, new.height_px));
     }
     Ok((index, new))
@@ -187,7 +187,7 @@ fn changed(
 const FIELD_OF_VIEW: &str = "horizontal_fov_deg";
 const CALIBRATION: [&str; 5] = ["fx_px", "fy_px", "cx_px", "cy_px", "distortion"];
 /// 4K: a second's work for a small machine, and 40 MB of shared memory.
-const MOST_PIXELS: u64 = 3840 * 2160;
+const MAX_PIXELS: u64 = 3840 * 2160;
 
 #[cfg(test)]
 mod tests {

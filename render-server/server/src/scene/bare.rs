@@ -179,7 +179,7 @@ struct Plan {
 impl Plan {
     fn of(splats: &Splats, bounds: &Bounds) -> Self {
         let span = (bounds.max - bounds.min) / CELL_M;
-        let cells = [span.x, span.y].map(|cells| (cells.ceil() as usize).clamp(1, MOST_CELLS));
+        let cells = [span.x, span.y].map(|cells| (cells.ceil() as usize).clamp(1, MAX_CELLS));
         let mut plan = Self { min: bounds.min, cells, filled: vec![0; cells[0] * cells[1]] };
         for (mean, opacity) in splats.means_m.iter().zip(&splats.opacities) {
             let flown = (0.3..TAKEOFF_HEIGHT_M as f32 + 0.5).contains(&mean.z);
@@ -260,7 +260,7 @@ const REACH_CELLS: i64 = 4;
 /// Fine against that reach. [m]
 const CELL_M: f64 = 0.1;
 /// 40 m; larger captures are planned over their first corner only.
-const MOST_CELLS: usize = 400;
+const MAX_CELLS: usize = 400;
 
 #[cfg(test)]
 mod tests {

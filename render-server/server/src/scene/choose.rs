@@ -31,7 +31,7 @@ impl Scenes {
             })
             .collect();
         scenes.sort();
-        scenes.truncate(MOST_SCENES);
+        scenes.truncate(MAX_SCENES);
         scenes
     }
 
@@ -75,7 +75,7 @@ impl Scenes {
 }
 
 /// More are no choice on a page.
-const MOST_SCENES: usize = 100;
+const MAX_SCENES: usize = 100;
 
 #[cfg(test)]
 mod tests {

@@ -69,8 +69,8 @@ fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     let (low_m, high_m) = (low_m.as_dvec3() - MARGIN_M, high_m.as_dvec3() + MARGIN_M);
     let of_size = |voxel_m: f64| ((high_m - low_m) / voxel_m).element_product();
     let mut voxel_m = arena.occupancy.voxel_m.min(VOXEL_M);
-    if of_size(voxel_m) > MOST_VOXELS {
-        voxel_m = ((high_m - low_m).element_product() / MOST_VOXELS).cbrt();
+    if of_size(voxel_m) > MAX_VOXELS {
+        voxel_m = ((high_m - low_m).element_product() / MAX_VOXELS).cbrt();
     }
     let grid = Grid::covering(low_m, high_m, voxel_m);
     let ellipsoids = (0..splats.len()).map(|k| Ellipsoid {
@@ -88,4 +88,4 @@ const VOXEL_M: f64 = 0.02;
 /// Within this of an object its field says the distance to it; further away, a lower bound. [m]
 const MARGIN_M: DVec3 = DVec3::splat(0.5);
 /// Larger objects get coarser voxels: 16 MB each.
-const MOST_VOXELS: f64 = 1.6e7;
+const MAX_VOXELS: f64 = 1.6e7;

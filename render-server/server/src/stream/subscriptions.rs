@@ -81,7 +81,7 @@ struct CameraSlots {
     full_since: ServerTime,
 }
 
-/// The places of a subscriber's images, by camera, [`MOST_IN_FLIGHT`] of each.
+/// The places of a subscriber's images, by camera, [`MAX_IN_FLIGHT`] of each.
 pub type Slots = Vec<Vec<Arc<InFlightImage>>>;
 
 /// An image on its vehicle to all who had room when it began. Reused from image to image.
@@ -162,7 +162,7 @@ impl Subscriptions {
         if purpose == Purpose::Fly {
             vehicle.subscribers.retain(|subscriber| subscriber.purpose != Purpose::Fly);
         }
-        let places = |_| (0..MOST_IN_FLIGHT).map(|_| Arc::default()).collect::<Vec<_>>();
+        let places = |_| (0..MAX_IN_FLIGHT).map(|_| Arc::default()).collect::<Vec<_>>();
         let all: Slots = (0..vehicle.cameras).map(places).collect();
         let slots = |all| CameraSlots { all, taken: 0, full_since: ServerTime::ZERO };
         let cameras = all.iter().cloned().map(slots).collect();
@@ -334,7 +334,7 @@ impl Subscriptions {
 }
 
 /// 100 ms of round trip at 70 Hz; more would only queue.
-pub const MOST_IN_FLIGHT: u32 = 8;
+pub const MAX_IN_FLIGHT: u32 = 8;
 /// The transport gives an image up after as long. [s]
 const STALLED_S: f64 = 0.15;
 /// How late a stalled runtime is noticed at most.

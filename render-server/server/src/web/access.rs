@@ -90,9 +90,9 @@ impl PageKeys {
         let team = |(name, key): (&String, &String)| (key.clone(), Viewer::Team(name.clone()));
         let all = file.vehicles.iter().map(team);
         for (key, viewer) in all.chain([(file.instructor.clone(), Viewer::Instructor)]) {
-            if key.len() < LEAST_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
+            if key.len() < MIN_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
                 let what = format!(
-                    "a key is {LEAST_KEY} letters and digits or more; remove a wrong one and start again for a new one"
+                    "a key is {MIN_KEY} letters and digits or more; remove a wrong one and start again for a new one"
                 );
                 return Err(damaged(what));
             }
@@ -164,7 +164,7 @@ impl Logins {
             sessions: Mutex::default(),
             tokens: Tokens::new()?,
             limiter: Mutex::default(),
-            queue: Semaphore::new(MOST_WAITING),
+            queue: Semaphore::new(MAX_WAITING),
             turn: Semaphore::new(1),
         }))
     }
@@ -470,9 +470,9 @@ const NO_KEY: &str = "this page needs a key: open the address that the instructo
      /enter?key=..., or log in with the instructor's password";
 const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session tells it, or reload the page";
 /// More logins at once are nobody's.
-const MOST_WAITING: usize = 8;
+const MAX_WAITING: usize = 8;
 /// 80 bits, should somebody write one by hand.
-const LEAST_KEY: usize = 16;
+const MIN_KEY: usize = 16;
 
 #[cfg(test)]
 #[path = "access/tests.rs"]

@@ -178,7 +178,7 @@ const PARAMETERS: [&str; 22] = [
 const DOWN_M: f64 = 0.05;
 /// The promise. [s], [m]
 const DOWN_WITHIN_S: f64 = 6.0;
-const DRIFT_AT_MOST_M: f64 = 1.0;
+const MAX_DRIFT_M: f64 = 1.0;
 /// How long a vehicle that shall fly on is watched after the loss is over. [s]
 const WATCH_S: f64 = 3.0;
 /// The room's fence, which the lab draws in. [m, world]
@@ -385,7 +385,7 @@ impl Row {
     /// Returns what breaks the promise.
     fn complaint(&self) -> Option<String> {
         let name = self.case.name;
-        if !(self.drift_m <= DRIFT_AT_MOST_M) {
+        if !(self.drift_m <= MAX_DRIFT_M) {
             return Some(format!("{name}: drifted by {:.2} m", self.drift_m));
         }
         match (self.case.lands, self.down_s) {

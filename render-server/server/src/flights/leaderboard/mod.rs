@@ -23,7 +23,7 @@ pub use database_url::{Database, UnknownDatabase};
 pub use export::write_csv;
 pub use grades::{GradeBoard, GradeEntry, GradePlace, grade_boards};
 pub use standings::{Standing, standings};
-pub use store::{Leaderboard, LeaderboardError, MOST_RUNS};
+pub use store::{Leaderboard, LeaderboardError, MAX_RUNS};
 
 use serde::{Deserialize, Serialize};
 

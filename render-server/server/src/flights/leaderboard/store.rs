@@ -40,7 +40,7 @@ pub enum LeaderboardError {
     Query(Database, sqlx::Error),
     /// A team's name that is none.
     #[error(
-        "{0:?} is no name for a team; give 1 to {MOST_NAME} characters, none of them a control character"
+        "{0:?} is no name for a team; give 1 to {MAX_NAME} characters, none of them a control character"
     )]
     Name(String),
     /// A team of that name is there.
@@ -133,7 +133,7 @@ impl Leaderboard {
     /// # Errors
     /// A name that is taken or none.
     pub async fn add_team(&self, name: &str) -> Result<String, LeaderboardError> {
-        let is_name = (1..=MOST_NAME).contains(&name.chars().count());
+        let is_name = (1..=MAX_NAME).contains(&name.chars().count());
         if !is_name || name.trim() != name || name.chars().any(char::is_control) {
             return Err(LeaderboardError::Name(name.to_owned()));
         }
@@ -287,7 +287,7 @@ impl Leaderboard {
         Ok(())
     }
 
-    /// Returns the newest [`MOST_RUNS`] runs, newest first; of one course, if it is named.
+    /// Returns the newest [`MAX_RUNS`] runs, newest first; of one course, if it is named.
     ///
     /// # Errors
     /// Of the database.
@@ -300,7 +300,7 @@ impl Leaderboard {
         )
         .bind(i64::from(course.is_some()))
         .bind(course.unwrap_or(""))
-        .bind(MOST_RUNS)
+        .bind(MAX_RUNS)
         .fetch_all(&self.pool)
         .await
         .map_err(|error| self.failed(error))?;
@@ -424,9 +424,9 @@ pub(super) fn unix_ms() -> i64 {
 }
 
 /// Runs that are listed at most: some terms of a large class.
-pub const MOST_RUNS: i64 = 20_000;
+pub const MAX_RUNS: i64 = 20_000;
 /// Characters of a team's name.
-const MOST_NAME: usize = 40;
+const MAX_NAME: usize = 40;
 /// A run whose server is silent for so long has no server any more.
 const UNHEARD: Duration = Duration::from_mins(1);
 /// How long the database may take to be there.

@@ -116,7 +116,7 @@ impl<'a> PosePacket<'a> {
             return Err(JsonError::Version(packet.vizflyt_pose));
         }
         // JSON has no NaN, but numbers that overflow.
-        if !packet.position_m.iter().all(|value| value.abs() <= MOST) {
+        if !packet.position_m.iter().all(|value| value.abs() <= MAX_VALUE) {
             return Err(JsonError::Position(packet.position_m));
         }
         let length = DQuat::from_array(packet.rotation_xyzw).length();
@@ -129,7 +129,7 @@ impl<'a> PosePacket<'a> {
             ("rotation_sigma_rad", packet.rotation_sigma_rad),
         ] {
             if let Some(value) = value
-                && !value.iter().all(|sigma| *sigma > 0.0 && *sigma <= MOST)
+                && !value.iter().all(|sigma| *sigma > 0.0 && *sigma <= MAX_VALUE)
             {
                 return Err(JsonError::Sigma { key, value });
             }
@@ -261,7 +261,7 @@ impl PoseStream for JsonStream {
 /// Who sends where nobody said.
 const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// No lab is a thousand kilometres wide, not in millimetres either.
-const MOST: f64 = 1e9;
+const MAX_VALUE: f64 = 1e9;
 /// Two readings of one clock, rounded. [s]
 const FUTURE_S: f64 = 0.001;
 /// A pose that took longer is another clock's. [s]

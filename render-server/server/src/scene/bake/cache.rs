@@ -3,7 +3,7 @@
 //! A file's name is the hash of the splats' geometry and of how they are baked, so a scene or a
 //! setting that changed is another file. It begins with a checksum: what does not match, or does
 //! not read, is baked anew and replaced. Files come whole (written aside, then renamed); the ones
-//! used longest ago go when the folder grows over [`MOST_BYTES`].
+//! used longest ago go when the folder grows over [`MAX_BYTES`].
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -159,7 +159,7 @@ impl BakeCache {
         files.sort();
         let mut bytes: u64 = files.iter().map(|(_, len, _)| len).sum();
         for (_, len, path) in files {
-            if bytes <= MOST_BYTES {
+            if bytes <= MAX_BYTES {
                 break;
             }
             if path != newest && fs::remove_file(&path).is_ok() {
@@ -204,4 +204,4 @@ const EXTENSION: &str = "field";
 const SPLATS_AT_ONCE: usize = 4096;
 const SPLAT_BYTES: usize = 44;
 /// A forest is 24 MB. [bytes]
-const MOST_BYTES: u64 = 1 << 30;
+const MAX_BYTES: u64 = 1 << 30;

@@ -27,7 +27,7 @@ use crate::clock;
 use crate::lock::lock;
 use crate::stream::Rooms;
 use crate::stream::rate_control::{DECIDE_EVERY, RateController, SentImage};
-use crate::stream::subscriptions::{InFlightImage, MOST_IN_FLIGHT, Part, Slots};
+use crate::stream::subscriptions::{InFlightImage, MAX_IN_FLIGHT, Part, Slots};
 use crate::stream::vehicle::VehicleStream;
 use crate::timing::RateMeter;
 
@@ -139,7 +139,7 @@ impl Drop for ImageSenders {
 /// Returns K: one image being acknowledged, and as many as a round trip spans.
 fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
     let spanned = (min_rtt.as_secs_f64() * rate_hz).ceil();
-    1 + (spanned as u32).clamp(1, MOST_IN_FLIGHT - 1)
+    1 + (spanned as u32).clamp(1, MAX_IN_FLIGHT - 1)
 }
 
 /// Sends the images that come to one place, for ever.

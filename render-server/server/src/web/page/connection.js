@@ -33,7 +33,7 @@ export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
     showLink("bad", "server gone, reconnecting");
     document.body.dataset.stale = "";
     if (!opened) explainRefusal();
-    setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MOST_WAIT_MS, wait_ms * 1.6));
+    setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MAX_WAIT_MS, wait_ms * 1.6));
   };
 }
 
@@ -65,4 +65,4 @@ function showLink(tone, text) {
 }
 
 const FIRST_WAIT_MS = 250;
-const MOST_WAIT_MS = 3000;
+const MAX_WAIT_MS = 3000;

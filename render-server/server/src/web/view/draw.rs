@@ -116,7 +116,7 @@ impl Request {
     /// Returns the camera, its size held to what a page can show.
     fn camera(&self) -> Camera {
         let [width, height] =
-            [self.width_px, self.height_px].map(|side| side.clamp(16, MOST_SIDE_PX));
+            [self.width_px, self.height_px].map(|side| side.clamp(16, MAX_SIDE_PX));
         let fov_rad = self.fov_deg.clamp(5.0, 150.0).to_radians();
         let world_from_body: Pose<World, Body> =
             Pose::new(self.p_m.into(), DQuat::from_rotation_z(self.yaw_rad));
@@ -160,7 +160,7 @@ fn in_scene(camera: &Camera, world_from_scene: &WorldFromScene) -> OracleCamera 
 /// A hand's breadth: one flies through things here. [m]
 const NEAR_M: f32 = 0.05;
 /// Full HD on a screen that is wider than high.
-const MOST_SIDE_PX: u32 = 1920;
+const MAX_SIDE_PX: u32 = 1920;
 const QUALITY: u8 = 85;
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ import { clockText, make } from "../dom.js";
 import { kindName, toneOf } from "../event_kinds.js";
 
 /** Lines kept on the page. */
-const MOST_LINES = 400;
+const MAX_LINES = 400;
 /** What the buttons leave in the list: all, those of the flight, those of the plugin. */
 const FEEDS = [["all", "all"], ["flight", "flight"], ["code", "plugin"]];
 
@@ -57,7 +57,7 @@ export const events = {
       line.dataset.tone = toneOf(entry);
       list.append(line);
     }
-    while (list.childElementCount > MOST_LINES) list.firstChild?.remove();
+    while (list.childElementCount > MAX_LINES) list.firstChild?.remove();
     follow();
   },
 };
