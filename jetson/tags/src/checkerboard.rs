@@ -7,7 +7,7 @@
 //!       -> columns x rows of them, lower left first; or nothing
 //! ```
 //! The ring is that of Bennett and Lasenby 2014, "ChESS - Quick and robust detection of chess-board features", section
-//! 3. The board must be in the image as a whole: of a part nobody can say which it is. 50 ms for 1280 x 720.
+//! 3. The board must be in the image as a whole: a part of it is ambiguous. 50 ms for 1280 x 720.
 
 mod corners;
 mod grid;

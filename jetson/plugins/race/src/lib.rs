@@ -6,7 +6,7 @@
 //! 2. [`odometry`]: where the camera is, by registering its depth to an earlier image;
 //! 3. [`plane_detection`]: new windows by their colour, walls by their size;
 //! 4. [`planar_obstacle`]: what of each is solid and what is free, and where its opening is widest;
-//!    [`known`] keeps them, and says which comes next;
+//!    [`known`] keeps them, and selects the next one;
 //! 5. [`hand`]: what moves in that opening, and when it will be away;
 //! 6. [`steer`]: through the opening of the nearest, clear of everything solid.
 //!
@@ -42,7 +42,7 @@ use steer::Aim;
 /// The plugin.
 #[derive(Clone, Debug, Default)]
 pub struct Race {
-    /// Where the flight shall end, if the course says. [m, world]
+    /// Where the flight is to end, if the course has a goal. [m, world]
     goal_m: Option<DVec3>,
     grid: PixelGrid,
     odometry: Odometry,
@@ -102,7 +102,7 @@ pub struct Here {
     pub p_m: DVec3,
     /// Of the camera. [m, home]
     pub camera_m: DVec3,
-    /// The course's goal, where the course tells that and the vehicle's place. [m, home]
+    /// The course's goal, where the course gives it and the vehicle's position. [m, home]
     pub goal_m: Option<DVec3>,
 }
 
@@ -131,7 +131,7 @@ impl Race {
     /// ground.
     ///
     /// # Panics
-    /// If none has for a second: it cannot fly here, and the runtime tells the person this sentence.
+    /// If none has for a second: it cannot fly here, and the runtime reports this sentence.
     fn has_depth(&mut self, camera: &CameraImage<'_>) -> bool {
         self.has_depth |= camera.depth_mm.iter().any(|&depth_mm| depth_mm > 0);
         self.without_depth += u32::from(!self.has_depth);

@@ -1,7 +1,7 @@
 //! Something upright with an opening in it, a window's frame or a wall, as a grid of what is solid
 //! and what is free.
 //!
-//! Each image says of each cell: a surface lies here, or the camera looked through. Where cells
+//! Each image shows of each cell: a surface lies here, or the camera looked through. Where cells
 //! are free and the frame is around them, there is an opening; one flies through the place that is
 //! farthest from everything solid, so an unknown shape is as good as a square.
 

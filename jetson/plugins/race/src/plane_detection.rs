@@ -164,7 +164,7 @@ fn upright_line(points_m: &[DVec3]) -> Option<Plane> {
 }
 
 /// Returns the upright plane through a point along a level direction; `None` if the direction is
-/// too short to tell, or the plane does not lie across the way.
+/// too short, or the plane does not lie across the way.
 fn plane_along(a_m: DVec3, along_m: DVec2) -> Option<Plane> {
     if along_m.length() < SPREAD_M {
         return None;

@@ -57,7 +57,7 @@ impl Coverage {
             rows.flat_map(|row| columns.clone().map(move |column| row * COLUMNS + column))
                 .any(|part| self.counts[part] < ENOUGH)
         };
-        // Thirds of the image; corners first, which are the hardest to reach and say most.
+        // Thirds of the image; corners first, which are the hardest to reach and constrain the lens most.
         let [low, mid, high] = [0..1, 1..ROWS - 1, ROWS - 1..ROWS];
         let [left, middle, right] = [0..1, 1..COLUMNS - 1, COLUMNS - 1..COLUMNS];
         for (name, rows, columns) in [

@@ -66,7 +66,7 @@ impl Line {
 fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2) -> Option<Line> {
     let (from_px, to_px) = (project(camera, from), project(camera, to));
     let length_px = from_px.distance(to_px);
-    // Widths of a cell along this edge and across it differ; the tag's middle tells the latter.
+    // Widths of a cell along this edge and across it differ; the tag's centre gives the latter.
     let across_px = 2.0 * distance_px(camera, from, to, centre);
     // The black border and the white around it are one cell of eight each (fewer in small families,
     // where cells are larger).

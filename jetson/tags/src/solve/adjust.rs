@@ -98,7 +98,7 @@ pub(super) fn adjust(
         }
     }
     let mut covariance = normal.inverse()?;
-    // Corners that scatter more than they should say that sigma was too small; never that it was
+    // Corners that scatter more than they should show that sigma was too small; never that it was
     // too large: few corners agree by chance.
     let freedom = (2 * normal.corners).saturating_sub(6).max(1);
     let scale = (normal.square_sum / freedom as f64).max(1.0);

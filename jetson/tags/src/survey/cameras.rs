@@ -107,7 +107,7 @@ fn cube_at(
         }
     }
     let solved = cube_pose(&seen)?;
-    // A single face may be seen in two ways: wait for a moment that says which.
+    // A single face may be seen in two ways: wait for an image that decides.
     solved.other.is_none().then_some(solved.best.world_from_body)
 }
 

@@ -370,7 +370,7 @@ fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> 
     Pose::new(middle_printed - q * middle_found, q)
 }
 
-/// Fewer images say little.
+/// Fewer images constrain too little.
 const MIN_IMAGES: usize = 5;
 /// A tag in fewer images is not checked by anything.
 const MIN_SIGHTINGS: usize = 2;

@@ -12,7 +12,7 @@ pub struct Picker {
 }
 
 impl Picker {
-    /// Takes the tags of the next image, and keeps them if they say something new.
+    /// Takes the tags of the next image, and keeps them if they add something new.
     pub fn offer(&mut self, image: Vec<Detection>, lens: &Intrinsics) {
         if image.len() < 2 || self.is_full() {
             return;
