@@ -15,7 +15,7 @@ use vizflyt_runtime::airframe::{
 };
 use vizflyt_runtime::link::same;
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;
 
 /// Finds what is wrong before it flies.
@@ -31,19 +31,19 @@ enum CheckCommand {
     ///
     /// Ends with status 1 if something is.
     #[command(after_help = "Examples:
-  vizflyt doctor vehicle                              what jetson.toml says, or udpin:0.0.0.0:14550
+  vizflyt doctor vehicle                              the autopilot of jetson.toml, or udpin:0.0.0.0:14550
   vizflyt doctor vehicle --mavlink serial:/dev/ttyACM0
   vizflyt doctor vehicle --arena arena.toml --apply   with the fence that the arena's room asks for
   vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply")]
     Vehicle(VehicleArgs),
-    /// Says where the vehicle is and which way it points, in plain words, while somebody lifts it, pushes it
-    /// forward and turns it left; then which setting is wrong.
+    /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
+    /// turns it left; then which setting is wrong.
     ///
     /// Ends with status 1 if one is.
     #[command(after_help = "Examples:
   vizflyt doctor localization arena.toml
   vizflyt doctor localization --pose natnet:239.255.42.99:1511,up=y
-  vizflyt doctor localization --pose vicon --watch        only says where it is, until Ctrl-C")]
+  vizflyt doctor localization --pose vicon --watch        only prints the pose, until Ctrl-C")]
     Localization(localization::LocalizationArgs),
 }
 
@@ -84,17 +84,17 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let version = session.version()?;
     let firmware = session.link().firmware().map_or("ArduCopter".to_owned(), |f| f.to_string());
     let system = session.link().system().unwrap_or(0);
-    tell(format!("vehicle  system {system}, {firmware}, {} parameters", has.len()));
+    print_line(format!("vehicle  system {system}, {firmware}, {} parameters", has.len()));
     let wanted = args.wanted(version)?;
     let arena = args.arena()?;
     let cylinder = args.fence_cylinder(arena.as_ref());
     let found = compare(version, &wanted, cylinder, |name| has.get(name).copied());
     for difference in &found {
-        tell(line(difference));
+        print_line(line(difference));
     }
     let dangers = found.iter().filter(|f| f.danger.is_some()).count();
     let wrong: Vec<_> = found.iter().filter(|f| f.has.is_some()).collect();
-    tell(format!(
+    print_line(format!(
         "{dangers} dangerous, {} other differences, {} parameters that it does not have",
         wrong.len() - dangers,
         found.len() - wrong.len()
@@ -102,7 +102,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     if !args.apply {
         if !wrong.is_empty() || arena.is_some() {
             let also = if arena.is_some() { ", and the arena's polygons" } else { "" };
-            tell(format!("`--apply` writes the right values{also}"));
+            print_line(format!("`--apply` writes the right values{also}"));
         }
         return Ok(status(dangers));
     }
@@ -110,14 +110,14 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let mut failed = 0;
     for ((name, right), (_, now)) in values.iter().zip(session.write(&values)?) {
         match now {
-            Some(now) if same(now, *right) => tell(format!("written  {name} = {right}")),
+            Some(now) if same(now, *right) => print_line(format!("written  {name} = {right}")),
             Some(now) => {
                 failed += 1;
-                tell(format!("FAILED   {name} is still {now}, not {right}"));
+                print_line(format!("FAILED   {name} is still {now}, not {right}"));
             }
             None => {
                 failed += 1;
-                tell(format!("FAILED   {name}: no answer"));
+                print_line(format!("FAILED   {name}: no answer"));
             }
         }
     }
@@ -125,7 +125,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         failed += usize::from(!upload_fence(&mut session, arena)?);
     }
     if !values.is_empty() {
-        tell("restart the autopilot, then look again: some parameters appear only then");
+        print_line("restart the autopilot, then look again: some parameters appear only then");
     }
     Ok(status(failed))
 }
@@ -148,7 +148,7 @@ impl VehicleArgs {
             radius_m: Some(radius_m),
         } = cylinder
         {
-            tell(format!(
+            print_line(format!(
                 "arena    {}: a fence from {floor_m:.2} m to {ceiling_m:.2} m over the start, {radius_m:.2} m \
                  around it, and polygons",
                 arena.name
@@ -172,12 +172,12 @@ fn upload_fence(session: &mut ParamSession, arena: &ArenaConfig) -> Result<bool>
     let info = arena.info();
     let fence = AutopilotFence::of(&info);
     if let Some(warning) = fence.warning(&info) {
-        tell(format!("note     {warning}"));
+        print_line(format!("note     {warning}"));
     }
     let accepted = session.upload_fence(fence.polygons)?;
     match &accepted {
-        Ok(polygons) => tell(format!("written  fence of {polygons} polygons")),
-        Err(why) => tell(format!("FAILED   fence of polygons: {why}")),
+        Ok(polygons) => print_line(format!("written  fence of {polygons} polygons")),
+        Err(why) => print_line(format!("FAILED   fence of polygons: {why}")),
     }
     Ok(accepted.is_ok())
 }

@@ -179,7 +179,7 @@ fn of_pose(pose: &PoseQuality) -> String {
         };
         let _ = writeln!(
             out,
-            "  {name}: {:.0} Hz, {:.1} ms late, {} believed, {} rejected{}",
+            "  {name}: {:.0} Hz, {:.1} ms late, {} accepted, {} rejected{}",
             source.rate_hz,
             source.latency_ms,
             source.believed,
@@ -203,12 +203,12 @@ fn of_rejects(rejects: &Rejects) -> String {
         (frozen, "frozen"),
         (disagree, "against another source"),
     ];
-    let said: Vec<_> = reasons
+    let counted: Vec<_> = reasons
         .iter()
         .filter(|(count, _)| *count > 0)
         .map(|(count, reason)| format!("{count} {reason}"))
         .collect();
-    if said.is_empty() { String::new() } else { format!(" ({})", said.join(", ")) }
+    if counted.is_empty() { String::new() } else { format!(" ({})", counted.join(", ")) }
 }
 
 fn of_timing(timing: &Timing, with_arrivals: bool) -> String {
@@ -302,7 +302,7 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
 fn of_account(camera: &str, account: &Delivery) -> String {
     let Delivery { drawn, delivered, under_way, skipped } = account;
     let mut out = format!(
-        "  {camera:<9} {drawn} drawn, {delivered} delivered, {} skipped, {under_way} under way\n",
+        "  {camera:<9} {drawn} rendered, {delivered} delivered, {} skipped, {under_way} under way\n",
         skipped.sum()
     );
     for ((name, count), (_, why)) in skipped.each().into_iter().zip(REASONS) {
@@ -347,7 +347,7 @@ fn print(text: &str) {
 
 /// Why images are skipped, in the order of their way.
 const REASONS: [(&str, &str); 8] = [
-    ("no_room", "a newer one was drawn before encoder and transport had room"),
+    ("no_room", "a newer one was rendered before encoder and transport had room"),
     ("failed", "could not be encoded"),
     ("late", "given up on the way: past its deadline, or the connection broke"),
     ("stale", "a newer one was there already"),
@@ -421,7 +421,7 @@ mod tests {
     fn an_account_names_its_reasons() {
         let skipped = Skipped { no_room: 3, overrun: 2, ..Skipped::default() };
         let text = of_account("front", &Delivery { drawn: 9, delivered: 4, under_way: 0, skipped });
-        assert!(text.contains("9 drawn, 4 delivered, 5 skipped, 0 under way"), "{text}");
+        assert!(text.contains("9 rendered, 4 delivered, 5 skipped, 0 under way"), "{text}");
         assert!(text.contains("3 no_room") && text.contains("2 overrun"), "{text}");
         assert!(!text.contains("stale"), "{text}");
         let names = Skipped::default().each().map(|(name, _)| name);

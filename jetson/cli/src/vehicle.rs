@@ -14,7 +14,7 @@ use vizflyt_runtime::config::{self, JetsonConfig};
 use vizflyt_runtime::link::port::MavlinkAddress;
 use vizflyt_runtime::link::{LinkSettings, SigningFile};
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Which autopilot.
 #[derive(Args, Debug)]
@@ -102,7 +102,7 @@ pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
     let VehicleCommand::Sign(args) = &args.command;
     let Some(path) = &args.key else {
         args.autopilot.open_wired_session()?.sign(None)?;
-        tell("signing is off; take `signing_key` out of jetson.toml");
+        print_line("signing is off; take `signing_key` out of jetson.toml");
         return Ok(ExitCode::SUCCESS);
     };
     let file = SigningFile::new(path);
@@ -112,12 +112,15 @@ pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
             .and_then(|mut random| random.read_exact(&mut bytes))
             .context("no random numbers for a key")?;
         file.create(&SigningKey::new(bytes))?;
-        tell(format!("key      {} (new; only you can read it)", path.display()));
+        print_line(format!("key      {} (new; only you can read it)", path.display()));
     }
     let signing = file.open()?;
     let mut session = args.autopilot.open_wired_session()?;
     session.sign(Some(&signing))?;
-    tell(format!("given    to system {}", session.link().system().unwrap_or(0)));
-    tell(format!("now set signing_key = \"{}\" under [vehicle] in jetson.toml", path.display()));
+    print_line(format!("given    to system {}", session.link().system().unwrap_or(0)));
+    print_line(format!(
+        "now set signing_key = \"{}\" under [vehicle] in jetson.toml",
+        path.display()
+    ));
     Ok(ExitCode::SUCCESS)
 }

@@ -224,19 +224,19 @@ fn tell_stream(sender: SyncSender<ControlInput>) -> impl Fn(StreamEvent) -> bool
 fn print_ready(json: bool, server: &ServerAddress, mavlink: &str, log: &FlightLog) {
     let log = log.path().map(|path| path.display().to_string());
     if json {
-        print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
+        print_line(json!({"ready": "runtime", "mavlink": mavlink, "log": log}));
     } else {
-        print_line(&format!("waiting for server {server} and an autopilot on {mavlink}"));
+        print_line(format!("waiting for server {server} and an autopilot on {mavlink}"));
     }
 }
 
 fn print_outcome(args: &FlyArgs, report: &Report) {
     if args.json {
-        print_line(&json!({"report": report}).to_string());
+        print_line(json!({"report": report}));
         return;
     }
-    print_line(&format!("{}: {}", report.outcome.name(), report.reason));
-    print_line(&format!(
+    print_line(format!("{}: {}", report.outcome.name(), report.reason));
+    print_line(format!(
         "{:.1} s in the air, {} images at {:.1} Hz, age {:.1} ms (p99 {:.1}), {} setpoints",
         report.seconds,
         report.images_delivered,
@@ -246,6 +246,6 @@ fn print_outcome(args: &FlyArgs, report: &Report) {
         report.setpoints_sent
     ));
     if let Some(log) = &report.log {
-        print_line(&format!("log: {log}"));
+        print_line(format!("log: {log}"));
     }
 }

@@ -96,7 +96,7 @@ pub(crate) struct Shard {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Run {
-    /// Of the place and of the simulator's noise.
+    /// Seed of the course and of the simulator's noise.
     pub seed: u64,
     /// The surroundings.
     pub variant: String,
@@ -125,7 +125,7 @@ pub(crate) struct Run {
     pub path_m: f64,
     /// Images that the plugin answered.
     pub images: u64,
-    /// SHA-256 of the place: its splats.
+    /// SHA-256 of the scene: its splats.
     pub scene_sha256: String,
     /// SHA-256 of its rules: `arena.toml`.
     pub rules_sha256: String,
@@ -179,9 +179,9 @@ impl Shard {
         1 <= index && index <= count && count <= MAX_SEEDS
     }
 
-    /// Whether the flight at this place of the order belongs to it.
-    pub(crate) fn holds(self, place: usize) -> bool {
-        place as u64 % self.count == self.index - 1
+    /// Whether the flight at this index of the order belongs to it.
+    pub(crate) fn holds(self, index: usize) -> bool {
+        index as u64 % self.count == self.index - 1
     }
 }
 
@@ -350,7 +350,7 @@ impl Summary {
 fn hash_of(runs: &[Run]) -> String {
     let mut hash = Sha256::new();
     for run in runs {
-        // Lengths are fixed or told, so that no two lists give the same bytes.
+        // Lengths are fixed or written, so that no two lists give the same bytes.
         hash.update(run.seed.to_le_bytes());
         hash.update((run.variant.len() as u64).to_le_bytes());
         hash.update(run.variant.as_bytes());

@@ -390,7 +390,7 @@ impl ControlLoop {
         let record = json!({"stream": stream, "line": line, "image_seq": image_seq, "tick": tick});
         self.control.log.line(now, stream, line, tick);
         if self.control.json {
-            print_line(&json!({"plugin": record}).to_string());
+            print_line(json!({"plugin": record}));
         } else {
             self.control.screen.line(&format!("tick {tick} | {line}"));
         }

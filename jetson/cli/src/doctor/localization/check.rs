@@ -4,7 +4,7 @@
 //! it stands -> lift it -> push it forward -> turn it left -> raise its nose
 //! ```
 //! A motion is over when the vehicle rests again; how far it went does not matter, so that wrong units
-//! are no hindrance. What was seen at rest is taken back to what the stream said, and every setting
+//! are no hindrance. The poses at rest are converted back to the stream's own values, and every setting
 //! that there is (units, axes, nose, order of angles) is tried on it: the smallest change under which
 //! all motions look as they were done is the answer.
 
@@ -17,7 +17,7 @@ use vizflyt_server::poses::settings::{
     Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis,
 };
 
-use super::words::direction;
+use super::description::direction;
 
 /// What is to be done next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,10 +62,10 @@ impl Step {
     }
 }
 
-/// What came of it.
+/// The result of the check.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Verdict {
-    /// What looked wrong, in words; empty if nothing did.
+pub(super) struct Diagnosis {
+    /// The faults, in sentences; empty if there are none.
     pub(super) faults: Vec<String>,
     /// Settings to change: key and value. Empty, too, if none would help.
     pub(super) change: Vec<(&'static str, String)>,
@@ -190,16 +190,16 @@ impl Check {
     }
 
     /// Returns what is wrong, when all was seen.
-    pub(super) fn verdict(&self) -> Verdict {
+    pub(super) fn diagnosis(&self) -> Diagnosis {
         let faults = faults(&self.rests);
         if faults.is_empty() {
-            return Verdict::default();
+            return Diagnosis::default();
         }
         let best = self
             .trials()
             .filter(|trial| self::faults(&self.under(trial)).is_empty())
             .min_by(|a, b| self.cost(a).total_cmp(&self.cost(b)));
-        Verdict { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
+        Diagnosis { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
     }
 
     /// Returns every combination of settings.
