@@ -182,7 +182,7 @@ fn of_pose(pose: &PoseQuality) -> String {
             "  {name}: {:.0} Hz, {:.1} ms late, {} accepted, {} rejected{}",
             source.rate_hz,
             source.latency_ms,
-            source.believed,
+            source.accepted,
             source.rejected.total(),
             of_rejects(&source.rejected)
         );
@@ -300,9 +300,9 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
 }
 
 fn of_account(camera: &str, account: &Delivery) -> String {
-    let Delivery { drawn, delivered, under_way, skipped } = account;
+    let Delivery { rendered, delivered, under_way, skipped } = account;
     let mut out = format!(
-        "  {camera:<9} {drawn} rendered, {delivered} delivered, {} skipped, {under_way} under way\n",
+        "  {camera:<9} {rendered} rendered, {delivered} delivered, {} skipped, {under_way} under way\n",
         skipped.sum()
     );
     for ((name, count), (_, why)) in skipped.each().into_iter().zip(REASONS) {
@@ -420,7 +420,8 @@ mod tests {
     #[test]
     fn an_account_names_its_reasons() {
         let skipped = Skipped { no_room: 3, overrun: 2, ..Skipped::default() };
-        let text = of_account("front", &Delivery { drawn: 9, delivered: 4, under_way: 0, skipped });
+        let text =
+            of_account("front", &Delivery { rendered: 9, delivered: 4, under_way: 0, skipped });
         assert!(text.contains("9 rendered, 4 delivered, 5 skipped, 0 under way"), "{text}");
         assert!(text.contains("3 no_room") && text.contains("2 overrun"), "{text}");
         assert!(!text.contains("stale"), "{text}");

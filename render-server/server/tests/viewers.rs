@@ -85,8 +85,8 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         for name in VEHICLES {
             let tilt = format!("{{\"tilt_deg\": {}}}", changes % 2);
             let path = format!("PATCH /api/vehicles/{name}/cameras/front");
-            let (status, said) = send_json(server.http, &path, None, &tilt);
-            assert_eq!(status, 200, "{said}");
+            let (status, answer) = send_json(server.http, &path, None, &tilt);
+            assert_eq!(status, 200, "{answer}");
         }
     });
     std::thread::sleep(Duration::from_secs(1));
@@ -128,7 +128,7 @@ async fn images(connection: quinn::Connection, got: Arc<Got>) {
 /// Counts what a runtime must be told.
 async fn messages(mut client: Client, got: Arc<Got>) {
     loop {
-        // Without pages nothing is said for minutes.
+        // Without pages nothing is sent for minutes.
         if let ToRuntime::Camera { .. } = client.next_ever().await {
             got.cameras_changed.fetch_add(1, Ordering::Relaxed);
         }

@@ -61,7 +61,7 @@ pub(super) struct Estimate {
     covariance: Covariance,
 }
 
-/// What a reading says beyond what was expected.
+/// The innovation of a reading: its difference from the expected one.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Innovation {
     /// Read less expected.
@@ -174,12 +174,12 @@ impl Estimate {
         }
     }
 
-    /// Returns what a position says beyond what is known. [m, world]
+    /// Returns the innovation of a position. [m, world]
     pub(super) fn position_innovation(&self, p_world_m: DVec3, variance_m2: DMat3) -> Innovation {
         self.innovation(&self.position_reading(p_world_m, variance_m2))
     }
 
-    /// Returns what an attitude says beyond what is known, as a rotation vector. [rad, body]
+    /// Returns the innovation of an attitude, as a rotation vector. [rad, body]
     pub(super) fn attitude_innovation(&self, rotation: DQuat, variance_rad2: DMat3) -> Innovation {
         self.innovation(&self.attitude_reading(rotation, variance_rad2))
     }

@@ -38,7 +38,7 @@ pub struct PoseFilter {
     change: Option<PoseChange>,
     imu: Imu,
     /// Intervals of accepted poses, and their innovations. [standard deviations]
-    believed: Fading,
+    accepted: Fading,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -82,7 +82,7 @@ impl PoseFilter {
             lost: false,
             change: None,
             imu: Imu::default(),
-            believed: Fading::default(),
+            accepted: Fading::default(),
         }
     }
 
@@ -95,7 +95,7 @@ impl PoseFilter {
                 if let Some((_, estimate)) = self.history.newest() {
                     self.sources[index].accept(measured, estimate, self.imu.turned);
                 }
-                self.believed.add(measured.stamp, sigmas);
+                self.accepted.add(measured.stamp, sigmas);
                 self.rejected = None;
                 if std::mem::take(&mut self.lost) {
                     self.change = Some(PoseChange::Regained);
@@ -205,7 +205,7 @@ impl PoseFilter {
         }
         let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
         let trusted = self.sources.iter().enumerate().find(|(other, source)| {
-            let age_s = source.believed_at.map(|at| stamp.seconds_since(at).abs());
+            let age_s = source.accepted_at.map(|at| stamp.seconds_since(at).abs());
             *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
         });
         if let Some((other, _)) = trusted {
@@ -215,11 +215,11 @@ impl PoseFilter {
         let newest = self.newest.map_or(stamp, |newest| newest.stamp);
         let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
         let speed_mps = distance_m / dt_s;
-        // A gyroscope would have felt a turn.
-        let felt = self.imu_is_fresh(stamp) && angle_rad > FELT_RAD;
+        // A gyroscope would have measured a turn.
+        let measured_turn = self.imu_is_fresh(stamp) && angle_rad > MEASURABLE_RAD;
         let kind = if place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS {
             ClaimKind::Jump(speed_mps)
-        } else if attitude.sigmas > gate && (felt || angle_rad / dt_s > MAX_TURN_RADPS) {
+        } else if attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS) {
             ClaimKind::Flip
         } else {
             ClaimKind::Manoeuvre(dt_s)
@@ -275,14 +275,14 @@ impl PoseFilter {
         self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
-    /// Returns the sigma to work with: what the source says, within what can be.
+    /// Returns the sigma to use: the source's own, within limits.
     fn sigma(&self, measured: &Measured) -> PoseSigma {
         let settings = self.config.sigma();
-        let said = measured.sigma.filter(|sigma| {
+        let stated = measured.sigma.filter(|sigma| {
             let least = sigma.position_m.min_element().min(sigma.rotation_rad.min_element());
             sigma.position_m.is_finite() && sigma.rotation_rad.is_finite() && least > 0.0
         });
-        let sigma = said.unwrap_or(settings);
+        let sigma = stated.unwrap_or(settings);
         PoseSigma {
             position_m: sigma.position_m.clamp(DVec3::splat(1e-5), DVec3::splat(10.0)),
             rotation_rad: sigma.rotation_rad.clamp(DVec3::splat(1e-5), DVec3::splat(3.0)),
@@ -375,10 +375,10 @@ impl PoseFilter {
         let sigma = self.history.newest_pose().map(|(_, estimate)| estimate.sigma());
         PoseQuality {
             age_ms: Some(now.seconds_since(newest.stamp) * 1e3),
-            rate_hz: self.believed.rate_hz(now),
+            rate_hz: self.accepted.rate_hz(now),
             position_sigma_mm: sigma.map_or(0.0, |s| s.position_m.max_element() * 1e3),
             rotation_sigma_deg: sigma.map_or(0.0, |s| s.rotation_rad.max_element().to_degrees()),
-            innovation_sigmas: self.believed.value(),
+            innovation_sigmas: self.accepted.value(),
             speed_mps: newest.twist.linear_mps.length(),
             imu: self.imu_is_fresh(newest.stamp),
             resets: self.resets,
@@ -451,7 +451,7 @@ const MAX_MANOEUVRE_MPS: f64 = 15.0;
 /// Racing drones turn by 2000 degrees a second. [rad/s]
 const MAX_TURN_RADPS: f64 = 35.0;
 /// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
-const FELT_RAD: f64 = 0.2;
+const MEASURABLE_RAD: f64 = 0.2;
 /// A jump that stays put for so many measurements, over so long, is the truth (a moved origin, a
 /// regained object). [s]
 const JUMP_CONFIRMED: u32 = 10;

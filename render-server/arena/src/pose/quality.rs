@@ -98,7 +98,8 @@ pub struct SourceQuality {
     /// From the measurement to its arrival, by its stamps. [ms]
     pub latency_ms: f64,
     /// Believed so far.
-    pub believed: u64,
+    #[serde(rename = "believed")]
+    pub accepted: u64,
     /// Turned away so far.
     pub rejected: Rejects,
 }

@@ -48,8 +48,8 @@ pub(super) struct Source {
     last: Option<(ServerTime, ServerTime)>,
     still: Option<Still>,
     claim: Option<Claim>,
-    pub believed_at: Option<ServerTime>,
-    believed: u64,
+    pub accepted_at: Option<ServerTime>,
+    accepted: u64,
     rejected: Rejects,
     latency: Fading,
     noise: Noise,
@@ -126,12 +126,12 @@ impl Source {
         claim
     }
 
-    /// Takes note of an accepted pose, after which the vehicle moves as `estimate` says.
+    /// Takes note of an accepted pose, after which the vehicle moves as in `estimate`.
     pub(super) fn accept(&mut self, measured: &Measured, estimate: &Estimate, turned: DQuat) {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         self.claim = None;
-        self.believed += 1;
-        self.believed_at = Some(stamp);
+        self.accepted += 1;
+        self.accepted_at = Some(stamp);
         if self.still.is_none_or(|still| still.pose != pose) {
             self.still = Some(Still {
                 since: stamp,
@@ -170,19 +170,19 @@ impl Source {
     }
 
     pub(super) fn quality(&self, source: u8, now: ServerTime) -> Option<SourceQuality> {
-        (self.believed + self.rejected.total() > 0).then(|| SourceQuality {
+        (self.accepted + self.rejected.total() > 0).then(|| SourceQuality {
             source,
             name: String::new(),
             rate_hz: self.latency.rate_hz(now),
             latency_ms: self.latency.value() * 1e3,
-            believed: self.believed,
+            accepted: self.accepted,
             rejected: self.rejected,
         })
     }
 }
 
 impl Claim {
-    /// Whether a vehicle that is where the claim says could be there now.
+    /// Whether a vehicle at the claimed position could be there now.
     fn fits(&self, stamp: ServerTime, pose: &Pose<World, Body>) -> bool {
         let dt_s = stamp.seconds_since(self.newest);
         let moved_m = (pose.translation_m - self.pose.translation_m).length();
@@ -203,7 +203,7 @@ impl Claim {
 const LEARNS: f64 = 0.02;
 /// One measurement does not count for more. [sigma^2]
 const MAX_SQUARE: f64 = 36.0;
-/// Beyond this a source scatters by more than it says; a motion model that fits badly for a while
+/// Beyond this a source scatters by more than it states; a motion model that fits badly for a while
 /// does not reach it.
 const NOISY_SQUARE: f64 = 2.5;
 /// Below this its weight may rise again.

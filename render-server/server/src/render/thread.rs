@@ -91,7 +91,7 @@ pub fn run(
         let mut stamp = ServerTime::ZERO;
         cameras.clear();
         let atmosphere = atmosphere(&rendering.environment.now());
-        let mut views = [View::default(); MAX_VEHICLES];
+        let mut ranges = [CameraRange::default(); MAX_VEHICLES];
         for (vehicle, set) in sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
             // A vehicle's pose is kept until a camera of it is due.
@@ -126,7 +126,7 @@ pub fn run(
                 std::mem::swap(&mut images[cameras.len() - 1], &mut slot.image);
             }
             let at = shown.map_or(ServerTime::ZERO, |exposure| exposure.at);
-            views[vehicle] = View { first, end: cameras.len(), at };
+            ranges[vehicle] = CameraRange { first, end: cameras.len(), at };
         }
         let span = trace_span!("tick", seq, stamp_ns = stamp.as_ns()).entered();
         let images = &mut images[..cameras.len()];
@@ -136,8 +136,8 @@ pub fn run(
                 return renderer.render(&[], &cameras, images).map(|_| ());
             }
             // Each vehicle sees the moment that its images show, and not itself.
-            let drawn = views.iter().enumerate().filter(|(_, view)| view.first < view.end);
-            drawn.into_iter().try_for_each(|(vehicle, &View { first, end, at })| {
+            let due = ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
+            due.into_iter().try_for_each(|(vehicle, &CameraRange { first, end, at })| {
                 placements.clear();
                 rendering.dynamic_objects.place(at, vehicle, &known, &mut placements);
                 let images = &mut images[first..end];
@@ -165,7 +165,7 @@ pub fn run(
             }
             Err(error) => {
                 if !std::mem::replace(&mut refused, true) {
-                    warn!("tick {seq} is not drawn: {error}; more of these go unsaid");
+                    warn!("tick {seq} is not rendered: {error}; further errors are not logged");
                 }
                 ticks.recycle(tick);
             }
@@ -175,13 +175,13 @@ pub fn run(
 
 /// Which of a tick's cameras are a vehicle's, and the instant that they show.
 #[derive(Clone, Copy, Debug, Default)]
-struct View {
+struct CameraRange {
     first: usize,
     end: usize,
     at: ServerTime,
 }
 
-/// Tells when another renderer has taken over, as the processor does from a lost graphics device.
+/// Reports when another renderer has taken over, as the processor does from a lost graphics device.
 fn note_renderer(rendering: &Rendering, flights: &Flights, renderer: &dyn Rasterizer) {
     let name = renderer.name();
     let mut info = lock(&rendering.renderer);

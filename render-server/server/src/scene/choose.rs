@@ -62,7 +62,7 @@ impl Scenes {
                 names => format!("there is no scene '{name}'; there are {}", names.join(", ")),
             });
         };
-        // What is wrong with it is told now, not after the present one is gone.
+        // Errors in it are reported now, not after the present one is gone.
         super::parse_arena(arena).map_err(|error| format!("{error:#}"))?;
         *lock(&self.chosen) = Some(arena.clone());
         Ok(())

@@ -37,7 +37,7 @@ pub(super) fn read_all(
 }
 
 /// Returns what must not be touched: what stands still as baked already, and each object with a field
-/// baked in its own frame; phases that the arena does not say are drawn from the seed.
+/// baked in its own frame; phases that the arena does not set are random, from the seed.
 pub fn obstacles(
     arena: &ArenaConfig,
     objects: &[RigidObject],
@@ -85,7 +85,7 @@ fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
 
 /// Finer than a scene's: objects are small, and a hand of 3 cm must not grow to 10. [m]
 const VOXEL_M: f64 = 0.02;
-/// Within this of an object its field says the distance to it; further away, a lower bound. [m]
+/// Within this of an object its field has the distance to it; further away, a lower bound. [m]
 const MARGIN_M: DVec3 = DVec3::splat(0.5);
 /// Larger objects get coarser voxels: 16 MB each.
 const MAX_VOXELS: f64 = 1.6e7;

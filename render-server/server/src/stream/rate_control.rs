@@ -235,7 +235,7 @@ pub struct RateController {
 }
 
 impl RateController {
-    /// Makes the policy; `adapt` says how far it may go.
+    /// Makes the policy; `adapt` limits how far it may go.
     pub fn new(adapt: Adaptation) -> Self {
         Self {
             levels: adapt.levels(),
@@ -275,7 +275,7 @@ impl RateController {
         if image.delivered {
             let since = self.silent_since.take();
             if since.is_some_and(|since| ended.seconds_since(since) > SILENT_S) {
-                // An outage says nothing of the link that came back.
+                // An outage has no information about the link that came back.
                 self.samples.clear();
             }
         } else {

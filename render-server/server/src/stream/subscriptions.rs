@@ -2,7 +2,7 @@
 //!
 //! A vehicle's images go to its runtime and to any number of watchers, at most [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS).
 //! For each camera at most K images may be in flight to each of them (handed to the transport, not
-//! yet acknowledged). The encode thread takes the newest drawn tick only when someone has room, so
+//! yet acknowledged). The encode thread takes the newest rendered tick only when someone has room, so
 //! that what waits is always the newest, and nothing is encoded that could not leave; an image is
 //! encoded once, for all who have room ([`Subscriptions::begin`]).
 //!
@@ -30,7 +30,7 @@ pub struct Wanted {
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
     /// By vehicle and camera: the runtime has room for an image.
     pub fly: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
-    /// No runtime wants anything, but a page does: drawn ticks go on to the previews.
+    /// No runtime wants anything, but a page does: rendered ticks go on to the previews.
     pub pass_on: bool,
 }
 

@@ -102,10 +102,10 @@ pub(super) async fn standing(
     if let Err(refusal) = origin::check_host(&headers) {
         return refuse(&refusal);
     }
-    tell(&page, page.access.judge(from.ip(), &headers).as_ref())
+    respond(&page, page.access.judge(from.ip(), &headers).as_ref())
 }
 
-fn tell(page: &Page, shown: Option<&Shown>) -> Response {
+fn respond(page: &Page, shown: Option<&Shown>) -> Response {
     let standing = Standing {
         role: shown.map(|shown| match shown.viewer {
             Viewer::Instructor => "instructor",
@@ -183,7 +183,7 @@ pub(super) async fn login(
         Ok(Ok(checked)) => checked,
         Ok(Err(error)) => {
             warn!("page: {error}");
-            return (StatusCode::INTERNAL_SERVER_ERROR, "the server's log says what is wrong")
+            return (StatusCode::INTERNAL_SERVER_ERROR, "the server's log has the reason")
                 .into_response();
         }
         Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
@@ -201,7 +201,7 @@ pub(super) async fn login(
             };
             let set = access::cookie_line(access::SESSION, &cookie, None, &headers);
             let shown = Shown { viewer: Viewer::Instructor, session: Some(cookie), key: None };
-            let mut response = tell(&page, Some(&shown));
+            let mut response = respond(&page, Some(&shown));
             if let Ok(value) = HeaderValue::from_str(&set) {
                 response.headers_mut().append(header::SET_COOKIE, value);
             }

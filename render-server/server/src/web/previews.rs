@@ -1,4 +1,4 @@
-//! The preview thread: small pictures of what was drawn, for the pages.
+//! The preview thread: small pictures of what was rendered, for the pages.
 //!
 //! Takes the ticks that the encode thread is done with ([`crate::render::rendered`]), each newest-wins, of
 //! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera; of those that fly

@@ -1,4 +1,4 @@
-//! The top view behind the page's map: drawn once at the start.
+//! The top view behind the page's map: rendered once at the start.
 //!
 //! A picture of the twin seen straight down from far above (so that a perspective camera is as good
 //! as a parallel one), without what lies above the flight: crowns and ceilings would hide the
@@ -16,7 +16,7 @@ use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Spla
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
 pub struct TopView {
-    /// JPEG, north up; empty if it could not be drawn.
+    /// JPEG, north up; empty if it could not be rendered.
     pub jpeg: Bytes,
     /// South-west corner of the picture. [m, world]
     pub min_m: [f64; 2],
@@ -97,7 +97,7 @@ impl Obstacles {
 /// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
 /// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MAX_SHELL`].
 ///
-/// `solid` says whether anything solid is within a distance [m] of a point [m, world].
+/// `solid` returns whether anything solid is within a distance [m] of a point [m, world].
 pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64) -> bool) -> Bytes {
     let span = (max_m - min_m).max(DVec3::splat(1e-3));
     let mut cell_m = cell_m.max((span.element_product() / MAX_SAMPLES).cbrt());
@@ -201,7 +201,7 @@ fn below(splats: &Splats, ceiling_m: f32) -> Splats {
         scales_m: kept.iter().map(|&k| splats.scales_m[k]).collect(),
         rotations: kept.iter().map(|&k| splats.rotations[k]).collect(),
         opacities: kept.iter().map(|&k| splats.opacities[k]).collect(),
-        // Seen straight down from afar the constant term tells the colour.
+        // Seen straight down from afar the constant term is the colour.
         sh_degree: 0,
         sh: kept.iter().flat_map(|&k| &splats.sh[k * per_splat..][..3]).copied().collect(),
     }
@@ -227,7 +227,7 @@ fn base64(bytes: &[u8]) -> String {
 
 /// Hides that the picture is seen from a point: a post of 1 m leans by 1/30 of its distance.
 const DISTANCE: f64 = 30.0;
-/// A map wider than this is drawn coarser. [px]
+/// A map wider than this is rendered coarser. [px]
 const WANTED_SIDE_PX: u32 = 1200;
 const MAX_SIDE_PX: u32 = 2048;
 /// Tenths of a second to look through. [cells]
@@ -273,7 +273,7 @@ mod tests {
         assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
         assert_eq!((bytes.len() - 16) / 6, 125 - 27);
         assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
-        // A hall of walls is drawn in cells as coarse as it takes; nothing at all is an empty list.
+        // A hall of walls is rendered in cells as coarse as needed; nothing at all is an empty list.
         let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_, _| true);
         assert!(all.len() <= 16 + 6 * MAX_SHELL && all.len() > 1000);
         assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_, _| false).len(), 16);

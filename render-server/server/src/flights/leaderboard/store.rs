@@ -193,7 +193,7 @@ impl Leaderboard {
     /// # Errors
     /// Of the database.
     pub async fn team_of(&self, token: &str) -> Result<Option<String>, LeaderboardError> {
-        // Looked up by its hash: how long that takes says nothing about the token.
+        // Looked up by its hash: how long that takes reveals nothing about the token.
         let row = sqlx::query("SELECT name FROM teams WHERE token_hash = $1 AND retired = 0")
             .bind(hash(token))
             .fetch_optional(&self.pool)
@@ -248,11 +248,11 @@ impl Leaderboard {
         }
     }
 
-    /// Says that a run is still flown. Call every few seconds: what is not heard of for a minute is cut off.
+    /// Marks a run as still flown. Call every few seconds: a run without a mark for a minute is cut off.
     ///
     /// # Errors
     /// Of the database.
-    pub async fn heard(&self, id: &str) -> Result<(), LeaderboardError> {
+    pub async fn keep_alive(&self, id: &str) -> Result<(), LeaderboardError> {
         sqlx::query("UPDATE runs SET heard_unix_ms = $1 WHERE id = $2 AND state = 'flying'")
             .bind(unix_ms())
             .bind(id)

@@ -42,7 +42,7 @@ impl FrameClock {
         }
         let lateness_s = self.lateness_s();
         // The counter's clock slipped against ours for good (the source paused): start over. Time
-        // tells this from a burst after a pause of our own, which is over in an instant.
+        // separates this from a burst after a pause of our own, which is over in an instant.
         self.late_since =
             if lateness_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
         if self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S) {
@@ -199,7 +199,7 @@ mod tests {
         for frame in 0..300 {
             clock.stamp(frame, truth(frame));
         }
-        // From here on every frame comes 60 ms later than its number says.
+        // From here on every frame comes 60 ms later than its number implies.
         let late = |frame| truth(frame).plus_ns(60_000_000);
         let stamps: Vec<_> = (300..400).map(|frame| clock.stamp(frame, late(frame))).collect();
         let last = *stamps.last().unwrap();

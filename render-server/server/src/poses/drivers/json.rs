@@ -7,7 +7,7 @@
 //! ```
 //! `seq`, `stamp_ns`, `clock` and the sigmas may be left out. Stamps are of this computer's
 //! CLOCK_MONOTONIC (`"clock": "server"`), or of any clock of the sender's (`"sender"`, also if
-//! nothing is said), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
+//! nothing is given), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
 //! rhythm; without either, a pose is as old as its arrival. `quality` is what `vizflyt tags locate` saw:
 //! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. What else the object
 //! holds is ignored.
@@ -58,7 +58,7 @@ pub struct PosePacket<'a> {
     pub quality: Option<TagsSeen>,
 }
 
-/// Reads what `vizflyt tags locate` says; what another program means by `quality` is its own affair.
+/// Reads the `quality` of `vizflyt tags locate`; what another program means by `quality` is its own affair.
 fn tags_if_any<'de, D: serde::Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<TagsSeen>, D::Error> {
@@ -258,7 +258,7 @@ impl PoseStream for JsonStream {
     }
 }
 
-/// Who sends where nobody said.
+/// The default sender.
 const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// No lab is a thousand kilometres wide, not in millimetres either.
 const MAX_VALUE: f64 = 1e9;

@@ -45,7 +45,7 @@ struct System {
     /// Who it is, and where it is.
     from: Option<(MavHeader, SocketAddr)>,
     asked: Option<ServerTime>,
-    /// ODOMETRY comes: the other messages say the same, less well.
+    /// ODOMETRY comes: the other messages have the same, less precisely.
     has_odometry: bool,
     /// The newest stamp used. [ns, autopilot]
     last_ns: u64,

@@ -8,7 +8,7 @@
 //! The wire format is the crate `natnet`'s: no unsafe code, no dependency, every count checked
 //! against the bytes that are there, tested against captures of Motive 3.1; its sockets stay out. What
 //! is ours is the conversation, and time: Motive's clock is related to ours by the packets' `transmit`
-//! stamps, and a pose is as old as `transmit - mid exposure` says.
+//! stamps, and a pose is as old as `transmit - mid exposure`.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -51,7 +51,7 @@ pub struct NatnetStream {
     asked: Option<ServerTime>,
     asked_names: Option<ServerTime>,
     kept_alive: Option<ServerTime>,
-    heard: Option<ServerTime>,
+    received_at: Option<ServerTime>,
     warned_of_version: bool,
 }
 
@@ -82,7 +82,7 @@ impl NatnetStream {
             asked: None,
             asked_names: None,
             kept_alive: None,
-            heard: None,
+            received_at: None,
             warned_of_version: false,
         }
     }
@@ -148,7 +148,7 @@ impl NatnetStream {
             Ok(_) => return,
             Err(error) => return self.roster.bad(&error, NOT_MOTIVE),
         };
-        self.heard = Some(now);
+        self.received_at = Some(now);
         let unknown = |body: &RigidBody| !talk.vehicles.contains_key(&body.id);
         if frame.params & LIST_CHANGED != 0 || frame.rigid_bodies.iter().any(unknown) {
             talk.has_names = false;
@@ -194,7 +194,7 @@ impl NatnetStream {
         self.roster.measure(vehicle, (stamp, now), (p, rotation.normalize()), None);
     }
 
-    /// Returns when the cameras were exposed for a frame; `None` if it does not say.
+    /// Returns when the cameras were exposed for a frame; `None` if it does not state it.
     fn stamp(&mut self, frame: &FrameOfData, now: ServerTime) -> Option<ServerTime> {
         let ticks_hz = self.talk.as_ref()?.ticks_hz;
         let timing = &frame.timing;
@@ -223,8 +223,8 @@ impl NatnetStream {
     fn ask(&mut self, now: ServerTime) {
         let unicast = matches!(self.motive, Motive::Unicast(_));
         // Motive was restarted, or the network was away: it has forgotten us.
-        if unicast && self.heard.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
-            (self.talk, self.heard) = (None, None);
+        if unicast && self.received_at.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
+            (self.talk, self.received_at) = (None, None);
         }
         let Some(talk) = &self.talk else {
             let options = ConnectOptions { bitstream_version: self.wanted, ..Default::default() };

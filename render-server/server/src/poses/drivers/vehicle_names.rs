@@ -236,7 +236,7 @@ fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
 const RESTART_FRAMES: i32 = 2000;
 /// Names in a warning.
 pub(super) const MAX_NAMES: usize = 8;
-/// Things to tell that may wait.
+/// Maximum number of warnings that wait.
 const MAX_WARNINGS: usize = 16;
 /// No lab is wider. [m]
 const FAR_M: f64 = 100.0;

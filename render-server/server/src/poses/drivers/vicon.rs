@@ -9,7 +9,7 @@
 //! Tracker pads packets to a block size: bytes after the last item are ignored. Items with
 //! another id are skipped by their size.
 //!
-//! Rotation: unless the setting `euler` says otherwise, turns about the fixed x, then the fixed y,
+//! Rotation: unless the setting `euler` overrides it, turns about the fixed x, then the fixed y,
 //! then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on
 //! site.
 //!

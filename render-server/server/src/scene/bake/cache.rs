@@ -21,13 +21,13 @@ pub struct BakeCache {
     folder: PathBuf,
 }
 
-/// What a bake is known by.
+/// The identity of a bake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BakeKey([u8; SHA256_OUTPUT_LEN]);
 
-/// What the cache has of a key.
+/// The cache's entry of a key.
 #[derive(Debug)]
-pub(super) enum Kept {
+pub(super) enum CachedField {
     Field(DistanceField),
     Nothing,
     /// Why the file is no good.
@@ -109,20 +109,20 @@ impl BakeCache {
         }
     }
 
-    pub(super) fn read(&self, key: &BakeKey) -> Kept {
+    pub(super) fn read(&self, key: &BakeKey) -> CachedField {
         let path = self.path(key);
         let bytes = match fs::read(&path) {
             Ok(bytes) => bytes,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Kept::Nothing,
-            Err(error) => return Kept::Broken(error.to_string()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return CachedField::Nothing,
+            Err(error) => return CachedField::Broken(error.to_string()),
         };
         match parse(&bytes) {
             Ok(field) => {
                 // What was used last is thrown away last; a clock that cannot be set costs a bake.
                 let _ = File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
-                Kept::Field(field)
+                CachedField::Field(field)
             }
-            Err(why) => Kept::Broken(why),
+            Err(why) => CachedField::Broken(why),
         }
     }
 

@@ -1,4 +1,4 @@
-//! One drawn image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
+//! One rendered image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
 //! before is on its way already.
 //!
 //! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms (feature `turbo`) a slice, so
@@ -20,7 +20,7 @@ use crate::render::rendered::RenderedImage;
 use crate::render::schedule::withholds_depth;
 use crate::stream::subscriptions::{Broadcast, Subscriptions};
 
-/// Turns drawn images into bytes for [`Subscriptions`]; owns the scratch memory.
+/// Turns rendered images into bytes for [`Subscriptions`]; owns the scratch memory.
 #[derive(Debug)]
 pub struct SliceEncoder {
     encoder: Encoder,

@@ -45,7 +45,7 @@ struct SenderContext {
     vehicle: usize,
     connection: Connection,
     id: u64,
-    /// The runtime's; a watcher far away says nothing of the flight.
+    /// The runtime's; a watcher far away has no influence on the flight.
     rate_controller: Option<Arc<Mutex<RateController>>>,
 }
 
@@ -94,7 +94,7 @@ impl ImageSenders {
                 }
                 _ = decide.tick() => {
                     let cameras = self.context.stream().images.cameras.iter();
-                    let rendered = cameras.map(|counters| counters.counts().drawn).sum();
+                    let rendered = cameras.map(|counters| counters.counts().rendered).sum();
                     self.context.decide(rendered_rate.of(rendered, clock::now()));
                 }
             }
@@ -118,7 +118,7 @@ impl SenderContext {
         &self.rooms.streaming.vehicles[self.vehicle]
     }
 
-    /// Lowers or raises how images are made; `wanted_hz` are drawn, of all cameras.
+    /// Lowers or raises how images are made; `wanted_hz` are rendered, of all cameras.
     fn decide(&self, wanted_hz: f64) {
         let Some(rate_controller) = &self.rate_controller else { return };
         let change = lock(rate_controller).decide(clock::now(), wanted_hz);

@@ -51,7 +51,7 @@ async function explainRefusal() {
     showVehicles(names, null);
     showOutcome("warn", `No vehicle '${wanted}'`, `here fly ${names.join(", ")}`);
   } catch {
-    // The server is gone: the link says so already.
+    // The server is gone: the link shows it already.
   }
 }
 
