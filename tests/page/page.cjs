@@ -69,7 +69,7 @@ async function shot(page, name) {
   if (shots) await page.screenshot({ path: path.join(shots, `${name}.png`) });
 }
 
-/** Everything that can be pressed or filled says what it is, and the stop button is in sight. */
+/** Everything that can be pressed or filled has a label, and the stop button is in sight. */
 async function checkAccess(page, size) {
   const nameless = await page.evaluate(() =>
     [...document.querySelectorAll("button, input, select, a[href], canvas, summary")]
@@ -276,7 +276,7 @@ async function lab(browser) {
   await page.keyboard.press("Escape");
   await until(page, "announcement", /no runtime is connected/);
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
-  // Light and fog: a name at once, a sight with the button, and what cannot be is told.
+  // Light and fog: a name at once, a sight with the button, and an invalid value is reported.
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night-fog");
   await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).name === "night-fog");
@@ -396,7 +396,7 @@ async function main() {
       console.log(`FAIL  ${test.name}: ${error.stack}`);
       const page = browser.contexts().at(-1)?.pages()[0];
       if (page) {
-        console.log(`      the page says: ${page.faults}`);
+        console.log(`      the page reports: ${page.faults}`);
         await shot(page, `failed-${test.name}`);
       }
     }

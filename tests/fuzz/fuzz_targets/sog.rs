@@ -1,4 +1,4 @@
-//! A SOG scene from a stranger: an error or a sound scene. The first byte says what of a good scene
+//! A SOG scene from a stranger: an error or a sound scene. The first byte selects what of a good scene
 //! is replaced by the others: the whole archive, its meta data, or one of its textures.
 #![no_main]
 use std::io::{Cursor, Read as _, Write as _};

@@ -149,7 +149,7 @@ const CASES: [Case; 13] = [
 /// Vehicles that fly at a time; the server is the last row's, alone.
 const TOGETHER: usize = 4;
 /// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
-/// for an autopilot that does not hear it.
+/// for an autopilot that does not receive it.
 const PARAMETERS: [&str; 22] = [
     "FS_GCS_ENABLE",
     "FS_GCS_TIMEOUT",
@@ -243,7 +243,7 @@ fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
     })
 }
 
-/// Returns the simulator's arguments for a vehicle set up as `hardware/airframe` says, with a pilot.
+/// Returns the simulator's arguments for a vehicle set up by the files in `hardware/airframe`, with a pilot.
 fn vehicle() -> Vec<String> {
     let path = vizflyt_e2e::root().join("hardware/airframe/whippet-copter-4.8.param");
     let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
