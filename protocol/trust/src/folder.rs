@@ -91,7 +91,7 @@ impl KeysFolder {
         self.read_as(name, 0o077)
     }
 
-    /// Returns what tells one state of a file from another; `None` if there is none.
+    /// Returns what distinguishes one state of a file from another; `None` if there is none.
     pub fn stamp(&self, name: &str) -> Option<FileStamp> {
         let about = fs::metadata(self.file(name)).ok()?;
         Some(FileStamp([

@@ -231,11 +231,11 @@ mod trial {
             let (splats, camera) = scene_and_camera();
             let check = |spoil: fn(&mut RgbdImage, usize), part: &str| {
                 let mut renderer = Spoiling(CpuRenderer::new(&splats), spoil, 0);
-                let said = match check(&mut renderer, &splats, &camera) {
+                let reason = match check(&mut renderer, &splats, &camera) {
                     Ok(found_db) => format!("{found_db} dB"),
                     Err(why) => why,
                 };
-                assert!(said.contains(part), "{said:?} lacks {part:?}");
+                assert!(reason.contains(part), "{reason:?} lacks {part:?}");
             };
             check(|_, _| (), "200 dB");
             check(|image, _| image.rgb[777] += 1e-3, " dB");

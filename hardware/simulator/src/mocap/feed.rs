@@ -70,7 +70,7 @@ impl FromStr for FeedTarget {
 pub struct Feed {
     target: FeedTarget,
     socket: UdpSocket,
-    /// NatNet's listeners, and when they were last heard.
+    /// NatNet's listeners, and when they last sent something.
     listeners: Vec<(SocketAddr, AutopilotTime)>,
 }
 
@@ -125,8 +125,10 @@ impl Feed {
         for _ in 0..MAX_LISTENERS {
             // Errors are an empty socket, or a complaint that someone has gone.
             let Ok((length, from)) = self.socket.recv_from(&mut buffer) else { break };
-            if let Some((_, heard)) = self.listeners.iter_mut().find(|(known, _)| *known == from) {
-                *heard = now;
+            if let Some((_, received_at)) =
+                self.listeners.iter_mut().find(|(known, _)| *known == from)
+            {
+                *received_at = now;
             } else if self.listeners.len() < MAX_LISTENERS {
                 self.listeners.push((from, now));
             } else {
@@ -136,7 +138,7 @@ impl Feed {
                 let _ = self.socket.send_to(&answer, from);
             }
         }
-        self.listeners.retain(|(_, heard)| now.seconds_since(*heard) < FORGOTTEN_S);
+        self.listeners.retain(|(_, received_at)| now.seconds_since(*received_at) < FORGOTTEN_S);
     }
 }
 

@@ -37,7 +37,7 @@ pub enum FromPlugin {
         /// What it returned; `None` leaves the former setpoint in force until its deadline.
         setpoint: Option<Setpoint>,
     },
-    /// The plugin gives up, and says why.
+    /// The plugin gives up; why.
     Failed {
         /// One sentence.
         reason: Text,

@@ -1,11 +1,11 @@
 //! Relates two clocks from request-reply exchanges: offset, drift, and a bound of the error.
 //!
-//! An exchange says that the remote clock showed `remote` at some moment between `sent` and
+//! An exchange shows that the remote clock was at `remote` at some moment between `sent` and
 //! `received`. As clocks run forward, their offset (remote less local) was at most
 //! `remote - sent` when it was sent, and at least `remote - received` when the answer was read.
 //! Over a window of exchanges these are half-planes in (offset, drift); what all of them leave is
 //! where the truth lies, and its middle is the estimate. No delay needs to be symmetric, and a
-//! slow exchange costs nothing: it only says little.
+//! slow exchange costs nothing: its bound is only wide.
 //!
 //! The bound rests on two assumptions: a clock runs wrong by at most [`MAX_DRIFT`], and over the
 //! window its drift changes by at most [`WANDER`]. Exchanges that contradict each other prove a
@@ -37,7 +37,7 @@ struct Exchange {
     received_ns: u64,
 }
 
-/// What the window says.
+/// The estimate of the window.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
     /// When the offset was so: the end of the newest exchange. [ns, local]

@@ -77,7 +77,7 @@ impl Coder for SymbolWriter {
     }
 }
 
-/// Takes symbols apart again. Behind the end come zeros; [`Self::is_finished`] tells.
+/// Takes symbols apart again. Behind the end come zeros; [`Self::is_finished`] detects it.
 pub(super) struct SymbolReader<'a> {
     states: [u32; LANES],
     words: &'a [[u8; 2]],
@@ -86,7 +86,7 @@ pub(super) struct SymbolReader<'a> {
 }
 
 impl<'a> SymbolReader<'a> {
-    /// Returns `None` if the bytes are fewer than they say.
+    /// Returns `None` if the bytes are fewer than they state.
     pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
         let (header, rest) = bytes.split_first_chunk::<HEADER_BYTES>()?;
         let number = |at: usize| {
