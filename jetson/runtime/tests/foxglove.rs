@@ -90,7 +90,7 @@ fn a_viewer_sees_the_logs_channels_and_their_messages() {
     viewer.0.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
     let mut first = [0; 1];
     let body = loop {
-        log.write(Channel::Asked, host_now(), &json!({"seq": 12_345}));
+        log.write(Channel::Requested, host_now(), &json!({"seq": 12_345}));
         if viewer.0.peek(&mut first).is_ok() {
             viewer.0.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
             let (is_text, body) = viewer.read();
