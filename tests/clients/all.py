@@ -70,7 +70,7 @@ def square(command, script, address, seed, results):
 
 
 def counted(lines):
-    """Returns how many checks a client says have passed."""
+    """Returns how many checks a client reports as passed."""
     found = re.search(r"(\d+) passed", lines[-1]) if lines else None
     return int(found.group(1)) if found else 0
 

@@ -43,8 +43,8 @@ def wrap(angle):
 
 
 def before_flight(lab):
-    heard = lab.until(10, lambda: "HEARTBEAT" in lab.newest and lab.vicon.pose)
-    check("heartbeat and mocap come", heard)
+    received = lab.until(10, lambda: "HEARTBEAT" in lab.newest and lab.vicon.pose)
+    check("heartbeat and mocap come", received)
     heartbeat = lab.newest["HEARTBEAT"]
     check(
         "heartbeat is an ArduCopter quadrotor in STABILIZE, disarmed",
@@ -69,7 +69,7 @@ def before_flight(lab):
     check("Vicon frames count up at 200 Hz", 150 < rate < 210 and frames == sorted(frames), rate)
 
     check("arming without vision is refused", arm(lab) == FAILED, lab.texts)
-    check("and says why", lab.said("PreArm: VisOdom: not healthy"), lab.texts)
+    check("and reports why", lab.has_text("PreArm: VisOdom: not healthy"), lab.texts)
     lab.vision = True
     lab.until(5, lab.prearm_good)
     check("LAND is no mode to arm in", set_mode(lab, 9) == ACCEPTED and arm(lab) == FAILED)
@@ -133,7 +133,7 @@ def position_comes(lab):
         and lab.prearm_good(),
     )
     check("the estimator and the checks turn good", good, lab.newest["EKF_STATUS_REPORT"])
-    check("the height datum is announced", lab.until(5, lambda: lab.said("Field Elevation Set")))
+    check("the height datum is announced", lab.until(5, lambda: lab.has_text("Field Elevation Set")))
     lab.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 20000)
     lab.local_times.clear()
     lab.until(10, lambda: len(lab.local_times) > 60)
@@ -149,7 +149,7 @@ def fly_square(lab):
     high = lab.until(20, lambda: abs(lab.vicon.pose[2] - HEIGHT) < 0.1)
     check("it climbs to the height", high, lab.vicon.pose)
     lab.until(3, lab.armed)
-    check("the heartbeat says armed, GUIDED", lab.armed() and lab.newest["HEARTBEAT"].custom_mode == 4)
+    check("the heartbeat has armed, GUIDED", lab.armed() and lab.newest["HEARTBEAT"].custom_mode == 4)
     x0, y0 = SPAWN
     yaw_ned = math.pi / 2 - math.radians(SPAWN_YAW_DEG)
     for corner, (dx, dy) in enumerate([(2, 0), (2, 2), (0, 2), (0, 0)], 1):
@@ -166,7 +166,7 @@ def fly_square(lab):
     lab.fly_for(4)
     check("a position is held without resending", lab.distance(x0, y0, HEIGHT) < 0.15)
     yaw = lab.newest["ATTITUDE"].yaw
-    check("the nose stayed where it was told", abs(wrap(yaw - yaw_ned)) < 0.1, yaw)
+    check("the nose kept the ordered heading", abs(wrap(yaw - yaw_ned)) < 0.1, yaw)
 
 
 def fly_velocities(lab):
@@ -216,11 +216,11 @@ def land(lab):
 def other_links(command):
     for endpoint in ("tcpin", "udpin"):
         lab = Lab(command, endpoint, "--param", "FS_GCS_ENABLE=0")
-        heard = lab.until(10, lambda: lab.counts["HEARTBEAT"] > 1)
+        received = lab.until(10, lambda: lab.counts["HEARTBEAT"] > 1)
         lab.link.mav.param_request_read_send(1, 1, b"FS_GCS_ENABLE", -1)
         lab.until(3, lambda: "FS_GCS_ENABLE" in lab.params)
         value = lab.params.get("FS_GCS_ENABLE")
-        check("%s: a client is served" % endpoint, heard and value and value.param_value == 0)
+        check("%s: a client is served" % endpoint, received and value and value.param_value == 0)
         _, status = lab.close()
         check("%s: ends when its parent lets go" % endpoint, status == 0, status)
 

@@ -17,7 +17,7 @@ SYSTEM = {69: "target"}
 
 
 def value(index, kind, length):
-    """Returns a value that shows where it went: the target fields are told apart from the rest."""
+    """Returns a value that shows where it went: the target fields differ from the rest."""
     if kind == "char":
         return ("text%d" % index).encode()[:length] if length else b"x"
     number = 1.5 if kind in ("float", "double") else 3 + index % 100

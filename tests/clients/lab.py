@@ -214,7 +214,7 @@ class Lab:
             & mavlink.MAV_SYS_STATUS_PREARM_CHECK
         )
 
-    def said(self, words):
+    def has_text(self, words):
         return any(words in text for text in self.texts)
 
     def close(self):

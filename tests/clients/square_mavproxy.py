@@ -35,12 +35,12 @@ class Proxy:
             text=True,
         )
         self.newest = {}
-        self.said = []
+        self.lines = []
         threading.Thread(target=self.listen, daemon=True).start()
 
     def listen(self):
         for line in self.process.stdout:
-            self.said.append(line.rstrip())
+            self.lines.append(line.rstrip())
 
     def type(self, line):
         self.process.stdin.write(line + "\n")
@@ -90,18 +90,18 @@ class Proxy:
 
 
 def fly(check, proxy):
-    check("connects", proxy.until(lambda: "HEARTBEAT" in proxy.newest), proxy.said[-5:])
-    got_all = lambda: any("Received" in line and "parameters" in line for line in proxy.said)
-    check("reads the parameters", proxy.until(got_all), proxy.said[-5:])
-    check("becomes ready", proxy.until(proxy.ready), proxy.said[-5:])
+    check("connects", proxy.until(lambda: "HEARTBEAT" in proxy.newest), proxy.lines[-5:])
+    got_all = lambda: any("Received" in line and "parameters" in line for line in proxy.lines)
+    check("reads the parameters", proxy.until(got_all), proxy.lines[-5:])
+    check("becomes ready", proxy.until(proxy.ready), proxy.lines[-5:])
     # Its `position` ignores yaw: the nose must not turn into travel (pitfall 4).
     proxy.type("param set WP_YAW_BEHAVIOR 0")
-    check("GUIDED", proxy.until(lambda: proxy.mode() == 4, "mode GUIDED"), proxy.said[-5:])
-    check("arms", proxy.until(proxy.armed, "arm throttle"), proxy.said[-5:])
+    check("GUIDED", proxy.until(lambda: proxy.mode() == 4, "mode GUIDED"), proxy.lines[-5:])
+    check("arms", proxy.until(proxy.armed, "arm throttle"), proxy.lines[-5:])
     north, east, ground = proxy.position()
     proxy.type("takeoff %g" % HEIGHT)
     up = lambda: abs(proxy.position()[2] - ground - HEIGHT) < 0.2
-    check("takes off", proxy.until(up), proxy.said[-5:])
+    check("takes off", proxy.until(up), proxy.lines[-5:])
     sin, cos = math.sin(proxy.yaw()), math.cos(proxy.yaw())
     for number, (dx, dy) in enumerate(CORNERS, 1):
         target = (north + dx, east + dy, ground + HEIGHT)
@@ -110,8 +110,8 @@ def fly(check, proxy):
         proxy.type("position %.3f %.3f %.3f" % (x * cos + y * sin, y * cos - x * sin, -z))
         there = lambda: reached(proxy.position(), proxy.speed(), target)
         check("corner %d" % number, proxy.until(there), (proxy.position(), target))
-    check("LAND", proxy.until(lambda: proxy.mode() == 9, "mode LAND"), proxy.said[-5:])
-    check("lands and disarms", proxy.until(lambda: not proxy.armed()), proxy.said[-5:])
+    check("LAND", proxy.until(lambda: proxy.mode() == 9, "mode LAND"), proxy.lines[-5:])
+    check("lands and disarms", proxy.until(lambda: not proxy.armed()), proxy.lines[-5:])
     check("stands on the ground", abs(proxy.position()[2] - ground) < 0.3, proxy.position())
 
 

@@ -44,7 +44,7 @@ def main():
         v = telemetry.position_velocity_ned().velocity
         return math.hypot(v.north_m_s, v.east_m_s, v.down_m_s)
 
-    # MAVSDK's own health asks for GPS; arming itself tells whether the vehicle is ready, once there
+    # MAVSDK's own health asks for GPS; arming itself shows whether the vehicle is ready, once there
     # is a position to hold.
     known = lambda: not any(math.isnan(v) for v in position())
     check("position comes", until(known))

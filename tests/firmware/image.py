@@ -30,11 +30,11 @@ def valid(image, what):
     with tempfile.NamedTemporaryFile(suffix=".bin") as file:
         file.write(image)
         file.flush()
-        said = subprocess.run(
+        checked = subprocess.run(
             [sys.executable, "-m", "esptool", "--chip", "esp32c3", "image-info", file.name],
             capture_output=True, text=True, check=False)
-    good = said.returncode == 0 and said.stdout.count("(valid)") == 2
-    assert good, f"esptool does not take {what}:\n{said.stdout}{said.stderr}"
+    good = checked.returncode == 0 and checked.stdout.count("(valid)") == 2
+    assert good, f"esptool does not take {what}:\n{checked.stdout}{checked.stderr}"
 
 
 def main():

@@ -65,7 +65,7 @@ class Network:
         self.wire.send(BRIDGE_MAC + OUR_MAC + struct.pack("!H", kind) + payload)
 
     def send(self, port, payload, source=None, to=None, to_port=BRIDGE_PORT):
-        """Sends a datagram from our `port`; to the bridge if nothing else is said."""
+        """Sends a datagram from our `port`; to the bridge by default."""
         source = source or self.address
         to = socket.inet_aton(to) if to else self.bridge
         length = 8 + len(payload)

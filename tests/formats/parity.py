@@ -7,7 +7,7 @@ DIR holds venv/ and node_modules/ (tests/formats/run installs them); CONVERT is 
 For every tool, format and degree of harmonics there are up to two comparisons: "we read theirs" (they
 write the known scene, we convert it to PLY) and "they read ours" (we write it, they convert it to PLY).
 Splats are matched by position and must agree within what the format's steps allow. A line each; the
-last says how many passed. --keep copies the files the tools wrote and the known scenes, which is how
+last reports how many passed. --keep copies the files the tools wrote and the known scenes, which is how
 the fixtures of render-server/splat/tests/data/formats were made.
 """
 import argparse
@@ -27,7 +27,7 @@ COLOUR = 1 / 255 / C0   # one step of a colour byte, as a harmonic
 # --- scenes as dictionaries of arrays: mean, log_scale, wxyz, opacity (0..1), sh [n, k, 3]
 
 def known(degree, count, seed):
-    """Splats far enough apart to be told apart, with values that no format clamps."""
+    """Splats far enough apart to be distinguished, with values that no format clamps."""
     rng = np.random.default_rng(seed)
     cells = rng.permutation(14 ** 3)[:count]
     mean = np.stack([cells // 196, cells // 14 % 14, cells % 14], 1) * 0.5 - 3.25

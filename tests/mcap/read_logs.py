@@ -48,9 +48,9 @@ def fly(program, folder, seconds, images, kill):
     command = [program, "demo", "--headless", "--seed", "7", "--seconds", str(seconds),
                f"--log={images}", f"--log-dir={folder}"]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    said = []
+    printed = []
     for line in demo.stdout:
-        said.append(line)
+        printed.append(line)
         if kill and "plugin flies" in line:
             logs = list(folder.glob("*.mcap"))
             check(len(logs) == 1, f"one log: {logs}")
@@ -63,7 +63,7 @@ def fly(program, folder, seconds, images, kill):
             kill = False
     demo.wait()
     logs = list(folder.glob("*.mcap"))
-    check(len(logs) == 1, f"one log: {logs} {said}")
+    check(len(logs) == 1, f"one log: {logs} {printed}")
     return logs[0]
 
 
@@ -121,7 +121,7 @@ def read(path, is_whole, is_full):
                 check(schema.name == FOXGLOVE[topic], f"{topic} is {schema.name}")
             if channel.message_encoding == "json":
                 check(isinstance(json.loads(message.data), dict), f"{topic} is an object")
-                check(schema.encoding == "jsonschema", f"{topic} says how it is built")
+                check(schema.encoding == "jsonschema", f"{topic} has its schema")
                 json.loads(schema.data)
                 continue
             check((channel.message_encoding, schema.encoding) == ("protobuf", "protobuf"), topic)
@@ -194,7 +194,7 @@ def main():
               f"{', within a write' if is_cut else ''}")
         _, report = replay(program, killed, "killed")
         check(report["compared"] > 0, str(report))
-        check(report["images_left_out"] > 0, f"a reduced log says so: {report}")
+        check(report["images_left_out"] > 0, f"a reduced log reports so: {report}")
         print(f"{checks} checks passed")
 
 

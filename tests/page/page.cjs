@@ -69,7 +69,7 @@ async function shot(page, name) {
   if (shots) await page.screenshot({ path: path.join(shots, `${name}.png`) });
 }
 
-/** Everything that can be pressed or filled says what it is, and the stop button is in sight. */
+/** Everything that can be pressed or filled has a label, and the stop button is in sight. */
 async function checkAccess(page, size) {
   const nameless = await page.evaluate(() =>
     [...document.querySelectorAll("button, input, select, a[href], canvas, summary")]
@@ -150,7 +150,7 @@ async function flight(browser) {
   await shot(page, "laptop-flying");
   // Someone who types has the space bar; escape stops from anywhere.
   await page.keyboard.press("Escape");
-  await until(page, "said", /lands/);
+  await until(page, "announcement", /lands/);
   await until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/);
   await shot(page, "laptop-stopped");
   assert.deepEqual(page.faults, []);
@@ -250,7 +250,7 @@ async function lab(browser) {
   await page.locator("#setup summary").click();
   await page.locator("#camera-form [name=width_px]").fill("200");
   await page.locator("#camera-form button[type=submit]").click();
-  await until(page, "camera-said", /applied/);
+  await until(page, "camera-status", /applied/);
   await until(page, "camera-name", /200 ×/);
   // The view in space: drawn, and turned by keys. Not in flight: without a card it takes the processor.
   await page.locator("#view-space").click();
@@ -271,12 +271,12 @@ async function lab(browser) {
   await page.waitForFunction(() => /^\d{3}.?\d{3}$/.test(document.querySelector(".pair-code").textContent));
   await shot(page, "pairing");
   await page.locator("#estop").click();
-  await until(page, "said", /no runtime is connected/);
-  await page.evaluate(() => (document.getElementById("said").textContent = ""));
+  await until(page, "announcement", /no runtime is connected/);
+  await page.evaluate(() => (document.getElementById("announcement").textContent = ""));
   await page.keyboard.press("Escape");
-  await until(page, "said", /no runtime is connected/);
+  await until(page, "announcement", /no runtime is connected/);
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
-  // Light and fog: a name at once, a sight with the button, and what cannot be is told.
+  // Light and fog: a name at once, a sight with the button, and an invalid value is reported.
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night-fog");
   await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).name === "night-fog");
@@ -345,7 +345,7 @@ async function leaderboard(browser) {
   await page.locator("#team-form [name=token]").fill("no token of any team");
   await page.locator("#team-form [name=attempt]").selectOption("official");
   await page.locator("#team-form button").click();
-  await until(page, "team-said", /no team/);
+  await until(page, "team-status", /no team/);
   await page.locator("#team-form [name=token]").fill(token);
   await page.locator("#team-form button").click();
   await until(page, "checked-in", /wasps flies: official/);
@@ -396,7 +396,7 @@ async function main() {
       console.log(`FAIL  ${test.name}: ${error.stack}`);
       const page = browser.contexts().at(-1)?.pages()[0];
       if (page) {
-        console.log(`      the page says: ${page.faults}`);
+        console.log(`      the page reports: ${page.faults}`);
         await shot(page, `failed-${test.name}`);
       }
     }

@@ -64,7 +64,7 @@ class Stage:
             self.rehearsal.receive(timeout_s=0.02)
 
     def answer(self, seq, stamp_ns=0):
-        """Publishes an image and returns what the plugin said to it."""
+        """Publishes an image and returns the plugin's reply."""
         self.publish(seq, stamp_ns)
         return self.rehearsal.receive()
 

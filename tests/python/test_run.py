@@ -1,4 +1,4 @@
-"""The main loop, as a process of its own: what the runtime hears when a plugin goes wrong."""
+"""The main loop, as a process of its own: what the runtime receives when a plugin fails."""
 
 import signal
 import subprocess

@@ -84,10 +84,10 @@ def test_whatever_holds_three_numbers_is_a_vector(value):
     ],
 )
 def test_the_sentence(make, error, sentence):
-    with pytest.raises(error) as told:
+    with pytest.raises(error) as raised:
         make()
-    assert sentence in str(told.value)
-    assert "\n" not in str(told.value)
+    assert sentence in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_setpoints_show_how_to_make_them():

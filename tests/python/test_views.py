@@ -12,7 +12,7 @@ import vizflyt
 
 
 def mapping_of(address):
-    """Returns the file behind an address of this process, as the kernel tells it."""
+    """Returns the file behind an address of this process, as the kernel lists it."""
     with open("/proc/self/maps") as maps:
         for line in maps:
             place, _, _, _, _, *file = line.split(maxsplit=5)
@@ -141,8 +141,8 @@ def test_kept_images_never_change_and_later_ones_are_copied_with_a_warning():
             truth[seq] = stage.publish(seq)
             what, answered, *_ = stage.rehearsal.receive()
             assert (what, answered) == ("answer", seq)
-        told = [w for w in caught if w.category is vizflyt.HeldImagesWarning]
-    assert len(told) == 1 and "keep what you need with .copy()" in str(told[0].message)
+        warned = [w for w in caught if w.category is vizflyt.HeldImagesWarning]
+    assert len(warned) == 1 and "keep what you need with .copy()" in str(warned[0].message)
     # Two stay where they are; all others are copies.
     assert [is_copy for _, is_copy, *_ in kept] == [False, False] + [True] * 38
     for seq, _, rgb, depth_mm in kept:

@@ -50,7 +50,7 @@ def main():
                 theirs[int(path.stem), tag.tag_id] = corners
     both = ours.keys() & theirs.keys()
     print(f"{len(images)} images: {len(ours)} tags found, {len(theirs)} by pupil-apriltags, {len(both)} by both")
-    assert len(images) >= 30 and len(both) >= 150, "too few to tell"
+    assert len(images) >= 30 and len(both) >= 150, "too few to compare"
     false = [key for key in ours if key not in truth]
     assert not false, f"found what is not there: {false}"
     missed = theirs.keys() - ours.keys()

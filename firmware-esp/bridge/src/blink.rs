@@ -1,4 +1,4 @@
-//! How a bridge's one light says what [`Light`] is: the same on every chip.
+//! How a bridge's one light shows its [`Light`]: the same on every chip.
 
 use embassy_time::{Duration, Timer};
 

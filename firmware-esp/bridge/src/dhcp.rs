@@ -25,7 +25,7 @@ pub struct Leases {
 #[derive(Clone, Copy, Debug)]
 struct Lease {
     mac: [u8; 6],
-    heard: u32,
+    renewed: u32,
 }
 
 impl Default for Leases {
@@ -94,11 +94,11 @@ impl Leases {
         self.turn = self.turn.wrapping_add(1);
         let own = self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
         let turn = self.turn;
-        let age = |lease: &Option<Lease>| lease.map_or(u32::MAX, |l| turn.wrapping_sub(l.heard));
+        let age = |lease: &Option<Lease>| lease.map_or(u32::MAX, |l| turn.wrapping_sub(l.renewed));
         let place = own
             .or_else(|| (0..LEASES).rev().max_by_key(|&place| age(&self.taken[place])))
             .unwrap_or(0);
-        self.taken[place] = Some(Lease { mac, heard: turn });
+        self.taken[place] = Some(Lease { mac, renewed: turn });
         place
     }
 }

@@ -29,7 +29,7 @@ pub fn answer(
         let &[kind_high, kind, class_high, class] = query.get(after..after + 4)? else {
             return None;
         };
-        // The top bit of the class asks for an answer to the asker alone; all may hear ours.
+        // The top bit of the class asks for a reply to the sender alone; ours goes to all.
         let for_address = kind_high == 0 && matches!(kind, KIND_A | KIND_ANY);
         asked |= is_ours && for_address && [class_high & 0x7F, class] == [0, CLASS_IN];
         at = after + 4;

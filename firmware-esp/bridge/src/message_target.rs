@@ -1,4 +1,4 @@
-//! Where a message says whom it is for. MAVLink sorts fields by size, so the place differs by
+//! The target fields of a message. MAVLink sorts fields by size, so the place differs by
 //! message; this table holds it for every message of our dialect that is addressed. A message
 //! that is not here goes to everybody, as MAVLink's routing rules want.
 

@@ -24,7 +24,7 @@ pub fn respond(bridge: &Bridge, now: HostTime, request: &[u8]) -> String<RESPONS
         ),
     };
     if written.is_err() {
-        // More clients than were thought of: say so rather than half a page.
+        // More clients than fit: an error rather than half a page.
         out.clear();
         let _ = out
             .write_str("HTTP/1.0 500 Internal Server Error\r\nConnection: close\r\n\r\ntoo long\n");

@@ -1,5 +1,5 @@
 //! Packets in a ring of bytes: first in, first out, several readers. Where it is full the writer
-//! says what gives way; what did is told to the caller, so that every lost packet is counted.
+//! decides what is dropped; what was is reported to the caller, so that every lost packet is counted.
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 

@@ -161,7 +161,7 @@ struct Sender {
 
 /// A jump this far or further is taken for a restart or an overtaken packet: a loss of half the
 /// counter's range at once cannot be distinguished from either.
-const MOST_LOST: u8 = 128;
+const MAX_LOST: u8 = 128;
 
 impl<const N: usize> Sequences<N> {
     pub(crate) const fn new() -> Self {
@@ -173,7 +173,7 @@ impl<const N: usize> Sequences<N> {
         let known = self.senders.iter_mut().flatten().find(|sender| sender.source == source);
         if let Some(sender) = known {
             let missing = sequence.wrapping_sub(sender.last).wrapping_sub(1);
-            if missing < MOST_LOST {
+            if missing < MAX_LOST {
                 sender.last = sequence;
                 return missing.into();
             }

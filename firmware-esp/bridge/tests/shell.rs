@@ -234,7 +234,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
             }
         };
         up.await;
-        let say = async {
+        let sender = async {
             for number in 0..COUNT {
                 uart_out.write_all(&packet((1, 1), ATTITUDE, number)).await.unwrap();
                 if number % 40 == 39 {
@@ -243,7 +243,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
                 }
             }
         };
-        let hear = async {
+        let receiver = async {
             let (mut came, mut bytes) = (0, [0; 1500]);
             while came < COUNT {
                 let (len, _) = socket.recv_from(&mut bytes).await.unwrap();
@@ -257,7 +257,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
                 assert_eq!(cut.dropped_bytes, 0);
             }
         };
-        join(say, hear).await;
+        join(sender, receiver).await;
     });
     assert!(chip.lights.contains(&Light::NoAutopilot), "{:?}", chip.lights);
 }
@@ -298,19 +298,19 @@ fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
                     let len = socket.write(sent).await.unwrap();
                     sent = &sent[len..];
                 }
-                let mut heard = false;
-                while !heard {
+                let mut received = false;
+                while !received {
                     let len = uart_in.read(&mut bytes).await;
                     up.push(&bytes[..len], |found| {
-                        heard |= found.bytes() == packet((255, 191), VISION, number);
+                        received |= found.bytes() == packet((255, 191), VISION, number);
                     });
                 }
                 uart_out.write_all(&packet((1, 1), ATTITUDE, number)).await.unwrap();
-                let mut heard = false;
-                while !heard {
+                let mut received = false;
+                while !received {
                     let len = socket.read(&mut bytes).await.unwrap();
                     down.push(&bytes[..len], |found| {
-                        heard |= found.bytes() == packet((1, 1), ATTITUDE, number);
+                        received |= found.bytes() == packet((1, 1), ATTITUDE, number);
                     });
                 }
             }
@@ -389,7 +389,7 @@ fn an_armed_vehicle_keeps_its_firmware() {
         let mut heartbeat = [0; 280];
         let len = write_packet(&mut heartbeat, (1, 1), 0, 0, &payload);
         uart_out.write_all(&heartbeat[..len]).await.unwrap();
-        // Taken when the page says so.
+        // Accepted when the page confirms it.
         loop {
             let answer = bring(stack, &signed(&firmware())[..50]).await;
             if answer.contains("the vehicle is armed") {

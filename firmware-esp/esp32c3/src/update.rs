@@ -66,7 +66,7 @@ pub(crate) struct Updates {
 }
 
 impl Updates {
-    /// Returns `None` if this firmware has no key, or the flash does not tell which half runs.
+    /// Returns `None` if this firmware has no key, or the flash does not show which half runs.
     pub(crate) fn new(flash: &'static Flash) -> Option<Self> {
         let wanted = Wanted { target: Target::Esp32C3, build: BUILD, key: KEY? };
         Some(Self { wanted, halves: Halves::of(flash)?, updater: None })

@@ -3,7 +3,7 @@
  *
  * One thread of control: vizflyt_start and vizflyt_poll are never called from an interrupt, nor
  * from within a platform_ function. Interrupts may only note that something happened; whoever
- * runs the loop then tells it by the `events` of vizflyt_poll. */
+ * runs the loop then passes it as `events` of vizflyt_poll. */
 #ifndef VIZFLYT_PLATFORM_H
 #define VIZFLYT_PLATFORM_H
 
@@ -27,7 +27,7 @@ void vizflyt_start(void);
 uint32_t vizflyt_poll(uint32_t events);
 
 /* Takes one Ethernet frame that the radio received, without its checksum. Returns 0, or -1 when
- * there is no room and the frame is dropped: the packets' own numbers tell what was lost. From the loop's context only; poll after. */
+ * there is no room and the frame is dropped: the packets' own numbers show what was lost. From the loop's context only; poll after. */
 int32_t vizflyt_frame_in(const uint8_t *frame, uint32_t len);
 /* For how many frames there is room: who can wait asks first, and loses none. */
 uint32_t vizflyt_frame_room(void);
@@ -62,7 +62,7 @@ void platform_uart_configure(uint32_t baud, uint32_t flow_control);
 void platform_mac(uint8_t into[6]);
 /* Whether a frame can be sent now. */
 uint32_t platform_frame_ready(void);
-/* Sends one Ethernet frame; it is copied. Only after platform_frame_ready said so. */
+/* Sends one Ethernet frame; it is copied. Only after platform_frame_ready returned true. */
 void platform_frame_out(const uint8_t *frame, uint32_t len);
 /* Joins a network, or stops trying and opens one. Texts end in a zero; an empty password: open. */
 int32_t platform_wifi_station(const char *ssid, const char *password);

@@ -64,7 +64,7 @@ void platform_wake(void)
     woken = 1;
 }
 
-static void say(const char *line, uint32_t len)
+static void put_line(const char *line, uint32_t len)
 {
     if (len > sizeof page - 1)
         len = sizeof page - 1;
@@ -76,7 +76,7 @@ static void say(const char *line, uint32_t len)
 /* The core has given up. */
 void abort(void)
 {
-    say("abort", 5);
+    put_line("abort", 5);
     stop(1);
     __builtin_unreachable();
 }
@@ -229,7 +229,7 @@ static void report_stack(void)
     uint32_t at = 12;
     for (uint32_t scale = 10000; scale; scale /= 10)
         line[at++] = '0' + used / scale % 10;
-    say(line, at);
+    put_line(line, at);
 }
 
 int main(void)

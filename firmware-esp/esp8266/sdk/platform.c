@@ -329,7 +329,7 @@ void ICACHE_FLASH_ATTR platform_frame_out(const uint8_t *frame, uint32_t len)
     /* PBUF_LINK leaves room in front for what the radio puts there. */
     struct pbuf *packet = pbuf_alloc(PBUF_LINK, len, PBUF_RAM);
     if (!packet)
-        return; /* as a frame lost on the air; the bridge's sequence counters tell of it */
+        return; /* as a frame lost on the air; the bridge's sequence counters count it */
     pbuf_take(packet, frame, len);
     ours->linkoutput(ours, packet);
     pbuf_free(packet);

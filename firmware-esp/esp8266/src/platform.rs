@@ -1,4 +1,4 @@
-//! What the C side offers, safely wrapped. `include/vizflyt_platform.h` tells what each one does.
+//! What the C side offers, safely wrapped. `include/vizflyt_platform.h` documents each one.
 
 #![expect(unsafe_code, reason = "the seam to C")]
 

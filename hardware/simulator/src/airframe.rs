@@ -1,4 +1,4 @@
-//! The vehicle as a rigid body: motor commands in, pose, twist and felt acceleration out.
+//! The vehicle as a rigid body: motor commands in, pose, twist and specific force out.
 //!
 //! Runge-Kutta of fourth order, 800 turns a second, world frame z up. Forces: four rotors (lagged,
 //! see [`crate::motor`]), gravity, linear and quadratic drag against the wind, gyroscopic torque
@@ -136,7 +136,7 @@ impl Airframe {
         self.soundness[motor] = share.clamp(0.0, 1.0);
     }
 
-    /// Returns what an ideal accelerometer felt on average over the last tick. [m/s^2, body]
+    /// Returns the mean specific force over the last tick, as an ideal accelerometer measures it. [m/s^2, body]
     pub fn specific_force_body_mps2(&self) -> DVec3 {
         self.specific_force_body
     }

@@ -41,7 +41,7 @@ pub struct SimArgs {
     /// MAVLink over a pseudo-terminal that is made and linked to by this name.
     #[arg(long, value_name = "PATH", conflicts_with = "serial")]
     pub pty: Option<PathBuf>,
-    /// Baud rate of --serial and --pty; bytes leave no faster than it says.
+    /// Baud rate of --serial and --pty; bytes leave no faster than that.
     #[arg(long, value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
     pub baud: u32,
     /// Where the motion capture sends Vicon's UDP object stream; nowhere if absent.

@@ -31,7 +31,7 @@ const TICK_S: f64 = 1.0 / TICK_HZ as f64;
 /// Physics steps a tick: 800 Hz.
 const STEPS: u32 = 2;
 
-/// An autopilot that reboots says nothing for this long. [s]
+/// An autopilot that reboots is silent for this long. [s]
 const BOOT_S: f64 = 1.5;
 
 /// The lab as it stands at the start.

@@ -20,7 +20,7 @@ use crazyflie_lib::{Crazyflie, NoTocCache};
 use tokio::time::timeout;
 
 use self::estimate::pose_packet;
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 mod estimate;
 
@@ -77,7 +77,7 @@ async fn send(args: &CrazyflieArgs) -> Result<()> {
     }
     let period = LogPeriod::from_millis((1000 / args.rate).max(10)).context("its log's period")?;
     let stream = block.start(period).await.context("its log")?;
-    tell(format!("{} -> {} as '{}'", args.uri, args.to, args.object));
+    print_line(format!("{} -> {} as '{}'", args.uri, args.to, args.object));
     let mut seq = 0_u64;
     loop {
         let data = match timeout(SILENCE, stream.next()).await {

@@ -10,7 +10,7 @@ use vizflyt_runtime::args::LogArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::plugins;
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
 #[derive(Args, Debug)]
@@ -64,6 +64,6 @@ pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
     if let Some(path) = &args.report {
         report.write(path)?;
     }
-    tell(report.summary());
+    print_line(report.summary());
     Ok(if report.outcome == OutcomeKind::Finished { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

@@ -10,39 +10,40 @@ use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_runtime::airframe::{
-    ArenaFence, Difference, Room, Version, Visit, compare, parse_params, shipped,
+    AutopilotFence, Difference, FenceCylinder, ParamSession, Version, compare, parse_params,
+    shipped,
 };
 use vizflyt_runtime::link::same;
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;
 
 /// Finds what is wrong before it flies.
 #[derive(Args, Debug)]
 pub(crate) struct DoctorArgs {
     #[command(subcommand)]
-    what: What,
+    check: CheckCommand,
 }
 
 #[derive(Subcommand, Debug)]
-enum What {
+enum CheckCommand {
     /// Compares the autopilot's parameters with this airframe's, and names what is dangerous in a room.
     ///
     /// Ends with status 1 if something is.
     #[command(after_help = "Examples:
-  vizflyt doctor vehicle                              what jetson.toml says, or udpin:0.0.0.0:14550
+  vizflyt doctor vehicle                              the autopilot of jetson.toml, or udpin:0.0.0.0:14550
   vizflyt doctor vehicle --mavlink serial:/dev/ttyACM0
   vizflyt doctor vehicle --arena arena.toml --apply   with the fence that the arena's room asks for
   vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply")]
     Vehicle(VehicleArgs),
-    /// Says where the vehicle is and which way it points, in plain words, while somebody lifts it, pushes it
-    /// forward and turns it left; then which setting is wrong.
+    /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
+    /// turns it left; then which setting is wrong.
     ///
     /// Ends with status 1 if one is.
     #[command(after_help = "Examples:
   vizflyt doctor localization arena.toml
   vizflyt doctor localization --pose natnet:239.255.42.99:1511,up=y
-  vizflyt doctor localization --pose vicon --watch        only says where it is, until Ctrl-C")]
+  vizflyt doctor localization --pose vicon --watch        only prints the pose, until Ctrl-C")]
     Localization(localization::LocalizationArgs),
 }
 
@@ -72,28 +73,28 @@ fn metres(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| format!("'{text}': give metres, from 1 to 100"))
 }
 
-/// Looks.
+/// Runs the checks.
 pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
-    let args = match &args.what {
-        What::Vehicle(args) => args,
-        What::Localization(args) => return localization::run(args),
+    let args = match &args.check {
+        CheckCommand::Vehicle(args) => args,
+        CheckCommand::Localization(args) => return localization::run(args),
     };
-    let mut visit = args.autopilot.visit()?;
-    let has = visit.read()?;
-    let version = visit.version()?;
-    let firmware = visit.link().firmware().map_or("ArduCopter".to_owned(), |f| f.to_string());
-    let system = visit.link().system().unwrap_or(0);
-    tell(format!("vehicle  system {system}, {firmware}, {} parameters", has.len()));
+    let mut session = args.autopilot.open_session()?;
+    let has = session.read()?;
+    let version = session.version()?;
+    let firmware = session.link().firmware().map_or("ArduCopter".to_owned(), |f| f.to_string());
+    let system = session.link().system().unwrap_or(0);
+    print_line(format!("vehicle  system {system}, {firmware}, {} parameters", has.len()));
     let wanted = args.wanted(version)?;
     let arena = args.arena()?;
-    let room = args.room(arena.as_ref());
-    let found = compare(version, &wanted, room, |name| has.get(name).copied());
+    let cylinder = args.fence_cylinder(arena.as_ref());
+    let found = compare(version, &wanted, cylinder, |name| has.get(name).copied());
     for difference in &found {
-        tell(line(difference));
+        print_line(line(difference));
     }
     let dangers = found.iter().filter(|f| f.danger.is_some()).count();
     let wrong: Vec<_> = found.iter().filter(|f| f.has.is_some()).collect();
-    tell(format!(
+    print_line(format!(
         "{dangers} dangerous, {} other differences, {} parameters that it does not have",
         wrong.len() - dangers,
         found.len() - wrong.len()
@@ -101,30 +102,30 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     if !args.apply {
         if !wrong.is_empty() || arena.is_some() {
             let also = if arena.is_some() { ", and the arena's polygons" } else { "" };
-            tell(format!("`--apply` writes the right values{also}"));
+            print_line(format!("`--apply` writes the right values{also}"));
         }
         return Ok(status(dangers));
     }
     let values: Vec<_> = wrong.iter().map(|f| (f.name.clone(), f.right)).collect();
     let mut failed = 0;
-    for ((name, right), (_, now)) in values.iter().zip(visit.write(&values)?) {
+    for ((name, right), (_, now)) in values.iter().zip(session.write(&values)?) {
         match now {
-            Some(now) if same(now, *right) => tell(format!("written  {name} = {right}")),
+            Some(now) if same(now, *right) => print_line(format!("written  {name} = {right}")),
             Some(now) => {
                 failed += 1;
-                tell(format!("FAILED   {name} is still {now}, not {right}"));
+                print_line(format!("FAILED   {name} is still {now}, not {right}"));
             }
             None => {
                 failed += 1;
-                tell(format!("FAILED   {name}: no answer"));
+                print_line(format!("FAILED   {name}: no answer"));
             }
         }
     }
     if let Some(arena) = &arena {
-        failed += usize::from(!upload_fence(&mut visit, arena)?);
+        failed += usize::from(!upload_fence(&mut session, arena)?);
     }
     if !values.is_empty() {
-        tell("restart the autopilot, then look again: some parameters appear only then");
+        print_line("restart the autopilot, then look again: some parameters appear only then");
     }
     Ok(status(failed))
 }
@@ -137,23 +138,23 @@ impl VehicleArgs {
         Ok(Some(ArenaConfig::parse(&text).with_context(|| path.display().to_string())?))
     }
 
-    fn room(&self, arena: Option<&ArenaConfig>) -> Room {
-        let given = Room { ceiling_m: self.ceiling, floor_m: None, radius_m: self.radius };
+    fn fence_cylinder(&self, arena: Option<&ArenaConfig>) -> FenceCylinder {
+        let given = FenceCylinder { ceiling_m: self.ceiling, floor_m: None, radius_m: self.radius };
         let Some(arena) = arena else { return given };
-        let room = Room::of(&arena.info(), arena.spawn.position_m).unwrap_or(given);
-        if let Room {
+        let cylinder = FenceCylinder::of(&arena.info(), arena.spawn.position_m).unwrap_or(given);
+        if let FenceCylinder {
             ceiling_m: Some(ceiling_m),
             floor_m: Some(floor_m),
             radius_m: Some(radius_m),
-        } = room
+        } = cylinder
         {
-            tell(format!(
+            print_line(format!(
                 "arena    {}: a fence from {floor_m:.2} m to {ceiling_m:.2} m over the start, {radius_m:.2} m \
                  around it, and polygons",
                 arena.name
             ));
         }
-        room
+        cylinder
     }
 
     fn wanted(&self, version: Version) -> Result<BTreeMap<String, f64>> {
@@ -166,19 +167,19 @@ impl VehicleArgs {
     }
 }
 
-/// Has the autopilot keep the arena's polygons; returns whether it does.
-fn upload_fence(visit: &mut Visit, arena: &ArenaConfig) -> Result<bool> {
+/// Uploads the arena's polygons; returns whether the autopilot accepts them.
+fn upload_fence(session: &mut ParamSession, arena: &ArenaConfig) -> Result<bool> {
     let info = arena.info();
-    let fence = ArenaFence::of(&info);
-    if let Some(gap) = fence.gap(&info) {
-        tell(format!("note     {gap}"));
+    let fence = AutopilotFence::of(&info);
+    if let Some(warning) = fence.warning(&info) {
+        print_line(format!("note     {warning}"));
     }
-    let kept = visit.upload_fence(fence.polygons)?;
-    match &kept {
-        Ok(polygons) => tell(format!("written  fence of {polygons} polygons")),
-        Err(why) => tell(format!("FAILED   fence of polygons: {why}")),
+    let accepted = session.upload_fence(fence.polygons)?;
+    match &accepted {
+        Ok(polygons) => print_line(format!("written  fence of {polygons} polygons")),
+        Err(why) => print_line(format!("FAILED   fence of polygons: {why}")),
     }
-    Ok(kept.is_ok())
+    Ok(accepted.is_ok())
 }
 
 fn status(wrong: usize) -> ExitCode {

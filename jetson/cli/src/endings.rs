@@ -1,5 +1,5 @@
-//! One flight has one end: whatever happens in it, and however late each side hears of the other, runtime,
-//! server, page, crash card, leaderboard and grade say the same of it.
+//! One flight has one end: whatever happens in it, and however late each side receives the other's events,
+//! runtime, server, page, crash card, leaderboard and grade report the same.
 
 use glam::{DQuat, DVec3};
 use proptest::prelude::*;
@@ -11,19 +11,19 @@ use vizflyt_protocol::flight_end::{
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::messages::{Event, EventKind, Limits, OutcomeKind, Setpoint, bounded};
 use vizflyt_protocol::time::{HostTime, ServerTime};
-use vizflyt_runtime::flight::{Flight, FlightSettings, Input, LinkView};
-use vizflyt_runtime::guard::Fix;
+use vizflyt_runtime::flight::{Flight, FlightInput, FlightSettings, LinkView};
+use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::link::{Goal, LinkEvent};
 use vizflyt_server::flights::events::Origin;
 use vizflyt_server::flights::vehicle::VehicleFlight;
 
-/// What the server's clock is ahead of the runtime's. [ns]
+/// Lead of the server's clock over the runtime's. [ns]
 const AHEAD_NS: u64 = 5_000_000_000;
 const TICK_NS: u64 = 20_000_000;
 
-/// Something that happens, and who sees it first.
+/// An occurrence in flight, as the side that observes it first sees it.
 #[derive(Clone, Debug)]
-enum Happening {
+enum Occurrence {
     Server(Box<EventKind>),
     PluginFails,
     PluginLands,
@@ -63,9 +63,9 @@ fn touch() -> EventKind {
     EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps })
 }
 
-/// What a flight came to, by each who says so.
+/// The end of a flight, as each side reports it.
 #[derive(Debug)]
-struct Said {
+struct ReportedEnds {
     runtime: EndReason,
     server: Option<EndReason>,
     /// Written to leaderboard and crash card.
@@ -73,7 +73,7 @@ struct Said {
     grade: EndReason,
 }
 
-impl Said {
+impl ReportedEnds {
     #[track_caller]
     fn check(&self, expected: &EndReason) {
         assert_eq!(&self.runtime, expected, "{self:?}");
@@ -83,9 +83,9 @@ impl Said {
     }
 }
 
-/// Flies until the vehicle has landed and both sides have heard all; `delays_ms` are to the runtime and
+/// Flies until the vehicle has landed and both sides have received every event; `delays_ms` are to the runtime and
 /// to the server.
-fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
+fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds {
     let arena = arena();
     let info = arena.info();
     let vehicle = VehicleFlight::new(0, "vizflyt", info.clone());
@@ -93,16 +93,16 @@ fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
     let stamp = |ns: u64| ServerTime::from_ns(ns + AHEAD_NS);
     let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: Limits::NONE };
     let mut flight = Flight::new(settings, at(0));
-    flight.handle(at(0), Input::Arena(Box::new(info)));
-    flight.handle(at(0), Input::PluginReady);
+    flight.handle(at(0), FlightInput::Arena(Box::new(info)));
+    flight.handle(at(0), FlightInput::PluginReady);
     let mut link =
         LinkView { connected: true, armed: false, mode: 0, took_off: false, ready_to_arm: Ok(()) };
     let (mut p_m, mut answer, mut poses) = (DVec3::new(1.0, 2.0, 0.0), Some(Setpoint::Hold), true);
     // Each is a nanosecond off the runtime's ticks, and apart from the others.
-    let mut waiting: Vec<(u64, Happening)> = happenings
+    let mut waiting: Vec<(u64, Occurrence)> = occurrences
         .iter()
         .zip(1..)
-        .map(|((ms, happening), k)| (ms * 1_000_000 + k, happening.clone()))
+        .map(|((ms, occurrence), k)| (ms * 1_000_000 + k, occurrence.clone()))
         .collect();
     waiting.sort_by_key(|(ns, _)| *ns);
     let mut waiting = std::collections::VecDeque::from(waiting);
@@ -111,45 +111,46 @@ fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
     for tick in 1..2000 {
         let now = tick * TICK_NS;
         while waiting.front().is_some_and(|(ns, _)| *ns <= now) {
-            let Some((ns, happening)) = waiting.pop_front() else { break };
-            match happening {
-                Happening::Server(kind) => {
+            let Some((ns, occurrence)) = waiting.pop_front() else { break };
+            match occurrence {
+                Occurrence::Server(kind) => {
                     let event = Event { stamp: stamp(ns), kind: *kind, text: bounded("") };
                     vehicle.log(Origin::Server, event.clone());
                     all.push(event.clone());
                     to_runtime.push((ns + delays_ms.0 * 1_000_000, event));
                 }
-                Happening::PluginFails => {
+                Occurrence::PluginFails => {
                     let fault = PluginFault::ended("exit status 3");
-                    flight.handle(at(now), Input::PluginFailed(fault));
+                    flight.handle(at(now), FlightInput::PluginFailed(fault));
                 }
-                Happening::PluginLands => answer = Some(Setpoint::Land),
-                Happening::PluginHangs => answer = None,
-                Happening::PilotTakesOver if link.armed => link.mode = CopterMode::Loiter as u32,
-                Happening::PilotTakesOver => {}
-                Happening::AutopilotRestarts => {
-                    flight.handle(at(now), Input::Link(LinkEvent::Rebooted));
+                Occurrence::PluginLands => answer = Some(Setpoint::Land),
+                Occurrence::PluginHangs => answer = None,
+                Occurrence::PilotTakesOver if link.armed => link.mode = CopterMode::Loiter as u32,
+                Occurrence::PilotTakesOver => {}
+                Occurrence::AutopilotRestarts => {
+                    flight.handle(at(now), FlightInput::Link(LinkEvent::Rebooted));
                 }
-                Happening::AutopilotRefuses => {
-                    flight.handle(at(now), Input::Link(LinkEvent::Refused("denied".into())));
+                Occurrence::AutopilotRefuses => {
+                    flight.handle(at(now), FlightInput::Link(LinkEvent::Refused("denied".into())));
                 }
-                Happening::Interrupt => flight.handle(at(now), Input::Interrupt),
-                Happening::PosesStop => poses = false,
+                Occurrence::Interrupt => flight.handle(at(now), FlightInput::Interrupt),
+                Occurrence::PosesStop => poses = false,
             }
         }
         let due = |(ns, _): &mut (u64, Event)| *ns <= now;
         for (_, event) in to_runtime.extract_if(.., due) {
             let seen = at(event.stamp.as_ns() - AHEAD_NS);
-            flight.handle(at(now), Input::Server(event, seen));
+            flight.handle(at(now), FlightInput::Server(event, seen));
         }
         if poses {
             let rotation = DQuat::IDENTITY;
-            let fix = Fix { stamp: at(now), p_world_m: p_m, v_world_mps: DVec3::ZERO, rotation };
-            flight.handle(at(now), Input::Pose(fix));
+            let (stamp, v_world_mps) = (at(now), DVec3::ZERO);
+            let motion = VehicleMotion { stamp, p_world_m: p_m, v_world_mps, rotation };
+            flight.handle(at(now), FlightInput::Pose(motion));
         }
-        flight.handle(at(now), Input::ImagePublished { seq: tick });
+        flight.handle(at(now), FlightInput::ImagePublished { seq: tick });
         if let Some(setpoint) = answer.clone() {
-            flight.handle(at(now), Input::Answered { seq: tick, setpoint: Some(setpoint) });
+            flight.handle(at(now), FlightInput::Replied { seq: tick, setpoint: Some(setpoint) });
         }
         let orders = flight.tick(at(now), &link);
         match orders.goal {
@@ -174,14 +175,14 @@ fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
         for (_, event) in to_server.extract_if(.., due) {
             vehicle.log(Origin::Page, event);
         }
-        let heard = waiting.is_empty() && to_runtime.is_empty() && to_server.is_empty();
-        if heard && flight.outcome().is_some() {
+        let all_received = waiting.is_empty() && to_runtime.is_empty() && to_server.is_empty();
+        if all_received && flight.outcome().is_some() {
             break;
         }
     }
     all.sort_by_key(|event| event.stamp);
     let verdict = vehicle.verdict(&arena);
-    Said {
+    ReportedEnds {
         runtime: flight.outcome().expect("it has landed").clone(),
         server: vehicle.flight().end.reason().cloned(),
         verdict: (verdict.outcome, verdict.reason),
@@ -189,7 +190,7 @@ fn fly(happenings: &[(u64, Happening)], delays_ms: (u64, u64)) -> Said {
     }
 }
 
-fn happening() -> impl Strategy<Value = Happening> {
+fn occurrence() -> impl Strategy<Value = Occurrence> {
     let breach = FenceBreach {
         p_world_m: DVec3::ONE,
         margin_m: -0.1,
@@ -210,16 +211,16 @@ fn happening() -> impl Strategy<Value = Happening> {
         EventKind::Note,
     ]);
     prop_oneof![
-        3 => server.prop_map(|kind| Happening::Server(Box::new(kind))),
+        3 => server.prop_map(|kind| Occurrence::Server(Box::new(kind))),
         2 => prop::sample::select(vec![
-            Happening::PluginFails,
-            Happening::PluginLands,
-            Happening::PluginHangs,
-            Happening::PilotTakesOver,
-            Happening::AutopilotRestarts,
-            Happening::AutopilotRefuses,
-            Happening::Interrupt,
-            Happening::PosesStop,
+            Occurrence::PluginFails,
+            Occurrence::PluginLands,
+            Occurrence::PluginHangs,
+            Occurrence::PilotTakesOver,
+            Occurrence::AutopilotRestarts,
+            Occurrence::AutopilotRefuses,
+            Occurrence::Interrupt,
+            Occurrence::PosesStop,
         ]),
     ]
 }
@@ -228,36 +229,36 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(128))]
 
     #[test]
-    fn everyone_says_the_same_of_any_flight(
-        happenings in prop::collection::vec((2500..11_000_u64, happening()), 0..6),
+    fn all_sides_report_the_same_end_of_any_flight(
+        occurrences in prop::collection::vec((2500..11_000_u64, occurrence()), 0..6),
         delays_ms in (0..400_u64, 0..400_u64),
     ) {
-        let said = fly(&happenings, delays_ms);
-        said.check(&said.runtime);
+        let reported = fly(&occurrences, delays_ms);
+        reported.check(&reported.runtime);
     }
 }
 
 #[test]
-fn a_touch_on_the_way_down_after_land_was_pressed_is_a_landing_to_everyone() {
+fn all_sides_report_a_landing_for_a_touch_after_land_was_pressed() {
     for delays_ms in [(0, 0), (300, 10), (10, 300)] {
         let landed = [(4000, EventKind::Land), (4600, touch())];
-        let said =
-            fly(&landed.map(|(ms, kind)| (ms, Happening::Server(Box::new(kind)))), delays_ms);
-        said.check(&EndReason::LandButton);
+        let reported =
+            fly(&landed.map(|(ms, kind)| (ms, Occurrence::Server(Box::new(kind)))), delays_ms);
+        reported.check(&EndReason::LandButton);
         // Pressed too late, it is a collision.
         let touched = [(4001, EventKind::Land), (4000, touch())];
-        let said =
-            fly(&touched.map(|(ms, kind)| (ms, Happening::Server(Box::new(kind)))), delays_ms);
-        assert_eq!(said.runtime.outcome(), OutcomeKind::Collided);
-        said.check(&said.runtime);
+        let reported =
+            fly(&touched.map(|(ms, kind)| (ms, Occurrence::Server(Box::new(kind)))), delays_ms);
+        assert_eq!(reported.runtime.outcome(), OutcomeKind::Collided);
+        reported.check(&reported.runtime);
     }
 }
 
 #[test]
-fn after_a_landing_for_a_lost_pose_no_time_runs_out_to_anyone() {
-    let late = Happening::Server(Box::new(EventKind::TimeLimit { limit_s: 9.0 }));
-    let said = fly(&[(4000, Happening::PosesStop), (20_000, late)], (20, 20));
-    assert!(matches!(said.runtime, EndReason::PoseLost { .. }), "{said:?}");
-    assert!(said.runtime.is_failure() && said.runtime.title() == "Pose lost");
-    said.check(&said.runtime);
+fn no_side_reports_a_time_limit_after_a_landing_for_a_lost_pose() {
+    let late = Occurrence::Server(Box::new(EventKind::TimeLimit { limit_s: 9.0 }));
+    let reported = fly(&[(4000, Occurrence::PosesStop), (20_000, late)], (20, 20));
+    assert!(matches!(reported.runtime, EndReason::PoseLost { .. }), "{reported:?}");
+    assert!(reported.runtime.is_failure() && reported.runtime.title() == "Pose lost");
+    reported.check(&reported.runtime);
 }

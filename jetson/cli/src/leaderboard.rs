@@ -12,7 +12,7 @@ use vizflyt_server::flights::leaderboard::{
 };
 
 use crate::grade::{self, Grade};
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Shows who flew what how well, keeps the teams, and exports the runs.
 #[derive(Args, Debug)]
@@ -134,13 +134,13 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
             let Some(path) = &export.out else {
                 let mut csv = Vec::new();
                 write_csv(&runs, &mut csv)?;
-                tell(String::from_utf8_lossy(&csv).trim_end());
+                print_line(String::from_utf8_lossy(&csv).trim_end());
                 return Ok(());
             };
             let file = std::fs::File::create(path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
             write_csv(&runs, file).with_context(|| format!("cannot write {}", path.display()))?;
-            tell(format!("{} runs written to {}", runs.len(), path.display()));
+            print_line(format!("{} runs written to {}", runs.len(), path.display()));
             Ok(())
         }
     }
@@ -150,22 +150,26 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
     match command {
         TeamCommand::Add { name } => {
             let token = board.add_team(name).await?;
-            tell(format!("team '{name}' is added; its token, shown this once:"));
-            tell(&token);
-            tell("the team checks in with it on the server's page before it flies");
+            print_line(format!("team '{name}' is added; its token, shown this once:"));
+            print_line(&token);
+            print_line("the team checks in with it on the server's page before it flies");
         }
         TeamCommand::List => {
             let teams = board.teams().await?;
             if teams.is_empty() {
-                tell("no teams yet; add one with `vizflyt leaderboard team add NAME`");
+                print_line("no teams yet; add one with `vizflyt leaderboard team add NAME`");
             }
             for team in teams {
-                tell(format!("{}{}", team.name, if team.retired { " (retired)" } else { "" }));
+                print_line(format!(
+                    "{}{}",
+                    team.name,
+                    if team.retired { " (retired)" } else { "" }
+                ));
             }
         }
         TeamCommand::Retire { name } => {
             board.retire_team(name).await?;
-            tell(format!("the token of team '{name}' opens nothing any more; its runs stay"));
+            print_line(format!("the token of team '{name}' opens nothing any more; its runs stay"));
         }
     }
     Ok(())
@@ -208,7 +212,7 @@ fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
 
 async fn add(board: &Leaderboard, entry: &GradeEntry, document: &str) -> Result<()> {
     board.add_grade(entry, document).await?;
-    tell(format!("the grade {} of team '{}' is added", entry.hash, entry.team));
+    print_line(format!("the grade {} of team '{}' is added", entry.hash, entry.team));
     let boards = grade_boards(&board.grades().await?);
     let own = boards.iter().filter(|board| {
         (&board.project, &board.level, &board.conditions)
@@ -219,11 +223,11 @@ async fn add(board: &Leaderboard, entry: &GradeEntry, document: &str) -> Result<
 }
 
 fn show_grades(board: &GradeBoard) {
-    tell(format!("{} {}, graded: {}", board.project, board.level, board.conditions));
+    print_line(format!("{} {}, graded: {}", board.project, board.level, board.conditions));
     for place in &board.places {
         let best = &place.best;
         let median = best.median_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.2} s"));
-        tell(format!(
+        print_line(format!(
             "{:>4}  {:<24} {:>5.2} of {:<2} stages  {:>3} of {:<3} finished  {median:>10}  {:>3} grades",
             place.rank,
             best.team,
@@ -253,11 +257,11 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
                 })
             })
             .collect();
-        tell(serde_json::json!({ "courses": boards, "graded": graded, "runs": runs }));
+        print_line(serde_json::json!({ "courses": boards, "graded": graded, "runs": runs }));
         return Ok(());
     }
     if courses.is_empty() && graded.is_empty() {
-        tell(match &args.course {
+        print_line(match &args.course {
             Some(course) => format!("nobody has flown '{course}' yet"),
             None => format!("nobody has flown yet; runs are kept in {}", board.database()),
         });
@@ -266,15 +270,15 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
         for attempt in [Attempt::Official, Attempt::Practice] {
             let places = standings(&runs, &course, attempt);
             if !places.is_empty() {
-                tell(format!("{course}, {}", attempt.name()));
+                print_line(format!("{course}, {}", attempt.name()));
                 for place in &places {
-                    tell(line(place));
+                    print_line(line(place));
                 }
             }
         }
         let of_course: Vec<&Run> = runs.iter().filter(|run| run.course == course).collect();
         let nobodys = of_course.iter().filter(|run| run.team.is_none()).count();
-        tell(format!(
+        print_line(format!(
             "{course}: {} runs, {nobodys} of them by nobody who had checked in",
             of_course.len()
         ));

@@ -107,12 +107,12 @@ fn main() -> ExitCode {
         Ok(Some(cli)) => cli,
         Ok(None) => return ExitCode::SUCCESS,
         Err(error) => {
-            terminal::tell_error(format_args!("error: {error:#}"));
+            terminal::print_error(format_args!("error: {error:#}"));
             return ExitCode::from(2);
         }
     };
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
-        // These tell their own story; logs would drown it.
+        // These print their own report; logs would bury it.
         Command::Demo(_) | Command::Fly(_) | Command::Replay(_) | Command::Grade(_) => {
             "warn".to_owned()
         }
@@ -121,13 +121,13 @@ fn main() -> ExitCode {
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
-        terminal::tell_error(format_args!("error: --log-level '{log_level}': {error}"));
+        terminal::print_error(format_args!("error: --log-level '{log_level}': {error}"));
         return ExitCode::from(2);
     }
     match run(cli.command, &log_level) {
         Ok(code) => code,
         Err(error) => {
-            terminal::tell_error(format_args!("error: {error:#}"));
+            terminal::print_error(format_args!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }
@@ -144,7 +144,7 @@ fn command_line() -> Result<Option<Cli>> {
     if let Some(("serve", serve)) = matches.subcommand()
         && serve.get_flag("print_config")
     {
-        terminal::tell(settings::to_toml(serve).trim_end());
+        terminal::print_line(settings::to_toml(serve).trim_end());
         return Ok(None);
     }
     Ok(Some(Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())))

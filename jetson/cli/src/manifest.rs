@@ -65,7 +65,7 @@ impl PluginManifest {
     /// Reads the file in `folder`; `None` if there is none. Paths are returned from here.
     ///
     /// # Errors
-    /// A file that cannot be read, or says what it must not.
+    /// A file that cannot be read, or has settings that it must not have.
     pub(crate) fn read(folder: &Path) -> Result<Option<Self>> {
         let file = folder.join(FILE);
         if !file.is_file() {
@@ -83,7 +83,7 @@ impl PluginManifest {
         Ok(Some(manifest))
     }
 
-    /// Returns what `text` says.
+    /// Parses the manifest in `text`.
     fn parse(text: &str) -> Result<Self> {
         Ok(vizflyt_toml::parse(text)?)
     }

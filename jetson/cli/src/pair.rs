@@ -11,7 +11,7 @@ use vizflyt_runtime::args::ServerAddress;
 use vizflyt_trust::KeysFolder;
 use vizflyt_trust::pairing::Code;
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Pairs this computer with a render server, once.
 ///
@@ -53,11 +53,11 @@ pub(crate) fn run(args: &PairArgs) -> Result<ExitCode> {
             names.join(", ")
         }
     };
-    tell(format!(
+    print_line(format!(
         "paired with {}: this computer, '{name}', may fly and watch {right}",
         args.server
     ));
-    tell(format!("identity of the server: {}", paired.server));
+    print_line(format!("identity of the server: {}", paired.server));
     Ok(ExitCode::SUCCESS)
 }
 

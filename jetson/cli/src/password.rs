@@ -9,7 +9,7 @@ use clap::Args;
 use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
 use vizflyt_trust::KeysFolder;
 
-use crate::terminal::{tell, tell_error};
+use crate::terminal::{print_error, print_line};
 
 /// Sets the password by which the instructor logs in on the server's page.
 ///
@@ -38,7 +38,7 @@ pub(crate) fn run(args: &PasswordArgs) -> Result<ExitCode> {
         line()?
     };
     vizflyt_server::web::set_password(&folder, &password)?;
-    tell("the password is set: log in on the page, at the bottom");
+    print_line("the password is set: log in on the page, at the bottom");
     Ok(ExitCode::SUCCESS)
 }
 
@@ -49,7 +49,7 @@ fn ask(question: &str) -> Result<String> {
     let hidden = Hidden::begin()?;
     let password = line();
     drop(hidden);
-    tell_error("");
+    print_error("");
     password
 }
 

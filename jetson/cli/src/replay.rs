@@ -12,20 +12,22 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
 use vizflyt_runtime::log::read::{LogReader, RecordedFlight, RecordedPoses};
-use vizflyt_runtime::replay::{Differs, FlownPlugin, Plan, ReplayOptions, ReplayReport, replay};
+use vizflyt_runtime::replay::{
+    Differs, FlownPlugin, ReplayOptions, ReplayPlan, ReplayReport, replay,
+};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
 use crate::fly::plugin::Plugin;
 use crate::plugins;
-use crate::terminal::{tell, tell_error};
+use crate::terminal::{print_error, print_line};
 
-/// Feeds a flight's recorded images to the plugin again, or to another one, and says where the
+/// Feeds a flight's recorded images to the plugin again, or to another one, and reports where the
 /// answers differ.
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt replay flights/2026-11-21T04-09-21.123Z.mcap
   vizflyt replay flight.mcap --plugin ./my_plugin.py    how another plugin had answered
-  vizflyt replay flight.mcap --answers one.jsonl        all answers; cmp tells two runs apart
+  vizflyt replay flight.mcap --answers one.jsonl        all answers; cmp compares two runs
   vizflyt replay flight.mcap --poses-to 127.0.0.1:51002 only its poses, to `vizflyt serve ARENA --pose json`
 
 Nothing is flown. Status 0 if the plugin came to the end of the log, 1 if it failed.")]
@@ -74,10 +76,10 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     if let Some(to) = args.poses_to {
         let sent =
             poses::send(RecordedPoses::new(reader), to, &args.object).with_context(cannot)?;
-        tell(format!("{sent} poses sent to {to}"));
+        print_line(format!("{sent} poses sent to {to}"));
         return Ok(ExitCode::SUCCESS);
     }
-    let plan = Plan::read(RecordedFlight::new(reader, false)).with_context(cannot)?;
+    let plan = ReplayPlan::read(RecordedFlight::new(reader, false)).with_context(cannot)?;
     let (plugin, arguments) = match &args.plugin {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),
         None => flown(plan.flown.as_ref())?,
@@ -99,11 +101,11 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         answers: args.answers.clone().unwrap_or_else(|| args.log.with_extension("answers.jsonl")),
     };
     if plan.is_cut {
-        tell("the log ends early: its runtime was killed, or its disk was full");
+        print_line("the log ends early: its runtime was killed, or its disk was full");
     }
     let line = &mut |stream: Stream, text: &str| match stream {
-        Stream::Stdout => tell(format!("plugin: {text}")),
-        Stream::Stderr => tell_error(format_args!("plugin: {text}")),
+        Stream::Stdout => print_line(format!("plugin: {text}")),
+        Stream::Stderr => print_error(format_args!("plugin: {text}")),
     };
     let report = replay(&args.log, plan, &options, line).with_context(cannot)?;
     if let Some(path) = &args.report {
@@ -115,9 +117,9 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
             .with_context(|| format!("report {} cannot be written", path.display()))?;
     }
     for sentence in sentences(&report) {
-        tell(sentence);
+        print_line(sentence);
     }
-    tell(format!("answers: {}", options.answers.display()));
+    print_line(format!("answers: {}", options.answers.display()));
     Ok(if report.plugin_failed.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
@@ -125,7 +127,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
 /// log of somebody else must not choose what this computer runs.
 fn flown(flown: Option<&FlownPlugin>) -> Result<(OsString, Vec<OsString>)> {
     let Some(FlownPlugin { plugin, arguments }) = flown else {
-        bail!("the log does not say which plugin flew; name one with --plugin");
+        bail!("the log does not name the plugin that flew; give one with --plugin");
     };
     let here = std::env::current_dir().and_then(|folder| folder.canonicalize());
     let is_here = |path: &Path| {

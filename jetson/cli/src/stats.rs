@@ -129,7 +129,7 @@ fn get(url: &str, path: &str) -> Result<(u16, String)> {
     write!(stream, "GET {path} HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n")
         .with_context(no_server)?;
     let mut answer = String::new();
-    stream.take(MOST_BYTES).read_to_string(&mut answer).with_context(no_server)?;
+    stream.take(MAX_BYTES).read_to_string(&mut answer).with_context(no_server)?;
     let (head, body) = answer.split_once("\r\n\r\n").with_context(no_server)?;
     let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
     Ok((status.with_context(no_server)?, body.to_owned()))
@@ -179,10 +179,10 @@ fn of_pose(pose: &PoseQuality) -> String {
         };
         let _ = writeln!(
             out,
-            "  {name}: {:.0} Hz, {:.1} ms late, {} believed, {} rejected{}",
+            "  {name}: {:.0} Hz, {:.1} ms late, {} accepted, {} rejected{}",
             source.rate_hz,
             source.latency_ms,
-            source.believed,
+            source.accepted,
             source.rejected.total(),
             of_rejects(&source.rejected)
         );
@@ -203,12 +203,12 @@ fn of_rejects(rejects: &Rejects) -> String {
         (frozen, "frozen"),
         (disagree, "against another source"),
     ];
-    let said: Vec<_> = reasons
+    let counted: Vec<_> = reasons
         .iter()
         .filter(|(count, _)| *count > 0)
         .map(|(count, reason)| format!("{count} {reason}"))
         .collect();
-    if said.is_empty() { String::new() } else { format!(" ({})", said.join(", ")) }
+    if counted.is_empty() { String::new() } else { format!(" ({})", counted.join(", ")) }
 }
 
 fn of_timing(timing: &Timing, with_arrivals: bool) -> String {
@@ -300,9 +300,9 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
 }
 
 fn of_account(camera: &str, account: &Delivery) -> String {
-    let Delivery { drawn, delivered, under_way, skipped } = account;
+    let Delivery { rendered, delivered, under_way, skipped } = account;
     let mut out = format!(
-        "  {camera:<9} {drawn} drawn, {delivered} delivered, {} skipped, {under_way} under way\n",
+        "  {camera:<9} {rendered} rendered, {delivered} delivered, {} skipped, {under_way} under way\n",
         skipped.sum()
     );
     for ((name, count), (_, why)) in skipped.each().into_iter().zip(REASONS) {
@@ -347,7 +347,7 @@ fn print(text: &str) {
 
 /// Why images are skipped, in the order of their way.
 const REASONS: [(&str, &str); 8] = [
-    ("no_room", "a newer one was drawn before encoder and transport had room"),
+    ("no_room", "a newer one was rendered before encoder and transport had room"),
     ("failed", "could not be encoded"),
     ("late", "given up on the way: past its deadline, or the connection broke"),
     ("stale", "a newer one was there already"),
@@ -361,7 +361,7 @@ const BAR: f32 = 40.0;
 /// A server on the other side of the lab answers within this.
 const PATIENCE: Duration = Duration::from_secs(3);
 /// An answer has some 10 KB. [bytes]
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {
@@ -420,8 +420,9 @@ mod tests {
     #[test]
     fn an_account_names_its_reasons() {
         let skipped = Skipped { no_room: 3, overrun: 2, ..Skipped::default() };
-        let text = of_account("front", &Delivery { drawn: 9, delivered: 4, under_way: 0, skipped });
-        assert!(text.contains("9 drawn, 4 delivered, 5 skipped, 0 under way"), "{text}");
+        let text =
+            of_account("front", &Delivery { rendered: 9, delivered: 4, under_way: 0, skipped });
+        assert!(text.contains("9 rendered, 4 delivered, 5 skipped, 0 under way"), "{text}");
         assert!(text.contains("3 no_room") && text.contains("2 overrun"), "{text}");
         assert!(!text.contains("stale"), "{text}");
         let names = Skipped::default().each().map(|(name, _)| name);

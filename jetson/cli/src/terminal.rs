@@ -6,25 +6,19 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
-
-/// Prints a line for people; unlike `println!` it does not panic when nobody reads any more.
-pub(crate) fn tell(line: impl std::fmt::Display) {
-    use std::io::Write;
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
-}
+pub(crate) use vizflyt_runtime::control::print_line;
 
 /// Prints a line on standard error; unlike `eprintln!` it does not panic when nobody reads any more.
-pub(crate) fn tell_error(line: impl std::fmt::Display) {
+pub(crate) fn print_error(line: impl std::fmt::Display) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
 
-/// Prints a line for people, written as for `println!`; see [`tell`].
-macro_rules! say {
-    ($($text:tt)*) => { $crate::terminal::tell(format_args!($($text)*)) };
+/// Prints a line for people, formatted as by `println!`; see [`print_line`].
+macro_rules! print_fmt {
+    ($($text:tt)*) => { $crate::terminal::print_line(format_args!($($text)*)) };
 }
-pub(crate) use say;
+pub(crate) use print_fmt;
 
 /// Calls `notice` on SIGINT and SIGTERM, until it returns false.
 pub(crate) fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result<()> {
@@ -86,6 +80,6 @@ pub(crate) fn open_browser(url: &str) {
         .stderr(quiet())
         .spawn();
     if spawned.is_err() {
-        tell("            open it in a browser");
+        print_line("            open it in a browser");
     }
 }

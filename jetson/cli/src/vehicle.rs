@@ -1,4 +1,4 @@
-//! `vizflyt vehicle`: what is set up on the vehicle once. And how commands find an autopilot.
+//! `vizflyt vehicle`: sets up the vehicle once; and sessions with its autopilot for other commands.
 
 use std::fs::File;
 use std::io::Read;
@@ -8,13 +8,13 @@ use std::process::ExitCode;
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use vizflyt_protocol::mavlink::SigningKey;
-use vizflyt_runtime::airframe::Visit;
+use vizflyt_runtime::airframe::ParamSession;
 use vizflyt_runtime::args::link_settings;
 use vizflyt_runtime::config::{self, JetsonConfig};
 use vizflyt_runtime::link::port::MavlinkAddress;
 use vizflyt_runtime::link::{LinkSettings, SigningFile};
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Which autopilot.
 #[derive(Args, Debug)]
@@ -30,21 +30,21 @@ pub(crate) struct AutopilotArgs {
 }
 
 impl AutopilotArgs {
-    /// Finds the autopilot, and greets it.
-    pub(crate) fn visit(&self) -> Result<Visit> {
-        self.visit_with(|_| {})
+    /// Opens a session with the autopilot.
+    pub(crate) fn open_session(&self) -> Result<ParamSession> {
+        self.open_session_with(|_| {})
     }
 
-    /// As [`Self::visit`], over a wire that nobody else has.
-    fn visit_by_wire(&self) -> Result<Visit> {
-        self.visit_with(|settings| {
+    /// As [`Self::open_session`], over a wire that nobody else uses: unsigned packets are accepted.
+    fn open_wired_session(&self) -> Result<ParamSession> {
+        self.open_session_with(|settings| {
             if let Some(signing) = &mut settings.signing {
-                signing.trusts_wire = true;
+                signing.accepts_unsigned = true;
             }
         })
     }
 
-    fn visit_with(&self, change: impl Fn(&mut LinkSettings)) -> Result<Visit> {
+    fn open_session_with(&self, change: impl Fn(&mut LinkSettings)) -> Result<ParamSession> {
         let file = self.config.clone().or_else(config::find);
         let vehicle = match file {
             Some(file) => JetsonConfig::read(&file)?.vehicle,
@@ -58,7 +58,7 @@ impl AutopilotArgs {
         let name = vehicle.name.as_deref().unwrap_or("vizflyt");
         let mut settings = link_settings(&vehicle, name)?;
         change(&mut settings);
-        Ok(Visit::open(&address, settings)?)
+        Ok(ParamSession::open(&address, settings)?)
     }
 }
 
@@ -66,11 +66,11 @@ impl AutopilotArgs {
 #[derive(Args, Debug)]
 pub(crate) struct VehicleArgs {
     #[command(subcommand)]
-    what: What,
+    command: VehicleCommand,
 }
 
 #[derive(Subcommand, Debug)]
-enum What {
+enum VehicleCommand {
     /// Makes a key for MAVLink 2 signing, and gives it to the autopilot; from then on each refuses what
     /// the other did not sign.
     ///
@@ -99,10 +99,10 @@ struct SignArgs {
 
 /// Sets up.
 pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
-    let What::Sign(args) = &args.what;
+    let VehicleCommand::Sign(args) = &args.command;
     let Some(path) = &args.key else {
-        args.autopilot.visit_by_wire()?.sign(None)?;
-        tell("signing is off; take `signing_key` out of jetson.toml");
+        args.autopilot.open_wired_session()?.sign(None)?;
+        print_line("signing is off; take `signing_key` out of jetson.toml");
         return Ok(ExitCode::SUCCESS);
     };
     let file = SigningFile::new(path);
@@ -112,12 +112,15 @@ pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
             .and_then(|mut random| random.read_exact(&mut bytes))
             .context("no random numbers for a key")?;
         file.create(&SigningKey::new(bytes))?;
-        tell(format!("key      {} (new; only you can read it)", path.display()));
+        print_line(format!("key      {} (new; only you can read it)", path.display()));
     }
     let signing = file.open()?;
-    let mut visit = args.autopilot.visit_by_wire()?;
-    visit.sign(Some(&signing))?;
-    tell(format!("given    to system {}", visit.link().system().unwrap_or(0)));
-    tell(format!("now set signing_key = \"{}\" under [vehicle] in jetson.toml", path.display()));
+    let mut session = args.autopilot.open_wired_session()?;
+    session.sign(Some(&signing))?;
+    print_line(format!("given    to system {}", session.link().system().unwrap_or(0)));
+    print_line(format!(
+        "now set signing_key = \"{}\" under [vehicle] in jetson.toml",
+        path.display()
+    ));
     Ok(ExitCode::SUCCESS)
 }

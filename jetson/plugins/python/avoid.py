@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Flies to the goal through a forest, by a potential field on the depth image.
 
-The twin of the Rust plugin in jetson/plugins/avoid, step by step and with the same numbers; each says
+The twin of the Rust plugin in jetson/plugins/avoid, step by step and with the same numbers; each states
 there where it comes from. What happens at every image:
 
 1. scan: depth pixels become obstacle points in the world; floor and sky do not;
@@ -172,7 +172,7 @@ class View:
 
     def sees_through(self, points_m):
         """Returns for each point (N, 3) whether the image shows something well behind it. Pixels
-        without a return say nothing: they are no proof of free space."""
+        without a return are ignored: they are no proof of free space."""
         k, (height, width) = self.k, self.depth_mm.shape
         p_cam_m = (points_m - self.origin_m) @ self.axes
         z_m = np.maximum(p_cam_m[:, 2], 1e-6)

@@ -1,4 +1,4 @@
-//! Arguments from Python: whatever converts to numbers is taken, and what does not is told in one
+//! Arguments from Python: whatever converts to numbers is taken, and what does not is reported in one
 //! sentence that names it.
 
 use numpy::{AllowTypeChange, PyArray1, PyArrayDyn, PyArrayLikeDyn, PyUntypedArrayMethods};

@@ -91,7 +91,7 @@ impl PluginEnd {
     /// Sends the answer to one observation.
     #[pyo3(signature = (seq, entered_ns, setpoint))]
     fn answer(&self, seq: u64, entered_ns: u64, setpoint: Option<Setpoint>) -> PyResult<()> {
-        self.send(&FromPlugin::Answer {
+        self.send(&FromPlugin::Reply {
             seq,
             entered: HostTime::from_ns(entered_ns),
             returned: host_now(),

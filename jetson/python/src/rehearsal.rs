@@ -27,8 +27,8 @@ pub(crate) struct Rehearsal {
     _offer: Option<Offer>,
 }
 
-/// What a plugin said: (what, number of the observation, setpoint or words, entered [ns]).
-type Said = (&'static str, u64, Py<PyAny>, u64);
+/// A message of a plugin: (kind, number of the observation, setpoint or text, entered [ns]).
+type PluginMessage = (&'static str, u64, Py<PyAny>, u64);
 
 #[pymethods]
 impl Rehearsal {
@@ -91,21 +91,21 @@ impl Rehearsal {
         self.end.publish(loan).map_err(|error| failed(&error))
     }
 
-    /// Waits for what the plugin says: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
-    /// ('failed', 0, reason, 0); None if it says nothing for so long. [s]
+    /// Waits for a message of the plugin: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
+    /// ('failed', 0, reason, 0); None if none comes within this time. [s]
     #[pyo3(signature = (timeout_s = 10.0))]
-    fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<Said>> {
+    fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<PluginMessage>> {
         let deadline =
             std::time::Instant::now() + Duration::try_from_secs_f64(timeout_s).unwrap_or_default();
         loop {
             if let Some(message) = self.end.receive().map_err(|error| failed(&error))? {
-                return said(py, message).map(Some);
+                return to_python(py, message).map(Some);
             }
             let left = deadline.saturating_duration_since(std::time::Instant::now());
             if left.is_zero() {
                 return Ok(None);
             }
-            // Short, so that Ctrl-C is heard, and the plugin that we live.
+            // Short, so that Ctrl-C is noticed, and the plugin gets heartbeats.
             let wait = left.min(Duration::from_millis(200));
             py.detach(|| self.end.wait(wait)).map_err(|error| failed(&error))?;
             py.check_signals()?;
@@ -120,10 +120,10 @@ impl Rehearsal {
     }
 }
 
-fn said(py: Python<'_>, message: FromPlugin) -> PyResult<Said> {
+fn to_python(py: Python<'_>, message: FromPlugin) -> PyResult<PluginMessage> {
     Ok(match message {
         FromPlugin::Ready { name } => ("ready", 0, name.into_pyobject(py)?.into_any().unbind(), 0),
-        FromPlugin::Answer { seq, entered, setpoint, .. } => {
+        FromPlugin::Reply { seq, entered, setpoint, .. } => {
             let setpoint = match setpoint {
                 Some(setpoint) => Py::new(py, Setpoint(setpoint))?.into_any(),
                 None => py.None(),

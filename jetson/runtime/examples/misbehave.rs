@@ -164,7 +164,7 @@ fn go_round(how: &str, service: &str) -> ExitCode {
         let Ok(Some(_)) = end.observation() else { continue };
         images += u64::from(flying);
         let (entered, returned, setpoint) = (host_now(), host_now(), Some(Setpoint::Hold));
-        let answer = FromPlugin::Answer { seq: images, entered, returned, setpoint };
+        let answer = FromPlugin::Reply { seq: images, entered, returned, setpoint };
         if images <= GOOD_IMAGES {
             end.send(&answer).expect("the runtime reads");
             continue;

@@ -24,7 +24,7 @@ use crate::log::{LogSettings, LoggedImages};
     after_help = "Example:\n  vizflyt fly ./target/release/my-plugin --server 192.168.10.2:4433 \\\n    \
                         --mavlink udpin:0.0.0.0:14550 --vehicle vizflyt\n\n\
                         The vehicle lands when the plugin ends, hangs or is killed, when poses stop,\n\
-                        and on Ctrl-C. What the command line leaves out, jetson.toml says."
+                        and on Ctrl-C. Options that are not given come from jetson.toml."
 )]
 pub struct FlyArgs {
     /// The plugin; started as a child process [default: `path` of [plugin] in jetson.toml]
@@ -87,7 +87,7 @@ pub struct FlyArgs {
     /// Reads no jetson.toml
     #[arg(long)]
     pub no_config: bool,
-    /// What `jetson.toml` says; [`FlyArgs::settle`] reads it.
+    /// The settings of `jetson.toml`; [`FlyArgs::settle`] reads them.
     #[arg(skip)]
     pub jetson: JetsonConfig,
 }
@@ -198,7 +198,7 @@ impl From<OsString> for LogOption {
 }
 
 impl LogArgs {
-    /// Returns the options for another `vizflyt fly` that is to log as this one was told to.
+    /// Returns the options for another `vizflyt fly` that is to log as this one does.
     pub fn to_command_line(&self) -> Vec<OsString> {
         let pairs = [
             ("--log", self.option.as_ref().map(LogOption::text)),
@@ -208,7 +208,7 @@ impl LogArgs {
         given.flatten().collect()
     }
 
-    /// Returns where and how to log; what the command line leaves out is as `config` says.
+    /// Returns where and how to log; options that the command line leaves out come from `config`.
     ///
     /// # Errors
     /// If two folders are given.
@@ -239,7 +239,7 @@ impl LogArgs {
 /// # Errors
 /// If the key for signing cannot be used.
 pub fn link_settings(vehicle: &VehicleConfig, name: &str) -> anyhow::Result<LinkSettings> {
-    // No name of the computer: the vehicle's own says enough.
+    // Without the computer's name: the vehicle's own suffices.
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let key = vehicle.signing_key.as_deref();
     Ok(LinkSettings {
@@ -269,7 +269,7 @@ impl ServerArgs {
     /// Returns where the server is.
     ///
     /// # Errors
-    /// If nobody said.
+    /// The default.
     pub fn address(&self) -> anyhow::Result<&ServerAddress> {
         self.at.as_ref().ok_or_else(|| {
             anyhow::anyhow!("no server is known; give --server, or [server] in jetson.toml")
@@ -397,7 +397,7 @@ mod tests {
         check(&["--log=full"], "", "flights", LoggedImages::Full);
         check(&["--log", "reduced", "--log-dir=d"], full, "d", LoggedImages::Reduced);
         check(&["--log=some/folder"], full, "some/folder", LoggedImages::Full);
-        // A child that is told again does the same.
+        // A child with the same options does the same.
         let line = ["fly", "x", "--log=full", "--log-dir=d"];
         let args = Program::try_parse_from(line).unwrap().fly.log;
         assert_eq!(args.to_command_line(), ["--log", "full", "--log-dir", "d"]);

@@ -128,7 +128,7 @@ impl From<LimitsConfig> for Limits {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PluginConfig {
-    /// What `vizflyt fly` flies if it is not told: a folder, a `.py`, a program, a built-in's name.
+    /// The default plugin of `vizflyt fly`: a folder, a `.py`, a program, a built-in's name.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
     /// Memory; without it half of this computer's. [MB]
@@ -246,7 +246,7 @@ pub enum ConfigError {
 }
 
 impl JetsonConfig {
-    /// Returns what `text` says, if it can work.
+    /// Parses and checks the settings in `text`.
     ///
     /// # Errors
     /// [`ConfigError::Toml`] with line and column, [`ConfigError::Invalid`] with the key.
@@ -256,7 +256,7 @@ impl JetsonConfig {
         Ok(config)
     }
 
-    /// Returns what the file says. Paths in it are relative to its folder.
+    /// Reads the settings of a file. Paths in it are relative to its folder.
     ///
     /// # Errors
     /// As [`JetsonConfig::parse`], with the path; [`ConfigError::Unreadable`].

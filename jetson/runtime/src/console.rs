@@ -10,7 +10,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::{FlightPhase, Telemetry};
 
-/// What the status line tells.
+/// The content of the status line.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Status {
     /// Where the flight stands.
@@ -55,7 +55,7 @@ impl Status {
     }
 }
 
-/// Returns the phase in a word or two.
+/// Returns the name of the phase.
 pub fn phase_name(phase: FlightPhase) -> &'static str {
     match phase {
         FlightPhase::Connecting => "connecting",
@@ -151,7 +151,7 @@ impl Console {
     }
 }
 
-/// A plugin's words must not move the cursor, or set the terminal's title.
+/// A plugin's output must not move the cursor, or set the terminal's title.
 fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() && c != '\t' { '\u{fffd}' } else { c }).collect()
 }

@@ -119,7 +119,7 @@ pub fn fly_command(
     let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
     report.log = flown.log.path().map(|path| path.display().to_string());
     drop(flown.log);
-    // The stream ends when the server has heard every event, and says goodbye on its way out.
+    // The stream ends when the server has acknowledged every event, and closes the connection.
     outbox.close();
     let _ = tokio.block_on(async { tokio::time::timeout(GOODBYE, talk).await });
     tokio.shutdown_background();
@@ -212,7 +212,7 @@ fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<ControlInput>) -> s
 fn tell_stream(sender: SyncSender<ControlInput>) -> impl Fn(StreamEvent) -> bool + Send + Sync {
     move |event| {
         let is_pose = matches!(event, StreamEvent::Pose(..));
-        // Poses are many and stale soon. An event that finds no room is told again by the server.
+        // Poses are many and stale soon. An event that finds no room is sent again by the server.
         let taken = sender.try_send(ControlInput::Stream(event)).is_ok();
         if !taken && !is_pose {
             tracing::error!("the control loop is stalled");
@@ -224,19 +224,19 @@ fn tell_stream(sender: SyncSender<ControlInput>) -> impl Fn(StreamEvent) -> bool
 fn print_ready(json: bool, server: &ServerAddress, mavlink: &str, log: &FlightLog) {
     let log = log.path().map(|path| path.display().to_string());
     if json {
-        print_line(&json!({"ready": "runtime", "mavlink": mavlink, "log": log}).to_string());
+        print_line(json!({"ready": "runtime", "mavlink": mavlink, "log": log}));
     } else {
-        print_line(&format!("waiting for server {server} and an autopilot on {mavlink}"));
+        print_line(format!("waiting for server {server} and an autopilot on {mavlink}"));
     }
 }
 
 fn print_outcome(args: &FlyArgs, report: &Report) {
     if args.json {
-        print_line(&json!({"report": report}).to_string());
+        print_line(json!({"report": report}));
         return;
     }
-    print_line(&format!("{}: {}", report.outcome.name(), report.reason));
-    print_line(&format!(
+    print_line(format!("{}: {}", report.outcome.name(), report.reason));
+    print_line(format!(
         "{:.1} s in the air, {} images at {:.1} Hz, age {:.1} ms (p99 {:.1}), {} setpoints",
         report.seconds,
         report.images_delivered,
@@ -246,6 +246,6 @@ fn print_outcome(args: &FlyArgs, report: &Report) {
         report.setpoints_sent
     ));
     if let Some(log) = &report.log {
-        print_line(&format!("log: {log}"));
+        print_line(format!("log: {log}"));
     }
 }

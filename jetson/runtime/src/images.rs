@@ -13,8 +13,8 @@
 //! is declared ready has a size. An image whose observation is published before it is finished is
 //! decoded again, from the pieces that have come, into the next one.
 //!
-//! Cameras may change while flying: each image says itself how it was drawn, and the observation
-//! that holds it says so too. The plugin never sees an image with another one's intrinsics.
+//! Cameras may change while flying: each image carries the camera it was rendered with, and so does the
+//! observation that holds it. The plugin never sees an image with another one's intrinsics.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -104,7 +104,7 @@ impl UnderWay {
 }
 
 impl ImagePublisher {
-    /// Makes one for these cameras (at most 8); what an image says of its camera later counts more.
+    /// Makes one for these cameras (at most 8); an image's own description of its camera replaces them later.
     pub fn new(ipc: Arc<RuntimeEnd>, cameras: Vec<CameraInfo>, senses: SharedSenses) -> Self {
         Self {
             ipc,
@@ -124,15 +124,15 @@ impl ImagePublisher {
         Self { log, ..self }
     }
 
-    /// Runs until `stop` says so; `tell` is called before each observation is published.
+    /// Runs until `stop` returns true; `notify` is called before each observation is published.
     pub fn run(
         mut self,
         mailbox: &Mailbox,
         stop: impl Fn() -> bool,
-        mut tell: impl FnMut(Published),
+        mut notify: impl FnMut(Published),
     ) {
         while !stop() {
-            if let Err(error) = self.step(mailbox, Duration::from_millis(100), &mut tell) {
+            if let Err(error) = self.step(mailbox, Duration::from_millis(100), &mut notify) {
                 tracing::warn!("an image is not published: {error}");
             }
         }
@@ -147,7 +147,7 @@ impl ImagePublisher {
         &mut self,
         mailbox: &Mailbox,
         timeout: Duration,
-        tell: &mut impl FnMut(Published),
+        notify: &mut impl FnMut(Published),
     ) -> Result<bool, IpcError> {
         // An image that would end the observation under way waits until it has come whole.
         let may_begin = |header: &ImageHeader| {
@@ -157,8 +157,8 @@ impl ImagePublisher {
         let Some((camera, step)) = mailbox.next(timeout, may_begin) else { return Ok(false) };
         let result = match step {
             Step::Begin(arrival) => self.begin(camera, &arrival),
-            Step::Piece(piece) => self.piece(camera, piece, tell),
-            Step::End(whole) => self.end(camera, &whole, tell),
+            Step::Piece(piece) => self.piece(camera, piece, notify),
+            Step::End(whole) => self.end(camera, &whole, notify),
             Step::Drop => {
                 self.forget(camera);
                 Ok(())
@@ -201,21 +201,21 @@ impl ImagePublisher {
         &mut self,
         camera: usize,
         piece: Vec<u8>,
-        tell: &mut impl FnMut(Published),
+        notify: &mut impl FnMut(Published),
     ) -> Result<(), Fault> {
         if let Some(lane) = self.lanes.get_mut(camera) {
             lane.pieces.push(piece);
         }
-        self.place(camera, tell)
+        self.place(camera, notify)
     }
 
     fn end(
         &mut self,
         camera: usize,
         whole: &Whole,
-        tell: &mut impl FnMut(Published),
+        notify: &mut impl FnMut(Published),
     ) -> Result<(), Fault> {
-        self.place(camera, tell)?;
+        self.place(camera, notify)?;
         let (Some(lane), Some(under_way)) = (self.lanes.get_mut(camera), &mut self.under_way)
         else {
             return Ok(());
@@ -254,18 +254,18 @@ impl ImagePublisher {
             });
         }
         if under_way.there & under_way.expected == under_way.expected {
-            self.publish(tell)?;
+            self.publish(notify)?;
         }
         Ok(())
     }
 
     /// Decodes what has come of a camera's image, and was not, into the observation under way.
-    fn place(&mut self, camera: usize, tell: &mut impl FnMut(Published)) -> Result<(), Fault> {
+    fn place(&mut self, camera: usize, notify: &mut impl FnMut(Published)) -> Result<(), Fault> {
         let image = self.lanes.get(camera).and_then(|lane| lane.image);
         let Some(arrival) = image else { return Ok(()) };
         let (tick, together) = (arrival.header.seq.get(), arrival.header.together.get());
         if self.under_way.as_ref().is_some_and(|under_way| under_way.is_over(tick, bit(camera))) {
-            self.publish(tell)?;
+            self.publish(notify)?;
         }
         self.follow(camera, &arrival)?;
         if self.under_way.is_none() {
@@ -285,7 +285,7 @@ impl ImagePublisher {
         Ok(lane.decode(&mut ImageMut { rgb, depth_mm, ..ImageMut::default() })?)
     }
 
-    /// Takes over how the camera was when the image was drawn. Another size lays out memory anew,
+    /// Takes over the camera that the image was rendered with. Another size re-allocates memory,
     /// and what this tick's observation has already moves there.
     fn follow(&mut self, index: usize, image: &Arrival) -> Result<(), Fault> {
         let camera = &mut self.cameras[index];
@@ -310,7 +310,7 @@ impl ImagePublisher {
         Ok(())
     }
 
-    fn publish(&mut self, tell: &mut impl FnMut(Published)) -> Result<(), IpcError> {
+    fn publish(&mut self, notify: &mut impl FnMut(Published)) -> Result<(), IpcError> {
         let Some(mut done) = self.under_way.take() else { return Ok(()) };
         if done.there == 0 {
             return Ok(());
@@ -321,7 +321,7 @@ impl ImagePublisher {
         let logged =
             self.log.as_ref().map(|log| (log, observation_head(done.memory.bytes()).to_vec()));
         // Told first: the answer must not overtake it.
-        tell(done.published.clone());
+        notify(done.published.clone());
         let published_at = host_now();
         self.ipc.publish(done.memory)?;
         if let Some((log, head)) = logged {

@@ -17,7 +17,6 @@
 //! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight.
 
 pub mod airframe;
-mod answers;
 pub mod args;
 pub mod clock;
 pub mod companion;
@@ -32,6 +31,7 @@ pub mod link;
 pub mod lockstep;
 pub mod log;
 pub mod replay;
+mod replies;
 pub mod report;
 pub mod stats;
 pub mod steering;

@@ -112,7 +112,7 @@ impl Report {
 }
 
 /// Returns the most memory this process has held (`VmHWM`); `None` where the system does not
-/// tell. [MB]
+/// report it. [MB]
 pub fn peak_rss_mb() -> Option<f64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;

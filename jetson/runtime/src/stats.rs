@@ -16,7 +16,7 @@ type Images = Bounded<Stamps, MAX_CAMERAS>;
 
 /// One answered image.
 #[derive(Clone, Copy, Debug)]
-struct Answered {
+struct AnsweredImage {
     at: HostTime,
     age_ms: f32,
     plugin_ms: f32,
@@ -46,7 +46,7 @@ struct Unsent {
 pub struct ImageTimes {
     pending: VecDeque<Pending>,
     unsent: Option<Unsent>,
-    recent: VecDeque<Answered>,
+    recent: VecDeque<AnsweredImage>,
     waterfalls: Waterfalls,
     ages: Histogram,
     plugin: Histogram,
@@ -107,7 +107,7 @@ impl ImageTimes {
         self.returned_at = returned;
         self.first_at.get_or_insert(entered);
         self.last_at = Some(entered);
-        self.recent.push_back(Answered {
+        self.recent.push_back(AnsweredImage {
             at: entered,
             age_ms: age_ms as f32,
             plugin_ms: plugin_ms as f32,
@@ -129,7 +129,7 @@ impl ImageTimes {
         while self.recent.front().is_some_and(|image| now.seconds_since(image.at) > 1.0) {
             self.recent.pop_front();
         }
-        let quantile = |q: f64, of: fn(&Answered) -> f32| {
+        let quantile = |q: f64, of: fn(&AnsweredImage) -> f32| {
             let mut values: Vec<f32> = self.recent.iter().map(of).collect();
             values.sort_by(f32::total_cmp);
             let rank = (q * values.len() as f64).ceil() as usize;
@@ -145,7 +145,7 @@ impl ImageTimes {
         }
     }
 
-    /// Returns the regular report of times at `now`; `arrived` says what became of images before
+    /// Returns the regular report of times at `now`; `arrived` is what became of images before
     /// they reached shared memory, by camera.
     pub fn timing(&self, now: HostTime, clock: Option<ClockState>, arrived: &[Arrivals]) -> Timing {
         let (waterfall, intervals) = self.waterfalls.recent(now);
@@ -160,7 +160,7 @@ impl ImageTimes {
         Timing { seconds, waterfall, intervals, clock, cameras: self.arrivals(arrived) }
     }
 
-    /// Returns what became of images, by camera: what is known here, added to what `before` says
+    /// Returns what became of images, by camera: what is known here, added to `before`
     /// of those that did not reach shared memory.
     pub fn arrivals(&self, before: &[Arrivals]) -> Bounded<Arrivals, MAX_CAMERAS> {
         let join = |(before, own): (&Arrivals, &Arrivals)| Arrivals {

@@ -1,55 +1,55 @@
-//! When setpoints leave: at once when the plugin has answered, else 50 times a second.
+//! When setpoints leave: at once when the plugin has replied, else 50 times a second.
 //!
-//! With a fixed 50 Hz an answer waited up to 20 ms for its turn, 10 on average: as much as an
+//! With a fixed 50 Hz a reply waited up to 20 ms for its turn, 10 on average: as much as an
 //! image takes from pose to plugin. Now it leaves as soon as it is there, but no sooner than
 //! 5 ms after the one before: two images in a burst are two setpoints, and 200 a second are 13 kB/s,
 //! which a serial link of 230 400 baud carries beside the poses; the usual 60 images a second are
-//! 4 kB/s. Without answers the guard still speaks every 20 ms, as its deadlines and ArduCopter's
+//! 4 kB/s. Without replies the guard still sends every 20 ms, as its deadlines and ArduCopter's
 //! time-out (3 s) want it. The guard takes the time between two ticks
 //! as it is, so its limits hold at any rhythm.
 
 use vizflyt_protocol::time::HostTime;
 
-/// Least time between two setpoints. [s]
-const LEAST_S: f64 = 0.005;
-/// Longest. [s]
-const MOST_S: f64 = 0.020;
+/// Minimum time between two setpoints. [s]
+const MIN_PERIOD_S: f64 = 0.005;
+/// Maximum time between two setpoints. [s]
+const MAX_PERIOD_S: f64 = 0.020;
 
 /// The rhythm of setpoints.
 #[derive(Clone, Copy, Debug)]
 pub struct Steering {
     last: HostTime,
-    answer_waits: bool,
+    reply_waits: bool,
 }
 
 impl Steering {
     /// Makes one that is due at `now`.
     pub fn new(now: HostTime) -> Self {
-        Self { last: now.plus_seconds(-MOST_S), answer_waits: false }
+        Self { last: now.plus_seconds(-MAX_PERIOD_S), reply_waits: false }
     }
 
-    /// Takes note that the plugin has answered with a setpoint.
-    pub fn answered(&mut self) {
-        self.answer_waits = true;
+    /// Takes note that the plugin has replied with a setpoint.
+    pub fn replied(&mut self) {
+        self.reply_waits = true;
     }
 
-    /// Takes note of something that must not wait for the rhythm, as the referee's verdict.
+    /// Takes note of something that must not wait for the rhythm, such as a decision of the referee.
     pub fn hurry(&mut self) {
-        self.answer_waits = true;
+        self.reply_waits = true;
     }
 
     /// Returns when the next setpoint shall leave.
     pub fn due(&self) -> HostTime {
-        self.last.plus_seconds(if self.answer_waits { LEAST_S } else { MOST_S })
+        self.last.plus_seconds(if self.reply_waits { MIN_PERIOD_S } else { MAX_PERIOD_S })
     }
 
-    /// Takes note that the guard has spoken at `now`.
+    /// Takes note that a setpoint was sent at `now`.
     pub fn done(&mut self, now: HostTime) {
         let due = self.due();
         // A timer's lateness does not add up; a stall is not made up for.
-        let is_rhythm = !self.answer_waits && now.seconds_since(due) < LEAST_S;
+        let is_rhythm = !self.reply_waits && now.seconds_since(due) < MIN_PERIOD_S;
         self.last = if is_rhythm { due } else { now };
-        self.answer_waits = false;
+        self.reply_waits = false;
     }
 }
 
@@ -57,23 +57,23 @@ impl Steering {
 mod tests {
     use super::*;
 
-    /// Runs a second in which the plugin answers every `answers_us`, and a timer is up to
-    /// `late_us` late; returns how many setpoints left, and the longest that an answer waited. [ms]
-    fn run(answers_us: u64, late_us: u64) -> (u32, f64) {
+    /// Runs a second in which the plugin replies every `replies_us`, and a timer is up to
+    /// `late_us` late; returns how many setpoints left, and the longest that a reply waited. [ms]
+    fn run(replies_us: u64, late_us: u64) -> (u32, f64) {
         let start = HostTime::from_ns(5_000_000_000);
         let mut steering = Steering::new(start);
-        let (mut sent, mut longest_ms, mut answer) = (0, 0.0_f64, None);
+        let (mut sent, mut longest_ms, mut reply) = (0, 0.0_f64, None);
         for us in 0..1_000_000_u64 {
             let now = start.plus_ns(us as i64 * 1000);
-            if answers_us > 0 && us % answers_us == answers_us - 1 {
-                steering.answered();
-                answer.get_or_insert(now);
+            if replies_us > 0 && us % replies_us == replies_us - 1 {
+                steering.replied();
+                reply.get_or_insert(now);
             }
             let late_ns = (us % (late_us + 1)) as i64 * 1000;
             if now >= steering.due().plus_ns(late_ns) {
                 steering.done(now);
                 sent += 1;
-                let waited_ms = answer.take().map_or(0.0, |at| now.seconds_since(at) * 1e3);
+                let waited_ms = reply.take().map_or(0.0, |at| now.seconds_since(at) * 1e3);
                 longest_ms = longest_ms.max(waited_ms);
             }
         }
@@ -81,17 +81,17 @@ mod tests {
     }
 
     #[test]
-    fn without_answers_it_is_50_hz_however_late_timers_are() {
+    fn sends_at_50_hz_without_replies_however_late_timers_are() {
         assert_eq!(run(0, 0), (50, 0.0));
         assert!(run(0, 3000).0 >= 49);
     }
 
     #[test]
-    fn answers_leave_at_once() {
-        // 60 Hz: each answer on its own, and nothing between them.
+    fn replies_leave_at_once() {
+        // 60 Hz: each reply on its own, and nothing between them.
         let (sent, longest_ms) = run(16_667, 0);
         assert!((60..=61).contains(&sent) && longest_ms == 0.0, "{sent}, {longest_ms} ms");
-        // 30 Hz: one more between two answers, which delays none.
+        // 30 Hz: one more between two replies, which delays none.
         let (sent, longest_ms) = run(33_333, 0);
         assert!((59..=61).contains(&sent) && longest_ms == 0.0, "{sent}, {longest_ms} ms");
     }

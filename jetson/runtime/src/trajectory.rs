@@ -1,6 +1,6 @@
 //! Follows a plugin's trajectory: where the reference is, and how it moves. Pure: the vehicle's
 //! place and `dt` in, a moving point out, at the guard's rate (50 to 200 Hz). The guard steers
-//! towards that point and has the last word.
+//! towards that point and keeps all limits.
 //!
 //! The reference waits for the vehicle: its pace falls with the distance between the two. So a
 //! vehicle that the guard slows down, or that starts away from the path, loses nothing of it.
@@ -32,15 +32,15 @@ pub struct Start {
 /// Up to this far behind, the reference keeps its pace: what a vehicle lags at 3 m/s. [m]
 const FREE_LAG_M: f64 = 0.5;
 /// This far behind, it stands. [m]
-const MOST_LAG_M: f64 = 1.5;
+const MAX_LAG_M: f64 = 1.5;
 /// Share of the acceleration limit that waypoints are flown with; the rest is for corrections.
 const SHARE: f64 = 0.5;
 /// A corner may change the velocity by what this time and that acceleration allow. [s]
 const CORNER_S: f64 = 0.25;
 /// A path shorter than this has no direction. [m]
-const LEAST_M: f64 = 1e-6;
+const MIN_M: f64 = 1e-6;
 /// Slower than this, level, there is no direction of travel for the nose. [m/s]
-const LEAST_MPS: f64 = 0.05;
+const MIN_MPS: f64 = 0.05;
 
 /// Follows one trajectory. See the module.
 #[derive(Clone, Debug)]
@@ -86,7 +86,7 @@ impl Follower {
                     let to_m = origin_m + world_from_axes * point.p_m;
                     let way_m = to_m - from_m;
                     let length_m = way_m.length();
-                    (length_m > LEAST_M).then(|| {
+                    (length_m > MIN_M).then(|| {
                         let direction = way_m / length_m;
                         let leg = Leg { from_m, direction, length_m, speed_mps: point.speed_mps };
                         from_m = to_m;
@@ -120,7 +120,7 @@ impl Follower {
         dt_s: f64,
     ) -> Reference {
         let lag_m = (self.place().0 - p_world_m).length();
-        let pace = ((MOST_LAG_M - lag_m) / (MOST_LAG_M - FREE_LAG_M)).clamp(0.0, 1.0);
+        let pace = ((MAX_LAG_M - lag_m) / (MAX_LAG_M - FREE_LAG_M)).clamp(0.0, 1.0);
         match &mut self.progress {
             Progress::Legs { legs, at, way_m, speed_mps } => {
                 let acceleration_mps2 = SHARE * max_acceleration_mps2;
@@ -128,7 +128,7 @@ impl Follower {
                 *speed_mps = wanted_mps.min(*speed_mps + acceleration_mps2 * dt_s);
                 *way_m += *speed_mps * pace * dt_s;
                 while let Some(leg) = legs.get(*at)
-                    && *way_m >= leg.length_m - LEAST_M
+                    && *way_m >= leg.length_m - MIN_M
                 {
                     (*way_m, *at) = ((*way_m - leg.length_m).max(0.0), *at + 1);
                 }
@@ -146,7 +146,7 @@ impl Follower {
             }
         }
         let (p_world_m, v_world_mps) = self.place();
-        if v_world_mps.truncate().length() > LEAST_MPS {
+        if v_world_mps.truncate().length() > MIN_MPS {
             self.ahead = YawTarget::Angle(v_world_mps.y.atan2(v_world_mps.x));
         }
         let yaw = match self.trajectory.yaw {
@@ -195,7 +195,7 @@ fn most_mps(legs: &[Leg], way_m: f64, max_speed_mps: f64, acceleration_mps2: f64
         let corner_mps = legs.get(index + 1).map_or(0.0, |next| {
             // v turned by an angle changes by 2 v sin(angle / 2) = v |d1 - d2|.
             let turn = (next.direction - leg.direction).length();
-            next.speed_mps.min(acceleration_mps2 * CORNER_S / turn.max(LEAST_M))
+            next.speed_mps.min(acceleration_mps2 * CORNER_S / turn.max(MIN_M))
         });
         let braking_mps =
             (corner_mps * corner_mps + 2.0 * acceleration_mps2 * to_corner_m.max(0.0)).sqrt();

@@ -184,7 +184,7 @@ impl Waterfalls {
 
     /// Returns the figures of the whole flight.
     pub fn flight(&self) -> (Waterfall, Intervals) {
-        self.flight.told()
+        self.flight.report()
     }
 
     /// Returns the figures of the last [`RECENT_S`] seconds before `now`.
@@ -196,7 +196,7 @@ impl Waterfalls {
                 rows.merge(&second.rows);
             }
         }
-        rows.told()
+        rows.report()
     }
 
     fn count(&mut self, at: HostTime, add: impl Fn(&mut Rows)) {
@@ -229,7 +229,7 @@ impl Rows {
         self.out_of_bound += other.out_of_bound;
     }
 
-    fn told(&self) -> (Waterfall, Intervals) {
+    fn report(&self) -> (Waterfall, Intervals) {
         let waterfall = Waterfall {
             images: self.age.count(),
             answered: self.total.count(),
@@ -343,7 +343,7 @@ mod tests {
         }
         let (waterfall, _) = falls.flight();
         assert_eq!((waterfall.clamped, waterfall.out_of_bound), (1, 2));
-        assert!(waterfall.stages.send.p50 < 0.002, "the least that is told");
+        assert!(waterfall.stages.send.p50 < 0.002, "the smallest reported value");
     }
 
     proptest! {

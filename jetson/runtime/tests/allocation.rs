@@ -78,8 +78,8 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
         let trailer = ImageTrailer::new(len, stamp, stamp);
         mailbox.end(ticket, Some(Whole { trailer, received: host_now() }));
         let mut published = 0;
-        let mut tell = |_| published += 1;
-        while publisher.step(&mailbox, Duration::ZERO, &mut tell).unwrap() {}
+        let mut notify = |_| published += 1;
+        while publisher.step(&mailbox, Duration::ZERO, &mut notify).unwrap() {}
         published
     };
     let names = [bounded("front")];

@@ -19,7 +19,7 @@ fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
     let line = serde_json::json!({"text": "x".repeat(100_000)});
     let mut written = 0;
     let trouble = loop {
-        log.write(Channel::Asked, host_now(), &line);
+        log.write(Channel::Requested, host_now(), &line);
         written += 1;
         // A chunk at least each second; the limit is that of a test that hangs.
         assert!(written < 1_000_000, "the disk is never full");
@@ -30,7 +30,7 @@ fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
         }
     };
     // More records stop nobody.
-    log.write(Channel::Asked, host_now(), &line);
+    log.write(Channel::Requested, host_now(), &line);
     drop(log);
     let len = std::fs::metadata(&path).unwrap().len();
     assert!(len <= ROOM, "{len} bytes");

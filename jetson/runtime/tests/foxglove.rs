@@ -1,4 +1,4 @@
-//! A viewer as Foxglove is one: connects by WebSocket, is told of the channels, subscribes to one,
+//! A viewer as Foxglove is one: connects by WebSocket, receives the channels, subscribes to one,
 //! gets its messages. Written against the protocol (foxglove.sdk.v1), not against the library.
 
 use std::io::{Read, Write};
@@ -56,7 +56,7 @@ impl Viewer {
     }
 
     /// Sends a short text.
-    fn say(&mut self, message: &Value) {
+    fn send(&mut self, message: &Value) {
         let text = message.to_string();
         let len = u8::try_from(text.len()).ok().filter(|len| *len < 126).unwrap();
         // A client masks; by zeros, nothing changes.
@@ -84,13 +84,13 @@ fn a_viewer_sees_the_logs_channels_and_their_messages() {
     assert_eq!(find("/pose")["schemaName"], "foxglove.PoseInFrame");
     let asked = find("/setpoint/asked");
     assert_eq!(asked["encoding"], "json");
-    viewer.say(&json!({"op": "subscribe",
+    viewer.send(&json!({"op": "subscribe",
         "subscriptions": [{"id": 7, "channelId": asked["id"]}]}));
     // Whatever is logged before the subscription counts is not sent: go on until one comes.
     viewer.0.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
     let mut first = [0; 1];
     let body = loop {
-        log.write(Channel::Asked, host_now(), &json!({"seq": 12_345}));
+        log.write(Channel::Requested, host_now(), &json!({"seq": 12_345}));
         if viewer.0.peek(&mut first).is_ok() {
             viewer.0.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
             let (is_text, body) = viewer.read();

@@ -1,4 +1,4 @@
-//! The C interface. Types mirror `include/vizflyt.h` field by field; their meaning is said there.
+//! The C interface. Types mirror `include/vizflyt.h` field by field; their meaning is documented there.
 
 #![allow(unsafe_code, reason = "the C interface: pointers from the caller")]
 
@@ -94,7 +94,7 @@ impl From<&Volume> for VizflytVolume {
     }
 }
 
-/// What a plugin is told at the start.
+/// The description of the flight that a plugin gets at the start.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytArena {
@@ -166,7 +166,7 @@ pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
         return NOT_ATTACHED;
     }
     let code = vizflyt_sdk::run(CPlugin(callbacks));
-    // `ExitCode` tells no number.
+    // `ExitCode` does not give its number.
     [0, 1, 2, 101].into_iter().find(|&n| ExitCode::from(n) == code).unwrap_or(1).into()
 }
 

@@ -1,4 +1,4 @@
-//! The SDK for C and C++: `include/vizflyt.h` says how it is used, and is the contract.
+//! The SDK for C and C++: `include/vizflyt.h` documents its use, and is the contract.
 //!
 //! A C++ plugin links `libvizflyt_c.a` and gives [`vizflyt_run`] four callbacks. Each observation
 //! is handed over as it lies in shared memory, after the SDK has validated it: no pixel is copied.

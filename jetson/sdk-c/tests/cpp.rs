@@ -117,7 +117,7 @@ impl Rig {
             if let Some(message) = self.ipc.receive().unwrap() {
                 return message;
             }
-            assert!(Instant::now() < until, "the plugin says nothing");
+            assert!(Instant::now() < until, "the plugin sends nothing");
             self.ipc.wait(Duration::from_millis(50)).unwrap();
         }
     }
@@ -133,7 +133,7 @@ impl Rig {
             writer.image_ready(1, &cameras[1], ImageStamps::default());
         }
         self.ipc.publish(loan).unwrap();
-        let FromPlugin::Answer { seq, setpoint, .. } = self.next() else { panic!("no answer") };
+        let FromPlugin::Reply { seq, setpoint, .. } = self.next() else { panic!("no answer") };
         assert_eq!(seq, self.seq);
         setpoint
     }
@@ -152,11 +152,11 @@ fn a_cpp_plugin_attaches_sees_and_answers() {
     assert_eq!(rig.see(2000), ahead(0.5, YawTarget::Keep));
     assert_eq!(rig.see(900), ahead(0.0, YawTarget::Rate(0.5)));
     rig.ipc.send(&ToPlugin::Stop).unwrap();
-    let mut said = String::new();
-    std::io::Read::read_to_string(rig.child.stdout.as_mut().unwrap(), &mut said).unwrap();
+    let mut output = String::new();
+    std::io::Read::read_to_string(rig.child.stdout.as_mut().unwrap(), &mut output).unwrap();
     assert!(rig.child.wait().unwrap().success());
     assert_eq!(
-        said,
+        output,
         "flying in hall: floor at 0.25 m, 1 no-fly boxes, a map of 1, velocities allowed\nstopped after 3 images\n"
     );
 }

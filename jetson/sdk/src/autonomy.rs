@@ -4,7 +4,7 @@ use vizflyt_protocol::messages::{ArenaInfo, Event, Setpoint};
 
 use crate::observation::Observation;
 
-/// A plugin: it sees images and says where to fly.
+/// A plugin: receives images and returns setpoints.
 ///
 /// All methods are called from one thread, one at a time, in this order: `on_start` once, then
 /// `on_image` and `on_event` as they come, then `on_stop` once.

@@ -454,7 +454,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever a header says, a view stays within its bytes or is refused.
+        /// Whatever a header contains, a view stays within its bytes or is refused.
         #[test]
         fn poisoned_headers_never_reach_outside(at in 0usize..size_of::<ObservationHeader>(), value in any::<u8>()) {
             let mut buffer = ObservationBuffer::new(&[camera("front", 8, 6)]);

@@ -23,7 +23,7 @@ use crate::observation::Observation;
 /// Other arguments are left to the plugin.
 ///
 /// Returns 0 after a flight, 1 if the runtime vanished, 2 if there was none to attach to, 101
-/// after a panic in the plugin (which the runtime is told).
+/// after a panic in the plugin (which is reported to the runtime).
 pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
     let given = service_argument(std::env::args_os());
     let program = std::env::args().next().unwrap_or_default();
@@ -96,14 +96,14 @@ enum End {
 }
 
 fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> {
-    // `None` until the runtime said what the plugin flies in.
+    // `None` until the runtime has sent the arena.
     let mut names: Option<Vec<Name>> = None;
     let mut imu_had = HostTime::ZERO;
-    let mut heard = Instant::now();
+    let mut received_at = Instant::now();
     loop {
         if end.wait(RUNTIME_GONE_AFTER / 4)? {
-            heard = Instant::now();
-        } else if heard.elapsed() > RUNTIME_GONE_AFTER {
+            received_at = Instant::now();
+        } else if received_at.elapsed() > RUNTIME_GONE_AFTER {
             plugin.on_stop();
             return Ok(End::RuntimeGone);
         }
@@ -129,7 +129,7 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
         let setpoint = plugin.on_image(&observation.with_imu_after(imu_had));
         imu_had = observation.newest_imu().unwrap_or(imu_had);
         let seq = observation.seq();
-        end.send(&FromPlugin::Answer { seq, entered, returned: host_now(), setpoint })?;
+        end.send(&FromPlugin::Reply { seq, entered, returned: host_now(), setpoint })?;
     }
 }
 

@@ -28,7 +28,7 @@ fn main() {
 fn accuracy(seconds: f64) {
     let head = |first: &str| {
         println!(
-            "\n| {first} | rms [mm] | p99 [mm] | attitude rms [deg] | located [%] | squared error / said |"
+            "\n| {first} | rms [mm] | p99 [mm] | attitude rms [deg] | located [%] | squared error / predicted |"
         );
         println!("|---|---|---|---|---|---|");
     };

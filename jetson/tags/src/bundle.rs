@@ -164,7 +164,7 @@ impl Bundle {
         let places = self.places();
         let mut normal = self.normal(&places);
         let mut damping = 1e-3;
-        for _ in 0..MOST_ROUNDS {
+        for _ in 0..MAX_ROUNDS {
             let Some((shared, views)) = normal.step(damping) else {
                 damping *= 10.0;
                 if damping > GIVE_UP {
@@ -350,7 +350,7 @@ fn columns(by_point: &[DVec2; 3], by_position: DMat3, by_turn: DMat3) -> [DVec2;
 }
 
 /// Far more than any problem that converges takes.
-const MOST_ROUNDS: usize = 100;
+const MAX_ROUNDS: usize = 100;
 /// Damping beyond which no step will help.
 const GIVE_UP: f64 = 1e9;
 /// What a corner behind its camera counts as. [px]

@@ -155,7 +155,7 @@ impl Calibrator {
         self.take(corners, ViewOutcome::NoBoard, is_stream)
     }
 
-    /// Takes corners on the board and in the image; `absent` says that there are too few.
+    /// Takes corners on the board and in the image; `absent` means that there are too few.
     fn take(
         &mut self,
         corners: Vec<(DVec2, DVec2)>,
@@ -163,7 +163,7 @@ impl Calibrator {
         is_stream: bool,
     ) -> ViewOutcome {
         let before = std::mem::replace(&mut self.last, corners.clone());
-        if self.views.len() >= MOST_VIEWS {
+        if self.views.len() >= MAX_VIEWS {
             return ViewOutcome::Enough;
         }
         if corners.len() < self.board.least_corners() {
@@ -197,8 +197,8 @@ impl Calibrator {
     /// Returns where to hold the board next, each a sentence; nothing if it has been everywhere.
     pub fn wanted(&self) -> Vec<String> {
         let mut wanted = self.coverage().wanted();
-        if self.views.len() < LEAST_VIEWS {
-            wanted.push(format!("show {} more views of the board", LEAST_VIEWS - self.views.len()));
+        if self.views.len() < MIN_VIEWS {
+            wanted.push(format!("show {} more views of the board", MIN_VIEWS - self.views.len()));
         }
         wanted
     }
@@ -206,11 +206,11 @@ impl Calibrator {
     /// Returns the lens.
     ///
     /// # Errors
-    /// [`Refused`] for a set of views that does not determine one well: it says what to add.
+    /// [`Refused`] for a set of views that does not determine one well: its message lists what to add.
     pub fn finish(&self, model: LensModel) -> Result<Calibrated, Refused> {
         let wanted = self.wanted();
         if !wanted.is_empty() {
-            let why = format!("{} views do not say enough of this lens", self.views.len());
+            let why = format!("{} views do not determine this lens", self.views.len());
             return Err(Refused { why, add: wanted });
         }
         let held_out = |i: usize| i % HELD_OUT == HELD_OUT - 1;
@@ -374,9 +374,9 @@ fn rotation(x: DVec3, y: DVec3) -> DQuat {
 }
 
 /// Views that a set must have: twelve used, three held back.
-const LEAST_VIEWS: usize = 15;
-/// More views cost time and say nothing new.
-const MOST_VIEWS: usize = 80;
+const MIN_VIEWS: usize = 15;
+/// More views cost time and add nothing.
+const MAX_VIEWS: usize = 80;
 /// One view in so many is held back.
 const HELD_OUT: usize = 5;
 /// Views are alike if their corners are nearer than this. [share of the image's width]

@@ -34,7 +34,7 @@ use crate::file::{self, FileError, PoseConfig, check_number, invalid};
 pub struct TagCamera {
     /// What people call it.
     pub name: String,
-    /// Where its images come from: `/dev/video0`, a folder, a video file; absent if the caller says.
+    /// Where its images come from: `/dev/video0`, a folder, a video file; absent if the caller gives it.
     pub source: Option<String>,
     /// Size, focal lengths, principal point, distortion.
     pub intrinsics: Intrinsics,
@@ -47,7 +47,7 @@ pub struct TagCamera {
 /// Where a camera is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Mounting {
-    /// Nobody said: calibrated, not yet surveyed.
+    /// Absent: calibrated, not yet surveyed.
     Unknown,
     /// Fixed in the room: `world_from_cam`.
     World(Pose<World, Cam>),

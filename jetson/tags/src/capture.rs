@@ -8,7 +8,7 @@
 //! | `-` | YUV4MPEG2 on standard input | `XSTAMP_NS=` of each image, else arrival |
 //! | `\| COMMAND` | YUV4MPEG2 that a shell command prints, as of GStreamer | likewise |
 //!
-//! Stamps say when the exposure was half over. Those of a camera and of programs are on the monotonic
+//! Stamps are the middle of the exposure. Those of a camera and of programs are on the monotonic
 //! clock of this computer; recorded ones count from anywhere.
 
 mod decode;

@@ -7,7 +7,7 @@
 //!       -> columns x rows of them, lower left first; or nothing
 //! ```
 //! The ring is that of Bennett and Lasenby 2014, "ChESS - Quick and robust detection of chess-board features", section
-//! 3. The board must be in the image as a whole: of a part nobody can say which it is. 50 ms for 1280 x 720.
+//! 3. The board must be in the image as a whole: a part of it is ambiguous. 50 ms for 1280 x 720.
 
 mod corners;
 mod grid;
@@ -73,9 +73,9 @@ impl Checkerboard {
 
     fn validate(&self) -> Result<(), FileError> {
         for (key, count) in [("columns", self.columns), ("rows", self.rows)] {
-            if !(LEAST_CORNERS..=MOST_CORNERS).contains(&count) {
+            if !(MIN_CORNERS..=MAX_CORNERS).contains(&count) {
                 let advice = format!(
-                    "count the corners where four squares meet: {LEAST_CORNERS} to {MOST_CORNERS}"
+                    "count the corners where four squares meet: {MIN_CORNERS} to {MAX_CORNERS}"
                 );
                 return Err(invalid(format!("checkerboard.{key}"), count, advice));
             }
@@ -106,17 +106,17 @@ impl Checkerboard {
         let found = corners::candidates(image);
         let grid = grid::grow(image, &found, self)?;
         let spacing_px = grid::least_spacing_px(&grid, self.columns as usize);
-        let half_px = (0.3 * spacing_px).clamp(2.0, MOST_HALF_PX) as i32;
+        let half_px = (0.3 * spacing_px).clamp(2.0, MAX_HALF_PX) as i32;
         grid.into_iter().map(|corner| corners::refine(image, corner, half_px)).collect()
     }
 }
 
 /// Fewer corners make no grid that can be distinguished from clutter.
-const LEAST_CORNERS: u32 = 3;
+const MIN_CORNERS: u32 = 3;
 /// More are smaller than any camera sees.
-const MOST_CORNERS: u32 = 100;
+const MAX_CORNERS: u32 = 100;
 /// A corner is measured within so many pixels to each side; further out the lens bends its edges. [px]
-const MOST_HALF_PX: f64 = 8.0;
+const MAX_HALF_PX: f64 = 8.0;
 
 #[cfg(test)]
 pub(crate) mod tests;

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::ffi;
 
-/// A set of tags that are told from one another by their cells.
+/// A set of tags that are distinguished by their cells.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize,
 )]

@@ -30,7 +30,7 @@ pub enum FileError {
     Invalid {
         /// Where in the file: `tags[1].size_m`.
         key: String,
-        /// What it says.
+        /// The message.
         value: String,
         /// What is wrong and what to do.
         advice: String,
@@ -106,7 +106,7 @@ pub(crate) fn check_number(
     Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
 }
 
-/// Reads a file and says in any error which one it was.
+/// Reads a file; errors name it.
 pub(crate) fn read<T>(
     path: &Path,
     parse: impl Fn(&str) -> Result<T, FileError>,

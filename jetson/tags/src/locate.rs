@@ -45,7 +45,7 @@ pub struct LocateSettings {
     pub most_rms_px: f64,
     /// The vehicle never leans further than this: rules out answers on their heads. [rad]
     pub most_tilt_rad: f64,
-    /// What print, survey and lens leave uncertain whatever the corners say; added to the covariance. [m]
+    /// Uncertainty of print, survey and lens, independent of the corners; added to the covariance. [m]
     pub floor_m: f64,
     /// Likewise. [rad]
     pub floor_rad: f64,
@@ -127,7 +127,7 @@ pub enum Unlocated {
     NoPose,
     /// Corners lie too far from where the best pose puts them, root mean square. [px]
     Residuals(f64),
-    /// One tag, and two poses that explain it: more images will tell.
+    /// One tag, and two poses that explain it: more images will decide.
     Ambiguous,
     /// The images are older than those before.
     Old,
@@ -243,7 +243,8 @@ impl Locator {
     /// If there is no view, a camera has no such index, or an image is not of the camera's size.
     pub fn handle_images(&mut self, views: &[StampedImage]) -> LocateOutcome {
         let stamp = views.iter().map(|view| view.stamp).max().expect("there is a view");
-        let mut expected = self.track.predict(stamp).map(|pose| (pose, self.track.doubt_m(stamp)));
+        let mut expected =
+            self.track.predict(stamp).map(|pose| (pose, self.track.uncertainty_m(stamp)));
         let mut looks = Vec::with_capacity(views.len());
         for view in views {
             looks.push(self.look(view, expected.as_ref()));
@@ -255,7 +256,7 @@ impl Locator {
                     && solved.other.is_none()
                     && solved.best.rms_px <= self.settings.most_rms_px
                 {
-                    expected = Some((solved.best.world_from_body, region::FOUND_DOUBT_M));
+                    expected = Some((solved.best.world_from_body, region::FOUND_UNCERTAINTY_M));
                 }
             }
         }
@@ -278,8 +279,8 @@ impl Locator {
         let k = station.camera.intrinsics;
         let size = (view.image.width_px(), view.image.height_px());
         assert_eq!(size, (k.width_px, k.height_px), "images have the size of their intrinsics");
-        let expected = expected.map_or(Expected::Unknown, |(pose, doubt_m)| {
-            region::expect(&station.camera, self.tags.values(), pose, *doubt_m)
+        let expected = expected.map_or(Expected::Unknown, |(pose, uncertainty_m)| {
+            region::expect(&station.camera, self.tags.values(), pose, *uncertainty_m)
         });
         // Where it is not found, the whole image is searched, but seldom: something is in the way. Not while
         // another camera sees the vehicle: then the place is right, and a search of this image (140 ms at
@@ -353,7 +354,7 @@ impl Locator {
                 let edge_px = tag.corners_px[0].distance(tag.corners_px[2]) / 2f64.sqrt();
                 let px_per_m = edge_px / placed.size_m;
                 let corners = (4 * tags.len()) as f64;
-                let carried_px = lag_s.abs() * SPEED_DOUBT_MPS * px_per_m * corners.sqrt();
+                let carried_px = lag_s.abs() * SPEED_UNCERTAINTY_MPS * px_per_m * corners.sqrt();
                 let sigma_px = self.settings.corner_sigma_px.hypot(carried_px);
                 all.push(Sighting {
                     camera: &station.camera.intrinsics,
@@ -494,7 +495,7 @@ const SEEN_LATELY_S: f64 = 0.2;
 /// Exposures closer than this are one. [s]
 const TOGETHER_S: f64 = 0.001;
 /// What the vehicle's estimated velocity may be off. [m/s]
-const SPEED_DOUBT_MPS: f64 = 0.1;
+const SPEED_UNCERTAINTY_MPS: f64 = 0.1;
 /// Cosine to a tag's normal below which it cannot be read: 81 degrees.
 const GRAZING: f64 = 0.15;
 

@@ -117,7 +117,7 @@ fn check_rim(
     Ok(())
 }
 
-/// Returns what a measured bar says of all lengths.
+/// Returns the scale of all lengths from a measured bar.
 fn scale(bar_mm: f64) -> Result<f64, PrintError> {
     // Beyond 10 % the wrong thing was measured.
     if !(90.0..=110.0).contains(&bar_mm) {

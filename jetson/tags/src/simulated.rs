@@ -89,7 +89,7 @@ impl Default for Sensor {
     }
 }
 
-/// A camera that sees tags where the truth says.
+/// A camera that sees tags where the true pose puts them.
 #[derive(Debug)]
 pub struct SimulatedCamera {
     camera: TagCamera,

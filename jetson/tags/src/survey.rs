@@ -119,7 +119,7 @@ const SIGMA_PX: f64 = 0.3;
 const LOSS_PX: f64 = 1.5;
 /// Calibrated lenses leave 0.1 to 0.4 px, and hardly a corner beyond [`LOSS_PX`] but those of misread
 /// tags; a wrong camera file leaves many.
-const MOST_OUTLIERS: f64 = 0.1;
+const MAX_OUTLIERS: f64 = 0.1;
 
 #[cfg(test)]
 mod tests;

@@ -9,10 +9,10 @@ use flights::{Figures, Path, fly, lemniscate, locate, pose_on, spiral, square};
 use glam::{DVec2, DVec3};
 use vizflyt_tags::simulated::{Sensor, belly_camera, cube, mat, webcams};
 
-fn tell(name: &str, figures: &Figures) {
+fn print_figures(name: &str, figures: &Figures) {
     println!(
-        "{name}: {:.1} mm rms, {:.1} mm p99, {:.2} deg rms, located in {:.1} % of {}; squared errors {:.2} of what \
-         was said; looked at {:.1} % of the images; {:?}",
+        "{name}: {:.1} mm rms, {:.1} mm p99, {:.2} deg rms, located in {:.1} % of {}; squared errors {:.2} of the \
+         predicted; looked at {:.1} % of the images; {:?}",
         figures.rms_mm(),
         figures.p99_mm(),
         figures.rms_deg(),
@@ -33,7 +33,7 @@ fn two_webcams_locate_the_cube_along_square_spiral_and_lemniscate() {
         let figures = fly(webcams(2), &[cube()], Sensor::default(), false, 5.0, |t_s| {
             pose_on(path, speed_mps, t_s)
         });
-        tell(name, &figures);
+        print_figures(name, &figures);
         assert!(figures.rms_mm() <= 15.0 && figures.p99_mm() <= 50.0, "{name}");
         assert!(figures.rms_deg() <= 1.0, "{name}");
         assert!(figures.availability_percent() >= 99.0, "{name}");
@@ -41,7 +41,7 @@ fn two_webcams_locate_the_cube_along_square_spiral_and_lemniscate() {
         looked_at += figures.looked_at;
         sets += figures.sets;
     }
-    // Errors are as large as they are said to be, or smaller.
+    // Errors are as large as predicted, or smaller.
     assert!((0.05..1.5).contains(&squared), "{squared}");
     // After the first, images are not searched as a whole.
     assert!(looked_at < 0.05 * sets as f64, "{looked_at} of {sets}");
@@ -52,7 +52,7 @@ fn two_webcams_locate_the_cube_along_square_spiral_and_lemniscate() {
 fn the_hall_behind_the_tags_changes_nothing() {
     let figures =
         locate(hall::seen_by(webcams(2)), &[cube()], 4.0, |t_s| pose_on(lemniscate, 2.0, t_s));
-    tell("in the hall", &figures);
+    print_figures("in the hall", &figures);
     assert!(figures.rms_mm() <= 15.0 && figures.p99_mm() <= 50.0);
     assert!(figures.rms_deg() <= 1.0);
     assert!(figures.availability_percent() >= 99.0);
@@ -61,7 +61,7 @@ fn the_hall_behind_the_tags_changes_nothing() {
     let over = |s_m: f64| lemniscate(s_m) * DVec3::new(1.0, 1.0, 0.0) + DVec3::Z;
     let figures =
         locate(hall::seen_by(vec![belly_camera()]), &[mat], 1.5, |t_s| pose_on(over, 1.0, t_s));
-    tell("over the mat in the hall", &figures);
+    print_figures("over the mat in the hall", &figures);
     assert!(figures.rms_mm() <= 8.0, "{} mm", figures.rms_mm());
     assert!(figures.rms_deg() <= 1.0);
     assert!(figures.availability_percent() >= 99.0);
@@ -74,7 +74,7 @@ fn a_webcam_under_the_vehicle_locates_it_over_a_mat() {
     let figures = fly(vec![belly_camera()], &[mat], Sensor::default(), false, 4.0, |t_s| {
         pose_on(over, 1.0, t_s)
     });
-    tell("over the mat", &figures);
+    print_figures("over the mat", &figures);
     assert!(figures.rms_mm() <= 8.0, "{} mm", figures.rms_mm());
     assert!(figures.rms_deg() <= 1.0);
     assert!(figures.availability_percent() >= 99.0);

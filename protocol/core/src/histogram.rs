@@ -75,7 +75,7 @@ impl Histogram {
         f64::from(self.max_ms)
     }
 
-    /// Returns the percentiles that are told. [ms]
+    /// Returns the percentiles that are reported. [ms]
     pub fn times(&self) -> StageTimes {
         StageTimes {
             p50: self.quantile_ms(0.5) as f32,

@@ -14,7 +14,7 @@ use crate::image::ImageMut;
 use crate::plane::{PlaneDecoder, Samples};
 
 /// Turns bitstreams into images; owns the scratch memory, which grows with the caller's room and
-/// never by what a header says.
+/// never by a header's value.
 #[derive(Debug, Default)]
 pub struct Decoder {
     /// The image under way.

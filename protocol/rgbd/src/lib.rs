@@ -9,7 +9,7 @@
 //!
 //! Read in this order:
 //! - [`ImageView`], [`ImageMut`]: pixels;
-//! - [`Info`] and [`peek`]: the header; every choice is in it, so a decoder is told nothing;
+//! - [`Info`] and [`peek`]: the header; every choice is in it, so a decoder needs no settings;
 //! - `color`: JPEG whose tables are stored once, or exact planes; [`encode_jpeg`] for pictures;
 //! - [`depth`]: predicted, zig-zagged, bit-packed; a scalar reference and a fast path that give the
 //!   same bytes; [`DepthBound`] for depth that need not be exact;

@@ -1,4 +1,4 @@
-//! TOML files that people write: what is not known is refused, and all that is wrong is said at
+//! TOML files that people write: what is not known is refused, and all errors are reported at
 //! once, each with its line, its key, and the nearest key that is known.
 //!
 //! [`parse`] takes a text and returns a value or [`TomlErrors`]. Serde stops at the first error. So
@@ -232,11 +232,11 @@ mod tests {
 
     /// Parses, and expects these lines of errors.
     fn check(text: &str, expected: &[&str]) {
-        let said = parse::<Room>(text).expect_err(text).to_string();
-        let said: Vec<&str> = said.lines().collect();
-        assert_eq!(said.len(), expected.len(), "{said:#?}");
-        for (said, expected) in said.iter().zip(expected) {
-            assert!(said.contains(expected), "{said:?} does not say {expected:?}");
+        let message = parse::<Room>(text).expect_err(text).to_string();
+        let errors: Vec<&str> = message.lines().collect();
+        assert_eq!(errors.len(), expected.len(), "{errors:#?}");
+        for (error, expected) in errors.iter().zip(expected) {
+            assert!(error.contains(expected), "{error:?} does not contain {expected:?}");
         }
     }
 
@@ -279,10 +279,10 @@ mod tests {
         let text = "name = 'a'\nsize_m = [1, 2, 3]\n[[cameras]]\nwidth_px = 1\n[[cameras]]\n\
                     height_px = 2\n";
         check(text, &["line 3", "line 5"]);
-        let said = parse::<Room>(text).unwrap_err().to_string();
+        let message = parse::<Room>(text).unwrap_err().to_string();
         assert!(
-            said.contains("missing field `height_px`") && said.contains("`width_px`"),
-            "{said}"
+            message.contains("missing field `height_px`") && message.contains("`width_px`"),
+            "{message}"
         );
         check("size_m = [1, 2, 3]\n", &["missing field `name`"]);
         check("", &["missing field"]);

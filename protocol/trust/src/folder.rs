@@ -91,7 +91,7 @@ impl KeysFolder {
         self.read_as(name, 0o077)
     }
 
-    /// Returns what tells one state of a file from another; `None` if there is none.
+    /// Returns what distinguishes one state of a file from another; `None` if there is none.
     pub fn stamp(&self, name: &str) -> Option<FileStamp> {
         let about = fs::metadata(self.file(name)).ok()?;
         Some(FileStamp([
@@ -116,11 +116,9 @@ impl KeysFolder {
             return Err(KeyError::Open { path, mode, fix: "600" });
         }
         let mut text = String::new();
-        file.take(MOST_BYTES + 1)
-            .read_to_string(&mut text)
-            .map_err(|error| io("read it", error))?;
-        if text.len() as u64 > MOST_BYTES {
-            let what = format!("more than {MOST_BYTES} bytes; this is no file of ours");
+        file.take(MAX_BYTES + 1).read_to_string(&mut text).map_err(|error| io("read it", error))?;
+        if text.len() as u64 > MAX_BYTES {
+            let what = format!("more than {MAX_BYTES} bytes; this is no file of ours");
             return Err(KeyError::Damaged { path, what });
         }
         Ok(Some(text))
@@ -193,7 +191,7 @@ fn user_folder(config: Option<PathBuf>, home: Option<PathBuf>) -> Option<PathBuf
 }
 
 /// No file of ours comes near.
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {

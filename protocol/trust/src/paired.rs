@@ -58,7 +58,7 @@ impl Paired {
     /// Reads and checks the text of the file.
     ///
     /// # Errors
-    /// A sentence that says where and what.
+    /// A sentence with the position and the error.
     pub fn parse(text: &str) -> Result<Self, String> {
         let paired: Self = toml::from_str(text).map_err(|error| error.to_string())?;
         for (index, client) in paired.clients.iter().enumerate() {

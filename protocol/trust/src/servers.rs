@@ -31,7 +31,7 @@ impl Servers {
     /// Reads and checks the text of the file.
     ///
     /// # Errors
-    /// A sentence that says where and what.
+    /// A sentence with the position and the error.
     pub fn parse(text: &str) -> Result<Self, String> {
         let servers: Self = toml::from_str(text).map_err(|error| error.to_string())?;
         for (index, server) in servers.servers.iter().enumerate() {

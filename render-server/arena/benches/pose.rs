@@ -30,14 +30,14 @@ fn row(trial: Trial) {
         alone.measured_deg,
         alone.predicted_deg,
         imu.predicted_deg,
-        alone.believed * 100.0,
+        alone.accepted * 100.0,
     );
 }
 
 fn table() {
     println!(
         "| speed m/s | poses Hz | noise mm | noise deg | latency ms | lost % | as measured mm | \
-         predicted mm | times less | with IMU | as measured deg | predicted deg | with IMU | believed % |"
+         predicted mm | times less | with IMU | as measured deg | predicted deg | with IMU | accepted % |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     let usual = Trial::default();

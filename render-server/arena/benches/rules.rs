@@ -8,7 +8,7 @@ use vizflyt_arena::collision::sweep;
 use vizflyt_arena::config::{BodyPart, MotionConfig, ObjectConfig};
 use vizflyt_arena::grid::Grid;
 use vizflyt_arena::objects::MovingObjects;
-use vizflyt_arena::obstacles::{Obstacles, Visit};
+use vizflyt_arena::obstacles::{Obstacles, TimedPose};
 use vizflyt_arena::{BakeSpec, BodyShape, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_protocol::geometry::Pose;
 
@@ -103,14 +103,14 @@ fn rules(criterion: &mut Criterion) {
             bencher.iter(|| {
                 // Past the hand's face, 0.2 to 0.8 m before it, as a vehicle waits for its turn.
                 tick = (tick + 1) % 800;
-                let visit = |tick: i64| {
+                let timed_pose = |tick: i64| {
                     let before_m = 0.5 + 0.3 * (tick as f64 * 0.01).sin();
                     let at_m = DVec3::new(-before_m, 0.1, 1.2);
                     let world_from_body =
                         Pose::new(at_m, DQuat::from_rotation_z(tick as f64 * 1e-3));
-                    Visit { since_epoch_ns: tick * 5_000_000, world_from_body }
+                    TimedPose { since_epoch_ns: tick * 5_000_000, world_from_body }
                 };
-                turning.sweep(&body, &visit(tick), &visit(tick + 1))
+                turning.sweep(&body, &timed_pose(tick), &timed_pose(tick + 1))
             });
         });
     }

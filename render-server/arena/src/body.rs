@@ -95,7 +95,7 @@ fn cover(part: &BodyPart) -> impl Iterator<Item = Ball> {
     let &BodyPart { from_m, radius_m, .. } = part;
     let to_m = part.to_m.unwrap_or(from_m);
     let length_m = (to_m - from_m).length();
-    let gaps = (length_m / (SPACING * radius_m)).ceil().min(MOST_GAPS) as u32;
+    let gaps = (length_m / (SPACING * radius_m)).ceil().min(MAX_GAPS) as u32;
     // A ball that far from the next covers the capsule's side between them with this radius.
     let half_gap_m = 0.5 * length_m / f64::from(gaps.max(1));
     (0..=gaps).map(move |n| Ball {
@@ -107,7 +107,7 @@ fn cover(part: &BodyPart) -> impl Iterator<Item = Ball> {
 /// From one ball of a capsule to the next, at most. [radii]
 const SPACING: f64 = 0.5;
 /// A wire of 1 mm and 1 m is covered by fewer, larger balls: a tick's budget.
-const MOST_GAPS: f64 = 64.0;
+const MAX_GAPS: f64 = 64.0;
 
 #[cfg(test)]
 mod tests {

@@ -52,7 +52,7 @@ pub fn sweep(
 /// Returns the shortest step worth taking against a field; also how deep a first contact may lie.
 /// [m]
 pub fn least_step_m(field: &DistanceField) -> f64 {
-    LEAST_STEP_VOXELS * field.grid().voxel_m
+    MIN_STEP_VOXELS * field.grid().voxel_m
 }
 
 /// Walks a motion in which nothing of the body moves by more than `motion_m` relative to the
@@ -86,7 +86,7 @@ pub fn advance(
 /// little faster than true distance.
 const TRUST: f64 = 0.8;
 /// See [`least_step_m`]. Obstacles are a voxel thick at least. [voxels]
-const LEAST_STEP_VOXELS: f64 = 0.25;
+const MIN_STEP_VOXELS: f64 = 0.25;
 
 #[cfg(test)]
 mod tests {

@@ -78,7 +78,7 @@ pub struct ArenaConfig {
     /// Light and fog.
     #[serde(default, skip_serializing_if = "EnvironmentConfig::is_default")]
     pub environment: EnvironmentConfig,
-    /// How poses are fused, when they count as lost, and for which moment images are drawn.
+    /// How poses are fused, when they count as lost, and for which moment images are rendered.
     #[serde(default, skip_serializing_if = "PoseConfig::is_default")]
     pub pose: PoseConfig,
     /// The cameras, in the order of their index on the wire; 1 to 8.

@@ -1,5 +1,5 @@
-//! What a flight that failed tells afterwards: its probable cause in words, and drawings of its end.
-//! Pure; the autograder's report and the page's crash card say and draw the same.
+//! The analysis of a failed flight: its probable cause in a sentence, and drawings of its end.
+//! Pure; the autograder's report and the page's crash card show the same.
 //!
 //! ```text
 //! verdict, samples, answers, images   --> probable_cause --> a sentence
@@ -49,7 +49,7 @@ pub struct Flight<'a> {
     pub seen: &'a [Seen],
     /// The last line that the plugin printed.
     pub last_line: Option<&'a str>,
-    /// From when an image is drawn until its answer counts. [s]
+    /// From when an image is rendered until its reply counts. [s]
     pub delay_s: f64,
 }
 

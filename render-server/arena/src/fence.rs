@@ -8,7 +8,7 @@ use vizflyt_protocol::messages::{Limits, bounded};
 
 use crate::config::ArenaConfig;
 
-/// What a boundary says to a position and velocity.
+/// The check of a position and velocity against a boundary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum FenceVerdict {
     /// The vehicle stops before it with room to spare.

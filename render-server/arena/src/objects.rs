@@ -303,12 +303,12 @@ mod tests {
     #[test]
     fn phases_come_from_the_seed_unless_given() {
         let motion = MotionConfig::Rotation { axis: DVec3::X, period_s: 6.0 };
-        let drawn = |seed| MovingObjects::of(&[object(motion.clone(), None)], seed);
-        assert_eq!(drawn(3), drawn(3));
-        assert_ne!(drawn(3).placements(0), drawn(4).placements(0));
-        let said = |seed| MovingObjects::of(&[object(motion.clone(), Some(7.5))], seed);
-        assert_eq!(said(3), said(4));
-        assert_eq!(said(3).placements(0), one(motion.clone()).placements(S * 3 / 2));
+        let random = |seed| MovingObjects::of(&[object(motion.clone(), None)], seed);
+        assert_eq!(random(3), random(3));
+        assert_ne!(random(3).placements(0), random(4).placements(0));
+        let fixed = |seed| MovingObjects::of(&[object(motion.clone(), Some(7.5))], seed);
+        assert_eq!(fixed(3), fixed(4));
+        assert_eq!(fixed(3).placements(0), one(motion.clone()).placements(S * 3 / 2));
     }
 
     fn motions() -> impl Strategy<Value = MotionConfig> {

@@ -40,7 +40,7 @@ impl From<DistanceField> for Obstacles {
 
 /// A body's pose and when it was there.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Visit {
+pub struct TimedPose {
     /// Since the arena's epoch. [ns]
     pub since_epoch_ns: i64,
     /// Where the body was.
@@ -91,9 +91,9 @@ impl Obstacles {
         nearest_m
     }
 
-    /// Sweeps a body from one visit to the next, against everything that stands or moves; the least
+    /// Sweeps a body from one timed pose to the next, against everything that stands or moves; the least
     /// clearance is over all, the contact the first, and what was touched comes with it.
-    pub fn sweep(&self, body: &BodyShape, from: &Visit, to: &Visit) -> (Sweep, Touched) {
+    pub fn sweep(&self, body: &BodyShape, from: &TimedPose, to: &TimedPose) -> (Sweep, Touched) {
         let mut found = sweep(&self.still, body, &from.world_from_body, &to.world_from_body);
         let mut touched = Touched::Still;
         for (index, field) in self.moving.iter().enumerate() {
@@ -113,8 +113,8 @@ impl Obstacles {
         index: usize,
         field: &DistanceField,
         body: &BodyShape,
-        from: &Visit,
-        to: &Visit,
+        from: &TimedPose,
+        to: &TimedPose,
     ) -> Sweep {
         let (a, b) = (&from.world_from_body, &to.world_from_body);
         let took_ns = to.since_epoch_ns.saturating_sub(from.since_epoch_ns).max(0);
@@ -192,8 +192,8 @@ mod tests {
         Obstacles::new(nothing(), vec![hand_field()], MovingObjects::of(&[hand], 0))
     }
 
-    fn visit(ns: i64, p_m: DVec3) -> Visit {
-        Visit { since_epoch_ns: ns, world_from_body: Pose::new(p_m, DQuat::IDENTITY) }
+    fn timed_pose(ns: i64, p_m: DVec3) -> TimedPose {
+        TimedPose { since_epoch_ns: ns, world_from_body: Pose::new(p_m, DQuat::IDENTITY) }
     }
 
     #[test]
@@ -220,7 +220,8 @@ mod tests {
         let body = BodyShape::sphere(BODY_M);
         // Waits at the left, where the hand comes by after three quarters of a turn.
         let p_m = DVec3::new(0.0, 0.6, 0.0);
-        let (found, touched) = clock.sweep(&body, &visit(0, p_m), &visit(4_000_000_000, p_m));
+        let (found, touched) =
+            clock.sweep(&body, &timed_pose(0, p_m), &timed_pose(4_000_000_000, p_m));
         let contact = found.contact.unwrap();
         assert_eq!(touched, Touched::Object(0));
         // The hand's side, 4 cm from its middle line, meets the body's at asin(0.16 / 0.6) before.
@@ -230,7 +231,7 @@ mod tests {
         let through = |at_s: f64| {
             let ns = (at_s * 1e9) as i64;
             let (from_m, to_m) = (p_m - DVec3::X, p_m + DVec3::X);
-            clock.sweep(&body, &visit(ns, from_m), &visit(ns + 100_000_000, to_m)).0
+            clock.sweep(&body, &timed_pose(ns, from_m), &timed_pose(ns + 100_000_000, to_m)).0
         };
         assert_eq!(through(1.0).contact, None);
         assert!(through(2.95).contact.is_some());
@@ -242,9 +243,11 @@ mod tests {
         let clock = clock(0.05, 0.01);
         let body = BodyShape::sphere(BODY_M);
         let p_m = DVec3::new(0.0, 0.7, 0.0);
-        let (found, _) = clock.sweep(&body, &visit(0, p_m), &visit(100_000_000, p_m));
+        let (found, _) = clock.sweep(&body, &timed_pose(0, p_m), &timed_pose(100_000_000, p_m));
         assert!(found.contact.is_some());
-        assert!(clock.sweep(&body, &visit(0, DVec3::NAN), &visit(1, p_m)).0.contact.is_some());
+        assert!(
+            clock.sweep(&body, &timed_pose(0, DVec3::NAN), &timed_pose(1, p_m)).0.contact.is_some()
+        );
     }
 
     proptest! {
@@ -267,7 +270,7 @@ mod tests {
                 })
                 .fold(f64::INFINITY, f64::min);
             let body = BodyShape::sphere(BODY_M);
-            let (found, _) = clock.sweep(&body, &visit(0, from_m), &visit(took_ns, to_m));
+            let (found, _) = clock.sweep(&body, &timed_pose(0, from_m), &timed_pose(took_ns, to_m));
             prop_assert!(truth_m > -VOXEL_M || found.contact.is_some(), "missed {}", truth_m);
             prop_assert!(truth_m < VOXEL_M || found.contact.is_none(), "false {}", truth_m);
         }

@@ -6,9 +6,9 @@
 //!                             in the air     -> collision, fence, course, time -> events
 //! ```
 //! A flight begins when the body's centre rises 0.3 m above the start. The first thing seen that ends a
-//! flight is said; after it nothing more is judged until [`Referee::restart`]. Where someone else ends
+//! flight is reported; after it nothing more is judged until [`Referee::restart`]. Where someone else ends
 //! the flight ([`Referee::handle_event`]), course and time stop, and only a touch or a breach on the
-//! way down is still said. What a flight's end is, [`vizflyt_protocol::flight_end`] decides.
+//! way down is still reported. What a flight's end is, [`vizflyt_protocol::flight_end`] decides.
 
 use std::collections::VecDeque;
 
@@ -24,7 +24,7 @@ use crate::course::{Course, Progress};
 use crate::distance::ObstacleSlice;
 use crate::fence::{Boundaries, FenceVerdict};
 use crate::neighbours::{Neighbour, Passage};
-use crate::obstacles::{Obstacles, Touched, Visit};
+use crate::obstacles::{Obstacles, TimedPose, Touched};
 use crate::pose::{ImuReading, Measured, Motion, PoseChange, PoseFilter, PoseQuality, Rejected};
 
 /// Rise that counts as take-off; a vehicle that rocks on its legs does not reach it. [m]
@@ -58,7 +58,7 @@ pub struct Referee {
     course: Course,
     last: Option<(ServerTime, Pose<World, Body>)>,
     took_off: Option<ServerTime>,
-    /// Its end was said, or the vehicle has landed: nothing is judged.
+    /// Its end was reported, or the vehicle has landed: nothing is judged.
     over: bool,
     /// Someone else ended the flight: course and time are not judged.
     ended: bool,
@@ -117,7 +117,7 @@ impl Referee {
         self.least_clearance_m = f64::INFINITY;
     }
 
-    /// Takes a measurement of the vehicle; returns the pose if it is believed.
+    /// Takes a measurement of the vehicle; returns the pose if it is accepted.
     pub fn handle_measurement(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
         let known = self.filter.newest().map(|newest| newest.stamp);
         let sample = self.filter.handle_pose(measured)?;
@@ -184,7 +184,7 @@ impl Referee {
         self.took_off.is_some() && !self.over
     }
 
-    /// Returns the newest believed pose.
+    /// Returns the newest accepted pose.
     pub fn newest(&self) -> Option<&PoseSample> {
         self.filter.newest()
     }
@@ -234,22 +234,25 @@ impl Referee {
         from: &Pose<World, Body>,
     ) {
         let to = &sample.world_from_body;
-        let visit = |at: ServerTime, pose: &Pose<World, Body>| Visit {
+        let timed_pose = |at: ServerTime, pose: &Pose<World, Body>| TimedPose {
             since_epoch_ns: self.since_epoch_ns(at),
             world_from_body: *pose,
         };
-        let (mut found, touched) =
-            self.obstacles.sweep(&self.body, &visit(since, from), &visit(sample.stamp, to));
+        let (mut found, touched) = self.obstacles.sweep(
+            &self.body,
+            &timed_pose(since, from),
+            &timed_pose(sample.stamp, to),
+        );
         let mut met = match touched {
             Touched::Still => Met::Still,
             Touched::Object(index) => Met::Object(index),
         };
         let passage =
             |stamp, pose: &Pose<World, Body>| Passage { stamp, p_world_m: pose.translation_m };
-        let way = (passage(since, from), passage(sample.stamp, to));
+        let path = (passage(since, from), passage(sample.stamp, to));
         for (number, neighbour) in self.neighbours.iter().enumerate() {
             let Some(neighbour) = neighbour else { continue };
-            let other = neighbour.sweep(way.0, way.1, self.body.radius_m());
+            let other = neighbour.sweep(path.0, path.1, self.body.radius_m());
             found.clearance_m = found.clearance_m.min(other.clearance_m);
             let first = found.contact.map_or(f64::INFINITY, |contact| contact.fraction);
             if let Some(contact) = other.contact.filter(|contact| contact.fraction < first) {
@@ -300,7 +303,7 @@ impl Referee {
             FenceVerdict::Near => {
                 if !std::mem::replace(&mut self.near_fence, true) {
                     let text = format!("close to {boundary}: {margin_m:.2} m left");
-                    self.tell(sample.stamp, EventKind::Note, &text);
+                    self.report(sample.stamp, EventKind::Note, &text);
                 }
             }
             FenceVerdict::Breach => {
@@ -321,13 +324,13 @@ impl Referee {
                 Progress::Stage(index) => {
                     let name = self.config.stages[index].name.clone();
                     let kind = EventKind::Stage { index: index as u8, name: bounded(&name) };
-                    self.tell(sample.stamp, kind, &format!("passed {name} after {seconds:.1} s"));
+                    self.report(sample.stamp, kind, &format!("passed {name} after {seconds:.1} s"));
                 }
                 Progress::Finished => self.end(sample.stamp, EventKind::Finished { seconds }),
                 Progress::GoalTooEarly(index) => {
                     let name = &self.config.stages[index].name;
                     let text = format!("at the goal, but {name} is not passed yet");
-                    self.tell(sample.stamp, EventKind::Note, &text);
+                    self.report(sample.stamp, EventKind::Note, &text);
                 }
             }
         }
@@ -370,15 +373,15 @@ impl Referee {
             Some(PoseChange::Lost(age_s, why)) => {
                 let why = why.map_or_else(String::new, |why| format!(": {why}"));
                 let text = format!("no pose for {:.0} ms{why}", age_s * 1e3);
-                self.tell(now, EventKind::PoseLost { age_s }, &text);
+                self.report(now, EventKind::PoseLost { age_s }, &text);
             }
             Some(PoseChange::Regained) => {
-                self.tell(now, EventKind::PoseRegained, "poses are back");
+                self.report(now, EventKind::PoseRegained, "poses are back");
             }
             Some(PoseChange::ImuLeftOut) => {
                 let text = "the autopilot's IMU contradicts the poses and is left out: is the \
                             object's frame turned against the autopilot?";
-                self.tell(now, EventKind::Note, text);
+                self.report(now, EventKind::Note, text);
             }
             None => {}
         }
@@ -391,8 +394,8 @@ impl Referee {
         }
     }
 
-    fn tell(&mut self, stamp: ServerTime, kind: EventKind, text: &str) {
-        // Bounded: each kind of end is said once a flight, and the server drains after every call.
+    fn report(&mut self, stamp: ServerTime, kind: EventKind, text: &str) {
+        // Bounded: each kind of end is reported once a flight, and the server drains after every call.
         self.events.push_back(Event { stamp, kind, text: bounded(text) });
     }
 }

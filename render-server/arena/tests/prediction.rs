@@ -11,7 +11,7 @@ fn prediction_cuts_the_error_of_images_to_a_fifth() {
         for imu in [false, true] {
             let errors = Trial { rate_hz, imu, ..Trial::default() }.fly(1);
             assert!(errors.gain() >= 5.0, "{rate_hz} Hz, IMU {imu}: {errors:?}");
-            assert!(errors.believed > 0.99, "{rate_hz} Hz, IMU {imu}: {errors:?}");
+            assert!(errors.accepted > 0.99, "{rate_hz} Hz, IMU {imu}: {errors:?}");
             assert!(errors.predicted_deg < errors.measured_deg, "{rate_hz} Hz: {errors:?}");
         }
     }
@@ -27,6 +27,6 @@ fn noise_dropouts_and_latency_leave_most_of_it() {
     ] {
         let errors = trial.fly(2);
         assert!(errors.gain() >= 5.0, "{trial:?}: {errors:?}");
-        assert!(errors.believed > 0.95, "{trial:?}: {errors:?}");
+        assert!(errors.accepted > 0.95, "{trial:?}: {errors:?}");
     }
 }

@@ -135,7 +135,7 @@ struct Levels {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SensorSuite {
-    /// What plugins may ask for, if not what `[rules]` says.
+    /// The allowed setpoints, if not those of `[rules]`.
     #[serde(default)]
     setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
@@ -156,7 +156,7 @@ impl CourseProject {
     /// ```
     ///
     /// # Errors
-    /// [`UnknownProject`], which says the names that there are.
+    /// [`UnknownProject`], which lists the names.
     ///
     /// # Panics
     /// If a project's file in this program is wrong, which a test excludes.

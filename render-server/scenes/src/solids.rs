@@ -117,7 +117,7 @@ pub(crate) fn bounds(volume: &Volume) -> Option<(DVec3, DVec3)> {
     }
 }
 
-/// How far a volume is felt. [m]
+/// How far a volume has influence. [m]
 pub(crate) const REACH_M: f64 = 1.0;
 const CELL_M: f64 = 0.5;
 

@@ -1,5 +1,5 @@
 //! Obstacles baked from the splats of generated scenes against their true geometry, by size of
-//! voxel: nothing missed beyond one voxel, hardly anything told that is free by one and a half.
+//! voxel: nothing missed beyond one voxel, hardly anything reported that is free by one and a half.
 
 mod judge;
 

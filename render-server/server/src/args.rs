@@ -25,7 +25,7 @@ pub struct ServeArgs {
     #[arg(required = false, required_unless_present_any = ["config", "print_config"])]
     pub arena: PathBuf,
 
-    /// A file that says what these flags say: each is a key of its name, with `_` for `-`; flags go before it
+    /// A file with these settings: each flag is a key of its name, with `_` for `-`; flags go before it
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
 
@@ -122,15 +122,15 @@ pub struct ServeArgs {
     #[arg(long, value_enum, default_value_t)]
     pub login: Login,
 
-    /// Folder of this server's key and of paired.toml, which says who may connect
+    /// Folder of this server's key and of paired.toml, the list of who may connect
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
 
     /// Where flights are written down: a file, postgres://USER:PASSWORD@HOST/NAME, or none
     /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite]
-    #[arg(long, value_name = "FILE|URL|none", value_parser = kept, value_hint = ValueHint::FilePath)]
-    pub leaderboard: Option<Kept>,
+    #[arg(long, value_name = "FILE|URL|none", value_parser = run_storage, value_hint = ValueHint::FilePath)]
+    pub leaderboard: Option<RunStorage>,
 
     /// A team's official runs on a course, at most; further ones are practice [default: as many as it likes]
     #[arg(long, value_name = "N")]
@@ -145,17 +145,17 @@ pub struct ServeArgs {
     pub lifeline: bool,
 }
 
-/// Where flights are written down.
+/// Where runs are stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Kept {
-    /// There.
+pub enum RunStorage {
+    /// In this database.
     In(Database),
     /// Nowhere.
     Nowhere,
 }
 
-fn kept(text: &str) -> Result<Kept, UnknownDatabase> {
-    if text == "none" { Ok(Kept::Nowhere) } else { text.parse().map(Kept::In) }
+fn run_storage(text: &str) -> Result<RunStorage, UnknownDatabase> {
+    if text == "none" { Ok(RunStorage::Nowhere) } else { text.parse().map(RunStorage::In) }
 }
 
 /// How colour is stored.
@@ -183,16 +183,15 @@ pub enum Depth {
 }
 
 impl ServeArgs {
-    /// Returns where poses come from: what the command line says, else what `arena.toml` says, else
-    /// Vicon.
+    /// Returns the sources of poses: those of the command line, else those of `arena.toml`, else Vicon.
     pub fn localization(&self, arena: Vec<LocalizationConfig>) -> Vec<LocalizationConfig> {
         let vicon = self.vicon.map(|address| LocalizationConfig {
             address: Some(address.to_string()),
             ..LocalizationConfig::new(Driver::Vicon)
         });
-        let said: Vec<_> = vicon.into_iter().chain(self.pose.clone()).collect();
+        let given: Vec<_> = vicon.into_iter().chain(self.pose.clone()).collect();
         let vicon = || vec![LocalizationConfig::new(Driver::Vicon)];
-        [said, arena].into_iter().find(|sources| !sources.is_empty()).unwrap_or_else(vicon)
+        [given, arena].into_iter().find(|sources| !sources.is_empty()).unwrap_or_else(vicon)
     }
 
     /// Returns how images are encoded.
@@ -279,8 +278,8 @@ mod tests {
         assert_eq!(parse("a.toml --pair team:ant,bee").unwrap().pair, Some(team));
         let sources = |words: &str, arena: &[&str]| {
             let arena = arena.iter().map(|text| LocalizationConfig::parse(text).unwrap());
-            let said = parse(words).unwrap().localization(arena.collect());
-            said.iter().map(|s| format!("{}:{}", s.driver, s.address())).collect::<Vec<_>>()
+            let given = parse(words).unwrap().localization(arena.collect());
+            given.iter().map(|s| format!("{}:{}", s.driver, s.address())).collect::<Vec<_>>()
         };
         assert_eq!(sources("a.toml", &[]), ["vicon:0.0.0.0:51001"]);
         assert_eq!(sources("a.toml", &["natnet"]), ["natnet:239.255.42.99:1511"]);

@@ -136,7 +136,7 @@ impl Authorizer {
             Err(error) => {
                 warn!("{error}");
                 self.pairing_news.send_replace(error.to_string());
-                Err("the server could not keep the pairing; its log says why".to_owned())
+                Err("the server could not keep the pairing; its log has the reason".to_owned())
             }
         }
     }
@@ -150,7 +150,7 @@ impl Authorizer {
         loop {
             tick.tick().await;
             let found = self.folder.stamp(Paired::FILE);
-            // Two looks alike: an editor that empties the file before it fills it is not believed.
+            // Two equal reads: a file that an editor has emptied and not yet filled is not accepted.
             if found == seen && found != taken {
                 taken = found;
                 self.reread();

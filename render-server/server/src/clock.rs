@@ -17,7 +17,7 @@ use vizflyt_protocol::time::ServerTime;
 pub fn now() -> ServerTime {
     static ANCHOR: OnceLock<(Instant, u64)> = OnceLock::new();
     let (instant, ns) = *ANCHOR.get_or_init(anchor);
-    // `Instant` is CLOCK_MONOTONIC too, but does not say its value.
+    // `Instant` is CLOCK_MONOTONIC too, but hides its value.
     let present = tokio::time::Instant::now().into_std();
     ServerTime::from_ns(match present.checked_duration_since(instant) {
         Some(since) => ns + since.as_nanos() as u64,

@@ -66,7 +66,7 @@ impl<T: Default> Mailbox<T> {
     /// Gives a buffer back.
     pub fn recycle(&self, item: T) {
         let spares = &mut self.lock().spares;
-        if spares.len() < MOST_SPARES {
+        if spares.len() < MAX_SPARES {
             spares.push(item);
         }
     }
@@ -89,7 +89,7 @@ impl<T: Default> Mailbox<T> {
 }
 
 /// One being written, one in the slot, one being read; and two on their way back another way.
-const MOST_SPARES: usize = 5;
+const MAX_SPARES: usize = 5;
 
 #[cfg(test)]
 mod tests {

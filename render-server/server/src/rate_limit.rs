@@ -33,10 +33,10 @@ impl RateLimiter {
     /// Takes one attempt.
     pub(crate) fn charge(&mut self, now: Instant, address: IpAddr) {
         let place = place(address);
-        if self.debts.len() >= MOST_PLACES && !self.debts.contains_key(&place) {
+        if self.debts.len() >= MAX_PLACES && !self.debts.contains_key(&place) {
             self.debts.retain(|_, debt| debt.owed(now) > Duration::ZERO);
         }
-        let full = self.debts.len() >= MOST_PLACES;
+        let full = self.debts.len() >= MAX_PLACES;
         let debt = match self.debts.get_mut(&place) {
             Some(debt) => debt,
             None if full => self.others.get_or_insert(Debt { full_at: now }),
@@ -65,7 +65,7 @@ const BURST: u32 = 10;
 /// One attempt comes back after this long.
 const EACH: Duration = Duration::from_secs(3);
 /// Some 100 KB.
-const MOST_PLACES: usize = 1024;
+const MAX_PLACES: usize = 1024;
 
 #[cfg(test)]
 mod tests {
@@ -111,7 +111,7 @@ mod tests {
         for bits in 0..20_000 {
             limiter.charge(start, Ipv4Addr::from_bits(bits).into());
         }
-        assert_eq!(limiter.debts.len(), MOST_PLACES);
+        assert_eq!(limiter.debts.len(), MAX_PLACES);
         let late = Ipv4Addr::from_bits(30_000).into();
         assert!(!limiter.may_try(start, late), "the rest shares what is left, and that is used up");
         // Those who were charged once are free again, and make room.

@@ -2,7 +2,7 @@
 //!
 //! Every flag is a key of its long name, with `_` for `-`; the arena is `arena`. A key's value is read
 //! by its flag's own parser, so that file and command line take and refuse the same. What the command
-//! line says goes before the file. Paths in a file are relative to its folder.
+//! line has overrides the file. Paths in a file are relative to its folder.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ use crate::args::ServeArgs;
 /// Flags that are no settings.
 const NO_KEYS: [&str; 5] = ["config", "print_config", "lifeline", "help", "version"];
 
-/// Returns a command line of `serve` with all that its file says and it does not; `matches` is what
+/// Returns a command line of `serve` with the settings of its file that it does not have; `matches` is what
 /// clap made of `line`. Without `--config` the line stays as it is.
 ///
 /// # Errors
@@ -63,7 +63,7 @@ pub fn to_toml(matches: &ArgMatches) -> String {
 
 const ARENA: &str = "arena";
 
-/// One key of a file, as the arguments that say the same.
+/// One key of a file, as the equivalent arguments.
 struct Setting {
     id: String,
     arguments: Vec<OsString>,
@@ -161,8 +161,8 @@ fn check(arguments: &[OsString], is_flag: bool) -> Result<(), String> {
     let arena: &[OsString] = if is_flag { &["x".into()] } else { &[] };
     let line = [OsString::from("serve")].into_iter().chain(arguments.iter().chain(arena).cloned());
     let Err(error) = command().try_get_matches_from(line) else { return Ok(()) };
-    let said = error.to_string();
-    let first = said.lines().next().unwrap_or_default();
+    let message = error.to_string();
+    let first = message.lines().next().unwrap_or_default();
     Err(first.trim_start_matches("error: ").to_owned())
 }
 
@@ -237,7 +237,7 @@ mod tests {
             "line 5, column 8: http: invalid value 'lab'",
             "line 7, column 2: unknown key 'page'",
         ] {
-            assert!(error.contains(part), "{error:?} does not say {part:?}");
+            assert!(error.contains(part), "{error:?} does not contain {part:?}");
         }
         assert!(!error.contains("vehicle: "), "one is a list, too: {error}");
         let error = format!("{:#}", settled("quality = 80\n", &[]).unwrap_err());

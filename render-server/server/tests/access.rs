@@ -261,7 +261,7 @@ fn every_route_knows_a_stranger_a_team_and_the_instructor() {
 }
 
 /// The table that makes the router is the table that is walked: a new route fails here until it is
-/// said above what it takes.
+/// stated above what it takes.
 #[test]
 fn every_route_of_the_server_is_walked() {
     for (method, path, takes) in vizflyt_server::web::routes() {

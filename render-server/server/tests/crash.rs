@@ -30,10 +30,10 @@ async fn a_flight_into_a_wall_leaves_a_card() {
 
     let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
     let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
-    client.say(&ToServer::Telemetry(flying)).await;
+    client.send(&ToServer::Telemetry(flying)).await;
     let kind = EventKind::Phase(FlightPhase::TakingOff);
     let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
-    client.say(&ToServer::Event { seq: 1, event }).await;
+    client.send(&ToServer::Event { seq: 1, event }).await;
     // Three seconds at 0.6 m/s, until the body touches the wall at x = 5 m.
     let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| {
         3.0 + f64::from(frame.clamp(100, 750) - 100) * 0.003

@@ -33,7 +33,7 @@ fn standings(server: &Server) -> Value {
 /// Reports phases, each heard of by the server before the next.
 async fn report(client: &mut Client, socket: &mut Socket, phases: &[(FlightPhase, &str)]) {
     for &(phase, name) in phases {
-        client.say(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
+        client.send(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
         while socket.message("state")["report"]["phase"] != name {}
     }
 }
@@ -49,7 +49,7 @@ async fn a_team_checks_in_flies_and_stands() {
     let arena = write_arena(folder.path(), "");
     let server = Server::start(&arena, &[&option, "--official-attempts=1"]);
 
-    // Wrong tokens: said so, and bounded.
+    // Wrong tokens: reported, and bounded.
     let (status, text) = put(&server, r#"{"token": "guess"}"#);
     assert_eq!((status, text.as_str()), (401, "no team has this token"));
     assert_eq!(put(&server, r#"{"attempt": "official"}"#).0, 400);

@@ -216,7 +216,7 @@ async fn start_land_and_reset_are_refused_with_the_reason_or_reach_the_runtime()
         (FlightPhase::Waiting, "waiting"),
         (FlightPhase::Flying, "flying"),
     ] {
-        client.say(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
+        client.send(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
         assert!((0..MANY).any(|_| socket.message("state")["report"]["phase"] == name));
         let statuses = ["start", "land", "reset"].map(|what| press(what).0);
         let expected = match phase {

@@ -62,17 +62,17 @@ async fn pair(
         }
     };
     let (client, begin) = PairingClient::begin(code, "jetson", binding);
-    let mut say = async |message: &PairingRequest| {
+    let mut write = async |message: &PairingRequest| {
         send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
     };
-    say(&begin).await;
+    write(&begin).await;
     let share = match read().await {
         PairingReply::Share { share } => share,
         PairingReply::Refused(why) => return Err(why.as_str().to_owned()),
         other @ PairingReply::Paired { .. } => panic!("{other:?}"),
     };
     let (confirming, confirm) = client.confirm(&share).unwrap();
-    say(&confirm).await;
+    write(&confirm).await;
     match read().await {
         PairingReply::Paired { proof, grant } => {
             assert!(confirming.is_proof(&proof), "the server knows the code");

@@ -17,8 +17,8 @@ fn usual() -> TransportConfig {
 async fn closed(connection: &quinn::Connection) -> (u64, String) {
     let closing = tokio::time::timeout(PATIENCE, connection.closed()).await;
     match closing.expect("the server closes the connection") {
-        ConnectionError::ApplicationClosed(said) => {
-            (said.error_code.into_inner(), String::from_utf8_lossy(&said.reason).into_owned())
+        ConnectionError::ApplicationClosed(frame) => {
+            (frame.error_code.into_inner(), String::from_utf8_lossy(&frame.reason).into_owned())
         }
         other => panic!("{other}"),
     }
@@ -65,7 +65,7 @@ async fn a_team_flies_its_own_vehicle_and_no_other() {
         assert_eq!(text, format!("'team' may use 'wasp' here, not '{vehicle}'").as_str());
     }
     // It did not even disturb the one that flies.
-    flying.say(&ToServer::Telemetry(Telemetry::default())).await;
+    flying.send(&ToServer::Telemetry(Telemetry::default())).await;
     flying.pose().await;
 }
 
@@ -97,8 +97,8 @@ fn the_identity_is_kept_and_never_replaced_silently() {
             .arg(&option)
             .output()
             .unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(!output.status.success() && said.contains(what), "{said}");
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && message.contains(what), "{message}");
     };
     std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
     refused("chmod 600");

@@ -63,7 +63,7 @@ async fn images_follow_the_poses() {
     }
 
     let sent = HostTime::from_ns(77);
-    client.say(&ToServer::Clock(ClockRequest { sent })).await;
+    client.send(&ToServer::Clock(ClockRequest { sent })).await;
     let reply = client
         .until(|message| match message {
             ToRuntime::Clock(reply) => Some(reply),
@@ -126,7 +126,7 @@ async fn strangers_are_refused_by_name() {
     let (mut first, _) = Client::welcomed(&server, usual()).await;
     let mut second = Client::hello(&server, "vizflyt", usual()).await;
     // The first keeps reporting, so it is alive whatever the machine's load.
-    first.say(&ToServer::Telemetry(Telemetry::default())).await;
+    first.send(&ToServer::Telemetry(Telemetry::default())).await;
     let text = second.until(refusal).await;
     assert!(text.starts_with("vehicle 'vizflyt' is flown by test 1 at 127.0.0.1:"), "{text}");
 
@@ -221,7 +221,7 @@ async fn a_restarted_runtime_gets_images_again() {
         let (header, _) = client.image().await;
         assert!(header.seq.get() > seq);
         seq = header.seq.get();
-        client.say(&ToServer::Telemetry(Telemetry::default())).await;
+        client.send(&ToServer::Telemetry(Telemetry::default())).await;
         client.close().await;
     }
 }
@@ -234,7 +234,7 @@ async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
     let (mut client, _) = Client::welcomed(&server, usual()).await;
     client.image().await;
     let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
-    client.say(&ToServer::Telemetry(flying)).await;
+    client.send(&ToServer::Telemetry(flying)).await;
     emitter.pause(true);
     let lost = |message| match message {
         ToRuntime::Event { event, .. } => {
@@ -285,9 +285,9 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     assert_eq!(welcome.received_events.of(boot), 0);
     client.image().await;
     let flying = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
-    client.say(&ToServer::Telemetry(flying)).await;
+    client.send(&ToServer::Telemetry(flying)).await;
     for (seq, text) in [(1, "one"), (2, "two"), (2, "two"), (1, "one")] {
-        client.say(&ToServer::Event { seq, event: note(text) }).await;
+        client.send(&ToServer::Event { seq, event: note(text) }).await;
     }
     client.until(|message| (message == ToRuntime::EventsReceived(2)).then_some(())).await;
     emitter.pause(true);
@@ -306,8 +306,8 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     };
     let (next, back) = client.until(event).await;
     assert!(next > seq && back.kind == EventKind::PoseRegained, "{back:?}");
-    client.say(&ToServer::Event { seq: 2, event: note("two") }).await;
-    client.say(&ToServer::Event { seq: 3, event: note("three") }).await;
+    client.send(&ToServer::Event { seq: 2, event: note("two") }).await;
+    client.send(&ToServer::Event { seq: 3, event: note("three") }).await;
     client.until(|message| (message == ToRuntime::EventsReceived(3)).then_some(())).await;
     let page = server.http;
     let log = tokio::task::spawn_blocking(move || {
@@ -339,7 +339,7 @@ async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
     watcher.pose().await;
     // What it says does not count, and it takes nobody's lease.
     let landed = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
-    watcher.say(&ToServer::Telemetry(landed)).await;
+    watcher.send(&ToServer::Telemetry(landed)).await;
     let (runtime, _) = Client::welcomed(&server, usual()).await;
     // One that reads nothing, beside the two that do.
     let mut transport = usual();

@@ -21,7 +21,7 @@ use vizflyt_protocol::messages::ToRuntime;
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
 const VIEWERS: usize = 20;
 /// In the second half of the watched time. [MB]
-const MOST_MEMORY_GROWTH_MB: f64 = 12.0;
+const MAX_MEMORY_GROWTH_MB: f64 = 12.0;
 
 /// What one vehicle's runtime has got.
 #[derive(Debug, Default)]
@@ -85,8 +85,8 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         for name in VEHICLES {
             let tilt = format!("{{\"tilt_deg\": {}}}", changes % 2);
             let path = format!("PATCH /api/vehicles/{name}/cameras/front");
-            let (status, said) = send_json(server.http, &path, None, &tilt);
-            assert_eq!(status, 200, "{said}");
+            let (status, answer) = send_json(server.http, &path, None, &tilt);
+            assert_eq!(status, 200, "{answer}");
         }
     });
     std::thread::sleep(Duration::from_secs(1));
@@ -113,7 +113,7 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         pictures as f64 / VIEWERS as f64 / seconds as f64,
         states as f64 / VIEWERS as f64 / seconds as f64,
     );
-    assert!(tenths[10] - tenths[5] < MOST_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
+    assert!(tenths[10] - tenths[5] < MAX_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
 }
 
 /// Counts a runtime's images.
@@ -128,7 +128,7 @@ async fn images(connection: quinn::Connection, got: Arc<Got>) {
 /// Counts what a runtime must be told.
 async fn messages(mut client: Client, got: Arc<Got>) {
     loop {
-        // Without pages nothing is said for minutes.
+        // Without pages nothing is sent for minutes.
         if let ToRuntime::Camera { .. } = client.next_ever().await {
             got.cameras_changed.fetch_add(1, Ordering::Relaxed);
         }

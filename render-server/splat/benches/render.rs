@@ -9,7 +9,7 @@
 //! Scenes are synthetic (100 k and 1 M splats), the captured ones of a neighbouring `../shared`
 //! where present, and any PLY named on the command line (seen from the middle of its splats).
 //! Times are of the whole machine's cores, so compare figures of one run with each other; where
-//! others use the machine, the least of the per-pass table says most.
+//! others use the machine, the minimum of the per-pass table is the most meaningful.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};

@@ -130,7 +130,7 @@ mod trial {
     use crate::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
     /// Less is no rounding: right renderers differ by 75 dB and more.
-    const LEAST_DB: f64 = 50.0;
+    const MIN_DB: f64 = 50.0;
 
     /// Returns 20 k splats in many layers, more than one group of the sort holds, and a camera that
     /// sees most of them.
@@ -172,7 +172,7 @@ mod trial {
         }
         let found_db = alike_db(&images[0], &expected[0]);
         // Positive, so that NaN is refused.
-        if found_db >= LEAST_DB {
+        if found_db >= MIN_DB {
             Ok(found_db)
         } else {
             Err(format!("renders the test image {found_db:.0} dB from the processor's"))
@@ -231,11 +231,11 @@ mod trial {
             let (splats, camera) = scene_and_camera();
             let check = |spoil: fn(&mut RgbdImage, usize), part: &str| {
                 let mut renderer = Spoiling(CpuRenderer::new(&splats), spoil, 0);
-                let said = match check(&mut renderer, &splats, &camera) {
+                let reason = match check(&mut renderer, &splats, &camera) {
                     Ok(found_db) => format!("{found_db} dB"),
                     Err(why) => why,
                 };
-                assert!(said.contains(part), "{said:?} lacks {part:?}");
+                assert!(reason.contains(part), "{reason:?} lacks {part:?}");
             };
             check(|_, _| (), "200 dB");
             check(|image, _| image.rgb[777] += 1e-3, " dB");

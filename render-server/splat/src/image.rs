@@ -35,7 +35,7 @@ pub enum DepthKind {
 
 impl RgbdImage {
     /// Alpha from which an expected depth counts as a return: below, more than half of the light
-    /// comes from the background, and the median says "no return" too.
+    /// comes from the background, and the median is "no return" too.
     pub const MIN_DEPTH_ALPHA: f32 = 0.5;
 
     /// Gives every buffer the length of a `width_px` x `height_px` image. Contents are

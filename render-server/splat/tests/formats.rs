@@ -1,4 +1,4 @@
-//! Files that other people's tools wrote from known splats; how they were made is said beside them.
+//! Files that other people's tools wrote from known splats; how they were made is documented beside them.
 
 use std::path::{Path, PathBuf};
 

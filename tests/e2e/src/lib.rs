@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 /// Returns the `vizflyt` program built beside this test.
 ///
 /// # Panics
-/// If it is not built; the message says how.
+/// If it is not built; the message has the command.
 pub fn vizflyt() -> PathBuf {
     // target/PROFILE/deps/this-test
     let test = std::env::current_exe().expect("a test knows its own path");

@@ -94,7 +94,7 @@ fn every_import_is_an_arrow_of_the_architecture() {
             if !test_only && ours.contains(dependency.name.as_str()) {
                 assert!(
                     allowed.contains(&dependency.name.as_str()),
-                    "{} may not import {}; docs/ARCHITECTURE.md says why",
+                    "{} may not import {}; docs/ARCHITECTURE.md has the reason",
                     package.name,
                     dependency.name
                 );

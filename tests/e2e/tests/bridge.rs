@@ -231,12 +231,12 @@ fn it_is_claimed_configured_and_keeps_its_settings() {
             .args(more)
             .output()
             .unwrap();
-        let said = [output.stdout, output.stderr].concat();
-        (output.status.success(), String::from_utf8(said).unwrap())
+        let printed = [output.stdout, output.stderr].concat();
+        (output.status.success(), String::from_utf8(printed).unwrap())
     };
     let check = |more: &[&str], works: bool, expected: &str| {
-        let (worked, said) = configure(more);
-        assert!(worked == works && said.contains(expected), "{more:?}: {said}");
+        let (worked, printed) = configure(more);
+        assert!(worked == works && printed.contains(expected), "{more:?}: {printed}");
     };
     check(&["LOSS_MS=700"], false, "--claim");
     check(&["--claim"], true, "claimed");
@@ -249,8 +249,8 @@ fn it_is_claimed_configured_and_keeps_its_settings() {
     // An armed vehicle's bridge stays as it is.
     until("the bridge knows that the vehicle is armed", || {
         rig.uart.write_all(&packet(0, (1, 1), &heartbeat(true))).unwrap();
-        let (worked, said) = configure(&["LOSS_MS=800"]);
-        !worked && said.contains("armed")
+        let (worked, printed) = configure(&["LOSS_MS=800"]);
+        !worked && printed.contains("armed")
     });
     // Killed and started anew on the same flash.
     drop(rig);
@@ -260,8 +260,8 @@ fn it_is_claimed_configured_and_keeps_its_settings() {
         .args(["bridge", "configure", "--bridge", &address])
         .output()
         .unwrap();
-    let said = String::from_utf8(output.stdout).unwrap();
-    assert!(said.contains("LOSS_MS            700"), "{said}");
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(printed.contains("LOSS_MS            700"), "{printed}");
 }
 
 #[test]
@@ -271,8 +271,8 @@ fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
     let firmware = |args: &[&str]| {
         let output =
             Command::new(vizflyt()).args(["bridge", "firmware"]).args(args).output().unwrap();
-        let said = [output.stdout, output.stderr].concat();
-        (output.status.success(), String::from_utf8(said).unwrap())
+        let printed = [output.stdout, output.stderr].concat();
+        (output.status.success(), String::from_utf8(printed).unwrap())
     };
     let (keys, image) = (at("keys"), at("image"));
     let (_, key) = firmware(&["key", "--keys", &keys]);
@@ -280,17 +280,17 @@ fn firmware_is_brought_over_the_network_and_judged_as_on_a_chip() {
         .unwrap();
     let sign = |chip: &str, build: &str| {
         let signed = at(&format!("{chip}-{build}.signed"));
-        let (made, said) = firmware(&[
+        let (made, printed) = firmware(&[
             "sign", &image, "--chip", chip, "--build", build, "--keys", &keys, "-o", &signed,
         ]);
-        assert!(made, "{said}");
+        assert!(made, "{printed}");
         signed
     };
     let rig = Rig::start(&["--page=127.0.0.1:0", "--firmware-key", key.trim()]);
     let page = rig.page.clone();
     let check = |file: &str, works: bool, expected: &str| {
-        let (worked, said) = firmware(&["send", file, "--bridge", &page]);
-        assert!(worked == works && said.contains(expected), "{file}: {said}");
+        let (worked, printed) = firmware(&["send", file, "--bridge", &page]);
+        assert!(worked == works && printed.contains(expected), "{file}: {printed}");
     };
     let seven = sign("host", "7");
     check(&seven, true, "verified");

@@ -1,4 +1,4 @@
-//! What the command line says when used, and when used wrongly.
+//! The command line's output when used, and when used wrongly.
 
 use std::process::{Command, Output, Stdio};
 
@@ -15,7 +15,7 @@ fn check_refused(args: &[&str], texts: &[&str]) {
     assert!(!output.status.success(), "{args:?} succeeded");
     assert!(!message.contains("panicked"), "{args:?}: {message}");
     for text in texts {
-        assert!(message.contains(text), "{args:?} does not say '{text}': {message}");
+        assert!(message.contains(text), "{args:?} does not contain '{text}': {message}");
     }
 }
 

@@ -209,7 +209,7 @@ fn a_camera_changes_in_flight_and_the_plugin_flies_on() {
     assert!(response.starts_with("HTTP/1.1 400") && response.contains("near_m"), "{response}");
     let code = demo.wait(FLIGHT);
     let report = file.read();
-    // The example finds its way by what each image says of itself.
+    // The example finds its way by each image's own description.
     assert_eq!(report["outcome"], "finished", "{report:#} {:#?}", demo.seen);
     assert_eq!(code, Some(0));
     assert_eq!((&report["image_width"], &report["image_height"]), (&400.into(), &200.into()));

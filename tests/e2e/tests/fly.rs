@@ -61,10 +61,10 @@ impl Desk {
         assert!(!output.status.success(), "{args:?} succeeded");
         let error =
             message.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_else(|| {
-                panic!("{args:?} says no error: {message}");
+                panic!("{args:?} reports no error: {message}");
             });
         for part in parts {
-            assert!(error.contains(part), "{args:?} does not say {part:?}: {message}");
+            assert!(error.contains(part), "{args:?} does not contain {part:?}: {message}");
         }
     }
     /// Starts a flight that writes a report here.
@@ -121,13 +121,13 @@ fn which_lab_it_is_stands_before_everything_else() {
     );
     // The file in the folder where it is called, without being named.
     let output = desk.run(&["fly", "--ready-within", "1"]);
-    let said = String::from_utf8(output.stdout).unwrap();
-    let first = said.lines().next().unwrap();
+    let output_text = String::from_utf8(output.stdout).unwrap();
+    let first = output_text.lines().next().unwrap();
     for part in ["lab ", "real: server 127.0.0.1:9", "vehicle red", "jetson.toml"] {
-        assert!(first.contains(part), "{said}");
+        assert!(first.contains(part), "{output_text}");
     }
     assert!(!output.status.success());
-    assert!(said.contains("error: not in the air after 1 s"), "{said}");
+    assert!(output_text.contains("error: not in the air after 1 s"), "{output_text}");
 
     // The same file, and the simulated lab all the same.
     let mut flight = desk.fly(

@@ -114,7 +114,7 @@ fn keys_of(rig: &Rig) -> String {
     format!("--keys={}", rig.at("keys"))
 }
 
-/// Runs `vizflyt leaderboard` on a database of the rig's; returns what it says, or what it refuses with.
+/// Runs `vizflyt leaderboard` on a database of the rig's; returns its output, or its refusal.
 fn leaderboard(rig: &Rig, args: &[&str]) -> Result<String, String> {
     let database = format!("--database={}", rig.at("board.sqlite"));
     let output = Command::new(vizflyt()).args(["leaderboard", &database]).args(args).output();
@@ -139,10 +139,10 @@ fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
     let others = format!("--keys={}", rig.at("others"));
     let error = leaderboard(rig, &["add", whole, "--team=wasps", &others]).unwrap_err();
     assert!(error.contains("is signed with the key"), "{error}");
-    let said = add(whole, "--team=wasps").unwrap();
+    let printed = add(whole, "--team=wasps").unwrap();
     assert!(
-        said.contains("of team 'wasps' is added") && said.contains("2 of 2   finished"),
-        "{said}"
+        printed.contains("of team 'wasps' is added") && printed.contains("2 of 2   finished"),
+        "{printed}"
     );
     refused(whole, "--team=wasps", "already: team 'wasps' has added it");
     refused(whole, "--team=bees", "already: team 'wasps' has added it");
@@ -167,7 +167,7 @@ fn the_race_is_flown_from_images_and_refused_without_depth() {
     let run = &grade["runs"][0];
     assert_eq!(run["outcome"], "finished", "{run}");
     assert_eq!(run["stages_passed"], 4, "{run}");
-    // Colour alone: it says so before it takes off, and what would do.
+    // Colour alone: it reports so before it takes off, and what it needs.
     let grade = rig.grade(&[&race[..], &["--level=g"]].concat());
     let run = &grade["runs"][0];
     assert_eq!(run["outcome"], "plugin_failed", "{run}");
@@ -243,7 +243,7 @@ fn block(language: &str) -> String {
     begin.split_once("\n```").unwrap().0.to_owned()
 }
 
-/// Runs a shell script in which `vizflyt` only says how it was called; returns what it said.
+/// Runs a shell script in which `vizflyt` only prints its arguments; returns its output.
 fn called(rig: &Rig, shell: &[&str], environment: &[(&str, &str)]) -> String {
     let tools = rig.at("tools");
     fs::create_dir_all(&tools).unwrap();
@@ -260,7 +260,7 @@ fn called(rig: &Rig, shell: &[&str], environment: &[(&str, &str)]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Whether the program takes these arguments, told by what it says of a project that is not there.
+/// Whether the program takes these arguments, judged by its message about a project that does not exist.
 fn is_understood(rig: &Rig, called: &str) -> bool {
     let given = called.trim().replace("--project p5", "--project p9");
     let args: Vec<&str> = given.split_whitespace().collect();
@@ -298,9 +298,12 @@ fn the_array_script_of_the_guide_flies_its_part() {
         ("SLURM_CPUS_PER_TASK", "2"),
         ("HOME", rig.folder.path().to_str().unwrap()),
     ];
-    let said = called(&rig, &["bash", &file, vizflyt().to_str().unwrap(), "p5"], &environment);
-    assert!(said.contains("--shard 3/16") && said.contains("parts-77/part-3.json"), "{said}");
-    assert!(said.starts_with("grade ") && is_understood(&rig, &said), "{said}");
+    let printed = called(&rig, &["bash", &file, vizflyt().to_str().unwrap(), "p5"], &environment);
+    assert!(
+        printed.contains("--shard 3/16") && printed.contains("parts-77/part-3.json"),
+        "{printed}"
+    );
+    assert!(printed.starts_with("grade ") && is_understood(&rig, &printed), "{printed}");
     assert!(block("bash").contains("#SBATCH --array=1-16\n"));
 }
 
@@ -338,11 +341,11 @@ fn the_job_of_the_guide_flies_every_part() {
     assert_eq!(container["command"], serde_json::json!(["/bin/sh", "-c"]));
     let line = container["args"][0].as_str().unwrap();
     for index in [0, parts - 1] {
-        let said =
+        let printed =
             called(&rig, &["sh", "-c", line], &[("JOB_COMPLETION_INDEX", &index.to_string())]);
-        assert!(said.contains(&format!("--shard {}/{parts}", index + 1)), "{said}");
-        assert!(said.contains(&format!("part-{index}.json")), "{said}");
-        let known = said.replace("/plugin", "avoid").replace("/keys/own", &rig.at("keys"));
-        assert!(is_understood(&rig, &known), "{said}");
+        assert!(printed.contains(&format!("--shard {}/{parts}", index + 1)), "{printed}");
+        assert!(printed.contains(&format!("part-{index}.json")), "{printed}");
+        let known = printed.replace("/plugin", "avoid").replace("/keys/own", &rig.at("keys"));
+        assert!(is_understood(&rig, &known), "{printed}");
     }
 }

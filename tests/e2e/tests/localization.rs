@@ -16,7 +16,7 @@ fn free() -> String {
 }
 
 /// Lets the hand carry the vehicle before a motion capture of this `format`, and the doctor look at it
-/// as `settings` say; returns whether it is content, and what it said.
+/// as `settings` say; returns whether it finds no fault, and its output.
 fn doctor(format: &str, settings: &str, within: &str) -> (bool, String) {
     let address = free();
     let mut doctor = Command::new(vizflyt());

@@ -1,4 +1,4 @@
-//! `vizflyt tags locate` as a program: the truth comes in, webcams are drawn, the pose goes out; and the same from
+//! `vizflyt tags locate` as a program: the truth comes in, webcams are rendered, the pose goes out; and the same from
 //! images on disk.
 
 use std::net::UdpSocket;

@@ -1,5 +1,5 @@
 //! Distance fields that move along with their objects, against the true geometry of generated ones:
-//! nothing missed beyond one voxel, hardly anything told that is free by one and a half, at every
+//! nothing missed beyond one voxel, hardly anything reported that is free by one and a half, at every
 //! instant.
 
 use std::sync::Arc;

@@ -53,7 +53,7 @@ fn run(args: &[&str]) -> Output {
     Command::new(vizflyt()).args(args).stdin(Stdio::null()).output().unwrap()
 }
 
-fn said(output: &Output) -> String {
+fn text_of(output: &Output) -> String {
     let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
     text(&output.stdout) + &text(&output.stderr)
 }
@@ -77,7 +77,7 @@ fn a_computer_is_refused_then_paired_then_let_in() {
         args.extend(more);
         let output = run(&args);
         assert!(!output.status.success(), "there is no vehicle to fly");
-        said(&output)
+        text_of(&output)
     };
 
     // This side knows no such server; nor does the server know this side.
@@ -89,10 +89,14 @@ fn a_computer_is_refused_then_paired_then_let_in() {
 
     let wrong = if code == "000 000" { "111111" } else { "000000" };
     let output = run(&["pair", &address, "--keys", &keys, "--code", wrong]);
-    assert!(!output.status.success() && said(&output).contains("wrong code, 2 of 3 tries left"));
+    assert!(!output.status.success() && text_of(&output).contains("wrong code, 2 of 3 tries left"));
     let output = run(&["pair", &address, "--keys", &keys, "--code", &code, "--name", "jetson-3"]);
-    assert!(output.status.success(), "{}", said(&output));
-    assert!(said(&output).contains("'jetson-3', may fly and watch 'vizflyt'"), "{}", said(&output));
+    assert!(output.status.success(), "{}", text_of(&output));
+    assert!(
+        text_of(&output).contains("'jetson-3', may fly and watch 'vizflyt'"),
+        "{}",
+        text_of(&output)
+    );
     let text = fly(&[]);
     assert!(!text.contains("paired") && text.contains("autopilot"), "{text}");
 

@@ -32,7 +32,7 @@ fn refused(args: &[&str], texts: &[&str]) {
     assert!(!output.status.success(), "{args:?} succeeded");
     assert!(!message.contains("panicked"), "{args:?}: {message}");
     for text in texts {
-        assert!(message.contains(text), "{args:?} does not say '{text}': {message}");
+        assert!(message.contains(text), "{args:?} does not contain '{text}': {message}");
     }
 }
 
@@ -123,7 +123,7 @@ fn obstacles_are_baked_once_and_kept() {
 #[test]
 fn pictures_are_written_as_png_and_as_arrays() {
     let rig = Rig::new();
-    let said = good(&[
+    let printed = good(&[
         "scene",
         "render",
         &rig.at("race"),
@@ -132,7 +132,7 @@ fn pictures_are_written_as_png_and_as_arrays() {
         "--out",
         &rig.at("a"),
     ]);
-    assert!(said.contains("renderer") && said.contains("160x120 in "), "{said}");
+    assert!(printed.contains("renderer") && printed.contains("160x120 in "), "{printed}");
     let folder = PathBuf::from(rig.at("a"));
     assert_eq!(png_head(&folder.join("rgb.png")), (160, 120, 8, 2));
     assert_eq!(png_head(&folder.join("depth_mm.png")), (160, 120, 16, 0));
@@ -175,8 +175,8 @@ fn moving_objects_are_rendered_at_their_time() {
     let door = |at: &str| {
         let out = rig.at(at);
         let fixed = ["scene", "render", &scene, "--camera", &camera, "--format", "npy"];
-        let said = good(&[&fixed[..], &["--at", at, "--out", &out]].concat());
-        assert!(said.contains("door, pendulum, second drone at"), "{said}");
+        let printed = good(&[&fixed[..], &["--at", at, "--out", &out]].concat());
+        assert!(printed.contains("door, pendulum, second drone at"), "{printed}");
         let ids = saved(&out, "ids.npy").values;
         (0..ids.len()).filter(|&k| ids[k] == 1.0).map(|k| k % 160).collect::<Vec<_>>()
     };
@@ -341,12 +341,12 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     let ask = json!({"p_m": welcome["start_m"], "yaw_rad": 0.3, "pitch_rad": -0.1, "fov_deg": 80,
                      "width_px": 200, "height_px": 100, "depth": false, "at_s": 2.5});
     socket.send(&ask.to_string());
-    let told: Value = serde_json::from_slice(&socket.receive()).unwrap();
-    assert!(told["visible"].as_u64().unwrap() > 100, "{told}");
+    let info: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    assert!(info["visible"].as_u64().unwrap() > 100, "{info}");
     assert_eq!(socket.receive()[..2], [0xff, 0xd8], "a JPEG follows");
 
-    rig.write("copied.json", &told["camera"].to_string());
-    let said = good(&[
+    rig.write("copied.json", &info["camera"].to_string());
+    let printed = good(&[
         "scene",
         "render",
         &rig.at("race"),
@@ -357,7 +357,7 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
         "--out",
         &rig.at("copied"),
     ]);
-    assert!(said.contains(&format!("{} splats in sight", told["visible"])), "{said} {told}");
+    assert!(printed.contains(&format!("{} splats in sight", info["visible"])), "{printed} {info}");
 
     kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM).unwrap();
     assert!(child.wait().unwrap().success());

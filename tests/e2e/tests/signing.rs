@@ -50,7 +50,7 @@ fn a_signed_flight_is_flown_and_a_stranger_is_not_obeyed() {
     };
     let mut flight = lab.fly(0, plan);
 
-    // Until the vehicle has the key, what it says is not believed.
+    // Until the vehicle has the key, its packets are rejected.
     flight.until("not signed");
     let usb = format!("tcpout:{}", flight.link(0));
     let given = Command::new(vizflyt())

@@ -104,8 +104,9 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
 
     // Print.
     succeeds(home, &["print", "board", "-o", "board.pdf"]);
-    let said = succeeds(home, &["print", "mat", "-o", "mat.pdf", "--columns", "3", "--rows", "3"]);
-    assert!(said.contains("mat.pdf: 4 sheets of A4, 9 tags"), "{said}");
+    let printed =
+        succeeds(home, &["print", "mat", "-o", "mat.pdf", "--columns", "3", "--rows", "3"]);
+    assert!(printed.contains("mat.pdf: 4 sheets of A4, 9 tags"), "{printed}");
     succeeds(home, &["print", "cube", "-o", "cube.pdf", "--paper", "letter"]);
     for name in ["board", "mat", "cube"] {
         let pdf = std::fs::read(home.join(format!("{name}.pdf"))).unwrap();
@@ -121,8 +122,8 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
     assert!(!home.join("left.toml").exists());
     write_folder(&home.join("images"), &images);
     let all = ["calibrate", "images", "--board", "board.toml", "-o", "left.toml"];
-    let said = succeeds(home, &all);
-    assert!(said.contains("held back"), "{said}");
+    let printed = succeeds(home, &all);
+    assert!(printed.contains("held back"), "{printed}");
     let left = TagCamera::read(&home.join("left.toml")).unwrap();
     assert!((left.intrinsics.fx_px / webcam().fx_px - 1.0).abs() < 3e-3, "{left:?}");
     assert!(left.calibration.unwrap().held_out_rms_px < 0.3, "{left:?}");
@@ -147,12 +148,12 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
     std::fs::write(home.join("walk.y4m"), stream).unwrap();
     let survey =
         ["survey", "mat", "| cat walk.y4m", "--camera", "left.toml", "--layout", "mat.toml"];
-    let said = succeeds(home, &[&survey[..], &["-o", "room.toml", "--anchor", "100"]].concat());
-    assert!(said.contains("9 tags from 16 images"), "{said}");
+    let printed = succeeds(home, &[&survey[..], &["-o", "room.toml", "--anchor", "100"]].concat());
+    assert!(printed.contains("9 tags from 16 images"), "{printed}");
     let room = TagLayout::read(&home.join("room.toml")).unwrap();
     for tag in &room.tags {
         let off_m = tag.position_m.distance(glued.find(tag.family, tag.id).unwrap().position_m);
-        assert!(off_m < 0.002, "tag {} is {:.1} mm off: {said}", tag.id, 1e3 * off_m);
+        assert!(off_m < 0.002, "tag {} is {:.1} mm off: {printed}", tag.id, 1e3 * off_m);
     }
 
     // Survey two fixed cameras by that mat.
@@ -168,13 +169,13 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
     let no_source = ["survey", "cameras", "left.toml", "--mat", "room.toml"];
     refused(home, &no_source, &["left.toml", "names no source"]);
     let files = ["left.toml=left", "right.toml=right"];
-    let said = succeeds(home, &["survey", "cameras", files[0], files[1], "--mat", "room.toml"]);
+    let printed = succeeds(home, &["survey", "cameras", files[0], files[1], "--mat", "room.toml"]);
     for (name, truth) in ["left", "right"].into_iter().zip(truth) {
         let camera = TagCamera::read(&home.join(format!("{name}.toml"))).unwrap();
         let Mounting::World(found) = camera.mounting else { panic!("{name} was not placed") };
         let off_m = found.translation_m.distance(truth.translation_m);
         let off_rad = found.rotation.angle_between(truth.rotation);
-        assert!(off_m < 0.01 && off_rad < 0.01, "{name}: {off_m} m, {off_rad} rad: {said}");
+        assert!(off_m < 0.01 && off_rad < 0.01, "{name}: {off_m} m, {off_rad} rad: {printed}");
     }
     // A cube's layout is no mat.
     let wrong = ["survey", "cameras", files[0], "--mat", "cube.toml"];

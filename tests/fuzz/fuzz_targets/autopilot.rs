@@ -12,7 +12,7 @@ use vizflyt_simulator::wifi::WifiConfig;
 const MISSION: [u32; 6] = [44, 73, 47, 51, 43, 45];
 
 /// Says a whole message of the mission protocol with this payload.
-fn say(simulation: &mut Simulation, which: u8, payload: &[u8]) {
+fn inject(simulation: &mut Simulation, which: u8, payload: &[u8]) {
     let id = MISSION[usize::from(which) % MISSION.len()];
     let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, payload) else { return };
     let header = MavHeader { system_id: 255, component_id: 191, sequence: which };
@@ -36,7 +36,7 @@ fuzz_target!(|input: (bool, bool, Vec<(u8, &[u8])>)| {
             251 => simulation.set_radio(Radio::Lost),
             252 => simulation.set_radio(Radio::Receiving),
             253 => simulation.break_motor(packet.len() % 4, 0.5),
-            240..=249 => say(&mut simulation, what - 240, packet),
+            240..=249 => inject(&mut simulation, what - 240, packet),
             link => simulation.handle_mavlink(usize::from(link) % MAX_LINKS, packet),
         }
         for _ in 0..5 {

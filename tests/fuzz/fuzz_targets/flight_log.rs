@@ -6,7 +6,7 @@ use std::io::Cursor;
 use libfuzzer_sys::fuzz_target;
 use vizflyt_runtime::log::read::{LogReader, Recorded, RecordedFlight};
 use vizflyt_runtime::log::{Observation, ObservedImage};
-use vizflyt_runtime::replay::{Plan, decode, observation_len};
+use vizflyt_runtime::replay::{ReplayPlan, decode, observation_len};
 use zerocopy::IntoBytes;
 
 /// Larger ones are for the machine that replays, not for the fuzzer.
@@ -31,7 +31,7 @@ fuzz_target!(|bytes: &[u8]| {
         return;
     }
     let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
-    let _ = Plan::read(RecordedFlight::new(reader, false));
+    let _ = ReplayPlan::read(RecordedFlight::new(reader, false));
     let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
     let mut flight = RecordedFlight::new(reader, true);
     while let Ok(Some(recorded)) = flight.next() {

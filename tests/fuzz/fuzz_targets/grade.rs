@@ -28,7 +28,7 @@ fuzz_target!(|text: &str| {
     let mut changed = own.clone();
     changed.hash.push('0');
     assert!(changed.verify(&key.verifying_key()).is_err());
-    // Parts: a grade merges alone or says why not, and never with itself.
+    // Parts: a grade merges alone or reports why not, and never with itself.
     let name = || "grade".to_owned();
     if let Ok(whole) = merge(&[(name(), own.clone())], &key.verifying_key()) {
         assert_eq!(whole.runs.len(), own.runs.len());

@@ -14,7 +14,7 @@ use vizflyt_protocol::messages::{PoseSample, YawTarget};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::link::{COMPONENT_ID, FencePolygon, Goal, Link, SYSTEM_ID};
 
-/// What an autopilot, another companion or a ground station may say.
+/// Messages that an autopilot, another companion or a ground station may send.
 const MESSAGES: [u32; 23] = [
     0, 1, 22, 27, 30, 32, 49, 77, 84, 105, 109, 111, 148, 193, 230, 253, 256, 20, 23, 76, 40, 47,
     51,
@@ -36,7 +36,7 @@ impl Machine {
         let [kind, value, length, rest @ ..] = data else { return &[] };
         let (argument, rest) = rest.split_at(rest.len().min(usize::from(*length)));
         match kind % 8 {
-            0 | 1 => self.say(*value, argument),
+            0 | 1 => self.inject(*value, argument),
             2 => self.link.handle_input(self.now, argument),
             3 => {
                 let seconds = f64::from(*value) * 0.05;
@@ -77,7 +77,7 @@ impl Machine {
     }
 
     /// A whole packet with this payload; the sender is the autopilot, or now and then another.
-    fn say(&mut self, value: u8, payload: &[u8]) {
+    fn inject(&mut self, value: u8, payload: &[u8]) {
         let id = MESSAGES[usize::from(value) % MESSAGES.len()];
         let Ok(message) = MavMessage::parse(MavlinkVersion::V2, id, payload) else { return };
         let component_id = if value >= 240 { COMPONENT_ID } else { 1 };

@@ -1,4 +1,4 @@
-//! NatNet packets after Motive has said who it is: counted and dropped, or a measurement of finite
+//! NatNet packets after Motive has identified itself: counted and dropped, or a measurement of finite
 //! numbers; and no packet makes us talk without end.
 #![no_main]
 use libfuzzer_sys::fuzz_target;

@@ -48,7 +48,7 @@ impl Machine {
                 let source = input.byte()?;
                 let late_s = input.number(0.05)?;
                 let turned = quaternion(input.three(3.0)?);
-                let said = Measured {
+                let measured = Measured {
                     source,
                     stamp: self.now.plus_seconds(-late_s),
                     arrival: self.now,
@@ -64,7 +64,7 @@ impl Machine {
                         }),
                     },
                 };
-                self.refused += u64::from(self.filter.handle_pose(&said).is_err());
+                self.refused += u64::from(self.filter.handle_pose(&measured).is_err());
             }
             2 => {
                 let late_s = input.number(0.05)?;

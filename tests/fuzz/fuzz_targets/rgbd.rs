@@ -1,4 +1,4 @@
-//! The RGB-D bitstream, whole: an error, or an image of the size it says; bounded time and memory.
+//! The RGB-D bitstream, whole: an error, or an image of the stated size; bounded time and memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_rgbd::{Decoder, ImageMut, peek};

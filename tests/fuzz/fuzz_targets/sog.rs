@@ -1,4 +1,4 @@
-//! A SOG scene from a stranger: an error or a sound scene. The first byte says what of a good scene
+//! A SOG scene from a stranger: an error or a sound scene. The first byte selects what of a good scene
 //! is replaced by the others: the whole archive, its meta data, or one of its textures.
 #![no_main]
 use std::io::{Cursor, Read as _, Write as _};
@@ -10,7 +10,7 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 /// More than the smallest file may hold.
-const MOST: usize = 1 << 20;
+const MAX_SPLATS: usize = 1 << 20;
 
 /// The parts of a good scene, by name.
 static PARTS: LazyLock<Vec<(String, Vec<u8>)>> = LazyLock::new(|| {
@@ -31,7 +31,7 @@ static PARTS: LazyLock<Vec<(String, Vec<u8>)>> = LazyLock::new(|| {
 fuzz_target!(|bytes: &[u8]| {
     let Some((&choice, bytes)) = bytes.split_first() else { return };
     let Some(replaced) = usize::from(choice).checked_sub(1) else {
-        vizflyt_fuzz::check_scene(parse(bytes, Format::Sog), MOST);
+        vizflyt_fuzz::check_scene(parse(bytes, Format::Sog), MAX_SPLATS);
         return;
     };
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
@@ -42,5 +42,5 @@ fuzz_target!(|bytes: &[u8]| {
         archive.write_all(content).expect("memory");
     }
     let wrapped = archive.finish().expect("memory").into_inner();
-    vizflyt_fuzz::check_scene(parse(&wrapped, Format::Sog), MOST);
+    vizflyt_fuzz::check_scene(parse(&wrapped, Format::Sog), MAX_SPLATS);
 });

@@ -9,12 +9,12 @@ use libfuzzer_sys::fuzz_target;
 use vizflyt_splat::format::{Format, parse};
 
 /// More than a file of the longest input may inflate to.
-const MOST: usize = 1 << 20;
+const MAX_SPLATS: usize = 1 << 20;
 
 fuzz_target!(|bytes: &[u8]| {
-    vizflyt_fuzz::check_scene(parse(bytes, Format::Spz), MOST);
+    vizflyt_fuzz::check_scene(parse(bytes, Format::Spz), MAX_SPLATS);
     let mut stream = GzEncoder::new(Vec::new(), Compression::none());
     stream.write_all(bytes).expect("memory");
     let wrapped = stream.finish().expect("memory");
-    vizflyt_fuzz::check_scene(parse(&wrapped, Format::Spz), MOST);
+    vizflyt_fuzz::check_scene(parse(&wrapped, Format::Spz), MAX_SPLATS);
 });

@@ -1,4 +1,4 @@
-//! Image files (PNG, JPEG, PGM) and the stamps beside them: images of the size they say, or a sentence.
+//! Image files (PNG, JPEG, PGM) and the stamps beside them: images of the stated size, or a sentence.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_tags::capture::{decode, parse_stamps};

@@ -26,9 +26,9 @@ pub enum Peer {
 #[derive(Clone, Debug)]
 pub(crate) struct Client {
     pub peer: Peer,
-    /// Told by the settings: stays, however silent.
+    /// Given by the settings: stays, however silent.
     pub fixed: bool,
-    pub heard_at: HostTime,
+    pub received_at: HostTime,
     /// Systems and components that spoke from here.
     pub systems: heapless::Vec<(u8, u8), 4>,
     pub sequences: Sequences<3>,
@@ -53,7 +53,7 @@ impl Client {
         Self {
             peer,
             fixed,
-            heard_at: now,
+            received_at: now,
             systems: heapless::Vec::new(),
             sequences: Sequences::new(),
             sequence: 0,
@@ -68,7 +68,7 @@ impl Client {
 
     /// Takes note of a packet that came from it; returns how many were lost before it.
     pub(crate) fn note(&mut self, now: HostTime, packet: Raw<'_>) -> u32 {
-        self.heard_at = now;
+        self.received_at = now;
         let source = packet.source();
         if !self.systems.contains(&source) {
             if self.systems.is_full() {
@@ -89,7 +89,7 @@ impl Client {
 
     /// Whether it has been silent for too long.
     pub(crate) fn is_gone(&self, now: HostTime, settings: &Settings) -> bool {
-        let silent_s = now.seconds_since(self.heard_at);
+        let silent_s = now.seconds_since(self.received_at);
         matches!(self.peer, Peer::Udp(_))
             && !self.fixed
             && silent_s > f64::from(settings.client_timeout_s)

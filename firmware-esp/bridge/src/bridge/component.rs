@@ -228,7 +228,7 @@ impl PacketRouter {
     pub(super) fn grant(&mut self, now: HostTime, request: access::ShellRequest) {
         match request {
             access::ShellRequest::Save => {
-                // Twice the same wish is one; four different ones do not exist.
+                // A request that comes twice counts once; four different ones do not exist.
                 let _ = self.events.push_back(Event::Save);
             }
             access::ShellRequest::Reset => {
@@ -261,7 +261,7 @@ impl PacketRouter {
         self.reply(now, from, TUNNEL, &answer[..5 + used]);
     }
 
-    // ---- what we say ----
+    // ---- messages of our own ----
 
     /// Once a second, and when the companion is silent.
     pub(super) fn poll_component(&mut self, now: HostTime) {

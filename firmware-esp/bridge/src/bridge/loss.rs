@@ -52,7 +52,7 @@ pub(crate) struct LinkLoss {
 #[derive(Clone, Copy, Debug)]
 struct Streamer {
     source: (u8, u8),
-    heard_at: HostTime,
+    received_at: HostTime,
     counted: u8,
     counting_since: HostTime,
 }
@@ -82,7 +82,7 @@ impl LinkLoss {
     pub(crate) fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
         match &mut self.streamer {
             Some(streamer) if streamer.source == source => {
-                streamer.heard_at = now;
+                streamer.received_at = now;
                 if streams && streamer.counted < STREAM {
                     if now.seconds_since(streamer.counting_since) > STREAM_S {
                         streamer.counting_since = now;
@@ -94,10 +94,10 @@ impl LinkLoss {
             // Another companion takes over only from a silent one, or from no companion.
             Some(streamer)
                 if streamer.counted >= STREAM
-                    && now.seconds_since(streamer.heard_at) < STREAM_S => {}
+                    && now.seconds_since(streamer.received_at) < STREAM_S => {}
             _ if streams => {
                 self.streamer =
-                    Some(Streamer { source, heard_at: now, counted: 1, counting_since: now });
+                    Some(Streamer { source, received_at: now, counted: 1, counting_since: now });
             }
             _ => {}
         }
@@ -123,7 +123,7 @@ impl LinkLoss {
         }
         let streamer = self.streamer.filter(|streamer| streamer.counted >= STREAM)?;
         (flight.follows() && loss_ms > 0)
-            .then(|| streamer.heard_at.plus_ns(i64::from(loss_ms) * 1_000_000))
+            .then(|| streamer.received_at.plus_ns(i64::from(loss_ms) * 1_000_000))
     }
 
     /// Returns what is to be done at `now`.
@@ -140,7 +140,7 @@ impl LinkLoss {
         }
         // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
         // later without one is not landed for its silence.
-        let ended = |streamer: &Streamer| now.seconds_since(streamer.heard_at) > ENDED_S;
+        let ended = |streamer: &Streamer| now.seconds_since(streamer.received_at) > ENDED_S;
         if !flight.follows() && self.streamer.as_ref().is_some_and(ended) {
             self.streamer = None;
         }

@@ -330,7 +330,7 @@ impl PacketRouter {
             .enumerate()
             .filter_map(|(index, client)| Some((index, client.as_ref()?)))
             .filter(|(_, client)| matches!(client.peer, Peer::Udp(_)) && !client.fixed)
-            .map(|(index, client)| (index, now.seconds_since(client.heard_at)))
+            .map(|(index, client)| (index, now.seconds_since(client.received_at)))
             .filter(|&(_, silent_s)| silent_s > REPLACEABLE_S)
             .max_by(|a, b| a.1.total_cmp(&b.1))
             .map(|(index, _)| index)

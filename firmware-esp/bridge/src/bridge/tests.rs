@@ -367,10 +367,10 @@ fn the_companions_silence_lands_the_vehicle_and_is_reported() {
     }
     assert_eq!(seen, [(1500, 0), (1800, 1)]);
     assert!(bridge.is_landing());
-    let told = datagrams(&mut bridge, at(2600)).iter().flat_map(|(_, b)| decode(b)).any(|packet| {
+    let reported = datagrams(&mut bridge, at(2600)).iter().flat_map(|(_, b)| decode(b)).any(|packet| {
         matches!(packet.message, MavMessage::STATUSTEXT(text) if text.text.starts_with(b"bridge: the companion is silent"))
     });
-    assert!(told);
+    assert!(reported);
     bridge.handle_uart(at(2700), &bytes(0, AUTOPILOT, &heartbeat(true, 9)));
     bridge.handle_timeout(at(2701));
     assert!(!bridge.is_landing());

@@ -134,7 +134,7 @@ fn drag_slows_a_glide_and_wind_carries() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
-    /// Whatever the motors are told, poison included, the state stays finite and above the floor.
+    /// Whatever the motor commands are, NaN included, the state stays finite and above the floor.
     #[test]
     fn no_command_breaks_the_state(
         commands in prop::collection::vec(

@@ -1,4 +1,4 @@
-//! Arming, disarming, take-off: the checks of a real ArduCopter and what it says when one fails.
+//! Arming, disarming, take-off: the checks of a real ArduCopter and its texts when one fails.
 
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::time::AutopilotTime;

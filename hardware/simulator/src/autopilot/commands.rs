@@ -226,13 +226,13 @@ impl Autopilot {
         if self.params.value(Param::VisoType) == 0.0 {
             return;
         }
-        // Heard, and not flown by, unless the sources say external navigation.
+        // Received, and not used, unless the sources are external navigation.
         if self.params.value(Param::Ek3PosXy) != EXTERNAL_NAVIGATION {
             self.estimator.note_vision_alive(now);
             return;
         }
         let least_m = self.params.value(Param::VisoPosNoise);
-        // A sender that does not know its covariance says NaN.
+        // A sender that does not know its covariance sends NaN.
         let sigma_m = f64::from(variance_m2).max(0.0).sqrt().clamp(least_m, 100.0);
         let measurement = VisionMeasurement {
             world_from_body,

@@ -16,7 +16,7 @@ use super::dialect::{
 };
 
 /// Corners kept at most; ArduCopter's storage holds about as many.
-const MOST_CORNERS: u16 = 70;
+const MAX_CORNERS: u16 = 70;
 /// An item that does not come is asked for again after this. [s]
 const REPEAT_S: f64 = 1.0;
 /// A sender silent for this long has given up. [s]
@@ -38,7 +38,7 @@ struct Upload {
     from: Sender,
     count: u16,
     got: Vec<FenceCorner>,
-    heard_at: AutopilotTime,
+    received_at: AutopilotTime,
     asked_at: AutopilotTime,
 }
 
@@ -160,8 +160,8 @@ impl Autopilot {
             return self.answer(from, MavMissionResult::MAV_MISSION_DENIED);
         }
         self.polygons.upload = None;
-        if count > MOST_CORNERS {
-            let text = format!("Only {MOST_CORNERS} items are supported");
+        if count > MAX_CORNERS {
+            let text = format!("Only {MAX_CORNERS} items are supported");
             self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return self.answer(from, MavMissionResult::MAV_MISSION_NO_SPACE);
         }
@@ -170,7 +170,7 @@ impl Autopilot {
             return self.answer(from, MavMissionResult::MAV_MISSION_ACCEPTED);
         }
         let got = Vec::with_capacity(usize::from(count));
-        self.polygons.upload = Some(Upload { from, count, got, heard_at: now, asked_at: now });
+        self.polygons.upload = Some(Upload { from, count, got, received_at: now, asked_at: now });
         self.ask_for_item(now);
     }
 
@@ -190,7 +190,7 @@ impl Autopilot {
                 return self.answer(from, result);
             }
         }
-        upload.heard_at = now;
+        upload.received_at = now;
         if upload.got.len() < usize::from(upload.count) {
             return self.ask_for_item(now);
         }
@@ -220,7 +220,7 @@ impl Autopilot {
     /// Asks again for what does not come, and gives up in the end.
     pub(super) fn tend_upload(&mut self, now: AutopilotTime) {
         let Some(upload) = &self.polygons.upload else { return };
-        if now.seconds_since(upload.heard_at) > TIMEOUT_S {
+        if now.seconds_since(upload.received_at) > TIMEOUT_S {
             let from = upload.from;
             self.polygons.upload = None;
             self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "Fence upload timeout");

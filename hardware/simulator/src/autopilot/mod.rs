@@ -77,7 +77,7 @@ pub enum Radio {
     /// None is connected: a lab without a pilot.
     #[default]
     Absent,
-    /// A transmitter is heard.
+    /// A transmitter is received.
     Receiving,
     /// The transmitter has fallen silent.
     Lost,
@@ -247,7 +247,7 @@ impl Autopilot {
         self.armed
     }
 
-    /// Whether the autopilot believes to stand on the ground.
+    /// Whether the autopilot estimates that it stands on the ground.
     pub fn is_landed(&self) -> bool {
         self.landed
     }

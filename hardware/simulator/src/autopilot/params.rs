@@ -1,7 +1,7 @@
 //! The parameters of ArduCopter that this autopilot honours, by the names of 4.8.
 //!
 //! Defaults are a lab's (`docs` of ArduCopter: external navigation, no GPS, no compass), not
-//! ArduCopter's own, wherever the comment says so.
+//! ArduCopter's own, wherever the comment states it.
 
 use super::dialect::MavParamType;
 
@@ -159,7 +159,7 @@ params! {
     BattCrtMah = "BATT_CRT_MAH", 0.0, 0.0..100000.0, MAV_PARAM_TYPE_REAL32;
     /// A voltage must be low for this long. [s]
     BattLowTimer = "BATT_LOW_TIMER", 10.0, 0.0..120.0, MAV_PARAM_TYPE_INT16;
-    /// Low: 0 is only said, 1 LAND (lab), 2 RTL, 5 motors off, 7 BRAKE.
+    /// Low: 0 is only reported, 1 LAND (lab), 2 RTL, 5 motors off, 7 BRAKE.
     BattFsLowAct = "BATT_FS_LOW_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
     /// Critical: likewise (lab).
     BattFsCrtAct = "BATT_FS_CRT_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;

@@ -58,7 +58,7 @@ impl Signing {
         self.signer.sign(time, buffer, len)
     }
 
-    /// Whether a packet that came over a link is to be believed.
+    /// Whether a packet that came over a link is accepted.
     pub(super) fn accepts(
         &mut self,
         now: AutopilotTime,

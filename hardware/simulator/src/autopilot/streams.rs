@@ -46,7 +46,7 @@ const DEFAULTS: [(u32, i32); 17] = [
 ];
 
 /// Fastest stream: the main loop's rate. [us]
-const LEAST_INTERVAL_US: i32 = 2_500;
+const MIN_INTERVAL_US: i32 = 2_500;
 
 /// When each message is due.
 #[derive(Clone, Debug)]
@@ -85,7 +85,7 @@ impl Streams {
         } else if interval_us == 0.0 {
             DEFAULTS[index].1
         } else {
-            (interval_us as i32).max(LEAST_INTERVAL_US)
+            (interval_us as i32).max(MIN_INTERVAL_US)
         };
         true
     }

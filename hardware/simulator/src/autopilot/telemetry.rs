@@ -1,4 +1,4 @@
-//! What the autopilot reports by itself and on request; [`streams`](super::streams) says how often.
+//! What the autopilot reports by itself and on request; [`streams`](super::streams) has the rates.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::yaw_of;

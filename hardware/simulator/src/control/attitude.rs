@@ -32,7 +32,7 @@ const YAW_RATE_LIMIT: f64 = 4.0;
 const DAMPING_CUTOFF: f64 = 250.0;
 /// Share of gravity that the vertical thrust never falls below in flight: below it there is
 /// nothing left to steer with.
-const LEAST_LIFT: f64 = 0.15;
+const MIN_LIFT: f64 = 0.15;
 /// Share of the full thrust left for steering.
 const THRUST_SHARE: f64 = 0.85;
 
@@ -94,7 +94,7 @@ impl AttitudeController {
 
         // Thrust counts along the axis the vehicle has, not the one it is still turning to.
         let along = (estimate.world_from_body * DVec3::Z).dot(force_world);
-        let thrust_n = along.max(LEAST_LIFT * MASS_KG * GRAVITY_MPS2);
+        let thrust_n = along.max(MIN_LIFT * MASS_KG * GRAVITY_MPS2);
         Wrench {
             thrust_n: thrust_n.min(4.0 * MAX_THRUST_N * THRUST_SHARE),
             torque_nm: self.torque(estimate.omega_body_radps, omega_target, dt_s),
@@ -122,7 +122,7 @@ impl AttitudeController {
 fn limited_force(a_world_mps2: DVec3, limits: &Limits) -> (DVec3, bool) {
     let wanted = (a_world_mps2 + DVec3::Z * GRAVITY_MPS2) * MASS_KG;
     let most = 4.0 * MAX_THRUST_N * THRUST_SHARE;
-    let lift = wanted.z.clamp(LEAST_LIFT * MASS_KG * GRAVITY_MPS2, most);
+    let lift = wanted.z.clamp(MIN_LIFT * MASS_KG * GRAVITY_MPS2, most);
     let sideways = DVec3::new(wanted.x, wanted.y, 0.0);
     let by_tilt = lift * limits.tilt_rad.tan();
     let by_thrust = (most * most - lift * lift).max(0.0).sqrt();

@@ -137,7 +137,7 @@ impl PositionController {
         self.horizontal.shaped.v + self.vertical.shaped.v
     }
 
-    /// Returns the acceleration to fly, gravity not included [m/s^2, world]. `saturated` says that
+    /// Returns the acceleration to fly, gravity not included [m/s^2, world]. `saturated` means that
     /// the last one could not be flown in full.
     pub fn update(
         &mut self,

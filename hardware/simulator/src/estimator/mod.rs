@@ -48,7 +48,7 @@ const HISTORY_S: f64 = 0.55;
 /// IMU samples per prediction of the covariance: 100 Hz.
 const SAMPLES_PER_PREDICTION: u32 = 4;
 
-/// What external navigation says.
+/// A measurement of external navigation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisionMeasurement {
     /// The pose.
@@ -225,7 +225,7 @@ impl Estimator {
     }
 
     /// Adds the height of the moment to all heights from now on. ArduCopter does this when it
-    /// says "Field Elevation Set": it takes where it stands for the new zero of the barometer,
+    /// reports "Field Elevation Set": it takes where it stands for the new zero of the barometer,
     /// but adds it where it should subtract, so that 0.59 m became 1.17 m. Harmless at z = 0.
     pub fn reset_height_datum(&mut self) {
         let z = self.estimate.p_world_m.z;
@@ -237,7 +237,7 @@ impl Estimator {
         self.baro.datum_m = None;
     }
 
-    /// Takes one sensor sample, `dt_s` after the last. `still` says that the motors are off.
+    /// Takes one sensor sample, `dt_s` after the last. `still` means that the motors are off.
     pub fn handle_sensors(
         &mut self,
         now: AutopilotTime,
@@ -339,7 +339,7 @@ impl Estimator {
         }
         a.done = true;
         self.gyro_bias = a.gyro / a.samples;
-        // What is felt when standing points up.
+        // The specific force of a vehicle at rest points up.
         let up_body = a.accel.normalize_or(DVec3::Z);
         self.estimate.world_from_body = DQuat::from_rotation_arc(up_body, DVec3::Z);
     }

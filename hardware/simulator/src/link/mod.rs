@@ -225,7 +225,7 @@ impl Link {
     pub fn send(&mut self, packet: &[u8]) {
         match self {
             Self::Udp { socket, target, peers } => {
-                peers.retain(|(_, heard)| heard.elapsed() < PEER_SILENCE);
+                peers.retain(|(_, received_at)| received_at.elapsed() < PEER_SILENCE);
                 for address in target.iter().chain(peers.iter().map(|(address, _)| address)) {
                     // Lost like any datagram: the autopilot does not learn of it either.
                     let _ = socket.send_to(packet, address);
@@ -260,7 +260,7 @@ impl Link {
 }
 
 impl TcpSide {
-    /// Returns a new peer, if there is one; `busy` says that one is being served.
+    /// Returns a new peer, if there is one; `busy` means that one is being served.
     fn next_peer(&mut self, busy: bool) -> Option<TcpStream> {
         match self {
             // Also while busy: a second client is let go at once, not left to wait for ever.

@@ -295,12 +295,12 @@ mod tests {
         assert_eq!(vehicle.dropped(), 1);
         for _ in 0..2 {
             let mut bridge = SerialPort::make(&path, 921_600).unwrap();
-            let mut heard = Vec::new();
+            let mut received = Vec::new();
             until(|| {
                 vehicle.receive(|_| {});
                 vehicle.send(b"here");
-                read(&mut bridge, &mut heard);
-                !heard.is_empty()
+                read(&mut bridge, &mut received);
+                !received.is_empty()
             });
             drop(bridge);
             until(|| {
@@ -324,14 +324,14 @@ mod tests {
         let kept = sent - vehicle.dropped() as usize;
         assert!(kept >= MAX_WAITING / 200 && kept < sent, "{kept} of {sent} kept");
         // A tenth of a second's worth: it cannot come sooner, however slow the machine.
-        let mut heard = Vec::new();
+        let mut received = Vec::new();
         until(|| {
             vehicle.receive(|_| {});
-            read(&mut client, &mut heard);
-            heard.len() >= 600
+            read(&mut client, &mut received);
+            received.len() >= 600
         });
-        let least_s = (heard.len() as f64 - 5_760.0 * BURST_S) / 5_760.0 - 1e-3;
-        assert!(start.elapsed().as_secs_f64() >= least_s, "{} bytes", heard.len());
+        let least_s = (received.len() as f64 - 5_760.0 * BURST_S) / 5_760.0 - 1e-3;
+        assert!(start.elapsed().as_secs_f64() >= least_s, "{} bytes", received.len());
     }
 
     #[test]

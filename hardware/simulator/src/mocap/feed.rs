@@ -70,7 +70,7 @@ impl FromStr for FeedTarget {
 pub struct Feed {
     target: FeedTarget,
     socket: UdpSocket,
-    /// NatNet's listeners, and when they were last heard.
+    /// NatNet's listeners, and when they last sent something.
     listeners: Vec<(SocketAddr, AutopilotTime)>,
 }
 
@@ -122,12 +122,14 @@ impl Feed {
     fn answer(&mut self, object: &str, now: AutopilotTime) {
         let mut buffer = [0; 2048];
         // As many as may wait: a loop that another program could keep busy.
-        for _ in 0..MOST_LISTENERS {
+        for _ in 0..MAX_LISTENERS {
             // Errors are an empty socket, or a complaint that someone has gone.
             let Ok((length, from)) = self.socket.recv_from(&mut buffer) else { break };
-            if let Some((_, heard)) = self.listeners.iter_mut().find(|(known, _)| *known == from) {
-                *heard = now;
-            } else if self.listeners.len() < MOST_LISTENERS {
+            if let Some((_, received_at)) =
+                self.listeners.iter_mut().find(|(known, _)| *known == from)
+            {
+                *received_at = now;
+            } else if self.listeners.len() < MAX_LISTENERS {
                 self.listeners.push((from, now));
             } else {
                 continue;
@@ -136,7 +138,7 @@ impl Feed {
                 let _ = self.socket.send_to(&answer, from);
             }
         }
-        self.listeners.retain(|(_, heard)| now.seconds_since(*heard) < FORGOTTEN_S);
+        self.listeners.retain(|(_, received_at)| now.seconds_since(*received_at) < FORGOTTEN_S);
     }
 }
 
@@ -151,6 +153,6 @@ fn any(like: IpAddr) -> IpAddr {
 /// Where Motive takes commands.
 const COMMAND_PORT: u16 = 1510;
 /// Listeners by unicast at most.
-const MOST_LISTENERS: usize = 16;
+const MAX_LISTENERS: usize = 16;
 /// Who is silent for so long is forgotten. [s]
 const FORGOTTEN_S: f64 = 5.0;

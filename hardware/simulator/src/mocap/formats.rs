@@ -48,7 +48,7 @@ const BODY_ID: i32 = 1;
 /// Ticks of Motive's clock. [Hz]
 const TICKS_HZ: u64 = 10_000_000;
 
-/// Returns a frame of NatNet, seen as `sight` says and sent `now`.
+/// Returns a frame of NatNet, seen as in `sight` and sent `now`.
 pub fn encode_natnet(sight: &Sight, now: AutopilotTime) -> Option<Vec<u8>> {
     let y_up = |v: DVec3| DVec3::new(v.x, v.z, -v.y);
     let pose = &sight.world_from_body;

@@ -19,7 +19,7 @@ use vizflyt_protocol::messages::YawTarget;
 use super::{Simulation, SimulationConfig, TICK_HZ, TICK_S};
 
 /// A companion computer on the virtual clock: feeds vision from the mocap, sends heartbeats, and
-/// remembers what the autopilot says.
+/// remembers the autopilot's messages.
 pub(crate) struct Companion {
     pub(crate) lab: Simulation,
     decoder: StreamDecoder,
@@ -172,7 +172,7 @@ impl Companion {
             }
             self.tick();
         }
-        panic!("{what} did not come within {seconds} s; said {:?}", self.texts);
+        panic!("{what} did not come within {seconds} s; texts {:?}", self.texts);
     }
 
     pub(crate) fn set_origin(&mut self) {

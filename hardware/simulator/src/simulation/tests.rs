@@ -130,8 +130,8 @@ fn accelerations_are_flown_and_zero_keeps_the_velocity() {
 /// Zig-zag at 5 m/s with the hardest turns: the estimate must stay on the truth.
 #[test]
 fn the_estimate_holds_in_aggressive_flight() {
-    let check = |latency_s: f64, told_ms: f32, most_m: f64| {
-        let params = vec![("VISO_DELAY_MS".into(), told_ms)];
+    let check = |latency_s: f64, set_ms: f32, most_m: f64| {
+        let params = vec![("VISO_DELAY_MS".into(), set_ms)];
         let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.5);
         c.vision_latency_s = latency_s;
         let mut errors = Vec::new();
@@ -147,7 +147,7 @@ fn the_estimate_holds_in_aggressive_flight() {
         errors.sort_by(f64::total_cmp);
         let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
         println!(
-            "latency {latency_s} s, told {told_ms} ms: median {median:.3} m, worst {worst:.3} m"
+            "latency {latency_s} s, set to {set_ms} ms: median {median:.3} m, worst {worst:.3} m"
         );
         assert!(median < most_m, "{median}");
         assert!(worst < 8.0 * most_m, "{worst}");
@@ -224,7 +224,7 @@ fn the_same_seed_sends_the_same_bytes() {
     assert_ne!(run(4), run(5));
 }
 
-/// The shock clips the accelerometer; the estimate must not believe what is left of it. (It once
+/// The shock clips the accelerometer; the estimate must not use what is left of it. (It once
 /// did, and climbed away while it thought to sink.)
 #[test]
 fn a_crash_landing_does_not_end_in_a_fly_away() {

@@ -13,7 +13,7 @@ use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::poses::settings;
 use vizflyt_server::scene::{self, Up};
 
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Looks at rooms and courses before anyone flies in them.
 #[derive(Args, Debug)]
@@ -74,9 +74,13 @@ fn check_seed(project: &CourseProject, seed: u64) -> bool {
     let still = Arc::new(scene::bake(&generated.splats, &generated.arena));
     let obstacles = scene::obstacles(&generated.arena, &generated.objects, still, seed);
     let checked = check(&generated.arena, &obstacles);
-    say(&format!("{} seed {seed}", project.name()), generated.arena.stages.len(), &checked);
+    print_summary(
+        &format!("{} seed {seed}", project.name()),
+        generated.arena.stages.len(),
+        &checked,
+    );
     for finding in &checked.findings {
-        say!("  {finding}");
+        print_fmt!("  {finding}");
     }
     checked.findings.is_empty()
 }
@@ -96,15 +100,15 @@ fn check_file(path: &Path) -> Result<bool> {
     let checked = check(&scene.arena, &obstacles);
     for finding in &checked.findings {
         let line = line_of(&text, &finding.key).map_or_else(String::new, |line| format!(":{line}"));
-        say!("{}{line}: {finding}", file.display());
+        print_fmt!("{}{line}: {finding}", file.display());
     }
-    say(&file.display().to_string(), scene.arena.stages.len(), &checked);
+    print_summary(&file.display().to_string(), scene.arena.stages.len(), &checked);
     Ok(checked.findings.is_empty())
 }
 
-fn say(what: &str, stages: usize, checked: &Checked) {
+fn print_summary(what: &str, stages: usize, checked: &Checked) {
     if !checked.findings.is_empty() {
-        say!("{what}: cannot be flown, {} found", checked.findings.len());
+        print_fmt!("{what}: cannot be flown, {} found", checked.findings.len());
         return;
     }
     let room = if checked.least_room_m.is_finite() {
@@ -112,5 +116,5 @@ fn say(what: &str, stages: usize, checked: &Checked) {
     } else {
         String::new()
     };
-    say!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
+    print_fmt!("{what}: can be flown; {stages} stages{room}; a way of {:.1} m", checked.way_m);
 }

@@ -14,7 +14,7 @@ use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Draws views of a scene and encodes them at each level that a slow link may get; prints what they
 /// need.
@@ -91,22 +91,22 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
     let sizes = if args.size.is_empty() { USUAL_SIZES.to_vec() } else { args.size.clone() };
     let mut rows = Vec::new();
     for size in sizes {
-        let mut drawn = Vec::new();
+        let mut images = Vec::new();
         for view in &views {
             let mut images = [RgbdImage::default()];
             let view = camera::resized(view, size)?;
             rasterizer.render(&[], std::slice::from_ref(&view), &mut images)?;
             let [image] = images;
-            drawn.push(Pixels::of(&image));
+            images.push(Pixels::of(&image));
         }
         rows.extend(
             levels()
-                .map(|(name, options)| row(&drawn, name, options))
+                .map(|(name, options)| row(&images, name, options))
                 .collect::<Result<Vec<_>>>()?,
         );
     }
     if args.json {
-        say!("{}", serde_json::to_string_pretty(&rows)?);
+        print_fmt!("{}", serde_json::to_string_pretty(&rows)?);
     } else {
         print(&rows);
     }
@@ -171,14 +171,14 @@ fn psnr_db(a: &[u8], b: &[u8]) -> f64 {
 }
 
 fn print(rows: &[Row]) {
-    say!(
+    print_fmt!(
         "                                                           kB            Mbit/s at     dB, on a gigabit"
     );
-    say!(
+    print_fmt!(
         "size       level                                        mean  most    30    60   100 Hz least  at 60 Hz"
     );
     for row in rows {
-        say!(
+        print_fmt!(
             "{:<10} {:<43} {:>5.0} {:>5.0} {:>5.0} {:>5.0} {:>5.0}    {:>5.1}  {:>4}",
             format!("{}x{}", row.width_px, row.height_px),
             row.level,

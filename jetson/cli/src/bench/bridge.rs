@@ -26,7 +26,7 @@ use vizflyt_protocol::mavlink::dialect::{
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
 use crate::bridge::{EmulateArgs, Emulation};
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Measures the latency that the emulated bridge adds, and counts what it loses.
 #[derive(Args, Clone, Debug)]
@@ -115,18 +115,18 @@ pub(crate) fn run(args: &BridgeBenchArgs) -> Result<()> {
             "straight": {"up": straight.0.json(), "down": straight.1.json()},
             "counters": report,
         });
-        tell(serde_json::to_string_pretty(&all)?);
+        print_line(serde_json::to_string_pretty(&all)?);
         return Ok(());
     }
-    tell(format!("{} baud, {} s each; ms from send to receive", args.baud, args.seconds));
-    tell("                          sent    lost     p50     p99     max");
+    print_line(format!("{} baud, {} s each; ms from send to receive", args.baud, args.seconds));
+    print_line("                          sent    lost     p50     p99     max");
     for (name, way) in [
         ("bridge, to the autopilot", &through.0),
         ("bridge, to the companion", &through.1),
         ("straight, one way", &straight.0),
         ("straight, other way", &straight.1),
     ] {
-        tell(format!(
+        print_line(format!(
             "{name:24} {:6} {:7} {:7.2} {:7.2} {:7.2}",
             way.sent,
             way.sent - way.times_ms.len(),
@@ -135,8 +135,9 @@ pub(crate) fn run(args: &BridgeBenchArgs) -> Result<()> {
             way.quantile_ms(1.0)
         ));
     }
-    let added = |with: &Way, without: &Way, q| with.quantile_ms(q) - without.quantile_ms(q);
-    tell(format!(
+    let added =
+        |with: &Direction, without: &Direction, q| with.quantile_ms(q) - without.quantile_ms(q);
+    print_line(format!(
         "added at p50 / p99: {:.2} / {:.2} ms up, {:.2} / {:.2} ms down",
         added(&through.0, &straight.0, 0.5),
         added(&through.0, &straight.0, 0.99),
@@ -152,15 +153,15 @@ fn socket() -> Result<UdpSocket> {
     Ok(socket)
 }
 
-/// What went one way.
+/// The packets of one direction.
 #[derive(Default)]
-struct Way {
+struct Direction {
     sent: usize,
     /// Sorted. [ms]
     times_ms: Vec<f64>,
 }
 
-impl Way {
+impl Direction {
     fn quantile_ms(&self, q: f64) -> f64 {
         let last = self.times_ms.len().saturating_sub(1);
         self.times_ms.get((last as f64 * q).round() as usize).copied().unwrap_or(f64::NAN)
@@ -177,11 +178,15 @@ impl Way {
     }
 }
 
-/// Sends both ways for `seconds`; returns what went up, to the autopilot, and what went down.
-fn measure(companion: Box<dyn End>, autopilot: Box<dyn End>, seconds: u32) -> (Way, Way) {
+/// Sends in both directions for `seconds`; returns the packets up, to the autopilot, and those down.
+fn measure(
+    companion: Box<dyn End>,
+    autopilot: Box<dyn End>,
+    seconds: u32,
+) -> (Direction, Direction) {
     let start = Instant::now();
     // 100 Hz in two kinds up; 201 Hz in four kinds down, as the runtime asks for.
-    let up: Talk = |tick, stamp| {
+    let up: MessagesAt = |tick, stamp| {
         let mut all = Vec::new();
         if tick % 4 == 0 {
             all.push(setpoint(stamp));
@@ -191,7 +196,7 @@ fn measure(companion: Box<dyn End>, autopilot: Box<dyn End>, seconds: u32) -> (W
         }
         all
     };
-    let down: Talk = |tick, stamp| {
+    let down: MessagesAt = |tick, stamp| {
         let mut all = Vec::new();
         if tick % 200 == 0 {
             all.push(heartbeat());
@@ -205,35 +210,35 @@ fn measure(companion: Box<dyn End>, autopilot: Box<dyn End>, seconds: u32) -> (W
         }
         all
     };
-    let upper = std::thread::spawn(move || talk(companion, start, seconds, (255, 191), up));
-    let lower = talk(autopilot, start, seconds, (1, 1), down);
-    let (up_sent, down_heard) = upper.join().unwrap_or_default();
-    let (down_sent, up_heard) = lower;
-    (way(&up_sent, up_heard), way(&down_sent, down_heard))
+    let upper = std::thread::spawn(move || exchange(companion, start, seconds, (255, 191), up));
+    let lower = exchange(autopilot, start, seconds, (1, 1), down);
+    let (up_sent, down_received) = upper.join().unwrap_or_default();
+    let (down_sent, up_received) = lower;
+    (direction(&up_sent, up_received), direction(&down_sent, down_received))
 }
 
-fn way(sent: &[u32], mut heard: Vec<(u32, f64)>) -> Way {
-    heard.retain(|(stamp, _)| sent.contains(stamp));
-    let mut times_ms: Vec<f64> = heard.into_iter().map(|(_, ms)| ms).collect();
+fn direction(sent: &[u32], mut received: Vec<(u32, f64)>) -> Direction {
+    received.retain(|(stamp, _)| sent.contains(stamp));
+    let mut times_ms: Vec<f64> = received.into_iter().map(|(_, ms)| ms).collect();
     times_ms.sort_by(f64::total_cmp);
-    Way { sent: sent.len(), times_ms }
+    Direction { sent: sent.len(), times_ms }
 }
 
-type Talk = fn(u32, u32) -> Vec<MavMessage>;
+type MessagesAt = fn(u32, u32) -> Vec<MavMessage>;
 
 /// A tick. [us]
 const TICK_US: u32 = 5000;
 
-/// Sends by the tick and hears all the time. A stamp is the time of sending, to 10 us, which no two
-/// messages share; returns the stamps sent, and those heard with the time they took. [ms]
-fn talk(
+/// Sends at every tick and receives all the time. A stamp is the time of sending, to 10 us, which no two
+/// messages share; returns the stamps sent, and those received with the time they took. [ms]
+fn exchange(
     mut end: Box<dyn End>,
     start: Instant,
     seconds: u32,
     from: (u8, u8),
-    say: Talk,
+    messages_at: MessagesAt,
 ) -> (Vec<u32>, Vec<(u32, f64)>) {
-    let (mut sent, mut heard) = (Vec::new(), Vec::new());
+    let (mut sent, mut received) = (Vec::new(), Vec::new());
     let (mut decoder, mut tick, mut sequence) = (StreamDecoder::default(), 0, 0u8);
     let ticks = seconds * 1_000_000 / TICK_US;
     let mut bytes = [0; 4096];
@@ -242,9 +247,9 @@ fn talk(
     let due = |tick: u32| start + Duration::from_micros(u64::from(tick) * u64::from(TICK_US));
     while Instant::now() < until {
         while tick < ticks && Instant::now() >= due(tick) {
-            for place in 0..say(tick, 0).len() {
+            for place in 0..messages_at(tick, 0).len() {
                 let stamp = (start.elapsed().as_micros() / 10) as u32 + place as u32;
-                let message = say(tick, stamp).swap_remove(place);
+                let message = messages_at(tick, stamp).swap_remove(place);
                 let header = MavHeader { system_id: from.0.into(), component_id: from.1, sequence };
                 end.send(encode(header, &message, &mut [0; MAX_PACKET]));
                 sequence = sequence.wrapping_add(1);
@@ -258,11 +263,11 @@ fn talk(
         let now_us = start.elapsed().as_secs_f64() * 1e6;
         decoder.push(&bytes[..len], |packet| {
             if let Some(stamp) = stamp_of(&packet.message) {
-                heard.push((stamp, (now_us - f64::from(stamp) * 10.0) / 1e3));
+                received.push((stamp, (now_us - f64::from(stamp) * 10.0) / 1e3));
             }
         });
     }
-    (sent, heard)
+    (sent, received)
 }
 
 /// The first ticks find no client yet: what is sent before the bridge knows one is not counted.

@@ -10,7 +10,7 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Draws a scene many times over; prints milliseconds per image and pass.
 #[derive(Args, Debug)]
@@ -41,7 +41,7 @@ pub(super) struct RenderArgs {
     json: bool,
 }
 
-/// What `--json` prints; times in milliseconds, medians but where the name says otherwise.
+/// What `--json` prints; times in milliseconds, medians unless the name has another statistic.
 #[derive(Debug, Serialize)]
 struct Figures {
     scene: String,
@@ -81,7 +81,7 @@ struct Work {
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let figures = measure(args)?;
     if args.json {
-        say!("{}", serde_json::to_string_pretty(&figures)?);
+        print_fmt!("{}", serde_json::to_string_pretty(&figures)?);
     } else {
         print(&figures);
     }
@@ -150,19 +150,23 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
 }
 
 fn print(f: &Figures) {
-    say!("scene       {}: {} splats", f.scene, f.splats);
-    say!("renderer    {} ({})", f.renderer, f.renderer_reason);
-    say!("prepared    in {:.0} ms", f.prepare_ms);
-    say!(
+    print_fmt!("scene       {}: {} splats", f.scene, f.splats);
+    print_fmt!("renderer    {} ({})", f.renderer, f.renderer_reason);
+    print_fmt!("prepared    in {:.0} ms", f.prepare_ms);
+    print_fmt!(
         "images      {} of {}x{} from {} cameras: RGB, alpha, expected and median depth",
         f.images,
         f.width_px,
         f.height_px,
         f.cameras
     );
-    say!("work        {} splats in sight, {} tile pairs", f.workload.visible, f.workload.pairs);
-    say!("median      {:.2} ms, {:.1} images/s", f.median_ms, 1e3 / f.median_ms);
-    say!("p99         {:.2} ms", f.p99_ms);
+    print_fmt!(
+        "work        {} splats in sight, {} tile pairs",
+        f.workload.visible,
+        f.workload.pairs
+    );
+    print_fmt!("median      {:.2} ms, {:.1} images/s", f.median_ms, 1e3 / f.median_ms);
+    print_fmt!("p99         {:.2} ms", f.p99_ms);
     let passes = &f.passes;
     for (name, ms) in [
         ("cull", passes.cull_ms),
@@ -172,7 +176,7 @@ fn print(f: &Figures) {
         ("blend", passes.blend_ms),
         ("read", passes.read_ms),
     ] {
-        say!("  {name:<9} {ms:.2} ms");
+        print_fmt!("  {name:<9} {ms:.2} ms");
     }
 }
 

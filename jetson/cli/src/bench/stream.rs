@@ -42,7 +42,7 @@ use vizflyt_splat::RgbdImage;
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
 use crate::scene::camera::ImageSize;
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Streams images over loopback to a plugin; prints how long they take.
 #[derive(Args, Debug)]
@@ -64,9 +64,9 @@ pub(super) struct StreamArgs {
     json: bool,
 }
 
-/// What one way took.
+/// The times of one kind of transfer.
 #[derive(Debug, Serialize)]
-struct Way {
+struct Transfer {
     name: &'static str,
     bytes: usize,
     sent: u64,
@@ -81,7 +81,7 @@ struct Figures {
     width_px: u32,
     height_px: u32,
     rate_hz: u32,
-    ways: Vec<Way>,
+    ways: Vec<Transfer>,
     packet_to_tcp_p50: f64,
     rss_start_mb: f64,
     rss_end_mb: f64,
@@ -108,12 +108,15 @@ pub(super) fn run(args: &StreamArgs) -> Result<()> {
         rss_end_mb: rss_mb(),
     };
     if args.json {
-        say!("{}", serde_json::to_string_pretty(&figures)?);
+        print_fmt!("{}", serde_json::to_string_pretty(&figures)?);
         return Ok(());
     }
-    say!("{width_px}x{height_px} RGB-D at {} Hz over loopback, to the plugin's wake-up", args.rate);
+    print_fmt!(
+        "{width_px}x{height_px} RGB-D at {} Hz over loopback, to the plugin's wake-up",
+        args.rate
+    );
     for way in &figures.ways {
-        say!(
+        print_fmt!(
             "{:<7} {:>4} KB  p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} came",
             way.name,
             way.bytes / 1000,
@@ -124,8 +127,12 @@ pub(super) fn run(args: &StreamArgs) -> Result<()> {
             way.sent
         );
     }
-    say!("packet takes {:.2} times as long as tcp", figures.packet_to_tcp_p50);
-    say!("memory {:.0} MB at the start, {:.0} MB at the end", rss_start_mb, figures.rss_end_mb);
+    print_fmt!("packet takes {:.2} times as long as tcp", figures.packet_to_tcp_p50);
+    print_fmt!(
+        "memory {:.0} MB at the start, {:.0} MB at the end",
+        rss_start_mb,
+        figures.rss_end_mb
+    );
     Ok(())
 }
 
@@ -149,15 +156,23 @@ impl Bench {
         Ok(())
     }
 
-    fn way(&self, name: &'static str, bytes: usize, mut ms: Vec<f64>) -> Result<Way> {
+    fn way(&self, name: &'static str, bytes: usize, mut ms: Vec<f64>) -> Result<Transfer> {
         ms.sort_unstable_by(f64::total_cmp);
         let last = ms.len().checked_sub(1).ok_or_else(|| anyhow!("{name}: no image arrived"))?;
         let at = |share: f64| ms[(share * last as f64).round() as usize];
         let (delivered, sent) = (ms.len(), self.count);
-        Ok(Way { name, bytes, sent, delivered, ms_p50: at(0.5), ms_p99: at(0.99), ms_max: at(1.0) })
+        Ok(Transfer {
+            name,
+            bytes,
+            sent,
+            delivered,
+            ms_p50: at(0.5),
+            ms_p99: at(0.99),
+            ms_max: at(1.0),
+        })
     }
 
-    fn packet(&self, payload: &Bytes) -> Result<Way> {
+    fn packet(&self, payload: &Bytes) -> Result<Transfer> {
         let link = Link::start(self.size)?;
         let plugin = Plugin::start(8 + payload.len(), handed_first)?;
         let (ipc, mailbox, stop) =
@@ -180,7 +195,7 @@ impl Bench {
         self.way("packet", payload.len(), ms)
     }
 
-    fn tcp(&self, payload: &Bytes) -> Result<Way> {
+    fn tcp(&self, payload: &Bytes) -> Result<Transfer> {
         let listener = TcpListener::bind(("127.0.0.1", 0)).context("no loopback")?;
         let mut send = TcpStream::connect(listener.local_addr()?)?;
         send.set_nodelay(true)?;
@@ -213,7 +228,7 @@ impl Bench {
         self.way("tcp", payload.len(), ms)
     }
 
-    fn pixels(&self) -> Result<Way> {
+    fn pixels(&self) -> Result<Transfer> {
         let link = Link::start(self.size)?;
         let set = link.rooms.rendering.cameras[0].newest();
         let names = vec![set.infos[0].name.clone()];

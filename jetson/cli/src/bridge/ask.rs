@@ -1,4 +1,4 @@
-//! Asks a bridge over the network: requests in MAVLink's TUNNEL, answers by it (`vizflyt_bridge::access`).
+//! Client of a bridge on the network: requests and replies in MAVLink's TUNNEL (`vizflyt_bridge::access`).
 
 use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
@@ -13,15 +13,15 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 
 /// TUNNEL's number.
 const TUNNEL: u32 = 385;
-/// We speak as a ground station's component of our own: MAV_COMP_ID_ONBOARD_COMPUTER4.
+/// Our ids, a ground station's component of our own: MAV_COMP_ID_ONBOARD_COMPUTER4.
 const SOURCE: (u8, u8) = (255, 194);
-/// An answer takes this long at most; then the request is repeated.
+/// Maximum time for a reply; then the request is repeated.
 const PATIENCE: Duration = Duration::from_millis(400);
 /// Repetitions.
 const ATTEMPTS: u8 = 6;
 
 /// A bridge on the network.
-pub(crate) struct Asked {
+pub(crate) struct BridgeClient {
     socket: UdpSocket,
     address: SocketAddr,
     sequence: u8,
@@ -33,7 +33,7 @@ pub(crate) struct Asked {
     pub(crate) version: String,
 }
 
-impl Asked {
+impl BridgeClient {
     /// Finds the bridge at `address`.
     pub(crate) fn open(address: &str) -> Result<Self> {
         let with_port =
@@ -45,7 +45,7 @@ impl Asked {
             .with_context(|| format!("bridge: {address} has no IPv4 address"))?;
         let socket = UdpSocket::bind("0.0.0.0:0").context("bridge: cannot open a socket")?;
         socket.set_read_timeout(Some(Duration::from_millis(50)))?;
-        let mut asked = Self {
+        let mut client = Self {
             socket,
             address: resolved,
             sequence: 0,
@@ -54,7 +54,7 @@ impl Asked {
             claimed: false,
             version: String::new(),
         };
-        let (_, hello) = asked.ask(Op::Hello, b"", None)?;
+        let (_, hello) = client.ask(Op::Hello, b"", None)?;
         let (Some(random), Some(counter), Some(&flags)) = (
             hello.first_chunk(),
             hello.get(16..20).and_then(|bytes| bytes.try_into().ok()),
@@ -62,11 +62,11 @@ impl Asked {
         ) else {
             bail!("bridge: {address} answers as no bridge of ours does");
         };
-        asked.random = *random;
-        asked.counter = u32::from_le_bytes(counter);
-        asked.claimed = flags & 1 != 0;
-        asked.version = String::from_utf8_lossy(&hello[21..]).into_owned();
-        Ok(asked)
+        client.random = *random;
+        client.counter = u32::from_le_bytes(counter);
+        client.claimed = flags & 1 != 0;
+        client.version = String::from_utf8_lossy(&hello[21..]).into_owned();
+        Ok(client)
     }
 
     /// Asks, and returns status and body of the answer; `key` proves a change.

@@ -12,8 +12,8 @@ use vizflyt_bridge::settings::{Key, NUMBERS, TEXTS, key_from_hex, key_to_hex};
 use vizflyt_bridge::stats::REPORT;
 use vizflyt_trust::KeysFolder;
 
-use super::ask::Asked;
-use crate::terminal::tell;
+use super::ask::BridgeClient;
+use crate::terminal::print_line;
 
 /// Shows and changes a bridge's settings.
 #[derive(Args, Clone, Debug)]
@@ -65,16 +65,16 @@ const KEY_FILE: &str = "bridge.key";
 
 /// Runs `configure`.
 pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
-    let mut asked = Asked::open(&args.bridge)?;
+    let mut client = BridgeClient::open(&args.bridge)?;
     if args.claim {
-        claim(&mut asked, args)?;
+        claim(&mut client, args)?;
     }
     let changes = !args.changes.is_empty() || args.reset || args.restart;
     if changes {
         let key = read_key(args)?.with_context(
             || "bridge: no key in the folder of keys; `vizflyt bridge configure --claim` makes one",
         )?;
-        let mut tell_it = |op: Op, body: &str| change(&mut asked, op, body, &key);
+        let mut tell_it = |op: Op, body: &str| change(&mut client, op, body, &key);
         if args.reset {
             tell_it(Op::Reset, "")?;
         }
@@ -84,18 +84,18 @@ pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
         tell_it(Op::Save, "")?;
         if args.restart {
             tell_it(Op::Restart, "")?;
-            tell("saved; the bridge restarts");
+            print_line("saved; the bridge restarts");
             return Ok(());
         }
-        tell("saved");
+        print_line("saved");
     }
     if !args.claim {
-        show(&mut asked)?;
+        show(&mut client)?;
     }
     Ok(())
 }
 
-fn claim(asked: &mut Asked, args: &ConfigureArgs) -> Result<()> {
+fn claim(client: &mut BridgeClient, args: &ConfigureArgs) -> Result<()> {
     let key = if let Some(key) = read_key(args)? {
         key
     } else {
@@ -107,12 +107,12 @@ fn claim(asked: &mut Asked, args: &ConfigureArgs) -> Result<()> {
         folder.write(KEY_FILE, &format!("{}\n", key_to_hex(&key)))?;
         key
     };
-    let (status, _) = asked.ask(Op::Claim, &key, None)?;
+    let (status, _) = client.ask(Op::Claim, &key, None)?;
     if status != Status::Done {
         bail!("bridge: not claimed: {}", status.message());
     }
     let path = KeysFolder::open(args.keys.as_deref())?.file(KEY_FILE);
-    tell(format!("claimed; its key is in {}", path.display()));
+    print_line(format!("claimed; its key is in {}", path.display()));
     Ok(())
 }
 
@@ -125,8 +125,8 @@ fn read_key(args: &ConfigureArgs) -> Result<Option<Key>> {
     Ok(Some(key))
 }
 
-fn change(asked: &mut Asked, op: Op, body: &str, key: &Key) -> Result<()> {
-    match asked.ask(op, body.as_bytes(), Some(key))? {
+fn change(client: &mut BridgeClient, op: Op, body: &str, key: &Key) -> Result<()> {
+    match client.ask(op, body.as_bytes(), Some(key))? {
         (Status::Done, _) => Ok(()),
         (status, _) => {
             // A password must not end up in somebody's terminal log.
@@ -136,14 +136,14 @@ fn change(asked: &mut Asked, op: Op, body: &str, key: &Key) -> Result<()> {
     }
 }
 
-fn show(asked: &mut Asked) -> Result<()> {
-    let claimed = if asked.claimed { "" } else { "; it has no key yet: --claim" };
-    tell(format!("bridge {}{claimed}", asked.version));
+fn show(client: &mut BridgeClient) -> Result<()> {
+    let claimed = if client.claimed { "" } else { "; it has no key yet: --claim" };
+    print_line(format!("bridge {}{claimed}", client.version));
     let names = NUMBERS.iter().map(|number| number.name);
     for name in names.chain(TEXTS.iter().map(|&(name, _)| name)) {
         // An older firmware may not know a name of ours.
-        if let (Status::Done, value) = asked.ask(Op::Read, name.as_bytes(), None)? {
-            tell(format!("{name:18} {}", String::from_utf8_lossy(&value)));
+        if let (Status::Done, value) = client.ask(Op::Read, name.as_bytes(), None)? {
+            print_line(format!("{name:18} {}", String::from_utf8_lossy(&value)));
         }
     }
     Ok(())
@@ -151,10 +151,10 @@ fn show(asked: &mut Asked) -> Result<()> {
 
 /// Runs `stats`.
 pub(crate) fn stats(args: &StatsArgs) -> Result<()> {
-    let mut asked = Asked::open(&args.bridge)?;
+    let mut client = BridgeClient::open(&args.bridge)?;
     let mut before: Option<Vec<u32>> = None;
     loop {
-        let (_, body) = asked.ask(Op::Stats, b"", None)?;
+        let (_, body) = client.ask(Op::Stats, b"", None)?;
         let values: Vec<u32> = body
             .chunks_exact(4)
             .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
@@ -163,17 +163,17 @@ pub(crate) fn stats(args: &StatsArgs) -> Result<()> {
         if args.json {
             let map: Map<String, Value> =
                 named().map(|(name, &value)| (name.to_owned(), value.into())).collect();
-            tell(Value::Object(map));
+            print_line(Value::Object(map));
         } else if let Some(before) = &before {
             let changed: Vec<String> = named()
                 .zip(before)
                 .filter(|((_, value), before)| value != before)
                 .map(|((name, value), before)| format!("{name} +{}", value.wrapping_sub(*before)))
                 .collect();
-            tell(changed.join("  "));
+            print_line(changed.join("  "));
         } else {
             for (name, value) in named() {
-                tell(format!("{name:24} {value}"));
+                print_line(format!("{name:24} {value}"));
             }
         }
         if !args.watch {

@@ -25,7 +25,7 @@ use vizflyt_protocol::time::HostTime;
 use super::flash::FileFlash;
 use super::page::Page;
 use super::port::{Port, Uart};
-use crate::terminal::{stop_flag, tell};
+use crate::terminal::{print_line, stop_flag};
 
 /// Runs the bridge's firmware on this computer.
 #[derive(Args, Clone, Debug)]
@@ -94,7 +94,7 @@ impl EmulateArgs {
 /// The loop wakes at least this often, to see that it shall end.
 const WAKE: Duration = Duration::from_millis(50);
 
-/// Runs it until told to end.
+/// Runs it until it is stopped.
 pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let mut emulation = Emulation::open(args)?;
@@ -109,14 +109,16 @@ pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
         None => None,
     };
     if args.json {
-        tell(json!({"ready": "bridge", "uart": uart, "udp": udp, "tcp": tcp, "page": page}));
+        print_line(json!({"ready": "bridge", "uart": uart, "udp": udp, "tcp": tcp, "page": page}));
     } else {
-        tell(format!("bridge ready: autopilot at {uart}, clients at udp {udp}; Ctrl-C ends it"));
+        print_line(format!(
+            "bridge ready: autopilot at {uart}, clients at udp {udp}; Ctrl-C ends it"
+        ));
         if let Some(tcp) = tcp {
-            tell(format!("              and tcp {tcp}"));
+            print_line(format!("              and tcp {tcp}"));
         }
         if let Some(page) = page {
-            tell(format!("              its page: http://{page}"));
+            print_line(format!("              its page: http://{page}"));
         }
     }
     while !stop.load(Ordering::Relaxed) {
@@ -125,10 +127,10 @@ pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
     }
     let report = emulation.report();
     if args.json {
-        tell(json!({ "report": report }));
+        print_line(json!({ "report": report }));
     } else {
         for (name, value) in report.as_object().into_iter().flatten() {
-            tell(format!("{name:24} {value}"));
+            print_line(format!("{name:24} {value}"));
         }
     }
     Ok(())
@@ -383,7 +385,7 @@ fn firmware_key(text: &str) -> Result<Key, String> {
     key_from_hex(text).map_err(|_| "it has 64 hexadecimal digits".to_owned())
 }
 
-/// Returns the settings of a start: what flash holds, then what the command line says.
+/// Returns the settings of a start: those in flash, then those of the command line.
 fn boot_settings(store: &mut Store<FileFlash>, overrides: &[(String, String)]) -> Result<Settings> {
     let mut settings = store.load().unwrap_or_default();
     for (name, value) in overrides {

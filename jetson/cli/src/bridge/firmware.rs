@@ -14,7 +14,7 @@ use vizflyt_bridge::settings::{Key, key_from_hex, key_to_hex};
 use vizflyt_bridge::update::{Header, MAGIC, Target};
 use vizflyt_trust::KeysFolder;
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Signs a bridge's firmware, and brings it over the network.
 #[derive(Args, Clone, Debug)]
@@ -84,7 +84,7 @@ struct SendArgs {
 
 /// The key's file.
 const KEY_FILE: &str = "firmware.key";
-/// A bridge that says nothing for so long is gone; erasing its flash takes less.
+/// A bridge that is silent for so long is gone; erasing its flash takes less.
 const PATIENCE: Duration = Duration::from_secs(15);
 
 /// Runs what was asked for.
@@ -95,7 +95,7 @@ pub(crate) fn run(args: &FirmwareArgs) -> Result<()> {
                 Some(key) => key,
                 None => make_key(args)?,
             };
-            tell(key_to_hex(&key.verifying_key().to_bytes()));
+            print_line(key_to_hex(&key.verifying_key().to_bytes()));
             Ok(())
         }
         FirmwareCommand::Sign(args) => sign(args),
@@ -139,7 +139,7 @@ fn sign(args: &SignArgs) -> Result<()> {
     let signed = signed(&key, target, args.build, &image)?;
     fs::write(&args.output, &signed)
         .with_context(|| format!("cannot write {}", args.output.display()))?;
-    tell(format!("{}: build {}, {} bytes", args.output.display(), args.build, signed.len()));
+    print_line(format!("{}: build {}, {} bytes", args.output.display(), args.build, signed.len()));
     Ok(())
 }
 
@@ -161,7 +161,7 @@ fn send(args: &SendArgs) -> Result<()> {
         address if address.contains(':') => address.clone(),
         address => format!("{address}:80"),
     };
-    tell(format!("{}: {}", args.bridge, bring(&address, &firmware, &args.file)?));
+    print_line(format!("{}: {}", args.bridge, bring(&address, &firmware, &args.file)?));
     Ok(())
 }
 
@@ -177,20 +177,20 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let head = format!("POST /update HTTP/1.0\r\nContent-Length: {}\r\n\r\n", firmware.len());
-    // A bridge that refuses says so before the last byte: what it says counts, not that we were cut.
+    // A bridge that refuses replies before the last byte: its reply counts, not the broken connection.
     let sent = stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(firmware));
     let mut answer = Vec::new();
-    let heard = stream.read_to_end(&mut answer);
+    let received = stream.read_to_end(&mut answer);
     let answer = String::from_utf8_lossy(&answer).into_owned();
     let words = answer.split_once("\r\n\r\n").map_or("", |(_, body)| body.trim());
     let status = answer.split_whitespace().nth(1).unwrap_or_default();
     match status {
         "200" => Ok(words.to_owned()),
         "" => {
-            sent.and(heard.map(|_| ())).with_context(|| {
+            sent.and(received.map(|_| ())).with_context(|| {
                 format!("bridge: the connection broke while {} was on its way", name.display())
             })?;
-            bail!("bridge: it said nothing; look at its page")
+            bail!("bridge: it sent no reply; look at its page")
         }
         "404" => {
             bail!("bridge: its firmware is older than updates over the network; flash it by wire")

@@ -257,17 +257,17 @@ mod tests {
         let mut autopilot = OpenOptions::new().read(true).write(true).open(port.path()).unwrap();
         autopilot.write_all(&[7; 100]).unwrap();
         let start = Instant::now() + Duration::from_secs(1);
-        let mut heard = 0;
+        let mut received = 0;
         let mut arrivals = Vec::new();
         for step in 0..400u32 {
             let now = start + Duration::from_micros(100) * step;
             port.receive(now, |bytes| {
-                heard += bytes.len();
+                received += bytes.len();
                 arrivals.push((step, bytes.len()));
             })
             .unwrap();
         }
-        assert_eq!(heard, 100);
+        assert_eq!(received, 100);
         // 64 bytes are 11.1 ms, the other 36 are 6.25 ms more.
         assert_eq!(arrivals, [(112, 64), (174, 36)]);
 
@@ -275,8 +275,8 @@ mod tests {
         port.send(start, &[9; 57]);
         assert!(!port.is_free(start + Duration::from_micros(9_800)).unwrap());
         assert!(port.is_free(start + Duration::from_micros(9_900)).unwrap());
-        let mut said = [0; 57];
-        autopilot.read_exact(&mut said).unwrap();
-        assert_eq!(said, [9; 57]);
+        let mut sent = [0; 57];
+        autopilot.read_exact(&mut sent).unwrap();
+        assert_eq!(sent, [9; 57]);
     }
 }

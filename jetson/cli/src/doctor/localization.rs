@@ -1,7 +1,7 @@
 //! `vizflyt doctor localization`: the pose in plain words, and the check by hand.
 
 mod check;
-mod words;
+mod description;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -12,9 +12,9 @@ use clap::Args;
 use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 use vizflyt_server::poses::{drivers, settings};
 
-use self::check::{Check, Step, Verdict};
-use self::words::pose_in_words;
-use crate::terminal::tell;
+use self::check::{Check, Diagnosis, Step};
+use self::description::describe_pose;
+use crate::terminal::print_line;
 
 /// What is looked at.
 #[derive(Args, Debug)]
@@ -27,7 +27,7 @@ pub(crate) struct LocalizationArgs {
     /// The vehicle
     #[arg(long, value_name = "NAME", default_value = "vizflyt")]
     vehicle: String,
-    /// Only says where it is, until Ctrl-C
+    /// Only prints the pose, until Ctrl-C
     #[arg(long)]
     watch: bool,
     /// Gives up after so long
@@ -35,44 +35,44 @@ pub(crate) struct LocalizationArgs {
     within: f64,
 }
 
-/// Looks.
+/// Runs the check.
 pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
     let config = args.source()?;
     let mut opened = drivers::open(std::slice::from_ref(&config))?;
     let address = opened.first_mut().map(|source| source.address()).unwrap_or_default();
-    tell(format!("listens  {} {address}", config.driver));
+    print_line(format!("listens  {} {address}", config.driver));
     let mut source = drivers::track(opened, &[args.vehicle.as_str()])?;
     let mut check = Check::new(config.clone());
-    let (start, mut told) = (Instant::now(), None::<Instant>);
+    let (start, mut printed_at) = (Instant::now(), None::<Instant>);
     let mut step = None;
     while args.watch || start.elapsed().as_secs_f64() < args.within {
         let now_s = start.elapsed().as_secs_f64();
         let measured = source.receive(Duration::from_millis(100)).last().copied();
         while let Some(warning) = source.next_warning() {
-            tell(format!("note     {warning}"));
+            print_line(format!("note     {warning}"));
         }
         let Some(measured) = measured else { continue };
         let pose = measured.world_from_body;
-        if told.is_none_or(|at| at.elapsed() >= TELL_EVERY) {
-            told = Some(Instant::now());
-            tell(format!("pose     {}", pose_in_words(&pose)));
+        if printed_at.is_none_or(|at| at.elapsed() >= PRINT_PERIOD) {
+            printed_at = Some(Instant::now());
+            print_line(format!("pose     {}", describe_pose(&pose)));
         }
         if args.watch {
             continue;
         }
         if step.is_none() {
             step = Some(check.step());
-            tell(format!("do       {}", check.step().ask()));
+            print_line(format!("do       {}", check.step().ask()));
         }
         if !check.handle_pose(now_s, &pose) {
             continue;
         }
-        tell(format!("seen     {}", check.seen()));
+        print_line(format!("seen     {}", check.seen()));
         if check.step() == Step::Done {
-            return Ok(report(&config, &check.verdict()));
+            return Ok(report(&config, &check.diagnosis()));
         }
         step = Some(check.step());
-        tell(format!("do       {}", check.step().ask()));
+        print_line(format!("do       {}", check.step().ask()));
     }
     let counters = source.counters(0);
     if counters.poses == 0 {
@@ -88,23 +88,23 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
     bail!("the check was not done within {:.0} s; --within gives more time", args.within)
 }
 
-fn report(config: &LocalizationConfig, verdict: &Verdict) -> ExitCode {
-    for line in &verdict.faults {
-        tell(format!("WRONG    {line}"));
+fn report(config: &LocalizationConfig, diagnosis: &Diagnosis) -> ExitCode {
+    for line in &diagnosis.faults {
+        print_line(format!("WRONG    {line}"));
     }
-    for (key, value) in &verdict.change {
-        tell(format!(
+    for (key, value) in &diagnosis.change {
+        print_line(format!(
             "set      {key} = \"{value}\" in [[localization]], or --pose {}:{},...,{key}={value}",
             config.driver,
             config.address()
         ));
     }
-    if verdict.faults.is_empty() {
-        tell("right    axes, units and turns are as they must be");
+    if diagnosis.faults.is_empty() {
+        print_line("right    axes, units and turns are as they must be");
         return ExitCode::SUCCESS;
     }
-    if verdict.change.is_empty() {
-        tell(
+    if diagnosis.change.is_empty() {
+        print_line(
             "no setting explains all of it: do it again, one motion at a time, straight up, straight \
              towards the nose, a quarter turn to the left; then look whether the object's axes were laid \
              along the vehicle's when it was made",
@@ -122,7 +122,7 @@ impl LocalizationArgs {
         let Some(arena) = &self.arena else { return Ok(LocalizationConfig::new(Driver::Vicon)) };
         let sources = settings::of_arena(arena)?;
         if sources.len() > 1 {
-            tell(format!(
+            print_line(format!(
                 "note     the first of {} sources is checked; --pose names another",
                 sources.len()
             ));
@@ -131,5 +131,5 @@ impl LocalizationArgs {
     }
 }
 
-/// Often enough to follow, seldom enough to read.
-const TELL_EVERY: Duration = Duration::from_secs(1);
+/// Period of the printed poses: often enough to follow, slow enough to read.
+const PRINT_PERIOD: Duration = Duration::from_secs(1);

@@ -1,5 +1,5 @@
 //! `vizflyt fly PLUGIN`: the same command in the simulated lab and in the real one. Which of the two
-//! it is, one line says before anything is armed.
+//! it is, one line reports before anything is armed.
 
 pub(crate) mod plugin;
 mod watch;
@@ -10,10 +10,9 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
-use vizflyt_runtime::control::print_line;
 
 use crate::lab::{self, LabArgs, LabFlight};
-use crate::terminal::tell;
+use crate::terminal::print_line;
 use plugin::Plugin;
 
 /// Flies a plugin: in the simulated lab, or in the real one if `jetson.toml` or --server names a
@@ -33,7 +32,7 @@ use plugin::Plugin;
                                                            the real lab
 
 The vehicle lands when the plugin ends, hangs or is killed, when poses stop, and on Ctrl-C.
-What the command line leaves out, jetson.toml says.")]
+Options that are not given come from jetson.toml.")]
 pub(crate) struct FlyArgs {
     #[command(flatten)]
     runtime: vizflyt_runtime::FlyArgs,
@@ -53,7 +52,7 @@ pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
     let name = args.runtime.plugin.clone().unwrap_or_default();
     let plugin = if args.runtime.attach { None } else { Some(Plugin::find(&name)?) };
     let plugin = plugin.as_ref();
-    // Whoever started us has said which lab it is.
+    // The parent has reported which lab it is.
     if args.runtime.server.at.is_some() && !args.sim {
         fly_real(&args, plugin, file.as_deref())
     } else {
@@ -68,7 +67,7 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
     }
     let mut command = plugin.map_or(Ok(Vec::new()), Plugin::command)?;
     command.extend(runtime.plugin_arguments.iter().cloned());
-    // A parent has said which lab it is.
+    // The parent has reported which lab it is.
     if !runtime.lifeline {
         let server = runtime.server.address()?;
         let from = file.map_or("the command line".into(), |file| file.display().to_string());
@@ -153,19 +152,19 @@ fn fly_simulated(
         report.write(path)?;
     }
     if runtime.json {
-        print_line(&json!({"report": report}).to_string());
+        print_line(json!({"report": report}));
     } else {
-        tell(report.summary());
+        print_line(report.summary());
     }
     Ok(if report.outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// The one line that says which of the two labs it is.
+/// The line that reports which of the two labs it is.
 fn say_lab(json: bool, which: &str, what: &str) {
     if json {
-        print_line(&json!({"lab": which, "text": what}).to_string());
+        print_line(json!({"lab": which, "text": what}));
     } else {
-        tell(format!("lab         {which}: {what}"));
+        print_line(format!("lab         {which}: {what}"));
     }
 }
 

@@ -226,7 +226,7 @@ fn build(folder: &Path) -> Result<PathBuf> {
         })?;
     let mut messages = String::new();
     if let Some(mut stdout) = cargo.stdout.take() {
-        stdout.read_to_string(&mut messages).context("cannot read what cargo says")?;
+        stdout.read_to_string(&mut messages).context("cannot read cargo's messages")?;
     }
     if !cargo.wait().context("cannot wait for cargo")?.success() {
         bail!("{} does not build; see the compiler's message above", folder.display());
@@ -244,7 +244,7 @@ fn build(folder: &Path) -> Result<PathBuf> {
     }
 }
 
-/// Returns the programs that cargo's messages tell of.
+/// Returns the programs in cargo's messages.
 fn programs(messages: &str) -> Vec<PathBuf> {
     let artifact = |line: &str| {
         let message: Value = serde_json::from_str(line).ok()?;
@@ -262,7 +262,7 @@ mod tests {
     fn refused(name: &Path, parts: &[&str]) {
         let error = format!("{:#}", Plugin::find(name.as_os_str()).unwrap_err());
         for part in parts {
-            assert!(error.contains(part), "{} does not say {part:?}: {error}", name.display());
+            assert!(error.contains(part), "{} does not contain {part:?}: {error}", name.display());
         }
     }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime};
 use anyhow::{Context, Result};
 
 use super::plugin::Plugin;
-use crate::terminal::tell_error;
+use crate::terminal::print_error;
 
 /// Files are looked at this often: the hand is barely off the key, and a folder of sources costs
 /// nothing to list.
@@ -43,7 +43,7 @@ pub(crate) fn watch(plugin: Plugin) -> Result<Receiver<()>> {
             match plugin.command() {
                 Ok(_) if sender.send(()).is_err() => return,
                 Ok(_) => {}
-                Err(error) => tell_error(format_args!("not reloaded: {error:#}")),
+                Err(error) => print_error(format_args!("not reloaded: {error:#}")),
             }
         }
     };

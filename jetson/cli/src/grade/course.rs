@@ -1,4 +1,4 @@
-//! What is flown for a grade: a project's place, made from a seed.
+//! The course that is flown for a grade: an instance of a project, generated from a seed.
 
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ pub(crate) struct CourseInstance {
 }
 
 impl CourseInstance {
-    /// Makes the place of a seed.
+    /// Generates the course of a seed.
     ///
     /// # Errors
     /// If its arena cannot be written down, which a test of the projects excludes.
@@ -114,14 +114,14 @@ mod tests {
     #[test]
     fn a_place_is_known_by_its_hashes() {
         let project = CourseProject::named("forest").unwrap();
-        let place =
+        let course =
             |variant, seed| CourseInstance::make(&project, Level::Ug, variant, seed).unwrap();
-        let (one, again) = (place(Variant::DAY, 1), place(Variant::DAY, 1));
+        let (one, again) = (course(Variant::DAY, 1), course(Variant::DAY, 1));
         assert_eq!(
             (one.scene_sha256.as_str(), &one.rules_sha256),
             (again.scene_sha256.as_str(), &again.rules_sha256)
         );
-        let night = place("night".parse().unwrap(), 1);
+        let night = course("night".parse().unwrap(), 1);
         assert_eq!(night.rules_sha256, one.rules_sha256, "the rules are those of the day");
         assert_ne!(night.scene_sha256, one.scene_sha256);
         let other = CourseInstance::make(&project, Level::G, Variant::DAY, 1).unwrap();

@@ -16,9 +16,9 @@ use super::statistics::{Interval, mean_interval, share_interval};
 pub(crate) const FORMAT: &str = "vizflyt-grade-1";
 
 /// Seeds that are flown at most, and parts of a grade.
-pub(crate) const MOST_SEEDS: u64 = 100_000;
+pub(crate) const MAX_SEEDS: u64 = 100_000;
 /// Variants that there are at most, in this version and those to come.
-const MOST_VARIANTS: usize = 64;
+const MAX_VARIANTS: usize = 64;
 
 /// A grade.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -96,7 +96,7 @@ pub(crate) struct Shard {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Run {
-    /// Of the place and of the simulator's noise.
+    /// Seed of the course and of the simulator's noise.
     pub seed: u64,
     /// The surroundings.
     pub variant: String,
@@ -125,7 +125,7 @@ pub(crate) struct Run {
     pub path_m: f64,
     /// Images that the plugin answered.
     pub images: u64,
-    /// SHA-256 of the place: its splats.
+    /// SHA-256 of the scene: its splats.
     pub scene_sha256: String,
     /// SHA-256 of its rules: `arena.toml`.
     pub rules_sha256: String,
@@ -176,12 +176,12 @@ impl Subject {
 impl Shard {
     /// Whether there is such a part.
     fn is_one(index: u64, count: u64) -> bool {
-        1 <= index && index <= count && count <= MOST_SEEDS
+        1 <= index && index <= count && count <= MAX_SEEDS
     }
 
-    /// Whether the flight at this place of the order belongs to it.
-    pub(crate) fn holds(self, place: usize) -> bool {
-        place as u64 % self.count == self.index - 1
+    /// Whether the flight at this index of the order belongs to it.
+    pub(crate) fn holds(self, index: usize) -> bool {
+        index as u64 % self.count == self.index - 1
     }
 }
 
@@ -286,8 +286,8 @@ impl Grade {
         let grade: Self = serde_json::from_str(text)?;
         let Subject { seeds, variants, .. } = &grade.subject;
         ensure!(
-            *seeds <= MOST_SEEDS && variants.len() <= MOST_VARIANTS,
-            "{seeds} seeds in {} variants: at most {MOST_SEEDS} and {MOST_VARIANTS}",
+            *seeds <= MAX_SEEDS && variants.len() <= MAX_VARIANTS,
+            "{seeds} seeds in {} variants: at most {MAX_SEEDS} and {MAX_VARIANTS}",
             variants.len()
         );
         if let Some(Shard { index, count }) = grade.shard {
@@ -350,7 +350,7 @@ impl Summary {
 fn hash_of(runs: &[Run]) -> String {
     let mut hash = Sha256::new();
     for run in runs {
-        // Lengths are fixed or told, so that no two lists give the same bytes.
+        // Lengths are fixed or written, so that no two lists give the same bytes.
         hash.update(run.seed.to_le_bytes());
         hash.update((run.variant.len() as u64).to_le_bytes());
         hash.update(run.variant.as_bytes());

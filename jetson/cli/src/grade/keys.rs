@@ -16,7 +16,7 @@ const KEY_FILE: &str = "grading.key";
 /// What no plugin is made of: what builds and interpreters leave behind.
 const LEFT_ASIDE: [&str; 4] = ["target", "__pycache__", "node_modules", "venv"];
 /// A plugin of more files than this is some other folder.
-const MOST_FILES: usize = 20_000;
+const MAX_FILES: usize = 20_000;
 
 /// Returns the key that grades are signed with; the first grade makes it.
 pub(crate) fn signing_key(keys: Option<&Path>) -> Result<SigningKey> {
@@ -120,8 +120,8 @@ fn gather(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
         } else if entry.path().is_file() {
             files.push(entry.path());
         }
-        if files.len() > MOST_FILES {
-            bail!("{} holds more than {MOST_FILES} files; is it a plugin's?", folder.display());
+        if files.len() > MAX_FILES {
+            bail!("{} holds more than {MAX_FILES} files; is it a plugin's?", folder.display());
         }
     }
     Ok(())

@@ -2,7 +2,7 @@
 //! it.
 //!
 //! ```text
-//! project, level, variant, seed -> course  place in memory: splats, arena, distance field
+//! project, level, variant, seed -> course  in memory: splats, arena, distance field
 //!                               -> trial   one flight in lock-step, a plugin process of its own
 //!                               -> vizflyt_arena::crash  what a failure probably was
 //! flights                       -> document  figures, hash, signature -> report/, junit, JSON
@@ -40,11 +40,11 @@ use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
-use self::document::{DelaysMs, MOST_SEEDS, Run, Shard, Subject, hex};
+use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
 use self::trial::{Delays, Flown, Trial};
 use crate::fly::plugin::Plugin;
-use crate::terminal::{stop_flag, tell, tell_error};
+use crate::terminal::{print_error, print_line, stop_flag};
 
 /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
 #[derive(Args, Clone, Debug)]
@@ -82,7 +82,7 @@ struct FlyArgs {
         "Light and fog that each seed is flown in: {}", Variant::names()
     ))]
     variants: Vec<Variant>,
-    /// Number of seeds: each is another place
+    /// Number of seeds: each is another course
     #[arg(long, value_name = "N", default_value_t = 10)]
     seeds: u64,
     /// The first seed; keep it secret, so that nobody prepares for the courses
@@ -174,7 +174,7 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
         None => grade(&args.fly),
         Some(GradeCommand::Verify { file, key, keys }) => {
             let grade = verified(file, key.as_deref(), keys.as_deref())?;
-            tell(format!(
+            print_line(format!(
                 "{}: as signed with {}; score {:.1}, {} of {} finished",
                 file.display(),
                 grade.signature.as_ref().map_or("", |signed| &signed.key),
@@ -196,12 +196,12 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
             }
             hand_over(&grade, result)?;
             if let (Some(folder), false) = (report, result.json) {
-                tell(format!("report      {}", folder.join("index.html").display()));
+                print_line(format!("report      {}", folder.join("index.html").display()));
             }
             Ok(ExitCode::SUCCESS)
         }
         Some(GradeCommand::Key { keys }) => {
-            tell(hex(&keys::signing_key(keys.as_deref())?.verifying_key().to_bytes()));
+            print_line(hex(&keys::signing_key(keys.as_deref())?.verifying_key().to_bytes()));
             Ok(ExitCode::SUCCESS)
         }
     }
@@ -229,7 +229,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let flights: Vec<(Variant, u64)> = subject
         .flights()
         .enumerate()
-        .filter(|(place, _)| args.shard.is_none_or(|shard| shard.holds(*place)))
+        .filter(|(index, _)| args.shard.is_none_or(|shard| shard.holds(*index)))
         .map(|(_, (variant, seed))| Ok((variant.parse()?, seed)))
         .collect::<Result<_>>()?;
     let stop: &AtomicBool = &*stop_flag(false)?;
@@ -241,16 +241,16 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<Done>> {
         let named = || format!("seed {seed}, {variant}");
-        let place =
+        let course =
             CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
-        let limits = PluginLimits { map: place.map.clone(), ..limits.clone() };
-        let (place, command, limits) = (&place, &command[..], &limits);
-        let trial = Trial { place, seed, command, limits, answer_within, delays, stop };
+        let limits = PluginLimits { map: course.map.clone(), ..limits.clone() };
+        let (course, command, limits) = (&course, &command[..], &limits);
+        let trial = Trial { course, seed, command, limits, answer_within, delays, stop };
         let Some(flown) = trial.fly().with_context(named)? else { return Ok(None) };
-        let run = run_of(place, &delays, seed, variant, &flown);
+        let run = run_of(course, &delays, seed, variant, &flown);
         let card = match (&args.report, &run.cause) {
             (Some(folder), Some(_)) => {
-                Some(report::card::write(folder, &place.arena, &place.field, &run, &flown)?)
+                Some(report::card::write(folder, &course.arena, &course.field, &run, &flown)?)
             }
             _ => None,
         };
@@ -263,7 +263,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         pool::run(&flights, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
     progress.end();
     let Some(done) = done? else {
-        tell_error("ended on request; nothing is graded");
+        print_error("ended on request; nothing is graded");
         return Ok(ExitCode::FAILURE);
     };
     let (runs, cards): (Vec<Run>, Vec<Option<String>>) =
@@ -278,7 +278,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     }
     hand_over(&grade, &args.result)?;
     if let (Some(folder), false) = (&args.report, args.result.json) {
-        tell(format!("report      {}", folder.join("index.html").display()));
+        print_line(format!("report      {}", folder.join("index.html").display()));
     }
     let is_enough = args.least.is_none_or(|least| grade.summary.score.value >= least);
     Ok(if is_enough { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -297,11 +297,7 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     ensure!(within(image_rate, 1.0, 200.0), "--image-rate {image_rate}: give 1 to 200 Hz");
     ensure!(within(image_delay, 0.0, 200.0), "--image-delay {image_delay}: give 0 to 200 ms");
     ensure!(within(answer_delay, 0.0, 1000.0), "--answer-delay {answer_delay}: give 0 to 1000 ms");
-    ensure!(
-        (1..=MOST_SEEDS).contains(&args.seeds),
-        "--seeds {}: give 1 to {MOST_SEEDS}",
-        args.seeds
-    );
+    ensure!((1..=MAX_SEEDS).contains(&args.seeds), "--seeds {}: give 1 to {MAX_SEEDS}", args.seeds);
     Ok(Delays {
         image_period_ns: (1e9 / image_rate) as i64,
         image_ns: (image_delay * 1e6) as i64,
@@ -336,7 +332,7 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<S
 }
 
 fn run_of(
-    place: &CourseInstance,
+    course: &CourseInstance,
     delays: &Delays,
     seed: u64,
     variant: Variant,
@@ -348,7 +344,7 @@ fn run_of(
         variant: variant.to_string(),
         outcome: verdict.outcome,
         reason: verdict.reason.clone(),
-        cause: probable_cause(&place.arena, &place.field, &flown.record(delays)),
+        cause: probable_cause(&course.arena, &course.field, &flown.record(delays)),
         stages_passed: verdict.stages_passed,
         stages: verdict.stages.clone(),
         seconds: verdict.seconds,
@@ -358,8 +354,8 @@ fn run_of(
         max_speed_mps: verdict.max_speed_mps,
         path_m: verdict.path_m,
         images: flown.images,
-        scene_sha256: place.scene_sha256.clone(),
-        rules_sha256: place.rules_sha256.clone(),
+        scene_sha256: course.scene_sha256.clone(),
+        rules_sha256: course.rules_sha256.clone(),
         hash: hex(&flown.hash),
     }
 }
@@ -377,15 +373,15 @@ fn hand_over(grade: &Grade, args: &ResultArgs) -> Result<()> {
         write(path, &grade.to_text()?)?;
     }
     if args.json {
-        tell(grade.to_text()?.trim_end());
+        print_line(grade.to_text()?.trim_end());
         return Ok(());
     }
     let summary = &grade.summary;
-    tell(format!(
+    print_line(format!(
         "score       {:.1} (95 %: {:.1} to {:.1})",
         summary.score.value, summary.score.low, summary.score.high
     ));
-    tell(format!(
+    print_line(format!(
         "finished    {} of {} (95 %: {:.0} to {:.0} %)",
         summary.finished,
         summary.runs,
@@ -393,12 +389,12 @@ fn hand_over(grade: &Grade, args: &ResultArgs) -> Result<()> {
         summary.finish_share.high * 100.0
     ));
     if let Some(mean_s) = summary.mean_finish_s {
-        tell(format!("time        {mean_s:.1} s to the finish, on average"));
+        print_line(format!("time        {mean_s:.1} s to the finish, on average"));
     }
     if let Some(clearance_m) = summary.min_clearance_m {
-        tell(format!("clearance   {clearance_m:.2} m at least"));
+        print_line(format!("clearance   {clearance_m:.2} m at least"));
     }
-    tell(format!("hash        {}", grade.hash));
+    print_line(format!("hash        {}", grade.hash));
     Ok(())
 }
 

@@ -9,7 +9,7 @@ use std::thread;
 use anyhow::{Context, Result, bail};
 
 /// Runs `work` on each of `tasks`, on `jobs` threads; returns the results in the order of the tasks.
-/// `told` hears of each as it ends, on the calling thread. `None` if it is stopped before all are done.
+/// `notify` is called with each as it ends, on the calling thread. `None` if it is stopped before all are done.
 ///
 /// # Errors
 /// The first error of `work`; the others are stopped then.
@@ -18,7 +18,7 @@ pub(crate) fn run<T: Sync, R: Send>(
     jobs: NonZero<usize>,
     stop: &AtomicBool,
     work: impl Fn(&T) -> Result<Option<R>> + Sync,
-    mut told: impl FnMut(&R),
+    mut notify: impl FnMut(&R),
 ) -> Result<Option<Vec<R>>> {
     let next = AtomicUsize::new(0);
     let mut results: Vec<Option<R>> = tasks.iter().map(|_| None).collect();
@@ -42,7 +42,7 @@ pub(crate) fn run<T: Sync, R: Send>(
         for (index, result) in done {
             match result {
                 Ok(Some(result)) => {
-                    told(&result);
+                    notify(&result);
                     results[index] = Some(result);
                 }
                 Ok(None) => stop.store(true, Ordering::Relaxed),
@@ -74,11 +74,11 @@ mod tests {
     #[test]
     fn results_come_in_the_order_of_the_tasks() {
         let tasks: Vec<u64> = (0..50).collect();
-        let mut told = 0;
+        let mut notified = 0;
         let stop = AtomicBool::new(false);
-        let found = run(&tasks, JOBS, &stop, |n| Ok(Some(n * n)), |_| told += 1);
+        let found = run(&tasks, JOBS, &stop, |n| Ok(Some(n * n)), |_| notified += 1);
         assert_eq!(found.unwrap().unwrap(), tasks.iter().map(|n| n * n).collect::<Vec<_>>());
-        assert_eq!(told, 50);
+        assert_eq!(notified, 50);
         let none = run(&[] as &[u64], JOBS, &stop, |n| Ok(Some(*n)), |_| {}).unwrap();
         assert_eq!(none, Some(Vec::new()));
     }

@@ -50,7 +50,7 @@ impl Progress {
         let _ = out.flush();
     }
 
-    /// Ends the line; says how fast it went.
+    /// Ends the line with the speed.
     pub(super) fn end(&self) {
         let mut out = std::io::stderr().lock();
         let clear = if self.is_terminal { "\r\x1b[K" } else { "" };

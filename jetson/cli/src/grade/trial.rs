@@ -28,7 +28,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Setpoint};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
-use vizflyt_runtime::guard::Fix;
+use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
@@ -43,7 +43,7 @@ use super::course::CourseInstance;
 /// How long things take in a graded flight, always the same.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Delays {
-    /// From one image to the next, of cameras that do not say it themselves. [ns]
+    /// From one image to the next, of cameras that have no rate of their own. [ns]
     pub image_period_ns: i64,
     /// From the start of rendering until the plugin is given the image, which shows the vehicle where
     /// it is by then, as far as can be foretold. [ns]
@@ -55,8 +55,8 @@ pub(crate) struct Delays {
 /// What is flown, and how.
 pub(crate) struct Trial<'a> {
     /// Where.
-    pub place: &'a CourseInstance,
-    /// Of the place, and of the simulator's noise.
+    pub course: &'a CourseInstance,
+    /// Seed of the course and of the simulator's noise.
     pub seed: u64,
     /// The command that starts the plugin.
     pub command: &'a [OsString],
@@ -107,7 +107,7 @@ pub(crate) struct Flown {
 }
 
 impl Flown {
-    /// Returns what its probable cause is told from.
+    /// Returns the record from which its probable cause is found.
     pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
         Record {
             verdict: &self.verdict,
@@ -166,7 +166,7 @@ struct Pending {
     /// What it shows.
     shown: ServerTime,
     /// By camera; those not rendered this time are `None`.
-    drawn: Vec<Option<Picture>>,
+    rendered: Vec<Option<Picture>>,
 }
 
 /// What a plugin gets of a camera.
@@ -220,7 +220,7 @@ struct Flight<'a> {
 
 impl<'a> Flight<'a> {
     fn new(trial: &'a Trial<'a>, process: PluginProcess) -> Result<Self> {
-        let arena = &trial.place.arena;
+        let arena = &trial.course.arena;
         let now = HostTime::from_ns(START_NS);
         let config = SimulationConfig {
             spawn_m: arena.spawn.position_m,
@@ -236,7 +236,7 @@ impl<'a> Flight<'a> {
             limits: Limits::NONE,
         };
         let info = arena.info();
-        let (splats, objects) = (&trial.place.splats, &trial.place.objects[..]);
+        let (splats, objects) = (&trial.course.splats, &trial.course.objects[..]);
         let renderer = CpuRenderer::new(Scene { splats, objects });
         let mut hash = Sha256::new();
         hash.update(renderer.name().as_bytes());
@@ -246,7 +246,7 @@ impl<'a> Flight<'a> {
             cameras: info.cameras.to_vec(),
             simulation,
             lockstep: Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns),
-            referee: Referee::new(arena, trial.place.obstacles.clone())
+            referee: Referee::new(arena, trial.course.obstacles.clone())
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
             images: Vec::new(),
@@ -328,7 +328,7 @@ impl<'a> Flight<'a> {
                 stamp: sample.stamp,
                 p_world_m,
                 v_world_mps: sample.twist.linear_mps,
-                yaw_rad: Fix::of(&sample, self.now).yaw_rad(),
+                yaw_rad: VehicleMotion::of(&sample, self.now).yaw_rad(),
                 clearance_m: self.referee.clearance_m(p_world_m),
             });
             self.poses += 1;
@@ -378,11 +378,11 @@ impl<'a> Flight<'a> {
         let images = &mut self.images[..cameras.len()];
         // What moves is where it is at the instant that the images show, as for the referee.
         let since_start_ns = exposure.at.as_ns().wrapping_sub(START_NS).cast_signed();
-        let placements = self.trial.place.obstacles.objects.placements(since_start_ns);
+        let placements = self.trial.course.obstacles.objects.placements(since_start_ns);
         self.renderer
             .render(&placements, &cameras, images)
             .context("an image cannot be rendered")?;
-        let mut drawn: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
+        let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for (&index, image) in due.iter().zip(images) {
             let mut picture = Picture::default();
             image.write_rgb8(&mut picture.rgb);
@@ -393,11 +393,11 @@ impl<'a> Flight<'a> {
                 // As in flight: what the course withholds is "no return" everywhere.
                 picture.depth_mm.fill(0);
             }
-            drawn[index] = Some(picture);
+            rendered[index] = Some(picture);
         }
         self.seq += 1;
         let (due, pose, shown) = (self.now.plus_ns(image_ns), sample.stamp, exposure.at);
-        self.pending.push_back(Pending { due, seq: self.seq, pose, shown, drawn });
+        self.pending.push_back(Pending { due, seq: self.seq, pose, shown, rendered });
         Ok(())
     }
 
@@ -408,7 +408,7 @@ impl<'a> Flight<'a> {
         let pose = HostTime::from_ns(pending.pose.as_ns());
         let stamps = ImageStamps { seq: pending.seq, pose, ahead_ns, ready: pending.due };
         let write = |writer: &mut ObservationWriter<'_>| {
-            for (index, picture) in pending.drawn.iter().enumerate() {
+            for (index, picture) in pending.rendered.iter().enumerate() {
                 let (Some(picture), camera) = (picture, &cameras[index]) else { continue };
                 picture.add_to(hash);
                 if let Some(planes) = writer.planes(index, camera) {
@@ -431,7 +431,7 @@ impl<'a> Flight<'a> {
         if self.end.reason().is_some() {
             return;
         }
-        let front = pending.drawn.first().and_then(Option::as_ref);
+        let front = pending.rendered.first().and_then(Option::as_ref);
         let k = self.cameras.first().map(|camera| camera.intrinsics);
         let ahead_m = front.and_then(|picture| picture.ahead_m);
         let stamp = self.server_now();

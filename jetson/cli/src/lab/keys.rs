@@ -49,5 +49,5 @@ impl Keys {
     }
 }
 
-/// What the server and the runtime call the vehicle if not told otherwise.
+/// The default name of the vehicle, for server and runtime.
 const VEHICLE: &str = "vizflyt";

@@ -39,7 +39,7 @@ impl Localization {
         Ok(())
     }
 
-    /// Returns the server's option: it says which address it got.
+    /// Returns the server's option: it reports the address that it got.
     pub(crate) fn of_server(self) -> OsString {
         match self {
             Self::Vicon => "--pose=vicon:127.0.0.1:0".into(),
@@ -57,7 +57,7 @@ impl Localization {
         }
     }
 
-    /// Returns the command that sees tags and sends poses to the server at `poses`; it says where it waits
+    /// Returns the command that sees tags and sends poses to the server at `poses`; it reports where it waits
     /// for the true poses that its cameras' images are rendered from.
     pub(crate) fn of_tags(poses: &str) -> Vec<OsString> {
         let words = ["tags", "locate", "--json", "--lifeline", "--simulated"];

@@ -87,21 +87,21 @@ mod tests {
         use std::process::{Command, Stdio};
 
         // It has memory of its own once it speaks, and waits until its input closes. A sum over this process would
-        // tell nothing: other tests of it take memory and give it back meanwhile.
+        // prove nothing: other tests of it take memory and give it back meanwhile.
         let mut child = Command::new("sh")
             .args(["-c", "echo up; read -r line"])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut said = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut said).unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let own = std::process::id();
         let together = family(own);
         let stranger = family(child.id());
         drop(child.stdin.take());
         child.wait().unwrap();
-        assert_eq!(said, "up\n");
+        assert_eq!(line, "up\n");
         assert!(together[&own] > 500, "this process has {} kB", together[&own]);
         assert!(together[&child.id()] > 0, "the child is not counted: {together:?}");
         assert!(!stranger.contains_key(&own), "a child's family holds its parent");

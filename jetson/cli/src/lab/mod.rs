@@ -4,10 +4,10 @@
 //! ```text
 //! prepare   generate (or find) the scene: scene.ply, arena.toml, truth.json
 //! keys      pair server and runtime, for this flight only
-//! serve     start the render server; it says which ports it got
-//! fly       start the runtime with the plugin; it says which port waits for MAVLink
-//! bridge    start the Wi-Fi bridge, if it is wanted; it says where its serial port is
-//! tags      start AprilTag localization, if it is wanted; it says where it waits for true poses
+//! serve     start the render server; it reports its ports
+//! fly       start the runtime with the plugin; it reports its MAVLink port
+//! bridge    start the Wi-Fi bridge, if it is wanted; it reports its serial port
+//! tags      start AprilTag localization, if it is wanted; it reports its address for true poses
 //! sim       start the vehicle: airframe, autopilot, mocap
 //! watch     print events and status, until the runtime ends (or a person ends it all)
 //! report    join what the three measured
@@ -35,7 +35,6 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
-use vizflyt_runtime::control::print_line;
 use vizflyt_server::render::RendererKind;
 
 use self::child::{Child, Notice, Role};
@@ -47,7 +46,7 @@ use self::localization::Localization;
 use self::memory::MemoryWatch;
 use self::prepare::Stage;
 use self::report::Parts;
-use crate::terminal::{on_interrupt, open_browser, tell};
+use crate::terminal::{on_interrupt, open_browser, print_line};
 
 pub(crate) use self::report::Report;
 
@@ -133,7 +132,7 @@ fn project_name(name: &str) -> Result<String, UnknownProject> {
 pub(crate) struct LabFlight<'a> {
     /// The lab.
     pub lab: &'a LabArgs,
-    /// The plugin, and what else `vizflyt fly` is to be told.
+    /// The plugin, and other arguments of `vizflyt fly`.
     pub fly: Vec<OsString>,
     /// Arguments for the plugin.
     pub plugin_arguments: &'a [OsString],
@@ -158,10 +157,10 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let stage = Stage::prepare(flight.lab)?;
     flight.lab.localization.check(stage.fence_m)?;
     if !flight.json {
-        tell(format!("scene       {scene}{}", stage.seeded(seed)));
+        print_line(format!("scene       {scene}{}", stage.seeded(seed)));
         if let Some(project) = flight.lab.project() {
             let (level, variant) = (flight.lab.level(), flight.lab.variant());
-            tell(format!("project     {}: level {level}, {variant}", project.title()));
+            print_line(format!("project     {}: level {level}, {variant}", project.title()));
         }
     }
     let keys = Keys::make()?;
@@ -180,14 +179,14 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
         Flown::To { log } => Ok(Some(show.parts.join(seed, memory.peak_mb(), &log))),
         Flown::Interrupted => {
             if !flight.json {
-                tell("ended on request");
+                print_line("ended on request");
             }
             Ok(None)
         }
     }
 }
 
-/// How long a child may take to say it is ready: a large scene is loaded and baked.
+/// How long a child may take to report that it is ready: a large scene is loaded and baked.
 const READY_LIMIT: Duration = Duration::from_mins(2);
 /// How long all children together may take to end.
 const END_LIMIT: Duration = Duration::from_millis(1500);
@@ -200,7 +199,7 @@ enum Flown {
     Interrupted,
 }
 
-/// The running children and what they have said.
+/// The running children and what they have reported.
 struct Show {
     /// The option that gives the children our log level.
     log_level: OsString,
@@ -244,14 +243,14 @@ impl Show {
         };
         let url = text(&server, "http")?;
         if self.json {
-            print_line(&json!({"ready": "lab", "http": url}).to_string());
+            print_line(json!({"ready": "lab", "http": url}));
         } else {
-            tell(format!(
+            print_line(format!(
                 "renderer    {} ({})",
                 text(&server, "renderer")?,
                 text(&server, "renderer_reason")?
             ));
-            tell(format!("page        {url}"));
+            print_line(format!("page        {url}"));
         }
         if !lab.headless {
             open_browser(&url);
@@ -308,7 +307,7 @@ impl Show {
                 return Ok(Flown::Interrupted);
             };
             if !self.json {
-                tell(format!("tags        {}", text(&tags, "http")?));
+                print_line(format!("tags        {}", text(&tags, "http")?));
             }
             format!("--truth-to={}", text(&tags, "truth")?)
         } else {
@@ -390,14 +389,14 @@ impl Show {
                 Role::Tags => &mut self.parts.localization,
             } = report.clone();
         }
-        // The server repeats to its page what the runtime says: take each from its source.
+        // The server repeats the runtime's events to its page: take each from its source.
         if from != Role::Runtime {
             return;
         }
         if self.json {
             // The report comes later, joined.
             if line.get("report").is_none() {
-                print_line(&line.to_string());
+                print_line(line);
             }
         } else if let Some(sentence) = line["event"]["text"].as_str() {
             self.screen.event(&format!("            {sentence}"));

@@ -70,7 +70,7 @@ impl Stage {
         })
     }
 
-    /// Returns how the seed made it what it is, to be said behind its name.
+    /// Returns what the seed changed, to be printed behind its name.
     pub(crate) fn seeded(&self, seed: u64) -> String {
         self.folder.as_ref().map_or(String::new(), |_| format!(", seed {seed}"))
     }

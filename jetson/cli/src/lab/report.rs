@@ -53,7 +53,7 @@ pub(crate) struct Report {
     /// Least distance of the body's surface to the true geometry; absent where a scene has none. [m]
     pub min_clearance_m: Option<f64>,
     /// How good the localization was in the end, by vehicle: rate, age, sigma, what each source
-    /// delivered and what of it was not believed.
+    /// delivered and what of it was rejected.
     pub pose: Value,
     /// Setpoints sent to the autopilot.
     pub setpoints_sent: u64,
@@ -109,7 +109,7 @@ impl Parts {
         }
     }
 
-    /// Joins the parts. A true collision outranks what the referee believed; a missing part is an
+    /// Joins the parts. A true collision outranks the referee's decision; a missing part is an
     /// error by name.
     pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> Report {
         let number = |part: &Value, key: &str| part[key].as_f64().unwrap_or(0.0);
@@ -195,7 +195,7 @@ impl Report {
         format!(
             "{outcome}{reason}\n\
              \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
-             \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, drawn in {render:.1} ms ({renderer})\n\
+             \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, rendered in {render:.1} ms ({renderer})\n\
              \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms; to the setpoint {setpoint:.1} ms\n\
              \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n{tags}\
              \x20 memory      {memory:.0} MB at most, all processes together\n\

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail};
 /// folder people work in or in one of `roots`.
 ///
 /// # Errors
-/// If there is none of that name; the sentence says which there are.
+/// If there is none of that name; the sentence lists those that exist.
 pub(super) fn find(name: &str, roots: &[PathBuf]) -> Result<PathBuf> {
     let roots: Vec<PathBuf> =
         std::iter::once(PathBuf::new()).chain(roots.iter().cloned()).collect();

@@ -16,7 +16,7 @@ use vizflyt_scenes::projects::{self, CourseProject};
 use crate::fly::sources;
 use crate::manifest;
 use crate::plugins::BuiltIn;
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
 #[derive(Args, Debug)]
@@ -76,14 +76,14 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
         };
         write().with_context(|| format!("cannot write {}", path.display()))?;
     }
-    tell(format!("{folder} is made; now"));
+    print_line(format!("{folder} is made; now"));
     if args.lang == Language::Python {
-        tell(format!(
+        print_line(format!(
             "  python3 -m venv {folder}/.venv && {folder}/.venv/bin/pip install -r \
              {folder}/requirements.txt"
         ));
     }
-    tell(format!("  vizflyt fly {folder}"));
+    print_line(format!("  vizflyt fly {folder}"));
     Ok(ExitCode::SUCCESS)
 }
 

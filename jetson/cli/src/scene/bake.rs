@@ -10,7 +10,7 @@ use serde::Serialize;
 use vizflyt_arena::BakeSpec;
 use vizflyt_server::scene::{BakeCache, Baked, Up, bake_with, load};
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Bakes a scene's obstacles for the referee, and keeps them for serve, demo and grade.
 #[derive(Args, Debug)]
@@ -20,7 +20,7 @@ use crate::terminal::tell;
 pub(crate) struct BakeArgs {
     /// arena.toml, its folder, or a bare scene file, for which an arena is made up
     scene: PathBuf,
-    /// Another side of a voxel than [occupancy] says, to compare
+    /// Another side of a voxel than that of [occupancy], to compare
     #[arg(long, value_name = "METRES")]
     voxel: Option<f64>,
     /// Bakes even if it is kept from an earlier time
@@ -81,9 +81,9 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     Bar::clear();
     let report = Report::of(&baked, scene.splats.len(), &spec);
     if args.json {
-        tell(serde_json::to_string(&report)?);
+        print_line(serde_json::to_string(&report)?);
     } else {
-        report.tell();
+        report.print();
     }
     Ok(())
 }
@@ -107,9 +107,9 @@ impl Report {
         }
     }
 
-    fn tell(&self) {
+    fn print(&self) {
         let how = if self.kept { "read" } else { "baked" };
-        tell(format!(
+        print_line(format!(
             "{how:<12} {} splats, {} voxels of {:.0} mm, {:.1} MB, in {:.2} s",
             self.splats,
             self.voxels,
@@ -118,14 +118,14 @@ impl Report {
             self.seconds
         ));
         if let Some(counts) = &self.counts {
-            tell(format!(
+            print_line(format!(
                 "obstacles    {} voxels solid, of which {} were voids; {} floating voxels and {} \
                  faint or outside splats left out",
                 counts.occupied, counts.enclosed, counts.floating, counts.splats_left_out
             ));
         }
         if let Some(file) = &self.file {
-            tell(format!("kept at      {file}"));
+            print_line(format!("kept at      {file}"));
         }
     }
 }

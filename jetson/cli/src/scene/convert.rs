@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use vizflyt_splat::format::{self, Format, Progress};
 
-use crate::terminal::{say, tell};
+use crate::terminal::{print_fmt, print_line};
 
 /// Converts a scene file to another format; the files' names decide, and content where it has a mark.
 #[derive(Args, Debug)]
@@ -32,10 +32,10 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
     let loaded = format::read_with_progress(&args.from, &mut |Progress { done, total }| {
         if start.elapsed().as_secs() >= shown_s {
             shown_s += 1;
-            tell(format!("{} %", done * 100 / total));
+            print_line(format!("{} %", done * 100 / total));
         }
     })?;
-    say!(
+    print_fmt!(
         "{}: {} splats, degree {}, {} dropped, {:.0} ms",
         loaded.format,
         loaded.splats.len(),
@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
         start.elapsed().as_secs_f64() * 1e3
     );
     for skipped in loaded.skipped_properties.iter().chain(&loaded.skipped_elements) {
-        say!("left out: {skipped}");
+        print_fmt!("left out: {skipped}");
     }
     match (args.variant, Format::of_name(&args.to)) {
         (Some(variant), Some(format)) => {

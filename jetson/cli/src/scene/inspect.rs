@@ -10,7 +10,7 @@ use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::Loaded;
 
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Reports what a scene holds, and what looks wrong with it.
 #[derive(Args, Debug)]
@@ -87,27 +87,27 @@ pub(super) fn run(args: &InspectArgs) -> Result<()> {
     let (path, loaded) = load_as_it_is(&args.scene)?;
     let found = inspect(&path, &loaded);
     if args.json {
-        say!("{}", serde_json::to_string_pretty(&found)?);
+        print_fmt!("{}", serde_json::to_string_pretty(&found)?);
         return Ok(());
     }
     let corners = |[min, max]: [[f32; 3]; 2]| {
         let size = Vec3::from(max) - Vec3::from(min);
         format!("{min:.2?} to {max:.2?}, {:.2} x {:.2} x {:.2}", size.x, size.y, size.z)
     };
-    say!("file        {}: {}, {:.1} MB", found.file, found.format, found.file_mb);
-    say!("splats      {}, {} left out", found.splats, found.dropped);
-    say!("harmonics   degree {}", found.sh_degree);
-    say!("memory      {:.1} MB", found.memory_mb);
-    say!("bounds      {}", corners(found.bounds));
-    say!("core        {}", corners(found.core_bounds));
-    say!("            min       1 %       10 %      50 %      90 %      99 %      max");
-    say!("opacity     {}", found.opacity.line());
-    say!("scale       {}", found.scale.line());
+    print_fmt!("file        {}: {}, {:.1} MB", found.file, found.format, found.file_mb);
+    print_fmt!("splats      {}, {} left out", found.splats, found.dropped);
+    print_fmt!("harmonics   degree {}", found.sh_degree);
+    print_fmt!("memory      {:.1} MB", found.memory_mb);
+    print_fmt!("bounds      {}", corners(found.bounds));
+    print_fmt!("core        {}", corners(found.core_bounds));
+    print_fmt!("            min       1 %       10 %      50 %      90 %      99 %      max");
+    print_fmt!("opacity     {}", found.opacity.line());
+    print_fmt!("scale       {}", found.scale.line());
     for warning in &found.warnings {
-        say!("warning     {warning}");
+        print_fmt!("warning     {warning}");
     }
     if found.warnings.is_empty() {
-        say!("nothing looks wrong");
+        print_fmt!("nothing looks wrong");
     }
     Ok(())
 }
@@ -259,7 +259,7 @@ fn warnings_of_splats(splats: &Splats, [low, high]: [Vec3; 2]) -> Vec<String> {
         ));
     }
     let extent = size.max_element();
-    if !(LEAST_EXTENT..=MOST_EXTENT).contains(&extent) {
+    if !(MIN_EXTENT..=MAX_EXTENT).contains(&extent) {
         warnings.push(format!(
             "the core is {extent:.3} units wide: the unit is hardly a metre; \
              `vizflyt serve` takes --scale METRES_PER_UNIT"
@@ -273,8 +273,8 @@ const EDGE: f64 = 0.02;
 /// Trained scenes have few beyond.
 const NEEDLE: f32 = 50.0;
 /// A table top, and a campus. [m]
-const LEAST_EXTENT: f32 = 1.0;
-const MOST_EXTENT: f32 = 500.0;
+const MIN_EXTENT: f32 = 1.0;
+const MAX_EXTENT: f32 = 500.0;
 
 #[cfg(test)]
 mod tests {

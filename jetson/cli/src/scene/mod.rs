@@ -14,7 +14,7 @@ use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_scenes::SceneKind;
 
-use crate::terminal::{open_browser, say, tell};
+use crate::terminal::{open_browser, print_fmt, print_line};
 
 /// Makes, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
@@ -67,8 +67,8 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
 fn view(args: vizflyt_server::ViewArgs) -> Result<()> {
     let quiet = args.no_browser;
     vizflyt_server::web::view(args, |url, renderer| {
-        tell(format!("renderer    {} ({})", renderer.name, renderer.reason));
-        tell(format!("page        {url}"));
+        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
+        print_line(format!("page        {url}"));
         if !quiet {
             open_browser(url);
         }
@@ -84,8 +84,8 @@ fn generate(kind: SceneKind, seed: u64, output: &std::path::Path, force: bool) -
     }
     let scene = vizflyt_scenes::generate(kind, seed);
     let written = scene.write(output)?;
-    say!("{} splats     {}", scene.splats.len(), written.scene.display());
-    say!("arena             {}", written.arena.display());
-    say!("{} true solids   {}", scene.truth.len(), written.truth.display());
+    print_fmt!("{} splats     {}", scene.splats.len(), written.scene.display());
+    print_fmt!("arena             {}", written.arena.display());
+    print_fmt!("{} true solids   {}", scene.truth.len(), written.truth.display());
     Ok(())
 }

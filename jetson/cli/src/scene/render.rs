@@ -14,7 +14,7 @@ use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
 use super::npy;
-use crate::terminal::say;
+use crate::terminal::print_fmt;
 
 /// Renders a scene as it is, from cameras in its own frame, to files.
 #[derive(Args, Debug)]
@@ -73,13 +73,13 @@ enum FileFormat {
 
 /// Runs `vizflyt scene render`.
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
-    // Cameras first: a mistake in one is told before the scene is loaded.
+    // Cameras first: a mistake in one is reported before the scene is loaded.
     let shots = shots(args)?;
     let (scene, loaded) = load_as_it_is(&args.scene)?;
     let environment = args.environment.environment();
     if environment.fog_visibility_m > 0.0 && !is_in_an_arena(&args.scene) {
         bail!(
-            "--environment {}: fog is in metres, and nothing says how long {}'s unit is; name the \
+            "--environment {}: fog is in metres, and the length of {}'s unit is unknown; name the \
              arena.toml that it belongs to",
             args.environment,
             scene.display()
@@ -89,15 +89,15 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let start = Instant::now();
     let twin = Scene { splats: &loaded.splats, objects: &objects };
     let Chosen { mut rasterizer, reason } = choose(twin, args.renderer)?;
-    say!("scene       {}: {} splats", scene.display(), loaded.splats.len());
+    print_fmt!("scene       {}: {} splats", scene.display(), loaded.splats.len());
     if !moving.is_empty() {
         let names: Vec<_> = moving.names().collect();
-        say!("objects     {} at {} s", names.join(", "), args.at);
+        print_fmt!("objects     {} at {} s", names.join(", "), args.at);
     }
-    say!("renderer    {} ({reason})", rasterizer.name());
+    print_fmt!("renderer    {} ({reason})", rasterizer.name());
     drop((loaded, objects));
     let placements = moving.placements((args.at * 1e9).round() as i64);
-    say!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
+    print_fmt!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
     let atmosphere = atmosphere(&environment);
     for Shot { camera, folder } in shots {
@@ -111,7 +111,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
             FileFormat::Npy => write_npy(image, &folder)?,
         }
         let work = rasterizer.workload();
-        say!(
+        print_fmt!(
             "{:<11} {}x{} in {:.1} ms, {} splats in sight",
             folder.display(),
             image.width_px,
@@ -123,7 +123,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     Ok(())
 }
 
-/// Within what a clock of nanoseconds can say.
+/// Within the range of a clock of nanoseconds.
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| format!("'{text}' is no number of seconds"))?;
     let good = value.is_finite() && value.abs() <= 1e9;

@@ -10,14 +10,14 @@ use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, ViewOutcome
 use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::capture;
 
-use crate::terminal::{on_interrupt, tell};
+use crate::terminal::{on_interrupt, print_line};
 
 /// Finds a camera's focal lengths, principal point and distortion from images of the printed board, and
 /// writes the camera's file.
 #[derive(Args, Debug)]
 #[command(after_help = "Focus and zoom must not change afterwards: turn autofocus off
 (v4l2-ctl -d /dev/video0 --set-ctrl focus_automatic_continuous=0).
-Move the board slowly through the whole image, near and far, tilted to all sides; the command says
+Move the board slowly through the whole image, near and far, tilted to all sides; the command reports
 where next, and ends by itself.")]
 pub(super) struct CalibrateArgs {
     /// Where images come from: /dev/video0, /dev/video0:1280x720@60, a folder, a video file, - or
@@ -54,18 +54,18 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
             stop.store(true, Ordering::Relaxed);
             false
         })?;
-        tell("show the board to the camera; Ctrl-C ends early");
+        print_line("show the board to the camera; Ctrl-C ends early");
     }
-    let mut said = String::new();
+    let mut printed = String::new();
     while let Some(exposure) = source.next()? {
         let verdict = session.take(exposure.image, is_live)?;
         if let Some(calibrator) = session.progress() {
             let line = guide(calibrator, verdict, is_live);
-            if line != said {
+            if line != printed {
                 if is_live || verdict == ViewOutcome::Kept {
-                    tell(&line);
+                    print_line(&line);
                 }
-                said = line;
+                printed = line;
             }
             if is_live && calibrator.views() >= LIVE_VIEWS && calibrator.wanted().is_empty() {
                 break;
@@ -77,9 +77,9 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     }
     drop(source);
     if let Some(calibrator) = session.progress() {
-        tell(format_args!("{} views; where corners were seen:", calibrator.views()));
+        print_line(format_args!("{} views; where corners were seen:", calibrator.views()));
         for row in calibrator.coverage().map() {
-            tell(format_args!("  {row}"));
+            print_line(format_args!("  {row}"));
         }
     }
     let found = session.finish().context("no camera file was written")?;
@@ -93,15 +93,15 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     };
     camera.write(&args.output)?;
     let [fx, fy, cx, cy] = found.sigma_px;
-    tell(format_args!(
+    print_line(format_args!(
         "focal length {:.1} +- {fx:.1}, {:.1} +- {fy:.1} px; middle {:.1} +- {cx:.1}, {:.1} +- {cy:.1} px",
         k.fx_px, k.fy_px, k.cx_px, k.cy_px
     ));
-    tell(format_args!(
+    print_line(format_args!(
         "corners are {:.2} px off in the {} views used, {:.2} px in those held back",
         quality.rms_px, quality.images, quality.held_out_rms_px
     ));
-    tell(format_args!("{}: written", args.output.display()));
+    print_line(format_args!("{}: written", args.output.display()));
     Ok(())
 }
 

@@ -22,7 +22,7 @@ use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, Stamped
 
 use self::sources::{Shot, Sources};
 use self::view::LiveView;
-use crate::terminal::{stop_flag, tell};
+use crate::terminal::{print_line, stop_flag};
 
 /// Locates the vehicle by tags and sends its pose.
 #[derive(Args, Debug)]
@@ -44,11 +44,11 @@ pub(crate) struct LocateArgs {
     /// Name of the vehicle; that of the file without it.
     #[arg(long)]
     object: Option<String>,
-    /// Takes a camera's images from elsewhere than its file says: a device, a folder, a video. May be given
+    /// Takes a camera's images from another source than its file's: a device, a folder, a video. May be given
     /// several times.
     #[arg(long = "source", value_name = "CAMERA=SOURCE", value_parser = parse_source)]
     sources: Vec<(String, String)>,
-    /// Where simulated cameras are told the true pose: `vizflyt sim --truth-to` this.
+    /// Address at which simulated cameras receive the true pose: `vizflyt sim --truth-to` this.
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     truth: SocketAddr,
     /// Sends the pose here: `vizflyt serve --pose json:ADDR` listens. May be given several times.
@@ -102,27 +102,30 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let mut locator = Locator::new(setup.cameras.clone(), &setup.layouts, setup.settings.clone())?;
     let live = args.http.map(|address| LiveView::serve(address, &setup.cameras)).transpose()?;
     let view_port = live.as_ref().map(|live| live.address().port());
-    let outlet = Outlet::open(&args.to, &setup.object, view_port)?;
+    let outlet = PoseSender::open(&args.to, &setup.object, view_port)?;
     let mut sources = Sources::open(&setup, args.truth, &stop)?;
     let page = live.as_ref().map(|live| format!("http://{}", live.address()));
     let names: Vec<&str> = setup.cameras.iter().map(|camera| camera.name.as_str()).collect();
     if args.json {
         let to: Vec<String> = args.to.iter().map(ToString::to_string).collect();
-        tell(json!({
+        print_line(json!({
             "ready": "tags", "truth": sources.truth(), "http": page, "cameras": names, "to": to,
         }));
     } else {
         let or_none = |value: Option<&dyn Display>| value.map_or("-".into(), ToString::to_string);
-        tell(format!("cameras     {}", names.join(", ")));
-        tell(format!(
+        print_line(format!("cameras     {}", names.join(", ")));
+        print_line(format!(
             "truth       {}",
             or_none(sources.truth().as_ref().map(|a| a as &dyn Display))
         ));
-        tell(format!("live view   {}", or_none(page.as_ref().map(|page| page as &dyn Display))));
+        print_line(format!(
+            "live view   {}",
+            or_none(page.as_ref().map(|page| page as &dyn Display))
+        ));
     }
     let mut figures = Figures::default();
     let mut second = Figures::default();
-    let mut told = Instant::now();
+    let mut printed_at = Instant::now();
     while !stop.load(Ordering::Relaxed) {
         let Some(shots) = sources.next(WAIT)? else { break };
         for set in together(&shots) {
@@ -140,7 +143,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
             if let Ok(located) = &outcome.located {
                 let sent = outlet.send(located, image_ms, sources.is_live());
                 if args.poses {
-                    tell(sent);
+                    print_line(sent);
                 }
             }
             let off_m = outcome.located.as_ref().ok().and_then(|located| {
@@ -152,23 +155,23 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
                 live.show(set, &outcome, image_ms);
             }
         }
-        if told.elapsed() >= Duration::from_secs(1) {
-            second.seconds = told.elapsed().as_secs_f64();
-            told = Instant::now();
+        if printed_at.elapsed() >= Duration::from_secs(1) {
+            second.seconds = printed_at.elapsed().as_secs_f64();
+            printed_at = Instant::now();
             if args.json {
-                tell(json!({ "status": second.to_json() }));
+                print_line(json!({ "status": second.to_json() }));
             } else {
-                tell(second.to_line());
+                print_line(second.to_line());
             }
             figures.add(&std::mem::take(&mut second));
         }
     }
-    second.seconds = told.elapsed().as_secs_f64();
+    second.seconds = printed_at.elapsed().as_secs_f64();
     figures.add(&second);
     if args.json {
-        tell(json!({ "report": figures.to_json() }));
+        print_line(json!({ "report": figures.to_json() }));
     } else {
-        tell(format!("in all: {}", figures.to_line()));
+        print_line(format!("in all: {}", figures.to_line()));
     }
     Ok(())
 }
@@ -196,7 +199,7 @@ fn together(shots: &[Shot]) -> impl Iterator<Item = &[Shot]> {
 }
 
 /// Sends poses.
-struct Outlet {
+struct PoseSender {
     socket: UdpSocket,
     to: Vec<SocketAddr>,
     object: String,
@@ -205,7 +208,7 @@ struct Outlet {
     seq: std::cell::Cell<u64>,
 }
 
-impl Outlet {
+impl PoseSender {
     fn open(to: &[SocketAddr], object: &str, view_port: Option<u16>) -> Result<Self> {
         let any = if to.iter().any(SocketAddr::is_ipv6) { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any).context("tags: cannot open a socket for poses")?;
@@ -306,8 +309,8 @@ impl Figures {
             (&mut self.off_mm, &other.off_mm),
         ] {
             mine.extend(theirs);
-            // Hours of flight are told by their last part.
-            let old = mine.len().saturating_sub(MOST_FIGURES);
+            // Hours of flight are reported by their last part.
+            let old = mine.len().saturating_sub(MAX_FIGURES);
             mine.drain(..old);
         }
     }
@@ -374,7 +377,7 @@ const WAIT: Duration = Duration::from_millis(100);
 /// Exposures closer than this are located as one. [s]
 const TOGETHER_S: f64 = 0.002;
 /// Figures of the report rest on so many sets at most: an hour of two cameras at 30 Hz.
-const MOST_FIGURES: usize = 216_000;
+const MAX_FIGURES: usize = 216_000;
 
 #[cfg(test)]
 mod tests {

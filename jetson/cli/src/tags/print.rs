@@ -9,21 +9,21 @@ use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::print::{BAR_MM, CUBE_FACES, Cube, Mat, Paper, Printed, checkerboard, pdf};
 
 use super::family;
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Prints a cube for the vehicle, a mat for the floor, or a board or checkerboard to calibrate with: a
 /// PDF, and the layout file beside it.
 #[derive(Args, Debug)]
 #[command(after_help = "Print at 100 %, then measure the bar at the foot of a sheet. If it is not
 100.0 mm long, run the same command again with --bar-mm: the sheets stay the same, and the layout
-file says how large the tags really are.")]
+file has the tags' real sizes.")]
 pub(super) struct PrintArgs {
     #[command(subcommand)]
-    what: What,
+    object: PrintCommand,
 }
 
 #[derive(Subcommand, Debug)]
-enum What {
+enum PrintCommand {
     /// Faces with folds and flaps: tags on the vehicle, seen by cameras in the room.
     Cube {
         #[command(flatten)]
@@ -133,54 +133,57 @@ impl From<PaperName> for Paper {
 
 /// Runs `vizflyt tags print`.
 pub(super) fn run(args: &PrintArgs) -> Result<()> {
-    match args.what {
-        What::Cube { ref common, first_id, faces, face_mm, tag_mm, middle_m } => {
+    match args.object {
+        PrintCommand::Cube { ref common, first_id, faces, face_mm, tag_mm, middle_m } => {
             let &Common { family, paper, bar_mm, .. } = common;
             let paper = paper.into();
             let cube = Cube { family, first_id, faces, face_mm, tag_mm, middle_m, paper, bar_mm };
             let printed = cube.print()?;
             finish("cube", common, &printed)?;
             for (tag, (name, ..)) in printed.layout.tags.iter().zip(CUBE_FACES) {
-                tell(format_args!("  {name:<6} {} {}", tag.family, tag.id));
+                print_line(format_args!("  {name:<6} {} {}", tag.family, tag.id));
             }
-            tell(format_args!(
+            print_line(format_args!(
                 "Glue it on a cube of {:.1} mm, each name where the vehicle has it.",
                 face_mm * bar_mm / BAR_MM
             ));
         }
-        What::Mat { ref common, first_id, columns, rows, pitch_mm, tag_mm, middle_m } => {
+        PrintCommand::Mat { ref common, first_id, columns, rows, pitch_mm, tag_mm, middle_m } => {
             let &Common { family, paper, bar_mm, .. } = common;
             let paper = paper.into();
             let mat =
                 Mat { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm };
             finish("mat", common, &mat.print()?)?;
-            tell(format_args!(
+            print_line(format_args!(
                 "Join the sheets edge to edge, columns to the east, rows to the north; then survey it: \
                  glued paper is off by millimetres."
             ));
         }
-        What::Board { ref common, first_id, tag_mm } => {
+        PrintCommand::Board { ref common, first_id, tag_mm } => {
             let &Common { family, paper, bar_mm, .. } = common;
             let board = Mat::board(family, first_id, tag_mm, paper.into(), bar_mm)?;
             finish("board", common, &board.print()?)?;
-            tell(format_args!(
+            print_line(format_args!(
                 "Glue it on something flat and stiff: a lens is only as straight as the board."
             ));
         }
-        What::Checkers { ref output, paper, square_mm, bar_mm } => {
+        PrintCommand::Checkers { ref output, paper, square_mm, bar_mm } => {
             let (sheet, board) = checkerboard(paper.into(), square_mm, bar_mm)?;
             let file = beside(output)?;
             write(output, &pdf("VizFlyt checkerboard", &[sheet]))?;
             write(&file, board.to_toml()?.as_bytes())?;
-            tell(format_args!(
+            print_line(format_args!(
                 "{}: {} x {} inner corners, {:.2} mm apart",
                 output.display(),
                 board.columns,
                 board.rows,
                 board.square_m * 1e3
             ));
-            tell(format_args!("{}: what is on it, for `tags calibrate --board`", file.display()));
-            tell(format_args!(
+            print_line(format_args!(
+                "{}: what is on it, for `tags calibrate --board`",
+                file.display()
+            ));
+            print_line(format_args!(
                 "Glue it on something flat and stiff: a lens is only as straight as the board."
             ));
         }
@@ -188,7 +191,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the file beside the PDF that says what is on it.
+/// Returns the file beside the PDF that describes its content.
 fn beside(pdf: &Path) -> Result<PathBuf> {
     let layout = pdf.with_extension("toml");
     if layout == *pdf {
@@ -203,12 +206,12 @@ fn finish(title: &str, common: &Common, printed: &Printed) -> Result<()> {
     write(path, &pdf(&format!("VizFlyt {title}"), &printed.sheets))?;
     write(&layout, printed.layout.to_toml()?.as_bytes())?;
     let (sheets, tags) = (printed.sheets.len(), printed.layout.tags.len());
-    tell(format_args!(
+    print_line(format_args!(
         "{}: {sheets} sheets of {}, {tags} tags",
         path.display(),
         Paper::from(common.paper)
     ));
-    tell(format_args!("{}: where they are", layout.display()));
+    print_line(format_args!("{}: where they are", layout.display()));
     Ok(())
 }
 

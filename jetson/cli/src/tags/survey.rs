@@ -12,17 +12,17 @@ use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{LayoutFrame, TagLayout};
 use vizflyt_tags::survey::{self, CameraImages, Picker};
 
-use crate::terminal::tell;
+use crate::terminal::print_line;
 
 /// Measures where a mat's tags really are, and where fixed cameras are.
 #[derive(Args, Debug)]
 pub(super) struct SurveyArgs {
     #[command(subcommand)]
-    what: What,
+    command: SurveyCommand,
 }
 
 #[derive(Subcommand, Debug)]
-enum What {
+enum SurveyCommand {
     Mat(MatArgs),
     Cameras(CamerasArgs),
 }
@@ -63,7 +63,7 @@ struct MatArgs {
 over the room are plenty. Folders: images of the same number belong together."
 )]
 struct CamerasArgs {
-    /// The cameras' files; FILE.toml=SOURCE where images come from elsewhere than the file says.
+    /// The cameras' files; FILE.toml=SOURCE where images come from another source than the file's.
     #[arg(required = true, value_name = "FILE.toml[=SOURCE]")]
     cameras: Vec<String>,
     /// The mat's surveyed layout.
@@ -76,9 +76,9 @@ struct CamerasArgs {
 
 /// Runs `vizflyt tags survey`.
 pub(super) fn run(args: &SurveyArgs) -> Result<()> {
-    match &args.what {
-        What::Mat(args) => mat(args),
-        What::Cameras(args) => cameras(args),
+    match &args.command {
+        SurveyCommand::Mat(args) => mat(args),
+        SurveyCommand::Cameras(args) => cameras(args),
     }
 }
 
@@ -107,10 +107,10 @@ fn mat(args: &MatArgs) -> Result<()> {
     }
     let anchor = args.anchor.map(|id| (family, id));
     let found = survey::mat(&camera.intrinsics, &printed, others, anchor, picker.images())?;
-    tell("tag   images  residual mm  sigma mm  moved mm");
+    print_line("tag   images  residual mm  sigma mm  moved mm");
     for (tag, known) in found.layout.tags.iter().zip(&found.residuals) {
         let moved = known.moved_m.map_or("new".into(), |m| format!("{:.1}", 1e3 * m));
-        tell(format_args!(
+        print_line(format_args!(
             "{:<5} {:>6}  {:>11.2}  {:>8.2}  {moved:>8}",
             tag.id,
             known.images,
@@ -119,9 +119,9 @@ fn mat(args: &MatArgs) -> Result<()> {
         ));
     }
     for (family, id, why) in &found.left_out {
-        tell(format_args!("left out: {family} {id}, {why}"));
+        print_line(format_args!("left out: {family} {id}, {why}"));
     }
-    tell(format_args!(
+    print_line(format_args!(
         "{} tags from {} images: corners are {:.2} px off, {:.2} mm on the tags",
         found.layout.tags.len(),
         found.images,
@@ -129,7 +129,7 @@ fn mat(args: &MatArgs) -> Result<()> {
         1e3 * found.rms_m
     ));
     found.layout.write(&args.output)?;
-    tell(format_args!("{}: written", args.output.display()));
+    print_line(format_args!("{}: written", args.output.display()));
     Ok(())
 }
 
@@ -165,7 +165,7 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
     loop {
         if is_live && cube.is_some() {
             let count = seen[0].images.len();
-            tell(format_args!(
+            print_line(format_args!(
                 "{count} places; hold the cube still and press Enter, or q and Enter to end"
             ));
             match lines.next().transpose()? {
@@ -194,7 +194,7 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
         let file = TagCamera { mounting: Mounting::World(placed.world_from_cam), ..camera.clone() };
         file.write(path)?;
         let p = placed.world_from_cam.translation_m;
-        tell(format_args!(
+        print_line(format_args!(
             "{}: at {:.3}, {:.3}, {:.3} m +- {:.1} mm; {} corners, {:.2} px off; written to {}",
             camera.name,
             p.x,

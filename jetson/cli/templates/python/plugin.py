@@ -16,7 +16,7 @@ def steer(depth_m, height_m):
     """Says where to fly by one depth image.
 
     depth_m: (H, W) float32, metres along the camera's axis; 0 where nothing is seen.
-    height_m: above the floor, or None where the course does not tell.
+    height_m: above the floor, or None where the course withholds it.
     Returns the velocity (forward, left, up) in m/s and the turn rate in rad/s, left positive.
     """
     depth_m = np.where(depth_m > 0, np.minimum(depth_m, FAR_M), FAR_M)

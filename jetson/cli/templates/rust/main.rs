@@ -25,7 +25,7 @@ impl Autonomy for {{class}} {
 }
 
 /// Says where to fly by one image: the velocity as forward, left, up [m/s], and how fast to turn,
-/// left positive [rad/s]. `height_m` is `None` where the course does not tell.
+/// left positive [rad/s]. `height_m` is `None` where the course withholds it.
 fn steer(image: &CameraImage<'_>, height_m: Option<f64>) -> (DVec3, f64) {
     let depth_m = |x, y| image.depth_m(x, y).map_or(FAR_M, |depth_m| f64::from(depth_m).min(FAR_M));
     let (columns, rows) = (image.width_px, image.height_px);

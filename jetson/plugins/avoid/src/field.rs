@@ -151,7 +151,7 @@ impl Field {
                 let y_m = least(self.to_go_m[at - PITCH], self.to_go_m[at + PITCH]);
                 // Most visits change nothing: no way over these neighbours can be shorter.
                 let step_m = self.step_m[at];
-                if least(x_m, y_m) + step_m * LEAST_STEP >= old_m {
+                if least(x_m, y_m) + step_m * MIN_STEP >= old_m {
                     continue;
                 }
                 // Solves (T - x)^2 + (T - y)^2 = step^2, upwind: from the one neighbour if the
@@ -234,7 +234,7 @@ const COST_OF_DISCOMFORT: f64 = 4.0;
 /// A way through an obstacle is no way, but finite: a field that starts inside one leads out.
 const COST_OF_TOUCH: f64 = 60.0;
 /// With both neighbours equal a step leads on by 1 / sqrt(2) of its length, and never by less.
-const LEAST_STEP: f64 = std::f64::consts::FRAC_1_SQRT_2;
+const MIN_STEP: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// More than any way through the grid.
 const UNREACHED_M: f64 = 1e6;
 /// Sweeping ends when no cell changes by more: a hundredth of what a track gains. [m]

@@ -34,7 +34,7 @@ impl View<'_> {
     }
 
     /// Whether the image shows something well behind `p_world_m`, so that nothing can be there.
-    /// Pixels without a return say nothing: they are no proof of free space.
+    /// Pixels without a return are ignored: they are no proof of free space.
     pub fn sees_through(&self, p_world_m: DVec3) -> bool {
         let p_cam_m = self.world_from_cam.inverse().transform_point(p_world_m);
         let Some(pixel) = self.intrinsics.project(p_cam_m) else {

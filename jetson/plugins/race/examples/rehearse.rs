@@ -1,5 +1,5 @@
 //! Flies generated courses in lock-step, without autopilot and server, with images and attitude alone:
-//! `cargo run --release -p vizflyt-race --example rehearse -- p5 0 1 2`. One seed alone is told of
+//! `cargo run --release -p vizflyt-race --example rehearse -- p5 0 1 2`. One seed alone is reported
 //! every half second.
 
 #[path = "../tests/world/mod.rs"]

@@ -106,7 +106,7 @@ impl Hand {
             .map(|sighting| (sighting.at_s, (sighting.middle_m - pivot_m).to_angle()))
             .collect();
         let omega_radps = while_in_sight_radps(&angles)?;
-        // Unseen it may have turned by any angle: that speed says by how many whole turns.
+        // Unseen it may have turned by any angle: that speed gives the number of whole turns.
         let newest_s = self.sightings.back()?.at_s;
         let (mut last_s, mut last_rad) = *angles.first()?;
         let line = Line::through(angles.iter().map(|&(at_s, angle_rad)| {

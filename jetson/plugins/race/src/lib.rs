@@ -6,7 +6,7 @@
 //! 2. [`odometry`]: where the camera is, by registering its depth to an earlier image;
 //! 3. [`plane_detection`]: new windows by their colour, walls by their size;
 //! 4. [`planar_obstacle`]: what of each is solid and what is free, and where its opening is widest;
-//!    [`known`] keeps them, and says which comes next;
+//!    [`known`] keeps them, and selects the next one;
 //! 5. [`hand`]: what moves in that opening, and when it will be away;
 //! 6. [`steer`]: through the opening of the nearest, clear of everything solid.
 //!
@@ -42,7 +42,7 @@ use steer::Aim;
 /// The plugin.
 #[derive(Clone, Debug, Default)]
 pub struct Race {
-    /// Where the flight shall end, if the course says. [m, world]
+    /// Where the flight is to end, if the course has a goal. [m, world]
     goal_m: Option<DVec3>,
     grid: PixelGrid,
     odometry: Odometry,
@@ -102,7 +102,7 @@ pub struct Here {
     pub p_m: DVec3,
     /// Of the camera. [m, home]
     pub camera_m: DVec3,
-    /// The course's goal, where the course tells that and the vehicle's place. [m, home]
+    /// The course's goal, where the course gives it and the vehicle's position. [m, home]
     pub goal_m: Option<DVec3>,
 }
 
@@ -131,7 +131,7 @@ impl Race {
     /// ground.
     ///
     /// # Panics
-    /// If none has for a second: it cannot fly here, and the runtime tells the person this sentence.
+    /// If none has for a second: it cannot fly here, and the runtime reports this sentence.
     fn has_depth(&mut self, camera: &CameraImage<'_>) -> bool {
         self.has_depth |= camera.depth_mm.iter().any(|&depth_mm| depth_mm > 0);
         self.without_depth += u32::from(!self.has_depth);
@@ -154,7 +154,7 @@ impl Race {
         self.known.update(now_s, here.camera_m, &self.grid, settled);
         let (wanted_mps, look_rad) = self.choose(now_s, &here);
         let solid = self.known.obstacles().iter();
-        let wanted_mps = steer::clear_of(wanted_mps, here.p_m, solid).clamp_length_max(MOST_MPS);
+        let wanted_mps = steer::clear_of(wanted_mps, here.p_m, solid).clamp_length_max(MAX_MPS);
         // Before take-off nobody follows: the setpoint must not run away from the vehicle.
         let from_mps = self.odometry.v_mps
             + (self.setpoint_mps - self.odometry.v_mps).clamp_length_max(MAX_LEAD_MPS);
@@ -245,7 +245,7 @@ impl Race {
         let next = self.known.next(here.p_m, Some(obstacle.kind))?;
         let middle_m = next.opening.map_or(next.plane.origin_m, |opening| opening.center_m);
         let look_rad = (middle_m - here.p_m).truncate().to_angle();
-        Some(look_rad.clamp(-MOST_LOOK_RAD, MOST_LOOK_RAD))
+        Some(look_rad.clamp(-MAX_LOOK_RAD, MAX_LOOK_RAD))
     }
 
     /// Looks about for something to fly through.
@@ -257,7 +257,7 @@ impl Race {
             let to_m = goal_m - here.p_m;
             return ((to_m * GOAL_PER_S).clamp_length_max(steer::CRUISE_MPS), 0.0);
         }
-        (DVec3::ZERO, MOST_LOOK_RAD * (TAU * since_s / SEARCH_S).sin())
+        (DVec3::ZERO, MAX_LOOK_RAD * (TAU * since_s / SEARCH_S).sin())
     }
 }
 
@@ -267,7 +267,7 @@ const PATIENCE: u32 = 30;
 /// Images farther apart than this are a gap, not a step. [s]
 const MAX_DT_S: f64 = 0.1;
 /// Ahead and sideways together. [m/s]
-const MOST_MPS: f64 = 1.3;
+const MAX_MPS: f64 = 1.3;
 /// Tilts the camera by atan(3.5 / 9.81) = 20 degrees. [m/s^2]
 const SLEW_MPS2: f64 = 3.5;
 /// The setpoint leads the velocity by slew times lag, 0.9 m/s; a little more is allowed. [m/s]
@@ -281,7 +281,7 @@ const THROUGH_S: f64 = 4.0;
 const WIDE_ENOUGH_M: f64 = 0.27;
 /// Nearer than this, the opening fills the image: look for the next. [m]
 const LOOK_M: f64 = 0.45;
-const MOST_LOOK_RAD: f64 = 1.0;
+const MAX_LOOK_RAD: f64 = 1.0;
 /// A look to both sides and back. [s]
 const SEARCH_S: f64 = 6.0;
 const GOAL_PER_S: f64 = 1.0;

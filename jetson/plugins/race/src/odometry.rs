@@ -5,7 +5,7 @@
 //! the key image where it falls. Its distance to the surface there, along that surface's normal, is
 //! made small (point to plane: Y. Chen and G. Medioni, "Object modelling by registration of multiple
 //! range images", Image and Vision Computing 10(3), 1992), and so is the difference in brightness,
-//! which says where a flat wall slides (F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual
+//! which measures how a flat wall slides (F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual
 //! odometry from dense RGB-D images", ICCV Workshops, 2011). Where the image carries no information on a
 //! direction, the vehicle's own velocity does. The floor gives the height without drift.
 
@@ -49,7 +49,7 @@ struct Cell {
     slope: DVec2,
 }
 
-/// What an image laid against the key tells.
+/// The result of aligning an image with the key image.
 #[derive(Clone, Copy, Debug)]
 struct Found {
     p_m: DVec3,
@@ -76,7 +76,7 @@ impl NormalEquations {
         }
     }
 
-    /// Adds what a point `offset_m` from the camera says along `slope`.
+    /// Adds the measurement of a point `offset_m` from the camera along `slope`.
     fn add_point(&mut self, slope: DVec3, offset_m: DVec3, residual: f64, weight: f64) {
         let lever = offset_m.cross(slope);
         self.add(&[slope.x, slope.y, slope.z, lever.x, lever.y, lever.z], residual, weight);
@@ -125,7 +125,7 @@ impl Odometry {
         grid.turn(DQuat::from_scaled_axis(self.turn_rad));
         let Found { mut p_m, turn_rad, overlap } = key.locate(expected_m, grid);
         grid.turn(DQuat::from_scaled_axis(turn_rad));
-        self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MOST_TURN_RAD);
+        self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MAX_TURN_RAD);
         p_m.z -= floor_error_m(grid, p_m.z);
         if dt_s > 0.0 {
             let v_mps = ((p_m - self.p_m) / dt_s).clamp_length_max(MAX_SPEED_MPS);
@@ -181,7 +181,7 @@ impl Key {
         for round in 0..ROUNDS {
             let gate_m = GATE_M / f64::from(1 << round.min(2));
             let turn = DQuat::from_scaled_axis(turn_rad);
-            // What the vehicle's motion and its attitude say, as weak measurements.
+            // The vehicle's motion and its attitude, as weak measurements.
             let mut sums = NormalEquations::default();
             for axis in 0..3 {
                 let (mut place, mut angle) = ([0.0; 6], [0.0; 6]);
@@ -338,7 +338,7 @@ const MOTION_M: f64 = 0.03;
 const ATTITUDE_RAD: f64 = 0.002;
 /// Share of the found error that is kept from image to image: in the long run the attitude is right.
 const STEADY: f64 = 0.995;
-const MOST_TURN_RAD: f64 = 0.05;
+const MAX_TURN_RAD: f64 = 0.05;
 const MAX_DT_S: f64 = 0.2;
 /// Of the velocity's smoothing. [s]
 const VELOCITY_LAG_S: f64 = 0.08;

@@ -1,7 +1,7 @@
 //! Something upright with an opening in it, a window's frame or a wall, as a grid of what is solid
 //! and what is free.
 //!
-//! Each image says of each cell: a surface lies here, or the camera looked through. Where cells
+//! Each image shows of each cell: a surface lies here, or the camera looked through. Where cells
 //! are free and the frame is around them, there is an opening; one flies through the place that is
 //! farthest from everything solid, so an unknown shape is as good as a square.
 
@@ -96,12 +96,12 @@ impl Cell {
     }
 
     fn meet(&mut self, colored: bool) {
-        self.evidence = (self.evidence + 1).min(MOST);
+        self.evidence = (self.evidence + 1).min(MAX_EVIDENCE);
         self.colored = self.colored.saturating_add(u8::from(colored));
     }
 
     fn look_through(&mut self) {
-        self.evidence = (self.evidence - 1).max(-MOST);
+        self.evidence = (self.evidence - 1).max(-MAX_EVIDENCE);
     }
 }
 
@@ -252,7 +252,7 @@ impl PlanarObstacle {
             for column in 0..COLUMNS {
                 let at = row * COLUMNS + column;
                 let room_m = self.room_m[at];
-                if room_m > LEAST_M
+                if room_m > MIN_M
                     && best.is_none_or(|(most_m, _)| room_m > most_m)
                     && self.is_framed(column, row)
                 {
@@ -392,7 +392,7 @@ const THROUGH_M: f64 = 0.25;
 const TOO_NEAR_M: f64 = 0.25;
 /// Looks that make a cell sure, and the most that count.
 const SURE: i8 = 2;
-const MOST: i8 = 5;
+const MAX_EVIDENCE: i8 = 5;
 /// The hand turns this near to its window's plane, before it. [m]
 const HAND_M: f64 = 0.25;
 /// Nearer than this the frame is not in the image any more. [m]
@@ -402,7 +402,7 @@ const KNOWN_M: f64 = 0.6;
 /// A plane measured from this share of the range is the better one.
 const SETTLE_SHARE: f64 = 0.8;
 /// The vehicle's radius and a hand's breadth. [m]
-const LEAST_M: f32 = 0.2;
+const MIN_M: f32 = 0.2;
 /// The frame is at most this far from the middle: 1.6 m.
 const REACH: usize = 40;
 /// Cells of a bar's width, and one more.

@@ -164,7 +164,7 @@ fn upright_line(points_m: &[DVec3]) -> Option<Plane> {
 }
 
 /// Returns the upright plane through a point along a level direction; `None` if the direction is
-/// too short to tell, or the plane does not lie across the way.
+/// too short, or the plane does not lie across the way.
 fn plane_along(a_m: DVec3, along_m: DVec2) -> Option<Plane> {
     if along_m.length() < SPREAD_M {
         return None;
@@ -172,7 +172,7 @@ fn plane_along(a_m: DVec3, along_m: DVec2) -> Option<Plane> {
     let normal = DVec2::new(along_m.y, -along_m.x);
     let normal = if normal.x < 0.0 { -normal } else { normal };
     let yaw_rad = normal.to_angle();
-    (yaw_rad.abs() < MOST_YAW_RAD).then_some(Plane { origin_m: a_m.with_z(0.0), yaw_rad })
+    (yaw_rad.abs() < MAX_YAW_RAD).then_some(Plane { origin_m: a_m.with_z(0.0), yaw_rad })
 }
 
 /// Bars farther away are a few pixels only. [m]
@@ -187,7 +187,7 @@ const TRIES: usize = 48;
 /// Two points nearer to each other carry no information on the direction. [m]
 const SPREAD_M: f64 = 0.4;
 /// Windows face the way within 20 degrees; twice that is another thing. [rad]
-const MOST_YAW_RAD: f64 = 0.7;
+const MAX_YAW_RAD: f64 = 0.7;
 /// Walls are looked for this near: 5 m.
 const BINS: usize = 50;
 const BIN_M: f64 = 0.1;

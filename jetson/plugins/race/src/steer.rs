@@ -55,7 +55,7 @@ pub fn clear_of<'a>(
         let Some(solid_m) = obstacle.nearest_solid_m(p_m, KEEP_M) else { continue };
         let apart_m = p_m.distance(solid_m);
         let Some(away) = (p_m - solid_m).try_normalize() else { continue };
-        let allowed_mps = (apart_m - LEAST_M) * OFF_PER_S;
+        let allowed_mps = (apart_m - MIN_M) * OFF_PER_S;
         let towards_mps = -v_mps.dot(away);
         if towards_mps > allowed_mps {
             v_mps += away * (towards_mps - allowed_mps);
@@ -86,7 +86,7 @@ const FAR_M: f64 = 0.7;
 /// Solid things nearer than this push. [m]
 const KEEP_M: f64 = 0.6;
 /// Nothing solid comes nearer than this to the middle of the vehicle. [m]
-const LEAST_M: f64 = 0.22;
+const MIN_M: f64 = 0.22;
 
 #[cfg(test)]
 mod tests;

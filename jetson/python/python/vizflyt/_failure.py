@@ -24,20 +24,20 @@ def sentence(error: BaseException, method: str) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "the plugin was interrupted (Ctrl-C)"
     what = type(error).__name__
-    said = " ".join(str(error).split())
+    detail = " ".join(str(error).split())
     if isinstance(error, SystemExit):
-        what, said = "the plugin called exit", f"status {error.code or 0}"
+        what, detail = "the plugin called exit", f"status {error.code or 0}"
     if isinstance(error, SyntaxError) and error.filename:
         # Its own place says more than the import that met it.
         return f"{os.path.basename(error.filename)}:{error.lineno}: {what}: {error.msg}"
-    told = f"{what}: {said}" if said else what
+    message = f"{what}: {detail}" if detail else what
     own = _own_line(error.__traceback__)
     if own is None:
-        return f"in {method}: {told}"
+        return f"in {method}: {message}"
     path, line, function = own
     source = linecache.getline(path, line).strip()
     inside = function if function == method else f"{function}, called from {method}"
-    return f"{os.path.basename(path)}:{line} in {inside}: {told}" + (f" ({source})" if source else "")
+    return f"{os.path.basename(path)}:{line} in {inside}: {message}" + (f" ({source})" if source else "")
 
 
 def without_our_frames(traceback: TracebackType | None) -> TracebackType | None:

@@ -6,7 +6,7 @@ from ._vizflyt import ArenaInfo, Event, Observation, Setpoint
 
 
 class Plugin:
-    """A plugin: it sees images and says where to fly.
+    """A plugin: receives images and returns setpoints.
 
     All methods are called from one thread, one at a time, in this order: ``on_start`` once, then
     ``on_image`` and ``on_event`` as they come, then ``on_stop`` once.

@@ -37,14 +37,14 @@ class HeldImagesWarning(UserWarning):
 def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
     """Runs a plugin to the end of the flight.
 
-    ``vizflyt fly my_plugin.py`` starts the program and tells it on the command line where its images
-    are. Started by hand (``python my_plugin.py``, a debugger, a notebook) it attaches to the one
+    ``vizflyt fly my_plugin.py`` starts the program and gives it the address of its images on the
+    command line. Started by hand (``python my_plugin.py``, a debugger, a notebook) it attaches to the one
     runtime of yours that waits for a plugin: ``vizflyt fly --attach``. Where several wait,
     ``service`` chooses.
 
     ``plugin`` is a class derived from :class:`Plugin`, or an instance of one.
 
-    An exception in the plugin ends the flight with a landing: the runtime is told, and the exception
+    An exception in the plugin ends the flight with a landing: the runtime gets the reason, and the exception
     goes on to the caller.
     """
     end = _attach(service)

@@ -670,8 +670,8 @@ class Rehearsal:
     def receive(
         self, timeout_s: float = 10.0
     ) -> tuple[Literal["ready", "answer", "failed"], int, Any, int] | None:
-        """Waits for what the plugin says: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
-        ('failed', 0, reason, 0); None if it says nothing for so long. [s]
+        """Waits for a message of the plugin: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
+        ('failed', 0, reason, 0); None if none comes within this time. [s]
         """
 
 @final

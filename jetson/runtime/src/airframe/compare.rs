@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::names::{Known, Version, known};
-use super::room::Room;
+use super::autopilot_fence::FenceCylinder;
+use super::names::{ParamSpec, Version, param_spec};
 use super::rules::RULES;
 use crate::link::same;
 
@@ -24,19 +24,19 @@ pub struct Difference {
 pub fn compare(
     version: Version,
     wanted: &BTreeMap<String, f64>,
-    room: Room,
+    cylinder: FenceCylinder,
     has: impl Fn(&str) -> Option<f64>,
 ) -> Vec<Difference> {
     let mut found: Vec<(usize, Difference)> = Vec::new();
     for (name, &right) in wanted {
-        let right = room.fit(version, name, right);
+        let right = cylinder.fit(version, name, right);
         let value = has(name);
         if value.is_some_and(|value| same(value, right)) {
             continue;
         }
-        let known = known(version, name);
-        let (rank, danger) = match (known, value) {
-            (Some(known), Some(value)) => danger(version, known, value, right),
+        let spec = param_spec(version, name);
+        let (rank, danger) = match (spec, value) {
+            (Some(spec), Some(value)) => danger(version, spec, value, right),
             _ => (usize::MAX, None),
         };
         let name = name.clone();
@@ -46,16 +46,16 @@ pub fn compare(
     found.into_iter().map(|(_, difference)| difference).collect()
 }
 
-/// Returns how bad a value is (less is worse), and why.
-fn danger(version: Version, known: &Known, value: f64, right: f64) -> (usize, Option<String>) {
-    let Some(rank) = RULES.iter().position(|rule| rule.name == known.name) else {
+/// Returns the rank of a value (0 is the most dangerous), and what is dangerous about it.
+fn danger(version: Version, spec: &ParamSpec, value: f64, right: f64) -> (usize, Option<String>) {
+    let Some(rank) = RULES.iter().position(|rule| rule.name == spec.name) else {
         return (usize::MAX, None);
     };
-    let newest = known.newest(version, value);
-    let beyond = matches!(known.name, "FENCE_ALT_MAX" | "FENCE_RADIUS") && value > right;
+    let newest = spec.newest(version, value);
+    let outside_room = matches!(spec.name, "FENCE_ALT_MAX" | "FENCE_RADIUS") && value > right;
     match (RULES[rank].danger)(newest) {
         Some(why) => (rank, Some(why.to_owned())),
-        None if beyond => (rank, Some("the fence ends outside the room".to_owned())),
+        None if outside_room => (rank, Some("the fence ends outside the room".to_owned())),
         None => (usize::MAX - 1, None),
     }
 }
@@ -69,24 +69,21 @@ mod tests {
         parse_params(shipped(version)).unwrap()
     }
 
-    /// The files: no unknown name, no value out of range, nothing that contradicts itself or that our
+    /// The files: no unknown name, no value out of range, no contradiction, nothing that our
     /// own rules call dangerous, and the same airframe in every version.
     #[test]
-    fn the_shipped_files_hold_water() {
+    fn shipped_files_are_valid_consistent_and_safe() {
         let mut newest: Vec<BTreeMap<&'static str, f64>> = Vec::new();
         for version in Version::ALL {
             let mut values = BTreeMap::new();
             for (name, value) in wanted(version) {
-                let known = known(version, &name)
+                let spec = param_spec(version, &name)
                     .unwrap_or_else(|| panic!("{name} is no parameter of {version:?}"));
-                let value = known.newest(version, value);
-                let in_range = (known.least..=known.most).contains(&value);
-                assert!(in_range, "{name} = {value} is not from {} to {}", known.least, known.most);
-                assert!(
-                    !known.whole || value.fract() == 0.0,
-                    "{name} = {value} is no whole number"
-                );
-                values.insert(known.name, value);
+                let value = spec.newest(version, value);
+                let in_range = (spec.min..=spec.max).contains(&value);
+                assert!(in_range, "{name} = {value} is not from {} to {}", spec.min, spec.max);
+                assert!(!spec.whole || value.fract() == 0.0, "{name} = {value} is no whole number");
+                values.insert(spec.name, value);
             }
             assert_eq!(contradictions(&values), Vec::<String>::new(), "{version:?}");
             for rule in RULES {
@@ -121,12 +118,12 @@ mod tests {
 
     /// The published lab's parameters, which would climb into the net.
     #[test]
-    fn the_published_labs_dangers_are_named() {
+    fn reports_the_published_labs_dangerous_values() {
         for version in Version::ALL {
             let mut has = wanted(version);
             let mut set = |name: &str, newest: f64| {
-                let known = super::super::names::known(Version::V48, name).unwrap();
-                has.insert(known.name_in(version).to_owned(), known.value_in(version, newest));
+                let spec = super::super::names::param_spec(Version::V48, name).unwrap();
+                has.insert(spec.name_in(version).to_owned(), spec.value_in(version, newest));
             };
             set("GPS1_TYPE", 14.0);
             set("EK3_SRC1_POSXY", 3.0);
@@ -135,8 +132,9 @@ mod tests {
             set("BATT_MONITOR", 0.0);
             set("FS_GCS_ENABLE", 1.0);
             set("RTL_ALT_M", 15.0);
-            let found =
-                compare(version, &wanted(version), Room::default(), |name| has.get(name).copied());
+            let found = compare(version, &wanted(version), FenceCylinder::default(), |name| {
+                has.get(name).copied()
+            });
             assert_eq!(found.len(), 7, "{found:?}");
             let dangers = found.iter().filter(|difference| difference.danger.is_some()).count();
             assert_eq!(dangers, 6, "{found:?}");
@@ -147,16 +145,17 @@ mod tests {
     }
 
     #[test]
-    fn the_room_goes_before_the_file() {
+    fn arena_fence_overrides_the_file() {
         let version = Version::V48;
-        let room = Room { ceiling_m: Some(2.5), floor_m: Some(0.2), radius_m: Some(3.0) };
+        let cylinder =
+            FenceCylinder { ceiling_m: Some(2.5), floor_m: Some(0.2), radius_m: Some(3.0) };
         let has = wanted(version);
-        let found = compare(version, &wanted(version), room, |name| has.get(name).copied());
+        let found = compare(version, &wanted(version), cylinder, |name| has.get(name).copied());
         let fence: Vec<_> = found.iter().map(|f| (f.name.as_str(), f.right)).collect();
         let right = [("FENCE_ALT_MAX", 2.5), ("FENCE_RADIUS", 3.0), ("FENCE_ALT_MIN", 0.2)];
         assert_eq!(fence, right);
         assert!(found[0].danger.as_ref().unwrap().contains("outside the room"), "{found:?}");
-        let nothing = compare(version, &wanted(version), Room::default(), |_| None);
+        let nothing = compare(version, &wanted(version), FenceCylinder::default(), |_| None);
         assert!(nothing.iter().all(|f| f.has.is_none() && f.danger.is_none()));
     }
 }

@@ -2,24 +2,24 @@
 //! names of three ArduCopter versions mean, and which values are dangerous in a room.
 //!
 //! ```text
-//! hardware/airframe/*.param ── file ──▶ wanted ─┐
-//! autopilot ── visit ──▶ firmware, values ──────┴─ compare ──▶ differences ──▶ a person; --apply
-//! arena ── room ──▶ heights and circle into `wanted`; polygons of the fence, uploaded
+//! hardware/airframe/*.param ── file ──▶ wanted ────┐
+//! autopilot ── param_session ──▶ firmware, values ─┴─ compare ──▶ differences ──▶ a person; --apply
+//! arena ── autopilot_fence ──▶ heights and circle into `wanted`; polygons of the fence, uploaded
 //! ```
 
+mod autopilot_fence;
 mod compare;
 mod file;
 mod names;
-mod room;
+mod param_session;
 mod rules;
-mod visit;
 
+pub use autopilot_fence::{AutopilotFence, FenceCylinder};
 pub use compare::{Difference, compare};
 pub use file::{ParamFileError, parse_params};
-pub use names::{Known, Version, known};
-pub use room::{ArenaFence, Room};
+pub use names::{ParamSpec, Version, param_spec};
+pub use param_session::{ParamSession, ParamSessionError};
 pub use rules::{RULES, Rule, contradictions};
-pub use visit::{Visit, VisitError};
 
 /// Returns this airframe's file for a version.
 pub fn shipped(version: Version) -> &'static str {

@@ -30,8 +30,8 @@ impl Version {
 
 /// A parameter: its names, and how the older values relate to the newest.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Known {
-    /// Name from 4.7 on; what rules and messages say.
+pub struct ParamSpec {
+    /// Name from 4.7 on; as rules and messages have it.
     pub name: &'static str,
     /// Name in 4.6; the same if empty.
     pub v46: &'static str,
@@ -39,15 +39,15 @@ pub struct Known {
     pub v45: &'static str,
     /// Newest value = this times the older one: 0.01 where centimetres became metres.
     pub scale: f64,
-    /// Least value, in the newest unit.
-    pub least: f64,
-    /// Greatest value, in the newest unit.
-    pub most: f64,
-    /// A whole number: a choice, a set of bits, a count.
+    /// Minimum, in the newest unit.
+    pub min: f64,
+    /// Maximum, in the newest unit.
+    pub max: f64,
+    /// A whole number: an option, a set of bits, a count.
     pub whole: bool,
 }
 
-impl Known {
+impl ParamSpec {
     /// Returns its name in a version.
     pub fn name_in(&self, version: Version) -> &'static str {
         let v46 = if self.v46.is_empty() { self.name } else { self.v46 };
@@ -75,7 +75,7 @@ impl Known {
         if version == Version::V48 {
             newest
         } else if self.name == ARMING {
-            // All checks, or those that were chosen: there is no older word for the rest.
+            // All checks, or the selected ones: the older parameter cannot express the rest.
             f64::from(u8::from(newest == 0.0))
         } else {
             newest / self.scale
@@ -83,22 +83,22 @@ impl Known {
     }
 }
 
-/// The one whose bits changed their meaning: checks to skip, formerly checks to make.
+/// The parameter whose bits changed their meaning: checks to skip, formerly checks to make.
 const ARMING: &str = "ARMING_SKIPCHK";
 
-/// Returns what is known of a name in a version.
-pub fn known(version: Version, name: &str) -> Option<&'static Known> {
-    TABLE.iter().find(|known| known.name_in(version) == name)
+/// Returns the parameter that has this name in a version.
+pub fn param_spec(version: Version, name: &str) -> Option<&'static ParamSpec> {
+    TABLE.iter().find(|spec| spec.name_in(version) == name)
 }
 
-/// A choice or count.
-const fn whole(name: &'static str, least: f64, most: f64) -> Known {
-    Known { name, v46: "", v45: "", scale: 1.0, least, most, whole: true }
+/// An option or a count.
+const fn whole(name: &'static str, min: f64, max: f64) -> ParamSpec {
+    ParamSpec { name, v46: "", v45: "", scale: 1.0, min, max, whole: true }
 }
 
 /// A measure that kept its name.
-const fn real(name: &'static str, least: f64, most: f64) -> Known {
-    Known { name, v46: "", v45: "", scale: 1.0, least, most, whole: false }
+const fn real(name: &'static str, min: f64, max: f64) -> ParamSpec {
+    ParamSpec { name, v46: "", v45: "", scale: 1.0, min, max, whole: false }
 }
 
 /// A measure whose name and unit changed in 4.7.
@@ -106,15 +106,15 @@ const fn renamed(
     name: &'static str,
     v46: &'static str,
     scale: f64,
-    least: f64,
-    most: f64,
-) -> Known {
-    Known { name, v46, v45: "", scale, least, most, whole: false }
+    min: f64,
+    max: f64,
+) -> ParamSpec {
+    ParamSpec { name, v46, v45: "", scale, min, max, whole: false }
 }
 
-const TABLE: &[Known] = &[
-    Known { v46: "SYSID_THISMAV", ..whole("MAV_SYSID", 1.0, 255.0) },
-    Known { v46: "SYSID_MYGCS", ..whole("MAV_GCS_SYSID", 1.0, 255.0) },
+const TABLE: &[ParamSpec] = &[
+    ParamSpec { v46: "SYSID_THISMAV", ..whole("MAV_SYSID", 1.0, 255.0) },
+    ParamSpec { v46: "SYSID_MYGCS", ..whole("MAV_GCS_SYSID", 1.0, 255.0) },
     whole("FRAME_CLASS", 0.0, 17.0),
     whole("FRAME_TYPE", 0.0, 19.0),
     // Estimator and external navigation.
@@ -130,7 +130,7 @@ const TABLE: &[Known] = &[
     real("VISO_POS_M_NSE", 0.05, 10.0),
     real("VISO_VEL_M_NSE", 0.05, 5.0),
     real("VISO_YAW_M_NSE", 0.05, 1.0),
-    Known { v45: "GPS_TYPE", ..whole("GPS1_TYPE", 0.0, 26.0) },
+    ParamSpec { v45: "GPS_TYPE", ..whole("GPS1_TYPE", 0.0, 26.0) },
     whole("COMPASS_ENABLE", 0.0, 1.0),
     // Failsafes.
     whole("FS_GCS_ENABLE", 0.0, 7.0),
@@ -143,7 +143,7 @@ const TABLE: &[Known] = &[
     whole("FS_CRASH_CHECK", 0.0, 1.0),
     whole("FS_VIBE_ENABLE", 0.0, 1.0),
     whole("FS_OPTIONS", 0.0, 63.0),
-    Known { v46: "ARMING_CHECK", ..whole(ARMING, -1.0, 2_097_151.0) },
+    ParamSpec { v46: "ARMING_CHECK", ..whole(ARMING, -1.0, 2_097_151.0) },
     whole("DISARM_DELAY", 0.0, 127.0),
     real("GUID_TIMEOUT", 0.1, 5.0),
     // Fence.
@@ -217,11 +217,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_is_sound() {
+    fn table_has_valid_ranges_and_unique_names() {
         for version in Version::ALL {
             for (i, row) in TABLE.iter().enumerate() {
                 let name = row.name_in(version);
-                assert!(name.len() <= 16 && row.least < row.most, "{name}");
+                assert!(name.len() <= 16 && row.min < row.max, "{name}");
                 let twice = TABLE[i + 1..].iter().any(|other| other.name_in(version) == name);
                 assert!(!twice, "{name} in {version:?}");
             }
@@ -231,9 +231,9 @@ mod tests {
     #[test]
     fn names_and_units_follow_the_version() {
         let check = |version, name: &str, value: f64, newest: f64| {
-            let known = known(version, name).unwrap();
-            assert!((known.newest(version, value) - newest).abs() < 1e-9, "{name}");
-            assert!((known.value_in(version, newest) - value).abs() < 1e-9, "{name}");
+            let spec = param_spec(version, name).unwrap();
+            assert!((spec.newest(version, value) - newest).abs() < 1e-9, "{name}");
+            assert!((spec.value_in(version, newest) - value).abs() < 1e-9, "{name}");
         };
         check(Version::V45, "WPNAV_SPEED", 100.0, 1.0);
         check(Version::V46, "RTL_ALT", 1500.0, 15.0);
@@ -241,10 +241,10 @@ mod tests {
         check(Version::V45, "GPS_TYPE", 14.0, 14.0);
         check(Version::V46, "ARMING_CHECK", 1.0, 0.0);
         assert!(
-            known(Version::V45, "GPS1_TYPE").is_none()
-                && known(Version::V46, "GPS1_TYPE").is_some()
+            param_spec(Version::V45, "GPS1_TYPE").is_none()
+                && param_spec(Version::V46, "GPS1_TYPE").is_some()
         );
-        assert!(known(Version::V48, "WPNAV_SPEED").is_none());
+        assert!(param_spec(Version::V48, "WPNAV_SPEED").is_none());
         let firmware = |minor| Firmware { name: "ArduCopter", version: (4, minor, 0) };
         assert_eq!(
             [5, 6, 7, 8].map(|minor| Version::of(firmware(minor))),

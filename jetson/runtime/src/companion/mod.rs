@@ -27,9 +27,9 @@ use vizflyt_protocol::messages::{
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle};
 
-use crate::airframe::ArenaFence;
-use crate::flight::{Flight, FlightSettings, Input, LinkView};
-use crate::guard::Fix;
+use crate::airframe::AutopilotFence;
+use crate::flight::{Flight, FlightInput, FlightSettings, LinkView};
+use crate::guard::VehicleMotion;
 use crate::link::{Datagram, Link, LinkEvent, LinkSettings};
 use crate::steering::Steering;
 use crate::stream::ServerClock;
@@ -125,15 +125,15 @@ impl Companion {
         }
     }
 
-    /// Has the arena's fence uploaded to the autopilot, once the arena is known; reports what a fence of
-    /// polygons cannot express.
+    /// Uploads the arena's fence to the autopilot, once the arena is known; reports what polygons cannot
+    /// express.
     pub fn upload_fence(&mut self, now: HostTime) {
         let Some(arena) = &self.arena else { return };
-        let fence = ArenaFence::of(arena);
-        let gap = fence.gap(arena);
+        let fence = AutopilotFence::of(arena);
+        let warning = fence.warning(arena);
         self.link.set_fence(now, fence.polygons);
-        if let Some(gap) = gap {
-            self.note(now, &gap);
+        if let Some(warning) = warning {
+            self.note(now, &warning);
         }
     }
 
@@ -143,7 +143,7 @@ impl Companion {
     pub fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
         // The plugin gets the limits that it is flown within.
         self.settings.tighten(&mut arena);
-        self.flight.handle(now, Input::Arena(arena.clone()));
+        self.flight.handle(now, FlightInput::Arena(arena.clone()));
         self.arena.get_or_insert(arena);
     }
 
@@ -159,7 +159,7 @@ impl Companion {
     /// Handles a pose that the server has fused; `stamp` is its time on this computer's clock.
     pub fn handle_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         self.link.vision(now, sample, stamp);
-        self.flight.handle(now, Input::Pose(Fix::of(sample, stamp)));
+        self.flight.handle(now, FlightInput::Pose(VehicleMotion::of(sample, stamp)));
         // Before the course is known, no pose is let out.
         if self.ground_truth() == Some(true) {
             self.vehicle = Some(Vehicle {
@@ -176,7 +176,7 @@ impl Companion {
     pub fn handle_event(&mut self, now: HostTime, event: Event) {
         self.send_to_plugin(&event);
         let at = self.clock.to_host(event.stamp).unwrap_or(now);
-        self.flight.handle(now, Input::Server(event, at));
+        self.flight.handle(now, FlightInput::Server(event, at));
         // It may have ended the flight: LAND does not wait for the next setpoint's turn.
         self.steering.hurry();
     }
@@ -184,12 +184,12 @@ impl Companion {
     /// Ends the flight because it cannot be flown: the server refused it, or the plugin's shared memory
     /// cannot be made; `why` in a sentence.
     pub fn refuse(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, Input::ServerRefused(why));
+        self.flight.handle(now, FlightInput::ServerRefused(why));
     }
 
     /// Ends the flight because a person interrupts it.
     pub fn interrupt(&mut self, now: HostTime) {
-        self.flight.handle(now, Input::Interrupt);
+        self.flight.handle(now, FlightInput::Interrupt);
     }
 
     // ---- inputs: the plugin ----
@@ -216,30 +216,30 @@ impl Companion {
 
     /// The plugin waits for images.
     pub fn plugin_ready(&mut self, now: HostTime) {
-        self.flight.handle(now, Input::PluginReady);
+        self.flight.handle(now, FlightInput::PluginReady);
     }
 
     /// Observation `seq` went to the plugin.
     pub fn published(&mut self, now: HostTime, seq: u64) {
-        self.flight.handle(now, Input::ImagePublished { seq });
+        self.flight.handle(now, FlightInput::ImagePublished { seq });
     }
 
     /// Handles the plugin's reply to observation `seq`.
     pub fn replied(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
         if setpoint.is_some() {
-            self.steering.answered();
+            self.steering.replied();
         }
-        self.flight.handle(now, Input::Answered { seq, setpoint });
+        self.flight.handle(now, FlightInput::Replied { seq, setpoint });
     }
 
     /// The plugin has failed for good.
     pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
-        self.flight.handle(now, Input::PluginFailed(fault));
+        self.flight.handle(now, FlightInput::PluginFailed(fault));
     }
 
     /// The plugin is being started again, and the vehicle holds until it replies; `why` in a sentence.
     pub fn plugin_restarts(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, Input::PluginRestarts(why));
+        self.flight.handle(now, FlightInput::PluginRestarts(why));
     }
 
     // ---- inputs: time, and notes of the driver's ----
@@ -373,13 +373,13 @@ impl Companion {
         if let GuidedMotion::Velocity(v_mps) = setpoint.motion {
             self.v_setpoint_mps = v_mps;
         }
-        Some(SentSetpoint { setpoint, replies_to: orders.answers })
+        Some(SentSetpoint { setpoint, replies_to: orders.replies_to })
     }
 
     fn handle_link_events(&mut self, now: HostTime) {
         while let Some(event) = self.link.poll_event() {
             self.link_events.push_back(event.clone());
-            self.flight.handle(now, Input::Link(event));
+            self.flight.handle(now, FlightInput::Link(event));
         }
     }
 

@@ -60,14 +60,14 @@ fn observed<T>(companion: &Companion, look: impl FnOnce(&Observation<'_>) -> T) 
 }
 
 #[test]
-fn a_plugin_is_greeted_first_and_learns_of_events_in_order() {
+fn plugin_is_greeted_first_and_receives_events_in_order() {
     let (_, messages) = after_collision(true);
     assert!(matches!(&messages[0], ToPlugin::Start(arena) if arena.name == "test"));
     assert_eq!(messages.len(), 2);
 }
 
 #[test]
-fn what_the_course_withholds_is_nowhere() {
+fn plugin_never_gets_what_the_course_withholds() {
     let place = |messages: &[ToPlugin]| match &messages[1] {
         ToPlugin::Event(Event { kind: EventKind::Collision(it), .. }) => it.p_world_m,
         other => panic!("{other:?}"),
@@ -83,7 +83,7 @@ fn what_the_course_withholds_is_nowhere() {
 }
 
 #[test]
-fn without_an_autopilot_the_flight_is_given_up_at_its_time() {
+fn flight_without_an_autopilot_ends_at_its_time_limit() {
     let mut companion = companion(true);
     companion.plugin_ready(at(0));
     let mut beats = 0;
@@ -149,7 +149,7 @@ fn a_camera_that_changes_before_the_greeting_is_in_it() {
     companion.greet_plugin(at(0));
     let Some(ToPlugin::Start(arena)) = companion.poll_plugin() else { panic!("no greeting") };
     assert_eq!(arena.cameras[0], camera);
-    // Later changes are told by the images themselves.
+    // Later changes come with the images themselves.
     camera.intrinsics = Intrinsics::from_horizontal_fov(8, 6, 1.5);
     companion.handle_camera(0, &camera);
     assert_eq!(companion.arena().unwrap().cameras[0].intrinsics.width_px, 16);

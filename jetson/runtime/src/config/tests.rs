@@ -5,7 +5,7 @@ use proptest::prelude::*;
 fn check_refused(text: &str, parts: &[&str]) {
     let error = JetsonConfig::parse(text).expect_err(text).to_string();
     for part in parts {
-        assert!(error.contains(part), "{text:?} does not say {part:?}: {error}");
+        assert!(error.contains(part), "{text:?} does not contain {part:?}: {error}");
     }
     assert!(!error.contains('\n'), "one sentence: {error}");
 }
@@ -18,7 +18,7 @@ fn an_empty_file_is_the_simulated_lab() {
 }
 
 #[test]
-fn the_example_of_the_module_is_read() {
+fn reads_the_modules_example() {
     let text = include_str!("../config.rs");
     let example: String = text
         .lines()
@@ -34,7 +34,7 @@ fn the_example_of_the_module_is_read() {
 }
 
 #[test]
-fn the_shipped_file_is_read() {
+fn reads_the_shipped_file() {
     let config = JetsonConfig::parse(include_str!("../../../systemd/jetson.toml")).unwrap();
     assert!(config.server.is_some() && config.plugin.path.is_some());
     // As a person who deletes the server's section flies the simulated lab.
@@ -80,7 +80,7 @@ fn mistakes_are_explained() {
 }
 
 #[test]
-fn what_the_plugin_may_use_is_read_and_the_rest_is_fair() {
+fn reads_the_plugins_limits_and_defaults_the_rest() {
     use crate::supervisor::{PluginLimits, Restart};
     let text = "[plugin]\nmemory_mb = 500\nrestart = \"in_flight\"\nnetwork = true\n";
     let found = JetsonConfig::parse(text).unwrap().plugin.limits();
@@ -121,7 +121,7 @@ fn a_file_is_named_and_its_paths_are_its_own() {
 }
 
 #[test]
-fn all_mistakes_are_said_at_once() {
+fn reports_all_mistakes_at_once() {
     let error = |text: &str| JetsonConfig::parse(text).unwrap_err().to_string();
     let keys = error("[limit]\nx = 1\n[vehicle]\nnam = 'a'\nsystem = 'b'\n");
     let lines: Vec<&str> = keys.lines().collect();

@@ -82,11 +82,11 @@ const IDLE: Duration = Duration::from_millis(20);
 /// Sends a datagram to the autopilot.
 pub type SendMavlink = Box<dyn Fn(&[u8])>;
 
-/// What the loop works with.
+/// The resources of the loop.
 pub struct Control {
     /// The command that starts the plugin; empty if a person starts it.
     pub plugin_command: Vec<OsString>,
-    /// What the plugin may use, and when it is started again.
+    /// The plugin's limits, and when it is started again.
     pub plugin_limits: PluginLimits,
     /// Limits of the flight as a whole.
     pub settings: FlightSettings,
@@ -94,7 +94,7 @@ pub struct Control {
     pub waits_for_start: bool,
     /// The way to the autopilot.
     pub to_autopilot: SendMavlink,
-    /// What a person has set of the link.
+    /// The link's settings.
     pub link: LinkSettings,
     /// Clock and mailbox of the stream.
     pub shared: Shared,
@@ -108,7 +108,7 @@ pub struct Control {
     pub screen: Screen,
 }
 
-/// What a flight leaves behind.
+/// The results of a flight.
 #[derive(Debug)]
 pub struct Flown {
     /// How it ended.
@@ -232,7 +232,7 @@ impl ControlLoop {
         }
     }
 
-    /// What is done every tick beside the companion's own work.
+    /// Does the driver's own work of a tick.
     fn tick(&mut self, now: HostTime) {
         self.tend_plugin(now);
         self.tend_by_hand(now);
@@ -259,7 +259,7 @@ impl ControlLoop {
         while let Some(event) = self.companion.poll_event() {
             tracing::info!(target: "flight", "{}", event.text);
             self.show_event(now, &event);
-            self.control.to_server.tell(event);
+            self.control.to_server.send_event(event);
         }
         while let Some(message) = self.companion.poll_plugin() {
             self.send_to_plugin(now, &message);
@@ -334,19 +334,19 @@ impl ControlLoop {
         let is_leaving = self.plugin.as_ref().is_none_or(|side| side.leaving.is_some());
         let counts = self.companion.is_plugin_greeted() && !is_leaving;
         match message {
-            FromPlugin::Ready { .. } | FromPlugin::Answer { .. } if !counts => {}
+            FromPlugin::Ready { .. } | FromPlugin::Reply { .. } if !counts => {}
             FromPlugin::Ready { name } => {
                 tracing::info!("plugin {name} is ready");
                 self.companion.plugin_ready(now);
             }
-            FromPlugin::Answer { seq, entered, returned, setpoint } => {
+            FromPlugin::Reply { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);
                 if let Some(side) = &mut self.plugin {
                     side.by_hand_replied = side.by_hand_replied.map(|_| now);
                 }
                 self.check_deadline(now, seq, returned.seconds_since(entered) * 1e3);
                 let asked = json!({"seq": seq, "setpoint": &setpoint});
-                self.control.log.write(Channel::Asked, returned, &asked);
+                self.control.log.write(Channel::Requested, returned, &asked);
                 self.companion.replied(now, seq, setpoint);
                 self.control.log.write(
                     Channel::Image,
@@ -390,7 +390,7 @@ impl ControlLoop {
         let record = json!({"stream": stream, "line": line, "image_seq": image_seq, "tick": tick});
         self.control.log.line(now, stream, line, tick);
         if self.control.json {
-            print_line(&json!({"plugin": record}).to_string());
+            print_line(json!({"plugin": record}));
         } else {
             self.control.screen.line(&format!("tick {tick} | {line}"));
         }
@@ -398,7 +398,7 @@ impl ControlLoop {
         if self.page_lines <= PAGE_LINES_PER_SECOND {
             let stamp = self.control.shared.clock.to_server(now);
             let text = bounded(&format!("tick {tick} | {line}"));
-            self.control.to_server.tell(Event { stamp, kind: EventKind::PluginOutput, text });
+            self.control.to_server.send_event(Event { stamp, kind: EventKind::PluginOutput, text });
         }
     }
 
@@ -427,7 +427,7 @@ impl ControlLoop {
             side.ipc.clean_up();
             side.stop.store(true, Ordering::Relaxed);
             // Who drops the shared memory last removes its files, so they are waited for; and
-            // heard out, as they may be waiting for room in the queue.
+            // drained, as they may be waiting for room in the queue.
             for thread in side.threads {
                 while !thread.is_finished() {
                     let _ = inputs.recv_timeout(Duration::from_millis(5));

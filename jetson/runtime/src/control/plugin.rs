@@ -13,13 +13,13 @@ use vizflyt_sdk::ObservationWriter;
 use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
 
 use super::{ControlInput, ControlLoop};
-use crate::answers::Answers;
 use crate::images::ImagePublisher;
+use crate::replies::PluginReplies;
 use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
-/// The plugin hears of us at least this often.
+/// Maximum time between two messages to the plugin.
 const HEARTBEAT_TICKS: u64 = 20;
-/// A plugin that says it has failed may still print why for this long, before it is started again. [s]
+/// A plugin that has reported a failure may still print why for this long, before it is started again. [s]
 const LAST_WORDS_S: f64 = 0.3;
 /// Whether a plugin that a person started still lives is looked up every 80 ms.
 const BY_HAND_TICKS: u64 = 4;
@@ -42,7 +42,7 @@ pub(super) struct PluginSide {
     /// The present process is on its way out, and another will be started; until when it may go
     /// by itself.
     pub(super) leaving: Option<HostTime>,
-    pub(super) answers: Arc<Answers>,
+    pub(super) replies: Arc<PluginReplies>,
     /// Ends its threads.
     pub(super) stop: Arc<AtomicBool>,
     pub(super) threads: Vec<JoinHandle<()>>,
@@ -71,8 +71,8 @@ impl ControlLoop {
             }
         };
         let stop = Arc::default();
-        let answers = Arc::new(Answers::new(Arc::clone(&ipc)));
-        let threads = self.start_threads(&ipc, cameras, &stop, &answers);
+        let replies = Arc::new(PluginReplies::new(Arc::clone(&ipc)));
+        let threads = self.start_threads(&ipc, cameras, &stop, &replies);
         let mut offer = None;
         if by_hand {
             match Offer::make(&service) {
@@ -94,7 +94,7 @@ impl ControlLoop {
             by_hand_replied: None,
             run: 0,
             leaving: None,
-            answers,
+            replies,
             stop,
             threads,
         });
@@ -129,18 +129,18 @@ impl ControlLoop {
     /// Starts the plugin's process, the first or another.
     pub(super) fn start_process(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
-        let (sender, answers, run) = (self.sender.clone(), Arc::clone(&side.answers), side.run);
+        let (sender, replies, run) = (self.sender.clone(), Arc::clone(&side.replies), side.run);
         // Lines and the end are never dropped: the loop always reads.
-        let tell = move |event| {
+        let handle = move |event| {
             if let PluginEvent::Exited(_) = &event {
-                // What it said comes before the news of its end: it may be why.
-                answers.drain(|message| {
+                // Its last messages are handled before its exit: they may have the reason.
+                replies.drain(|message| {
                     let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
                 });
             }
             let _ = sender.send(ControlInput::Plugin(run, event));
         };
-        match Supervisor::start(&side.command, &side.confinement, tell) {
+        match Supervisor::start(&side.command, &side.confinement, handle) {
             Ok(supervisor) => side.supervisor = Some(supervisor),
             Err(error) => {
                 let program = side.command[0].to_string_lossy();
@@ -150,7 +150,7 @@ impl ControlLoop {
         }
     }
 
-    /// The plugin says that it has failed; its process ends soon after.
+    /// The plugin reports that it has failed; its process ends soon after.
     pub(super) fn plugin_failed(&mut self, now: HostTime, sentence: String) {
         if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
             return;
@@ -176,7 +176,7 @@ impl ControlLoop {
         if side.leaving.take().is_some() && self.companion.flight().can_wait_for_plugin() {
             side.run += 1;
             self.companion.plugin_gone();
-            side.answers.begin_anew();
+            side.replies.restart();
             self.start_process(now);
         }
     }
@@ -212,7 +212,7 @@ impl ControlLoop {
         ipc: &Arc<RuntimeEnd>,
         cameras: Vec<CameraInfo>,
         stop: &Arc<AtomicBool>,
-        answers: &Arc<Answers>,
+        replies: &Arc<PluginReplies>,
     ) -> Vec<JoinHandle<()>> {
         let mailbox = Arc::clone(&self.control.shared.mailbox);
         let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
@@ -227,14 +227,14 @@ impl ControlLoop {
                 },
             );
         });
-        let (answers, sender, stopped) =
-            (Arc::clone(answers), self.sender.clone(), Arc::clone(stop));
-        let answers = spawn("answers", move || {
-            answers.read(&stopped, |message| {
+        let (replies, sender, stopped) =
+            (Arc::clone(replies), self.sender.clone(), Arc::clone(stop));
+        let reader = spawn("replies", move || {
+            replies.read(&stopped, |message| {
                 let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
             });
         });
-        images.into_iter().chain(answers).collect()
+        images.into_iter().chain(reader).collect()
     }
 
     /// Greets the plugin once it has attached; shows it that we live.

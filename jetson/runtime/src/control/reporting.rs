@@ -19,7 +19,7 @@ impl ControlLoop {
     pub(super) fn show_event(&mut self, now: HostTime, event: &Event) {
         self.control.log.event(now, event);
         if self.control.json {
-            print_line(&json!({"event": event}).to_string());
+            print_line(json!({"event": event}));
         } else {
             self.control.screen.event(&event.text);
         }
@@ -39,7 +39,7 @@ impl ControlLoop {
         if self.ticks.is_multiple_of(STATUS_TICKS) {
             let status = Status::of(&telemetry);
             if self.control.json {
-                print_line(&json!({"status": status}).to_string());
+                print_line(json!({"status": status}));
             } else {
                 self.control.screen.status(&status);
             }
@@ -81,8 +81,8 @@ impl ControlLoop {
     }
 }
 
-/// Prints a line for a program that may have stopped listening.
-pub fn print_line(line: &str) {
+/// Prints a line on standard output; unlike `println!` it does not panic when nobody reads any more.
+pub fn print_line(line: impl std::fmt::Display) {
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }

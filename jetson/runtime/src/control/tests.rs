@@ -14,10 +14,10 @@ use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 
 use super::*;
-use crate::answers::Answers;
 use crate::companion::Senses;
 use crate::lockstep::{Lockstep, Reply};
 use crate::log::LogSettings;
+use crate::replies::PluginReplies;
 use crate::stream::ServerClock;
 use crate::supervisor::Confinement;
 
@@ -79,7 +79,7 @@ impl Drivers {
         let ipc = Arc::new(RuntimeEnd::create(&service, 1 << 16).unwrap());
         let plugin = PluginEnd::open(&service).unwrap();
         control.plugin = Some(PluginSide {
-            answers: Arc::new(Answers::new(Arc::clone(&ipc))),
+            replies: Arc::new(PluginReplies::new(Arc::clone(&ipc))),
             ipc,
             command: Vec::new(),
             confinement: Confinement::prepare(&PluginLimits::default(), &[]),
@@ -150,7 +150,7 @@ impl Drivers {
             self.replies.pop_front_if(|(due, _)| *due <= now)
         {
             let (entered, returned) = (due, due);
-            self.message(now, FromPlugin::Answer { seq, entered, returned, setpoint });
+            self.message(now, FromPlugin::Reply { seq, entered, returned, setpoint });
         }
         self.control.handle_timeout(now);
 

@@ -1,23 +1,22 @@
-//! The flight on a virtual clock, with a vehicle that does as it is told.
+//! The flight on a virtual clock, with a vehicle that follows every command.
 
 use glam::{DQuat, DVec3};
-use vizflyt_protocol::flight_end::{Collision, Obstacle};
+use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
 use vizflyt_protocol::geometry::Volume;
+use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion};
 use vizflyt_protocol::messages::{Limits, OutcomeKind, PoseAges, YawTarget, bounded};
 use vizflyt_protocol::time::ServerTime;
-
-use vizflyt_protocol::mavlink::GuidedMotion;
 
 use super::*;
 use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
 
-/// What the plugin does with an image.
 /// The vehicle's own limits: slower than the arena, otherwise laxer.
 const OWN: Limits = Limits::new(0.1, 50.0);
 
+/// What the plugin replies to an image.
 #[derive(Clone)]
 #[allow(clippy::large_enum_variant)] // Why: there is one.
-enum Answers {
+enum Replies {
     Never,
     Without,
     With(Setpoint),
@@ -32,10 +31,10 @@ struct Script {
     poses: bool,
     /// Images are published, and answered so.
     images: bool,
-    answers: Answers,
+    replies: Replies,
     seq: u64,
     orders: Orders,
-    notices: Vec<Notice>,
+    notices: Vec<FlightNotice>,
 }
 
 pub(crate) fn arena() -> ArenaInfo {
@@ -75,9 +74,9 @@ impl Script {
             v_mps: DVec3::ZERO,
             poses: true,
             images: true,
-            answers: Answers::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
+            replies: Replies::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
             seq: 0,
-            orders: Orders { goal: Goal::Prepare, setpoint: None, answers: None },
+            orders: Orders { goal: Goal::Prepare, setpoint: None, replies_to: None },
             notices: Vec::new(),
         }
     }
@@ -86,8 +85,8 @@ impl Script {
     fn waiting() -> Self {
         let mut script = Self::new();
         script.flight.wait_for_start();
-        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-        script.flight.handle(script.now, Input::PluginReady);
+        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+        script.flight.handle(script.now, FlightInput::PluginReady);
         script.run(4.0);
         assert_eq!(script.flight.phase(), FlightPhase::Waiting, "{:?}", script.notices);
         script
@@ -95,8 +94,8 @@ impl Script {
 
     fn flying() -> Self {
         let mut script = Self::new();
-        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-        script.flight.handle(script.now, Input::PluginReady);
+        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+        script.flight.handle(script.now, FlightInput::PluginReady);
         script.run(4.0);
         assert_eq!(script.flight.phase(), FlightPhase::Flying, "{:?}", script.notices);
         script
@@ -106,24 +105,24 @@ impl Script {
         for _ in 0..(seconds * 50.0).round() as usize {
             self.now = self.now.plus_ns(20_000_000);
             if self.poses {
-                let fix = Fix {
+                let vehicle = VehicleMotion {
                     stamp: self.now.plus_ns(-10_000_000),
                     p_world_m: self.p_m,
                     v_world_mps: self.v_mps,
                     rotation: DQuat::IDENTITY,
                 };
-                self.flight.handle(self.now, Input::Pose(fix));
+                self.flight.handle(self.now, FlightInput::Pose(vehicle));
             }
             if self.images && self.flight.arena.is_some() {
                 self.seq += 1;
-                self.flight.handle(self.now, Input::ImagePublished { seq: self.seq });
-                let setpoint = match self.answers.clone() {
-                    Answers::Never => None,
-                    Answers::Without => Some(None),
-                    Answers::With(setpoint) => Some(Some(setpoint)),
+                self.flight.handle(self.now, FlightInput::ImagePublished { seq: self.seq });
+                let setpoint = match self.replies.clone() {
+                    Replies::Never => None,
+                    Replies::Without => Some(None),
+                    Replies::With(setpoint) => Some(Some(setpoint)),
                 };
                 if let Some(setpoint) = setpoint {
-                    let answer = Input::Answered { seq: self.seq, setpoint };
+                    let answer = FlightInput::Replied { seq: self.seq, setpoint };
                     self.flight.handle(self.now, answer);
                 }
             }
@@ -158,7 +157,7 @@ impl Script {
             Goal::Prepare | Goal::Fly | Goal::Land => {}
         }
         if let Some(setpoint) = self.orders.setpoint
-            && let vizflyt_protocol::mavlink::GuidedMotion::Velocity(v) = setpoint.motion
+            && let GuidedMotion::Velocity(v) = setpoint.motion
         {
             self.v_mps = v;
         }
@@ -167,11 +166,11 @@ impl Script {
 
     fn server(&mut self, kind: EventKind, text: &str) {
         let event = Event { stamp: ServerTime::ZERO, kind, text: bounded(text) };
-        self.flight.handle(self.now, Input::Server(event, self.now));
+        self.flight.handle(self.now, FlightInput::Server(event, self.now));
     }
 
     fn phases(&self) -> Vec<FlightPhase> {
-        let phase = |notice: &Notice| match notice.kind {
+        let phase = |notice: &FlightNotice| match notice.kind {
             EventKind::Phase(phase) => Some(phase),
             _ => None,
         };
@@ -189,7 +188,7 @@ impl Script {
 }
 
 #[test]
-fn from_contact_to_the_goal_to_the_ground() {
+fn flies_from_first_contact_to_the_goal_and_lands() {
     let mut script = Script::flying();
     script.run(3.0);
     assert!(script.orders.setpoint.is_some() && script.orders.goal == Goal::Fly);
@@ -210,14 +209,14 @@ fn nothing_is_armed_before_all_are_ready() {
         (|script| script.link.ready_to_arm = Err("the compass is confused".into()), "compass"),
         (|script| script.poses = false, "no pose"),
         (|script| script.images = false, "not answered an image"),
-        (|script| script.answers = Answers::Never, "not answered an image"),
+        (|script| script.replies = Replies::Never, "not answered an image"),
         (|script| script.link.armed = true, "armed already"),
     ];
     for (spoil, expected) in checks {
         let mut script = Script::new();
         spoil(&mut script);
-        script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-        script.flight.handle(script.now, Input::PluginReady);
+        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+        script.flight.handle(script.now, FlightInput::PluginReady);
         for _ in 0..18 {
             script.run(1.0);
             assert_eq!(script.orders.goal, Goal::Prepare, "{expected}");
@@ -237,7 +236,7 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
     let mut script = Script::new();
     script.run(6.0);
     assert!(script.notices.iter().any(|notice| notice.text.contains("no answer from the server")));
-    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
     script.run(6.0);
     assert!(script.notices.iter().any(|notice| notice.text.contains("on_start")));
     assert_eq!(script.flight.phase(), FlightPhase::Connecting);
@@ -292,20 +291,22 @@ fn a_touch_after_land_was_ordered_lands_at_once_and_changes_no_outcome() {
 }
 
 #[test]
-fn what_happened_first_is_the_outcome_though_it_is_heard_of_later() {
+fn outcome_is_the_earliest_event_though_it_arrives_later() {
     let mut script = Script::flying();
     script.run(1.0);
     let touched_at = script.now;
     script.run(0.1);
-    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("exit status 3")));
+    script
+        .flight
+        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("exit status 3")));
     script.run(0.1);
     let kind = EventKind::Collision(touch());
     let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
-    script.flight.handle(script.now, Input::Server(event, touched_at));
+    script.flight.handle(script.now, FlightInput::Server(event, touched_at));
     script.check_end(OutcomeKind::Collided, "collision with an obstacle");
-    // The server hears of what the runtime saw; the earlier stamp wins there as well.
-    let told = script.notices.iter().filter(|n| matches!(n.kind, EventKind::Ended(_))).count();
-    assert_eq!(told, 1);
+    // The server receives what the runtime saw; the earlier stamp wins there as well.
+    let ended = script.notices.iter().filter(|n| matches!(n.kind, EventKind::Ended(_))).count();
+    assert_eq!(ended, 1);
 }
 
 #[test]
@@ -350,44 +351,48 @@ fn on_the_ground_only_the_stop_button_ends_it() {
 }
 
 #[test]
-fn a_failed_plugin_lands_the_vehicle_and_says_why() {
+fn failed_plugin_lands_the_vehicle_and_reports_why() {
     let mut script = Script::flying();
-    script.answers = Answers::Never;
-    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("killed by SIGSEGV")));
+    script.replies = Replies::Never;
+    script
+        .flight
+        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("killed by SIGSEGV")));
     script.check_end(OutcomeKind::PluginFailed, "killed by SIGSEGV");
-    let is_failure = |notice: &&Notice| {
+    let is_failure = |notice: &&FlightNotice| {
         matches!(notice.kind, EventKind::Ended(EndReason::Plugin(_)))
             && notice.text == "killed by SIGSEGV"
     };
     assert_eq!(script.notices.iter().filter(is_failure).count(), 1);
 
     let mut script = Script::new();
-    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("exit status 1")));
+    script
+        .flight
+        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("exit status 1")));
     assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::PluginFailed);
 }
 
 #[test]
 fn a_silent_plugin_holds_then_lands() {
     let mut script = Script::flying();
-    script.answers = Answers::Never;
+    script.replies = Replies::Never;
     script.run(0.7);
     assert_eq!(script.flight.phase(), FlightPhase::Holding);
     // One that comes back in time is given the vehicle back.
-    script.answers = Answers::With(Setpoint::Hold);
+    script.replies = Replies::With(Setpoint::Hold);
     script.run(0.5);
     assert_eq!(script.flight.phase(), FlightPhase::Flying);
-    script.answers = Answers::Never;
+    script.replies = Replies::Never;
     script.check_end(OutcomeKind::PluginFailed, "has not answered image");
 }
 
 #[test]
-fn why_no_setpoint_comes_is_told_apart() {
+fn reports_why_no_setpoint_comes() {
     let mut script = Script::flying();
-    script.answers = Answers::Without;
+    script.replies = Replies::Without;
     script.check_end(OutcomeKind::PluginFailed, "without a setpoint");
 
     let mut script = Script::flying();
-    script.answers = Answers::With(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
+    script.replies = Replies::With(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
     script.check_end(OutcomeKind::PluginFailed, "not finite");
 
     let mut script = Script::flying();
@@ -409,11 +414,13 @@ fn lost_poses_hold_then_land() {
 #[test]
 fn a_take_off_that_goes_wrong_is_landed() {
     let mut script = Script::new();
-    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-    script.flight.handle(script.now, Input::PluginReady);
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::PluginReady);
     script.run(1.0);
     assert_eq!(script.flight.phase(), FlightPhase::TakingOff);
-    script.flight.handle(script.now, Input::Link(LinkEvent::Refused("take-off denied".into())));
+    script
+        .flight
+        .handle(script.now, FlightInput::Link(LinkEvent::Refused("take-off denied".into())));
     script.check_end(OutcomeKind::Error, "take-off denied");
 }
 
@@ -421,23 +428,23 @@ fn a_take_off_that_goes_wrong_is_landed() {
 fn a_lost_link_or_a_restart_ends_the_flight() {
     for (event, expected) in [(LinkEvent::Lost, "silent"), (LinkEvent::Rebooted, "restarted")] {
         let mut script = Script::flying();
-        script.flight.handle(script.now, Input::Link(event));
+        script.flight.handle(script.now, FlightInput::Link(event));
         script.check_end(OutcomeKind::Error, expected);
     }
     // Nothing comes any more at all: the flight still ends.
     let mut script = Script::flying();
     script.link.connected = false;
-    script.flight.handle(script.now, Input::Link(LinkEvent::Lost));
+    script.flight.handle(script.now, FlightInput::Link(LinkEvent::Lost));
     script.run(12.0);
     assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Error);
 }
 
 #[test]
-fn a_pilot_who_takes_over_is_left_alone() {
+fn sends_nothing_after_a_pilot_takes_over() {
     let mut script = Script::flying();
     script.link.mode = CopterMode::Loiter as u32;
     script.run(5.0);
-    assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None, answers: None });
+    assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None, replies_to: None });
     assert_eq!(script.flight.phase(), FlightPhase::Landing);
     script.link.armed = false;
     script.check_end(OutcomeKind::Error, "switched to Loiter, not by this runtime");
@@ -446,7 +453,7 @@ fn a_pilot_who_takes_over_is_left_alone() {
 #[test]
 fn an_interrupt_lands_first_and_leaves_soon() {
     let mut script = Script::flying();
-    script.flight.handle(script.now, Input::Interrupt);
+    script.flight.handle(script.now, FlightInput::Interrupt);
     script.run(0.02);
     assert_eq!(script.orders.goal, Goal::Land);
     script.run(1.2);
@@ -465,23 +472,23 @@ fn time_limits_count_from_take_off_and_the_shorter_wins() {
 
     let mut script = Script::flying();
     script.flight.settings.time_limit_s = 500.0;
-    script.answers = Answers::With(Setpoint::Hold);
+    script.replies = Replies::With(Setpoint::Hold);
     script.run(15.0);
     script.check_end(OutcomeKind::Timeout, "30 s");
 }
 
 #[test]
-fn a_server_that_comes_back_with_another_arena_ends_it() {
+fn another_arena_ends_the_flight() {
     let mut script = Script::flying();
-    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
     assert_eq!(script.flight.phase(), FlightPhase::Flying, "the same arena is welcome");
     let other = ArenaInfo { body_radius_m: 0.3, ..arena() };
-    script.flight.handle(script.now, Input::Arena(Box::new(other)));
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(other)));
     script.check_end(OutcomeKind::Error, "another arena");
 
     let mut script = Script::new();
     let broken = ArenaInfo { takeoff_height_m: f64::NAN, ..arena() };
-    script.flight.handle(script.now, Input::Arena(Box::new(broken)));
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(broken)));
     assert!(script.flight.outcome().unwrap().to_string().contains("takeoff_height_m"));
 }
 
@@ -499,10 +506,10 @@ fn the_stricter_limit_wins() {
 
 impl Script {
     fn restart(&mut self, why: &str) {
-        self.flight.handle(self.now, Input::PluginRestarts(why.to_owned()));
+        self.flight.handle(self.now, FlightInput::PluginRestarts(why.to_owned()));
     }
 
-    fn said(&self, text: &str) -> usize {
+    fn notice_count(&self, text: &str) -> usize {
         self.notices.iter().filter(|notice| notice.text.contains(text)).count()
     }
 }
@@ -511,29 +518,29 @@ impl Script {
 fn a_plugin_that_is_started_again_is_waited_for_in_the_air() {
     let mut script = Script::flying();
     script.run(1.0);
-    let answers = script.answers.clone();
+    let replies = script.replies.clone();
     script.restart("the plugin ended with exit status 3");
-    script.answers = Answers::Never;
+    script.replies = Replies::Never;
     // Longer than a silent plugin is given.
     script.run(6.0);
     assert_eq!(script.flight.phase(), Holding, "{:?}", script.notices);
     assert!(script.v_mps.length() < 1e-3, "it stands still: {}", script.v_mps);
-    assert_eq!(script.said("exit status 3; the plugin is started again"), 1);
-    script.flight.handle(script.now, Input::PluginReady);
-    script.answers = answers;
+    assert_eq!(script.notice_count("exit status 3; the plugin is started again"), 1);
+    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.replies = replies;
     script.run(1.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
     assert!(script.v_mps.x > 0.05, "{}", script.v_mps);
-    script.answers = Answers::With(Setpoint::Land);
+    script.replies = Replies::With(Setpoint::Land);
     script.check_end(OutcomeKind::Landed, "the plugin asked to land");
 }
 
 #[test]
-fn one_that_does_not_come_back_is_not_waited_for_longer() {
-    for answers in [Answers::Never, Answers::Without] {
+fn plugin_that_does_not_come_back_lands_the_vehicle() {
+    for replies in [Replies::Never, Replies::Without] {
         let mut script = Script::flying();
         script.restart("the plugin was killed by SIGSEGV");
-        script.answers = answers;
+        script.replies = replies;
         script.run(9.8);
         assert_eq!(script.flight.phase(), Holding);
         script.run(0.4);
@@ -544,7 +551,7 @@ fn one_that_does_not_come_back_is_not_waited_for_longer() {
 }
 
 #[test]
-fn what_a_former_runtime_left_in_the_air_is_landed() {
+fn lands_a_vehicle_that_a_former_runtime_left_in_the_air() {
     let mut script = Script::new();
     (script.link.armed, script.link.mode) = (true, 4);
     script.run(0.1);
@@ -554,38 +561,38 @@ fn what_a_former_runtime_left_in_the_air_is_landed() {
 }
 
 #[test]
-fn one_that_fails_on_the_ground_does_so_before_arming() {
+fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
     let mut script = Script::new();
     script.link.ready_to_arm = Err("the compass is confused".into());
-    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-    script.flight.handle(script.now, Input::PluginReady);
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::PluginReady);
     script.run(1.0);
     assert!(script.flight.is_on_ground() && script.flight.can_wait_for_plugin());
     script.restart("no model file");
     script.link.ready_to_arm = Ok(());
     script.run(3.0);
     assert_eq!(script.orders.goal, Goal::Prepare, "nobody is armed without a plugin");
-    script.flight.handle(script.now, Input::PluginReady);
+    script.flight.handle(script.now, FlightInput::PluginReady);
     script.run(4.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
     // Once the flight is over, there is nothing to be started for.
-    script.flight.handle(script.now, Input::PluginFailed(PluginFault::ended("it is broken")));
+    script.flight.handle(script.now, FlightInput::PluginFailed(PluginFault::ended("it is broken")));
     assert!(!script.flight.can_wait_for_plugin());
     script.restart("no");
     script.check_end(OutcomeKind::PluginFailed, "it is broken");
 }
 
 #[test]
-fn a_way_out_of_the_fence_is_told_once_and_not_flown() {
+fn setpoint_out_of_the_fence_is_reported_once_and_not_flown() {
     let mut script = Script::new();
     script.flight.settings.limits = arena().limits;
-    script.flight.handle(script.now, Input::Arena(Box::new(arena())));
-    script.flight.handle(script.now, Input::PluginReady);
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::PluginReady);
     script.run(4.0);
     let p_world_m = DVec3::new(1000.0, 0.0, 1.0);
-    script.answers = Answers::With(Setpoint::Position { p_world_m, yaw: YawTarget::Keep });
+    script.replies = Replies::With(Setpoint::Position { p_world_m, yaw: YawTarget::Keep });
     script.run(12.0);
     assert!(script.p_m.x > 3.0 && script.p_m.x < 5.0, "{}", script.p_m);
-    assert_eq!(script.said("asks to leave the geofence"), 1, "{:?}", script.notices);
+    assert_eq!(script.notice_count("asks to leave the geofence"), 1, "{:?}", script.notices);
     assert_eq!(script.flight.phase(), Flying);
 }

@@ -1,9 +1,12 @@
 use glam::{DQuat, DVec3};
 use proptest::prelude::*;
+use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{
-    ArenaInfo, COEFFICIENTS, Limits, PathYaw, Piece, Trajectory, Waypoint, bounded,
+    ArenaInfo, Axes, COEFFICIENTS, Limits, Path, PathYaw, Piece, Trajectory, Waypoint, bounded,
 };
 
+use super::limits::{FENCE_EXCESS, GRAVITY_MPS2, acceleration_within_tilt_mps2};
+use super::velocity::MAX_YAW_RATE_RADPS;
 use super::*;
 
 const TICK_S: f64 = 0.02;
@@ -68,9 +71,9 @@ impl Vehicle {
         (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).angle_between(DVec3::Z).to_degrees()
     }
 
-    fn fix(&self, stamp: HostTime) -> Fix {
+    fn motion(&self, stamp: HostTime) -> VehicleMotion {
         let rotation = DQuat::from_rotation_z(self.yaw_rad);
-        Fix { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, rotation }
+        VehicleMotion { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, rotation }
     }
 }
 
@@ -192,19 +195,19 @@ proptest! {
         (arena.floor_z_m, arena.no_fly) = (floor_z_m, no_fly.iter().copied().collect());
         // It could do more than it may.
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
-        let mut guard = Guard::new(&arena, &vehicle.fix(time(0)), time(0));
+        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), time(0));
         let mut v_before = DVec3::ZERO;
         let mut tick = 0;
         for (setpoint, ticks) in asked {
             for _ in 0..ticks {
                 tick += 1;
-                let _ = guard.ask(time(tick), setpoint.clone());
+                let _ = guard.handle_setpoint(time(tick), setpoint.clone());
                 // The pose is 20 ms old, as over a network.
-                let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick - 1)));
-                let Passed::Guided(guided) = passed else {
+                let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+                let GuardOutput::Guided(guided) = output else {
                     // Two seconds of NaN are two seconds without a setpoint.
-                    let silent = matches!(stance, Stance::Landing(LandReason::NoSetpoint(_)));
-                    prop_assert!(silent, "{stance:?}");
+                    let silent = matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(_)));
+                    prop_assert!(silent, "{mode:?}");
                     return Ok(());
                 };
                 let GuidedMotion::Velocity(v) = guided.motion else { panic!("not a velocity") };
@@ -241,24 +244,23 @@ proptest! {
         // Holding is reachable from anywhere, and it stops.
         for _ in 0..300 {
             tick += 1;
-            guard.ask(time(tick), Setpoint::Hold).unwrap();
-            let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick)));
-            prop_assert!(matches!(stance, Stance::Holding(HoldReason::Asked)), "{stance:?}");
-            let Passed::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) = passed
-            else { panic!("not a velocity") };
+            guard.handle_setpoint(time(tick), Setpoint::Hold).unwrap();
+            let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick)));
+            prop_assert!(matches!(mode, GuardMode::Holding(HoldReason::Requested)), "{mode:?}");
+            let v = output_velocity(output);
             vehicle.fly(v);
         }
         prop_assert!(vehicle.v_mps.length() < 0.1, "{}", vehicle.v_mps);
         // So is landing.
-        guard.ask(time(tick), Setpoint::Land).unwrap();
-        let (passed, _) = guard.tick(time(tick + 1), &vehicle.fix(time(tick + 1)));
-        prop_assert_eq!(passed, Passed::Land);
+        guard.handle_setpoint(time(tick), Setpoint::Land).unwrap();
+        let (output, _) = guard.tick(time(tick + 1), &vehicle.motion(time(tick + 1)));
+        prop_assert_eq!(output, GuardOutput::Land);
     }
 }
 
 /// A vehicle at rest in the middle of the room.
-fn at_rest(tick: usize) -> Fix {
-    Vehicle::new(DVec3::Z * 2.0, 4.0).fix(time(tick))
+fn at_rest(tick: usize) -> VehicleMotion {
+    Vehicle::new(DVec3::Z * 2.0, 4.0).motion(time(tick))
 }
 
 fn guard() -> Guard {
@@ -269,9 +271,9 @@ fn velocity(v_mps: DVec3) -> Setpoint {
     Setpoint::velocity(v_mps, YawTarget::Keep)
 }
 
-fn passed_velocity(passed: Passed) -> DVec3 {
-    match passed {
-        Passed::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) => v,
+fn output_velocity(output: GuardOutput) -> DVec3 {
+    match output {
+        GuardOutput::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) => v,
         other => panic!("{other:?} is no velocity"),
     }
 }
@@ -279,53 +281,58 @@ fn passed_velocity(passed: Passed) -> DVec3 {
 #[test]
 fn silence_holds_then_lands() {
     let mut guard = guard();
-    guard.ask(time(1), velocity(DVec3::X)).unwrap();
-    let stance = |guard: &mut Guard, tick| guard.tick(time(tick), &at_rest(tick)).1;
-    assert_eq!(stance(&mut guard, 2), Stance::Passing);
-    assert_eq!(stance(&mut guard, 26), Stance::Passing, "0.5 s");
-    assert_eq!(stance(&mut guard, 27), Stance::Holding(HoldReason::NoSetpoint));
-    assert_eq!(stance(&mut guard, 101), Stance::Holding(HoldReason::NoSetpoint), "2 s");
-    assert!(matches!(stance(&mut guard, 102), Stance::Landing(LandReason::NoSetpoint(_))));
+    guard.handle_setpoint(time(1), velocity(DVec3::X)).unwrap();
+    let mode = |guard: &mut Guard, tick| guard.tick(time(tick), &at_rest(tick)).1;
+    assert_eq!(mode(&mut guard, 2), GuardMode::Following);
+    assert_eq!(mode(&mut guard, 26), GuardMode::Following, "0.5 s");
+    assert_eq!(mode(&mut guard, 27), GuardMode::Holding(HoldReason::NoSetpoint));
+    assert_eq!(mode(&mut guard, 101), GuardMode::Holding(HoldReason::NoSetpoint), "2 s");
+    assert!(matches!(mode(&mut guard, 102), GuardMode::Landing(LandReason::NoSetpoint(_))));
     // Latched: a plugin that comes back is not obeyed any more.
-    guard.ask(time(103), velocity(DVec3::X)).unwrap();
-    assert_eq!(guard.tick(time(103), &at_rest(103)).0, Passed::Land);
+    guard.handle_setpoint(time(103), velocity(DVec3::X)).unwrap();
+    assert_eq!(guard.tick(time(103), &at_rest(103)).0, GuardOutput::Land);
 }
 
 #[test]
 fn a_plugin_that_never_answers_is_landed() {
     let mut guard = guard();
-    let (passed, stance) = guard.tick(time(101), &at_rest(101));
-    assert!(matches!(stance, Stance::Landing(LandReason::NoSetpoint(s)) if s > 2.0));
-    assert_eq!(passed, Passed::Land);
+    let (output, mode) = guard.tick(time(101), &at_rest(101));
+    assert!(matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(s)) if s > 2.0));
+    assert_eq!(output, GuardOutput::Land);
 }
 
 #[test]
 fn numbers_that_are_not_finite_do_not_count() {
     let mut guard = guard();
     for tick in 1..=27 {
-        assert!(guard.ask(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))).is_err());
+        assert!(
+            guard.handle_setpoint(time(tick), velocity(DVec3::new(0.0, f64::NAN, 0.0))).is_err()
+        );
         assert!(
             guard
-                .ask(time(tick), Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0)))
+                .handle_setpoint(
+                    time(tick),
+                    Setpoint::velocity(DVec3::ZERO, YawTarget::Rate(1.0 / 0.0))
+                )
                 .is_err()
         );
     }
-    assert_eq!(guard.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
+    assert_eq!(guard.tick(time(27), &at_rest(27)).1, GuardMode::Holding(HoldReason::NoSetpoint));
 }
 
 #[test]
 fn a_stale_pose_holds_then_lands() {
     let mut guard = guard();
     for tick in 1..=102 {
-        guard.ask(time(tick), velocity(DVec3::X)).unwrap();
-        let (passed, stance) = guard.tick(time(tick), &at_rest(1));
+        guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        let (output, mode) = guard.tick(time(tick), &at_rest(1));
         match tick {
-            1..=26 => assert_eq!(stance, Stance::Passing),
-            27..=101 => assert_eq!(stance, Stance::Holding(HoldReason::PoseStale)),
-            _ => assert!(matches!(stance, Stance::Landing(LandReason::PoseLost(_)))),
+            1..=26 => assert_eq!(mode, GuardMode::Following),
+            27..=101 => assert_eq!(mode, GuardMode::Holding(HoldReason::PoseStale)),
+            _ => assert!(matches!(mode, GuardMode::Landing(LandReason::PoseLost(_)))),
         }
         if tick == 101 {
-            assert_eq!(passed_velocity(passed), DVec3::ZERO);
+            assert_eq!(output_velocity(output), DVec3::ZERO);
         }
     }
 }
@@ -333,11 +340,11 @@ fn a_stale_pose_holds_then_lands() {
 #[test]
 fn outside_the_fence_it_lands() {
     let mut guard = guard();
-    guard.ask(time(1), velocity(DVec3::X)).unwrap();
-    let out = Fix { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
-    let (_, stance) = guard.tick(time(1), &out);
+    guard.handle_setpoint(time(1), velocity(DVec3::X)).unwrap();
+    let out = VehicleMotion { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
+    let (_, mode) = guard.tick(time(1), &out);
     assert!(
-        matches!(stance, Stance::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9)
+        matches!(mode, GuardMode::Landing(LandReason::OutsideFence(m)) if (m - 0.07).abs() < 1e-9)
     );
 }
 
@@ -347,20 +354,20 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
     let pillar = Volume::aabb(DVec3::new(1.0, -0.5, 0.0), DVec3::new(1.5, 0.4, 4.0));
     arena.no_fly.push(pillar).unwrap();
     let mut guard = Guard::new(&arena, &at_rest(0), time(0));
-    let inside = Fix { p_world_m: DVec3::new(0.95, 0.0, 2.0), ..at_rest(1) };
-    let (passed, stance) = guard.tick(time(1), &inside);
-    assert_eq!(passed, Passed::Land);
+    let inside = VehicleMotion { p_world_m: DVec3::new(0.95, 0.0, 2.0), ..at_rest(1) };
+    let (output, mode) = guard.tick(time(1), &inside);
+    assert_eq!(output, GuardOutput::Land);
     assert!(
-        matches!(stance, Stance::Landing(LandReason::InNoFly(m)) if (m - 0.07).abs() < 1e-9),
-        "{stance:?}"
+        matches!(mode, GuardMode::Landing(LandReason::InNoFly(m)) if (m - 0.07).abs() < 1e-9),
+        "{mode:?}"
     );
     // Straight at it: it stops before it. Past its edge: it goes round.
     let mut guard = Guard::new(&arena, &at_rest(0), time(0));
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let mut fly = |v_mps, ticks: std::ops::Range<usize>| {
         for tick in ticks {
-            guard.ask(time(tick), velocity(v_mps)).unwrap();
-            let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+            guard.handle_setpoint(time(tick), velocity(v_mps)).unwrap();
+            let v = output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0);
             vehicle.fly(v);
         }
         vehicle.p_m
@@ -378,8 +385,8 @@ fn a_plugin_does_not_fly_into_the_floor() {
     let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), time(0));
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     for tick in 1..200 {
-        guard.ask(time(tick), velocity(DVec3::new(0.2, 0.0, -3.0))).unwrap();
-        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        guard.handle_setpoint(time(tick), velocity(DVec3::new(0.2, 0.0, -3.0))).unwrap();
+        let v = output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0);
         vehicle.fly(v);
     }
     assert!((0.12..0.2).contains(&vehicle.p_m.z) && vehicle.v_mps.x > 0.1, "{}", vehicle.p_m);
@@ -390,15 +397,17 @@ fn heading_axes_turn_with_the_nose() {
     let mut guard = guard();
     let mut v = DVec3::ZERO;
     for tick in 1..100 {
-        let north =
-            Fix { rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2), ..at_rest(tick) };
+        let north = VehicleMotion {
+            rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
+            ..at_rest(tick)
+        };
         guard
-            .ask(
+            .handle_setpoint(
                 time(tick),
                 Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::Heading, yaw: YawTarget::Keep },
             )
             .unwrap();
-        v = passed_velocity(guard.tick(time(tick), &north).0);
+        v = output_velocity(guard.tick(time(tick), &north).0);
     }
     assert!((v - DVec3::Y).length() < 1e-9, "{v}");
 }
@@ -407,13 +416,16 @@ fn heading_axes_turn_with_the_nose() {
 fn keep_keeps_the_heading_of_the_moment() {
     let mut guard = guard();
     let yaw_after = |guard: &mut Guard, tick, yaw, yaw_rad| {
-        guard.ask(time(tick), Setpoint::velocity(DVec3::X, yaw)).unwrap();
+        guard.handle_setpoint(time(tick), Setpoint::velocity(DVec3::X, yaw)).unwrap();
         match guard
-            .tick(time(tick), &Fix { rotation: DQuat::from_rotation_z(yaw_rad), ..at_rest(tick) })
+            .tick(
+                time(tick),
+                &VehicleMotion { rotation: DQuat::from_rotation_z(yaw_rad), ..at_rest(tick) },
+            )
             .0
         {
-            Passed::Guided(guided) => guided.yaw,
-            Passed::Land => panic!("landed"),
+            GuardOutput::Guided(guided) => guided.yaw,
+            GuardOutput::Land => panic!("landed"),
         }
     };
     assert_eq!(yaw_after(&mut guard, 1, YawTarget::Keep, 0.5), YawTarget::Angle(0.3), "at start");
@@ -436,8 +448,10 @@ fn a_point_is_reached_and_held() {
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let p_world_m = DVec3::new(3.0, -1.5, 1.0);
     for tick in 1..800 {
-        guard.ask(time(tick), Setpoint::Position { p_world_m, yaw: YawTarget::Keep }).unwrap();
-        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        guard
+            .handle_setpoint(time(tick), Setpoint::Position { p_world_m, yaw: YawTarget::Keep })
+            .unwrap();
+        let v = output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0);
         vehicle.fly(v);
     }
     assert!((vehicle.p_m - p_world_m).length() < 0.01, "{}", vehicle.p_m);
@@ -448,8 +462,8 @@ fn it_slides_along_a_wall_rather_than_stopping() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(-4.0, 0.0, 2.0), 4.0);
     for tick in 1..200 {
-        guard.ask(time(tick), velocity(DVec3::new(1.0, 3.0, 0.0))).unwrap();
-        let v = passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0);
+        guard.handle_setpoint(time(tick), velocity(DVec3::new(1.0, 3.0, 0.0))).unwrap();
+        let v = output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0);
         vehicle.fly(v);
     }
     assert!(vehicle.p_m.y > 2.5 && vehicle.p_m.y < 2.88, "{}", vehicle.p_m);
@@ -459,20 +473,20 @@ fn it_slides_along_a_wall_rather_than_stopping() {
 #[test]
 fn an_orderly_end_brakes_before_it_lands() {
     let mut guard = guard();
-    let moving = |tick, v| Fix { v_world_mps: DVec3::X * v, ..at_rest(tick) };
-    guard.ask(time(1), velocity(DVec3::X * 2.0)).unwrap();
+    let moving = |tick, v| VehicleMotion { v_world_mps: DVec3::X * v, ..at_rest(tick) };
+    guard.handle_setpoint(time(1), velocity(DVec3::X * 2.0)).unwrap();
     guard.tick(time(1), &moving(1, 2.0));
     guard.brake_and_land(time(2));
-    let (passed, stance) = guard.tick(time(2), &moving(2, 2.0));
-    assert_eq!(stance, Stance::Holding(HoldReason::Ending));
-    assert!(passed_velocity(passed).length() < 0.1);
-    assert_eq!(guard.tick(time(3), &moving(3, 0.2)).0, Passed::Land);
+    let (output, mode) = guard.tick(time(2), &moving(2, 2.0));
+    assert_eq!(mode, GuardMode::Holding(HoldReason::Ending));
+    assert!(output_velocity(output).length() < 0.1);
+    assert_eq!(guard.tick(time(3), &moving(3, 0.2)).0, GuardOutput::Land);
 
     // A vehicle that does not stop is landed all the same.
     let mut other = self::guard();
     other.brake_and_land(time(2));
-    assert_ne!(other.tick(time(101), &moving(101, 2.0)).0, Passed::Land);
-    assert_eq!(other.tick(time(102), &moving(102, 2.0)).0, Passed::Land);
+    assert_ne!(other.tick(time(101), &moving(101, 2.0)).0, GuardOutput::Land);
+    assert_eq!(other.tick(time(102), &moving(102, 2.0)).0, GuardOutput::Land);
 }
 
 #[test]
@@ -480,11 +494,11 @@ fn an_offset_counts_from_where_it_was_taken() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(1.0, -1.0, 2.0), 4.0);
     let offset = |axes| Setpoint::Offset { d_m: DVec3::X * 0.5, axes, yaw: YawTarget::Keep };
-    guard.ask(time(0), offset(Axes::Heading)).unwrap();
+    guard.handle_setpoint(time(0), offset(Axes::Heading)).unwrap();
     let from_m = vehicle.p_m;
     for tick in 1..400 {
         guard.asked_at = time(tick);
-        vehicle.fly(passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0));
+        vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
     }
     let ahead = DVec3::new(0.3_f64.cos(), 0.3_f64.sin(), 0.0);
     assert!((vehicle.p_m - from_m - ahead * 0.5).length() < 0.02, "{}", vehicle.p_m);
@@ -499,23 +513,23 @@ fn a_trajectory_is_flown_while_the_plugin_answers() {
     let trajectory = Setpoint::Trajectory(Trajectory { path, ..Trajectory::default() });
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
-    guard.ask(time(0), trajectory).unwrap();
+    guard.handle_setpoint(time(0), trajectory).unwrap();
     let mut nearest_m = [f64::INFINITY; 3];
     let mut tick = 0;
     let end = loop {
         tick += 1;
-        guard.answered(time(tick));
-        let (passed, stance) = guard.tick(time(tick), &vehicle.fix(time(tick)));
-        if stance != Stance::Passing {
-            break stance;
+        guard.handle_empty_reply(time(tick));
+        let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick)));
+        if mode != GuardMode::Following {
+            break mode;
         }
-        vehicle.fly(passed_velocity(passed));
+        vehicle.fly(output_velocity(output));
         for (nearest_m, corner_m) in nearest_m.iter_mut().zip(corners) {
             *nearest_m = nearest_m.min((vehicle.p_m - corner_m).length());
         }
     };
     // Over: the plugin says nothing new, and the usual deadline holds.
-    assert_eq!(end, Stance::Holding(HoldReason::NoSetpoint));
+    assert_eq!(end, GuardMode::Holding(HoldReason::NoSetpoint));
     assert!(nearest_m.iter().all(|&m| m < 0.25), "{nearest_m:?}");
     assert!((vehicle.p_m - corners[2]).length() < 0.15, "{}", vehicle.p_m);
 
@@ -523,9 +537,9 @@ fn a_trajectory_is_flown_while_the_plugin_answers() {
     let mut silent = self::guard();
     let path = Path::Waypoints(points.into_iter().collect());
     let again = Setpoint::Trajectory(Trajectory { path, ..Trajectory::default() });
-    silent.ask(time(0), again).unwrap();
+    silent.handle_setpoint(time(0), again).unwrap();
     silent.tick(time(1), &at_rest(1));
-    assert_eq!(silent.tick(time(27), &at_rest(27)).1, Stance::Holding(HoldReason::NoSetpoint));
+    assert_eq!(silent.tick(time(27), &at_rest(27)).1, GuardMode::Holding(HoldReason::NoSetpoint));
 }
 
 #[test]
@@ -539,7 +553,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
     let mut forbidden = Guard::new(&strict, &at_rest(0), time(0));
     let allowed = SetpointKinds::USUAL;
     let refused = InvalidSetpoint::NotAllowed { asked: SetpointKind::AttitudeRate, allowed };
-    assert_eq!(forbidden.ask(time(1), rates(0.0, 1.0)), Err(refused));
+    assert_eq!(forbidden.handle_setpoint(time(1), rates(0.0, 1.0)), Err(refused));
 
     // Nose down for 0.2 s at 1 rad/s, then level rates: it accelerates ahead by g tan(0.2).
     let mut guard = guard();
@@ -547,9 +561,9 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
     for tick in 1..=40 {
         let (pitch_radps, thrust) =
             if tick <= 10 { (1.0, 1.0) } else { (0.0, 1.0 / 0.2_f64.cos()) };
-        guard.ask(time(tick), rates(pitch_radps, thrust)).unwrap();
+        guard.handle_setpoint(time(tick), rates(pitch_radps, thrust)).unwrap();
         let before = v;
-        v = passed_velocity(guard.tick(time(tick), &at_rest(tick)).0);
+        v = output_velocity(guard.tick(time(tick), &at_rest(tick)).0);
         if tick == 40 {
             let a = (v - before) / TICK_S;
             let ahead = DQuat::from_rotation_z(0.3) * DVec3::X;
@@ -564,13 +578,14 @@ fn only_what_the_course_allows_is_flown() {
     course.setpoints = [SetpointKind::Position].into_iter().collect();
     let mut guard = Guard::new(&course, &at_rest(0), time(0));
     let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
-    assert_eq!(guard.ask(time(1), position), Ok(()));
-    let refused = guard.ask(time(2), Setpoint::velocity(DVec3::X, YawTarget::Keep)).unwrap_err();
+    assert_eq!(guard.handle_setpoint(time(1), position), Ok(()));
+    let refused =
+        guard.handle_setpoint(time(2), Setpoint::velocity(DVec3::X, YawTarget::Keep)).unwrap_err();
     let text = "this course does not allow velocity; it allows position";
     assert_eq!(refused.to_string(), text);
     // It does not count against the deadline either: what was asked before stays in force.
     for always in [Setpoint::Hold, Setpoint::TakeOff, Setpoint::Land] {
-        assert_eq!(guard.ask(time(3), always), Ok(()));
+        assert_eq!(guard.handle_setpoint(time(3), always), Ok(()));
     }
 }
 
@@ -579,8 +594,8 @@ fn take_off_goes_back_to_the_height_of_the_beginning() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(1.0, 1.0, 0.5), 4.0);
     for tick in 1..600 {
-        guard.ask(time(tick), Setpoint::TakeOff).unwrap();
-        vehicle.fly(passed_velocity(guard.tick(time(tick), &vehicle.fix(time(tick))).0));
+        guard.handle_setpoint(time(tick), Setpoint::TakeOff).unwrap();
+        vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
     }
     assert!((vehicle.p_m - DVec3::new(1.0, 1.0, 2.0)).length() < 0.02, "{}", vehicle.p_m);
 }
@@ -590,9 +605,9 @@ fn landing_is_final() {
     let mut guard = guard();
     guard.land();
     for tick in 1..50 {
-        guard.ask(time(tick), velocity(DVec3::X)).unwrap();
-        let (passed, stance) = guard.tick(time(tick), &at_rest(tick));
-        assert_eq!((passed, stance), (Passed::Land, Stance::Landing(LandReason::Ordered)));
+        guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        let (output, mode) = guard.tick(time(tick), &at_rest(tick));
+        assert_eq!((output, mode), (GuardOutput::Land, GuardMode::Landing(LandReason::Ordered)));
     }
 }
 

@@ -37,7 +37,7 @@ fn sized_image(camera: u8, tick: u64, depth_mm: u16, [width, height]: [u32; 2]) 
     let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
     let mut payload = Vec::new();
     Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
-    // Mounted as far ahead as the tick says.
+    // Mounted as far ahead as the tick number.
     let mount = Pose::new(DVec3::X * tick as f64, DQuat::IDENTITY);
     let world_from_body = Pose::IDENTITY;
     TestImage {
@@ -99,7 +99,7 @@ impl Rig {
         self.mailbox.end(ticket, Some(Whole { trailer, received }));
     }
 
-    /// Gives it an image; returns what was told and (tick, metres) of each camera the plugin
+    /// Gives it an image; returns what was published and (tick, metres) of each camera the plugin
     /// sees.
     fn take(&mut self, image: &TestImage) -> Option<(Published, Vec<Seen>)> {
         let ticket = self.open(image)?;
@@ -108,13 +108,13 @@ impl Rig {
         self.step()
     }
 
-    /// Does all there is to do; returns what was told and what the plugin sees.
+    /// Does all there is to do; returns what was published and what the plugin sees.
     fn step(&mut self) -> Option<(Published, Vec<Seen>)> {
-        let mut told = None;
-        let tell = &mut |published| told = Some(published);
-        while self.publisher.step(&self.mailbox, Duration::ZERO, tell).unwrap() {}
+        let mut notified = None;
+        let notify = &mut |notice| notified = Some(notice);
+        while self.publisher.step(&self.mailbox, Duration::ZERO, notify).unwrap() {}
         let sample = self.plugin.observation().unwrap();
-        assert_eq!(told.is_some(), sample.is_some(), "told and published are the same");
+        assert_eq!(notified.is_some(), sample.is_some(), "notified of what is published");
         let sample = sample?;
         let observation = Observation::from_bytes(sample.bytes(), &self.names).unwrap();
         let seen = observation
@@ -123,13 +123,13 @@ impl Rig {
                 (c.name.to_owned(), c.seq, c.depth_m(c.width_px - 1, c.height_px - 1).unwrap())
             })
             .collect();
-        assert_eq!(observation.seq(), told.as_ref().unwrap().seq);
+        assert_eq!(observation.seq(), notified.as_ref().unwrap().seq);
         for camera in observation.cameras() {
             let (k, x_m) = (camera.intrinsics, camera.body_from_cam.translation_m.x);
             assert_eq!((k.width_px, k.height_px), (camera.width_px, camera.height_px));
             assert_eq!(x_m, camera.seq as f64, "the mounting is that of the image");
         }
-        Some((told.unwrap(), seen))
+        Some((notified.unwrap(), seen))
     }
 }
 
@@ -196,7 +196,7 @@ fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
     };
     // The front camera alone, at once.
     assert_eq!(rig.take(&together(image(0, 1, 1000), 0b01)).unwrap().1.len(), 1);
-    // Both; the rear one drawn a tick before, as it may be when the encoder was busy.
+    // Both; the rear one rendered a tick before, as it may be when the encoder was busy.
     assert!(rig.take(&together(image(0, 3, 1100), 0b11)).is_none());
     let (_, seen) = rig.take(&together(image(1, 2, 2000), 0b11)).unwrap();
     assert_eq!(seen, [("front".to_owned(), 3, 1.1), ("rear".to_owned(), 2, 2.0)]);
@@ -204,7 +204,7 @@ fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
 }
 
 #[test]
-fn images_that_are_nonsense_are_dropped() {
+fn invalid_images_are_dropped() {
     let mut rig = Rig::new(&["front"]);
     assert!(rig.take(&image(3, 1, 1000)).is_none(), "there is no camera 3");
     let mut cut = image(0, 2, 1000);
@@ -226,7 +226,7 @@ fn an_image_is_decoded_as_it_arrives_and_seen_when_it_is_whole() {
     assert!(rig.step().is_none());
     assert_eq!(rig.publisher.lanes[0].decoded, 2, "the first slice is decoded already");
     rig.push(ticket, &image, 2..99);
-    assert!(rig.step().is_none(), "not before it says that it is whole");
+    assert!(rig.step().is_none(), "not before it is whole");
     rig.end(ticket, &image);
     assert_eq!(rig.step().unwrap().1, [("front".to_owned(), 1, 1.5)]);
 }
@@ -268,7 +268,7 @@ fn a_camera_whose_image_stalls_holds_up_no_other_and_its_image_comes_along_later
 }
 
 #[test]
-fn one_that_gives_way_to_a_newer_one_is_not_mixed_with_it() {
+fn replaced_image_is_not_mixed_with_its_successor() {
     let mut rig = Rig::new(&["front"]);
     let (old, new) = (sized_image(0, 1, 1000, [64, 96]), sized_image(0, 2, 1100, [64, 96]));
     let ticket = rig.open(&old).unwrap();

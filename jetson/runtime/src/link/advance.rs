@@ -15,23 +15,23 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, GuidedSetpoint, guided
 use vizflyt_protocol::messages::YawTarget;
 use vizflyt_protocol::time::HostTime;
 
-use super::commands::{Answer, Command, Patience};
+use super::commands::{Command, CommandOutcome, Patience};
 use super::companions::ANNOUNCES;
 use super::dialect::Rise;
 use super::params::Request;
-use super::rates::Verdict;
+use super::rates::RateAction;
 use super::{FenceEvent, Goal, Link, LinkEvent, Rising, Target};
 
-/// Any place will do indoors: it only ties the local frame to the globe. ArduCopter's own
+/// Any position serves indoors: it only ties the local frame to the globe. ArduCopter's own
 /// test field. [1e-7 degrees, 1e-7 degrees, mm]
 const ORIGIN: (i32, i32, i32) = (-353_632_621, 1_491_652_374, 584_000);
 /// PX4 enters OFFBOARD only if setpoints have come at more than 2 Hz for a second: sent at 20. [s]
 const RISE_PERIOD_S: f64 = 0.05;
 /// Streamed for this long before the mode is asked for. [s]
 const RISE_LEAD_S: f64 = 1.2;
-/// Our name is told again this often while somebody else commands the vehicle. [s]
+/// Our name is announced again this often while somebody else commands the vehicle. [s]
 const ANNOUNCE_S: f64 = 5.0;
-/// Pre-arm checks are asked for in words this often while they fail; ArduCopter tells by itself
+/// Pre-arm texts are requested this often while checks fail; ArduCopter sends them by itself
 /// every 30 s. [s]
 const PREARM_S: f64 = 5.0;
 
@@ -39,7 +39,7 @@ impl Link {
     /// Sends the command that the goal needs next, or repeats the one under way.
     pub(super) fn advance(&mut self, now: HostTime) {
         let Some(target) = self.autopilot else { return };
-        if let Answer::GivenUp { command, why } = self.commands.handle_timeout(now) {
+        if let CommandOutcome::GivenUp { command, why } = self.commands.handle_timeout(now) {
             self.given_up(now, command, &why);
         }
         self.advance_params(now, target);
@@ -156,7 +156,7 @@ impl Link {
         if !self.dialect.keeps_polygons() {
             if self.fence.give_up() {
                 let why = "it has no place on the globe when it flies by external navigation";
-                self.events.push_back(LinkEvent::Fence(FenceEvent::NotKept(why.to_owned())));
+                self.events.push_back(LinkEvent::Fence(FenceEvent::Rejected(why.to_owned())));
             }
             return;
         }
@@ -181,9 +181,9 @@ impl Link {
     }
 
     pub(super) fn every_second(&mut self, now: HostTime) {
-        // Heartbeats also tell a bridge or an autopilot that waits where we are.
+        // Heartbeats also give our address to a bridge or an autopilot that waits for one.
         self.send_heartbeat(now);
-        if let Some(fault) = self.signatures.as_mut().and_then(super::Signatures::take_news) {
+        if let Some(fault) = self.signatures.as_mut().and_then(super::Signatures::take_fault) {
             self.events.push_back(LinkEvent::NotSigned(fault));
         }
         let Some(target) = self.autopilot else { return };
@@ -208,38 +208,38 @@ impl Link {
             );
         }
         self.check_rates(now);
-        self.tell_delay(now);
+        self.report_delay(now);
         self.announce(now);
-        self.ask_why(now, target);
+        self.request_prearm_texts(now, target);
     }
 
     fn check_rates(&mut self, now: HostTime) {
         let (chores, events) = (&mut self.chores, &mut self.events);
         // A queue of chores is asked for already.
         let may_ask = chores.is_empty();
-        self.rates.check(now, |verdict| match verdict {
-            Verdict::Ask((id, period_us)) if may_ask => {
+        self.rates.check(now, |action| match action {
+            RateAction::Request((id, period_us)) if may_ask => {
                 chores.push_back(Command::Interval(id, period_us));
             }
-            Verdict::Ask(_) => {}
-            Verdict::Slow(rate) => events.push_back(LinkEvent::Slow(rate)),
+            RateAction::Request(_) => {}
+            RateAction::Slow(rate) => events.push_back(LinkEvent::Slow(rate)),
         });
     }
 
     /// Compares external navigation's latency with the autopilot's setting, once, on the ground.
-    fn tell_delay(&mut self, now: HostTime) {
-        if self.delay_told || self.state.armed || self.params.is_busy() {
+    fn report_delay(&mut self, now: HostTime) {
+        if self.delay_reported || self.state.armed || self.params.is_busy() {
             return;
         }
         if let Some(delay) = self.delay(now) {
-            self.delay_told = true;
+            self.delay_reported = true;
             if !delay.is_close() {
                 self.events.push_back(LinkEvent::Delay(delay));
             }
         }
     }
 
-    /// Tells our name to others on the vehicle: once, and again while there are some.
+    /// Announces our name to others on the vehicle: once, and again while there are some.
     fn announce(&mut self, now: HostTime) {
         let due = match self.announced_at {
             None => true,
@@ -272,11 +272,11 @@ impl Link {
         !self.settings.name.is_empty() && text == self.own_name()
     }
 
-    /// Has failing pre-arm checks said in words.
-    fn ask_why(&mut self, now: HostTime, target: Target) {
+    /// Requests the texts of failing pre-arm checks.
+    fn request_prearm_texts(&mut self, now: HostTime, target: Target) {
         let due = self.prearm.asked_at.is_none_or(|at| now.seconds_since(at) >= PREARM_S);
         let wanted = self.prearm.ok == Some(false) && self.goal == Goal::Prepare;
-        if wanted && due && !self.prearm.mute && !self.state.armed {
+        if wanted && due && !self.prearm.is_unsupported && !self.state.armed {
             self.prearm.asked_at = Some(now);
             let command = MavCmd::MAV_CMD_RUN_PREARM_CHECKS;
             self.send_command(now, target, COMMAND_LONG_DATA { command, ..Default::default() });
@@ -292,7 +292,7 @@ impl Link {
 
     fn send_heartbeat(&mut self, now: HostTime) {
         let heartbeat = HEARTBEAT_DATA {
-            // Ours to use, as we are no autopilot: tells two runtimes apart.
+            // Unused by companions: distinguishes two runtimes.
             custom_mode: self.companions.own(),
             mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
             autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,

@@ -5,7 +5,7 @@ use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
 use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
 use vizflyt_protocol::time::HostTime;
 
-use super::words::is_final;
+use super::messages::is_final;
 
 /// A command to the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,7 +43,7 @@ impl Command {
     }
 }
 
-/// How long to go on.
+/// How often to retry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Patience {
     Bounded,
@@ -52,8 +52,8 @@ pub(super) enum Patience {
 
 /// What an acknowledgement or the passing of time led to.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Answer {
-    Nothing,
+pub(super) enum CommandOutcome {
+    Pending,
     Accepted(Command),
     GivenUp { command: Command, why: String },
 }
@@ -106,7 +106,7 @@ impl Commands {
         self.pending.as_ref().filter(|pending| !pending.dead).map(|pending| pending.due_at)
     }
 
-    /// Wants `command` brought about. Returns the confirmation count if it is to be sent now.
+    /// Starts or continues `command`. Returns the confirmation count if it is to be sent now.
     pub(super) fn start(
         &mut self,
         now: HostTime,
@@ -146,47 +146,52 @@ impl Commands {
         }
     }
 
-    pub(super) fn handle_ack(&mut self, now: HostTime, id: MavCmd, result: MavResult) -> Answer {
-        let Some(pending) = &mut self.pending else { return Answer::Nothing };
+    pub(super) fn handle_ack(
+        &mut self,
+        now: HostTime,
+        id: MavCmd,
+        result: MavResult,
+    ) -> CommandOutcome {
+        let Some(pending) = &mut self.pending else { return CommandOutcome::Pending };
         if pending.command.mavlink() != id || pending.dead || !pending.waits {
-            return Answer::Nothing;
+            return CommandOutcome::Pending;
         }
         let command = pending.command;
         match result {
             MavResult::MAV_RESULT_ACCEPTED => {
                 self.abandon();
-                Answer::Accepted(command)
+                CommandOutcome::Accepted(command)
             }
             MavResult::MAV_RESULT_IN_PROGRESS => {
                 pending.due_at = now.plus_seconds(REPEAT_S);
-                Answer::Nothing
+                CommandOutcome::Pending
             }
             refusal => {
                 pending.last_result = Some(refusal);
                 pending.refusals = pending.refusals.saturating_add(1);
                 pending.waits = false;
                 pending.due_at = now.plus_seconds(RETRY_S);
-                let final_word =
+                let is_last =
                     is_final(refusal) || pending.command.is_chore() || pending.refusals >= REFUSALS;
-                if pending.patience == Patience::Bounded && final_word {
+                if pending.patience == Patience::Bounded && is_last {
                     return self.give_up();
                 }
-                Answer::Nothing
+                CommandOutcome::Pending
             }
         }
     }
 
-    pub(super) fn handle_timeout(&mut self, now: HostTime) -> Answer {
-        let Some(pending) = &self.pending else { return Answer::Nothing };
+    pub(super) fn handle_timeout(&mut self, now: HostTime) -> CommandOutcome {
+        let Some(pending) = &self.pending else { return CommandOutcome::Pending };
         let exhausted = pending.patience == Patience::Bounded
             && pending.waits
             && pending.confirmation + 1 >= REPEATS
             && now >= pending.due_at;
-        if exhausted && !pending.dead { self.give_up() } else { Answer::Nothing }
+        if exhausted && !pending.dead { self.give_up() } else { CommandOutcome::Pending }
     }
 
-    fn give_up(&mut self) -> Answer {
-        let Some(pending) = &mut self.pending else { return Answer::Nothing };
+    fn give_up(&mut self) -> CommandOutcome {
+        let Some(pending) = &mut self.pending else { return CommandOutcome::Pending };
         pending.dead = true;
         let command = pending.command;
         let why = match pending.last_result {
@@ -194,9 +199,9 @@ impl Commands {
             None => format!("not answered ({REPEATS} times)"),
         };
         if command.is_chore() {
-            // Of no weight: the next one may go out at once.
+            // Not critical: the next one may go out at once.
             self.pending = None;
         }
-        Answer::GivenUp { command, why }
+        CommandOutcome::GivenUp { command, why }
     }
 }

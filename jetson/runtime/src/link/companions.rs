@@ -1,8 +1,8 @@
 //! Whether somebody else commands this vehicle. Two companions that steer one vehicle fight: the
-//! second is refused, by its name where it has told one.
+//! second is refused, by its name where it has announced one.
 //!
-//! Told apart by: heartbeats of a companion computer that are not an echo of ours (a number in their
-//! unused `custom_mode` says so), and answers of the autopilot to questions that we did not ask.
+//! Signs of another one: heartbeats of a companion computer that are not an echo of ours (a number in
+//! their unused `custom_mode` differs), and replies of the autopilot to requests that we did not send.
 
 use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavType};
 use vizflyt_protocol::time::HostTime;
@@ -15,8 +15,8 @@ pub(super) const ANNOUNCES: &str = "companion ";
 const GONE_AFTER_S: f64 = 5.0;
 /// Signs needed: one may be an answer to a former run of ours.
 const SIGNS: u32 = 3;
-/// Others remembered.
-const MOST: usize = 8;
+/// Maximum number of others remembered.
+const MAX_OTHERS: usize = 8;
 /// MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4.
 const COMPANIONS: std::ops::RangeInclusive<u8> = 191..=194;
 
@@ -25,13 +25,13 @@ struct Other {
     id: (u8, u8),
     name: Option<String>,
     signs: u32,
-    heard_at: HostTime,
+    received_at: HostTime,
 }
 
-/// Who else speaks to the vehicle.
+/// The other companions on the vehicle.
 #[derive(Clone, Debug)]
 pub(super) struct Companions {
-    /// Tells our heartbeats from those of another that has our ids.
+    /// Distinguishes our heartbeats from those of another that has our ids.
     own: u32,
     others: Vec<Other>,
 }
@@ -77,19 +77,19 @@ impl Companions {
     }
 
     fn sign(&mut self, now: HostTime, id: (u8, u8)) {
-        self.others.retain(|other| now.seconds_since(other.heard_at) < GONE_AFTER_S);
+        self.others.retain(|other| now.seconds_since(other.received_at) < GONE_AFTER_S);
         if let Some(other) = self.others.iter_mut().find(|other| other.id == id) {
             other.signs = other.signs.saturating_add(1);
-            other.heard_at = now;
-        } else if self.others.len() < MOST {
-            self.others.push(Other { id, name: None, signs: 1, heard_at: now });
+            other.received_at = now;
+        } else if self.others.len() < MAX_OTHERS {
+            self.others.push(Other { id, name: None, signs: 1, received_at: now });
         }
     }
 
-    /// Returns who else commands the vehicle, in words.
+    /// Returns who else commands the vehicle, for a message.
     pub(super) fn other(&self, now: HostTime) -> Option<String> {
         let here = |other: &&Other| {
-            other.signs >= SIGNS && now.seconds_since(other.heard_at) < GONE_AFTER_S
+            other.signs >= SIGNS && now.seconds_since(other.received_at) < GONE_AFTER_S
         };
         self.others.iter().find(here).map(|other| {
             let (system, component) = other.id;

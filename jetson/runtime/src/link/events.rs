@@ -1,4 +1,4 @@
-//! What the link reports, and refusals in words.
+//! What the link reports, and the sentences for refusals.
 
 use std::borrow::Cow;
 
@@ -18,7 +18,7 @@ pub enum LinkEvent {
     Lost,
     /// The autopilot restarted.
     Rebooted,
-    /// The autopilot told what it runs.
+    /// The autopilot reported its firmware.
     Firmware(Firmware),
     /// Motors may turn.
     Armed,
@@ -28,7 +28,7 @@ pub enum LinkEvent {
     TakingOff,
     /// The mode changed to this number (ArduCopter's), by us or by someone else.
     Mode(u32),
-    /// The autopilot will not do what the goal needs; why, in words.
+    /// The autopilot refuses a command that the goal needs; why, in a sentence.
     Refused(String),
     /// A text of the autopilot.
     Text {
@@ -39,13 +39,13 @@ pub enum LinkEvent {
     },
     /// A stream comes too seldom, and asking again did not help.
     Slow(Rate),
-    /// External navigation is later than the autopilot is told.
+    /// External navigation is later than the autopilot's setting.
     Delay(Delay),
     /// Packets are refused for their signature.
     NotSigned(SigningFault),
-    /// What became of the fence's polygons.
+    /// The result of a fence upload.
     Fence(FenceEvent),
-    /// What became of reading or writing parameters.
+    /// The result of reading or writing parameters.
     Param(ParamEvent),
 }
 
@@ -65,9 +65,9 @@ impl LinkEvent {
             Self::NotSigned(fault) => Some(format!(
                 "packets on the link are refused: {fault}; see `vizflyt vehicle sign`"
             )),
-            Self::Fence(FenceEvent::NotKept(why)) => Some(format!(
-                "the autopilot's own fence is not the arena's: {why}; it flies within what its FENCE_* \
-                 say, and guard and referee keep the rest"
+            Self::Fence(FenceEvent::Rejected(why)) => Some(format!(
+                "the autopilot's own fence is not the arena's: {why}; it flies within its FENCE_* \
+                 parameters, and guard and referee keep the rest"
             )),
             _ => None,
         }
@@ -79,17 +79,17 @@ impl LinkEvent {
 pub(super) fn refusal(
     command: &str,
     why: &str,
-    said: &[&str],
+    texts: &[&str],
     guess: Option<Cow<'static, str>>,
 ) -> String {
     let mut text = format!("{command} {why}");
     if let Some(guess) = guess {
         text = format!("{text}: {guess}");
     }
-    if !said.is_empty() {
-        text = format!("{text}; the autopilot says \"{}\"", said.join("\", \""));
+    if !texts.is_empty() {
+        text = format!("{text}; the autopilot says \"{}\"", texts.join("\", \""));
     }
-    if let Some(advice) = said.iter().rev().find_map(|said| advice(said)) {
+    if let Some(advice) = texts.iter().rev().find_map(|text| advice(text)) {
         text = format!("{text}; {advice}");
     }
     text

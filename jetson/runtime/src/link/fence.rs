@@ -1,6 +1,6 @@
 //! The arena's polygons for the autopilot's own fence, uploaded by the mission protocol: their number
-//! is offered, the autopilot asks for one corner after the other, and says in the end what it made of
-//! them. Only to a vehicle on the ground, anew after each restart, and again where an answer is lost.
+//! is offered, the autopilot requests one corner after the other, and acknowledges them all in the
+//! end. Only to a vehicle on the ground, anew after each restart, and again where an answer is lost.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::dialect::{MISSION_ACK_DATA, MavMissionResult, MavMissionType};
@@ -18,13 +18,13 @@ pub struct FencePolygon {
     pub corners_m: Vec<DVec2>,
 }
 
-/// What became of the polygons.
+/// The result of an upload.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FenceEvent {
-    /// The autopilot keeps them, this many.
-    Kept(usize),
-    /// It does not, and keeps what it had; why, in words.
-    NotKept(String),
+    /// The autopilot has accepted this many polygons.
+    Accepted(usize),
+    /// It has not, and keeps its former fence; why, in a sentence.
+    Rejected(String),
 }
 
 /// An offer or an item that nothing follows is offered anew after this; ArduCopter repeats a request
@@ -82,7 +82,7 @@ impl Upload {
         !matches!(self.stage, Stage::Idle)
     }
 
-    /// Takes the origin of the autopilot's local frame, which says where on the globe the polygons are.
+    /// Takes the origin of the autopilot's local frame, which places the polygons on the globe.
     pub(super) fn set_origin(&mut self, origin: GlobalPoint) {
         if self.origin == Some(origin) {
             return;
@@ -138,7 +138,7 @@ impl Upload {
         Some(corner)
     }
 
-    /// Takes the autopilot's word; returns what it comes to.
+    /// Handles the autopilot's acknowledgement; returns the result of the upload, once it is known.
     pub(super) fn acknowledged(
         &mut self,
         now: HostTime,
@@ -154,7 +154,7 @@ impl Upload {
             // An answer to an earlier attempt otherwise.
             MavMissionResult::MAV_MISSION_ACCEPTED if asked == self.corners.len() => {
                 self.stage = Stage::Idle;
-                Some(FenceEvent::Kept(self.polygons.len()))
+                Some(FenceEvent::Accepted(self.polygons.len()))
             }
             // A corner came twice, and it goes on.
             MavMissionResult::MAV_MISSION_ACCEPTED
@@ -172,6 +172,6 @@ impl Upload {
 
     fn fail(&mut self, why: &str) -> FenceEvent {
         self.stage = Stage::Idle;
-        FenceEvent::NotKept(why.to_owned())
+        FenceEvent::Rejected(why.to_owned())
     }
 }

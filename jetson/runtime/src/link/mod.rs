@@ -10,8 +10,8 @@
 //! Commands follow from what is observed, not from a script: whatever the goal needs next is
 //! sent, so a reboot of either side or a lost packet only repeats a step.
 //!
-//! `receive` reads packets, `advance` decides what to send next, `words` says it to people; what differs
-//! between ArduCopter and PX4 is in `dialect`.
+//! `receive` reads packets, `advance` decides what to send next, `messages` has the sentences for people;
+//! what differs between ArduCopter and PX4 is in `dialect`.
 
 mod advance;
 mod commands;
@@ -19,6 +19,7 @@ mod companions;
 mod dialect;
 mod events;
 mod fence;
+mod messages;
 mod navigation;
 mod params;
 pub mod port;
@@ -30,7 +31,6 @@ mod tcp;
 #[cfg(test)]
 mod tests;
 mod udp;
-mod words;
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
@@ -62,7 +62,7 @@ use receive::TextParts;
 use signing::Signatures;
 pub use signing::{LinkSigning, SigningFile, SigningFileError};
 
-/// What the link shall bring about.
+/// The state that the link is to reach.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Goal {
     /// Watch only: heartbeats, telemetry, origin and external navigation.
@@ -76,10 +76,10 @@ pub enum Goal {
     Land,
 }
 
-/// What a person may set.
+/// Settings of a person.
 #[derive(Clone, Debug)]
 pub struct LinkSettings {
-    /// What this companion calls itself to another one on the same vehicle; empty says nothing.
+    /// Name that is announced to other companions on the same vehicle; empty announces none.
     pub name: String,
     /// System id of the autopilot; `None` takes the only one there is.
     pub system: Option<u8>,
@@ -95,7 +95,7 @@ impl Default for LinkSettings {
     }
 }
 
-/// An autopilot's program.
+/// An autopilot's firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Firmware {
     /// ArduCopter or PX4.
@@ -154,16 +154,16 @@ struct Target {
 /// What is known of the pre-arm checks.
 #[derive(Clone, Debug)]
 struct Prearm {
-    /// `None` until SYS_STATUS told.
+    /// `None` before the first SYS_STATUS.
     ok: Option<bool>,
-    /// What it said fails, newest last.
+    /// Texts about failing checks, newest last.
     texts: VecDeque<(HostTime, String)>,
     /// Sensors that are in use and not healthy.
     unhealthy: MavSysStatusSensor,
-    /// When it was last asked to say; `None` if it may be asked.
+    /// When the checks were last requested; `None` if they may be requested.
     asked_at: Option<HostTime>,
-    /// It does not know the question.
-    mute: bool,
+    /// It does not support the request.
+    is_unsupported: bool,
 }
 
 impl Default for Prearm {
@@ -173,7 +173,7 @@ impl Default for Prearm {
             texts: VecDeque::new(),
             unhealthy: MavSysStatusSensor::empty(),
             asked_at: None,
-            mute: false,
+            is_unsupported: false,
         }
     }
 }
@@ -206,11 +206,11 @@ pub struct Link {
     autopilot: Option<Target>,
     dialect: &'static dyn Dialect,
     firmware: Option<Firmware>,
-    /// Another autopilot on the same link, and when it was heard.
+    /// Another autopilot on the same link, and when it last sent.
     rival: Option<(u8, HostTime)>,
     companions: Companions,
     announced_at: Option<HostTime>,
-    heard_at: HostTime,
+    received_at: HostTime,
     state: VehicleState,
     /// When the attitude in `state` was true.
     attitude_at: Option<HostTime>,
@@ -224,7 +224,7 @@ pub struct Link {
     /// Stamps of our newest clock requests. [ns]
     clock_asked: VecDeque<i64>,
     boot_ms: u32,
-    /// Of the autopilot's local frame, as it says.
+    /// Origin of the autopilot's local frame, as it reports it.
     origin: Option<GlobalPoint>,
     fence: fence::Upload,
     ekf: EkfStatusFlags,
@@ -232,7 +232,7 @@ pub struct Link {
     took_off: bool,
     rising: Option<Rising>,
     feed: Feed,
-    delay_told: bool,
+    delay_reported: bool,
     params: Params,
     rates: Rates,
     beat_at: HostTime,
@@ -241,14 +241,15 @@ pub struct Link {
 }
 
 impl Link {
-    /// Makes a link at `now` that has heard nothing yet, and takes the only autopilot there is.
+    /// Makes a link at `now` that has received nothing yet, and takes the only autopilot there is.
     pub fn new(now: HostTime) -> Self {
         Self::with(now, LinkSettings::default())
     }
 
     /// Makes a link at `now` as a person has set it.
     pub fn with(now: HostTime, settings: LinkSettings) -> Self {
-        // Two runtimes start in one nanosecond of their computers' uptimes only by a wonder.
+        // Two runtimes start in the same nanosecond of their computers' uptimes with negligible
+        // probability.
         let nonce = (now.as_ns() ^ now.as_ns() >> 32) as u32 ^ u32::from(settings.name.len() as u8);
         Self {
             decoder: StreamDecoder::default(),
@@ -268,7 +269,7 @@ impl Link {
             rival: None,
             companions: Companions::new(nonce),
             announced_at: None,
-            heard_at: now,
+            received_at: now,
             state: VehicleState { battery_fraction: -1.0, ..VehicleState::default() },
             attitude_at: None,
             position_known: false,
@@ -284,7 +285,7 @@ impl Link {
             took_off: false,
             rising: None,
             feed: Feed::new(settings.vision_hz),
-            delay_told: false,
+            delay_reported: false,
             params: Params::default(),
             rates: Rates::default(),
             beat_at: now,
@@ -317,7 +318,7 @@ impl Link {
             self.beat_at = now.plus_seconds(SECOND_S);
             self.every_second(now);
         }
-        if self.autopilot.is_some() && now.seconds_since(self.heard_at) > LOST_AFTER_S {
+        if self.autopilot.is_some() && now.seconds_since(self.received_at) > LOST_AFTER_S {
             self.autopilot = None;
             self.commands = Commands::default();
             self.rising = None;
@@ -361,20 +362,20 @@ impl Link {
         true
     }
 
-    /// Reads all parameters; [`LinkEvent::Param`] tells when they are there.
+    /// Reads all parameters; [`LinkEvent::Param`] reports when they have arrived.
     pub fn read_params(&mut self, now: HostTime) {
         self.params.read_all(now);
         self.advance(now);
     }
 
-    /// Writes a parameter; [`LinkEvent::Param`] tells what the autopilot made of it.
+    /// Writes a parameter; [`LinkEvent::Param`] reports the result.
     pub fn write_param(&mut self, now: HostTime, name: &str, value: f64) {
         self.params.write(name, value);
         self.advance(now);
     }
 
     /// Has the autopilot keep these polygons as its own fence, from the next time that it is on the
-    /// ground; [`LinkEvent::Fence`] tells what it made of them. Repeating the same changes nothing.
+    /// ground; [`LinkEvent::Fence`] reports the result. Repeating the same changes nothing.
     pub fn set_fence(&mut self, now: HostTime, polygons: Vec<FencePolygon>) {
         self.fence.want(polygons);
         if let Some(origin) = self.origin {
@@ -418,7 +419,7 @@ impl Link {
         Some(due.into_iter().flatten().fold(self.beat_at, Ord::min))
     }
 
-    /// Returns what the autopilot last said of the vehicle, in our frames.
+    /// Returns the vehicle's state as the autopilot last reported it, in our frames.
     pub fn state(&self) -> &VehicleState {
         &self.state
     }
@@ -444,7 +445,7 @@ impl Link {
         self.autopilot.map(|target| target.system)
     }
 
-    /// Returns the autopilot's program, once it has told it.
+    /// Returns the autopilot's firmware, once it has reported it.
     pub fn firmware(&self) -> Option<Firmware> {
         self.firmware
     }
@@ -503,7 +504,7 @@ impl Link {
     /// Whether the vehicle may be armed.
     ///
     /// # Errors
-    /// What it still waits for, in words.
+    /// Returns what arming waits for, in a sentence.
     pub fn ready_to_arm(&self, now: HostTime) -> Result<(), Cow<'static, str>> {
         match self.missing(now) {
             Some(missing) => Err(missing),

@@ -1,13 +1,13 @@
 //! The external navigation feed: which poses go to the autopilot, and how old they are when they
 //! get there. ArduCopter relates the stamps' clock to its own by the quickest packet, so the least
-//! latency is what it cannot see and has to be told: VISO_DELAY_MS.
+//! latency is what it cannot measure and has to be set: VISO_DELAY_MS.
 
 use vizflyt_protocol::time::HostTime;
 
 /// Rates that ArduCopter flew with; its filter takes at most 50 a second. [Hz]
 pub const VISION_HZ: std::ops::RangeInclusive<f64> = 30.0..=50.0;
 
-/// Poses older than this say nothing of now. [s]
+/// Poses older than this are not sent. [s]
 const STALE_S: f64 = 0.5;
 /// Poses over which the latency is measured: 5 s.
 const WINDOW: usize = 250;

@@ -1,5 +1,5 @@
 //! Parameters of the autopilot, read and written: each request is repeated until it is answered, and
-//! a value counts as written when the autopilot says it has it.
+//! a value counts as written when the autopilot confirms it.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,7 +8,7 @@ use vizflyt_protocol::time::HostTime;
 
 use super::dialect::Dialect;
 
-/// A parameter as the autopilot told it.
+/// A parameter as the autopilot reported it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Param {
     /// Its value.
@@ -17,7 +17,7 @@ pub struct Param {
     pub kind: MavParamType,
 }
 
-/// What a reading or writing came to.
+/// The result of reading or writing.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ParamEvent {
     /// All that was asked for has been read, or has no answer.
@@ -31,7 +31,7 @@ pub enum ParamEvent {
     Written {
         /// Which.
         name: String,
-        /// What it says it has.
+        /// The value that it confirms.
         value: f64,
     },
     /// The autopilot kept another value, or does not answer.
@@ -62,8 +62,8 @@ const LIST_PAUSE_S: f64 = 1.0;
 const TRIES: u8 = 5;
 /// Requests in flight at once; a serial link's buffers hold as many answers.
 const WINDOW: usize = 8;
-/// Values kept at most; ArduCopter has some 1400.
-const MOST: usize = 4096;
+/// Maximum number of values kept; ArduCopter has some 1400.
+const MAX_PARAMS: usize = 4096;
 
 #[derive(Clone, Debug)]
 enum Wanted {
@@ -72,7 +72,7 @@ enum Wanted {
 }
 
 #[derive(Clone, Debug)]
-struct Asked {
+struct PendingRead {
     wanted: Wanted,
     tries: u8,
     due_at: HostTime,
@@ -100,7 +100,7 @@ pub(super) struct Params {
     known: BTreeMap<String, Param>,
     list: Option<List>,
     queue: VecDeque<Wanted>,
-    asked: Vec<Asked>,
+    asked: Vec<PendingRead>,
     writes: VecDeque<(String, f64)>,
     writing: Option<Writing>,
     missing: Vec<String>,
@@ -151,7 +151,8 @@ impl Params {
     ) -> Option<ParamEvent> {
         let name = message.param_id.to_str().ok().filter(|name| !name.is_empty())?.to_owned();
         let value = dialect.value_from_wire(message.param_value, message.param_type);
-        if !value.is_finite() || (self.known.len() >= MOST && !self.known.contains_key(&name)) {
+        if !value.is_finite() || (self.known.len() >= MAX_PARAMS && !self.known.contains_key(&name))
+        {
             return None;
         }
         let param = Param { value, kind: message.param_type };
@@ -174,7 +175,7 @@ impl Params {
     /// Ticks an entry of the list off.
     fn note(&mut self, now: HostTime, index: u16, count: u16) {
         let Some(list) = &mut self.list else { return };
-        if list.got.is_empty() && count > 0 && usize::from(count) <= MOST {
+        if list.got.is_empty() && count > 0 && usize::from(count) <= MAX_PARAMS {
             list.got = vec![false; usize::from(count)];
         }
         if let Some(got) = list.got.get_mut(usize::from(index)) {
@@ -259,7 +260,7 @@ impl Params {
             && let Some(wanted) = self.queue.pop_front()
         {
             send(request(&wanted));
-            self.asked.push(Asked { wanted, tries: 1, due_at: now.plus_seconds(REPEAT_S) });
+            self.asked.push(PendingRead { wanted, tries: 1, due_at: now.plus_seconds(REPEAT_S) });
         }
     }
 
@@ -326,7 +327,7 @@ mod tests {
         values: Vec<(String, f32)>,
         loses: usize,
         answers: usize,
-        most: f32,
+        max: f32,
         events: Vec<ParamEvent>,
     }
 
@@ -335,10 +336,10 @@ mod tests {
             let name = |(i, n): (usize, &&str)| (format!("{n}_{i}"), i as f32);
             let values = NAMES.iter().enumerate().map(name).collect();
             let (params, now) = (Params::default(), HostTime::from_ns(1_000_000_000));
-            Self { params, now, values, loses, answers: 0, most: 100.0, events: Vec::new() }
+            Self { params, now, values, loses, answers: 0, max: 100.0, events: Vec::new() }
         }
 
-        fn answer(&mut self, index: usize, says: u16) {
+        fn answer(&mut self, index: usize, reported_index: u16) {
             self.answers += 1;
             if self.loses > 0 && self.answers.is_multiple_of(self.loses) {
                 return;
@@ -347,7 +348,7 @@ mod tests {
             let message = PARAM_VALUE_DATA {
                 param_value: *value,
                 param_count: self.values.len() as u16,
-                param_index: says,
+                param_index: reported_index,
                 param_id: name.as_str().into(),
                 param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
             };
@@ -378,7 +379,7 @@ mod tests {
                         }
                         Request::Set { name, value, .. } => {
                             if let Some(index) = find(&name) {
-                                self.values[index].1 = (value as f32).min(self.most);
+                                self.values[index].1 = (value as f32).min(self.max);
                                 self.answer(index, u16::MAX);
                             }
                         }
@@ -389,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_is_read_whole_however_much_is_lost() {
+    fn list_is_read_completely_despite_loss() {
         for loses in [0, 2, 3, 7] {
             let mut line = Line::new(loses);
             line.params.read_all(line.now);
@@ -401,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_it_does_not_have_are_told() {
+    fn reports_names_that_do_not_exist() {
         let mut line = Line::new(2);
         line.params.read(&["A_0", "NO_SUCH", "C_2"]);
         line.run(5.0);
@@ -411,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_ends_a_reading() {
+    fn silence_ends_a_read() {
         let mut line = Line::new(1);
         line.params.read_all(line.now);
         line.run(30.0);
@@ -419,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_is_written_when_the_autopilot_says_so() {
+    fn value_is_written_when_the_autopilot_confirms_it() {
         let mut line = Line::new(2);
         line.params.write("B_1", 0.3);
         line.params.write("C_2", 500.0);

@@ -73,7 +73,7 @@ pub(crate) fn shape(text: &str) -> Option<Shape<'_>> {
 const USUAL_PORT: u16 = 14550;
 
 impl MavlinkAddress {
-    /// Returns the one that counts where nobody says.
+    /// Returns the default.
     pub fn usual() -> Self {
         Self::UdpIn(([0, 0, 0, 0], USUAL_PORT).into())
     }
@@ -116,12 +116,12 @@ impl fmt::Display for MavlinkAddress {
     }
 }
 
-/// The way to the autopilot, shared by a receiving thread and the control loop.
+/// The transport to the autopilot, shared by a receiving thread and the control loop.
 #[derive(Debug)]
-pub struct Port(Way);
+pub struct Port(Transport);
 
 #[derive(Debug)]
-enum Way {
+enum Transport {
     Udp(UdpPort, Mutex<Partner>),
     Tcp(TcpPort),
     Serial(SerialPort),
@@ -135,7 +135,7 @@ impl Port {
     pub fn open(address: &MavlinkAddress) -> io::Result<Self> {
         Ok(Self(match address {
             MavlinkAddress::UdpIn(local) => {
-                Way::Udp(UdpPort::bind(*local)?, Mutex::new(Partner::waited_for()))
+                Transport::Udp(UdpPort::bind(*local)?, Mutex::new(Partner::waited_for()))
             }
             MavlinkAddress::UdpOut(to) => {
                 let any = if to.is_ipv4() {
@@ -144,12 +144,12 @@ impl Port {
                     SocketAddr::from(([0_u16; 8], 0))
                 };
                 let partner = Partner::fixed(*to, Instant::now());
-                Way::Udp(UdpPort::bind(any)?, Mutex::new(partner))
+                Transport::Udp(UdpPort::bind(any)?, Mutex::new(partner))
             }
-            MavlinkAddress::TcpIn(local) => Way::Tcp(TcpPort::listen(*local)?),
-            MavlinkAddress::TcpOut(to) => Way::Tcp(TcpPort::connect(*to)),
+            MavlinkAddress::TcpIn(local) => Transport::Tcp(TcpPort::listen(*local)?),
+            MavlinkAddress::TcpOut(to) => Transport::Tcp(TcpPort::connect(*to)),
             MavlinkAddress::Serial { path, baud, flow } => {
-                Way::Serial(SerialPort::open(path, *baud, *flow)?)
+                Transport::Serial(SerialPort::open(path, *baud, *flow)?)
             }
         }))
     }
@@ -160,9 +160,9 @@ impl Port {
     /// The system's refusal.
     pub fn local(&self) -> io::Result<String> {
         match &self.0 {
-            Way::Udp(udp, _) => Ok(udp.local_addr()?.to_string()),
-            Way::Tcp(tcp) => tcp.local(),
-            Way::Serial(serial) => Ok(serial.path().display().to_string()),
+            Transport::Udp(udp, _) => Ok(udp.local_addr()?.to_string()),
+            Transport::Tcp(tcp) => tcp.local(),
+            Transport::Serial(serial) => Ok(serial.path().display().to_string()),
         }
     }
 
@@ -170,30 +170,30 @@ impl Port {
     /// second sender while the first one speaks.
     ///
     /// # Errors
-    /// What waiting longer does not mend.
+    /// An error that waiting longer does not solve.
     pub fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<usize>> {
         match &self.0 {
-            Way::Udp(udp, partner) => {
+            Transport::Udp(udp, partner) => {
                 let Some((len, from)) = udp.receive(buffer)? else { return Ok(None) };
                 let mut partner = partner.lock().unwrap_or_else(PoisonError::into_inner);
-                Ok(partner.heard(from, Instant::now()).then_some(len))
+                Ok(partner.accept(from, Instant::now()).then_some(len))
             }
-            Way::Tcp(tcp) => Ok(tcp.receive(buffer)),
-            Way::Serial(serial) => Ok(serial.receive(buffer)),
+            Transport::Tcp(tcp) => Ok(tcp.receive(buffer)),
+            Transport::Serial(serial) => Ok(serial.receive(buffer)),
         }
     }
 
     /// Sends whole packets, if anybody is there; loss is the protocol's concern.
     pub fn send(&self, bytes: &[u8]) {
         match &self.0 {
-            Way::Udp(udp, partner) => {
+            Transport::Udp(udp, partner) => {
                 let partner = partner.lock().unwrap_or_else(PoisonError::into_inner).address();
                 if let Some(to) = partner {
                     udp.send(bytes, to);
                 }
             }
-            Way::Tcp(tcp) => tcp.send(bytes),
-            Way::Serial(serial) => serial.send(bytes),
+            Transport::Tcp(tcp) => tcp.send(bytes),
+            Transport::Serial(serial) => serial.send(bytes),
         }
     }
 }
@@ -231,7 +231,7 @@ mod tests {
     fn check(here: &Port, there: &Port) {
         let mut buffer = [0; 64];
         let mut exchange = |from: &Port, to: &Port, text: &[u8]| {
-            // The way may have to be found first: the other side speaks until it is heard.
+            // The partner may have to be found first: the other side sends until something arrives.
             for _ in 0..100 {
                 from.send(text);
                 if let Some(len) = to.receive(&mut buffer).unwrap() {
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn tcp_carries_both_ways_and_finds_its_way_again() {
+    fn tcp_carries_both_ways_and_reconnects() {
         let here = Port::open(&"tcpin:127.0.0.1:0".parse().unwrap()).unwrap();
         let address = format!("tcpout:{}", here.local().unwrap()).parse().unwrap();
         for _ in 0..2 {

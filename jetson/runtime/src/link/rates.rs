@@ -1,26 +1,26 @@
-//! Whether the autopilot streams what it was asked for, as often as it was asked.
+//! Checks that the autopilot streams messages at the requested rates.
 
 use vizflyt_protocol::time::HostTime;
 
 use super::dialect::Interval;
 
-/// A stream and how often it comes.
+/// A stream and its rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rate {
     /// Message id.
     pub id: u32,
-    /// Asked for. [Hz]
+    /// Requested. [Hz]
     pub asked_hz: f64,
-    /// Came, over the last window; 0 before the first. [Hz]
+    /// Received, over the last window; 0 before the first. [Hz]
     pub achieved_hz: f64,
 }
 
-/// What is to be done about a stream that comes too seldom.
+/// What to do about a stream that is too slow.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Verdict {
-    /// Ask again.
-    Ask(Interval),
-    /// Asking again did not help.
+pub(super) enum RateAction {
+    /// Request it again.
+    Request(Interval),
+    /// Requests did not help.
     Slow(Rate),
 }
 
@@ -28,19 +28,19 @@ pub(super) enum Verdict {
 const WINDOW_S: f64 = 2.0;
 /// Share of the rate that will do: schedulers round intervals to their ticks.
 const ENOUGH: f64 = 0.8;
-/// Asked again this often before it is told.
-const AGAIN: u8 = 2;
+/// Requested again this often before it is reported.
+const REQUESTS: u8 = 2;
 
 #[derive(Clone, Copy, Debug)]
 struct Row {
     rate: Rate,
     interval_us: f32,
     count: u32,
-    asked_again: u8,
-    told: bool,
+    requests: u8,
+    reported: bool,
 }
 
-/// The streams asked for.
+/// The requested streams.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Rates {
     rows: Vec<Row>,
@@ -58,23 +58,23 @@ impl Rates {
             return;
         }
         let rate = Rate { id, asked_hz: 1e6 / f64::from(interval_us), achieved_hz: 0.0 };
-        self.rows.push(Row { rate, interval_us, count: 0, asked_again: 0, told: false });
+        self.rows.push(Row { rate, interval_us, count: 0, requests: 0, reported: false });
     }
 
     /// Counts a message.
-    pub(super) fn heard(&mut self, id: u32) {
+    pub(super) fn received(&mut self, id: u32) {
         if let Some(row) = self.rows.iter_mut().find(|row| row.rate.id == id) {
             row.count = row.count.saturating_add(1);
         }
     }
 
-    /// Returns the streams as they came.
+    /// Returns the streams with their rates.
     pub(super) fn rates(&self) -> impl Iterator<Item = Rate> + '_ {
         self.rows.iter().map(|row| row.rate)
     }
 
-    /// Judges once a window is over; hands what is to be done to `act`.
-    pub(super) fn check(&mut self, now: HostTime, mut act: impl FnMut(Verdict)) {
+    /// Checks the rates once a window is over; calls `act` with what is to be done.
+    pub(super) fn check(&mut self, now: HostTime, mut act: impl FnMut(RateAction)) {
         let window_s = now.seconds_since(self.since);
         if window_s < WINDOW_S {
             return;
@@ -84,13 +84,13 @@ impl Rates {
             row.rate.achieved_hz = f64::from(row.count) / window_s;
             row.count = 0;
             if row.rate.achieved_hz >= ENOUGH * row.rate.asked_hz {
-                (row.asked_again, row.told) = (0, false);
-            } else if row.asked_again < AGAIN {
-                row.asked_again += 1;
-                act(Verdict::Ask((row.rate.id, row.interval_us)));
-            } else if !row.told {
-                row.told = true;
-                act(Verdict::Slow(row.rate));
+                (row.requests, row.reported) = (0, false);
+            } else if row.requests < REQUESTS {
+                row.requests += 1;
+                act(RateAction::Request((row.rate.id, row.interval_us)));
+            } else if !row.reported {
+                row.reported = true;
+                act(RateAction::Slow(row.rate));
             }
         }
     }
@@ -101,27 +101,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_slow_stream_is_asked_for_twice_then_told_once() {
+    fn slow_stream_is_requested_twice_then_reported_once() {
         let mut now = HostTime::from_ns(1_000_000_000);
         let mut rates = Rates::default();
         rates.watch(now, (30, 20_000.0));
         rates.watch(now, (32, 20_000.0));
-        let mut told = Vec::new();
+        let mut actions = Vec::new();
         for window in 0..6 {
             for tick in 0..100 {
                 now = now.plus_seconds(0.02);
-                rates.heard(30);
+                rates.received(30);
                 // 32 comes at 10 Hz, and recovers in the end.
                 if tick % 5 == 0 || window == 5 {
-                    rates.heard(32);
+                    rates.received(32);
                 }
-                rates.check(now, |verdict| told.push(verdict));
+                rates.check(now, |action| actions.push(action));
             }
         }
-        let slow = |verdict: &Verdict| matches!(verdict, Verdict::Slow(rate) if rate.id == 32);
-        assert_eq!(told.len(), 3, "{told:?}");
-        assert_eq!(told[..2], [Verdict::Ask((32, 20_000.0)); 2]);
-        assert!(slow(&told[2]));
+        let slow = |action: &RateAction| matches!(action, RateAction::Slow(rate) if rate.id == 32);
+        assert_eq!(actions.len(), 3, "{actions:?}");
+        assert_eq!(actions[..2], [RateAction::Request((32, 20_000.0)); 2]);
+        assert!(slow(&actions[2]));
         for rate in rates.rates() {
             assert!((rate.achieved_hz - 50.0).abs() < 1.5, "{rate:?}");
         }

@@ -1,4 +1,4 @@
-//! What the autopilot, and others on its network, say.
+//! Handles packets of the autopilot, and of others on its network.
 
 // Why: MISSION_REQUEST is superseded on paper, and what ArduCopter sends.
 #![allow(deprecated)]
@@ -19,10 +19,10 @@ use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{AutopilotTime, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
-use super::commands::{Answer, Command};
+use super::commands::{Command, CommandOutcome};
 use super::params::ParamEvent;
 use super::{
-    COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect, words,
+    COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect, messages,
 };
 
 /// A boot clock that falls by more than this has restarted. [ms]
@@ -44,7 +44,7 @@ impl Link {
             self.handle_heartbeat(now, from, heartbeat);
             return;
         }
-        // Ground stations, gimbals and other vehicles on the same network are not ours to hear.
+        // Packets of ground stations, gimbals and other vehicles on the same network are ignored.
         if self.autopilot != Some(from) {
             if let MavMessage::STATUSTEXT(message) = &packet.message {
                 let text = message.text.to_str().unwrap_or_default();
@@ -54,8 +54,8 @@ impl Link {
             }
             return;
         }
-        self.heard_at = now;
-        self.rates.heard(packet.message.message_id());
+        self.received_at = now;
+        self.rates.received(packet.message.message_id());
         match &packet.message {
             MavMessage::ATTITUDE(message) => {
                 self.handle_boot_time(message.time_boot_ms);
@@ -138,7 +138,7 @@ impl Link {
                 return;
             }
         }
-        self.heard_at = now;
+        self.received_at = now;
         let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         if armed != self.state.armed {
             self.state.armed = armed;
@@ -171,7 +171,7 @@ impl Link {
         self.firmware = None;
         self.params.forget();
         self.rates = super::Rates::default();
-        self.delay_told = false;
+        self.delay_reported = false;
         self.commands.abandon();
         let intervals = self.dialect.intervals().iter();
         self.chores = intervals.map(|&(id, period_us)| Command::Interval(id, period_us)).collect();
@@ -202,7 +202,7 @@ impl Link {
             return;
         }
         let stamp = self.measured_at(now, boot_us.saturating_mul(1000));
-        // Readers tell new samples by their stamps, so these must rise.
+        // Readers find new samples by their stamps, so these must rise.
         if self.imu.back().is_some_and(|newest| newest.stamp >= stamp) {
             return;
         }
@@ -230,7 +230,7 @@ impl Link {
         let in_use =
             message.onboard_control_sensors_enabled & message.onboard_control_sensors_present;
         self.prearm.unhealthy = in_use & !healthy & !check;
-        // 65535 and -1 say "not measured".
+        // 65535 and -1 mean "not measured".
         let millivolts = message.voltage_battery;
         self.state.battery_v =
             if millivolts == u16::MAX { 0.0 } else { f32::from(millivolts) / 1000.0 };
@@ -257,7 +257,7 @@ impl Link {
         let to = (message.target_system, message.target_component);
         let is_ours = self.clock_asked.contains(&message.ts1);
         if !is_ours {
-            // Older autopilots do not say whom they answer.
+            // Older autopilots do not name the receiver of their reply.
             if to != (0, 0) {
                 self.companions.answer(now, to);
             }
@@ -299,17 +299,17 @@ impl Link {
             return self.companions.answer(now, to);
         }
         if ack.command == MavCmd::MAV_CMD_RUN_PREARM_CHECKS {
-            self.prearm.mute = words::is_final(ack.result);
+            self.prearm.is_unsupported = messages::is_final(ack.result);
             return;
         }
         match self.commands.handle_ack(now, ack.command, ack.result) {
-            Answer::Nothing => {}
-            Answer::Accepted(command) => self.accepted(now, command),
-            Answer::GivenUp { command, why } => self.given_up(now, command, &why),
+            CommandOutcome::Pending => {}
+            CommandOutcome::Accepted(command) => self.accepted(now, command),
+            CommandOutcome::GivenUp { command, why } => self.given_up(now, command, &why),
         }
     }
 
-    /// Takes an acceptance at its word; the next heartbeat says otherwise if it is not so.
+    /// Takes the commanded state as reached; the next heartbeat corrects it if it is not.
     fn accepted(&mut self, now: HostTime, command: Command) {
         match command {
             Command::Mode(mode) => self.state.mode = mode as u32,

@@ -23,21 +23,21 @@ pub struct LinkSigning {
     pub key: SigningKey,
     /// The stamp of the moment at which the link is made.
     pub start: SigningTime,
-    /// Believes what is not signed too: only where a key is handed over, as USB is not signed.
-    pub trusts_wire: bool,
+    /// Accepts unsigned packets too: only where a key is handed over, as USB is not signed.
+    pub accepts_unsigned: bool,
 }
 
-/// Signs and judges.
+/// Signs and verifies packets.
 #[derive(Clone, Debug)]
 pub(super) struct Signatures {
     signer: Signer,
     verifier: Verifier,
     made_at: HostTime,
     start: SigningTime,
-    trusts_wire: bool,
+    accepts_unsigned: bool,
     refused: u64,
-    /// Not told yet.
-    news: Option<SigningFault>,
+    /// Not reported yet.
+    unreported: Option<SigningFault>,
 }
 
 impl Signatures {
@@ -47,9 +47,9 @@ impl Signatures {
             verifier: Verifier::new(signing.key),
             made_at: now,
             start: signing.start,
-            trusts_wire: signing.trusts_wire,
+            accepts_unsigned: signing.accepts_unsigned,
             refused: 0,
-            news: None,
+            unreported: None,
         }
     }
 
@@ -67,10 +67,10 @@ impl Signatures {
         self.signer.sign(time, buffer, len)
     }
 
-    /// Whether a packet may be believed. RADIO_STATUS is, unsigned: a bridge has no key (MAVLink
+    /// Whether a packet is accepted. RADIO_STATUS is, unsigned: a bridge has no key (MAVLink
     /// guide, "Accepting Unsigned Packets").
     pub(super) fn accepts(&mut self, now: HostTime, bytes: &[u8], message: &MavMessage) -> bool {
-        if self.trusts_wire || matches!(message, MavMessage::RADIO_STATUS(_)) {
+        if self.accepts_unsigned || matches!(message, MavMessage::RADIO_STATUS(_)) {
             return true;
         }
         let time = self.time(now);
@@ -78,7 +78,7 @@ impl Signatures {
             Ok(()) => true,
             Err(fault) => {
                 self.refused += 1;
-                self.news = Some(fault);
+                self.unreported = Some(fault);
                 false
             }
         }
@@ -89,8 +89,8 @@ impl Signatures {
     }
 
     /// Returns why a packet was refused since the last call.
-    pub(super) fn take_news(&mut self) -> Option<SigningFault> {
-        self.news.take()
+    pub(super) fn take_fault(&mut self) -> Option<SigningFault> {
+        self.unreported.take()
     }
 }
 
@@ -175,7 +175,7 @@ impl SigningFile {
         let start = if wall > last { wall } else { last.plus_us(RESERVE_US) };
         fs::write(&stamp_path, start.units().to_string())
             .map_err(|why| SigningFileError::Unusable { path: stamp_path, why })?;
-        Ok(LinkSigning { key, start, trusts_wire: false })
+        Ok(LinkSigning { key, start, accepts_unsigned: false })
     }
 
     fn unusable(&self, why: std::io::Error) -> SigningFileError {

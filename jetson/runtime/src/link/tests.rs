@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::*;
 
-/// What the other end says and hears.
+/// The autopilot's end of the link.
 struct Script {
     link: Link,
     now: HostTime,
@@ -78,7 +78,7 @@ impl Script {
     fn ready() -> Self {
         let mut script = Self::new();
         script.heartbeat();
-        script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+        script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
         script.estimator(EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_POS_HORIZ_REL);
         script.prearm(true);
         script.run(1.0);
@@ -92,7 +92,7 @@ impl Script {
         encode(header, message, &mut [0; MAX_PACKET]).to_vec()
     }
 
-    fn say_from(&mut self, from: (u8, u8), message: &MavMessage) {
+    fn inject_from(&mut self, from: (u8, u8), message: &MavMessage) {
         let bytes = self.bytes_of(from, message);
         for part in bytes.chunks(self.chunk) {
             self.link.handle_input(self.now, part);
@@ -100,14 +100,14 @@ impl Script {
         self.drain();
     }
 
-    fn say(&mut self, message: &MavMessage) {
-        self.say_from(AUTOPILOT, message);
+    fn inject(&mut self, message: &MavMessage) {
+        self.inject_from(AUTOPILOT, message);
     }
 
     fn heartbeat(&mut self) {
         let mut base_mode = MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED;
         base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, self.armed);
-        self.say(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        self.inject(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
             custom_mode: self.mode,
             mavtype: MavType::MAV_TYPE_QUADROTOR,
             autopilot: self.kind,
@@ -118,7 +118,7 @@ impl Script {
     }
 
     fn estimator(&mut self, flags: EkfStatusFlags) {
-        self.say(&MavMessage::EKF_STATUS_REPORT(EKF_STATUS_REPORT_DATA {
+        self.inject(&MavMessage::EKF_STATUS_REPORT(EKF_STATUS_REPORT_DATA {
             flags,
             ..Default::default()
         }));
@@ -127,7 +127,7 @@ impl Script {
     fn prearm(&mut self, good: bool) {
         let mut health = MavSysStatusSensor::empty();
         health.set(MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK, good);
-        self.say(&MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+        self.inject(&MavMessage::SYS_STATUS(SYS_STATUS_DATA {
             onboard_control_sensors_health: health,
             voltage_battery: 15_200,
             battery_remaining: 80,
@@ -136,7 +136,7 @@ impl Script {
     }
 
     fn text(&mut self, text: &str) {
-        self.say(&MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+        self.inject(&MavMessage::STATUSTEXT(STATUSTEXT_DATA {
             severity: MavSeverity::MAV_SEVERITY_CRITICAL,
             text: text.into(),
             ..Default::default()
@@ -146,20 +146,20 @@ impl Script {
     /// Takes what the link sent, answers its commands.
     fn drain(&mut self) {
         loop {
-            let mut heard = Vec::new();
+            let mut received = Vec::new();
             while let Some(datagram) = self.link.poll_transmit() {
                 self.decoder.push(&datagram, |packet| {
                     assert_eq!((packet.header.system_id, packet.header.component_id), (255, 191));
-                    heard.push(packet.message);
+                    received.push(packet.message);
                 });
             }
             while let Some(event) = self.link.poll_event() {
                 self.events.push(event);
             }
-            if heard.is_empty() {
+            if received.is_empty() {
                 return;
             }
-            for message in heard {
+            for message in received {
                 if let MavMessage::COMMAND_LONG(command) = &message
                     && let Some(result) = (self.answer)(command.command)
                 {
@@ -246,7 +246,7 @@ impl Script {
 }
 
 #[test]
-fn it_flies_the_sequence_a_real_arducopter_accepted() {
+fn sends_the_sequence_that_a_real_arducopter_accepted() {
     let mut script = Script::ready();
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     let intervals = script.count(|m| {
@@ -283,13 +283,13 @@ fn it_flies_the_sequence_a_real_arducopter_accepted() {
 }
 
 #[test]
-fn what_is_missing_is_said_in_words() {
+fn reports_what_arming_waits_for() {
     let mut script = Script::new();
     let missing = |script: &Script| script.link.ready_to_arm(script.now).unwrap_err();
     assert!(missing(&script).contains("heartbeat"));
     script.heartbeat();
     assert!(missing(&script).contains("origin"));
-    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     assert!(missing(&script).contains("position"));
     script.estimator(EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_CONST_POS_MODE);
     assert!(missing(&script).contains("position"));
@@ -310,7 +310,7 @@ fn the_origin_is_sent_every_second_until_confirmed() {
     };
     script.run(3.5);
     assert_eq!(origins(&script), 4);
-    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     script.run(3.0);
     assert_eq!(origins(&script), 4);
     assert_eq!(script.count(|message| matches!(message, MavMessage::HEARTBEAT(_))), 7);
@@ -330,7 +330,7 @@ fn an_unanswered_command_is_repeated_with_a_count_and_given_up() {
 }
 
 #[test]
-fn a_refusal_is_retried_then_told_with_the_autopilots_words_and_advice() {
+fn refusal_is_retried_then_reported_with_the_autopilots_text_and_advice() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => Some(MavResult::MAV_RESULT_FAILED),
@@ -357,7 +357,7 @@ fn a_refusal_is_retried_then_told_with_the_autopilots_words_and_advice() {
 }
 
 #[test]
-fn a_refusal_that_passes_does_no_harm() {
+fn temporary_refusal_does_no_harm() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_NAV_TAKEOFF => Some(MavResult::MAV_RESULT_TEMPORARILY_REJECTED),
@@ -407,7 +407,7 @@ fn arming_under_way_is_dropped_when_the_goal_becomes_landing() {
 }
 
 #[test]
-fn silence_is_reported_and_the_autopilot_taken_up_again() {
+fn silence_is_reported_and_the_connection_resumes() {
     let mut script = Script::ready();
     script.run_silently(3.2);
     assert!(script.events.contains(&LinkEvent::Lost));
@@ -426,23 +426,23 @@ fn a_restart_is_noticed_by_its_boot_clock() {
             ..Default::default()
         })
     };
-    script.say(&at(90_000));
-    script.say(&at(89_990));
+    script.inject(&at(90_000));
+    script.inject(&at(89_990));
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()), "packets out of order are no restart");
-    script.say(&at(500));
+    script.inject(&at(500));
     assert!(script.events.ends_with(&[LinkEvent::Rebooted]));
     assert!(script.link.ready_to_arm(script.now).unwrap_err().contains("origin"));
 }
 
 #[test]
-fn others_on_the_network_are_not_listened_to() {
+fn packets_of_others_on_the_network_are_ignored() {
     let mut script = Script::new();
     let gcs = HEARTBEAT_DATA {
         mavtype: MavType::MAV_TYPE_GCS,
         autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
         ..Default::default()
     };
-    script.say_from((254, 190), &MavMessage::HEARTBEAT(gcs));
+    script.inject_from((254, 190), &MavMessage::HEARTBEAT(gcs));
     assert!(!script.link.is_connected());
     script.heartbeat();
     let armed = HEARTBEAT_DATA {
@@ -450,9 +450,9 @@ fn others_on_the_network_are_not_listened_to() {
         base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
         ..Default::default()
     };
-    script.say_from((2, 1), &MavMessage::HEARTBEAT(armed));
+    script.inject_from((2, 1), &MavMessage::HEARTBEAT(armed));
     assert!(!script.link.state().armed, "that was another vehicle");
-    script.say_from((2, 1), &MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.inject_from((2, 1), &MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     let missing = |script: &Script| script.link.ready_to_arm(script.now).unwrap_err();
     assert!(missing(&script).contains("systems 1 and 2"), "which one is meant");
     script.run(4.0);
@@ -495,7 +495,7 @@ fn poses_are_passed_on_at_fifty_a_second() {
 }
 
 #[test]
-fn clocks_are_related_both_ways() {
+fn clocks_are_related_in_both_directions() {
     let mut script = Script::ready();
     let ahead_ns = 77_000_000_000i64;
     let request = script
@@ -507,7 +507,7 @@ fn clocks_are_related_both_ways() {
             _ => None,
         })
         .unwrap();
-    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA {
+    script.inject(&MavMessage::TIMESYNC(TIMESYNC_DATA {
         tc1: request + ahead_ns,
         ts1: request,
         ..Default::default()
@@ -520,7 +520,7 @@ fn clocks_are_related_both_ways() {
     assert!((offset(&script) - ahead_ns).abs() < 1_100_000_000, "{}", offset(&script));
     // Its own request is answered.
     script.sent.clear();
-    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 0, ts1: 4711, ..Default::default() }));
+    script.inject(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 0, ts1: 4711, ..Default::default() }));
     assert!(matches!(script.sent[..], [MavMessage::TIMESYNC(ref m)]
         if m.ts1 == 4711 && m.tc1 == script.now.as_ns() as i64));
 }

@@ -55,7 +55,7 @@ impl UdpPort {
     }
 }
 
-/// Whom to answer: the one given, or the one who speaks.
+/// The address to send to: a fixed one, or that of the current sender.
 #[derive(Debug)]
 pub(super) struct Partner {
     fixed: bool,
@@ -63,19 +63,19 @@ pub(super) struct Partner {
 }
 
 impl Partner {
-    /// Whoever speaks first.
+    /// The first sender.
     pub(super) fn waited_for() -> Self {
         Self { fixed: false, current: None }
     }
 
-    /// This one, whoever else speaks.
+    /// This one, whoever else sends.
     pub(super) fn fixed(to: SocketAddr, now: Instant) -> Self {
         Self { fixed: true, current: Some((to, now)) }
     }
 
-    /// Takes note of a sender; returns whether to listen to it. A second sender is ignored while
-    /// the first one speaks.
-    pub(super) fn heard(&mut self, from: SocketAddr, now: Instant) -> bool {
+    /// Takes note of a sender; returns whether to accept its packets. A second sender is ignored while
+    /// the first one sends.
+    pub(super) fn accept(&mut self, from: SocketAddr, now: Instant) -> bool {
         match &mut self.current {
             Some((known, at)) if *known == from => {
                 *at = now;
@@ -106,13 +106,13 @@ mod tests {
         let b = SocketAddr::from(([127, 0, 0, 1], 2));
         let mut partner = Partner::waited_for();
         assert_eq!(partner.address(), None);
-        assert!(partner.heard(a, start));
-        assert!(!partner.heard(b, start + second) && partner.address() == Some(a));
-        assert!(partner.heard(a, start + second));
-        assert!(!partner.heard(b, start + 3 * second));
-        assert!(partner.heard(b, start + 4 * second) && partner.address() == Some(b));
+        assert!(partner.accept(a, start));
+        assert!(!partner.accept(b, start + second) && partner.address() == Some(a));
+        assert!(partner.accept(a, start + second));
+        assert!(!partner.accept(b, start + 3 * second));
+        assert!(partner.accept(b, start + 4 * second) && partner.address() == Some(b));
 
         let mut fixed = Partner::fixed(a, start);
-        assert!(!fixed.heard(b, start + 9 * second) && fixed.address() == Some(a));
+        assert!(!fixed.accept(b, start + 9 * second) && fixed.address() == Some(a));
     }
 }

@@ -31,7 +31,7 @@ pub use process::{LineSink, PluginProcess, ProcessError};
 pub struct Reply {
     /// The observation's number.
     pub seq: u64,
-    /// What the plugin asks for, if anything.
+    /// The plugin's setpoint, if it sent one.
     pub setpoint: Option<Setpoint>,
 }
 

@@ -13,7 +13,7 @@ use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd, SERVICE_OPTION, 
 
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
 
-/// The plugin hears of us at least this often.
+/// Maximum time between two messages to the plugin.
 const HEARTBEAT: Duration = Duration::from_millis(400);
 /// How long a plugin may take to attach and to load what it needs: models take their time.
 const READY_WITHIN: Duration = Duration::from_mins(5);
@@ -66,10 +66,10 @@ impl PluginProcess {
         let ipc = RuntimeEnd::create_for(&service, len, confinement.user_id())?;
         command.push(format!("{SERVICE_OPTION}={service}").into());
         let (sender, events) = channel();
-        let tell = move |event| {
+        let handle = move |event| {
             let _ = sender.send(event);
         };
-        let supervisor = Supervisor::start(&command, &confinement, tell).map_err(|error| {
+        let supervisor = Supervisor::start(&command, &confinement, handle).map_err(|error| {
             let program = command.first().map(|program| program.to_string_lossy().into_owned());
             ProcessError::Start(program.unwrap_or_default(), error)
         })?;
@@ -100,7 +100,7 @@ impl PluginProcess {
                 None if Instant::now() > deadline => {
                     return Err(failed("`on_start` did not return within five minutes"));
                 }
-                Some(FromPlugin::Answer { .. }) | None => {}
+                Some(FromPlugin::Reply { .. }) | None => {}
             }
         }
     }
@@ -153,7 +153,7 @@ impl PluginProcess {
         let deadline = Instant::now() + self.within;
         loop {
             match self.next(line)? {
-                Some(FromPlugin::Answer { seq: found, setpoint, .. }) if found == seq => {
+                Some(FromPlugin::Reply { seq: found, setpoint, .. }) if found == seq => {
                     return Ok(setpoint);
                 }
                 Some(FromPlugin::Failed { reason }) => {
@@ -169,7 +169,7 @@ impl PluginProcess {
         }
     }
 
-    /// Shows the plugin that we live, if it has not heard of us for a while; its end is noticed when the
+    /// Sends a heartbeat to the plugin, if it has received nothing for a while; its end is noticed when the
     /// next image is not answered.
     pub fn tend(&mut self, line: LineSink<'_>) {
         if self.beaten.elapsed() >= HEARTBEAT {
@@ -200,7 +200,7 @@ impl PluginProcess {
             self.ipc.heartbeat();
         }
         let ended = self.pass_lines(line);
-        // What it said before it ended counts.
+        // Its messages before its end count.
         match (self.receive()?, ended) {
             (Some(message), _) => Ok(Some(message)),
             (None, Some(why)) => Err(failed(&why)),

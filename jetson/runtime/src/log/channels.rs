@@ -19,7 +19,7 @@ pub enum Channel {
     /// Localized velocity and the pose's age.
     Motion,
     /// What the plugin asked for.
-    Asked,
+    Requested,
     /// What the guard sent on.
     Sent,
     /// Events of server and runtime: foxglove.Log.
@@ -40,7 +40,7 @@ pub enum Channel {
     Plugin,
     /// Colour of a camera as encoded: foxglove.CompressedImage.
     Color(u8),
-    /// How a camera's images are drawn: foxglove.CameraCalibration.
+    /// How a camera's images are rendered: foxglove.CameraCalibration.
     Calibration(u8),
 }
 
@@ -59,7 +59,7 @@ impl Channel {
         Self::Pose,
         Self::Transform,
         Self::Motion,
-        Self::Asked,
+        Self::Requested,
         Self::Sent,
         Self::Event,
         Self::Telemetry,
@@ -77,7 +77,7 @@ impl Channel {
             Self::Pose => "/pose".into(),
             Self::Transform => "/tf".into(),
             Self::Motion => "/motion".into(),
-            Self::Asked => "/setpoint/asked".into(),
+            Self::Requested => "/setpoint/asked".into(),
             Self::Sent => "/setpoint/sent".into(),
             Self::Event => "/event".into(),
             Self::Telemetry => "/telemetry".into(),
@@ -125,7 +125,7 @@ impl Channel {
                     "omega_body_radps": vector, "age_ms": number});
                 ("vizflyt.Motion", properties)
             }
-            Self::Asked => ("vizflyt.Setpoint", json!({"seq": number, "setpoint": {}})),
+            Self::Requested => ("vizflyt.Setpoint", json!({"seq": number, "setpoint": {}})),
             Self::Sent => {
                 let properties =
                     json!({"v_world_mps": vector, "yaw_rad": number, "yaw_rate_radps": number});

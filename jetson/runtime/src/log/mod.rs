@@ -6,7 +6,7 @@
 //! image thread ── pieces of each image, as received ──┴─▶ Queue ─┤     (chunk a second)
 //!                  (their memory goes back afterwards)   bounded └─▶ Live ─▶ viewers
 //! ```
-//! Nobody who flies waits for it: what finds no room is dropped, counted and said. The file is a
+//! The flight never waits for it: records that do not fit are dropped, counted and reported. The file is a
 //! whole one whenever the process is killed, but within the one write of a chunk ([`file`]). Images are
 //! written as they came: the log neither decodes nor encodes them. A reduced log leaves some of them
 //! out whole ([`budget`]); the rest of every observation is always there. The oldest logs are deleted
@@ -108,7 +108,7 @@ pub struct FlightLog {
 
 impl FlightLog {
     /// Opens a log, named by the time of day (UTC), shows it to `live`'s viewers, and deletes logs
-    /// that are no longer to be kept. If it cannot be written, says so in a warning and writes nothing.
+    /// that are no longer to be kept. If it cannot be written, logs a warning and writes nothing.
     pub fn open(settings: &LogSettings, live: Option<Live>) -> Self {
         let LogSettings { folder, images, retention } = settings;
         let now = SystemTime::now();

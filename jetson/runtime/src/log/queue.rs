@@ -15,7 +15,7 @@ use crate::stream::Mailbox;
 const QUEUE: usize = 8192;
 /// Bytes of images waiting at most: some 5 s at 640x480 and 60 Hz. Beyond, images are dropped,
 /// counted. [bytes]
-pub(super) const MOST_IMAGE_BYTES: usize = 64 << 20;
+pub(super) const MAX_IMAGE_BYTES: usize = 64 << 20;
 
 /// Something to be logged.
 #[derive(Debug)]
@@ -86,7 +86,7 @@ pub struct Dropped {
     pub records: u64,
 }
 
-/// The queue, and what its ends tell each other.
+/// The queue, and what its ends share.
 #[derive(Debug)]
 pub(super) struct Queue {
     records: SyncSender<Record>,
@@ -120,7 +120,7 @@ impl Queue {
             _ => 0,
         };
         let waiting = self.image_bytes.fetch_add(len, Ordering::Relaxed);
-        let result = if len > 0 && waiting + len > MOST_IMAGE_BYTES {
+        let result = if len > 0 && waiting + len > MAX_IMAGE_BYTES {
             Err(record)
         } else {
             self.records.try_send(record).map_err(|error| match error {

@@ -1,6 +1,6 @@
 //! Reads flight logs: record by record, in bounded memory, whatever the file holds.
 //!
-//! A log of a killed runtime ends early; one that is damaged is read up to there. Both are said by
+//! A log of a killed runtime ends early; one that is damaged is read up to there. Both are reported by
 //! [`LogReader::is_cut`], not as errors.
 
 use std::collections::HashMap;

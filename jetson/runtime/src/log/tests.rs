@@ -75,10 +75,10 @@ fn what_is_logged_is_read_back() {
     let path = log.path().unwrap().to_owned();
     log.flight(&"avoid".into(), &["--gain=2".into()]);
     for n in 0..100 {
-        log.write(Channel::Asked, host_now(), &json!({"seq": n}));
+        log.write(Channel::Requested, host_now(), &json!({"seq": n}));
     }
     log.line(host_now(), "stdout", "hello", 7);
-    let answer = FromPlugin::Answer {
+    let answer = FromPlugin::Reply {
         seq: 3,
         entered: HostTime::from_ns(1),
         returned: HostTime::from_ns(2),
@@ -148,7 +148,7 @@ fn images_are_logged_as_they_came_and_their_memory_goes_back() {
 fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
     let (queue, records) = Queue::of(3);
     let home = Arc::new(Mailbox::default());
-    let event = || Record::Json { channel: Channel::Asked, at: HostTime::ZERO, json: vec![] };
+    let event = || Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: vec![] };
     for _ in 0..5 {
         queue.push(event());
     }
@@ -162,12 +162,12 @@ fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
         let home = Arc::clone(&home);
         Record::Observation(Box::new(ObservationRecord { at, seq: 1, head, images, home }))
     };
-    queue.push(observation(queue::MOST_IMAGE_BYTES - 10));
+    queue.push(observation(queue::MAX_IMAGE_BYTES - 10));
     queue.push(observation(11));
     queue.push(event());
     assert_eq!(queue.dropped(), Dropped { images: 1, records: 2 });
     assert_eq!(home.spare().map(|piece| piece.len()), Some(11), "its memory goes back");
-    queue.taken(queue::MOST_IMAGE_BYTES - 10);
+    queue.taken(queue::MAX_IMAGE_BYTES - 10);
     queue.push(observation(11));
     assert_eq!(queue.dropped().images, 1, "there is room again");
     drop(records);
@@ -205,7 +205,7 @@ fn a_folder_that_cannot_be_written_stops_nothing() {
     fs::write(&file, "x").unwrap();
     let log = FlightLog::open(&LogSettings::full(&file), None);
     assert_eq!(log.path(), None);
-    log.write(Channel::Asked, host_now(), &json!({}));
+    log.write(Channel::Requested, host_now(), &json!({}));
     assert!(log.images(&Arc::default()).is_none());
 }
 
@@ -236,7 +236,7 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
         for _ in 0..4 {
             writer.take(Record::Pose { at, stamp: at, sample }).unwrap();
         }
-        for channel in [Channel::Asked, Channel::Sent, Channel::Image] {
+        for channel in [Channel::Requested, Channel::Sent, Channel::Image] {
             writer.take(Record::Json { channel, at, json: vec![b' '; 200] }).unwrap();
         }
         writer.take(Record::Plugin { at, is_to_plugin: false, body: vec![0; 60] }).unwrap();
@@ -301,7 +301,7 @@ fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() 
 }
 
 #[test]
-fn old_logs_are_deleted_when_a_flight_begins_and_people_hear_of_it() {
+fn old_logs_are_deleted_when_a_flight_begins_and_it_is_reported() {
     let folder = tempfile::tempdir().unwrap();
     for hour in 10..20 {
         let name = format!("2026-01-01T{hour}-00-00.000Z.mcap");
@@ -311,8 +311,8 @@ fn old_logs_are_deleted_when_a_flight_begins_and_people_hear_of_it() {
     let retention = Retention { max_bytes: 5_500_000, max_age: None };
     let settings = LogSettings { retention, ..LogSettings::full(folder.path()) };
     let log = FlightLog::open(&settings, None);
-    let said = log.poll_trouble().unwrap();
-    assert!(said.contains("deleted the ") && said.contains("[log] keeps"), "{said}");
+    let notice = log.poll_trouble().unwrap();
+    assert!(notice.contains("deleted the ") && notice.contains("[log] keeps"), "{notice}");
     let left = fs::read_dir(folder.path()).unwrap().count();
     assert_eq!(left, 6, "five, and this flight's");
     assert!(log.path().unwrap().exists());
@@ -333,13 +333,13 @@ impl Disk for Failing {
 }
 
 #[test]
-fn a_full_disk_ends_the_log_and_says_so_and_images_go_round() {
+fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     let (queue, records) = Queue::of(64);
     let outlet = Outlet::new(Some(Failing(100_000)), None, None).unwrap();
     let home = Arc::new(Mailbox::default());
     // More than the disk holds, of which a chunk is made at once.
     let big = "x".repeat(5 << 20).into_bytes();
-    queue.push(Record::Json { channel: Channel::Asked, at: HostTime::ZERO, json: big });
+    queue.push(Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: big });
     let images = vec![image(1, ColorMode::Jpeg444)];
     let (at, head) = (HostTime::ZERO, vec![]);
     let record = ObservationRecord { at, seq: 1, head, images, home: Arc::clone(&home) };
@@ -367,7 +367,11 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     let images = vec![image(1, ColorMode::Jpeg444)];
     let record = ObservationRecord { at: HostTime::ZERO, seq: 1, head: vec![], images, home };
     queue.push(Record::Observation(Box::new(record)));
-    queue.push(Record::Json { channel: Channel::Asked, at: HostTime::ZERO, json: b"{}".into() });
+    queue.push(Record::Json {
+        channel: Channel::Requested,
+        at: HostTime::ZERO,
+        json: b"{}".into(),
+    });
     queue.end();
     writer.run(&records);
     let topics: Vec<_> =

@@ -35,10 +35,10 @@ const CHUNK_PERIOD: Duration = Duration::from_secs(1);
 const CHUNK_BYTES: usize = 4 << 20;
 /// Below so much room on disk images are left out, so that the flight's figures still fit, and the
 /// rest of the computer works. [bytes]
-const LEAST_FREE: u64 = 256 << 20;
+const MIN_FREE: u64 = 256 << 20;
 /// Above so much they come back. [bytes]
 const ENOUGH_FREE: u64 = 512 << 20;
-/// A camera's calibration is told this often, for viewers that come later.
+/// A camera's calibration is written this often, for viewers that connect later.
 const CALIBRATION_PERIOD_NS: u64 = 1_000_000_000;
 
 /// Where messages go.
@@ -169,7 +169,7 @@ impl<D: Disk> Outlet<D> {
     }
 }
 
-/// Name of the metadata record that says which flight this is.
+/// Name of the metadata record that identifies the flight.
 pub(super) const FLIGHT: &str = "vizflyt.flight";
 
 /// What the thread keeps besides the outlet.
@@ -182,14 +182,14 @@ pub(super) struct LogWriter<D: Disk> {
     images_fit: bool,
     /// Observations whose images were left out.
     left_out: u64,
-    /// What has been said of drops.
-    told: Dropped,
+    /// Drops that have been reported.
+    reported: Dropped,
     calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
     rest: Vec<u8>,
 }
 
 impl<D: Disk> LogWriter<D> {
-    /// `free_bytes` says how much room is on the disk, if that is known.
+    /// `free_bytes` returns the free space on the disk, if it is known.
     pub(super) fn new(
         outlet: Outlet<D>,
         queue: Arc<Queue>,
@@ -205,7 +205,7 @@ impl<D: Disk> LogWriter<D> {
             free_bytes,
             images_fit: true,
             left_out: 0,
-            told: Dropped::default(),
+            reported: Dropped::default(),
             calibrations: BTreeMap::new(),
             rest: Vec::new(),
         }
@@ -256,8 +256,8 @@ impl<D: Disk> LogWriter<D> {
         ));
     }
 
-    /// Looks after room on the disk and what was dropped, once a second.
-    pub(super) fn look_after(&mut self) -> McapResult<()> {
+    /// Checks the free disk space and reports drops, once a second.
+    pub(super) fn check_health(&mut self) -> McapResult<()> {
         let free = if self.outlet.file.is_some() { (self.free_bytes)() } else { None };
         let fit = images_fit(self.images_fit, free);
         if fit != self.images_fit {
@@ -275,10 +275,11 @@ impl<D: Disk> LogWriter<D> {
         }
         let dropped = self.queue.dropped();
         // The first, then ever fewer.
-        let is_news = |now: u64, told: u64| now > 0 && now >= 2 * told && now != told;
-        if is_news(dropped.images, self.told.images) || is_news(dropped.records, self.told.records)
+        let is_due = |now: u64, reported: u64| now > 0 && now >= 2 * reported && now != reported;
+        if is_due(dropped.images, self.reported.images)
+            || is_due(dropped.records, self.reported.records)
         {
-            self.told = dropped;
+            self.reported = dropped;
             self.queue.complain(format!(
                 "{} images and {} records were dropped so far: the disk is too slow",
                 dropped.images, dropped.records
@@ -441,7 +442,7 @@ impl<D: Disk> LogWriter<D> {
         Some(color.encode_to_vec())
     }
 
-    /// Tells how a camera's images are drawn, when that has changed and now and then.
+    /// Writes how a camera's images are rendered, when that has changed and every [`CALIBRATION_PERIOD_NS`].
     fn calibration(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
         let calibration = calibration(at_ns, &image.name, &image.header);
         let body_from_cam = image.header.body_from_cam();
@@ -449,8 +450,8 @@ impl<D: Disk> LogWriter<D> {
         let mut key = timeless.encode_to_vec();
         key.extend_from_slice(image.header.mount_m.as_bytes());
         key.extend_from_slice(image.header.mount_xyzw.as_bytes());
-        let is_known = self.calibrations.get(&image.camera).is_some_and(|(known, told_ns)| {
-            *known == key && at_ns.saturating_sub(*told_ns) < CALIBRATION_PERIOD_NS
+        let is_known = self.calibrations.get(&image.camera).is_some_and(|(known, written_ns)| {
+            *known == key && at_ns.saturating_sub(*written_ns) < CALIBRATION_PERIOD_NS
         });
         if is_known {
             return Ok(());
@@ -468,7 +469,7 @@ const BODY: &str = "body";
 
 /// Whether images are to be logged with so much room on the disk.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
-    free.is_none_or(|free| free >= if they_did { LEAST_FREE } else { ENOUGH_FREE })
+    free.is_none_or(|free| free >= if they_did { MIN_FREE } else { ENOUGH_FREE })
 }
 
 fn timestamp(at_ns: u64) -> fox::Timestamp {

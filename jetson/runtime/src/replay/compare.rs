@@ -37,7 +37,7 @@ pub fn difference(recorded: Option<&Setpoint>, replayed: Option<&Setpoint>) -> O
 fn bits(setpoint: Option<&Setpoint>) -> Vec<u8> {
     let zero = HostTime::ZERO;
     let answer =
-        FromPlugin::Answer { seq: 0, entered: zero, returned: zero, setpoint: setpoint.cloned() };
+        FromPlugin::Reply { seq: 0, entered: zero, returned: zero, setpoint: setpoint.cloned() };
     encode_body(&answer, &mut [0; MAX_FRAMED]).to_vec()
 }
 

@@ -1,4 +1,4 @@
-//! The runtime's end of a replay: starts the plugin, feeds it, waits for its answers.
+//! The runtime's end of a replay: starts the plugin, feeds it, waits for its replies.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -14,18 +14,18 @@ use crate::lockstep::{PluginProcess, ProcessError};
 use crate::log::Observation;
 use crate::supervisor::{PluginLimits, Stream};
 
-/// The plugin hears of us at least this often.
+/// Longest time between two messages to the plugin.
 const HEARTBEAT: Duration = Duration::from_millis(400);
 /// Largest observation that is fed: what eight of the largest cameras need is a faulty log.
 /// [bytes]
 const LARGEST: usize = 1 << 30;
 
-/// What came of an image.
+/// The outcome of feeding an image.
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
-pub(super) enum Answered {
-    /// The plugin answered.
-    With(Option<Setpoint>),
+pub(super) enum FeedOutcome {
+    /// The plugin replied.
+    Replied(Option<Setpoint>),
     /// The log does not hold it whole.
     Undecodable,
     /// The plugin failed: how, in a sentence.
@@ -61,36 +61,36 @@ impl<'a> Feeder<'a> {
             ToPlugin::Start(_) => {
                 self.stop(line);
                 let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
-                apart(self.process.insert(process).begin(message, line))
+                split_failure(self.process.insert(process).begin(message, line))
             }
             // Ours comes at the end of the log.
             ToPlugin::Stop => Ok(Ok(())),
             ToPlugin::Event(_) => match &mut self.process {
-                Some(process) => apart(process.send(message, line)),
+                Some(process) => split_failure(process.send(message, line)),
                 None => Ok(Ok(())),
             },
         }
     }
 
-    /// Publishes an observation and waits for its answer.
+    /// Publishes an observation and waits for the reply.
     pub(super) fn feed(
         &mut self,
         observation: &Observation,
         line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Answered, ReplayError> {
-        let Some(process) = &mut self.process else { return Ok(Answered::Undecodable) };
+    ) -> Result<FeedOutcome, ReplayError> {
+        let Some(process) = &mut self.process else { return Ok(FeedOutcome::Undecodable) };
         let Some(len) = observation_len(&observation.head) else {
-            return Ok(Answered::Undecodable);
+            return Ok(FeedOutcome::Undecodable);
         };
         let mut memory = process.loan(len)?;
         if decode(observation, memory.memory(), &mut self.decoders).is_none() {
-            return Ok(Answered::Undecodable);
+            return Ok(FeedOutcome::Undecodable);
         }
-        let answer = apart(process.ask(observation.seq, memory, line))?;
-        Ok(answer.map_or_else(Answered::Failed, Answered::With))
+        let answer = split_failure(process.ask(observation.seq, memory, line))?;
+        Ok(answer.map_or_else(FeedOutcome::Failed, FeedOutcome::Replied))
     }
 
-    /// Waits until then; the plugin hears that we live.
+    /// Waits until then, and sends heartbeats to the plugin.
     pub(super) fn idle_until(&mut self, due: Instant, line: &mut dyn FnMut(Stream, &str)) {
         while Instant::now() < due {
             sleep_until(due.min(Instant::now() + HEARTBEAT));
@@ -108,8 +108,8 @@ impl<'a> Feeder<'a> {
     }
 }
 
-/// Tells a plugin that failed, which is a finding, from what ends the replay.
-fn apart<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>, ReplayError> {
+/// Separates a plugin's failure, which is a finding, from errors that end the replay.
+fn split_failure<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>, ReplayError> {
     match result {
         Ok(value) => Ok(Ok(value)),
         Err(ProcessError::Failed(fault)) => Ok(Err(fault.to_string())),

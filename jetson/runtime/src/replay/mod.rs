@@ -1,7 +1,7 @@
 //! `vizflyt replay`: a flight's log to a plugin, in its own process over the same shared memory.
 //!
 //! ```text
-//! log ─▶ Plan (what when) ─┐
+//! log ─▶ ReplayPlan ─────────┐
 //! log ─▶ observations ─────┴─▶ Feeder: decode, publish ══shared memory══▶ plugin process
 //!                                 ▲      next image after the answer          │
 //!                                 └───────────────────────────────────────────┘
@@ -33,10 +33,10 @@ use vizflyt_protocol::messages::Setpoint;
 use vizflyt_protocol::time::HostTime;
 
 pub use self::compare::{Difference, difference};
-use self::feeder::{Answered, Feeder};
+use self::feeder::{FeedOutcome, Feeder};
 pub use self::feeder::{decode, observation_len};
-use self::plan::Feed;
-pub use self::plan::{FlownPlugin, Plan};
+use self::plan::FeedAction;
+pub use self::plan::{FlownPlugin, ReplayPlan};
 use crate::lockstep::ProcessError;
 use crate::log::read::{LogError, LogReader, Recorded, RecordedFlight};
 use crate::supervisor::{PluginLimits, Stream};
@@ -55,7 +55,7 @@ pub enum ReplayError {
     Protocol {
         /// The protocol's version.
         found: u32,
-        /// Who wrote it, as the log says.
+        /// The program that wrote it, from the log.
         program: String,
     },
     /// It has no images.
@@ -158,14 +158,14 @@ impl ReplayReport {
     }
 }
 
-/// Replays `log`; `line` hears what the plugin prints. Call it on a thread that lives as long: the
-/// plugin dies with it.
+/// Replays `log`; `line` is called with every line that the plugin prints. The calling thread must live as
+/// long: the plugin dies with it.
 ///
 /// # Errors
 /// [`ReplayError`], if it cannot begin or go on. A plugin that fails is in the report.
 pub fn replay(
     log: &Path,
-    plan: Plan,
+    plan: ReplayPlan,
     options: &ReplayOptions,
     line: &mut dyn FnMut(Stream, &str),
 ) -> Result<ReplayReport, ReplayError> {
@@ -187,7 +187,7 @@ pub fn replay(
 
 fn run(
     log: &Path,
-    mut plan: Plan,
+    mut plan: ReplayPlan,
     options: &ReplayOptions,
     line: &mut dyn FnMut(Stream, &str),
     report: &mut ReplayReport,
@@ -199,7 +199,8 @@ fn run(
     while let Some(recorded) = flight.next()? {
         let Recorded::Observation(observation) = recorded else { continue };
         let published = HostTime::from_ns(observation.published_ns);
-        let Feed::After(time, answer) = plan.feed(observation.seq, published, options.all) else {
+        let FeedAction::After(time, answer) = plan.feed(observation.seq, published, options.all)
+        else {
             continue;
         };
         if observation.images.is_empty() {
@@ -218,12 +219,12 @@ fn run(
             feeder.idle_until(due, line);
         }
         let setpoint = match feeder.feed(&observation, line)? {
-            Answered::With(setpoint) => setpoint,
-            Answered::Undecodable => {
+            FeedOutcome::Replied(setpoint) => setpoint,
+            FeedOutcome::Undecodable => {
                 report.images_missing += u64::from(answer.is_some());
                 continue;
             }
-            Answered::Failed(why) => return Ok(Some(why)),
+            FeedOutcome::Failed(why) => return Ok(Some(why)),
         };
         report.images_fed += 1;
         // Only what is the same in every replay: no time of this computer.

@@ -1,8 +1,8 @@
-//! What is to be fed when: read from the log once, before the plugin starts, without the images.
+//! The replay's schedule: read from the log once, before the plugin starts, without the images.
 //!
-//! In flight the plugin skips images that come while it works, and hears of events in between. A
+//! In flight the plugin skips images that come while it works, and receives events in between. A
 //! replay repeats that: it feeds the images that were answered, each after the messages that the
-//! plugin had before it entered `on_image`. After the last answer it feeds all there are: if the
+//! plugin had received before it entered `on_image`. After the last reply it feeds all images: if the
 //! plugin crashed or hung, then on one of those.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -17,9 +17,9 @@ use super::ReplayError;
 use crate::log::PluginMessage;
 use crate::log::read::{Recorded, RecordedFlight};
 
-/// An answer in flight.
+/// A reply that the plugin gave in flight.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Answer {
+pub(super) struct RecordedReply {
     pub(super) seq: u64,
     pub(super) entered: HostTime,
     pub(super) setpoint: Option<Setpoint>,
@@ -34,10 +34,10 @@ pub struct FlownPlugin {
     pub arguments: Vec<String>,
 }
 
-/// What a log holds for a replay.
+/// What a replay feeds to the plugin, and when.
 #[derive(Debug, Default)]
-pub struct Plan {
-    /// The plugin that flew, if the log says so.
+pub struct ReplayPlan {
+    /// The plugin that flew, if the log names it.
     pub flown: Option<FlownPlugin>,
     /// Observations in the log.
     pub observations: u64,
@@ -47,22 +47,22 @@ pub struct Plan {
     pub is_cut: bool,
     /// Messages to the plugin, and when they were sent. [host]
     pub(super) messages: VecDeque<(HostTime, ToPlugin)>,
-    /// Answers of each image number: numbers may come again when the plugin was restarted.
-    answers: BTreeMap<u64, VecDeque<Answer>>,
+    /// Replies by image number: numbers may come again when the plugin was restarted.
+    replies: BTreeMap<u64, VecDeque<RecordedReply>>,
     last_entered: HostTime,
 }
 
 /// What to do with an observation.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
-pub(super) enum Feed {
+pub(super) enum FeedAction {
     /// The plugin skipped it.
     Skip,
     /// Feed it after the messages sent before this time; and what the plugin answered, if it did.
-    After(HostTime, Option<Answer>),
+    After(HostTime, Option<RecordedReply>),
 }
 
-impl Plan {
+impl ReplayPlan {
     /// Reads it from a log.
     ///
     /// # Errors
@@ -73,10 +73,11 @@ impl Plan {
         while let Some(recorded) = flight.next()? {
             match recorded {
                 Recorded::Flight(values) => {
-                    // Said before anything is read that may be laid out otherwise.
+                    // Checked before anything is read that may be laid out otherwise.
                     program = values.get("program").cloned();
-                    let said = values.get("protocol").and_then(|text| text.parse().ok());
-                    said.map_or(Ok(()), |said| same_protocol(said, program.as_deref()))?;
+                    let protocol = values.get("protocol").and_then(|text| text.parse().ok());
+                    protocol
+                        .map_or(Ok(()), |protocol| same_protocol(protocol, program.as_deref()))?;
                     plan.flown = flown(&values);
                 }
                 Recorded::Plugin(message) => {
@@ -107,35 +108,39 @@ impl Plan {
             if let Ok(decoded) = decode_body(&message.body) {
                 self.messages.push_back((HostTime::from_ns(message.at_ns), decoded));
             }
-        } else if let Ok(FromPlugin::Answer { seq, entered, setpoint, .. }) =
+        } else if let Ok(FromPlugin::Reply { seq, entered, setpoint, .. }) =
             decode_body(&message.body)
         {
             self.last_entered = self.last_entered.max(entered);
-            self.answers.entry(seq).or_default().push_back(Answer { seq, entered, setpoint });
+            self.replies.entry(seq).or_default().push_back(RecordedReply {
+                seq,
+                entered,
+                setpoint,
+            });
         }
     }
 
     /// Returns what to do with observation `seq` that was published then; `all` feeds those too
     /// that the plugin skipped.
-    pub(super) fn feed(&mut self, seq: u64, published: HostTime, all: bool) -> Feed {
-        let answers = self.answers.get_mut(&seq);
-        let answer = answers.and_then(|answers| {
+    pub(super) fn feed(&mut self, seq: u64, published: HostTime, all: bool) -> FeedAction {
+        let replies = self.replies.get_mut(&seq);
+        let reply = replies.and_then(|replies| {
             // Earlier ones are another plugin process's.
-            while answers.front().is_some_and(|answer| answer.entered < published) {
-                answers.pop_front();
+            while replies.front().is_some_and(|reply| reply.entered < published) {
+                replies.pop_front();
             }
-            answers.pop_front()
+            replies.pop_front()
         });
-        match answer {
-            Some(answer) => Feed::After(answer.entered, Some(answer)),
-            None if all || published > self.last_entered => Feed::After(published, None),
-            None => Feed::Skip,
+        match reply {
+            Some(reply) => FeedAction::After(reply.entered, Some(reply)),
+            None if all || published > self.last_entered => FeedAction::After(published, None),
+            None => FeedAction::Skip,
         }
     }
 
-    /// Returns how many answers have not been fed.
+    /// Returns how many replies have not been fed.
     pub(super) fn unfed(&self) -> u64 {
-        self.answers.values().map(|answers| answers.len() as u64).sum()
+        self.replies.values().map(|replies| replies.len() as u64).sum()
     }
 }
 

@@ -98,7 +98,7 @@ impl Flight {
 
     fn answer(&self, seq: u64, ms: u64, setpoint: Option<Setpoint>) {
         let (entered, returned) = (at(ms), at(ms + 1));
-        let answer = FromPlugin::Answer { seq, entered, returned, setpoint };
+        let answer = FromPlugin::Reply { seq, entered, returned, setpoint };
         self.log.from_plugin(returned, &answer);
     }
 
@@ -109,8 +109,8 @@ impl Flight {
     }
 }
 
-fn plan(log: &Path) -> Result<Plan, ReplayError> {
-    Plan::read(RecordedFlight::new(LogReader::open(log)?, false))
+fn plan(log: &Path) -> Result<ReplayPlan, ReplayError> {
+    ReplayPlan::read(RecordedFlight::new(LogReader::open(log)?, false))
 }
 
 fn forward(x_mps: f64) -> Setpoint {
@@ -119,7 +119,7 @@ fn forward(x_mps: f64) -> Setpoint {
 }
 
 #[test]
-fn images_that_were_skipped_are_skipped_and_those_after_the_last_answer_are_fed() {
+fn feeds_answered_images_and_all_after_the_last_reply() {
     let flight = Flight::new();
     flight.start(5);
     for seq in 1..=6 {
@@ -131,8 +131,8 @@ fn images_that_were_skipped_are_skipped_and_those_after_the_last_answer_are_fed(
     let mut plan = plan(&path).unwrap();
     assert_eq!((plan.observations, plan.is_cut), (6, false));
     let mut feed = |seq: u64, all| match plan.feed(seq, at(10 * seq), all) {
-        Feed::Skip => "skip".to_owned(),
-        Feed::After(time, answer) => format!(
+        FeedAction::Skip => "skip".to_owned(),
+        FeedAction::After(time, answer) => format!(
             "{} {}",
             time.as_ns() / 1_000_000,
             answer.map_or("-".into(), |answer| answer.seq.to_string())
@@ -148,7 +148,7 @@ fn images_that_were_skipped_are_skipped_and_those_after_the_last_answer_are_fed(
 }
 
 #[test]
-fn a_restarted_plugins_answers_are_told_from_the_first_ones() {
+fn separates_replies_of_a_restarted_plugin() {
     let flight = Flight::new();
     flight.start(5);
     flight.image(1, 10);
@@ -159,7 +159,7 @@ fn a_restarted_plugins_answers_are_told_from_the_first_ones() {
     let (path, _folder) = flight.close();
     let mut plan = plan(&path).unwrap();
     let mut answer = |ms| match plan.feed(1, at(ms), false) {
-        Feed::After(_, Some(answer)) => answer.setpoint,
+        FeedAction::After(_, Some(answer)) => answer.setpoint,
         other => panic!("{other:?}"),
     };
     assert_eq!((answer(10), answer(110)), (Some(Setpoint::Hold), Some(Setpoint::Land)));
@@ -182,12 +182,12 @@ fn logs_that_cannot_be_replayed_say_why() {
     assert!(plan(&path).unwrap_err().to_string().contains("no MCAP file"));
 }
 
-/// Writes a log as another version may have: what it says of itself, and one message to the plugin of `protocol`.
-fn foreign_log(path: &Path, said: Option<&str>, protocol: u32) {
+/// Writes a log as another version may have: its metadata, and one message to the plugin of `protocol`.
+fn foreign_log(path: &Path, metadata: Option<&str>, protocol: u32) {
     let file = fs::File::create(path).unwrap();
     let mut log = mcap::WriteOptions::new().compression(None).create(file).unwrap();
-    if let Some(said) = said {
-        let values = [("protocol", said), ("program", "vizflyt 0.0.7")];
+    if let Some(metadata) = metadata {
+        let values = [("protocol", metadata), ("program", "vizflyt 0.0.7")];
         let metadata = values.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
         log.write_metadata(&mcap::records::Metadata { name: "vizflyt.flight".into(), metadata })
             .unwrap();
@@ -210,17 +210,17 @@ fn a_log_of_another_version_says_which() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     let ours = u32::from(PROTOCOL_VERSION);
-    for (said, protocol, expected) in [
+    for (metadata, protocol, expected) in [
         (Some("3"), ours, "of protocol 3, written by vizflyt 0.0.7, and this program"),
         (Some("3"), 3, "of protocol 3, written by vizflyt 0.0.7, and this program"),
         (None, 3, "of protocol 3, written by a program that it does not name"),
-        // What it says of itself makes no sense: its messages decide.
+        // Its metadata is invalid: its messages decide.
         (Some("x"), 70_000, "of protocol 70000, written by vizflyt 0.0.7"),
         (Some("x"), ours, "the log has no images"),
     ] {
-        foreign_log(&path, said, protocol);
+        foreign_log(&path, metadata, protocol);
         let error = plan(&path).unwrap_err().to_string();
-        assert!(error.contains(expected), "{said:?}, {protocol}: {error}");
+        assert!(error.contains(expected), "{metadata:?}, {protocol}: {error}");
     }
 }
 
@@ -278,7 +278,7 @@ fn a_map_is_handed_again() {
 }
 
 #[test]
-fn the_same_plugin_answers_the_same_and_another_one_differs() {
+fn finds_where_another_plugin_replies_differently() {
     let forward_plugin = misbehave("forward");
     let flight = Flight::new();
     flight.start(5);

@@ -25,7 +25,7 @@ use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::HostTime;
 
-/// What is known of an image when its first bytes have come.
+/// The head of an image, known from its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Arrival {
     /// Which connection it came over, counted from 1: a server that restarted counts ticks anew.
@@ -44,16 +44,16 @@ impl Arrival {
     }
 }
 
-/// What is known of an image when its last bytes have come.
+/// The end of an image, known from its last bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Whole {
-    /// What the server knew at the end.
+    /// The server's trailer.
     pub trailer: ImageTrailer,
     /// When the last byte had come. [host]
     pub received: HostTime,
 }
 
-/// What the decoder does next for a camera.
+/// The decoder's next step for a camera.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)] // Why: boxing would allocate per image.
 pub enum Step {
@@ -107,7 +107,7 @@ struct Inner {
 #[derive(Debug, Default)]
 struct Lane {
     images: Vec<Image>,
-    /// The image that the decoder has begun, and was not told the end of.
+    /// The image that the decoder has begun and not ended.
     decoding: Option<u64>,
     fates: Fates,
 }
@@ -139,7 +139,7 @@ impl Mailbox {
             lane.fates.replaced += 1;
             return None;
         }
-        if lane.images.len() >= MOST_UNDER_WAY {
+        if lane.images.len() >= MAX_UNDER_WAY {
             lane.fates.lost += 1;
             return None;
         }
@@ -185,7 +185,7 @@ impl Mailbox {
     }
 
     /// Returns the next thing to do and for which camera; `None` if there is nothing for `timeout`.
-    /// An image that has not come whole is begun only if `may_begin` says so.
+    /// An image that has not come whole is begun only if `may_begin` returns true.
     pub fn next(
         &self,
         timeout: Duration,
@@ -221,7 +221,7 @@ impl Mailbox {
     /// Takes back the memory of a piece.
     pub fn recycle(&self, piece: Vec<u8>) {
         let mut inner = self.lock();
-        if inner.spare_pieces.len() < MOST_SPARES {
+        if inner.spare_pieces.len() < MAX_SPARES {
             inner.spare_pieces.push(piece);
         }
     }
@@ -342,17 +342,17 @@ fn keep(
     spare_queues: &mut Vec<VecDeque<Vec<u8>>>,
     mut pieces: VecDeque<Vec<u8>>,
 ) {
-    let room = MOST_SPARES.saturating_sub(spare_pieces.len());
+    let room = MAX_SPARES.saturating_sub(spare_pieces.len());
     spare_pieces.extend(pieces.drain(..).take(room));
-    if spare_queues.len() < MOST_UNDER_WAY * MAX_CAMERAS {
+    if spare_queues.len() < MAX_UNDER_WAY * MAX_CAMERAS {
         spare_queues.push(pieces);
     }
 }
 
 /// The server keeps at most 8 in flight; more is a faulty peer.
-const MOST_UNDER_WAY: usize = 8;
+const MAX_UNDER_WAY: usize = 8;
 /// Pieces of a few images of every camera at the usual four slices.
-const MOST_SPARES: usize = 128;
+const MAX_SPARES: usize = 128;
 
 #[cfg(test)]
 mod tests {
@@ -488,6 +488,6 @@ mod tests {
         mailbox.end(new, Some(whole()));
         assert_eq!(steps(&mailbox), "0B1 0E");
         let opened = (0..50).filter(|seq| mailbox.open(&arrival(0, 2000 + seq)).is_some());
-        assert_eq!(opened.count(), MOST_UNDER_WAY);
+        assert_eq!(opened.count(), MAX_UNDER_WAY);
     }
 }

@@ -8,7 +8,7 @@
 //! ```
 //! Runs on tokio. Any outage (3 s of silence, a server that restarts) ends in a new connection,
 //! tried for as long as the flight lasts. Events are numbered and acknowledged both ways: after an
-//! outage what is missing is told again, and nothing twice. Both sides show a certificate; each
+//! outage missing events are sent again, and none twice. Both sides show a certificate; each
 //! knows the other's by its SHA-256.
 
 mod mailbox;
@@ -53,7 +53,7 @@ pub struct StreamSettings {
     pub program: Text,
 }
 
-/// What the server's side tells the control loop.
+/// An event of the server connection, for the control loop.
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // Why: handed on by value at once, never stored.
 pub enum StreamEvent {
@@ -156,16 +156,16 @@ const POSES_WAITING: usize = 4096;
 /// Pause before a new connection.
 const RETRY: Duration = Duration::from_millis(200);
 
-/// Talks to the server until `outbox` is closed and all its events are heard, or the caller drops
-/// the task. `tell` returns whether it took the event: one that it did not take is told again, on a
-/// new connection.
+/// Runs the connection to the server until `outbox` is closed and all its events are acknowledged, or
+/// the caller drops the task. `handle` returns whether it took the event: one that it did not take is
+/// sent again by the server, on a new connection.
 pub async fn run(
     settings: StreamSettings,
     shared: Shared,
     outbox: Arc<Outbox>,
-    tell: impl Fn(StreamEvent) -> bool + Send + Sync,
+    handle: impl Fn(StreamEvent) -> bool + Send + Sync,
 ) {
-    run_over(endpoint, settings, shared, outbox, tell).await;
+    run_over(endpoint, settings, shared, outbox, handle).await;
 }
 
 /// As [`run`], over endpoints that `open` makes, a new one for every connection: another network
@@ -175,16 +175,20 @@ pub async fn run_over(
     settings: StreamSettings,
     shared: Shared,
     outbox: Arc<Outbox>,
-    tell: impl Fn(StreamEvent) -> bool + Send + Sync,
+    handle: impl Fn(StreamEvent) -> bool + Send + Sync,
 ) {
     let mut past =
-        Past { boot: random_instance_id(), heard: ReceivedEvents::default(), welcomed: false };
+        Past { boot: random_instance_id(), received: ReceivedEvents::default(), welcomed: false };
     let mut last = String::new();
     loop {
         let error = match connect(&open, &settings).await {
             Ok((endpoint, connection)) => {
-                let with = session::With { settings: &settings, shared: &shared, outbox: &outbox };
-                let error = session::converse(&with, &mut past, &connection, &tell).await;
+                let with = session::SessionContext {
+                    settings: &settings,
+                    shared: &shared,
+                    outbox: &outbox,
+                };
+                let error = session::run(&with, &mut past, &connection, &handle).await;
                 connection.close(VarInt::from_u32(0), b"bye");
                 // Lets the close travel, so that the server frees the vehicle at once.
                 let _ = tokio::time::timeout(RETRY, endpoint.wait_idle()).await;
@@ -195,13 +199,13 @@ pub async fn run_over(
         match error {
             SessionEnd::Done => return,
             SessionEnd::Final(why) => {
-                tell(StreamEvent::Refused(why));
+                handle(StreamEvent::Refused(why));
                 return;
             }
             SessionEnd::Retry(why) => {
                 // Once per cause, not five times a second.
                 if why != last || std::mem::take(&mut past.welcomed) {
-                    tell(StreamEvent::Down(why.clone()));
+                    handle(StreamEvent::Down(why.clone()));
                     last = why;
                 }
             }
@@ -213,22 +217,22 @@ pub async fn run_over(
 /// What outlives a connection.
 #[derive(Clone, Copy, Debug)]
 struct Past {
-    /// Tells our events from those of another run.
+    /// Distinguishes our events from those of another run.
     boot: u64,
-    /// What we have heard of the server's events.
-    heard: ReceivedEvents,
-    /// The server welcomed us since the last outage was told.
+    /// The server's events that we have received.
+    received: ReceivedEvents,
+    /// The server has welcomed us since the last outage was reported.
     welcomed: bool,
 }
 
-/// Why a conversation ended.
+/// Why a session ended.
 #[derive(Debug)]
 enum SessionEnd {
     /// Another attempt may work.
     Retry(String),
     /// It will not.
     Final(String),
-    /// All has been said.
+    /// Everything has been sent and acknowledged.
     Done,
 }
 

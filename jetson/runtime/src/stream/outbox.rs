@@ -1,5 +1,5 @@
-//! What the runtime has to tell the server: the newest report, and every event until the server has
-//! acknowledged it, through any number of connections.
+//! Messages to the server: the newest report, and every event until the server has acknowledged it,
+//! over any number of connections.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -20,7 +20,7 @@ pub struct Outbox {
 struct Inner {
     report: Option<Telemetry>,
     timing: Option<Timing>,
-    /// What the IMU felt and is not told yet, oldest first.
+    /// Readings of the IMU that are not sent yet, oldest first.
     imu: heapless::Vec<ImuReading, MAX_IMU_BATCH>,
     /// Not yet acknowledged, oldest first.
     events: VecDeque<(u64, Event)>,
@@ -34,18 +34,18 @@ struct Inner {
 /// Readings of the IMU that leave together: 50 messages a second at 100 Hz, 20 ms late at most.
 const IMU_TOGETHER: usize = 2;
 
-/// What there is to write now.
+/// The next step of the writer.
 #[allow(clippy::large_enum_variant)] // Why: it is taken apart at once.
 enum Next {
-    Say(ToServer),
+    Send(ToServer),
     Wait,
     End,
 }
 
 impl Outbox {
-    /// Events kept at most, as many as the server's log keeps. Past that the oldest line that the
-    /// plugin printed goes, and only if there is none the oldest event.
-    pub const KEPT: usize = 4096;
+    /// Maximum number of events, as many as the server's log keeps. Beyond that the oldest line that the
+    /// plugin printed is dropped, and only if there is none the oldest event.
+    pub const MAX_EVENTS: usize = 4096;
 
     /// Puts a report in place of an older one.
     pub fn report(&self, report: Telemetry) {
@@ -59,7 +59,7 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Tells what the autopilot's IMU felt; of more than a batch the oldest goes.
+    /// Queues a reading of the autopilot's IMU; of more than a batch the oldest is dropped.
     pub fn imu(&self, reading: ImuReading) {
         let mut inner = self.lock();
         if inner.imu.is_full() {
@@ -67,20 +67,20 @@ impl Outbox {
         }
         // There is room now.
         let _ = inner.imu.push(reading);
-        let tell = inner.imu.len() >= IMU_TOGETHER;
+        let is_due = inner.imu.len() >= IMU_TOGETHER;
         drop(inner);
-        if tell {
+        if is_due {
             self.changed.notify_one();
         }
     }
 
-    /// Tells an event.
-    pub fn tell(&self, event: Event) {
+    /// Queues an event until the server has acknowledged it.
+    pub fn send_event(&self, event: Event) {
         let mut inner = self.lock();
         inner.made += 1;
         let seq = inner.made;
         inner.events.push_back((seq, event));
-        if inner.events.len() > Self::KEPT {
+        if inner.events.len() > Self::MAX_EVENTS {
             let is_line = |(_, event): &(u64, Event)| event.kind == EventKind::PluginOutput;
             let at = inner.events.iter().position(is_line).unwrap_or(0);
             if let Some((seq, event)) = inner.events.remove(at) {
@@ -94,33 +94,33 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Says that nothing follows: the flight is over.
+    /// Ends the messages: the flight is over.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_one();
     }
 
-    /// Begins on a new connection, whose server has heard events up to number `heard`. An old report
-    /// is stale.
-    pub(super) fn resume(&self, heard: u64) {
+    /// Begins on a new connection, whose server has received events up to number `received`. An old
+    /// report is stale.
+    pub(super) fn resume(&self, received: u64) {
         let mut inner = self.lock();
-        inner.forget(heard);
-        inner.written = heard;
+        inner.forget(received);
+        inner.written = received;
         (inner.report, inner.timing) = (None, None);
         inner.imu.clear();
     }
 
-    /// Takes note that the server has heard events up to number `seq`.
-    pub(super) fn heard(&self, seq: u64) {
+    /// Takes note that the server has received events up to number `seq`.
+    pub(super) fn acknowledged(&self, seq: u64) {
         self.lock().forget(seq);
         self.changed.notify_one();
     }
 
-    /// Returns the next message, events first; `None` once it is closed and all events are heard.
+    /// Returns the next message, events first; `None` once it is closed and all events are acknowledged.
     pub(super) async fn next(&self) -> Option<ToServer> {
         loop {
             match self.lock().take() {
-                Next::Say(message) => return Some(message),
+                Next::Send(message) => return Some(message),
                 Next::End => return None,
                 Next::Wait => {}
             }
@@ -135,8 +135,8 @@ impl Outbox {
 }
 
 impl Inner {
-    fn forget(&mut self, heard: u64) {
-        while self.events.front().is_some_and(|&(seq, _)| seq <= heard) {
+    fn forget(&mut self, received: u64) {
+        while self.events.front().is_some_and(|&(seq, _)| seq <= received) {
             self.events.pop_front();
         }
     }
@@ -145,16 +145,16 @@ impl Inner {
         let at = self.events.partition_point(|&(seq, _)| seq <= self.written);
         if let Some((seq, event)) = self.events.get(at).cloned() {
             self.written = seq;
-            return Next::Say(ToServer::Event { seq, event });
+            return Next::Send(ToServer::Event { seq, event });
         }
         if let Some(report) = self.report.take() {
-            return Next::Say(ToServer::Telemetry(report));
+            return Next::Send(ToServer::Telemetry(report));
         }
         if self.imu.len() >= IMU_TOGETHER {
-            return Next::Say(ToServer::Imu(std::mem::take(&mut self.imu)));
+            return Next::Send(ToServer::Imu(std::mem::take(&mut self.imu)));
         }
         if let Some(timing) = self.timing.take() {
-            return Next::Say(ToServer::Timing(timing));
+            return Next::Send(ToServer::Timing(timing));
         }
         if self.closed && self.events.is_empty() { Next::End } else { Next::Wait }
     }
@@ -176,8 +176,8 @@ mod tests {
         loop {
             let next = outbox.lock().take();
             found.push(match next {
-                Next::Say(ToServer::Event { seq, .. }) => seq.to_string(),
-                Next::Say(_) => "R".to_owned(),
+                Next::Send(ToServer::Event { seq, .. }) => seq.to_string(),
+                Next::Send(_) => "R".to_owned(),
                 Next::End => "-".to_owned(),
                 Next::Wait => break,
             });
@@ -189,26 +189,26 @@ mod tests {
     }
 
     #[test]
-    fn events_are_told_until_they_are_heard_and_no_longer() {
+    fn events_are_sent_until_they_are_acknowledged() {
         let outbox = Outbox::default();
         outbox.report(Telemetry::default());
         outbox.report(Telemetry::default());
         for _ in 0..3 {
-            outbox.tell(event(EventKind::Note, "n"));
+            outbox.send_event(event(EventKind::Note, "n"));
         }
         assert_eq!(written(&outbox), "1 2 3 R");
-        outbox.heard(1);
-        // The connection is lost; the server had heard one more than it could acknowledge.
+        outbox.acknowledged(1);
+        // The connection is lost; the server had received one more than it could acknowledge.
         outbox.report(Telemetry::default());
-        outbox.tell(event(EventKind::Note, "made meanwhile"));
+        outbox.send_event(event(EventKind::Note, "made meanwhile"));
         outbox.resume(2);
         assert_eq!(written(&outbox), "3 4");
-        // A server that was restarted has heard nothing of us; what was acknowledged stays so.
+        // A server that was restarted has received nothing; what was acknowledged stays so.
         outbox.resume(0);
         assert_eq!(written(&outbox), "3 4");
         outbox.close();
-        assert_eq!(written(&outbox), "", "4 has not been heard");
-        outbox.heard(4);
+        assert_eq!(written(&outbox), "", "4 is not acknowledged");
+        outbox.acknowledged(4);
         assert_eq!(written(&outbox), "-");
     }
 
@@ -221,7 +221,7 @@ mod tests {
             gyro_radps: glam::DVec3::ZERO,
         };
         let next = || match outbox.lock().take() {
-            Next::Say(ToServer::Imu(batch)) => {
+            Next::Send(ToServer::Imu(batch)) => {
                 batch.iter().map(|reading| reading.stamp.as_ns()).collect::<Vec<_>>()
             }
             _ => Vec::new(),
@@ -236,14 +236,14 @@ mod tests {
     }
 
     #[test]
-    fn a_talkative_plugin_loses_its_own_lines_first() {
+    fn drops_the_plugins_lines_before_other_events() {
         let outbox = Outbox::default();
-        outbox.tell(event(EventKind::EmergencyStop, "stop"));
-        for _ in 0..Outbox::KEPT + 10 {
-            outbox.tell(event(EventKind::PluginOutput, "line"));
+        outbox.send_event(event(EventKind::EmergencyStop, "stop"));
+        for _ in 0..Outbox::MAX_EVENTS + 10 {
+            outbox.send_event(event(EventKind::PluginOutput, "line"));
         }
         let inner = outbox.lock();
-        assert_eq!(inner.events.len(), Outbox::KEPT);
+        assert_eq!(inner.events.len(), Outbox::MAX_EVENTS);
         assert_eq!(inner.events[0].1.kind, EventKind::EmergencyStop);
         assert_eq!(inner.events[1].0, 13);
     }

@@ -17,12 +17,12 @@ use zerocopy::IntoBytes;
 
 use crate::args::ServerAddress;
 
-/// What a pairing has given.
+/// The result of a pairing.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NowPaired {
     /// The server's, noted in `servers.toml`.
     pub server: Fingerprint,
-    /// What this computer may do.
+    /// The rights of this computer.
     pub grant: Grant,
 }
 
@@ -67,10 +67,10 @@ async fn connect(
         .await
         .with_context(|| format!("server {server}: no connection"))?;
     let result = converse(&connection, &pin, identity, code, name).await;
-    // What the server said on closing tells more than which of our calls failed first.
+    // The server's reason for closing is more precise than which of our calls failed first.
     let result = result.map_err(|error| match connection.close_reason() {
-        Some(ConnectionError::ApplicationClosed(said)) if !said.reason.is_empty() => {
-            anyhow::anyhow!("{}", String::from_utf8_lossy(&said.reason))
+        Some(ConnectionError::ApplicationClosed(frame)) if !frame.reason.is_empty() => {
+            anyhow::anyhow!("{}", String::from_utf8_lossy(&frame.reason))
         }
         _ => error,
     });

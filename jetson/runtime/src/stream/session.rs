@@ -18,7 +18,7 @@ use crate::clock;
 
 /// Nothing from the server for this long: connect anew. Longer than a blackout of two seconds: a
 /// connection that lives on has the newest image through 15 ms after it, a new one would be in the
-/// middle of its handshake's time-outs. A server that was restarted says so itself.
+/// middle of its handshake's time-outs. A server that was restarted reports it itself.
 const SILENCE: Duration = Duration::from_secs(3);
 /// The clock is asked this often: four times a second at the start and when the server is
 /// silent, else once.
@@ -27,31 +27,31 @@ const CLOCK_SLOW: Duration = Duration::from_secs(1);
 /// Requests at the start that fill the filter's window.
 const CLOCK_FIRST: u32 = 8;
 
-/// What every conversation is led with.
-pub(super) struct With<'a> {
+/// The context of every session.
+pub(super) struct SessionContext<'a> {
     pub(super) settings: &'a StreamSettings,
     pub(super) shared: &'a Shared,
     pub(super) outbox: &'a Outbox,
 }
 
-/// Converses until the connection fails; returns why.
-pub(super) async fn converse(
-    with: &With<'_>,
+/// Runs the session until the connection fails; returns why.
+pub(super) async fn run(
+    with: &SessionContext<'_>,
     past: &mut Past,
     connection: &Connection,
-    tell: &(impl Fn(StreamEvent) -> bool + Send + Sync),
+    handle: &(impl Fn(StreamEvent) -> bool + Send + Sync),
 ) -> SessionEnd {
     with.shared.clock.reset();
-    let end = match converse_inner(with, past, connection, tell).await {
+    let end = match run_inner(with, past, connection, handle).await {
         Ok(never) => match never {},
         Err(end) => end,
     };
-    // What the server said on closing tells more than which of our calls failed first.
+    // The server's reason for closing is more precise than which of our calls failed first.
     match (connection.close_reason(), end) {
-        (Some(ConnectionError::ApplicationClosed(said)), _)
-            if said.error_code == VarInt::from_u32(close::UNPAIRED) =>
+        (Some(ConnectionError::ApplicationClosed(frame)), _)
+            if frame.error_code == VarInt::from_u32(close::UNPAIRED) =>
         {
-            SessionEnd::Final(String::from_utf8_lossy(&said.reason).into_owned())
+            SessionEnd::Final(String::from_utf8_lossy(&frame.reason).into_owned())
         }
         (Some(error), SessionEnd::Retry(_)) => lost(error),
         (_, end) => end,
@@ -62,11 +62,11 @@ fn lost(error: impl std::fmt::Display) -> SessionEnd {
     SessionEnd::Retry(format!("connection to the server lost: {error}"))
 }
 
-async fn converse_inner<T: Fn(StreamEvent) -> bool>(
-    with: &With<'_>,
+async fn run_inner<T: Fn(StreamEvent) -> bool>(
+    with: &SessionContext<'_>,
     past: &mut Past,
     connection: &Connection,
-    tell: &T,
+    handle: &T,
 ) -> Result<Infallible, SessionEnd> {
     let (mut send, mut receive) = connection.open_bi().await.map_err(lost)?;
     send.write_all(Preamble::of(PeerRole::Runtime).as_bytes()).await.map_err(lost)?;
@@ -75,50 +75,50 @@ async fn converse_inner<T: Fn(StreamEvent) -> bool>(
         purpose: with.settings.purpose,
         program: with.settings.program.clone(),
         boot: past.boot,
-        received_events: past.heard,
+        received_events: past.received,
     };
     write(&mut send, &ToServer::Hello(hello)).await?;
     check_preamble(&mut receive).await?;
 
     receive::start(connection, with.shared);
-    let mut listener = Listener { with, past, tell, server: None, newest_pose: ServerTime::ZERO };
+    let mut receiver = Receiver { with, past, handle, server: None, newest_pose: ServerTime::ZERO };
     let mut deframer = Box::new(Deframer::default());
     let mut chunk = vec![0; MAX_FRAMED];
     let mut ticks = interval(CLOCK_FAST);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let (mut heard, mut asked, mut asked_count) = (Instant::now(), Instant::now(), 0);
+    let (mut received_at, mut asked_at, mut asked_count) = (Instant::now(), Instant::now(), 0);
     loop {
         tokio::select! {
             read = receive.read(&mut chunk) => {
                 let len = read.map_err(lost)?.ok_or_else(|| lost("the server closed it"))?;
-                heard = Instant::now();
-                let (mut bytes, before) = (&chunk[..len], listener.past.heard);
+                received_at = Instant::now();
+                let (mut bytes, before) = (&chunk[..len], receiver.past.received);
                 while !bytes.is_empty() {
                     bytes = &bytes[deframer.push(bytes)..];
                     while let Some(message) = deframer.next::<ToRuntime>() {
-                        listener.take(message)?;
+                        receiver.take(message)?;
                     }
                 }
-                if listener.past.heard != before {
-                    write(&mut send, &ToServer::EventsReceived(listener.past.heard.seq)).await?;
+                if receiver.past.received != before {
+                    write(&mut send, &ToServer::EventsReceived(receiver.past.received.seq)).await?;
                 }
             }
             datagram = connection.read_datagram() => {
                 let datagram = datagram.map_err(lost)?;
-                heard = Instant::now();
-                listener.take_datagram(&datagram);
+                received_at = Instant::now();
+                receiver.take_datagram(&datagram);
             }
-            message = with.outbox.next(), if listener.server.is_some() => match message {
+            message = with.outbox.next(), if receiver.server.is_some() => match message {
                 Some(message) => write(&mut send, &message).await?,
                 None => return Err(SessionEnd::Done),
             },
             _ = ticks.tick() => {
-                if heard.elapsed() > SILENCE {
+                if received_at.elapsed() > SILENCE {
                     return Err(SessionEnd::Retry("the server has been silent for 3 s".into()));
                 }
-                let silent = heard.elapsed() >= CLOCK_FAST;
-                if asked_count < CLOCK_FIRST || silent || asked.elapsed() >= CLOCK_SLOW {
-                    (asked, asked_count) = (Instant::now(), asked_count + 1);
+                let silent = received_at.elapsed() >= CLOCK_FAST;
+                if asked_count < CLOCK_FIRST || silent || asked_at.elapsed() >= CLOCK_SLOW {
+                    (asked_at, asked_count) = (Instant::now(), asked_count + 1);
                     write(&mut send, &ToServer::Clock(ClockRequest { sent: clock::now() })).await?;
                 }
             }
@@ -139,17 +139,17 @@ async fn check_preamble(receive: &mut RecvStream) -> Result<(), SessionEnd> {
     }
 }
 
-/// Acts on what the server says.
-struct Listener<'a, T> {
-    with: &'a With<'a>,
+/// Handles the server's messages.
+struct Receiver<'a, T> {
+    with: &'a SessionContext<'a>,
     past: &'a mut Past,
-    tell: &'a T,
+    handle: &'a T,
     /// The server's `boot`, once it has welcomed us.
     server: Option<u64>,
     newest_pose: ServerTime,
 }
 
-impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
+impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
     fn take(&mut self, message: Result<ToRuntime, FramingError>) -> Result<(), SessionEnd> {
         match message {
             Ok(ToRuntime::Welcome(Welcome { boot, received_events, arena })) => {
@@ -166,13 +166,13 @@ impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
             }
             Ok(ToRuntime::Event { seq, event }) => {
                 let Some(boot) = self.server else { return Err(lost("an event before Welcome")) };
-                let mut heard = self.past.heard;
-                if heard.receive(boot, seq) {
+                let mut received = self.past.received;
+                if received.receive(boot, seq) {
                     self.hand(StreamEvent::Event(event))?;
-                    self.past.heard = heard;
+                    self.past.received = received;
                 }
             }
-            Ok(ToRuntime::EventsReceived(seq)) => self.with.outbox.heard(seq),
+            Ok(ToRuntime::EventsReceived(seq)) => self.with.outbox.acknowledged(seq),
             Ok(ToRuntime::Camera { index, camera }) => {
                 self.hand(StreamEvent::Camera(index, Box::new(camera)))?;
             }
@@ -182,9 +182,10 @@ impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
         Ok(())
     }
 
-    /// What is not taken is told again on the next connection.
+    /// Hands an event to the control loop; the server sends one that is not taken again on the next
+    /// connection.
     fn hand(&self, event: StreamEvent) -> Result<(), SessionEnd> {
-        if (self.tell)(event) {
+        if (self.handle)(event) {
             Ok(())
         } else {
             Err(SessionEnd::Retry("this runtime is too busy to listen".into()))
@@ -202,7 +203,7 @@ impl<T: Fn(StreamEvent) -> bool> Listener<'_, T> {
         // Before the first clock exchange a pose cannot be placed in time.
         if let Some(stamp) = self.with.shared.clock.to_host(sample.stamp) {
             self.newest_pose = sample.stamp;
-            (self.tell)(StreamEvent::Pose(sample, stamp));
+            (self.handle)(StreamEvent::Pose(sample, stamp));
         }
     }
 }

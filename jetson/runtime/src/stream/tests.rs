@@ -52,15 +52,15 @@ impl Server {
         self.welcome_as(BOOT, |_| 0).await.0
     }
 
-    /// Accepts one runtime and welcomes it as the run `boot` of a server, which has heard of the
-    /// runtime's events what `heard` says.
-    async fn welcome_as(&self, boot: u64, heard: impl Fn(&Hello) -> u64) -> (Peer, Hello) {
+    /// Accepts one runtime and welcomes it as the run `boot` of a server, which has received as
+    /// many of the runtime's events as `received` returns.
+    async fn welcome_as(&self, boot: u64, received: impl Fn(&Hello) -> u64) -> (Peer, Hello) {
         let mut peer = self.accept(Preamble::of(PeerRole::Server)).await;
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
         assert_eq!((hello.vehicle.as_str(), hello.purpose), ("vizflyt", Purpose::Fly));
-        let received_events = ReceivedEvents { boot: hello.boot, seq: heard(&hello) };
+        let received_events = ReceivedEvents { boot: hello.boot, seq: received(&hello) };
         let welcome = Welcome { boot, received_events, arena: arena() };
-        peer.say(&ToRuntime::Welcome(welcome)).await;
+        peer.send(&ToRuntime::Welcome(welcome)).await;
         (peer, hello)
     }
 }
@@ -73,7 +73,7 @@ struct Peer {
 }
 
 impl Peer {
-    async fn say(&mut self, message: &ToRuntime) {
+    async fn send(&mut self, message: &ToRuntime) {
         self.send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
     }
 
@@ -97,12 +97,12 @@ impl Peer {
         }
     }
 
-    async fn tell(&mut self, seq: u64, text: &str) {
-        self.say(&ToRuntime::Event { seq, event: note(text) }).await;
+    async fn send_event(&mut self, seq: u64, text: &str) {
+        self.send(&ToRuntime::Event { seq, event: note(text) }).await;
     }
 
     /// Returns when the runtime acknowledges the event `seq`.
-    async fn heard(&mut self, seq: u64) {
+    async fn acknowledged(&mut self, seq: u64) {
         while self.next_but_clock().await != Some(ToServer::EventsReceived(seq)) {}
     }
 
@@ -120,7 +120,7 @@ impl Peer {
                     // This server's clock is 100 s ahead.
                     let answered = ServerTime::from_ns(host_now().as_ns() + AHEAD_NS);
                     let reply = ClockReply { sent: request.sent, answered };
-                    self.say(&ToRuntime::Clock(reply)).await;
+                    self.send(&ToRuntime::Clock(reply)).await;
                 }
                 other => return Some(other),
             }
@@ -175,8 +175,8 @@ impl Client {
             program: bounded("test"),
         };
         let sender = std::sync::Mutex::new(sender);
-        let tell = move |event| sender.lock().unwrap().send(event).is_ok();
-        tokio::spawn(run(settings, shared.clone(), Arc::clone(&outbox), tell));
+        let handle = move |event| sender.lock().unwrap().send(event).is_ok();
+        tokio::spawn(run(settings, shared.clone(), Arc::clone(&outbox), handle));
         Self { events, outbox, shared }
     }
 
@@ -194,7 +194,7 @@ impl Client {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_conversation_and_an_image() {
+async fn exchanges_messages_and_receives_an_image() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut peer = server.welcome().await;
@@ -213,7 +213,7 @@ async fn a_conversation_and_an_image() {
     assert_eq!(found, pose);
     assert!(host_now().seconds_since(host).abs() < 5.0, "on our clock: {host:?}");
     let event = Event { stamp, kind: EventKind::EmergencyStop, text: bounded("stop") };
-    peer.say(&ToRuntime::Event { seq: 1, event: event.clone() }).await;
+    peer.send(&ToRuntime::Event { seq: 1, event: event.clone() }).await;
     assert!(matches!(client.next(), StreamEvent::Event(found) if found == event));
 
     let k = Intrinsics::from_horizontal_fov(64, 48, 1.5);
@@ -284,8 +284,8 @@ async fn a_pose_that_was_overtaken_is_dropped() {
     assert_eq!((next(), next()), (5, 8));
 }
 
-/// Failed before: whatever was told while the server was away was thrown away, and the server told
-/// everything since the flight's start again.
+/// A regression: events sent while the server was away were lost, and the server sent everything since
+/// the flight's start again.
 #[tokio::test(flavor = "multi_thread")]
 async fn events_survive_an_outage_both_ways_and_come_once() {
     let server = Server::start();
@@ -293,20 +293,20 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
     let (mut peer, hello) = server.welcome_as(BOOT, |_| 0).await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
     assert_eq!(hello.received_events, ReceivedEvents::default());
-    client.outbox.tell(note("one"));
-    client.outbox.tell(note("two"));
+    client.outbox.send_event(note("one"));
+    client.outbox.send_event(note("two"));
     assert_eq!(peer.event().await.unwrap(), (1, note("one")));
     assert_eq!(peer.event().await.unwrap(), (2, note("two")));
-    // Only the first is acknowledged before the outage; the second was heard all the same.
-    peer.say(&ToRuntime::EventsReceived(1)).await;
+    // Only the first is acknowledged before the outage; the second was received all the same.
+    peer.send(&ToRuntime::EventsReceived(1)).await;
     for (seq, text) in [(4, "four"), (9, "nine")] {
-        peer.tell(seq, text).await;
+        peer.send_event(seq, text).await;
         assert!(matches!(client.next(), StreamEvent::Event(event) if event == note(text)));
     }
-    peer.heard(9).await;
+    peer.acknowledged(9).await;
     peer.connection.close(VarInt::from_u32(1), b"outage");
     assert!(matches!(client.next(), StreamEvent::Down(_)));
-    client.outbox.tell(note("three"));
+    client.outbox.send_event(note("three"));
     client.outbox.report(Telemetry::default());
 
     let (mut peer, again) = server.welcome_as(BOOT, |_| 2).await;
@@ -315,28 +315,28 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
         (again.boot, again.received_events),
         (hello.boot, ReceivedEvents { boot: BOOT, seq: 9 })
     );
-    // A server that tells something twice is heard once.
-    peer.tell(9, "nine").await;
-    peer.tell(10, "ten").await;
+    // An event that the server sends twice is handled once.
+    peer.send_event(9, "nine").await;
+    peer.send_event(10, "ten").await;
     assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("ten")));
     assert_eq!(peer.event().await.unwrap(), (3, note("three")));
-    // The server is restarted: it has heard nothing, and numbers its events anew.
+    // The server is restarted: it has received nothing, and numbers its events anew.
     peer.connection.close(VarInt::from_u32(1), b"restart");
     assert!(matches!(client.next(), StreamEvent::Down(_)));
     let (mut peer, _) = server.welcome_as(BOOT + 1, |_| 0).await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
     assert_eq!(peer.event().await.unwrap(), (3, note("three")), "what nobody acknowledged");
-    peer.tell(1, "first").await;
+    peer.send_event(1, "first").await;
     assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("first")));
-    // It ends when the last event is heard.
+    // It ends when the last event is acknowledged.
     client.outbox.close();
-    peer.say(&ToRuntime::EventsReceived(3)).await;
+    peer.send(&ToRuntime::EventsReceived(3)).await;
     while peer.next_but_clock().await.is_some() {}
     peer.connection.closed().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_event_that_found_no_room_is_told_again() {
+async fn event_that_was_not_taken_is_sent_again() {
     let server = Server::start();
     let (sender, events) = channel();
     let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
@@ -350,17 +350,17 @@ async fn an_event_that_found_no_room_is_told_again() {
     };
     let (sender, refused) = (Mutex::new(sender), std::sync::atomic::AtomicBool::new(false));
     // The control loop is stalled when the event comes for the first time.
-    let tell = move |event| {
+    let handle = move |event| {
         let is_event = matches!(event, StreamEvent::Event(_));
         let stalled = is_event && !refused.swap(true, std::sync::atomic::Ordering::Relaxed);
         !stalled && sender.lock().unwrap().send(event).is_ok()
     };
-    tokio::spawn(run(settings, shared, Arc::default(), tell));
+    tokio::spawn(run(settings, shared, Arc::default(), handle));
     let mut peer = server.welcome().await;
-    peer.tell(1, "stop").await;
+    peer.send_event(1, "stop").await;
     let (mut again, hello) = server.welcome_as(BOOT, |_| 0).await;
     assert_eq!(hello.received_events.of(BOOT), 0);
-    again.tell(1, "stop").await;
+    again.send_event(1, "stop").await;
     let wait = || events.recv_timeout(WAIT).unwrap();
     while !matches!(tokio::task::block_in_place(wait), StreamEvent::Event(e) if e == note("stop")) {
     }
@@ -394,7 +394,7 @@ async fn another_certificate_is_refused_with_its_fingerprint() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn after_an_outage_or_a_silence_it_connects_anew() {
+async fn reconnects_after_an_outage_or_a_silence() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let peer = server.welcome().await;
@@ -420,7 +420,7 @@ async fn a_refusal_is_tried_again() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut peer = server.accept(Preamble::of(PeerRole::Server)).await;
-    peer.say(&ToRuntime::Refused(bounded("another runtime flies vizflyt"))).await;
+    peer.send(&ToRuntime::Refused(bounded("another runtime flies vizflyt"))).await;
     let StreamEvent::Down(why) = client.next() else { panic!("not down") };
     assert!(why.contains("another runtime flies"), "{why}");
     let _peer = server.welcome().await;

@@ -17,7 +17,7 @@ use nix::unistd::Pid;
 
 use super::limits::PluginLimits;
 
-/// What a group can limit.
+/// The limits of a group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Controller {
     Memory,

@@ -4,8 +4,8 @@
 //! |---|---|---|
 //! | memory, processes | control group | `RLIMIT_DATA` and `RLIMIT_NPROC`, and counting by the supervisor |
 //! | processors | control group | it is kept off the first processor |
-//! | network, the system itself | seccomp | said once |
-//! | writing outside its folders, reading what is hidden, signalling others | Landlock | said once |
+//! | network, the system itself | seccomp | reported once |
+//! | writing outside its folders, reading what is hidden, signalling others | Landlock | reported once |
 //! | the runtime's user | another user, if root | it keeps root's name without root's powers |
 //!
 //! All is prepared before the fork; after it only system calls are made.
@@ -39,7 +39,7 @@ use seccompiler::{
 use super::cgroup::{Cgroup, Controller};
 use super::limits::PluginLimits;
 
-/// What a plugin will be confined to. Good for any number of starts.
+/// The confinement of a plugin, for any number of starts.
 #[derive(Debug)]
 pub struct Confinement {
     pub(super) limits: PluginLimits,
@@ -52,7 +52,7 @@ pub struct Confinement {
     notes: Vec<String>,
 }
 
-/// What holds for one process, beside the confinement.
+/// The limits of one process, beside the confinement.
 pub(super) struct Bounds {
     group: Cgroup,
     memory: Option<u64>,
@@ -147,7 +147,7 @@ impl Confinement {
             for &door in &doors {
                 // SAFETY: writes a byte that outlives the call to a file that our parent holds.
                 let written = unsafe { libc::write(door, b"0".as_ptr().cast(), 1) };
-                said(check(written), "it cannot join its control group")?;
+                explained(check(written), "it cannot join its control group")?;
             }
             if let Some(processors) = &processors {
                 nix::sched::sched_setaffinity(Pid::from_raw(0), processors)?;
@@ -156,11 +156,11 @@ impl Confinement {
                 [(Resource::RLIMIT_DATA, memory), (Resource::RLIMIT_NPROC, processes)]
             {
                 if let Some(most) = most {
-                    said(lower(resource, most), "its limits cannot be set")?;
+                    explained(lower(resource, most), "its limits cannot be set")?;
                 }
             }
             if let Some((uid, gid)) = user {
-                said(become_user(uid, gid), "it cannot become another user")?;
+                explained(become_user(uid, gid), "it cannot become another user")?;
             }
             if drops_powers {
                 drop_capabilities();
@@ -175,12 +175,15 @@ impl Confinement {
             if let Some(landlock) = landlock {
                 // SAFETY: landlock_restrict_self(2) with a ruleset that our parent holds.
                 let done = unsafe { libc::syscall(libc::SYS_landlock_restrict_self, landlock, 0) };
-                said(check(done as isize), "Landlock refuses")?;
+                explained(check(done as isize), "Landlock refuses")?;
             }
             for filter in &filters {
-                // Its errors hold no memory; what they say is for the log of a kernel developer.
+                // Its errors hold no memory; their text is for a kernel developer.
                 let applied = seccompiler::apply_filter(filter);
-                said(applied.map_err(|_| io::ErrorKind::Unsupported.into()), "seccomp refuses")?;
+                explained(
+                    applied.map_err(|_| io::ErrorKind::Unsupported.into()),
+                    "seccomp refuses",
+                )?;
             }
             Ok(())
         };
@@ -201,9 +204,9 @@ impl Bounds {
     }
 }
 
-/// Passes a result on; before an error, says on standard error, which the supervisor reads, what
-/// was tried: only a number gets through exec.
-fn said(result: io::Result<()>, what: &'static str) -> io::Result<()> {
+/// Passes a result on; before an error, writes to standard error, which the supervisor reads, what
+/// failed: only a number gets through exec.
+fn explained(result: io::Result<()>, what: &'static str) -> io::Result<()> {
     if result.is_err() {
         for part in ["confining the plugin: ", what, "\n"] {
             // SAFETY: writes bytes that live for ever to the process's own standard error.
@@ -427,7 +430,7 @@ fn filters(limits: &PluginLimits) -> Result<Vec<BpfProgram>, seccompiler::Backen
     Ok(filters)
 }
 
-/// What no plugin needs: to look into other processes, to change the system, and io_uring, whose
+/// System calls that no plugin needs: to look into other processes, to change the system, and io_uring, whose
 /// requests a filter does not see.
 const FORBIDDEN: [i64; 31] = [
     libc::SYS_ptrace,

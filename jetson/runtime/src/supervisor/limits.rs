@@ -1,4 +1,4 @@
-//! What a plugin may use, and what happens when it ends: the settings, from `[plugin]` in
+//! Limits of a plugin, and what happens when it ends: the settings, from `[plugin]` in
 //! `jetson.toml`.
 
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ pub enum Restart {
     InFlight,
 }
 
-/// What a plugin may use. Memory, processors and processes count for it and all it starts.
+/// Limits of a plugin. Memory, processors and processes count for it and all it starts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PluginLimits {
     /// Memory. [MB]
@@ -53,7 +53,7 @@ impl Default for PluginLimits {
         Self {
             // Half of what there is: the other half is for the runtime, and on one computer for
             // the server.
-            memory_mb: (memory_total_mb() / 2).max(LEAST_MEMORY_MB),
+            memory_mb: (memory_total_mb() / 2).max(MIN_MEMORY_MB),
             // One is left for the runtime, so that setpoints leave in time.
             cpus: available_parallelism().map_or(1.0, |n| (n.get() as f64 - 1.0).max(1.0)),
             // numpy, OpenCV and torch start one to two threads per processor each.
@@ -72,25 +72,25 @@ impl Default for PluginLimits {
 }
 
 /// Less than this, no interpreter starts. [MB]
-pub const LEAST_MEMORY_MB: u64 = 64;
+pub const MIN_MEMORY_MB: u64 = 64;
 
 /// Linux takes environment variables of 128 KiB: some thousand obstacles.
-const MOST_MAP: usize = 120 * 1024;
+const MAX_MAP: usize = 120 * 1024;
 
 impl PluginLimits {
     /// Hands the plugin a map, if it is one.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The fault.
     pub fn hand_map(&mut self, text: &str) -> Result<(), String> {
         let volumes = vizflyt_sdk::parse_map(text).map_err(|error| error.to_string())?;
         let text = text.trim().to_owned();
-        if text.len() > MOST_MAP {
+        if text.len() > MAX_MAP {
             return Err(format!(
                 "the map of {} obstacles has {} kB, more than the {} kB that a plugin can be handed",
                 volumes.len(),
                 text.len() / 1024,
-                MOST_MAP / 1024
+                MAX_MAP / 1024
             ));
         }
         self.map = Some(text);
@@ -100,7 +100,7 @@ impl PluginLimits {
     /// As [`Self::hand_map`], of a file.
     ///
     /// # Errors
-    /// What is wrong with it, and its name.
+    /// The fault, and the name.
     pub fn hand_map_file(&mut self, path: &Path) -> anyhow::Result<()> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("the map {} cannot be read", path.display()))?;
@@ -113,9 +113,9 @@ impl PluginLimits {
     /// # Errors
     /// One sentence that names the setting.
     pub fn check(&self) -> Result<(), String> {
-        if self.memory_mb < LEAST_MEMORY_MB {
+        if self.memory_mb < MIN_MEMORY_MB {
             return Err(format!(
-                "plugin.memory_mb = {}: give {LEAST_MEMORY_MB} or more",
+                "plugin.memory_mb = {}: give {MIN_MEMORY_MB} or more",
                 self.memory_mb
             ));
         }
@@ -132,7 +132,7 @@ impl PluginLimits {
     }
 }
 
-/// Returns this computer's memory; 4 GB where the system does not tell. [MB]
+/// Returns this computer's memory; 4 GB where the system does not report it. [MB]
 fn memory_total_mb() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let kib = text.lines().find_map(|line| line.strip_prefix("MemTotal:"));

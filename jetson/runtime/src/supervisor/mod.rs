@@ -1,8 +1,8 @@
 //! The plugin as a child process: confined before its first instruction, its output read line by
-//! line, its limits watched, its death noticed at once and told in one sentence, never outliving
+//! line, its limits watched, its end noticed at once and reported in one sentence, never outliving
 //! the runtime.
 //!
-//! [`PluginLimits`] says what it may use, [`Confinement`] turns that into what this kernel offers,
+//! [`PluginLimits`] is what it may use, [`Confinement`] turns that into what this kernel offers,
 //! [`Supervisor`] is one running process. When to start the next one is for the
 //! [control loop](crate::control) to decide.
 
@@ -29,7 +29,7 @@ use confine::Bounds;
 use output::{Tracebacks, read_lines};
 
 pub use confine::Confinement;
-pub use limits::{LEAST_MEMORY_MB, PluginLimits, Restart};
+pub use limits::{MIN_MEMORY_MB, PluginLimits, Restart};
 pub use output::LINE_BYTES;
 
 /// Which of the two outputs a line came from.
@@ -41,7 +41,7 @@ pub enum Stream {
     Stderr,
 }
 
-/// What the supervisor tells.
+/// An event of the plugin's process.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PluginEvent {
     /// A line that the plugin printed, cut at [`LINE_BYTES`].
@@ -58,17 +58,17 @@ pub struct Supervisor {
     shared: Arc<SharedState>,
 }
 
-/// What the supervisor's threads share.
+/// State that the supervisor's threads share.
 struct SharedState {
     group: Pid,
     bounds: Bounds,
     limits: PluginLimits,
     ended: Mutex<Option<ExitStatus>>,
     changed: Condvar,
-    /// The newest words on standard error.
+    /// The newest line on standard error.
     last_error: Mutex<String>,
     /// Why the supervisor itself ended it.
-    verdict: Mutex<Option<String>>,
+    kill_reason: Mutex<Option<String>>,
 }
 
 /// Time a plugin has to end when asked.
@@ -77,7 +77,7 @@ const END_WITHIN: Duration = Duration::from_millis(300);
 const WATCH_EVERY: Duration = Duration::from_millis(100);
 
 impl Supervisor {
-    /// Starts `command` (program, then arguments), confined. `tell` is called from the
+    /// Starts `command` (program, then arguments), confined. `handle` is called from the
     /// supervisor's threads.
     ///
     /// The child dies with the thread that calls this (`PR_SET_PDEATHSIG`): call it from one that
@@ -88,7 +88,7 @@ impl Supervisor {
     pub fn start(
         command: &[OsString],
         confinement: &Confinement,
-        tell: impl Fn(PluginEvent) + Clone + Send + 'static,
+        handle: impl Fn(PluginEvent) + Clone + Send + 'static,
     ) -> io::Result<Self> {
         let (program, arguments) = command
             .split_first()
@@ -111,7 +111,7 @@ impl Supervisor {
         confinement.apply(&mut process, &bounds);
         let mut child = process.spawn()?;
         for note in notes {
-            tell(PluginEvent::Note(note));
+            handle(PluginEvent::Note(note));
         }
         let shared = Arc::new(SharedState {
             group: Pid::from_raw(child.id() as i32),
@@ -120,32 +120,32 @@ impl Supervisor {
             ended: Mutex::new(None),
             changed: Condvar::new(),
             last_error: Mutex::new(String::new()),
-            verdict: Mutex::new(None),
+            kill_reason: Mutex::new(None),
         });
         if let Some(stdout) = child.stdout.take() {
-            let tell = tell.clone();
+            let handle = handle.clone();
             spawn("plugin-stdout", move || {
-                read_lines(stdout, |line| tell(PluginEvent::Line(Stream::Stdout, line)));
+                read_lines(stdout, |line| handle(PluginEvent::Line(Stream::Stdout, line)));
             })?;
         }
         if let Some(stderr) = child.stderr.take() {
-            let (tell, shared) = (tell.clone(), Arc::clone(&shared));
+            let (handle, shared) = (handle.clone(), Arc::clone(&shared));
             let mut tracebacks = Tracebacks::new(confinement.own_folders().to_vec());
             spawn("plugin-stderr", move || {
-                let mut tell = |line| tell(PluginEvent::Line(Stream::Stderr, line));
+                let mut handle = |line| handle(PluginEvent::Line(Stream::Stderr, line));
                 read_lines(stderr, |line| {
                     if !line.trim().is_empty() {
                         lock(&shared.last_error).clone_from(&line);
                     }
-                    tracebacks.take(line, &mut tell);
+                    tracebacks.take(line, &mut handle);
                 });
-                tracebacks.end(&mut tell);
+                tracebacks.end(&mut handle);
             })?;
         }
         let watched = Arc::clone(&shared);
         spawn("plugin-watch", move || watched.watch())?;
         let waited = Arc::clone(&shared);
-        spawn("plugin-wait", move || waited.wait(child, &tell))?;
+        spawn("plugin-wait", move || waited.wait(child, &handle))?;
         Ok(Self { shared })
     }
 
@@ -172,7 +172,7 @@ impl Supervisor {
         }
     }
 
-    /// Kills the process and all it started; does not wait for its end, which is told.
+    /// Kills the process and all it started; does not wait for its end, which is reported.
     pub fn kill(&self) {
         if self.is_running() {
             self.shared.kill();
@@ -212,7 +212,7 @@ impl SharedState {
     fn watch(&self) {
         while !self.wait_ended(WATCH_EVERY) {
             if let Some(sentence) = self.beyond_limits() {
-                *lock(&self.verdict) = Some(sentence);
+                *lock(&self.kill_reason) = Some(sentence);
                 self.kill();
                 return;
             }
@@ -224,25 +224,25 @@ impl SharedState {
         watch::beyond_limits(&self.limits, self.bounds.group(), counted)
     }
 
-    /// Waits for the end of the process, tells it at once, and ends what it left behind.
-    fn wait(&self, mut child: Child, tell: &impl Fn(PluginEvent)) {
+    /// Waits for the end of the process, reports it at once, and ends what it left behind.
+    fn wait(&self, mut child: Child, handle: &impl Fn(PluginEvent)) {
         let status = child.wait();
         // What it left behind would keep the pipes open and the processor busy.
         self.kill();
-        // The last words travel through a pipe that another thread reads; they are usually there.
+        // The last lines travel through a pipe that another thread reads; they are usually there.
         // Waiting for them would delay the landing, so they are not waited for.
         let last = lock(&self.last_error).clone();
-        let verdict = lock(&self.verdict).take();
+        let kill_reason = lock(&self.kill_reason).take();
         let sentence = match &status {
             // The kernel may have been faster than the watch.
-            Ok(status) => verdict
+            Ok(status) => kill_reason
                 .or_else(|| watch::beyond_limits(&self.limits, self.bounds.group(), None))
                 .unwrap_or_else(|| describe(*status, &last)),
             Err(error) => format!("the plugin cannot be watched: {error}"),
         };
         *lock(&self.ended) = Some(status.unwrap_or_default());
         self.changed.notify_all();
-        tell(PluginEvent::Exited(sentence));
+        handle(PluginEvent::Exited(sentence));
     }
 }
 
@@ -287,12 +287,12 @@ fn describe(status: ExitStatus, last_error: &str) -> String {
 
 /// Returns what lies behind an error that a limit causes.
 fn hint(last_error: &str) -> &'static str {
-    let says = |marks: &[&str]| marks.iter().any(|mark| last_error.contains(mark));
-    if says(&["memory allocation of", "MemoryError", "bad_alloc"]) {
+    let mentions = |marks: &[&str]| marks.iter().any(|mark| last_error.contains(mark));
+    if mentions(&["memory allocation of", "MemoryError", "bad_alloc"]) {
         " (memory_mb in [plugin] allows no more)"
-    } else if says(&["Network is unreachable"]) {
+    } else if mentions(&["Network is unreachable"]) {
         " (a plugin has no network unless [plugin] says network = true)"
-    } else if says(&["Permission denied", "PermissionError"]) {
+    } else if mentions(&["Permission denied", "PermissionError"]) {
         " (a plugin writes in its own folder, /tmp, and what [plugin] write lists)"
     } else {
         ""

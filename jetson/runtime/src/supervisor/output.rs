@@ -16,32 +16,32 @@ const TRACEBACK_LINES: usize = 200;
 const FOREIGN_CALLS: usize = 6;
 
 /// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`].
-pub(super) fn read_lines(pipe: impl Read, mut tell: impl FnMut(String)) {
+pub(super) fn read_lines(pipe: impl Read, mut emit: impl FnMut(String)) {
     let mut reader = BufReader::new(pipe);
     let (mut window, mut passed, mut dropped) = (Instant::now(), 0, 0u64);
     let mut first = true;
-    let mut cut = |dropped: u64, tell: &mut dyn FnMut(String)| {
-        // The first time it says why; then it is a count.
+    let mut cut = |dropped: u64, emit: &mut dyn FnMut(String)| {
+        // The first message has the reason; the others are counts.
         let why = if first { "; printing less per image shows more" } else { "" };
         first = false;
-        tell(format!("({dropped} more lines in that second were dropped{why})"));
+        emit(format!("({dropped} more lines in that second were dropped{why})"));
     };
     while let Ok(Some(line)) = read_line(&mut reader) {
         if window.elapsed() >= Duration::from_secs(1) {
             if dropped > 0 {
-                cut(dropped, &mut tell);
+                cut(dropped, &mut emit);
             }
             (window, passed, dropped) = (Instant::now(), 0, 0);
         }
         if passed < LINES_PER_SECOND {
             passed += 1;
-            tell(line);
+            emit(line);
         } else {
             dropped += 1;
         }
     }
     if dropped > 0 {
-        cut(dropped, &mut tell);
+        cut(dropped, &mut emit);
     }
 }
 
@@ -105,12 +105,12 @@ impl Tracebacks {
     }
 
     /// Takes a line of the error output.
-    pub(super) fn take(&mut self, line: String, tell: &mut impl FnMut(String)) {
+    pub(super) fn take(&mut self, line: String, emit: &mut impl FnMut(String)) {
         let Some(held) = &mut self.held else {
             if line == FIRST {
                 self.held = Some(vec![line]);
             } else {
-                tell(line);
+                emit(line);
             }
             return;
         };
@@ -121,37 +121,37 @@ impl Tracebacks {
         }
         let held = self.held.take().unwrap_or_default();
         match calls(&held) {
-            // Words at the margin end it: `ValueError: ...`.
+            // A line at the margin ends it: `ValueError: ...`.
             Some(calls) if !line.starts_with(' ') && !line.is_empty() => {
-                self.turn_round(&line, &calls, tell);
+                self.innermost_first(&line, &calls, emit);
             }
-            _ => held.into_iter().chain([line]).for_each(tell),
+            _ => held.into_iter().chain([line]).for_each(emit),
         }
     }
 
-    /// The output has ended: tells what was held back.
-    pub(super) fn end(self, tell: &mut impl FnMut(String)) {
-        self.held.into_iter().flatten().for_each(tell);
+    /// The output has ended: emits the lines that were held back.
+    pub(super) fn end(self, emit: &mut impl FnMut(String)) {
+        self.held.into_iter().flatten().for_each(emit);
     }
 
-    fn turn_round(&self, what: &str, calls: &[Call], tell: &mut impl FnMut(String)) {
-        tell(what.to_owned());
+    fn innermost_first(&self, what: &str, calls: &[Call], emit: &mut impl FnMut(String)) {
+        emit(what.to_owned());
         let (own, foreign): (Vec<&Call>, Vec<&Call>) =
             calls.iter().rev().partition(|call| self.is_own(call.path));
         for call in &own {
-            tell(format!("  {}", self.describe(call)));
+            emit(format!("  {}", self.describe(call)));
         }
         if foreign.is_empty() {
             return;
         }
         if !own.is_empty() {
-            tell("  in other people's code:".to_owned());
+            emit("  in other people's code:".to_owned());
         }
         for call in foreign.iter().take(FOREIGN_CALLS) {
-            tell(format!("    {}", self.describe(call)));
+            emit(format!("    {}", self.describe(call)));
         }
         if foreign.len() > FOREIGN_CALLS {
-            tell(format!("    and {} calls more", foreign.len() - FOREIGN_CALLS));
+            emit(format!("    and {} calls more", foreign.len() - FOREIGN_CALLS));
         }
     }
 

@@ -27,11 +27,11 @@ fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
 fn start_with(limits: &PluginLimits, command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
     let (sender, receiver) = channel();
     let command: Vec<OsString> = command.iter().map(OsString::from).collect();
-    let tell = move |event| {
+    let handle = move |event| {
         let _ = sender.send(event);
     };
     let confinement = Confinement::prepare(limits, &command);
-    (Supervisor::start(&command, &confinement, tell).unwrap(), receiver)
+    (Supervisor::start(&command, &confinement, handle).unwrap(), receiver)
 }
 
 /// Returns the lines and the last sentence of a child that ends by itself.
@@ -72,7 +72,7 @@ fn check_sentence(script: &str, expected: &str) {
 }
 
 #[test]
-fn each_way_to_end_has_its_sentence() {
+fn every_kind_of_exit_has_its_sentence() {
     check_sentence("exit 0", "the plugin ended by itself (exit status 0)");
     check_sentence("exit 7", "the plugin ended with exit status 7");
     check_sentence("kill -SEGV $$", "the plugin was killed by SIGSEGV: it touched memory");
@@ -136,12 +136,12 @@ fn the_child_dies_with_the_thread_that_started_it() {
     let (sender, receiver) = channel();
     let starter = thread::spawn(move || {
         let command = ["sh", "-c", "echo up; sleep 1000"].map(OsString::from);
-        let tell = move |event| {
+        let handle = move |event| {
             let _ = sender.send(event);
         };
         // Forgotten, as by a runtime that is killed.
         let confinement = Confinement::prepare(&PluginLimits::default(), &command);
-        std::mem::forget(Supervisor::start(&command, &confinement, tell).unwrap());
+        std::mem::forget(Supervisor::start(&command, &confinement, handle).unwrap());
     });
     starter.join().unwrap();
     let end = std::iter::from_fn(|| receiver.recv_timeout(WAIT).ok())
@@ -176,14 +176,14 @@ print('unshare', libc.unshare(0x10000000), os.strerror(ctypes.get_errno()))
 print('ptrace', libc.ptrace(16, os.getppid(), 0, 0), os.strerror(ctypes.get_errno()))
 socket.create_connection(('192.0.2.1', 80), timeout=1)
 ";
-    let (said, sentence) = python(&PluginLimits::default(), program);
+    let (output, sentence) = python(&PluginLimits::default(), program);
     let expected = "Network is unreachable\nNetwork is unreachable\nunix\n\
                     unshare -1 Operation not permitted\nptrace -1 Operation not permitted";
-    assert!(said.starts_with(expected), "{said}");
+    assert!(output.starts_with(expected), "{output}");
     assert!(sentence.contains("no network unless [plugin] says network = true"), "{sentence}");
     let allowed = PluginLimits { network: true, ..PluginLimits::default() };
-    let (said, _) = python(&allowed, "import socket; socket.socket(); print('open')");
-    assert_eq!(said, "open");
+    let (output, _) = python(&allowed, "import socket; socket.socket(); print('open')");
+    assert_eq!(output, "open");
 }
 
 #[test]
@@ -201,16 +201,16 @@ except PermissionError:
     print('no signal')
 open({file:?}, 'w').write('x'); print('written')"
     );
-    let (said, sentence) = python(&PluginLimits::default(), &program);
+    let (output, sentence) = python(&PluginLimits::default(), &program);
     // Where the kernel has no Landlock, a user of its own may still keep it out.
     if !Confinement::prepare(&PluginLimits::default(), &[]).is_partial() {
-        assert!(said.contains("scratch\nno signal"), "{said}");
-        assert!(!file.exists(), "{said}");
+        assert!(output.contains("scratch\nno signal"), "{output}");
+        assert!(!file.exists(), "{output}");
         assert!(sentence.contains("a plugin writes in its own folder"), "{sentence}");
     }
     let limits = PluginLimits { write: vec![folder.path().to_owned()], ..PluginLimits::default() };
-    let (said, _) = python(&limits, &program);
-    assert!(said.contains("written") && file.exists(), "{said}");
+    let (output, _) = python(&limits, &program);
+    assert!(output.contains("written") && file.exists(), "{output}");
 }
 
 #[test]
@@ -229,11 +229,14 @@ fn it_does_not_read_what_is_hidden_and_reads_the_rest() {
         secret.display()
     );
     let limits = PluginLimits { hide: vec![secret], ..PluginLimits::default() };
-    let (said, sentence) = python(&limits, &program);
+    let (output, sentence) = python(&limits, &program);
     if Confinement::prepare(&limits, &[]).is_partial() {
-        assert_eq!(said, "read\nread", "without Landlock only the user's rights count: {sentence}");
+        assert_eq!(
+            output, "read\nread",
+            "without Landlock only the user's rights count: {sentence}"
+        );
     } else {
-        assert!(said.starts_with("read\n") && said.contains("PermissionError"), "{said}");
+        assert!(output.starts_with("read\n") && output.contains("PermissionError"), "{output}");
     }
 }
 
@@ -245,12 +248,16 @@ status = open('/proc/self/status').read()
 print(os.geteuid() == 0, [line.split()[1] for line in status.splitlines() if 'CapEff' in line])";
     for user in [None, Some("root".to_owned()), Some("nobody".to_owned())] {
         let limits = PluginLimits { user: user.clone(), ..PluginLimits::default() };
-        let (said, _) = python(&limits, program);
-        assert!(said.contains("0000000000000000"), "{user:?}: {said}");
+        let (output, _) = python(&limits, program);
+        assert!(output.contains("0000000000000000"), "{user:?}: {output}");
         // By name, if asked for, or if no other user could read what it runs.
         let command = ["python3", "-c", program].map(OsString::from);
         let changes = Confinement::prepare(&limits, &command).user_id().is_some();
-        assert_eq!(said.starts_with("False"), changes || !geteuid().is_root(), "{user:?}: {said}");
+        assert_eq!(
+            output.starts_with("False"),
+            changes || !geteuid().is_root(),
+            "{user:?}: {output}"
+        );
     }
 }
 
@@ -262,7 +269,7 @@ held = []
 while True: held.append(bytearray(5_000_000))";
     let (_, sentence) = python(&limits, program);
     assert!(sentence.contains("more than its 200 MB of memory"), "{sentence}");
-    // Without a control group the interpreter itself is refused, and says so.
+    // Without a control group the interpreter itself is refused, and reports it.
     assert_eq!(hint("MemoryError"), " (memory_mb in [plugin] allows no more)");
 }
 
@@ -348,7 +355,7 @@ impl Rig {
     /// Returns the plugin's next message; `None` if the plugin ends instead.
     fn next(&mut self) -> Option<FromPlugin> {
         loop {
-            // Looked at first: what a plugin said before it ended is still read.
+            // Checked first: messages that a plugin sent before it ended are still read.
             let running = self.supervisor.is_running();
             if let Some(message) = self.ipc.receive().unwrap() {
                 return Some(message);
@@ -383,11 +390,11 @@ impl Rig {
 }
 
 #[test]
-fn a_good_plugin_answers_each_image_and_stops_when_told() {
+fn plugin_replies_to_each_image_and_stops_on_request() {
     let mut rig = Rig::start("hover");
     for _ in 0..50 {
         rig.publish();
-        let Some(FromPlugin::Answer { seq, entered, returned, setpoint }) = rig.next() else {
+        let Some(FromPlugin::Reply { seq, entered, returned, setpoint }) = rig.next() else {
             panic!("no answer")
         };
         assert_eq!((seq, setpoint), (rig.seq, Some(Setpoint::Hold)));
@@ -403,7 +410,7 @@ fn a_good_plugin_answers_each_image_and_stops_when_told() {
 }
 
 #[test]
-fn a_panic_is_told_with_its_message() {
+fn panic_is_reported_with_its_message() {
     let mut rig = Rig::start("panic");
     rig.publish();
     let Some(FromPlugin::Failed { reason }) = rig.next() else { panic!("no failure") };

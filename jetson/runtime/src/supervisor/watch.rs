@@ -7,7 +7,7 @@ use nix::unistd::Pid;
 use super::cgroup::Cgroup;
 use super::limits::PluginLimits;
 
-/// What the processes of a group hold together.
+/// The memory and the number of the processes of a group.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Usage {
     /// Memory of their own: shared pages count for whoever made them. [bytes]

@@ -104,7 +104,7 @@ fn the_reference_waits_for_the_vehicle() {
     let mut follower = Follower::new(way(&[(DVec3::new(9.0, 0.0, 1.0), 3.0)]), &start());
     for _ in 0..500 {
         let reference = follower.advance(DVec3::Z, LIMITS, DT_S);
-        assert!(reference.p_world_m.x <= MOST_LAG_M, "{}", reference.p_world_m);
+        assert!(reference.p_world_m.x <= MAX_LAG_M, "{}", reference.p_world_m);
     }
     assert!(!follower.is_over());
     // Far from the beginning of a polynomial it does not begin.

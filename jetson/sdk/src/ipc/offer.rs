@@ -8,7 +8,7 @@ use std::{fs, process};
 
 use super::user_folder;
 
-/// A runtime's word that it waits for a plugin; taken back when dropped.
+/// A runtime's offer to a plugin that it waits for; withdrawn when dropped.
 #[derive(Debug)]
 pub struct Offer {
     file: PathBuf,

@@ -84,7 +84,7 @@ impl PluginEnd {
             .map_err(IpcError::transport(port))?;
         let wake_plugin =
             event("wake_plugin")?.listener_builder().create().map_err(IpcError::transport(port))?;
-        // Last: its presence tells the runtime that the plugin is complete.
+        // Last: its presence shows the runtime that the plugin is complete.
         let to_plugin =
             open("to_plugin")?.subscriber_builder().create().map_err(IpcError::transport(port))?;
         Ok(Self { observations, from_plugin, wake_runtime, wake_plugin, to_plugin, _node: node })

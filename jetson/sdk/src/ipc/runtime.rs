@@ -169,7 +169,7 @@ impl RuntimeEnd {
     /// Wakes the plugin. At least twice a second, so that it knows the runtime is alive.
     pub fn heartbeat(&self) {
         let _acting = Acting::as_user(self.owner);
-        // Nobody listening is no fault: the supervisor tells whether the plugin lives.
+        // A missing listener is no fault: the supervisor reports whether the plugin lives.
         let _ = self.wake_plugin.notify();
     }
 

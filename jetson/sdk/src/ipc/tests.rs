@@ -60,7 +60,7 @@ fn messages_arrive_both_ways_in_order() {
     }
     assert_eq!(plugin.receive().unwrap(), None);
 
-    let answer = FromPlugin::Answer {
+    let answer = FromPlugin::Reply {
         seq: 7,
         entered: HostTime::from_ns(1),
         returned: HostTime::from_ns(2),

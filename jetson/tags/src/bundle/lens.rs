@@ -4,7 +4,7 @@ use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
 /// Numbers of a lens that are found: fx, fy, cx, cy, then k1 k2 p1 p2 or k1 k2 k3 k4. k3 of
-/// Brown-Conrady stays as it is: boards do not reach far enough out to tell it from k2.
+/// Brown-Conrady stays as it is: boards do not reach far enough out to separate it from k2.
 pub(crate) const LENS: usize = 8;
 
 pub(super) struct Projected {

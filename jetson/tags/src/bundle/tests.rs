@@ -82,7 +82,7 @@ fn the_reported_covariance_matches_the_error() {
         }
     }
     let ratio: f64 = square / count;
-    assert!((0.3..2.5).contains(&ratio), "errors are {} of what is said", ratio.sqrt());
+    assert!((0.3..2.5).contains(&ratio), "errors are {} of the predicted", ratio.sqrt());
 }
 
 #[test]

@@ -63,7 +63,7 @@ impl Board {
     /// Returns how many corners make a view: of fewer the homography is shaky.
     pub(super) fn least_corners(&self) -> usize {
         match self {
-            Self::Tags(_) => 4 * LEAST_TAGS,
+            Self::Tags(_) => 4 * MIN_TAGS,
             Self::Checkerboard(board) => board.count(),
         }
     }
@@ -86,4 +86,4 @@ impl Board {
 }
 
 /// Tags that a view must have.
-const LEAST_TAGS: usize = 4;
+const MIN_TAGS: usize = 4;

@@ -57,7 +57,7 @@ impl Coverage {
             rows.flat_map(|row| columns.clone().map(move |column| row * COLUMNS + column))
                 .any(|part| self.counts[part] < ENOUGH)
         };
-        // Thirds of the image; corners first, which are the hardest to reach and say most.
+        // Thirds of the image; corners first, which are the hardest to reach and constrain the lens most.
         let [low, mid, high] = [0..1, 1..ROWS - 1, ROWS - 1..ROWS];
         let [left, middle, right] = [0..1, 1..COLUMNS - 1, COLUMNS - 1..COLUMNS];
         for (name, rows, columns) in [
@@ -77,7 +77,7 @@ impl Coverage {
         }
         let names = ["to the left", "to the right", "upwards", "downwards"];
         for (tilt_rad, name) in self.tilts_rad.iter().zip(names) {
-            if *tilt_rad < LEAST_TILT_RAD {
+            if *tilt_rad < MIN_TILT_RAD {
                 wanted.push(format!("turn the board to face {name} by 30 degrees"));
             }
         }
@@ -91,4 +91,4 @@ const ROWS: usize = 4;
 /// Corners that a part of the image must have.
 const ENOUGH: u32 = 4;
 /// Boards that face the camera carry little information on the focal length: 18 degrees at least. [rad]
-const LEAST_TILT_RAD: f64 = 0.314;
+const MIN_TILT_RAD: f64 = 0.314;

@@ -1,4 +1,4 @@
-//! The board's plane in an image: its homography, what that says of the focal length, its pose.
+//! The board's plane in an image: its homography, the focal length from it, its pose.
 
 use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::Intrinsics;

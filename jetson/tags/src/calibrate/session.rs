@@ -6,7 +6,7 @@ use crate::family::TagFamily;
 use crate::image::Gray;
 use vizflyt_protocol::geometry::Intrinsics;
 
-/// Takes images of a board until they say enough of the lens.
+/// Takes images of a board until they determine the lens.
 ///
 /// Corners are measured along edges that are straight behind the lens; at first nobody knows the lens.
 /// So chosen images are kept, and looked at again once a first lens is found.
@@ -80,7 +80,7 @@ impl Session {
     /// Returns the lens.
     ///
     /// # Errors
-    /// [`Refused`] for images that do not determine one well: it says what to add.
+    /// [`Refused`] for images that do not determine one well: its message lists what to add.
     pub fn finish(mut self) -> Result<Calibrated, Refused> {
         let Some(calibrator) = self.calibrator else {
             return Err(Refused {

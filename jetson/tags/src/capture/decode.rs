@@ -11,7 +11,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::image::Gray;
 
-/// Returns the image in a file's bytes, which say themselves what they are; colours become grey.
+/// Returns the image in a file's bytes, whose format is detected; colours become grey.
 ///
 /// # Errors
 /// What is wrong with it, in words.

@@ -69,7 +69,7 @@ impl ImageSource for Folder {
         let path = self.path.join(name);
         let bytes = std::fs::read(&path)
             .map_err(|error| CaptureError::io(path.display().to_string(), error))?;
-        // A folder is not the air: a damaged file is worth a word, not to be skipped in silence.
+        // Unlike a radio link, a folder should be complete: a damaged file is reported, not skipped.
         let image =
             decode(&bytes).map_err(|why| CaptureError::unfit(path.display().to_string(), why))?;
         Ok(Some(Exposure { stamp_ns, image }))

@@ -94,7 +94,7 @@ impl Pipe {
         }
     }
 
-    /// Reports why a stream ended: a program that failed has said more on standard error.
+    /// Reports why a stream ended: a program that failed has written more to standard error.
     fn ended(&mut self) -> Result<Option<Exposure>, CaptureError> {
         if let Some(mut child) = self.child.take() {
             let status = child.wait().map_err(|error| CaptureError::io(&self.name, error))?;

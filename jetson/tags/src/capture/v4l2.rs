@@ -2,7 +2,7 @@
 //!
 //! `/dev/video0`, or `/dev/video0:1280x720@60`. Grey, YUYV, NV12 and Motion JPEG are understood; of them,
 //! the one that the camera offers first in this order. Drivers stamp an image when its exposure began
-//! or when its last byte was read, and say which; the stamp is moved to the middle of the exposure of
+//! or when its last byte was read, and report which; the stamp is moved to the middle of the exposure of
 //! the middle row.
 
 mod ffi;

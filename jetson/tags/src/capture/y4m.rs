@@ -41,7 +41,7 @@ impl Y4m {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// Returns images a second, once the head has come, if it says so.
+    /// Returns images a second, once the header has come, if it has them.
     pub fn rate_hz(&self) -> Option<f64> {
         self.head.and_then(|head| head.rate_hz)
     }

@@ -16,13 +16,13 @@ pub(super) fn candidates(image: &Gray) -> Vec<DVec2> {
     for y in BORDER..height - BORDER {
         for x in BORDER..width - BORDER {
             let response = response(&smooth, width, x, y);
-            if response > LEAST_RESPONSE {
+            if response > MIN_RESPONSE {
                 responses.push((response, x, y));
                 greatest = greatest.max(response);
             }
         }
     }
-    responses.retain(|(response, ..)| *response > LEAST_SHARE * greatest);
+    responses.retain(|(response, ..)| *response > MIN_SHARE * greatest);
     responses.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut kept: Vec<DVec2> = Vec::new();
     for (_, x, y) in responses {
@@ -30,7 +30,7 @@ pub(super) fn candidates(image: &Gray) -> Vec<DVec2> {
         if kept.iter().all(|other| (*other - at).abs().max_element() > RADIUS_PX) {
             kept.push(at);
         }
-        if kept.len() == MOST_CANDIDATES {
+        if kept.len() == MAX_CANDIDATES {
             break;
         }
     }
@@ -77,7 +77,7 @@ fn smoothed(image: &Gray) -> Vec<f32> {
 /// and Gulch 1987). `None` where there is none close by.
 pub(super) fn refine(image: &Gray, start: DVec2, half_px: i32) -> Option<DVec2> {
     let mut corner = start;
-    for _ in 0..MOST_ROUNDS {
+    for _ in 0..MAX_ROUNDS {
         let mut sum = DMat2::ZERO;
         let mut right = DVec2::ZERO;
         for dy in -half_px..=half_px {
@@ -151,10 +151,10 @@ const RADIUS_PX: f64 = 5.0;
 /// The ring and a pixel of smoothing around it. [px]
 const BORDER: usize = 6;
 /// Four pairs of quarters that differ by ten grey levels. [grey levels]
-const LEAST_RESPONSE: f32 = 40.0;
+const MIN_RESPONSE: f32 = 40.0;
 /// Where the board is lit worst its corners have at least this share of the clearest one's response.
-const LEAST_SHARE: f32 = 0.15;
+const MIN_SHARE: f32 = 0.15;
 /// A board and as much clutter.
-const MOST_CANDIDATES: usize = 1500;
+const MAX_CANDIDATES: usize = 1500;
 /// It converges in three to six.
-const MOST_ROUNDS: usize = 12;
+const MAX_ROUNDS: usize = 12;

@@ -14,7 +14,7 @@ pub(super) fn grow(image: &Gray, corners: &[DVec2], board: &Checkerboard) -> Opt
     if corners.len() < board.count() {
         return None;
     }
-    corners.iter().take(MOST_SEEDS).enumerate().find_map(|(seed, _)| {
+    corners.iter().take(MAX_SEEDS).enumerate().find_map(|(seed, _)| {
         let cells = grow_from(image, corners, seed)?;
         order(&cells, corners, board)
     })
@@ -38,7 +38,7 @@ fn grow_from(image: &Gray, corners: &[DVec2], seed: usize) -> Option<HashMap<IVe
     let along = corners[joined.next()?] - start;
     let across = joined
         .map(|other| corners[other] - start)
-        .find(|step| step.angle_to(along).sin().abs() > LEAST_SINE)?;
+        .find(|step| step.angle_to(along).sin().abs() > MIN_SINE)?;
     let mut cells = HashMap::from([(IVec2::ZERO, seed)]);
     let mut taken = vec![false; corners.len()];
     taken[seed] = true;
@@ -93,7 +93,7 @@ fn is_edge(image: &Gray, from: DVec2, to: DVec2) -> bool {
         Some(sample(image, at + aside)? - sample(image, at - aside)?)
     };
     let [Some(a), Some(b), Some(c)] = [0.3, 0.5, 0.7].map(difference) else { return false };
-    a.abs().min(b.abs()).min(c.abs()) > LEAST_CONTRAST && a * b > 0.0 && b * c > 0.0
+    a.abs().min(b.abs()).min(c.abs()) > MIN_CONTRAST && a * b > 0.0 && b * c > 0.0
 }
 
 /// Returns the corners in the board's order.
@@ -131,10 +131,10 @@ fn order(
 }
 
 /// Corners from which a board is looked for: if not among the clearest, it is not there.
-const MOST_SEEDS: usize = 40;
+const MAX_SEEDS: usize = 40;
 /// A neighbour is within this share of a step from where it should be.
 const REACH: f64 = 0.35;
 /// Edges of one corner meet at 20 degrees at least, however the board is tilted.
-const LEAST_SINE: f64 = 0.34;
+const MIN_SINE: f64 = 0.34;
 /// Between the squares on both sides of an edge. [grey levels]
-const LEAST_CONTRAST: f64 = 12.0;
+const MIN_CONTRAST: f64 = 12.0;

@@ -76,7 +76,7 @@ impl Library {
         fill(&mut self.pixels);
         assert_eq!(self.pixels.len(), width * height, "rows are written without gaps");
         // The library divides the image into tiles of 4 pixels, after decimation.
-        if width.min(height) < LEAST_SIDE_PX || width.max(height) > MOST_SIDE_PX {
+        if width.min(height) < MIN_SIDE_PX || width.max(height) > MAX_SIDE_PX {
             return Vec::new();
         }
         // SAFETY: ours alone, see `new`.
@@ -139,7 +139,7 @@ fn corrected_bits(family: TagFamily, settings: &DetectorSettings) -> i32 {
     match family {
         // The library lists every code with every error: these would be 2.6 million, 120 MB.
         TagFamily::TagStandard52h13 => 0,
-        _ => i32::from(settings.corrected_bits.min(MOST_CORRECTED)),
+        _ => i32::from(settings.corrected_bits.min(MAX_CORRECTED)),
     }
 }
 
@@ -172,8 +172,8 @@ unsafe fn destroy(family: TagFamily, table: *mut c::apriltag_family_t) {
 }
 
 /// With 3 the list of 36h11 alone takes 150 MB.
-const MOST_CORRECTED: u8 = 2;
+const MAX_CORRECTED: u8 = 2;
 /// Smaller images hold no tag that can be read, and the library's tiles need some room. [px]
-const LEAST_SIDE_PX: usize = 24;
+const MIN_SIDE_PX: usize = 24;
 /// The largest side of an image anywhere here. [px]
-const MOST_SIDE_PX: usize = 8192;
+const MAX_SIDE_PX: usize = 8192;

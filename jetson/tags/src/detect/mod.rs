@@ -133,7 +133,7 @@ impl Detector {
         let mut found: Vec<Detection> = raw
             .into_iter()
             .filter(|tag| tag.margin >= self.settings.least_margin)
-            .filter(|tag| shortest(&tag.corners_px) >= LEAST_EDGE_PX)
+            .filter(|tag| shortest(&tag.corners_px) >= MIN_EDGE_PX)
             .filter(|tag| whole(&tag.corners_px, image))
             .map(|tag| {
                 // Edges of a small tag do not bend, and the library measures them as well.
@@ -198,7 +198,7 @@ fn enlarge(
 /// Half a cell of white around eight cells, as seen from the middle, and a little more for the perspective.
 const RIM: f64 = 1.15;
 /// Tags smaller than this cannot be distinguished from noise: a cell of 36h11 has one pixel then. [px]
-const LEAST_EDGE_PX: f64 = 8.0;
+const MIN_EDGE_PX: f64 = 8.0;
 /// From here on edges measured again, through the lens, are better than the library's: 0.05 px instead of
 /// 0.16 at 150 px behind a common webcam's lens, the same at 75 px (`detect/tests.rs`). [px]
 const REFINE_ABOVE_PX: f64 = 75.0;

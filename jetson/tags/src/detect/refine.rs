@@ -66,12 +66,12 @@ impl Line {
 fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2) -> Option<Line> {
     let (from_px, to_px) = (project(camera, from), project(camera, to));
     let length_px = from_px.distance(to_px);
-    // Widths of a cell along this edge and across it differ; the tag's middle tells the latter.
+    // Widths of a cell along this edge and across it differ; the tag's centre gives the latter.
     let across_px = 2.0 * distance_px(camera, from, to, centre);
     // The black border and the white around it are one cell of eight each (fewer in small families,
     // where cells are larger).
-    let reach_px = (REACH_CELLS * across_px / 8.0).clamp(LEAST_REACH_PX, MOST_REACH_PX);
-    let count = ((length_px / SPACING_PX) as usize).clamp(LEAST_POINTS + 2, MOST_POINTS);
+    let reach_px = (REACH_CELLS * across_px / 8.0).clamp(MIN_REACH_PX, MAX_REACH_PX);
+    let count = ((length_px / SPACING_PX) as usize).clamp(MIN_POINTS + 2, MAX_POINTS);
     // Neighbouring edges blur into the ends.
     let end = (reach_px / length_px).max(0.06);
     if end > 0.3 {
@@ -98,7 +98,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
             profiles.push((slope, px, normal, profile));
         }
     }
-    if profiles.len() < LEAST_POINTS {
+    if profiles.len() < MIN_POINTS {
         return None;
     }
     // Black and white vary slowly along the edge: two straight lines through all profiles' ends.
@@ -108,7 +108,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
     for (i, (slope, px, normal, profile)) in profiles.iter().enumerate() {
         let (black, white) = (black.at(i), white.at(i));
         let contrast = white - black;
-        if !(contrast.abs() >= LEAST_CONTRAST) {
+        if !(contrast.abs() >= MIN_CONTRAST) {
             continue;
         }
         // The white part of the way from -reach to reach.
@@ -208,7 +208,7 @@ impl Trend {
 
 fn fit(points: &[(DVec2, f64)], camera: &Intrinsics, reach_px: f64) -> Option<Line> {
     let total: f64 = points.iter().map(|(_, w)| w).sum();
-    if !(total >= LEAST_POINTS as f64) {
+    if !(total >= MIN_POINTS as f64) {
         return None;
     }
     let at = points.iter().map(|&(p, w)| p * w).sum::<DVec2>() / total;
@@ -270,16 +270,16 @@ fn slope_near(camera: &Intrinsics, px: DVec2, near: DVec2) -> Option<DVec2> {
 /// How far across an edge is looked, of a cell; within a cell on both sides there is one colour.
 const REACH_CELLS: f64 = 0.6;
 /// Less would be within the blur of the sharpest lens. [px]
-const LEAST_REACH_PX: f64 = 1.5;
+const MIN_REACH_PX: f64 = 1.5;
 /// More would gather uneven light, and costs time. [px]
-const MOST_REACH_PX: f64 = 5.0;
+const MAX_REACH_PX: f64 = 5.0;
 /// Between samples across an edge. [px]
 const STEP_PX: f64 = 0.5;
 /// Between points along an edge: closer, they see the same pixels. [px]
 const SPACING_PX: f64 = 1.0;
 /// Fewer points make no line.
-const LEAST_POINTS: usize = 5;
+const MIN_POINTS: usize = 5;
 /// More points than this add time, not sharpness.
-const MOST_POINTS: usize = 64;
+const MAX_POINTS: usize = 64;
 /// Less between black and white is noise. [grey levels]
-const LEAST_CONTRAST: f64 = 12.0;
+const MIN_CONTRAST: f64 = 12.0;

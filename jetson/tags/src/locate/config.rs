@@ -103,15 +103,15 @@ impl LocateConfig {
     pub fn parse(text: &str) -> Result<Self, FileError> {
         let config: Self = vizflyt_toml::parse(text)?;
         for (key, count, most) in [
-            ("cameras", config.cameras.len(), MOST_CAMERAS),
-            ("layouts", config.layouts.len(), MOST_LAYOUTS),
+            ("cameras", config.cameras.len(), MAX_CAMERAS),
+            ("layouts", config.layouts.len(), MAX_LAYOUTS),
         ] {
             if !(1..=most).contains(&count) {
                 return Err(invalid(key, format!("{count} files"), format!("name 1 to {most}")));
             }
         }
-        if !(1..=MOST_NAME_BYTES).contains(&config.object.len()) {
-            let advice = format!("give a name of 1 to {MOST_NAME_BYTES} bytes");
+        if !(1..=MAX_NAME_BYTES).contains(&config.object.len()) {
+            let advice = format!("give a name of 1 to {MAX_NAME_BYTES} bytes");
             return Err(invalid("object", format!("{:?}", config.object), advice));
         }
         check_number("corner_sigma_px", config.corner_sigma_px, "px", 0.01..=10.0)?;
@@ -183,11 +183,11 @@ fn default_tilt() -> f64 {
 /// The source of a camera that is rendered from the truth.
 pub const SIMULATED: &str = "simulated";
 /// As many as one computer's USB carries.
-const MOST_CAMERAS: usize = 8;
+const MAX_CAMERAS: usize = 8;
 /// A cube, a mat, and some walls.
-const MOST_LAYOUTS: usize = 16;
+const MAX_LAYOUTS: usize = 16;
 /// As the motion capture's names.
-const MOST_NAME_BYTES: usize = 24;
+const MAX_NAME_BYTES: usize = 24;
 
 #[cfg(test)]
 mod tests {

@@ -19,12 +19,12 @@ pub(super) enum Expected {
     Within(Region),
 }
 
-/// Returns where tags should be if the vehicle is at a pose, give or take `doubt_m`.
+/// Returns where tags should be if the vehicle is at a pose, give or take `uncertainty_m`.
 pub(super) fn expect<'a>(
     camera: &TagCamera,
     tags: impl Iterator<Item = &'a (LayoutFrame, Tag)>,
     world_from_body: &Pose<World, Body>,
-    doubt_m: f64,
+    uncertainty_m: f64,
 ) -> Expected {
     let k = &camera.intrinsics;
     let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
@@ -47,16 +47,16 @@ pub(super) fn expect<'a>(
         let (least, most) =
             edges.fold((f64::INFINITY, 0.0f64), |(low, high), e| (low.min(e), high.max(e)));
         edge_px = edge_px.max(least);
-        margin_px = margin_px.max(doubt_m * most / tag.size_m);
+        margin_px = margin_px.max(uncertainty_m * most / tag.size_m);
     }
     if !(high.x > low.x) {
         return Expected::OutOfView;
     }
     if let Mounting::Body(_) = camera.mounting {
         // The room moves through a carried camera's image when the vehicle turns.
-        margin_px += TURN_DOUBT_RAD * k.fx_px;
+        margin_px += TURN_UNCERTAINTY_RAD * k.fx_px;
     }
-    let margin = DVec2::splat(margin_px + LEAST_MARGIN_PX);
+    let margin = DVec2::splat(margin_px + MIN_MARGIN_PX);
     Expected::Within(Region {
         least_px: low - margin,
         most_px: high + margin,
@@ -65,10 +65,10 @@ pub(super) fn expect<'a>(
 }
 
 /// What the first solution of a search may be off. [m]
-pub(super) const FOUND_DOUBT_M: f64 = 0.15;
+pub(super) const FOUND_UNCERTAINTY_M: f64 = 0.15;
 /// Tags are found by the white rim around them, one cell of eight, and some of the paper.
 const WITH_RIM: f64 = 1.4;
 /// What the attitude may turn unforeseen between two images. [rad]
-const TURN_DOUBT_RAD: f64 = 0.03;
+const TURN_UNCERTAINTY_RAD: f64 = 0.03;
 /// What is added around in any case. [px]
-const LEAST_MARGIN_PX: f64 = 8.0;
+const MIN_MARGIN_PX: f64 = 8.0;

@@ -106,7 +106,7 @@ fn it_is_found_again_elsewhere_and_old_images_are_refused() {
             let truth = pose_at(stamp.seconds_since(at(0)));
             let off_m = found.world_from_body.translation_m.distance(truth.translation_m);
             assert!(off_m < 0.05, "{off_m} m at {stamp:?}");
-            // What the pose says is where the corners are.
+            // The pose predicts where the corners are.
             for seen in &outcome.looks[0].seen {
                 let expected = seen.expected_px.expect("there is a pose");
                 let off = expected[0].distance(seen.detection.corners_px[0]);

@@ -38,19 +38,21 @@ impl Track {
         self.hypotheses.first()?.predict(stamp)
     }
 
-    /// Returns how far from there it may be. [m]
-    pub(super) fn doubt_m(&self, stamp: HostTime) -> f64 {
+    /// Returns the uncertainty of the prediction. [m]
+    pub(super) fn uncertainty_m(&self, stamp: HostTime) -> f64 {
         let Some(newest) = self.newest() else { return f64::INFINITY };
         let dt_s = stamp.seconds_since(newest).abs();
-        LEAST_DOUBT_M + SPEED_DOUBT_MPS * dt_s + 0.5 * ACCELERATION_DOUBT_MPS2 * dt_s * dt_s
+        MIN_UNCERTAINTY_M
+            + SPEED_UNCERTAINTY_MPS * dt_s
+            + 0.5 * ACCELERATION_UNCERTAINTY_MPS2 * dt_s * dt_s
     }
 
-    /// Returns how it moves; `None` before some poses tell.
+    /// Returns how it moves; `None` before there are enough poses.
     pub(super) fn motion(&self) -> Option<Motion> {
         self.hypotheses.first()?.motion()
     }
 
-    /// Takes an answer; returns the fit to be believed, or `None` while two are open.
+    /// Takes a solution; returns the accepted fit, or `None` while two are possible.
     pub(super) fn update(
         &mut self,
         stamp: HostTime,
@@ -87,13 +89,13 @@ impl Track {
             hypothesis.penalty -= least;
         }
         next.retain(|(hypothesis, _)| hypothesis.penalty < HOPELESS);
-        let believed = match &next[..] {
+        let accepted = match &next[..] {
             [(_, fit)] => Some(*fit),
             [(_, fit), (second, _)] if second.penalty >= DECIDED => Some(*fit),
             _ => None,
         };
         self.hypotheses = next.into_iter().map(|(hypothesis, _)| hypothesis).collect();
-        believed
+        accepted
     }
 }
 
@@ -105,7 +107,7 @@ impl Hypothesis {
     fn push(&mut self, stamp: HostTime, pose: Pose<World, Body>) {
         self.past.push_back((stamp, pose));
         while self.past.front().is_some_and(|(old, _)| stamp.seconds_since(*old) > MOTION_SPAN_S)
-            || self.past.len() > MOST_KEPT
+            || self.past.len() > MAX_KEPT
         {
             self.past.pop_front();
         }
@@ -142,12 +144,12 @@ impl Hypothesis {
     /// Returns what a pose costs as the next of this one's.
     fn surprise(&self, stamp: HostTime, pose: &Pose<World, Body>) -> f64 {
         let (Some(expected), Some((newest, _))) = (self.predict(stamp), self.newest()) else {
-            return MOST_SURPRISE;
+            return MAX_SURPRISE;
         };
         let dt_s = stamp.seconds_since(newest).abs();
         let sigma_rad = TURN_SIGMA_RAD + TURN_SIGMA_RADPS * dt_s;
         let angle = expected.rotation.angle_between(pose.rotation);
-        (0.5 * (angle / sigma_rad).powi(2)).min(MOST_SURPRISE)
+        (0.5 * (angle / sigma_rad).powi(2)).min(MAX_SURPRISE)
     }
 }
 
@@ -161,26 +163,26 @@ fn turn(from: DQuat, to: DQuat) -> DVec3 {
 /// Poses of this span make the motion: at 30 Hz five of them. [s]
 const MOTION_SPAN_S: f64 = 0.14;
 /// And no more than this many.
-const MOST_KEPT: usize = 32;
+const MAX_KEPT: usize = 32;
 /// After this long a vehicle can be anywhere. [s]
 const FORGET_AFTER_S: f64 = 0.4;
 /// Noise of the prediction from one image to the next. [m]
-const LEAST_DOUBT_M: f64 = 0.04;
-/// What its velocity may be off. [m/s]
-const SPEED_DOUBT_MPS: f64 = 0.5;
-/// What it may accelerate unforeseen. [m/s^2]
-const ACCELERATION_DOUBT_MPS2: f64 = 10.0;
-/// How far the attitude may be from the foreseen, for noise. [rad]
+const MIN_UNCERTAINTY_M: f64 = 0.04;
+/// Standard error of its velocity. [m/s]
+const SPEED_UNCERTAINTY_MPS: f64 = 0.5;
+/// Unpredicted acceleration. [m/s^2]
+const ACCELERATION_UNCERTAINTY_MPS2: f64 = 10.0;
+/// Noise of the predicted attitude. [rad]
 const TURN_SIGMA_RAD: f64 = 0.05;
-/// And for what the vehicle may turn unforeseen. [rad/s]
+/// Unpredicted rate of turn. [rad/s]
 const TURN_SIGMA_RADPS: f64 = 1.0;
 /// One image decides little against motion: it may have been misread.
-const MOST_SURPRISE: f64 = 10.0;
+const MAX_SURPRISE: f64 = 10.0;
 /// Of what was learnt before, how much stays from image to image.
 const KEPT: f64 = 0.97;
-/// An answer that is e^4 times likelier is believed.
+/// A solution that is e^4 times likelier is accepted.
 const DECIDED: f64 = 4.0;
 /// One that is e^14 times less likely is dropped.
 const HOPELESS: f64 = 14.0;
-/// Penalty of what cannot be.
+/// Penalty of an impossible pose.
 const IMPOSSIBLE: f64 = 20.0;

@@ -21,9 +21,9 @@ pub fn checkerboard(
     let [width, height] = paper.room_mm().map(|room| room - 2.0 * RIM_MM);
     let [columns, rows] = [width, height].map(|room| (room / square_mm) as u32);
     let rows = if (columns + rows).is_multiple_of(2) { rows.saturating_sub(1) } else { rows };
-    if columns.min(rows) < LEAST_SQUARES {
+    if columns.min(rows) < MIN_SQUARES {
         let (what, room_mm) = ("a board of four squares", width.min(height));
-        let size_mm = square_mm * f64::from(LEAST_SQUARES);
+        let size_mm = square_mm * f64::from(MIN_SQUARES);
         return Err(PrintError::TooLarge { what, size_mm, paper, room_mm });
     }
     let title = format!("{} x {} inner corners", columns - 1, rows - 1);
@@ -45,7 +45,7 @@ pub fn checkerboard(
 /// White around the board. [mm]
 const RIM_MM: f64 = 5.0;
 /// Three inner corners.
-const LEAST_SQUARES: u32 = 4;
+const MIN_SQUARES: u32 = 4;
 
 #[cfg(test)]
 mod tests {

@@ -66,7 +66,7 @@ pub enum Shape {
         at: [f64; 2],
         /// Height of its letters.
         size: f64,
-        /// What it says; Latin letters.
+        /// The text; Latin letters.
         text: String,
     },
 }

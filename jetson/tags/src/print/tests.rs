@@ -79,12 +79,15 @@ fn a_mat_over_several_sheets_has_every_tag_once_at_its_place() {
         .map(|sheet| sheet.shapes.iter().filter(|s| matches!(s, Shape::Boxes(_))).count() - 1)
         .sum();
     assert_eq!(drawn, 12);
-    let says = |sheet: &Sheet, part: &str| {
+    let has_text = |sheet: &Sheet, part: &str| {
         sheet.shapes.iter().any(|s| matches!(s, Shape::Text { text, .. } if text.contains(part)))
     };
-    assert!(says(&printed.sheets[0], "tag36h11 100 to 101, ..., 103 to 104; cut along the marks"));
+    assert!(has_text(
+        &printed.sheets[0],
+        "tag36h11 100 to 101, ..., 103 to 104; cut along the marks"
+    ));
     let whole = Mat { columns: 2, rows: 2, ..mat() }.print().unwrap();
-    assert!(says(&whole.sheets[0], "tag36h11 100 to 103; this edge is north"));
+    assert!(has_text(&whole.sheets[0], "tag36h11 100 to 103; this edge is north"));
 }
 
 #[test]

@@ -66,7 +66,7 @@ pub(super) fn adjust(
     let mut pose = start;
     let mut normal = Normal::at(sightings, motion, &pose)?;
     let mut damping = 1e-4;
-    for _ in 0..MOST_ROUNDS {
+    for _ in 0..MAX_ROUNDS {
         let Some(change) = normal.step(damping) else {
             damping *= 10.0;
             if damping > 1e6 {
@@ -98,7 +98,7 @@ pub(super) fn adjust(
         }
     }
     let mut covariance = normal.inverse()?;
-    // Corners that scatter more than they should say that sigma was too small; never that it was
+    // Corners that scatter more than they should show that sigma was too small; never that it was
     // too large: few corners agree by chance.
     let freedom = (2 * normal.corners).saturating_sub(6).max(1);
     let scale = (normal.square_sum / freedom as f64).max(1.0);
@@ -292,4 +292,4 @@ const ROBUST_SIGMAS: f64 = 4.0;
 /// Nothing is in focus closer than this. [m]
 const NEAREST_M: f64 = 0.02;
 /// It converges in five to ten.
-const MOST_ROUNDS: usize = 40;
+const MAX_ROUNDS: usize = 40;

@@ -121,7 +121,7 @@ pub fn solve(
     }
     starts.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut fits: Vec<PoseFit> = Vec::with_capacity(2);
-    let mut tried: Vec<DQuat> = Vec::with_capacity(MOST_STARTS);
+    let mut tried: Vec<DQuat> = Vec::with_capacity(MAX_STARTS);
     for (_, start) in starts {
         // Starts in the same valley end in the same place.
         if tried.iter().any(|seen| seen.angle_between(start.rotation) < SAME_START_RAD) {
@@ -138,7 +138,7 @@ pub fn solve(
                 None => fits.push(fit),
             }
         }
-        if tried.len() == MOST_STARTS {
+        if tried.len() == MAX_STARTS {
             break;
         }
     }
@@ -186,7 +186,7 @@ const SAME_ANSWER_RAD: f64 = 0.06;
 /// Starts closer together than this are one. [rad]
 const SAME_START_RAD: f64 = 0.1;
 /// More starts come from tags that are misread or hardly seen.
-const MOST_STARTS: usize = 5;
+const MAX_STARTS: usize = 5;
 /// A second answer whose cost (half the sum of squares in units of sigma) is greater by this is e^12 times less likely
 /// by the corners' noise; what light, blur and print add is covered by the rest.
 const AMBIGUOUS_COST: f64 = 12.0;

@@ -3,7 +3,7 @@
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
-use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose, cube_pose};
+use super::{LOSS_PX, MAX_OUTLIERS, SurveyError, camera_pose, cube_pose};
 use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid};
 use crate::detection::Detection;
 use crate::layout::{CORNERS, TagLayout};
@@ -107,7 +107,7 @@ fn cube_at(
         }
     }
     let solved = cube_pose(&seen)?;
-    // A single face may be seen in two ways: wait for a moment that says which.
+    // A single face may be seen in two ways: wait for an image that decides.
     solved.other.is_none().then_some(solved.best.world_from_body)
 }
 
@@ -203,7 +203,7 @@ fn adjust(
         let good: Vec<f64> =
             residuals.iter().copied().filter(|square| *square <= LOSS_PX * LOSS_PX).collect();
         let rms_px = rms(&good);
-        if (corners - good.len()) as f64 > MOST_OUTLIERS * corners as f64 {
+        if (corners - good.len()) as f64 > MAX_OUTLIERS * corners as f64 {
             return Err(SurveyError::Contradiction {
                 rms_px: rms(&residuals),
                 most_px: LOSS_PX,

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
-use super::{LOSS_PX, MOST_OUTLIERS, SurveyError, camera_pose};
+use super::{LOSS_PX, MAX_OUTLIERS, SurveyError, camera_pose};
 use crate::bundle::{Bundle, CornerObservation, Parameter};
 use crate::detection::Detection;
 use crate::family::TagFamily;
@@ -73,11 +73,11 @@ pub fn mat(
         })
         .filter(|image| image.len() >= 2)
         .collect();
-    if images.len() < LEAST_IMAGES {
+    if images.len() < MIN_IMAGES {
         return Err(SurveyError::TooFew {
             what: "images",
             found: images.len(),
-            needed: LEAST_IMAGES,
+            needed: MIN_IMAGES,
             advice: "carry the camera over the mat so that two tags or more are in every image",
         });
     }
@@ -88,7 +88,7 @@ pub fn mat(
     let keys: Vec<Key> = start.tags.keys().copied().collect();
     for key in keys {
         let seen = counts.get(&key).copied().unwrap_or(0);
-        if seen < LEAST_SIGHTINGS {
+        if seen < MIN_SIGHTINGS {
             start.tags.remove(&key);
             let why = if seen == 0 { "in no image" } else { "in one image only" };
             left_out.push((key.0, key.1, why));
@@ -108,7 +108,7 @@ pub fn mat(
         });
     }
     let (bundle, numbers, solution) = adjust(lens, &start, &images, &size_m, &counts)?;
-    if !(solution.outliers <= MOST_OUTLIERS) {
+    if !(solution.outliers <= MAX_OUTLIERS) {
         return Err(SurveyError::Contradiction {
             rms_px: solution.all_rms_px,
             most_px: LOSS_PX,
@@ -245,7 +245,7 @@ impl Start {
             sightings.iter().map(off).sum()
         };
         let mut best: Option<(f64, Pose<World, Square>)> = None;
-        for (world_from_cam, corners_px) in sightings.iter().take(MOST_STARTS) {
+        for (world_from_cam, corners_px) in sightings.iter().take(MAX_STARTS) {
             // The camera's pose as seen from the tag, where the tag is the room.
             let Some((_, solved)) = camera_pose(lens, &[(Pose::IDENTITY, size_m, *corners_px)])
             else {
@@ -370,9 +370,9 @@ fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> 
     Pose::new(middle_printed - q * middle_found, q)
 }
 
-/// Fewer images say little.
-const LEAST_IMAGES: usize = 5;
+/// Fewer images constrain too little.
+const MIN_IMAGES: usize = 5;
 /// A tag in fewer images is not checked by anything.
-const LEAST_SIGHTINGS: usize = 2;
+const MIN_SIGHTINGS: usize = 2;
 /// Images from which a tag's place is tried.
-const MOST_STARTS: usize = 10;
+const MAX_STARTS: usize = 10;

@@ -12,7 +12,7 @@ pub struct Picker {
 }
 
 impl Picker {
-    /// Takes the tags of the next image, and keeps them if they say something new.
+    /// Takes the tags of the next image, and keeps them if they add something new.
     pub fn offer(&mut self, image: Vec<Detection>, lens: &Intrinsics) {
         if image.len() < 2 || self.is_full() {
             return;
@@ -41,14 +41,14 @@ impl Picker {
 
     /// Whether more images would not help any more.
     pub fn is_full(&self) -> bool {
-        self.images.len() >= MOST_IMAGES
+        self.images.len() >= MAX_IMAGES
     }
 }
 
 /// A tag must have moved by so much. [share of the image's width]
 const MOVED: f64 = 0.03;
 /// Some seconds of computing for a mat of a hundred tags.
-const MOST_IMAGES: usize = 300;
+const MAX_IMAGES: usize = 300;
 
 #[cfg(test)]
 mod tests {

@@ -57,7 +57,7 @@ pub(crate) struct Figures {
     pub(crate) errors_m: Vec<f64>,
     /// Of the attitude. [rad]
     pub(crate) errors_rad: Vec<f64>,
-    /// Errors in units of what was said they may be: squared, of six numbers.
+    /// Errors in units of their predicted standard deviations: squared, of six numbers.
     pub(crate) squared_sigmas: f64,
     /// Why sets gave no pose.
     pub(crate) unlocated: Vec<String>,

@@ -8,13 +8,13 @@
 //! The rules, as `docs/guides/course.md` has them:
 //! - the earliest reason by its stamp decides, whoever gives it; what comes later, a touch after LAND
 //!   was ordered among it, changes nothing;
-//! - what poses alone say (finish, collision, geofence, time limit, lost pose) counts from the take-off
+//! - what follows from poses alone (finish, collision, geofence, time limit, lost pose) counts from the take-off
 //!   on ([`EndReason::needs_take_off`]); people, plugin and autopilot end a flight on the ground as well;
 //! - a pose that comes back within the arena's `land_after_s` ends nothing; neither does a warning near
 //!   the fence.
 //!
-//! The order in which events are heard does not matter: an outage that delays one side's events does
-//! not change what that side says in the end.
+//! The order in which events arrive does not matter: an outage that delays one side's events does
+//! not change what that side reports in the end.
 
 mod reason;
 mod sentence;
@@ -37,7 +37,7 @@ use crate::time::{Clock, Server, Stamp};
 /// let mut end = FlightEnd::default();
 /// end.handle(at(1.0), &EventKind::Phase(FlightPhase::TakingOff));
 /// end.handle(at(9.5), &EventKind::TimeLimit { limit_s: 8.5 });
-/// // Pressed before the time was over, and heard of later.
+/// // Pressed before the time was over, and received later.
 /// end.handle(at(9.0), &EventKind::Land);
 /// assert_eq!(end.decided(), Some((at(9.0), &EndReason::LandButton)));
 /// ```

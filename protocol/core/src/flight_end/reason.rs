@@ -173,7 +173,7 @@ pub enum PluginFault {
 }
 
 impl PluginFault {
-    /// Makes the fault of a plugin that ended or gave up, by a sentence that says how.
+    /// Makes the fault of a plugin that ended or gave up, by a sentence that describes it.
     pub fn ended(sentence: &str) -> Self {
         Self::Ended(bounded(sentence))
     }
@@ -243,7 +243,7 @@ impl EndReason {
         )
     }
 
-    /// Whether it can only end a flight that has taken off: what poses say of a vehicle that someone
+    /// Whether it can only end a flight that has taken off: the poses of a vehicle that someone
     /// carries does not count.
     pub fn needs_take_off(&self) -> bool {
         matches!(

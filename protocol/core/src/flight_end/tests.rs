@@ -209,26 +209,26 @@ fn reasons_arrive_as_they_were_sent() {
 }
 
 proptest! {
-    /// Whoever hears of the same events in another order says the same.
+    /// The same events in another order have the same end.
     #[test]
     fn the_order_of_hearing_does_not_matter(
-        (events, heard) in prop::collection::vec(0..each().len() + 3, 1..12).prop_flat_map(|kinds| {
+        (events, received) in prop::collection::vec(0..each().len() + 3, 1..12).prop_flat_map(|kinds| {
             let kind = |kind: usize| match kind {
                 0 => EventKind::Phase(FlightPhase::Flying),
                 1 => EventKind::PoseLost { age_s: 0.2 },
                 2 => EventKind::Note,
                 kind => EventKind::Ended(each()[kind - 3].clone()),
             };
-            // After the take-off: on the ground the referee says nothing that counts.
+            // After the take-off: on the ground the referee reports nothing that counts.
             let stamp = |(k, event)| (2.0 + k as f64, event);
             let events: Vec<_> = kinds.into_iter().map(kind).enumerate().map(stamp).collect();
             (Just(events.clone()), Just(events).prop_shuffle())
         }),
-        take_off_heard in 0..12_usize,
+        take_off_received in 0..12_usize,
     ) {
         let mut end = FlightEnd::default();
-        for (k, (s, kind)) in heard.iter().enumerate() {
-            if k == take_off_heard.min(heard.len() - 1) {
+        for (k, (s, kind)) in received.iter().enumerate() {
+            if k == take_off_received.min(received.len() - 1) {
                 end.handle(at(1.0), &EventKind::Phase(FlightPhase::TakingOff));
             }
             end.handle(at(*s), kind);

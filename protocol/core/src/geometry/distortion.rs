@@ -230,7 +230,7 @@ impl Distortion {
 
 /// Slopes below this are distorted by less than f64 resolves.
 const NEAR_AXIS: f64 = 1e-8;
-/// Rays further from the axis are not drawn: at 89 degrees a slope is 57, and depth along z loses
+/// Rays further from the axis are not rendered: at 89 degrees a slope is 57, and depth along z loses
 /// its meaning. [rad]
 const MAX_ANGLE_RAD: f64 = 89.0 * core::f64::consts::PI / 180.0;
 /// Polynomials of degree four turn three times at most.

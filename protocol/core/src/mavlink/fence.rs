@@ -115,7 +115,7 @@ pub fn fence_corner_from_mavlink(
         MavCmd::MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION => FenceSide::Outside,
         _ => return Err(MavMissionResult::MAV_MISSION_UNSUPPORTED),
     };
-    if !(item.param1 >= 3.0 && item.param1 <= MOST_CORNERS) {
+    if !(item.param1 >= 3.0 && item.param1 <= MAX_CORNERS) {
         return Err(MavMissionResult::MAV_MISSION_INVALID_PARAM1);
     }
     let place = GlobalPoint { latitude_e7: item.x, longitude_e7: item.y };
@@ -151,7 +151,7 @@ pub fn mission_result_name(result: MavMissionResult) -> &'static str {
 /// degrees on a globe of 6378.1 km. [m]
 const METRES_PER_UNIT: f64 = 0.011_131_884_502_145_034;
 /// ArduPilot counts a polygon's corners in a byte.
-const MOST_CORNERS: f32 = 255.0;
+const MAX_CORNERS: f32 = 255.0;
 
 #[cfg(test)]
 mod tests {

@@ -157,7 +157,7 @@ pub fn local_position_from_mavlink(message: &LOCAL_POSITION_NED_DATA) -> (DVec3,
 /// ```
 /// use glam::DVec3;
 /// use vizflyt_protocol::mavlink::{dialect::RAW_IMU_DATA, raw_imu_from_mavlink};
-/// // Level and at rest, turning right at 0.5 rad/s: gravity is felt upwards, -z in FRD.
+/// // Level and at rest, turning right at 0.5 rad/s: the specific force points up, -z in FRD.
 /// let message = RAW_IMU_DATA { zacc: -1000, zgyro: 500, ..Default::default() };
 /// let (accel_mps2, gyro_radps) = raw_imu_from_mavlink(&message);
 /// assert_eq!((accel_mps2, gyro_radps), (DVec3::Z * 9.80665, DVec3::Z * -0.5));

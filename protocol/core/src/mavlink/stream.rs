@@ -15,7 +15,7 @@ pub const MAX_PACKET: usize = 280;
 pub struct Packet {
     /// Sender and sequence number.
     pub header: MavHeader,
-    /// What it says.
+    /// The message.
     pub message: MavMessage,
 }
 

@@ -19,7 +19,7 @@ pub struct Event {
 }
 
 impl Event {
-    /// Makes an event that ends a flight, with the sentence that says why.
+    /// Makes an event that ends a flight, with the sentence for its reason.
     pub fn ending(stamp: ServerTime, kind: EventKind) -> Self {
         let text = kind.end_reason().as_ref().map(displayed).unwrap_or_default();
         Self { stamp, kind, text }

@@ -70,7 +70,7 @@ pub struct SetpointKinds(u8);
 impl SetpointKinds {
     /// None but those that are always allowed.
     pub const NONE: Self = Self(0);
-    /// All but attitude rates: what a course allows that says nothing.
+    /// All but attitude rates: the default of a course.
     pub const USUAL: Self = Self(0b10_1111);
     /// Every one.
     pub const ALL: Self = Self(0b11_1111);

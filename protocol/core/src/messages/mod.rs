@@ -8,7 +8,7 @@
 //! 3. then events, changed cameras and clock replies flow down; telemetry, events and clock
 //!    requests up.
 //!
-//! Events are numbered from 1 by who makes them, and acknowledged with `EventsReceived`. Each side says at
+//! Events are numbered from 1 by who makes them, and acknowledged with `EventsReceived`. Each side states at
 //! the start what it has received of the other ([`ReceivedEvents`]), so that after an outage whatever is
 //! missing is sent again, and nothing twice.
 //!

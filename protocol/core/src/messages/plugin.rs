@@ -26,8 +26,8 @@ pub enum FromPlugin {
         /// The plugin's name for people.
         name: Text,
     },
-    /// The answer to one image.
-    Answer {
+    /// The reply to one image.
+    Reply {
         /// The image's sequence number.
         seq: u64,
         /// When `on_image` was entered.
@@ -37,7 +37,7 @@ pub enum FromPlugin {
         /// What it returned; `None` leaves the former setpoint in force until its deadline.
         setpoint: Option<Setpoint>,
     },
-    /// The plugin gives up, and says why.
+    /// The plugin gives up; why.
     Failed {
         /// One sentence.
         reason: Text,

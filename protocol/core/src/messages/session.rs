@@ -105,7 +105,7 @@ pub enum ToServer {
     EventsReceived(u64),
     /// Reports where images get their age. 1 Hz.
     Timing(Timing),
-    /// What the autopilot's IMU felt, oldest first; each reading once. 25 to 50 Hz.
+    /// Readings of the autopilot's IMU, oldest first; each once. 25 to 50 Hz.
     Imu(heapless::Vec<ImuReading, MAX_IMU_BATCH>),
 }
 
@@ -128,7 +128,7 @@ pub enum ToRuntime {
     },
     /// Every event of this client up to this number has been received.
     EventsReceived(u64),
-    /// A camera was changed while flying. Images drawn with it may come before this does: each
+    /// A camera was changed while flying. Images rendered with it may come before this does: each
     /// states itself how it was rendered.
     Camera {
         /// Index into [`ArenaInfo::cameras`].

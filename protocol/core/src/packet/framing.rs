@@ -210,7 +210,7 @@ mod tests {
                 path,
                 yaw: PathYaw::Target(YawTarget::Angle(1.1)),
             };
-            let message = FromPlugin::Answer {
+            let message = FromPlugin::Reply {
                 seq: u64::MAX,
                 entered: HostTime::from_ns(u64::MAX),
                 returned: HostTime::from_ns(u64::MAX),

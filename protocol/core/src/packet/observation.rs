@@ -95,7 +95,7 @@ pub struct ObservationHeader {
     /// Battery voltage; 0 if unknown. [V]
     pub battery_v: f64,
     /// The newest IMU samples, oldest first. Those that came with the former observation are
-    /// there again: a reader that skipped it misses none, and tells new ones by their stamps.
+    /// there again: a reader that skipped it misses none, and finds new ones by their stamps.
     pub imu: [ImuRecord; MAX_IMU],
     /// The cameras.
     pub cameras: [CameraHeader; MAX_CAMERAS],

@@ -36,7 +36,7 @@ impl PeerRole {
     }
 }
 
-/// Magic, version, party. Its layout never changes, so that any two versions can tell.
+/// Magic, version, party. Its layout never changes, so that any two versions can check it.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
 )]

@@ -1,13 +1,13 @@
 //! Relates two clocks from request-reply exchanges: offset, drift, and a bound of the error.
 //!
-//! An exchange says that the remote clock showed `remote` at some moment between `sent` and
+//! An exchange shows that the remote clock was at `remote` at some moment between `sent` and
 //! `received`. As clocks run forward, their offset (remote less local) was at most
 //! `remote - sent` when it was sent, and at least `remote - received` when the answer was read.
 //! Over a window of exchanges these are half-planes in (offset, drift); what all of them leave is
 //! where the truth lies, and its middle is the estimate. No delay needs to be symmetric, and a
-//! slow exchange costs nothing: it only says little.
+//! slow exchange costs nothing: its bound is only wide.
 //!
-//! The bound rests on two assumptions: a clock runs wrong by at most [`MOST_DRIFT`], and over the
+//! The bound rests on two assumptions: a clock runs wrong by at most [`MAX_DRIFT`], and over the
 //! window its drift changes by at most [`WANDER`]. Exchanges that contradict each other prove a
 //! step (a restart, a suspended computer): then only the newest counts.
 
@@ -37,7 +37,7 @@ struct Exchange {
     received_ns: u64,
 }
 
-/// What the window says.
+/// The estimate of the window.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
     /// When the offset was so: the end of the newest exchange. [ns, local]
@@ -57,7 +57,7 @@ struct Fit {
 const WINDOW: usize = 64;
 /// No clock runs wrong by more: crystals are cut to 50 ppm or better, so two differ by at most
 /// 100, and time services that slew gently add as much.
-const MOST_DRIFT: f64 = 200e-6;
+const MAX_DRIFT: f64 = 200e-6;
 /// How far the drift strays from its mean over the window: a crystal that warms by 5 degrees as
 /// the computer gets busy changes by about 1 ppm.
 const WANDER: f64 = 1e-6;
@@ -183,7 +183,7 @@ fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
         };
     }
     // The mean drift between any two of them; at 64 exchanges 4096 pairs a second.
-    let (mut least, mut most) = (-MOST_DRIFT, MOST_DRIFT);
+    let (mut least, mut most) = (-MAX_DRIFT, MAX_DRIFT);
     for later in &*bounds {
         for earlier in &*bounds {
             let span = later.received - earlier.sent;

@@ -26,7 +26,7 @@ pub(crate) fn groups() -> Vec<(&'static str, Vec<Image>)> {
     groups
 }
 
-/// The demo's forest, seed 7, from the start: drawn by `vizflyt-splat` at 640x480 with a field of
+/// The demo's forest, seed 7, from the start: rendered by `vizflyt-splat` at 640x480 with a field of
 /// view of 90 degrees, kept in this crate's own exact modes.
 fn forest() -> Image {
     let bytes = include_bytes!("forest.vzrd");

@@ -59,7 +59,7 @@ impl Decoder {
         let info = decoder.info().ok_or_else(|| damaged("no image"))?;
         if (u32::from(info.width), u32::from(info.height)) != (width, height) {
             let (w, h) = (info.width, info.height);
-            return Err(damaged(&format!("JPEG is {w}x{h}, the header says {width}x{height}")));
+            return Err(damaged(&format!("JPEG is {w}x{h}, the header has {width}x{height}")));
         }
         if decoder.output_buffer_size() != Some(rgb_out.len()) {
             return Err(damaged("JPEG does not decode to three bytes a pixel"));

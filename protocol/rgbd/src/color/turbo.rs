@@ -77,7 +77,7 @@ impl Decoder {
         let (width, height) = (width as usize, height as usize);
         if (header.width, header.height) != (width, height) {
             let (w, h) = (header.width, header.height);
-            return Err(damaged(&format!("JPEG is {w}x{h}, the header says {width}x{height}")));
+            return Err(damaged(&format!("JPEG is {w}x{h}, the header has {width}x{height}")));
         }
         let image =
             Image { pixels: rgb_out, width, pitch: 3 * width, height, format: PixelFormat::RGB };

@@ -35,7 +35,7 @@ impl Shape {
 
     /// Returns the cheapest shape of a block of residuals, and which of them have high bits; of
     /// equals, the shape with the most low bits. `top` is the length of the longest residual, and
-    /// `longer` tells, called for `top - 1` low bits and then ever fewer, which have more.
+    /// `longer` counts, called for `top - 1` low bits and then ever fewer, which have more.
     #[inline(always)]
     pub(super) fn cheapest(top: u32, mut longer: impl FnMut(u32) -> u64) -> (Self, u64) {
         // 16 low bits have no code; 15 and one high bit do.

@@ -19,7 +19,7 @@
 //!    vector operation; the masks, eight bytes each; the high bits. All lengths follow from the
 //!    table and the masks, and are checked before a pixel is written.
 //!
-//! [`scalar`] says the same a pixel at a time and is kept as the reference; tests compare bytes.
+//! [`scalar`] does the same a pixel at a time and is kept as the reference; tests compare bytes.
 
 mod blocks;
 pub mod bound;
@@ -142,7 +142,7 @@ impl DepthDecoder {
     /// Decodes into a row-major image. [mm]
     ///
     /// # Errors
-    /// [`DecodeError::Depth`] unless `bytes` are as long as their own table says.
+    /// [`DecodeError::Depth`] unless `bytes` are as long as in their own table.
     ///
     /// # Panics
     /// If `depth` is empty or no whole number of rows.

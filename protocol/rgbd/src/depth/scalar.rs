@@ -1,4 +1,4 @@
-//! The reference: the format said a pixel and a bit at a time.
+//! The reference: the format a pixel and a bit at a time.
 
 use super::blocks::Shape;
 use super::predict::{bases, med, unzigzag, zigzag};
@@ -55,7 +55,7 @@ pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
 /// Decodes into a row-major image. [mm]
 ///
 /// # Errors
-/// [`DecodeError::Depth`] unless `bytes` are as long as their own table says.
+/// [`DecodeError::Depth`] unless `bytes` are as long as in their own table.
 ///
 /// # Panics
 /// If `depth` is empty or no whole number of rows.

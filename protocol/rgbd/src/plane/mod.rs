@@ -4,7 +4,7 @@
 //!
 //! 1. **Stripes.** The plane is cut into 4 stripes of columns, each with a coder state of its own;
 //!    they advance together, 16 columns (a run) at a time.
-//! 2. **Runs.** A symbol says whether all pixels of a run are as predicted, coded, invalid, or
+//! 2. **Runs.** A symbol encodes whether all pixels of a run are as predicted, coded, invalid, or
 //!    mixed; in the context of the runs to the left and above. The mask of a mixed run follows as
 //!    four symbols. So flat areas cost next to nothing, and a mask only where it changes.
 //! 3. **Prediction.** By the median edge detector, or by the mean of left and above, whichever

@@ -7,7 +7,7 @@ use crate::bits::{BitReader, BitWriter};
 /// States, so that a processor has several symbols under way at once.
 pub(super) const LANES: usize = 4;
 /// States lie in 2^16 to 2^32 - 1.
-const LEAST: u32 = 1 << 16;
+const MIN_STATE: u32 = 1 << 16;
 /// Length of the words, then the states.
 const HEADER_BYTES: usize = 4 + 4 * LANES;
 
@@ -38,7 +38,7 @@ impl SymbolWriter {
 
     /// Appends everything to `out`.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
-        let mut states = [LEAST; LANES];
+        let mut states = [MIN_STATE; LANES];
         // A word a symbol at most, and one more to write in vain.
         if self.words.len() <= self.symbols.len() {
             self.words.resize(self.symbols.len() + 1, 0);
@@ -77,7 +77,7 @@ impl Coder for SymbolWriter {
     }
 }
 
-/// Takes symbols apart again. Behind the end come zeros; [`Self::is_finished`] tells.
+/// Takes symbols apart again. Behind the end come zeros; [`Self::is_finished`] detects it.
 pub(super) struct SymbolReader<'a> {
     states: [u32; LANES],
     words: &'a [[u8; 2]],
@@ -86,7 +86,7 @@ pub(super) struct SymbolReader<'a> {
 }
 
 impl<'a> SymbolReader<'a> {
-    /// Returns `None` if the bytes are fewer than they say.
+    /// Returns `None` if the bytes are fewer than they state.
     pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
         let (header, rest) = bytes.split_first_chunk::<HEADER_BYTES>()?;
         let number = |at: usize| {
@@ -103,7 +103,7 @@ impl<'a> SymbolReader<'a> {
 
     /// Returns whether everything was taken and every state is where the encoder began.
     pub(super) fn is_finished(&self) -> bool {
-        self.states == [LEAST; LANES] && self.next == self.words.len() && self.raw.is_finished()
+        self.states == [MIN_STATE; LANES] && self.next == self.words.len() && self.raw.is_finished()
     }
 }
 
@@ -118,7 +118,7 @@ impl Coder for SymbolReader<'_> {
         *state = share.wrapping_mul(*state >> TOTAL_BITS).wrapping_add(place - start);
         // Without a branch, as above.
         let word = self.words.get(self.next).copied().unwrap_or_default();
-        let short = *state < LEAST;
+        let short = *state < MIN_STATE;
         let refilled = *state << 16 | u32::from(u16::from_le_bytes(word));
         *state = if short { refilled } else { *state };
         self.next += usize::from(short);

@@ -84,7 +84,7 @@ pub struct Attempt {
 pub struct Admitted {
     /// The entry for `paired.toml`.
     pub client: Client,
-    /// What to tell the client.
+    /// The reply for the client.
     pub grant: Grant,
     /// The server's proof.
     pub proof: PairingProof,
@@ -120,7 +120,7 @@ impl PairingServer {
 
     /// Takes a client's first message; returns the attempt and the server's half.
     ///
-    /// An attempt that ends here has told the client nothing about the code.
+    /// An attempt that ends here has revealed nothing about the code to the client.
     pub fn begin(
         &mut self,
         now: Instant,

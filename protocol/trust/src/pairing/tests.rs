@@ -34,7 +34,7 @@ struct Lab {
     now: Instant,
 }
 
-/// What a client heard at the end.
+/// What a client received at the end.
 #[derive(Debug, PartialEq)]
 enum PairingOutcome {
     Paired(Box<Admitted>),
@@ -204,7 +204,7 @@ fn recorded_messages_cannot_be_replayed() {
     let (attempt, _) = lab.begin(&begin, &seen).unwrap();
     let end = lab.server.confirm(lab.now, attempt, &confirm);
     assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
-    // And the server's old proof says nothing to a new client.
+    // And the server's old proof is worthless to a new client.
     let (client, _) = PairingClient::begin(code("123456"), "jetson", seen);
     let (confirming, _) = client.confirm(&share).unwrap();
     assert!(!confirming.is_proof(&admitted.proof));
@@ -286,7 +286,7 @@ fn codes_of_another_form_are_refused() {
         assert!(wrong.parse::<Code>().is_err(), "{wrong}");
     }
     assert_eq!(format!("{:?}", code("123456")), "Code(..)", "not for logs");
-    let drawn: std::collections::BTreeSet<_> =
+    let codes: std::collections::BTreeSet<_> =
         (0..50).map(|_| Code::random().unwrap().to_string()).collect();
-    assert!(drawn.len() > 40, "fifty draws of a million repeat rarely");
+    assert!(codes.len() > 40, "fifty random codes of a million repeat rarely");
 }

@@ -76,10 +76,10 @@ pub struct CameraConfig {
     /// Turn about the optical axis, its right side down, after yaw and tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub roll_deg: f64,
-    /// What is nearer along the optical axis is not drawn. [m]
+    /// Nearest distance along the optical axis that is rendered. [m]
     #[serde(default = "default_near_m", skip_serializing_if = "is_default_near")]
     pub near_m: f64,
-    /// It is drawn at most so often; absent is as often as the server draws. [Hz]
+    /// The maximum rate; absent is as fast as the server renders. [Hz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
     /// When the network is short, the images of cameras with a higher number go first.
@@ -197,7 +197,7 @@ impl CameraConfig {
             check_number(&key("horizontal_fov_deg"), fov_deg, "degrees", 1.0..=170.0)?;
             if let Some((name, value)) = given {
                 let advice = format!(
-                    "horizontal_fov_deg = {fov_deg} says the same in another way; remove it, or \
+                    "horizontal_fov_deg = {fov_deg} is the same in another form; remove it, or \
                      fx_px, fy_px, cx_px and cy_px"
                 );
                 return Err(invalid(key(name), value, advice));

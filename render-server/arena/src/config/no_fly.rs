@@ -30,7 +30,7 @@ impl NoFly {
 }
 
 /// A thinner box is a typing error, and none that a pose's noise respects. [m]
-const LEAST_SIDE_M: f64 = 0.01;
+const MIN_SIDE_M: f64 = 0.01;
 
 impl ArenaConfig {
     pub(super) fn check_no_fly(&self) -> Result<(), ConfigError> {
@@ -44,9 +44,9 @@ impl ArenaConfig {
             check_name(&key("name"), &keep_out.name, &mut taken)?;
             check_position(&key("min_m"), keep_out.min_m)?;
             check_position(&key("max_m"), keep_out.max_m)?;
-            if !((keep_out.max_m - keep_out.min_m).min_element() >= LEAST_SIDE_M) {
+            if !((keep_out.max_m - keep_out.min_m).min_element() >= MIN_SIDE_M) {
                 let advice = format!(
-                    "must exceed min_m = {} by {LEAST_SIDE_M} m or more on each axis",
+                    "must exceed min_m = {} by {MIN_SIDE_M} m or more on each axis",
                     keep_out.min_m
                 );
                 return Err(invalid(key("max_m"), keep_out.max_m, advice));

@@ -238,7 +238,7 @@ name = "bee"
     assert_eq!(wasp.cameras[0].name, "rear");
     assert_eq!((bee.spawn, bee.cameras.len()), (arena.spawn, 2));
     wasp.validate().unwrap();
-    // The command line has the last word; what the file says of a vehicle it names counts.
+    // The command line overrides the file; the file's settings of a vehicle that it names stay.
     let chosen = arena.flying(&["fly".to_owned(), "wasp".to_owned()]).unwrap();
     assert_eq!(chosen, [VehicleConfig::named("fly"), flying[0].clone()]);
     let alone = ArenaConfig::parse(FOREST).unwrap().flying(&[]).unwrap();

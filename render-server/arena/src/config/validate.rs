@@ -24,7 +24,7 @@ pub enum ConfigError {
     Invalid {
         /// Where in the file: `geofence.max_m`, `cameras[1].name`.
         key: String,
-        /// What it says.
+        /// The value.
         value: String,
         /// What is wrong and what to do.
         advice: String,
@@ -57,7 +57,7 @@ impl ConfigError {
     }
 }
 
-/// Returns the refusal of a value: its key, what it says, and what to do.
+/// Returns the refusal of a value: its key, the value, and what to do.
 pub fn invalid(
     key: impl Into<String>,
     value: impl Display,
@@ -78,7 +78,7 @@ const MAX_STAGES: usize = 255;
 /// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
 const MAX_VOXELS: f64 = 4e8;
 
-/// Checks that a value lies within a range; `unit` is said in the refusal.
+/// Checks that a value lies within a range; `unit` is named in the refusal.
 ///
 /// # Errors
 /// [`ConfigError::Invalid`], also for NaN.

@@ -1,5 +1,5 @@
 //! The probable cause of a failed flight, in words: fixed rules over what was recorded, the first that
-//! holds. They say what to look at first; they prove nothing.
+//! holds. They are what to look at first; they prove nothing.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::flight_end::{Collision, EndReason, Obstacle, PluginFault};
@@ -62,7 +62,7 @@ fn of_plugin(flight: &Flight<'_>, fault: &PluginFault) -> String {
         (PluginFault::Refused(_), _) => {
             format!("its setpoints are no numbers to fly by: {reason}")
         }
-        // What it said is not said twice.
+        // Its message is not repeated.
         (_, Some(line)) if !reason.contains(line) => {
             format!("{reason}; the last it printed: {line}")
         }

@@ -119,13 +119,13 @@ fn window(arena: &ArenaConfig, samples: &[Sample]) -> (DVec2, DVec2) {
     let start = arena.spawn.position_m.truncate();
     let least = points().reduce(DVec2::min).unwrap_or(start) - AROUND_M;
     let greatest = points().reduce(DVec2::max).unwrap_or(start) + AROUND_M;
-    let grow = ((DVec2::splat(LEAST_VIEW_M) - (greatest - least)) / 2.0).max(DVec2::ZERO);
+    let grow = ((DVec2::splat(MIN_VIEW_M) - (greatest - least)) / 2.0).max(DVec2::ZERO);
     (least - grow, greatest + grow)
 }
 
 /// Returns the path through samples, thinned; its ends are there.
 fn line(samples: &[Sample], place: impl Fn(&Sample) -> (f64, f64)) -> String {
-    let every = samples.len().div_ceil(MOST_POINTS).max(1);
+    let every = samples.len().div_ceil(MAX_POINTS).max(1);
     let mut path = String::new();
     for (index, sample) in samples.iter().enumerate() {
         if index % every == 0 || index + 1 == samples.len() {
@@ -143,8 +143,8 @@ const HEIGHT: f64 = 220.0;
 /// Around a plot, for its words. [user units]
 const MARGIN: f64 = 34.0;
 /// Points of a path at most: finer than a pixel for any flight that is looked at, and 16 KB.
-const MOST_POINTS: usize = 1200;
+const MAX_POINTS: usize = 1200;
 /// The top view shows so much around the last part of the way. [m]
 const AROUND_M: f64 = 2.5;
 /// It shows so much at least. [m]
-const LEAST_VIEW_M: f64 = 6.0;
+const MIN_VIEW_M: f64 = 6.0;

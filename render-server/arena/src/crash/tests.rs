@@ -1,4 +1,4 @@
-//! Each rule that names a probable cause, by a flight that it is made for; and what is drawn of one.
+//! Each rule that names a probable cause, by a flight that it is made for; and the drawings of one.
 
 use glam::{DVec3, Quat, Vec3};
 use vizflyt_protocol::flight_end::{
@@ -90,7 +90,7 @@ fn head_on() -> Case {
     }
 }
 
-/// Returns what the flight is said to have failed of.
+/// Returns the reported cause of the failure.
 fn cause_of(case: &Case) -> Option<String> {
     let (arena, field) = room();
     let sample = |tick: u32| {
@@ -251,8 +251,8 @@ fn other_ends_have_their_own_causes() {
 fn a_plugin_that_failed_is_quoted() {
     let failed = |fault| Case { end: Some(EndReason::Plugin(fault)), ..head_on() };
     let ended = failed(PluginFault::ended("ended with exit status 3"));
-    let said = Case { last_line: Some("no such model"), ..ended.clone() };
-    check(&said, "ended with exit status 3; the last it printed: no such model");
+    let with_message = Case { last_line: Some("no such model"), ..ended.clone() };
+    check(&with_message, "ended with exit status 3; the last it printed: no such model");
     check(&ended, "ended with exit status 3");
     let hung = failed(PluginFault::NoAnswer { image: 7, silent_s: 2.0 });
     check(&hung, "it answers images, but for 0.0 s without a setpoint");
@@ -263,7 +263,7 @@ fn a_plugin_that_failed_is_quoted() {
         "does `on_image` wait for something, or loop?",
     );
     check(&failed(PluginFault::Refused(InvalidSetpoint::NotFinite)), "no numbers to fly by");
-    // What it said is not said twice.
+    // Its message is not repeated.
     let once = Case { last_line: Some("exit status 3"), ..ended };
     assert_eq!(cause_of(&once).as_deref(), Some("ended with exit status 3"));
     // Nor is a sentence that only reads like another fault taken for one.

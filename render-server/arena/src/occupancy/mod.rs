@@ -105,7 +105,7 @@ impl OccupancyGrid {
         Self::bake_with(ellipsoids, spec, &|_| ())
     }
 
-    /// Bakes splats; `progress` hears the share that is done, 0 to 1, from any thread.
+    /// Bakes splats; `progress` is called with the share that is done, 0 to 1, from any thread.
     pub fn bake_with(
         ellipsoids: impl IntoIterator<Item = Ellipsoid>,
         spec: &BakeSpec,
@@ -384,7 +384,7 @@ pub const FLOOR_BAND_M: f64 = 0.3;
 /// x planes that one task bakes: 8 of 280 x 90 voxels are 0.8 MB of transmittance, in cache.
 const SLAB_PLANES: usize = 8;
 
-/// Returns a grid with the voxels occupied whose centre the function says; for tests and benches.
+/// Returns a grid whose voxels are occupied where `solid` is true of the centre; for tests and benches.
 pub fn occupancy_of(grid: Grid, floor_z_m: f64, solid: impl Fn(DVec3) -> bool) -> OccupancyGrid {
     let [nx, ny, nz] = grid.size;
     let mut cells = Vec::with_capacity(grid.voxels());

@@ -1,5 +1,5 @@
 //! `[pose]` of `arena.toml`: what the filter accepts, when silence counts, and for which moment
-//! images are drawn.
+//! images are rendered.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -16,7 +16,7 @@ pub struct PoseConfig {
     pub hold_after_s: f64,
     /// Age from which it lands. [s]
     pub land_after_s: f64,
-    /// For which moment images are drawn.
+    /// For which moment images are rendered.
     pub predict: Predict,
     /// Whether the autopilot's IMU takes part, as far as it is sent.
     pub imu: bool,
@@ -34,7 +34,7 @@ pub struct PoseConfig {
     pub flip_believed_after_s: f64,
 }
 
-/// For which moment an image is drawn.
+/// For which moment an image is rendered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Predict {

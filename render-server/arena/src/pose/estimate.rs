@@ -42,7 +42,7 @@ const ACCEL_BIAS_SIGMA_MPS2: f64 = 0.3;
 const FIRST_SPEED_MPS: f64 = 10.0;
 const FIRST_TURN_RADPS: f64 = 5.0;
 /// Beyond this nothing is known of the vehicle. [s]
-const MOST_ADVANCE_S: f64 = 5.0;
+const MAX_ADVANCE_S: f64 = 5.0;
 /// Longest single step of the motion model; longer times are cut into several. [s]
 const STEP_S: f64 = 0.05;
 /// [m/s^2, world]
@@ -61,7 +61,7 @@ pub(super) struct Estimate {
     covariance: Covariance,
 }
 
-/// What a reading says beyond what was expected.
+/// The innovation of a reading: its difference from the expected one.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Innovation {
     /// Read less expected.
@@ -132,10 +132,10 @@ impl Estimate {
         PoseSigma { position_m: self.covariance.sigma(P), rotation_rad: self.covariance.sigma(R) }
     }
 
-    /// Moves on by `dt_s` without any reading, at most [`MOST_ADVANCE_S`]: stamps are others' numbers, and a
+    /// Moves on by `dt_s` without any reading, at most [`MAX_ADVANCE_S`]: stamps are others' numbers, and a
     /// year of steps would hold up whoever waits for the pose.
     pub(super) fn advance(&mut self, dt_s: f64) {
-        let dt_s = dt_s.min(MOST_ADVANCE_S);
+        let dt_s = dt_s.min(MAX_ADVANCE_S);
         let steps = (dt_s / STEP_S).ceil();
         if !(steps >= 1.0) {
             return;
@@ -174,12 +174,12 @@ impl Estimate {
         }
     }
 
-    /// Returns what a position says beyond what is known. [m, world]
+    /// Returns the innovation of a position. [m, world]
     pub(super) fn position_innovation(&self, p_world_m: DVec3, variance_m2: DMat3) -> Innovation {
         self.innovation(&self.position_reading(p_world_m, variance_m2))
     }
 
-    /// Returns what an attitude says beyond what is known, as a rotation vector. [rad, body]
+    /// Returns the innovation of an attitude, as a rotation vector. [rad, body]
     pub(super) fn attitude_innovation(&self, rotation: DQuat, variance_rad2: DMat3) -> Innovation {
         self.innovation(&self.attitude_reading(rotation, variance_rad2))
     }

@@ -38,7 +38,7 @@ pub struct PoseFilter {
     change: Option<PoseChange>,
     imu: Imu,
     /// Intervals of accepted poses, and their innovations. [standard deviations]
-    believed: Fading,
+    accepted: Fading,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -82,7 +82,7 @@ impl PoseFilter {
             lost: false,
             change: None,
             imu: Imu::default(),
-            believed: Fading::default(),
+            accepted: Fading::default(),
         }
     }
 
@@ -95,7 +95,7 @@ impl PoseFilter {
                 if let Some((_, estimate)) = self.history.newest() {
                     self.sources[index].accept(measured, estimate, self.imu.turned);
                 }
-                self.believed.add(measured.stamp, sigmas);
+                self.accepted.add(measured.stamp, sigmas);
                 self.rejected = None;
                 if std::mem::take(&mut self.lost) {
                     self.change = Some(PoseChange::Regained);
@@ -205,7 +205,7 @@ impl PoseFilter {
         }
         let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
         let trusted = self.sources.iter().enumerate().find(|(other, source)| {
-            let age_s = source.believed_at.map(|at| stamp.seconds_since(at).abs());
+            let age_s = source.accepted_at.map(|at| stamp.seconds_since(at).abs());
             *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
         });
         if let Some((other, _)) = trusted {
@@ -213,13 +213,13 @@ impl PoseFilter {
             return GateResult::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
         }
         let newest = self.newest.map_or(stamp, |newest| newest.stamp);
-        let dt_s = stamp.seconds_since(newest).abs().max(LEAST_DT_S);
+        let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
         let speed_mps = distance_m / dt_s;
-        // A gyroscope would have felt a turn.
-        let felt = self.imu_is_fresh(stamp) && angle_rad > FELT_RAD;
-        let kind = if place.sigmas > gate && speed_mps > MOST_MANOEUVRE_MPS {
+        // A gyroscope would have measured a turn.
+        let measured_turn = self.imu_is_fresh(stamp) && angle_rad > MEASURABLE_RAD;
+        let kind = if place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS {
             ClaimKind::Jump(speed_mps)
-        } else if attitude.sigmas > gate && (felt || angle_rad / dt_s > MOST_TURN_RADPS) {
+        } else if attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS) {
             ClaimKind::Flip
         } else {
             ClaimKind::Manoeuvre(dt_s)
@@ -275,14 +275,14 @@ impl PoseFilter {
         self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
-    /// Returns the sigma to work with: what the source says, within what can be.
+    /// Returns the sigma to use: the source's own, within limits.
     fn sigma(&self, measured: &Measured) -> PoseSigma {
         let settings = self.config.sigma();
-        let said = measured.sigma.filter(|sigma| {
+        let stated = measured.sigma.filter(|sigma| {
             let least = sigma.position_m.min_element().min(sigma.rotation_rad.min_element());
             sigma.position_m.is_finite() && sigma.rotation_rad.is_finite() && least > 0.0
         });
-        let sigma = said.unwrap_or(settings);
+        let sigma = stated.unwrap_or(settings);
         PoseSigma {
             position_m: sigma.position_m.clamp(DVec3::splat(1e-5), DVec3::splat(10.0)),
             rotation_rad: sigma.rotation_rad.clamp(DVec3::splat(1e-5), DVec3::splat(3.0)),
@@ -308,8 +308,8 @@ impl PoseFilter {
         let ImuReading { stamp, accel_mps2, gyro_radps } = *reading;
         let plausible = accel_mps2.is_finite()
             && gyro_radps.is_finite()
-            && accel_mps2.length() < MOST_ACCEL_MPS2
-            && gyro_radps.length() < MOST_GYRO_RADPS;
+            && accel_mps2.length() < MAX_ACCEL_MPS2
+            && gyro_radps.length() < MAX_GYRO_RADPS;
         let newer = self.imu.last.is_none_or(|last| stamp > last);
         let known = self.newest.is_some_and(|newest| {
             stamp.seconds_since(newest.stamp) < BEGIN_ANEW_AFTER_S && self.history.reaches(stamp)
@@ -318,7 +318,7 @@ impl PoseFilter {
             return;
         }
         if let (Some(last), Some((_, estimate))) = (self.imu.last, self.history.newest()) {
-            let dt_s = stamp.seconds_since(last).min(MOST_IMU_GAP_S);
+            let dt_s = stamp.seconds_since(last).min(MAX_IMU_GAP_S);
             let turn = DQuat::from_scaled_axis(estimate.without_bias(gyro_radps) * dt_s);
             self.imu.turned = (self.imu.turned * turn).normalize();
         }
@@ -375,10 +375,10 @@ impl PoseFilter {
         let sigma = self.history.newest_pose().map(|(_, estimate)| estimate.sigma());
         PoseQuality {
             age_ms: Some(now.seconds_since(newest.stamp) * 1e3),
-            rate_hz: self.believed.rate_hz(now),
+            rate_hz: self.accepted.rate_hz(now),
             position_sigma_mm: sigma.map_or(0.0, |s| s.position_m.max_element() * 1e3),
             rotation_sigma_deg: sigma.map_or(0.0, |s| s.rotation_rad.max_element().to_degrees()),
-            innovation_sigmas: self.believed.value(),
+            innovation_sigmas: self.accepted.value(),
             speed_mps: newest.twist.linear_mps.length(),
             imu: self.imu_is_fresh(newest.stamp),
             resets: self.resets,
@@ -444,14 +444,14 @@ const TRUSTED_FOR_S: f64 = 0.15;
 /// What is further off is no noise of a localization that flies. [m]
 const LEARNS_WITHIN_M: f64 = 0.3;
 /// Measurements closer together carry no information on speed. [s]
-const LEAST_DT_S: f64 = 1e-4;
+const MIN_DT_S: f64 = 1e-4;
 /// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
 /// [m/s]
-const MOST_MANOEUVRE_MPS: f64 = 15.0;
+const MAX_MANOEUVRE_MPS: f64 = 15.0;
 /// Racing drones turn by 2000 degrees a second. [rad/s]
-const MOST_TURN_RADPS: f64 = 35.0;
+const MAX_TURN_RADPS: f64 = 35.0;
 /// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
-const FELT_RAD: f64 = 0.2;
+const MEASURABLE_RAD: f64 = 0.2;
 /// A jump that stays put for so many measurements, over so long, is the truth (a moved origin, a
 /// regained object). [s]
 const JUMP_CONFIRMED: u32 = 10;
@@ -465,10 +465,10 @@ const ACCEL_SIGMA_MPS2: f64 = 0.6;
 /// Inertial readings further from the expected are left out one by one.
 const IMU_GATE_SIGMAS: f64 = 6.0;
 /// Beyond 16 g and 2300 degrees a second sensors saturate. [m/s^2], [rad/s]
-const MOST_ACCEL_MPS2: f64 = 160.0;
-const MOST_GYRO_RADPS: f64 = 40.0;
+const MAX_ACCEL_MPS2: f64 = 160.0;
+const MAX_GYRO_RADPS: f64 = 40.0;
 /// Readings further apart are not integrated. [s]
-const MOST_IMU_GAP_S: f64 = 0.1;
+const MAX_IMU_GAP_S: f64 = 0.1;
 /// Readings after which the IMU as a whole is judged: two seconds' worth.
 const IMU_TRIAL: u32 = 200;
 /// An IMU that has been silent for so long takes no part. [s]

@@ -5,7 +5,7 @@
 //! ```text
 //! poses, 30 to 500 Hz, of one or several sources --> stamps, frozen? -> gate -\
 //! the autopilot's IMU, 100 Hz, if there is one --------------------------------> estimate
-//!       each put where its stamp says, also in the past (history)               |
+//!       each put at its stamp, also in the past (history)                     |
 //!                                          PoseSample for each accepted pose <--+--> Motion
 //! ```
 //! Read in this order: [`estimate`](self) is the Kalman filter, over its [`covariance`](self), [`history`](self) lets it take
@@ -27,14 +27,14 @@ use vizflyt_protocol::time::ServerTime;
 
 pub use config::{PoseConfig, Predict};
 pub use filter::{PoseChange, PoseFilter};
-pub use motion::{Motion, PREDICT_MOST_S};
+pub use motion::{MAX_PREDICT_S, Motion};
 pub use quality::{PoseQuality, Rejects, SourceQuality};
 pub use vizflyt_protocol::messages::ImuReading;
 
 /// Most sources of one vehicle's poses; the measurements of others are taken for the last's.
 pub const MAX_SOURCES: usize = 8;
 
-/// How far a measured pose may be off, one standard deviation an axis, as its source says.
+/// Standard deviations of a measured pose, one an axis, as its source states them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseSigma {
     /// Of the position, along the world's axes. [m, world]
@@ -48,7 +48,7 @@ pub struct PoseSigma {
 pub struct Measured {
     /// Index of the source, less than [`MAX_SOURCES`].
     pub source: u8,
-    /// When the pose was true, as well as the source lets one tell.
+    /// When the pose was true, as precisely as the source states it.
     pub stamp: ServerTime,
     /// When it arrived.
     pub arrival: ServerTime,
@@ -108,8 +108,8 @@ pub enum Rejected {
     Frozen(f64),
     /// Against another source that is accepted at this time.
     #[error(
-        "the pose is {distance_m:.2} m and {:.0} degrees from what source {other} says, which is \
-         believed: are both in the same frame, and is it the same object?",
+        "the pose is {distance_m:.2} m and {:.0} degrees from that of source {other}, which is \
+        accepted: are both in the same frame, and is it the same object?",
         .angle_rad.to_degrees()
     )]
     Disagree {

@@ -7,7 +7,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::estimate::{ACCELERATION_LASTS_S, Estimate};
 
 /// Longest extrapolation; beyond it a motion model means nothing. [s]
-pub const PREDICT_MOST_S: f64 = 0.2;
+pub const MAX_PREDICT_S: f64 = 0.2;
 
 /// How the vehicle moves: enough to predict where it is at a time close by.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,16 +49,16 @@ impl Motion {
     /// Returns the time closest to `time` at which it knows the pose.
     pub fn reach(&self, time: ServerTime) -> ServerTime {
         let dt_s = time.seconds_since(self.stamp);
-        if dt_s.abs() <= PREDICT_MOST_S {
+        if dt_s.abs() <= MAX_PREDICT_S {
             return time;
         }
-        self.stamp.plus_seconds(dt_s.clamp(-PREDICT_MOST_S, PREDICT_MOST_S))
+        self.stamp.plus_seconds(dt_s.clamp(-MAX_PREDICT_S, MAX_PREDICT_S))
     }
 
     /// Returns the pose at a time up to 0.2 s before or after; of times further off, the pose at
     /// that end.
     pub fn at(&self, time: ServerTime) -> Pose<World, Body> {
-        let dt_s = time.seconds_since(self.stamp).clamp(-PREDICT_MOST_S, PREDICT_MOST_S);
+        let dt_s = time.seconds_since(self.stamp).clamp(-MAX_PREDICT_S, MAX_PREDICT_S);
         let decay = Decay::after(dt_s);
         Pose::new(
             self.world_from_body.translation_m

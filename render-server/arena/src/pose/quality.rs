@@ -98,7 +98,8 @@ pub struct SourceQuality {
     /// From the measurement to its arrival, by its stamps. [ms]
     pub latency_ms: f64,
     /// Believed so far.
-    pub believed: u64,
+    #[serde(rename = "believed")]
+    pub accepted: u64,
     /// Turned away so far.
     pub rejected: Rejects,
 }
@@ -115,7 +116,7 @@ impl Fading {
     /// Takes a value at a time.
     pub(super) fn add(&mut self, at: ServerTime, value: f64) {
         if let Some(last) = self.last.replace(at) {
-            let dt_s = at.seconds_since(last).clamp(0.0, MOST_INTERVAL_S);
+            let dt_s = at.seconds_since(last).clamp(0.0, MAX_INTERVAL_S);
             if self.interval_s == 0.0 {
                 (self.interval_s, self.value) = (dt_s, value);
             } else {
@@ -149,6 +150,6 @@ const FADES_S: f64 = 0.5;
 /// A source without a measurement for so long has no rate. [s]
 const SILENT_S: f64 = 1.0;
 /// A pause does not make the rate of what comes after it. [s]
-const MOST_INTERVAL_S: f64 = 1.0;
+const MAX_INTERVAL_S: f64 = 1.0;
 
 const _: () = assert!(MAX_SOURCES <= u8::MAX as usize);

@@ -48,8 +48,8 @@ pub(super) struct Source {
     last: Option<(ServerTime, ServerTime)>,
     still: Option<Still>,
     claim: Option<Claim>,
-    pub believed_at: Option<ServerTime>,
-    believed: u64,
+    pub accepted_at: Option<ServerTime>,
+    accepted: u64,
     rejected: Rejects,
     latency: Fading,
     noise: Noise,
@@ -85,7 +85,7 @@ impl Source {
             let jumped = back_s > CLOCK_JUMP_S && arrival > last_arrival;
             return Err(if jumped { Rejected::ClockJump(back_s) } else { Rejected::Stale });
         }
-        if self.last.is_some_and(|(last, _)| stamp.seconds_since(last) < LEAST_APART_S) {
+        if self.last.is_some_and(|(last, _)| stamp.seconds_since(last) < MIN_APART_S) {
             return Err(Rejected::Stale);
         }
         self.last = Some((stamp, arrival));
@@ -126,12 +126,12 @@ impl Source {
         claim
     }
 
-    /// Takes note of an accepted pose, after which the vehicle moves as `estimate` says.
+    /// Takes note of an accepted pose, after which the vehicle moves as in `estimate`.
     pub(super) fn accept(&mut self, measured: &Measured, estimate: &Estimate, turned: DQuat) {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         self.claim = None;
-        self.believed += 1;
-        self.believed_at = Some(stamp);
+        self.accepted += 1;
+        self.accepted_at = Some(stamp);
         if self.still.is_none_or(|still| still.pose != pose) {
             self.still = Some(Still {
                 since: stamp,
@@ -153,9 +153,9 @@ impl Source {
     /// three axes.
     pub(super) fn learn(&mut self, sigmas: f64) {
         let Noise { square, factor } = &mut self.noise;
-        *square += ((sigmas * sigmas / 3.0).min(MOST_SQUARE) - *square) * LEARNS;
+        *square += ((sigmas * sigmas / 3.0).min(MAX_SQUARE) - *square) * LEARNS;
         if *square > NOISY_SQUARE {
-            *factor = (*factor * (1.0 + LEARNS)).min(MOST_FACTOR);
+            *factor = (*factor * (1.0 + LEARNS)).min(MAX_FACTOR);
         } else if *square < CALM_SQUARE {
             *factor = (*factor * (1.0 - LEARNS)).max(1.0);
         }
@@ -170,19 +170,19 @@ impl Source {
     }
 
     pub(super) fn quality(&self, source: u8, now: ServerTime) -> Option<SourceQuality> {
-        (self.believed + self.rejected.total() > 0).then(|| SourceQuality {
+        (self.accepted + self.rejected.total() > 0).then(|| SourceQuality {
             source,
             name: String::new(),
             rate_hz: self.latency.rate_hz(now),
             latency_ms: self.latency.value() * 1e3,
-            believed: self.believed,
+            accepted: self.accepted,
             rejected: self.rejected,
         })
     }
 }
 
 impl Claim {
-    /// Whether a vehicle that is where the claim says could be there now.
+    /// Whether a vehicle at the claimed position could be there now.
     fn fits(&self, stamp: ServerTime, pose: &Pose<World, Body>) -> bool {
         let dt_s = stamp.seconds_since(self.newest);
         let moved_m = (pose.translation_m - self.pose.translation_m).length();
@@ -202,14 +202,14 @@ impl Claim {
 /// Share of what one measurement teaches: 50 of them.
 const LEARNS: f64 = 0.02;
 /// One measurement does not count for more. [sigma^2]
-const MOST_SQUARE: f64 = 36.0;
-/// Beyond this a source scatters by more than it says; a motion model that fits badly for a while
+const MAX_SQUARE: f64 = 36.0;
+/// Beyond this a source scatters by more than it states; a motion model that fits badly for a while
 /// does not reach it.
 const NOISY_SQUARE: f64 = 2.5;
 /// Below this its weight may rise again.
 const CALM_SQUARE: f64 = 1.2;
 /// Ten times the sigma: what is worse still is no localization.
-const MOST_FACTOR: f64 = 100.0;
+const MAX_FACTOR: f64 = 100.0;
 /// A measurement may seem to come before it was made by what two clocks disagree at most. [s]
 const EARLY_S: f64 = 0.02;
 /// Nobody flies on what is older. [s]
@@ -217,7 +217,7 @@ const LATE_S: f64 = 1.0;
 /// Packets overtake each other by less. [s]
 const CLOCK_JUMP_S: f64 = 0.25;
 /// Stamps closer together are those of packets that were read at once: no source is that fast. [s]
-const LEAST_APART_S: f64 = 0.000_5;
+const MIN_APART_S: f64 = 0.000_5;
 /// Slower than this the motion's own noise is not far away. [m/s]
 const MOVING_MPS: f64 = 0.3;
 /// The same of turning. [rad/s]

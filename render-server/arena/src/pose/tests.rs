@@ -57,12 +57,12 @@ proptest! {
                 filter.handle_imu(&reading);
             } else {
                 let sigma = PoseSigma { position_m: DVec3::splat(sigma), rotation_rad: b };
-                let said = Measured {
+                let measured = Measured {
                     source: kind,
                     sigma: (kind > 0).then_some(sigma),
                     ..Measured::new(at(t), Pose::new(a, DQuat::from_scaled_axis(b)))
                 };
-                let _ = filter.handle_pose(&said);
+                let _ = filter.handle_pose(&measured);
             }
             if let Some(sample) = filter.newest() {
                 prop_assert!(sample.is_valid(), "{:?}", sample);
@@ -108,7 +108,7 @@ fn a_jump_is_turned_away_until_it_proves_true() {
             break;
         }
     }
-    let (count, sample) = accepted.expect("a lasting jump is believed");
+    let (count, sample) = accepted.expect("a lasting jump is accepted");
     assert_eq!(count, 10);
     assert_eq!((sample.resets, sample.twist.linear_mps), (1, DVec3::ZERO));
 }
@@ -169,7 +169,7 @@ fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
     let flipped = |t: f64| {
         Measured::new(at(t), Pose::new(DVec3::X * t, DQuat::from_rotation_z(120f64.to_radians())))
     };
-    let mut believed_after_s = None;
+    let mut accepted_after_s = None;
     for i in 1..400 {
         let t = 1.0 + 0.005 * f64::from(i);
         match filter.handle_pose(&flipped(t)) {
@@ -177,14 +177,14 @@ fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
             Err(other) => panic!("{other}"),
             Ok(sample) => {
                 assert_eq!(sample.resets, 1);
-                believed_after_s = Some(t - 1.0);
+                accepted_after_s = Some(t - 1.0);
                 break;
             }
         }
         filter.handle_timeout(at(t));
     }
-    // By then the vehicle has been told to hold and to land.
-    assert!(believed_after_s.is_some_and(|s| s > 0.9), "{believed_after_s:?}");
+    // By then the vehicle has been ordered to hold and to land.
+    assert!(accepted_after_s.is_some_and(|s| s > 0.9), "{accepted_after_s:?}");
     // The flip's end came with the news of the loss and of its reason.
     assert_eq!(filter.poll_change(), Some(PoseChange::Regained));
 }
@@ -317,8 +317,9 @@ fn the_error_is_as_great_as_the_filter_says() {
         let p = truth + DVec3::new(noise(), noise(), noise()) * 2e-3;
         let sigma = PoseSigma { position_m: DVec3::splat(2e-3), rotation_rad: DVec3::splat(3e-3) };
         let turned = DQuat::from_scaled_axis(DVec3::new(noise(), noise(), noise()) * 3e-3);
-        let said = Measured { sigma: Some(sigma), ..Measured::new(at(t), Pose::new(p, turned)) };
-        let sample = filter.handle_pose(&said).unwrap();
+        let measured =
+            Measured { sigma: Some(sigma), ..Measured::new(at(t), Pose::new(p, turned)) };
+        let sample = filter.handle_pose(&measured).unwrap();
         let sigma_m = filter.quality(at(t)).position_sigma_mm / 1e3;
         let off = sample.world_from_body.translation_m - truth;
         count += 3;
@@ -332,7 +333,7 @@ fn the_error_is_as_great_as_the_filter_says() {
 
 #[test]
 fn an_overconfident_source_gets_a_larger_covariance_and_is_not_rejected() {
-    // Ten times the noise it says.
+    // Ten times the noise it states.
     let mut seed = 5u64;
     let mut noise = move || {
         let mut sum = 0.0;

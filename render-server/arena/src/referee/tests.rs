@@ -73,7 +73,7 @@ fn fly(referee: &mut Referee, way: &[[f64; 3]], speed_mps: f64, start_s: f64) ->
             let stamp = ServerTime::from_ns(0).plus_seconds(t_s);
             let measured = Measured::new(stamp, Pose::new(p, DQuat::IDENTITY));
             match referee.handle_measurement(&measured) {
-                // No vehicle turns a corner at full speed; the first pose beyond one is doubted.
+                // No vehicle turns a corner at full speed; the first pose beyond one is checked.
                 Ok(_) | Err(Rejected::Outlier(_)) => {}
                 Err(reason) => panic!("{reason}"),
             }
@@ -202,7 +202,7 @@ fn a_lost_pose_ends_the_run_at_once_and_a_restart_begins_anew() {
     );
 }
 
-fn told(kind: EventKind) -> Event {
+fn received(kind: EventKind) -> Event {
     Event { stamp: ServerTime::ZERO, kind, text: bounded("") }
 }
 
@@ -226,7 +226,7 @@ fn after_land_was_ordered_neither_course_nor_clock_runs_and_a_touch_is_still_sai
     {
         let mut referee = referee(&arena());
         fly(&mut referee, &UP, 2.0, 1.0);
-        referee.handle_event(&told(order));
+        referee.handle_event(&received(order));
         assert!(fly(&mut referee, &[[1., 0., 1.], [8., 0., 1.]], 2.0, 2.0).is_empty(), "no finish");
         let post = [[8., 0., 1.], [8., 1., 1.], [3., 1., 1.]];
         let events = fly(&mut referee, &post, 2.0, 5.6);
@@ -235,7 +235,7 @@ fn after_land_was_ordered_neither_course_nor_clock_runs_and_a_touch_is_still_sai
     // On the ground nothing is judged any more, wherever the vehicle is carried.
     let mut referee = referee(&arena());
     fly(&mut referee, &UP, 2.0, 1.0);
-    referee.handle_event(&told(EventKind::Phase(FlightPhase::Landed)));
+    referee.handle_event(&received(EventKind::Phase(FlightPhase::Landed)));
     assert!(fly(&mut referee, &[[1., 0., 1.], [1., -4., 1.]], 2.0, 2.0).is_empty());
     referee.handle_timeout(ServerTime::ZERO.plus_seconds(99.0));
     let after: Vec<_> = std::iter::from_fn(|| referee.poll_event()).collect();
@@ -248,7 +248,7 @@ fn what_a_hand_did_before_the_take_off_is_no_flight() {
     // Carried into the post.
     let events = fly(&mut referee, &[[0., 1., 0.], [0., 1., 1.], [4., 1., 1.]], 2.0, 1.0);
     assert!(matches!(&events[..], [Event { kind: EventKind::Collision(_), .. }]), "{events:?}");
-    referee.handle_event(&told(EventKind::Phase(FlightPhase::TakingOff)));
+    referee.handle_event(&received(EventKind::Phase(FlightPhase::TakingOff)));
     let events = fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [8., 0., 1.]], 2.0, 10.0);
     assert!(matches!(events.last().unwrap().kind, EventKind::Finished { .. }), "{events:?}");
 }
@@ -267,7 +267,7 @@ fn a_jump_of_the_localization_is_not_flown_through() {
         events.extend(std::iter::from_fn(|| referee.poll_event()));
     }
     assert!(events.is_empty(), "{events:?}");
-    assert_eq!(referee.newest().unwrap().resets, 1, "the new place is believed in the end");
+    assert_eq!(referee.newest().unwrap().resets, 1, "the new position is accepted in the end");
 }
 
 /// A door that slides through (4, 0) along y, 1 m to each side in 4 s, at the left when it starts.

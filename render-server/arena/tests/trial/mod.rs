@@ -1,8 +1,8 @@
-//! A flight whose truth is known, measured badly: what an image drawn with and without prediction
+//! A flight whose truth is known, measured badly: what an image rendered with and without prediction
 //! is off by. All by fixed seeds.
 //!
 //! The vehicle flies a lying eight whose sharpest corner takes 8 m/s^2, as the demo's limits do,
-//! leaning into its corners, nose ahead. Images are drawn 60 times a second and seen `pipeline_s`
+//! leaning into its corners, nose ahead. Images are rendered 60 times a second and seen `pipeline_s`
 //! later; their error is measured against where the vehicle is by then.
 
 use glam::{DMat3, DQuat, DVec3};
@@ -57,8 +57,8 @@ pub(crate) struct Errors {
     pub(crate) measured_deg: f64,
     /// Attitude, predicted. [deg]
     pub(crate) predicted_deg: f64,
-    /// Poses believed, of those that came.
-    pub(crate) believed: f64,
+    /// Share of the poses that were accepted.
+    pub(crate) accepted: f64,
 }
 
 impl Errors {
@@ -110,8 +110,8 @@ impl Path {
         let turn = before.conjugate() * after;
         let turn = if turn.w < 0.0 { -turn } else { turn };
         let (_, _, a) = self.place(t);
-        let felt = self.pose(t).rotation.conjugate() * (a + DVec3::Z * 9.80665);
-        (felt, turn.to_scaled_axis() / 2e-4)
+        let accel_mps2 = self.pose(t).rotation.conjugate() * (a + DVec3::Z * 9.80665);
+        (accel_mps2, turn.to_scaled_axis() / 2e-4)
     }
 }
 
@@ -148,14 +148,14 @@ impl Trial {
         arrivals.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut filter = PoseFilter::default();
         let mut newest: Option<Pose<World, Body>> = None;
-        let (mut came, mut believed, mut images) = (0.0, 0.0, 0.0);
+        let (mut came, mut accepted, mut images) = (0.0, 0.0, 0.0);
         let mut sums = [0.0; 4];
         for (t, arrival) in arrivals {
             match arrival {
                 Arrival::Pose(measured) => {
                     came += 1.0;
                     if filter.handle_pose(&measured).is_ok() {
-                        believed += 1.0;
+                        accepted += 1.0;
                         newest = Some(measured.world_from_body);
                     }
                 }
@@ -176,7 +176,7 @@ impl Trial {
         }
         let [measured_m, predicted_m, measured_deg, predicted_deg] =
             sums.map(|sum| (sum / images).sqrt());
-        Errors { measured_m, predicted_m, measured_deg, predicted_deg, believed: believed / came }
+        Errors { measured_m, predicted_m, measured_deg, predicted_deg, accepted: accepted / came }
     }
 
     fn arrivals(&self, path: &Path, noise: &mut Noise) -> Vec<(f64, Arrival)> {
@@ -207,8 +207,8 @@ impl Trial {
                 (DVec3::new(0.01, -0.01, 0.02), DVec3::new(0.1, 0.1, -0.2));
             for k in 0..2000u32 {
                 let t = f64::from(k) * 0.01;
-                let (felt, turn) = path.imu(t);
-                let accel_mps2 = felt + accel_bias + noise.gaussian3() * 0.3;
+                let (true_accel_mps2, turn) = path.imu(t);
+                let accel_mps2 = true_accel_mps2 + accel_bias + noise.gaussian3() * 0.3;
                 let gyro_radps = turn + gyro_bias + noise.gaussian3() * 0.01;
                 let reading = ImuReading { stamp: at(t), accel_mps2, gyro_radps };
                 // The last of its batch, and the way.

@@ -17,7 +17,7 @@ pub(crate) enum Species {
 }
 
 /// A branch: a straight, tapering limb.
-// Why: each is a length or a place in metres, and says so.
+// Why: each is a length or a position in metres, by its name.
 #[expect(clippy::struct_field_names)]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limb {

@@ -174,7 +174,7 @@ impl Mover {
         Made { config, object: RigidObject { id, splats }, truth }
     }
 
-    /// As the arena file will say it: degrees, and back.
+    /// As in the arena file: degrees, and back.
     fn rest(&self) -> Pose<World, Object> {
         let yaw_rad = self.yaw_rad.to_degrees().to_radians();
         Pose::new(self.position_m, DQuat::from_rotation_z(yaw_rad))

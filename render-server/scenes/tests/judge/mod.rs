@@ -1,4 +1,4 @@
-//! Holds a way of telling collisions against the true geometry of a generated scene.
+//! Holds a method of collision detection against the true geometry of a generated scene.
 
 #![allow(dead_code)] // Why: test and bench use different parts.
 
@@ -31,11 +31,11 @@ pub(crate) struct Places(Vec<(DVec3, f64)>);
 pub(crate) struct Score {
     /// Places where the body reaches more than the tolerance into something.
     pub touching: usize,
-    /// Of these, not told.
+    /// Of these, not detected.
     pub missed: usize,
     /// Places where it is free by more than the other tolerance.
     pub clear: usize,
-    /// Of these, told to touch.
+    /// Of these, reported as contact.
     pub alarms: usize,
 }
 
@@ -117,7 +117,7 @@ impl Score {
     }
 }
 
-/// Bakes a scene as its arena says, with voxels of another size.
+/// Bakes a scene by its arena, with voxels of another size.
 pub(crate) fn bake(scene: &Generated, voxel_m: f64) -> DistanceField {
     let mut arena = scene.arena.clone();
     arena.occupancy.voxel_m = voxel_m;

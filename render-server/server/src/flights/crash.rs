@@ -31,7 +31,7 @@ pub(crate) async fn follow(
     let (arena, mut count) = (Arc::new(arena), 0);
     let mut log = vehicle.events.subscribe();
     let mut telemetry = vehicle.telemetry.subscribe();
-    // The flight and the end that were dealt with last; an earlier end that is heard of later has a card
+    // The flight and the end that were handled last; an earlier end that arrives later has a card
     // of its own.
     let mut known: Option<(u64, ServerTime)> = None;
     loop {
@@ -45,7 +45,7 @@ pub(crate) async fn follow(
             .decided()
             .filter(|(_, reason)| flight.took_off.is_some() && reason.is_failure())
         else {
-            // Something earlier, heard of later, was no failure.
+            // An earlier event that arrived later was no failure.
             if known.take_if(|(flight, _)| *flight == vehicle.flights()).is_some() {
                 vehicle.crash.send_replace(None);
             }
@@ -90,9 +90,9 @@ fn card(
         .iter()
         .map(|shot| Seen { stamp: shot.shown, ahead_m: shot.preview.ahead_m })
         .collect();
-    let told: Vec<&Event> = events.iter().filter(|event| event.stamp <= at).collect();
-    let (printed, told): (Vec<&Event>, Vec<&Event>) =
-        told.into_iter().partition(|event| event.kind == EventKind::PluginOutput);
+    let reported: Vec<&Event> = events.iter().filter(|event| event.stamp <= at).collect();
+    let (printed, reported): (Vec<&Event>, Vec<&Event>) =
+        reported.into_iter().partition(|event| event.kind == EventKind::PluginOutput);
     let delay_s = vehicle.telemetry.borrow().as_ref().map(|report| report.images);
     let delay_s = delay_s.filter(|images| images.delivered > 0);
     let flight = Flight {
@@ -132,7 +132,7 @@ fn card(
             since(&samples, at, f64::INFINITY),
         ),
         top_height_m,
-        events: told[newest(&told, EVENTS)..]
+        events: reported[newest(&reported, EVENTS)..]
             .iter()
             .map(|event| CardEvent {
                 before_s: before_s(event.stamp),
@@ -159,11 +159,11 @@ fn line(sample: &Sample, before_s: f64) -> CardSample {
     }
 }
 
-/// The last image before the end is drawn, taken and shrunk by then.
+/// The last image before the end is rendered, taken and shrunk by then.
 const IMAGES_LATE: Duration = Duration::from_millis(300);
 /// Clearance and speed are plotted over so long. [s]
 const PLOTTED_S: f64 = 4.0;
-/// Age of an image when its answer counts, where the runtime has not said it. [s]
+/// Age of an image when its reply counts, where the runtime has not reported it. [s]
 const USUAL_DELAY_S: f64 = 0.04;
 /// Events that are shown.
 const EVENTS: usize = 12;

@@ -26,7 +26,7 @@ pub struct Entry {
     pub index: u64,
     /// Who made it.
     pub origin: Origin,
-    /// What.
+    /// The event.
     pub event: Event,
 }
 

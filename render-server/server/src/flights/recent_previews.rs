@@ -32,13 +32,13 @@ pub struct Shot {
 impl RecentPreviews {
     /// Makes room for all that this many cameras will ever keep.
     pub fn of(cameras: usize) -> Self {
-        Self((0..cameras).map(|_| VecDeque::with_capacity(MOST_SHOTS)).collect())
+        Self((0..cameras).map(|_| VecDeque::with_capacity(MAX_SHOTS)).collect())
     }
 
     /// Adds a camera's preview, in place of the oldest where there is no room.
     pub fn add(&mut self, camera: usize, shown: ServerTime, preview: Arc<Preview>) {
         let Some(kept) = self.0.get_mut(camera) else { return };
-        if kept.len() == MOST_SHOTS {
+        if kept.len() == MAX_SHOTS {
             kept.pop_front();
         }
         kept.push_back(Shot { shown, preview });
@@ -54,7 +54,7 @@ impl RecentPreviews {
 /// Images are shown over so long. [s]
 const SHOWN_S: f64 = 2.0;
 /// Previews kept of a camera: [`SHOWN_S`] and the delay until a card is made, at 15 Hz.
-const MOST_SHOTS: usize = 36;
+const MAX_SHOTS: usize = 36;
 
 #[cfg(test)]
 mod tests {
@@ -74,7 +74,7 @@ mod tests {
             // A camera that is not there is nobody's.
             shots.add(7, shown(f64::from(k) / 15.0), preview);
         }
-        assert_eq!((shots.0[1].len(), shots.0[1].capacity()), (MOST_SHOTS, room));
+        assert_eq!((shots.0[1].len(), shots.0[1].capacity()), (MAX_SHOTS, room));
         // The end was 0.3 s ago: what came after it is not shown, what came in time is.
         let end = shown(199.0 / 15.0 - 0.3);
         let found = shots.until(end);

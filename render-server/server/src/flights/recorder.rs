@@ -39,7 +39,7 @@ pub(crate) async fn record(
             _ = beat.tick() => true,
         };
         if let Err(error) = recorder.follow(is_beat).await {
-            // A flight is worth more than its record: said, and tried again at the next change.
+            // A flight is worth more than its record: logged, and tried again at the next change.
             warn!("{error}");
             if is_beat {
                 vehicle.note(&format!("this flight is not written down: {error}"));
@@ -63,7 +63,7 @@ struct Running {
     id: String,
     /// Number of its flight.
     flight: u64,
-    /// When it was decided, by what was written down: told then, when it is decided otherwise by
+    /// When it was decided, by what was written down: reported then, when it is decided otherwise by
     /// something earlier, and when landed.
     decided: Option<ServerTime>,
 }
@@ -91,7 +91,7 @@ impl Recorder {
                 self.run = None;
             }
         } else if is_beat && run.decided.is_none() {
-            self.board.heard(&run.id).await?;
+            self.board.keep_alive(&run.id).await?;
         }
         Ok(())
     }
@@ -130,5 +130,5 @@ fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {
     }
 }
 
-/// How often a run says that it is still flown.
+/// Period of a run's marks that it is still flown.
 const HEARD_EVERY: Duration = Duration::from_secs(10);

@@ -14,7 +14,7 @@ pub struct Samples {
 
 impl Default for Samples {
     fn default() -> Self {
-        Self { kept: Vec::new(), apart_s: LEAST_APART_S, least_clearance_m: f64::INFINITY }
+        Self { kept: Vec::new(), apart_s: MIN_APART_S, least_clearance_m: f64::INFINITY }
     }
 }
 
@@ -33,7 +33,7 @@ impl Samples {
     /// Adds where the vehicle is at the end of its flight, however short ago the last was.
     pub fn end(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
         self.least_clearance_m = least_clearance_m;
-        if self.kept.len() >= MOST {
+        if self.kept.len() >= MAX_SAMPLES {
             // An hour in the air keeps its shape at half the rate.
             let mut keep = false;
             self.kept.retain(|_| {
@@ -43,7 +43,7 @@ impl Samples {
             self.apart_s *= 2.0;
         }
         // All at once: growing would copy megabytes between two poses. What is not used yet is no memory.
-        self.kept.reserve_exact(MOST - self.kept.len());
+        self.kept.reserve_exact(MAX_SAMPLES - self.kept.len());
         self.kept.push(Sample {
             stamp: pose.stamp,
             p_world_m: pose.world_from_body.translation_m,
@@ -65,9 +65,9 @@ impl Samples {
 }
 
 /// 50 Hz: 10 cm at 5 m/s.
-const LEAST_APART_S: f64 = 0.019;
+const MIN_APART_S: f64 = 0.019;
 /// A quarter of an hour at 50 Hz: 4 MB.
-const MOST: usize = 45_000;
+const MAX_SAMPLES: usize = 45_000;
 
 #[cfg(test)]
 mod tests {
@@ -86,7 +86,7 @@ mod tests {
             samples.add(&PoseSample::still(stamp, at), 1.0, 0.5);
         }
         let kept = samples.kept();
-        assert!((MOST / 2..=MOST).contains(&kept.len()), "{}", kept.len());
+        assert!((MAX_SAMPLES / 2..=MAX_SAMPLES).contains(&kept.len()), "{}", kept.len());
         assert!(kept.is_sorted_by(|a, b| a.stamp < b.stamp));
         assert!(kept[0].p_world_m.x < 100.0 && kept[kept.len() - 1].p_world_m.x > 199_900.0);
         assert_eq!(samples.least_clearance_m(), Some(0.5));

@@ -13,7 +13,7 @@ pub struct Track {
 
 impl Default for Track {
     fn default() -> Self {
-        Self { points: Vec::new(), spacing_m: LEAST_SPACING_M }
+        Self { points: Vec::new(), spacing_m: MIN_SPACING_M }
     }
 }
 
@@ -28,7 +28,7 @@ impl Track {
         if !far {
             return;
         }
-        if self.points.len() >= MOST_POINTS {
+        if self.points.len() >= MAX_POINTS {
             let mut keep = false;
             self.points.retain(|_| {
                 keep = !keep;
@@ -46,9 +46,9 @@ impl Track {
 }
 
 /// About the vehicle's radius. [m]
-const LEAST_SPACING_M: f32 = 0.05;
+const MIN_SPACING_M: f32 = 0.05;
 /// 32 KB; 100 m of path at the finest spacing.
-const MOST_POINTS: usize = 2048;
+const MAX_POINTS: usize = 2048;
 
 #[cfg(test)]
 mod tests {
@@ -65,7 +65,7 @@ mod tests {
             let along = Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY);
             track.add(&PoseSample::still(ServerTime::ZERO, along));
         }
-        assert!(track.points.len() <= MOST_POINTS);
+        assert!(track.points.len() <= MAX_POINTS);
         assert_eq!(track.points[0][0], 0.0);
         assert!(track.points.last().unwrap()[0] > 398.0);
         assert!(track.points.is_sorted_by(|a, b| a[0] < b[0]));

@@ -1,7 +1,7 @@
 //! The vehicle's cameras as they are at this moment; changed through the page and the API.
 //!
 //! The render thread takes the newest set at each tick, and every image keeps the camera it was
-//! drawn with: a change takes effect with the next tick, and no image is skipped or mislabelled.
+//! rendered with: a change takes effect with the next tick, and no image is skipped or mislabelled.
 //! Sessions and pages receive each change.
 
 use std::sync::Arc;
@@ -37,7 +37,7 @@ impl CameraSet {
     }
 }
 
-/// The cameras of one vehicle as they are drawn: smaller than they are where the link is too slow.
+/// The cameras of one vehicle as they are rendered: smaller where the link is too slow.
 #[derive(Debug, Default)]
 pub struct RenderedCameras {
     of: Arc<CameraSet>,
@@ -87,7 +87,7 @@ pub enum ChangeError {
     /// It would take so long to draw that the vehicle flies blind.
     #[error(
         "width_px x height_px = {0}x{1}: too large to change to while flying; give at most \
-         {MOST_PIXELS} pixels, as 3840x2160"
+         {MAX_PIXELS} pixels, as 3840x2160"
     )]
     Pixels(u32, u32),
 }
@@ -108,21 +108,21 @@ impl Cameras {
         self.0.subscribe()
     }
 
-    /// Replaces the camera `name` by what `json` says: the keys of `[[cameras]]` in `arena.toml`.
+    /// Replaces the camera `name` by `json`: the keys of `[[cameras]]` in `arena.toml`.
     pub fn put(&self, name: &str, json: &[u8]) -> Result<CameraConfig, ChangeError> {
         self.change(name, |_| Ok(serde_json::from_slice(json)?))
     }
 
-    /// Changes of the camera `name` what `json` says, null removing a key (RFC 7396, JSON merge
+    /// Changes the keys in `json` of the camera `name`, null removing a key (RFC 7396, JSON merge
     /// patch). A field of view takes the place of a calibration, and the other way round.
     pub fn patch(&self, name: &str, json: &[u8]) -> Result<CameraConfig, ChangeError> {
         self.change(name, |old| {
             let patch: Map<String, Value> = serde_json::from_slice(json)?;
-            let says = |key: &&str| patch.get(*key).is_some_and(|value| !value.is_null());
+            let has = |key: &&str| patch.get(*key).is_some_and(|value| !value.is_null());
             let mut new: Map<String, Value> = serde_json::from_value(serde_json::to_value(old)?)?;
-            if says(&FIELD_OF_VIEW) {
+            if has(&FIELD_OF_VIEW) {
                 new.retain(|key, _| !CALIBRATION.contains(&key.as_str()));
-            } else if CALIBRATION.iter().any(says) {
+            } else if CALIBRATION.iter().any(has) {
                 new.remove(FIELD_OF_VIEW);
             }
             for (key, value) in patch {
@@ -178,7 +178,7 @@ fn changed(
         return Err(ChangeError::Renamed(new.name));
     }
     new.validate()?;
-    if u64::from(new.width_px) * u64::from(new.height_px) > MOST_PIXELS {
+    if u64::from(new.width_px) * u64::from(new.height_px) > MAX_PIXELS {
         return Err(ChangeError::Pixels(new.width_px, new.height_px));
     }
     Ok((index, new))
@@ -187,7 +187,7 @@ fn changed(
 const FIELD_OF_VIEW: &str = "horizontal_fov_deg";
 const CALIBRATION: [&str; 5] = ["fx_px", "fy_px", "cx_px", "cy_px", "distortion"];
 /// 4K: a second's work for a small machine, and 40 MB of shared memory.
-const MOST_PIXELS: u64 = 3840 * 2160;
+const MAX_PIXELS: u64 = 3840 * 2160;
 
 #[cfg(test)]
 mod tests {
@@ -207,14 +207,14 @@ mod tests {
     #[test]
     fn a_slow_link_gets_smaller_images_of_the_same_view() {
         let cameras = Cameras::new(vec![CameraConfig::ahead("a", [640, 480], 90.0, DVec3::ZERO)]);
-        let (newest, mut drawn) = (cameras.newest(), RenderedCameras::default());
-        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 1), &newest));
-        let half = drawn.follow(newest.clone(), 2);
+        let (newest, mut rendered) = (cameras.newest(), RenderedCameras::default());
+        assert!(Arc::ptr_eq(&rendered.follow(newest.clone(), 1), &newest));
+        let half = rendered.follow(newest.clone(), 2);
         let (k, full) = (half.infos[0].intrinsics, newest.infos[0].intrinsics);
         assert_eq!((k.width_px, k.height_px, k.fx_px), (320, 240, full.fx_px / 2.0));
-        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 2), &half), "made once");
-        assert_eq!(drawn.follow(newest.clone(), 3).infos[0].intrinsics.width_px, 213);
-        assert!(Arc::ptr_eq(&drawn.follow(newest.clone(), 1), &newest), "and back");
+        assert!(Arc::ptr_eq(&rendered.follow(newest.clone(), 2), &half), "made once");
+        assert_eq!(rendered.follow(newest.clone(), 3).infos[0].intrinsics.width_px, 213);
+        assert!(Arc::ptr_eq(&rendered.follow(newest.clone(), 1), &newest), "and back");
     }
 
     #[test]

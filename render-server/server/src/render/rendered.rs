@@ -1,7 +1,7 @@
-//! Drawn ticks on their way: from the render thread to the encode thread, then to the previews.
+//! Rendered ticks: from the render thread to the encode thread, then to the previews.
 //!
 //! ```text
-//! render --publish--> drawn --take--> encode --pass_on--> spent --take_spent--> previews
+//! render --publish--> ready --take--> encode --pass_on--> spent --take_spent--> previews
 //!            \--- what no one took, if a page watches ------^                      |
 //!   ^---------------------------- buffers, reused -----------------------<---------/
 //! ```
@@ -18,7 +18,7 @@ use vizflyt_splat::RgbdImage;
 use crate::mailbox::Mailbox;
 use crate::render::cameras::CameraSet;
 
-/// What was drawn in one tick, and what nobody took of the ticks it replaced; reused from tick to
+/// The images rendered in one tick, and those of replaced ticks that nobody took; reused from tick to
 /// tick.
 #[derive(Debug, Default)]
 pub struct RenderedTick {
@@ -31,7 +31,7 @@ pub struct RenderedTick {
 pub struct RenderedImage {
     /// Whether there is one; everything else counts only then.
     pub fresh: bool,
-    /// Whether a runtime flew when it was drawn, so that it counts.
+    /// Whether a runtime flew when it was rendered, so that it counts.
     pub counted: bool,
     /// Index of the vehicle.
     pub vehicle: usize,
@@ -43,9 +43,9 @@ pub struct RenderedImage {
     pub pose: ServerTime,
     /// The instant it shows.
     pub shown: ServerTime,
-    /// The pose drawn from: that of the instant.
+    /// The pose rendered from: that of the instant.
     pub world_from_body: Option<Pose<World, Body>>,
-    /// The vehicle's cameras as they were drawn with.
+    /// The vehicle's cameras that it was rendered with.
     pub set: Option<Arc<CameraSet>>,
     /// Rendering of the tick began.
     pub render_start: ServerTime,
@@ -70,35 +70,35 @@ impl RenderedTick {
 /// The ticks between the threads.
 #[derive(Debug, Default)]
 pub struct RenderQueue {
-    drawn: Mailbox<RenderedTick>,
+    ready: Mailbox<RenderedTick>,
     spent: Mailbox<RenderedTick>,
 }
 
 impl RenderQueue {
     /// Returns a tick to fill.
     pub fn spare(&self) -> RenderedTick {
-        self.drawn.spare()
+        self.ready.spare()
     }
 
-    /// Puts a drawn tick in place of one that nobody took, which goes to the previews if someone
+    /// Puts a rendered tick in place of one that nobody took, which goes to the previews if someone
     /// has them `watched`; returns whether it replaced one.
     pub fn publish(&self, tick: RenderedTick, watched: bool) -> bool {
-        let replaced = self.drawn.put_over(tick, RenderedTick::inherit);
+        let replaced = self.ready.put_over(tick, RenderedTick::inherit);
         replaced.map(|old| self.pass_on(old, watched)).is_some()
     }
 
     /// Waits at most `timeout` for a tick to encode.
     pub fn take(&self, timeout: Duration) -> Option<RenderedTick> {
-        self.drawn.take(timeout)
+        self.ready.take(timeout)
     }
 
     /// Gives a tick that the encoder has done with to the previews, if someone has them `watched`.
     pub fn pass_on(&self, tick: RenderedTick, watched: bool) {
         if !watched {
-            return self.drawn.recycle(tick);
+            return self.ready.recycle(tick);
         }
         if let Some(old) = self.spent.put_over(tick, RenderedTick::inherit) {
-            self.drawn.recycle(old);
+            self.ready.recycle(old);
         }
     }
 
@@ -109,7 +109,7 @@ impl RenderQueue {
 
     /// Gives a tick back to be filled anew.
     pub fn recycle(&self, tick: RenderedTick) {
-        self.drawn.recycle(tick);
+        self.ready.recycle(tick);
     }
 }
 

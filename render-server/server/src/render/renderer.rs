@@ -1,4 +1,4 @@
-//! `--renderer`: which renderer draws, as the command line says it and as the page shows it.
+//! `--renderer`: which renderer is used, as the command line names it and as the page shows it.
 
 use std::fmt;
 

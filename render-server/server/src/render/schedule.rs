@@ -152,7 +152,7 @@ mod tests {
         rates_hz.iter().map(camera).collect()
     }
 
-    /// Runs a second in which each tick takes `tick_ms`; returns how often each camera was drawn.
+    /// Runs a second in which each tick takes `tick_ms`; returns how often each camera was rendered.
     fn drawn_in_a_second(rates_hz: &[Option<f64>], tick_ms: i64) -> Vec<usize> {
         let (start, cameras) = (START, cameras(rates_hz));
         let mut schedule = CameraSchedule::new(start);
@@ -162,7 +162,7 @@ mod tests {
             schedule.hasten(&cameras, &LIVE, now);
             now = now.max(schedule.next(&cameras).unwrap());
             let taken = schedule.take(&cameras, &LIVE, now);
-            assert!(taken.contains(&true), "a tick draws something");
+            assert!(taken.contains(&true), "a tick renders something");
             for (count, taken) in counts.iter_mut().zip(taken) {
                 *count += usize::from(taken);
             }
@@ -177,7 +177,7 @@ mod tests {
         let counts = drawn_in_a_second(&[Some(30.0), None, Some(10.0), Some(500.0)], 1);
         assert!(counts[0].abs_diff(30) <= 1 && counts[2].abs_diff(10) <= 1, "{counts:?}");
         assert!(counts[1].abs_diff(120) <= 1 && counts[3] == counts[1], "{counts:?}");
-        // A machine that draws 40 ticks a second gives every one to the camera without a rate.
+        // A machine that renders 40 ticks a second gives every one to the camera without a rate.
         let counts = drawn_in_a_second(&[Some(30.0), None], 25);
         assert!(counts[0].abs_diff(30) <= 1 && counts[1].abs_diff(40) <= 1, "{counts:?}");
     }

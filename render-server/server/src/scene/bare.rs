@@ -42,7 +42,7 @@ pub fn align(splats: &Splats, up: Up, scale: Option<f64>) -> WorldFromScene {
 /// robust bounds, the start on the floor where there is room and the view is best, one camera of
 /// 320x240, no goal.
 ///
-/// `scene` is what the arena's `scene` key shall say.
+/// `scene` is the value of the arena's `scene` key.
 pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
     let bounds = Bounds::of(splats, |mean| mean);
     let (spawn, yaw_rad) = best_view(splats, &Plan::of(splats, &bounds).places());
@@ -91,7 +91,7 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
 ///
 /// A capture is sharp only near where its photographs were taken, and those places are not in the
 /// file. But seen from elsewhere it is blur and void, and that a picture shows: so small pictures
-/// are drawn from everywhere and compared.
+/// are rendered from everywhere and compared.
 fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
     let mut renderer = CpuRenderer::new(splats);
     let mut images = vec![RgbdImage::default(); HEADINGS];
@@ -179,7 +179,7 @@ struct Plan {
 impl Plan {
     fn of(splats: &Splats, bounds: &Bounds) -> Self {
         let span = (bounds.max - bounds.min) / CELL_M;
-        let cells = [span.x, span.y].map(|cells| (cells.ceil() as usize).clamp(1, MOST_CELLS));
+        let cells = [span.x, span.y].map(|cells| (cells.ceil() as usize).clamp(1, MAX_CELLS));
         let mut plan = Self { min: bounds.min, cells, filled: vec![0; cells[0] * cells[1]] };
         for (mean, opacity) in splats.means_m.iter().zip(&splats.opacities) {
             let flown = (0.3..TAKEOFF_HEIGHT_M as f32 + 0.5).contains(&mean.z);
@@ -260,7 +260,7 @@ const REACH_CELLS: i64 = 4;
 /// Fine against that reach. [m]
 const CELL_M: f64 = 0.1;
 /// 40 m; larger captures are planned over their first corner only.
-const MOST_CELLS: usize = 400;
+const MAX_CELLS: usize = 400;
 
 #[cfg(test)]
 mod tests {

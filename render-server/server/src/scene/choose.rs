@@ -31,7 +31,7 @@ impl Scenes {
             })
             .collect();
         scenes.sort();
-        scenes.truncate(MOST_SCENES);
+        scenes.truncate(MAX_SCENES);
         scenes
     }
 
@@ -62,7 +62,7 @@ impl Scenes {
                 names => format!("there is no scene '{name}'; there are {}", names.join(", ")),
             });
         };
-        // What is wrong with it is told now, not after the present one is gone.
+        // Errors in it are reported now, not after the present one is gone.
         super::parse_arena(arena).map_err(|error| format!("{error:#}"))?;
         *lock(&self.chosen) = Some(arena.clone());
         Ok(())
@@ -75,7 +75,7 @@ impl Scenes {
 }
 
 /// More are no choice on a page.
-const MOST_SCENES: usize = 100;
+const MAX_SCENES: usize = 100;
 
 #[cfg(test)]
 mod tests {

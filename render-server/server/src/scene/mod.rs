@@ -176,14 +176,14 @@ fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
 /// Reads a scene file of any format; how far it has come goes to the log, if it takes long.
 fn read(path: &Path) -> Result<Loaded> {
     let start = Instant::now();
-    let mut told = start;
-    let mut tell = |at: Progress| {
-        if told.elapsed() >= TELL_EVERY && at.done < at.total {
-            told = Instant::now();
+    let mut logged_at = start;
+    let mut log_progress = |at: Progress| {
+        if logged_at.elapsed() >= LOG_PERIOD && at.done < at.total {
+            logged_at = Instant::now();
             info!("{}: {:.0} % read", path.display(), 100.0 * at.done as f64 / at.total as f64);
         }
     };
-    let loaded = format::read_with_progress(path, &mut tell)
+    let loaded = format::read_with_progress(path, &mut log_progress)
         .with_context(|| format!("cannot use scene {}", path.display()))?;
     let dropped = loaded.dropped.total();
     if dropped > 0 {
@@ -200,7 +200,7 @@ fn read(path: &Path) -> Result<Loaded> {
 }
 
 /// Shorter loads need no progress.
-const TELL_EVERY: Duration = Duration::from_secs(1);
+const LOG_PERIOD: Duration = Duration::from_secs(1);
 
 /// Parses metres per unit of a bare scene.
 ///

@@ -37,7 +37,7 @@ pub(super) fn read_all(
 }
 
 /// Returns what must not be touched: what stands still as baked already, and each object with a field
-/// baked in its own frame; phases that the arena does not say are drawn from the seed.
+/// baked in its own frame; phases that the arena does not set are random, from the seed.
 pub fn obstacles(
     arena: &ArenaConfig,
     objects: &[RigidObject],
@@ -69,8 +69,8 @@ fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     let (low_m, high_m) = (low_m.as_dvec3() - MARGIN_M, high_m.as_dvec3() + MARGIN_M);
     let of_size = |voxel_m: f64| ((high_m - low_m) / voxel_m).element_product();
     let mut voxel_m = arena.occupancy.voxel_m.min(VOXEL_M);
-    if of_size(voxel_m) > MOST_VOXELS {
-        voxel_m = ((high_m - low_m).element_product() / MOST_VOXELS).cbrt();
+    if of_size(voxel_m) > MAX_VOXELS {
+        voxel_m = ((high_m - low_m).element_product() / MAX_VOXELS).cbrt();
     }
     let grid = Grid::covering(low_m, high_m, voxel_m);
     let ellipsoids = (0..splats.len()).map(|k| Ellipsoid {
@@ -85,7 +85,7 @@ fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
 
 /// Finer than a scene's: objects are small, and a hand of 3 cm must not grow to 10. [m]
 const VOXEL_M: f64 = 0.02;
-/// Within this of an object its field says the distance to it; further away, a lower bound. [m]
+/// Within this of an object its field has the distance to it; further away, a lower bound. [m]
 const MARGIN_M: DVec3 = DVec3::splat(0.5);
 /// Larger objects get coarser voxels: 16 MB each.
-const MOST_VOXELS: f64 = 1.6e7;
+const MAX_VOXELS: f64 = 1.6e7;

@@ -21,7 +21,7 @@ use vizflyt_trust::KeysFolder;
 
 use self::load::{LoadedScene, prepare};
 use self::print::{Ready, ReadySource, ReadyVehicle};
-use crate::args::{Kept, ServeArgs};
+use crate::args::{RunStorage, ServeArgs};
 use crate::authorization::Authorizer;
 use crate::clock;
 use crate::flights::leaderboard::{Database, Leaderboard};
@@ -184,7 +184,7 @@ async fn run(
     rooms.streaming.subscriptions.shut();
     tasks.shutdown().await;
     for thread in threads {
-        // A thread that panicked has said so on stderr; the report still comes.
+        // A thread that panicked has reported it on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
     print::report(args.json, &print::Report::of(&rooms));
@@ -198,7 +198,7 @@ struct Sockets {
     sources: Vec<Opened>,
 }
 
-/// Binds all addresses; `again` says that a former round may still hold them for a moment.
+/// Binds all addresses; `again` means that a former round may still hold them for a moment.
 async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) -> Result<Sockets> {
     let mut tries = if again { BIND_TRIES } else { 0 };
     loop {
@@ -256,11 +256,11 @@ async fn make_rooms(
     }
 }
 
-/// Opens the database of runs. Without one the lab flies all the same: a warning says why.
+/// Opens the database of runs. Without one the lab flies all the same: a warning has the reason.
 async fn open_leaderboard(args: &ServeArgs) -> Option<Leaderboard> {
     let database = match &args.leaderboard {
-        Some(Kept::Nowhere) => return None,
-        Some(Kept::In(database)) => database.clone(),
+        Some(RunStorage::Nowhere) => return None,
+        Some(RunStorage::In(database)) => database.clone(),
         None => Database::File(Database::default_file()?),
     };
     match Leaderboard::open(&database).await {
@@ -278,7 +278,7 @@ fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bo
     if json {
         print::line(&serde_json::json!({ "pairing": { "code": window.code.to_string() } }));
     } else {
-        print::say(&format!(
+        print::plain(&format!(
             "pairing      code {}, good for {} s: on the other computer `vizflyt pair HOST:{port}`",
             window.code,
             window.left.as_secs()
@@ -292,7 +292,7 @@ fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bo
             if json {
                 print::line(&serde_json::json!({ "pairing": { "news": text } }));
             } else {
-                print::say(&format!("pairing      {text}"));
+                print::plain(&format!("pairing      {text}"));
             }
         }
     });

@@ -88,7 +88,7 @@ pub(super) fn page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool)
         if json {
             line(&serde_json::json!({ "page_key": { "for": whose, "link": link } }));
         } else {
-            say(&format!("page key     {link} ({whose})"));
+            plain(&format!("page key     {link} ({whose})"));
         }
     }
 }
@@ -113,8 +113,8 @@ pub(super) async fn events(vehicle: Arc<VehicleFlight>, alone: bool, json: bool)
                 (true, false) => {
                     line(&serde_json::json!({ "vehicle": vehicle.name, "event": entry.event }));
                 }
-                (false, true) => say(&entry.event.text),
-                (false, false) => say(&format!("{}: {}", vehicle.name, entry.event.text)),
+                (false, true) => plain(&entry.event.text),
+                (false, false) => plain(&format!("{}: {}", vehicle.name, entry.event.text)),
             }
         }
     }
@@ -125,20 +125,23 @@ pub(super) fn ready(json: bool, ready: &Ready<'_>) {
     if json {
         return line(ready);
     }
-    say(&format!("arena        {}", ready.arena));
-    say(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
-    say(&format!("page         {}", ready.http));
+    plain(&format!("arena        {}", ready.arena));
+    plain(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
+    plain(&format!("page         {}", ready.http));
     for source in &ready.pose {
-        say(&format!("{:<12} {} (poses)", source.driver.name(), source.address));
+        plain(&format!("{:<12} {} (poses)", source.driver.name(), source.address));
     }
     for vehicle in &ready.vehicles {
         let named = match &*ready.vehicles {
             [one] if one.name == "vizflyt" => String::new(),
             _ => format!(" --vehicle {}", vehicle.name),
         };
-        say(&format!("runtime      vizflyt fly PLUGIN --server HOST:{}{named}", ready.quic.port()));
+        plain(&format!(
+            "runtime      vizflyt fly PLUGIN --server HOST:{}{named}",
+            ready.quic.port()
+        ));
     }
-    say(&format!("identity     {} ({} paired)", ready.fingerprint, ready.paired));
+    plain(&format!("identity     {} ({} paired)", ready.fingerprint, ready.paired));
 }
 
 /// Prints the report at the end.
@@ -146,8 +149,8 @@ pub(super) fn report(json: bool, report: &Report) {
     if json {
         return line(&serde_json::json!({ "report": report }));
     }
-    say(&format!(
-        "{} images sent, {} ticks drawn ({} skipped); render {:.1} ms, p99 {:.1}; peak memory {:.0} MB; {}",
+    plain(&format!(
+        "{} images sent, {} ticks rendered ({} skipped); render {:.1} ms, p99 {:.1}; peak memory {:.0} MB; {}",
         report.images_sent,
         report.ticks,
         report.ticks_skipped,
@@ -161,13 +164,13 @@ pub(super) fn report(json: bool, report: &Report) {
 /// Prints a JSON line.
 pub(super) fn line(value: &impl Serialize) {
     match serde_json::to_string(value) {
-        Ok(text) => say(&text),
+        Ok(text) => plain(&text),
         Err(error) => tracing::warn!("a line was not printed: {error}"),
     }
 }
 
 /// Prints a line; unlike `println!` it does not panic when the reader has gone.
-pub(super) fn say(text: &str) {
+pub(super) fn plain(text: &str) {
     use std::io::Write;
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{text}").and_then(|()| out.flush());

@@ -1,12 +1,12 @@
-//! What became of every image that was drawn for a runtime: delivered, under way, or skipped and
-//! why.
+//! The delivery statistics of every image that was rendered for a runtime: delivered, in flight, or
+//! skipped and why.
 //!
 //! ```text
-//! render ─ drawn ─▶ encode ─ handed ─▶ transport ─ late ─▶ .     counted here, by camera
+//! render ─ rendered ─▶ encode ─ handed ─▶ transport ─ late ─▶ .  counted here, by camera
 //! runtime ─ arrived, delivered, stale, ... ─▶ DeliveryStats             reported once a second
 //! ```
-//! Both sides only count up. What is handed over and has not arrived is under way, or late as far
-//! as the transport has given it up; so the sum of an account is what was drawn, at any moment.
+//! Both sides only count up. What is handed over and has not arrived is in flight, or late as far
+//! as the transport has given it up; so the sum is the number of rendered images, at any moment.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,20 +16,20 @@ use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
 /// Running counts of one camera's images.
 #[derive(Debug, Default)]
 pub struct CameraCounters {
-    drawn: AtomicU64,
+    rendered: AtomicU64,
     handed: AtomicU64,
     failed: AtomicU64,
     late: AtomicU64,
 }
 
 impl CameraCounters {
-    /// Counts an image drawn while a runtime flies.
+    /// Counts an image rendered while a runtime flies.
     pub fn count_rendered(&self) {
-        self.drawn.fetch_add(1, Ordering::SeqCst);
+        self.rendered.fetch_add(1, Ordering::SeqCst);
     }
 
-    /// Counts an image handed to the runtime's transport; `counted` says whether it was when it was
-    /// drawn: the first one of a session may have been drawn for nobody.
+    /// Counts an image handed to the runtime's transport; `counted` is whether it was when it was
+    /// rendered: the first one of a session may have been rendered for nobody.
     pub fn count_sent(&self, counted: bool) {
         if !counted {
             self.count_rendered();
@@ -37,7 +37,7 @@ impl CameraCounters {
         self.handed.fetch_add(1, Ordering::SeqCst);
     }
 
-    /// Counts a drawn image that could not be encoded.
+    /// Counts a rendered image that could not be encoded.
     pub fn count_failed(&self, counted: bool) {
         if !counted {
             self.count_rendered();
@@ -56,15 +56,15 @@ impl CameraCounters {
         let late = self.late.load(Ordering::SeqCst);
         let (failed, handed) =
             (self.failed.load(Ordering::SeqCst), self.handed.load(Ordering::SeqCst));
-        Counts { late, failed, handed, drawn: self.drawn.load(Ordering::SeqCst) }
+        Counts { late, failed, handed, rendered: self.rendered.load(Ordering::SeqCst) }
     }
 }
 
 /// Counts of one camera's images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Drawn while a runtime flies.
-    pub drawn: u64,
+    /// Rendered while a runtime flies.
+    pub rendered: u64,
     /// Handed to its transport.
     pub handed: u64,
     /// Not encoded for an error.
@@ -76,7 +76,7 @@ pub struct Counts {
 impl Counts {
     fn since(self, start: Self) -> Self {
         Self {
-            drawn: self.drawn.saturating_sub(start.drawn),
+            rendered: self.rendered.saturating_sub(start.rendered),
             handed: self.handed.saturating_sub(start.handed),
             failed: self.failed.saturating_sub(start.failed),
             late: self.late.saturating_sub(start.late),
@@ -84,11 +84,12 @@ impl Counts {
     }
 }
 
-/// What became of the images of one camera in the present flight; `drawn` is the sum of the rest.
+/// The delivery of one camera's images in the present flight; `rendered` is the sum of the rest.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Delivery {
-    /// Drawn.
-    pub drawn: u64,
+    /// Rendered.
+    #[serde(rename = "drawn")]
+    pub rendered: u64,
     /// Given to the plugin.
     pub delivered: u64,
     /// Neither ended nor reported yet.
@@ -97,7 +98,7 @@ pub struct Delivery {
     pub skipped: Skipped,
 }
 
-/// What became of the images of one camera.
+/// The delivery of one camera's images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CameraDelivery {
     /// Its name.
@@ -110,7 +111,7 @@ pub struct CameraDelivery {
 /// Images skipped, by reason, in the order of their way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skipped {
-    /// Drawn, but a newer one was before the encoder was free and the transport had room.
+    /// Rendered, but a newer one was before the encoder was free and the transport had room.
     pub no_room: u64,
     /// Could not be encoded.
     pub failed: u64,
@@ -156,7 +157,7 @@ impl Delivery {
         let on_the_way = server.handed - arrived;
         let late = server.late.min(on_the_way);
         let skipped = Skipped {
-            no_room: server.drawn.saturating_sub(server.handed + server.failed),
+            no_room: server.rendered.saturating_sub(server.handed + server.failed),
             failed: server.failed,
             late,
             stale: runtime.stale,
@@ -167,7 +168,7 @@ impl Delivery {
         };
         let waiting = arrived.saturating_sub(runtime.ended());
         Self {
-            drawn: server.drawn,
+            rendered: server.rendered,
             delivered: runtime.delivered,
             under_way: on_the_way - late + waiting,
             skipped,
@@ -301,7 +302,7 @@ mod tests {
     }
 
     proptest! {
-        /// Every image that is drawn is accounted for: at any moment by the sum, in the end by its
+        /// Every image that is rendered is accounted for: at any moment by the sum, in the end by its
         /// own reason, though reports lag behind and the runtime is restarted in flight.
         #[test]
         fn every_drawn_image_is_accounted_for(
@@ -338,8 +339,8 @@ mod tests {
                     delivery.report(&runtime);
                 }
                 let account = delivery.account(3, counter);
-                prop_assert_eq!(account.drawn, step as u64 + 1);
-                prop_assert_eq!(sum(&account), account.drawn);
+                prop_assert_eq!(account.rendered, step as u64 + 1);
+                prop_assert_eq!(sum(&account), account.rendered);
             }
             for end in late_arrivals {
                 arrive(&mut runtime[3], end);
@@ -349,7 +350,7 @@ mod tests {
             prop_assert!(found.delivered <= arrived + runtime[3].arrived);
             let of = |end| truth[ENDS.iter().position(|&e| e == end).unwrap()];
             let expected = Delivery {
-                drawn: script.len() as u64,
+                rendered: script.len() as u64,
                 delivered: of(End::Delivered) + of(End::LateButDelivered),
                 under_way: 0,
                 skipped: Skipped {

@@ -235,12 +235,12 @@ pub struct RateController {
 }
 
 impl RateController {
-    /// Makes the policy; `adapt` says how far it may go.
+    /// Makes the policy; `adapt` limits how far it may go.
     pub fn new(adapt: Adaptation) -> Self {
         Self {
             levels: adapt.levels(),
             level: 0,
-            samples: VecDeque::with_capacity(MOST_SAMPLES),
+            samples: VecDeque::with_capacity(MAX_SAMPLES),
             last_ended: ServerTime::ZERO,
             silent_since: None,
             fits_since: None,
@@ -275,7 +275,7 @@ impl RateController {
         if image.delivered {
             let since = self.silent_since.take();
             if since.is_some_and(|since| ended.seconds_since(since) > SILENT_S) {
-                // An outage says nothing of the link that came back.
+                // An outage has no information about the link that came back.
                 self.samples.clear();
             }
         } else {
@@ -285,13 +285,13 @@ impl RateController {
         if self.changed.is_some_and(|then| handed <= then) {
             return;
         }
-        if self.samples.len() == MOST_SAMPLES {
+        if self.samples.len() == MAX_SAMPLES {
             self.samples.pop_front();
         }
         self.samples.push_back(Sample {
             ended,
             bytes: image.bytes as f64,
-            service_s: took_s.max(LEAST_SERVICE_S),
+            service_s: took_s.max(MIN_SERVICE_S),
         });
     }
 
@@ -310,7 +310,7 @@ impl RateController {
         let full_bps = 8.0 * mean_bytes * wanted_hz / LEVELS[self.level].share;
         let needs = |level: usize| full_bps * LEVELS[level].load() / capacity_bps;
 
-        let to = if needs(self.level) > MOST {
+        let to = if needs(self.level) > MAX_LOAD {
             self.fits_since = None;
             // The first that fits, but one lower at least; the last if none does.
             let lower = self.level + 1..self.levels;
@@ -332,8 +332,8 @@ impl RateController {
         let since_s = self.changed.map_or(f64::INFINITY, |then| now.seconds_since(then));
         if to > from && self.raised && since_s < LASTS_S {
             // The raise did not last: the link is between two levels.
-            self.patience_s = (2.0 * self.patience_s).min(MOST_PATIENCE_S);
-        } else if self.raised && since_s > MOST_PATIENCE_S {
+            self.patience_s = (2.0 * self.patience_s).min(MAX_PATIENCE_S);
+        } else if self.raised && since_s > MAX_PATIENCE_S {
             self.patience_s = PATIENCE_S;
         }
         (self.raised, self.changed, self.fits_since) = (to < from, Some(now), None);
@@ -345,7 +345,7 @@ impl RateController {
     fn capacity_bps(&self, now: ServerTime) -> Option<f64> {
         let silent_s = self.silent_since.map_or(0.0, |since| now.seconds_since(since));
         let is_out = silent_s > SILENT_S && silent_s < OUTAGE_S;
-        if self.samples.len() < LEAST_SAMPLES || is_out {
+        if self.samples.len() < MIN_SAMPLES || is_out {
             return None;
         }
         let mut rates: Vec<f64> =
@@ -360,15 +360,15 @@ pub const DECIDE_EVERY: Duration = Duration::from_millis(250);
 /// Images of the last so many seconds count: enough for a median at 20 Hz, and an outage fits. [s]
 const WINDOW_S: f64 = 3.0;
 /// An eighth of a second at 60 Hz; at the lowest rates half a second.
-const LEAST_SAMPLES: usize = 8;
+const MIN_SAMPLES: usize = 8;
 /// 640 bytes a session; a second and more at 60 Hz.
-const MOST_SAMPLES: usize = 64;
+const MAX_SAMPLES: usize = 64;
 /// Share of the capacity above which a level is too much: packets have headers (3 %), and a queue
 /// at full load never empties.
-const MOST: f64 = 0.9;
+const MAX_LOAD: f64 = 0.9;
 /// Share of the capacity that a lower level is chosen by.
 const AIM: f64 = 0.8;
-/// Share of the capacity that a raise may need: below [`MOST`] by more than levels next to each
+/// Share of the capacity that a raise may need: below [`MAX_LOAD`] by more than levels next to each
 /// other vary with the scene.
 const RAISE: f64 = 0.7;
 /// Below this share of the capacity a raise that did not last before is no reason to wait.
@@ -376,7 +376,7 @@ const AMPLE: f64 = 0.4;
 /// How long the next better level must fit. [s]
 const PATIENCE_S: f64 = 2.0;
 /// Where the link is just between two levels: one try in so long. [s]
-const MOST_PATIENCE_S: f64 = 32.0;
+const MAX_PATIENCE_S: f64 = 32.0;
 /// A raise that is taken back within this did not last. [s]
 const LASTS_S: f64 = 10.0;
 /// Without any acknowledgement for so long it is no outage but a link that carries nothing of this
@@ -387,7 +387,7 @@ const SILENT_S: f64 = 0.5;
 /// The runtime's `max_ack_delay`: not the link's doing. [s]
 const ACK_DELAY_S: f64 = 0.002;
 /// What is quicker cannot be distinguished from the clock's and the tasks' own delays. [s]
-const LEAST_SERVICE_S: f64 = 0.0002;
+const MIN_SERVICE_S: f64 = 0.0002;
 
 #[cfg(test)]
 mod tests;

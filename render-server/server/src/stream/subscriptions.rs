@@ -2,7 +2,7 @@
 //!
 //! A vehicle's images go to its runtime and to any number of watchers, at most [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS).
 //! For each camera at most K images may be in flight to each of them (handed to the transport, not
-//! yet acknowledged). The encode thread takes the newest drawn tick only when someone has room, so
+//! yet acknowledged). The encode thread takes the newest rendered tick only when someone has room, so
 //! that what waits is always the newest, and nothing is encoded that could not leave; an image is
 //! encoded once, for all who have room ([`Subscriptions::begin`]).
 //!
@@ -30,7 +30,7 @@ pub struct Wanted {
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
     /// By vehicle and camera: the runtime has room for an image.
     pub fly: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
-    /// No runtime wants anything, but a page does: drawn ticks go on to the previews.
+    /// No runtime wants anything, but a page does: rendered ticks go on to the previews.
     pub pass_on: bool,
 }
 
@@ -81,7 +81,7 @@ struct CameraSlots {
     full_since: ServerTime,
 }
 
-/// The places of a subscriber's images, by camera, [`MOST_IN_FLIGHT`] of each.
+/// The places of a subscriber's images, by camera, [`MAX_IN_FLIGHT`] of each.
 pub type Slots = Vec<Vec<Arc<InFlightImage>>>;
 
 /// An image on its vehicle to all who had room when it began. Reused from image to image.
@@ -162,7 +162,7 @@ impl Subscriptions {
         if purpose == Purpose::Fly {
             vehicle.subscribers.retain(|subscriber| subscriber.purpose != Purpose::Fly);
         }
-        let places = |_| (0..MOST_IN_FLIGHT).map(|_| Arc::default()).collect::<Vec<_>>();
+        let places = |_| (0..MAX_IN_FLIGHT).map(|_| Arc::default()).collect::<Vec<_>>();
         let all: Slots = (0..vehicle.cameras).map(places).collect();
         let slots = |all| CameraSlots { all, taken: 0, full_since: ServerTime::ZERO };
         let cameras = all.iter().cloned().map(slots).collect();
@@ -334,7 +334,7 @@ impl Subscriptions {
 }
 
 /// 100 ms of round trip at 70 Hz; more would only queue.
-pub const MOST_IN_FLIGHT: u32 = 8;
+pub const MAX_IN_FLIGHT: u32 = 8;
 /// The transport gives an image up after as long. [s]
 const STALLED_S: f64 = 0.15;
 /// How late a stalled runtime is noticed at most.

@@ -4,7 +4,7 @@
 //! one there too. Everyone else logs in with the password ([`super::login`]) and is the instructor,
 //! or shows a key, once, by opening `/enter?key=...`, and has it in a cookie from then on. Who shows
 //! a session or a key is judged by it, wherever it comes from. The instructor's key opens
-//! everything, a vehicle's key that vehicle's page and stop button. What each route takes is said
+//! everything, a vehicle's key that vehicle's page and stop button. What each route takes is stated
 //! where it is made ([`super::routes`]); one that nobody thought of is the instructor's.
 //!
 //! What changes something also takes the token that belongs to the cookie, which no other site's
@@ -90,9 +90,9 @@ impl PageKeys {
         let team = |(name, key): (&String, &String)| (key.clone(), Viewer::Team(name.clone()));
         let all = file.vehicles.iter().map(team);
         for (key, viewer) in all.chain([(file.instructor.clone(), Viewer::Instructor)]) {
-            if key.len() < LEAST_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
+            if key.len() < MIN_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
                 let what = format!(
-                    "a key is {LEAST_KEY} letters and digits or more; remove a wrong one and start again for a new one"
+                    "a key is {MIN_KEY} letters and digits or more; remove a wrong one and start again for a new one"
                 );
                 return Err(damaged(what));
             }
@@ -164,7 +164,7 @@ impl Logins {
             sessions: Mutex::default(),
             tokens: Tokens::new()?,
             limiter: Mutex::default(),
-            queue: Semaphore::new(MOST_WAITING),
+            queue: Semaphore::new(MAX_WAITING),
             turn: Semaphore::new(1),
         }))
     }
@@ -468,11 +468,11 @@ const TOKEN: &str = "x-vizflyt-token";
 const COOKIE_S: u32 = 180 * 24 * 3600;
 const NO_KEY: &str = "this page needs a key: open the address that the instructor gave you, which ends in \
      /enter?key=..., or log in with the instructor's password";
-const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session tells it, or reload the page";
+const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session has it, or reload the page";
 /// More logins at once are nobody's.
-const MOST_WAITING: usize = 8;
+const MAX_WAITING: usize = 8;
 /// 80 bits, should somebody write one by hand.
-const LEAST_KEY: usize = 16;
+const MIN_KEY: usize = 16;
 
 #[cfg(test)]
 #[path = "access/tests.rs"]

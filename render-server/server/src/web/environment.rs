@@ -16,9 +16,9 @@ use vizflyt_arena::config::EnvironmentConfig;
 
 use super::{Page, ordered};
 
-/// What there is, and what is.
+/// The present environment, and the named ones.
 #[derive(Debug, Serialize)]
-struct Told {
+struct EnvironmentStatus {
     /// The name of the one of this moment, if it has one.
     name: Option<&'static str>,
     #[serde(flatten)]
@@ -26,9 +26,9 @@ struct Told {
     names: Vec<&'static str>,
 }
 
-/// Tells the environment.
+/// Returns the environment.
 pub(super) async fn get(State(page): State<Arc<Page>>) -> Response {
-    Json(told(page.rooms.rendering.environment.now())).into_response()
+    Json(status(page.rooms.rendering.environment.now())).into_response()
 }
 
 /// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
@@ -37,11 +37,11 @@ pub(super) async fn change(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let wish = match ordered::<Map<String, Value>>(&headers, body) {
-        Ok(wish) => wish,
+    let request = match ordered::<Map<String, Value>>(&headers, body) {
+        Ok(request) => request,
         Err(refusal) => return *refusal,
     };
-    let environment = match parse(wish) {
+    let environment = match parse(request) {
         Ok(environment) => environment,
         Err(why) => return (StatusCode::BAD_REQUEST, why).into_response(),
     };
@@ -54,12 +54,12 @@ pub(super) async fn change(
         Ok(false) => {}
         Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
     }
-    Json(told(environment)).into_response()
+    Json(status(environment)).into_response()
 }
 
-fn parse(wish: Map<String, Value>) -> Result<EnvironmentConfig, String> {
-    let Some(name) = wish.get("name").filter(|_| wish.len() == 1) else {
-        return serde_json::from_value(Value::Object(wish)).map_err(|error| error.to_string());
+fn parse(request: Map<String, Value>) -> Result<EnvironmentConfig, String> {
+    let Some(name) = request.get("name").filter(|_| request.len() == 1) else {
+        return serde_json::from_value(Value::Object(request)).map_err(|error| error.to_string());
     };
     let named = name.as_str().and_then(EnvironmentConfig::named);
     named.ok_or_else(|| {
@@ -69,13 +69,13 @@ fn parse(wish: Map<String, Value>) -> Result<EnvironmentConfig, String> {
     })
 }
 
-fn told(now: EnvironmentConfig) -> Told {
+fn status(now: EnvironmentConfig) -> EnvironmentStatus {
     let names = EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect();
-    Told { name: now.name(), now, names }
+    EnvironmentStatus { name: now.name(), now, names }
 }
 
 #[cfg(test)]
 pub(super) fn examples() -> Vec<serde_json::Value> {
     let own = EnvironmentConfig { fog_visibility_m: 7.5, ..EnvironmentConfig::default() };
-    [EnvironmentConfig::default(), own].map(|now| serde_json::json!(told(now))).into()
+    [EnvironmentConfig::default(), own].map(|now| serde_json::json!(status(now))).into()
 }

@@ -82,7 +82,7 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
     Json(answer).into_response()
 }
 
-/// Who checks in: a team by its token, or as the instructor says.
+/// Who checks in: a team by its token, or as the instructor sets it.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CheckingIn {
@@ -182,7 +182,7 @@ fn failed(error: &LeaderboardError) -> Response {
     warn!("page: {error}");
     (
         StatusCode::SERVICE_UNAVAILABLE,
-        "the leaderboard cannot be read now; the server's log says why",
+        "the leaderboard cannot be read now; the server's log has the reason",
     )
         .into_response()
 }

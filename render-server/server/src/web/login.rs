@@ -43,9 +43,9 @@ struct LoginFile {
 pub fn set_password(folder: &KeysFolder, password: &str) -> Result<(), KeyError> {
     let damaged = |what: String| KeyError::Damaged { path: folder.file(FILE), what };
     let length = password.chars().count();
-    if length < LEAST_LETTERS || password.len() > MOST_BYTES {
+    if length < MIN_LETTERS || password.len() > MAX_BYTES {
         return Err(damaged(format!(
-            "a password has {LEAST_LETTERS} letters at least and {MOST_BYTES} bytes at most, not \
+            "a password has {MIN_LETTERS} letters at least and {MAX_BYTES} bytes at most, not \
              {length} letters; take four words that nobody else puts together"
         )));
     }
@@ -72,7 +72,7 @@ fn read(folder: &KeysFolder) -> Result<Option<PasswordHash>, KeyError> {
     let hash = PasswordHash::new(&file.password)
         .map_err(|error| damaged(format!("password is no Argon2 hash: {error}")))?;
     let params = Params::try_from(&hash).map_err(|error| damaged(error.to_string()))?;
-    if params.m_cost() > MOST_KIB || params.t_cost() > MOST_PASSES {
+    if params.m_cost() > MAX_KIB || params.t_cost() > MAX_PASSES {
         return Err(damaged(format!("a hash of {} KiB is refused", params.m_cost())));
     }
     Ok(Some(hash))
@@ -102,10 +102,10 @@ pub(super) async fn standing(
     if let Err(refusal) = origin::check_host(&headers) {
         return refuse(&refusal);
     }
-    tell(&page, page.access.judge(from.ip(), &headers).as_ref())
+    respond(&page, page.access.judge(from.ip(), &headers).as_ref())
 }
 
-fn tell(page: &Page, shown: Option<&Shown>) -> Response {
+fn respond(page: &Page, shown: Option<&Shown>) -> Response {
     let standing = Standing {
         role: shown.map(|shown| match shown.viewer {
             Viewer::Instructor => "instructor",
@@ -160,7 +160,7 @@ pub(super) async fn login(
     let Ok(attempt) = serde_json::from_slice::<Attempt>(&body) else {
         return (StatusCode::BAD_REQUEST, "send {\"password\": \"...\"}").into_response();
     };
-    if attempt.password.len() > MOST_BYTES {
+    if attempt.password.len() > MAX_BYTES {
         return (StatusCode::UNAUTHORIZED, WRONG).into_response();
     }
     // Few wait: whoever tries in numbers must not hold up memory or the processor.
@@ -183,7 +183,7 @@ pub(super) async fn login(
         Ok(Ok(checked)) => checked,
         Ok(Err(error)) => {
             warn!("page: {error}");
-            return (StatusCode::INTERNAL_SERVER_ERROR, "the server's log says what is wrong")
+            return (StatusCode::INTERNAL_SERVER_ERROR, "the server's log has the reason")
                 .into_response();
         }
         Err(_) => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
@@ -201,7 +201,7 @@ pub(super) async fn login(
             };
             let set = access::cookie_line(access::SESSION, &cookie, None, &headers);
             let shown = Shown { viewer: Viewer::Instructor, session: Some(cookie), key: None };
-            let mut response = tell(&page, Some(&shown));
+            let mut response = respond(&page, Some(&shown));
             if let Ok(value) = HeaderValue::from_str(&set) {
                 response.headers_mut().append(header::SET_COOKIE, value);
             }
@@ -239,12 +239,12 @@ const NO_PASSWORD: &str =
 const TOO_MANY: &str = "too many tries; wait some seconds, then try again";
 /// NIST SP 800-63B-4, section 3.1.1.2: 15 where a password stands alone; a lab's lies behind its own
 /// network, and tries are limited.
-const LEAST_LETTERS: usize = 10;
+const MIN_LETTERS: usize = 10;
 /// More is no password. [bytes]
-const MOST_BYTES: usize = 256;
+const MAX_BYTES: usize = 256;
 /// A quarter of a GiB: more is a slip of the hand. [KiB]
-const MOST_KIB: u32 = 256 << 10;
-const MOST_PASSES: u32 = 32;
+const MAX_KIB: u32 = 256 << 10;
+const MAX_PASSES: u32 = 32;
 
 #[cfg(test)]
 pub(super) fn examples() -> Vec<serde_json::Value> {
@@ -268,7 +268,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         assert!(read(&folder).unwrap().is_none());
-        for wrong in ["", "short", &"x".repeat(MOST_BYTES + 1)] {
+        for wrong in ["", "short", &"x".repeat(MAX_BYTES + 1)] {
             let error = set_password(&folder, wrong).unwrap_err().to_string();
             assert!(error.contains("10 letters at least"), "{error}");
         }

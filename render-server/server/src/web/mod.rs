@@ -5,7 +5,7 @@
 //! GET /ws?vehicle=V   WebSocket: JSON text (arena, track, events, state at 20 Hz) and binary
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
 //!                  vehicle, if none is named
-//! GET /api/map     the top view: a JPEG drawn at the start
+//! GET /api/map     the top view: a JPEG rendered at the start
 //! GET /api/shell   what is solid, as cells, for the view in space ([`crate::web::top_view::shell`])
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
@@ -212,7 +212,7 @@ async fn watch(
         Err(none) => return *none,
     };
     match upgrade {
-        // Viewers have nothing to say: a byte limit keeps a hostile one small.
+        // Viewers have nothing to send: a byte limit keeps a hostile one small.
         Ok(upgrade) => upgrade
             .max_message_size(1024)
             .on_upgrade(async move |socket| viewer::run(page, vehicle, shown, socket).await),

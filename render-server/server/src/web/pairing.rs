@@ -34,16 +34,16 @@ struct Open {
     tries_left: u32,
 }
 
-/// What is to be opened: `instructor` or `team:VEHICLE[,VEHICLE...]`, as `--pair` has it.
+/// The right to open: `instructor` or `team:VEHICLE[,VEHICLE...]`, as `--pair` has it.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Wish {
+struct OpenRequest {
     right: String,
 }
 
-/// Tells how pairing stands.
+/// Returns the pairing's status.
 pub(super) async fn standing(State(page): State<Arc<Page>>) -> Response {
-    tell(&page)
+    respond(&page)
 }
 
 /// Opens a pairing.
@@ -55,8 +55,8 @@ pub(super) async fn open(
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
-    let wish = serde_json::from_slice::<Wish>(&body).map_err(|error| error.to_string());
-    let grant = match wish.and_then(|wish| parse_grant(&wish.right)) {
+    let request = serde_json::from_slice::<OpenRequest>(&body).map_err(|error| error.to_string());
+    let grant = match request.and_then(|request| parse_grant(&request.right)) {
         Ok(grant) => grant,
         Err(error) => return (StatusCode::BAD_REQUEST, error).into_response(),
     };
@@ -67,7 +67,7 @@ pub(super) async fn open(
         return (StatusCode::BAD_REQUEST, unknown).into_response();
     }
     match page.authorizer.open_pairing(grant) {
-        Ok(_) => tell(&page),
+        Ok(_) => respond(&page),
         Err(error) => (StatusCode::CONFLICT, error).into_response(),
     }
 }
@@ -78,10 +78,10 @@ pub(super) async fn shut(State(page): State<Arc<Page>>, headers: HeaderMap) -> R
         return refuse(&refusal);
     }
     page.authorizer.shut_pairing();
-    tell(&page)
+    respond(&page)
 }
 
-fn tell(page: &Page) -> Response {
+fn respond(page: &Page) -> Response {
     let open = page.authorizer.pairing().map(|window| Open {
         code: window.code.to_string(),
         right: match &window.grant {

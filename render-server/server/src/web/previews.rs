@@ -1,9 +1,9 @@
-//! The preview thread: small pictures of what was drawn, for the pages.
+//! The preview thread: small pictures of what was rendered, for the pages.
 //!
 //! Takes the ticks that the encode thread is done with ([`crate::render::rendered`]), each newest-wins, of
 //! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera; of those that fly
 //! and nobody watches, [`UNWATCHED_HZ`], for the card of a crash ([`crate::flights::crash`]). Per image of
-//! 640x480, on this thread of its own: 3 ms, most of it the two JPEGs of at most [`MOST_WIDTH_PX`].
+//! 640x480, on this thread of its own: 3 ms, most of it the two JPEGs of at most [`MAX_WIDTH_PX`].
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -163,23 +163,23 @@ fn jpeg(rgb: &[u8], size: [u32; 2], small: &mut Vec<u8>) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-/// Writes `rgb` to `small`, at most [`MOST_WIDTH_PX`] wide, and returns the new width and height:
+/// Writes `rgb` to `small`, at most [`MAX_WIDTH_PX`] wide, and returns the new width and height:
 /// every pixel is the mean of all that it covers.
 fn shrink(rgb: &[u8], [width, height]: [u32; 2], small: &mut Vec<u8>) -> [u32; 2] {
     small.clear();
-    if width <= MOST_WIDTH_PX {
+    if width <= MAX_WIDTH_PX {
         small.extend_from_slice(rgb);
         return [width, height];
     }
-    let new_height = (height * MOST_WIDTH_PX / width).max(1);
+    let new_height = (height * MAX_WIDTH_PX / width).max(1);
     // The pixels that pixel `at` of `new` covers, of `old` in a row or column.
     let covered = |at: u32, new: u32, old: u32| {
         (at * old / new) as usize..((at + 1) * old).div_ceil(new) as usize
     };
     for y in 0..new_height {
         let rows = covered(y, new_height, height);
-        for x in 0..MOST_WIDTH_PX {
-            let columns = covered(x, MOST_WIDTH_PX, width);
+        for x in 0..MAX_WIDTH_PX {
+            let columns = covered(x, MAX_WIDTH_PX, width);
             let mut sum = [0u32; 3];
             for row in rows.clone() {
                 let start = row * width as usize;
@@ -194,7 +194,7 @@ fn shrink(rgb: &[u8], [width, height]: [u32; 2], small: &mut Vec<u8>) -> [u32; 2
             small.extend(sum.map(|sum| ((sum + count / 2) / count) as u8));
         }
     }
-    [MOST_WIDTH_PX, new_height]
+    [MAX_WIDTH_PX, new_height]
 }
 
 /// Returns the colour of a depth on the page: pale near, dark far by the logarithm from 0.3 to
@@ -255,7 +255,7 @@ pub const PREVIEW_HZ: u32 = 15;
 const UNWATCHED_HZ: u32 = 5;
 const PREVIEW_QUALITY: u8 = 80;
 /// Wider than the page shows a camera. [px]
-const MOST_WIDTH_PX: u32 = 480;
+const MAX_WIDTH_PX: u32 = 480;
 /// How long a stop may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
 

@@ -1,4 +1,4 @@
-//! Every route of the page in one table: it makes the router, and says what each request takes.
+//! Every route of the page in one table: it makes the router, and states what each request takes.
 //! What is not in it is the instructor's, and answered with 404 or 405.
 
 use std::collections::HashMap;

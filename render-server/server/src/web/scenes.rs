@@ -15,9 +15,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{Page, ordered};
 
-/// What there is to choose from.
+/// The scenes that can be selected.
 #[derive(Debug, Serialize)]
-struct Choice {
+struct SceneList {
     /// The one that is shown now; nothing if it is none of them.
     now: Option<String>,
     scenes: Vec<String>,
@@ -25,20 +25,20 @@ struct Choice {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Wish {
+struct SceneRequest {
     name: String,
 }
 
-/// Tells which scenes there are.
+/// Returns the scenes.
 pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
     let scenes = page.scenes.clone();
     // Reads a folder.
-    let found = tokio::task::spawn_blocking(move || Choice {
+    let found = tokio::task::spawn_blocking(move || SceneList {
         now: scenes.current(),
         scenes: scenes.list().into_iter().map(|(name, _)| name).collect(),
     });
     match found.await {
-        Ok(choice) => Json(choice).into_response(),
+        Ok(list) => Json(list).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
@@ -49,7 +49,7 @@ pub(super) async fn change(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let Wish { name } = match ordered(&headers, body) {
+    let SceneRequest { name } = match ordered(&headers, body) {
         Ok(wish) => wish,
         Err(refusal) => return *refusal,
     };
@@ -78,6 +78,6 @@ pub(super) async fn change(
 pub(super) fn examples() -> Vec<serde_json::Value> {
     let scenes = vec!["room".to_owned()];
     [Some("room".to_owned()), None]
-        .map(|now| serde_json::json!(Choice { now, scenes: scenes.clone() }))
+        .map(|now| serde_json::json!(SceneList { now, scenes: scenes.clone() }))
         .into()
 }

@@ -30,7 +30,7 @@ impl Sessions {
         password: Option<FileStamp>,
     ) -> Result<String, String> {
         self.forget(now, password);
-        if self.live.len() >= MOST_SESSIONS
+        if self.live.len() >= MAX_SESSIONS
             && let Some(oldest) = self.live.iter().min_by_key(|(_, ends)| **ends).map(|(id, _)| *id)
         {
             self.live.remove(&oldest);
@@ -109,7 +109,7 @@ impl Tokens {
 /// A session that nothing is asked of for half a day ends. The page asks while it is open.
 const IDLE: Duration = Duration::from_hours(12);
 /// An instructor's browsers, many times over.
-const MOST_SESSIONS: usize = 64;
+const MAX_SESSIONS: usize = 64;
 
 #[cfg(test)]
 mod tests {
@@ -141,12 +141,12 @@ mod tests {
         };
         let (mut sessions, start) = (Sessions::default(), Instant::now());
         let first = stamp("one");
-        let cookies: Vec<_> = (0..MOST_SESSIONS + 5)
+        let cookies: Vec<_> = (0..MAX_SESSIONS + 5)
             .map(|k| sessions.begin(start + Duration::from_secs(k as u64), first).unwrap())
             .collect();
         let now = start + Duration::from_secs(1000);
         let live = cookies.iter().filter(|cookie| sessions.is_live(now, first, cookie)).count();
-        assert_eq!(live, MOST_SESSIONS);
+        assert_eq!(live, MAX_SESSIONS);
         assert!(!sessions.is_live(now, first, &cookies[0]), "the oldest went first");
         let second = stamp("another");
         assert!(!sessions.is_live(now, second, &cookies[60]));

@@ -82,7 +82,7 @@ impl VehicleStats {
 }
 
 #[derive(Debug, Deserialize)]
-pub(super) struct Question {
+pub(super) struct StatsQuery {
     /// Name; the first one without.
     vehicle: Option<String>,
 }
@@ -90,11 +90,11 @@ pub(super) struct Question {
 /// Answers with the figures of a vehicle.
 pub(super) async fn get(
     State(page): State<Arc<Page>>,
-    question: Result<Query<Question>, QueryRejection>,
+    question: Result<Query<StatsQuery>, QueryRejection>,
 ) -> Response {
     let vehicle = match question {
-        Ok(Query(Question { vehicle: Some(name) })) => page.rooms.flights.vehicle(&name),
-        Ok(Query(Question { vehicle: None })) => Ok(&page.rooms.flights.vehicles[0]),
+        Ok(Query(StatsQuery { vehicle: Some(name) })) => page.rooms.flights.vehicle(&name),
+        Ok(Query(StatsQuery { vehicle: None })) => Ok(&page.rooms.flights.vehicles[0]),
         Err(rejection) => return rejection.into_response(),
     };
     match vehicle {

@@ -1,4 +1,4 @@
-//! The top view behind the page's map: drawn once at the start.
+//! The top view behind the page's map: rendered once at the start.
 //!
 //! A picture of the twin seen straight down from far above (so that a perspective camera is as good
 //! as a parallel one), without what lies above the flight: crowns and ceilings would hide the
@@ -16,7 +16,7 @@ use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Spla
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
 pub struct TopView {
-    /// JPEG, north up; empty if it could not be drawn.
+    /// JPEG, north up; empty if it could not be rendered.
     pub jpeg: Bytes,
     /// South-west corner of the picture. [m, world]
     pub min_m: [f64; 2],
@@ -68,7 +68,7 @@ pub struct Obstacles {
 
 impl Obstacles {
     /// Returns what is solid in the rectangle from `min_m` to `max_m`, on cells of `cell_m` or
-    /// coarser, so that no side has more than [`MOST_CELLS`].
+    /// coarser, so that no side has more than [`MAX_CELLS`].
     pub fn scan(
         min_m: DVec2,
         max_m: DVec2,
@@ -76,8 +76,8 @@ impl Obstacles {
         mut solid: impl FnMut(DVec2) -> bool,
     ) -> Self {
         let span = max_m - min_m;
-        let cell_m = cell_m.max(span.max_element() / MOST_CELLS as f64);
-        let cells = |length: f64| ((length / cell_m).ceil() as usize).clamp(1, MOST_CELLS);
+        let cell_m = cell_m.max(span.max_element() / MAX_CELLS as f64);
+        let cells = |length: f64| ((length / cell_m).ceil() as usize).clamp(1, MAX_CELLS);
         let (width, height) = (cells(span.x), cells(span.y));
         let mut bits = vec![0u8; (width * height).div_ceil(8)];
         for y in 0..height {
@@ -95,12 +95,12 @@ impl Obstacles {
 
 /// Returns the surface of what is `solid` in a box, as cells for the page: little-endian, the box's
 /// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
-/// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MOST_SHELL`].
+/// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MAX_SHELL`].
 ///
-/// `solid` says whether anything solid is within a distance [m] of a point [m, world].
+/// `solid` returns whether anything solid is within a distance [m] of a point [m, world].
 pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64) -> bool) -> Bytes {
     let span = (max_m - min_m).max(DVec3::splat(1e-3));
-    let mut cell_m = cell_m.max((span.element_product() / MOST_SAMPLES).cbrt());
+    let mut cell_m = cell_m.max((span.element_product() / MAX_SAMPLES).cbrt());
     cell_m = cell_m.max(span.max_element() / f64::from(u16::MAX));
     loop {
         let [nx, ny, nz] = (span / cell_m).ceil().to_array().map(|n| (n as usize).max(1));
@@ -141,7 +141,7 @@ pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64)
                 }
             }
         }
-        if bytes.len() <= 16 + 6 * MOST_SHELL {
+        if bytes.len() <= 16 + 6 * MAX_SHELL {
             return bytes.into();
         }
         cell_m *= 1.25;
@@ -153,7 +153,7 @@ pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64)
 fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Camera {
     let (span, middle) = (max_m - min_m, (min_m + max_m) / 2.0);
     let height_m = span.max_element() * DISTANCE;
-    let side = |metres: f64| ((metres * px_per_m).round() as u32).clamp(16, MOST_SIDE_PX);
+    let side = |metres: f64| ((metres * px_per_m).round() as u32).clamp(16, MAX_SIDE_PX);
     let (width_px, height_px) = (side(span.x), side(span.y));
     // At the ceiling's height one metre is `px_per_m` pixels; the camera hangs `height_m` above it.
     let f_px = px_per_m * height_m;
@@ -201,7 +201,7 @@ fn below(splats: &Splats, ceiling_m: f32) -> Splats {
         scales_m: kept.iter().map(|&k| splats.scales_m[k]).collect(),
         rotations: kept.iter().map(|&k| splats.rotations[k]).collect(),
         opacities: kept.iter().map(|&k| splats.opacities[k]).collect(),
-        // Seen straight down from afar the constant term tells the colour.
+        // Seen straight down from afar the constant term is the colour.
         sh_degree: 0,
         sh: kept.iter().flat_map(|&k| &splats.sh[k * per_splat..][..3]).copied().collect(),
     }
@@ -227,15 +227,15 @@ fn base64(bytes: &[u8]) -> String {
 
 /// Hides that the picture is seen from a point: a post of 1 m leans by 1/30 of its distance.
 const DISTANCE: f64 = 30.0;
-/// A map wider than this is drawn coarser. [px]
+/// A map wider than this is rendered coarser. [px]
 const WANTED_SIDE_PX: u32 = 1200;
-const MOST_SIDE_PX: u32 = 2048;
+const MAX_SIDE_PX: u32 = 2048;
 /// Tenths of a second to look through. [cells]
-const MOST_SAMPLES: f64 = 400_000.0;
+const MAX_SAMPLES: f64 = 400_000.0;
 /// What a phone draws without a jerk; 360 KB.
-const MOST_SHELL: usize = 60_000;
+const MAX_SHELL: usize = 60_000;
 /// 64 KB of bits at most.
-const MOST_CELLS: usize = 720;
+const MAX_CELLS: usize = 720;
 
 /// What hangs this far above the flight is still drawn on the map. [m]
 const MAP_HEADROOM_M: f64 = 0.4;
@@ -261,7 +261,7 @@ mod tests {
         // South row free; north row: the two eastern cells.
         assert_eq!(found.bits, base64(&[0b1100_0000]));
         let coarse = Obstacles::scan(DVec2::ZERO, DVec2::new(7200.0, 1.0), 0.1, solid);
-        assert_eq!((coarse.width, coarse.height), (MOST_CELLS, 1));
+        assert_eq!((coarse.width, coarse.height), (MAX_CELLS, 1));
     }
 
     #[test]
@@ -273,9 +273,9 @@ mod tests {
         assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
         assert_eq!((bytes.len() - 16) / 6, 125 - 27);
         assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
-        // A hall of walls is drawn in cells as coarse as it takes; nothing at all is an empty list.
+        // A hall of walls is rendered in cells as coarse as needed; nothing at all is an empty list.
         let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_, _| true);
-        assert!(all.len() <= 16 + 6 * MOST_SHELL && all.len() > 1000);
+        assert!(all.len() <= 16 + 6 * MAX_SHELL && all.len() > 1000);
         assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_, _| false).len(), 16);
     }
 

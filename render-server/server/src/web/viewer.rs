@@ -38,8 +38,8 @@ pub(super) async fn run(
     shown: Shown,
     mut socket: WebSocket,
 ) {
-    if page.rooms.streaming.subscriptions.viewers() >= MOST_VIEWERS {
-        debug!("page: {MOST_VIEWERS} viewers already");
+    if page.rooms.streaming.subscriptions.viewers() >= MAX_VIEWERS {
+        debug!("page: {MAX_VIEWERS} viewers already");
         return;
     }
     let presence = Presence::new(&page, &vehicle);
@@ -155,4 +155,4 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// Events shown to a page that opens late.
 const HISTORY: usize = 200;
 /// A lecture hall; each costs some 3 Mbit/s.
-const MOST_VIEWERS: u32 = 64;
+const MAX_VIEWERS: u32 = 64;

@@ -82,7 +82,7 @@ pub struct Server {
     pub quic: SocketAddr,
     pub http: SocketAddr,
     pub vicon: SocketAddr,
-    /// What it said when it was ready.
+    /// Its `ready` line.
     pub ready: Value,
     /// An instructor's, paired before the start.
     pub instructor: Identity,
@@ -300,7 +300,7 @@ pub fn hello(vehicle: &str, purpose: Purpose) -> Hello {
     }
 }
 
-/// Connects, without a word said yet.
+/// Connects, without any message yet.
 pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
     connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
 }
@@ -356,7 +356,7 @@ impl Client {
         recv.read_exact(&mut theirs).await.unwrap();
         assert_eq!(Preamble::check(&theirs, PeerRole::Runtime), Ok(PeerRole::Server));
         let mut client = Self { connection, send, recv, deframer: Deframer::default(), endpoint };
-        client.say(&ToServer::Hello(hello)).await;
+        client.send(&ToServer::Hello(hello)).await;
         client
     }
 
@@ -399,7 +399,7 @@ impl Client {
         pose
     }
 
-    pub async fn say(&mut self, message: &ToServer) {
+    pub async fn send(&mut self, message: &ToServer) {
         self.send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
     }
 

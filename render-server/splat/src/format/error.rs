@@ -19,7 +19,7 @@ pub enum FormatError {
         /// The system's error.
         source: std::io::Error,
     },
-    /// Neither the content nor the name tells a format.
+    /// Neither the content nor the name has a known format.
     #[error("{what}; supported are {}", Format::list())]
     Unknown {
         /// What the file seems to be.

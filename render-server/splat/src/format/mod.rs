@@ -1,6 +1,6 @@
 //! Scene files of every kind in, [`Splats`] out, and back.
 //!
-//! [`read`] tells the format by content, then by name, and hands the bytes (mapped, not copied) to
+//! [`read`] detects the format by content, then by name, and hands the bytes (mapped, not copied) to
 //! the format's own module, which checks every size against the file's length before it allocates,
 //! and decodes in parallel into a [`Loaded`]: activated, in the axes of the PLY the scene was trained
 //! to, what cannot be rendered left out and counted. [`write`] goes the other way by file name. Called
@@ -52,7 +52,7 @@ pub struct Loaded {
     pub splats: Splats,
     /// What was left out, by reason.
     pub dropped: DropCounts,
-    /// Whether the file says that the scene was trained with anti-aliasing (mip-splatting); rendered
+    /// Whether the file states that the scene was trained with anti-aliasing (mip-splatting); rendered
     /// without, its smallest splats look a little too bright.
     pub antialiased: bool,
     /// Names of what the file holds of each splat and no splat needs, in file order.
@@ -149,7 +149,7 @@ impl Format {
         }
     }
 
-    /// Returns the format that a file's name says.
+    /// Returns the format of a file's name.
     pub fn of_name(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.to_ascii_lowercase();
         if name == sog::META {
@@ -165,7 +165,7 @@ impl Format {
             .max_by_key(|format| format.extension().len())
     }
 
-    /// Returns the format that a file's first bytes say; `.splat` has no mark.
+    /// Returns the format of a file's first bytes; `.splat` has no mark.
     pub fn of_content(bytes: &[u8]) -> Option<Self> {
         if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
             // Which of the two PLYs is determined by its header.
@@ -210,7 +210,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Loaded, FormatError> {
     read_metered(path.as_ref(), &Meter::SILENT)
 }
 
-/// [`read()`], telling `report` how far it came, so that a load of more than a second can show it.
+/// [`read()`], reporting its progress to `report`, so that a load of more than a second can show it.
 ///
 /// # Errors
 /// As [`read()`].
@@ -229,12 +229,12 @@ pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
     decode(bytes, Format::of_content(bytes).unwrap_or(named), &Meter::SILENT)
 }
 
-/// Writes a scene in the format that the file's name says; a `meta.json` becomes a SOG scene of
+/// Writes a scene in the format of the file's name; a `meta.json` becomes a SOG scene of
 /// single files beside it. Beside its place first and then renamed, so that a reader never sees
 /// half a file.
 ///
 /// # Errors
-/// [`FormatError::Unknown`] where the name says no format; [`FormatError::Io`] with the path.
+/// [`FormatError::Unknown`] where the name has no known format; [`FormatError::Io`] with the path.
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.

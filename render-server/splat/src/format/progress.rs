@@ -1,4 +1,4 @@
-//! How far a load has come, told from whichever thread got there.
+//! The progress of a load, reported from any thread.
 
 use std::sync::{Mutex, PoisonError};
 

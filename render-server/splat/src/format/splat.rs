@@ -8,7 +8,7 @@
 //! | 28..32 | quaternion wxyz, each q * 128 + 128 |
 //!
 //! No harmonics beyond the constant; axes as in the PLY it was made from. There is no magic: only
-//! the name tells the format.
+//! the name decides the format.
 
 use glam::Vec3;
 

@@ -339,13 +339,13 @@ fn files_and_folders_are_read_by_path() {
     for format in Format::ALL {
         let path = folder.path().join("scene").with_extension(format.extension());
         write(&path, &some()).unwrap();
-        let mut heard = Vec::new();
-        let loaded = read_with_progress(&path, &mut |progress| heard.push(progress)).unwrap();
+        let mut reports = Vec::new();
+        let loaded = read_with_progress(&path, &mut |progress| reports.push(progress)).unwrap();
         assert_eq!((loaded.format, loaded.splats.len()), (format, 7));
         assert_eq!(loaded, read(&path).unwrap());
-        let last = *heard.last().unwrap();
+        let last = *reports.last().unwrap();
         assert_eq!(last.done, last.total, "{format}");
-        assert!(last.total >= 7 && heard.is_sorted_by_key(|Progress { done, .. }| *done));
+        assert!(last.total >= 7 && reports.is_sorted_by_key(|Progress { done, .. }| *done));
     }
     let loose = folder.path().join("loose");
     std::fs::create_dir(&loose).unwrap();

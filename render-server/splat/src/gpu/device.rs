@@ -85,7 +85,7 @@ impl Adapter {
         let fault = Arc::new(OnceLock::new());
         let uncaptured = Arc::clone(&fault);
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            // The first says most; later ones follow from it.
+            // The first is the cause; later ones follow from it.
             let _ = uncaptured.set(error.to_string());
         }));
         let lost = Arc::clone(&fault);

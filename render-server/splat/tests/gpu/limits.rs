@@ -122,7 +122,7 @@ fn a_device_lost_between_begin_and_finish_is_an_error() {
     let Some(mut gpu) = renderer(&splats) else { return };
     gpu.begin(&[], &camera).expect("a camera");
     gpu.lose_device();
-    // Either the tick was done before, or the loss is told; nothing hangs or panics.
+    // Either the tick was done before, or the loss is reported; nothing hangs or panics.
     let mut image = [RgbdImage::default()];
     match gpu.finish(&mut image) {
         Ok(_) => crate::compare::assert_clean(&image[0]),

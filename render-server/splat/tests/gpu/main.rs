@@ -1,5 +1,5 @@
 //! The renderer for graphics cards against the one for processors, on whatever adapter there is:
-//! software Vulkan (`mesa-vulkan-drivers`) will do. Without any, each test says what it skips.
+//! software Vulkan (`mesa-vulkan-drivers`) will do. Without any, each test prints what it skips.
 #![cfg(feature = "gpu")]
 
 mod agreement;

@@ -4,7 +4,7 @@
 //! Where the repository has a neighbour `../shared/scenes`, its captured scenes are compared too.
 //!
 //! Limits: 60 dB of RGB and alpha, depths within 1e-3 on 99.5 % of pixels. Single pixels flip at
-//! the thresholds of f32 (alpha 1/255, transmittance 1e-4 and 1/2), so maxima say nothing.
+//! the thresholds of f32 (alpha 1/255, transmittance 1e-4 and 1/2), so maxima are meaningless.
 
 use std::path::{Path, PathBuf};
 

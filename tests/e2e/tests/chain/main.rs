@@ -59,13 +59,13 @@ fn a_wall_of_the_twin_is_answered_by_land() {
         let lines = flight.until("collision");
         let (_, line) = lines.last().expect("the line of the collision");
         let at_m = collision(line);
-        // The first packet in which the vehicle is where the server says that it touched.
+        // The first packet in which the vehicle is where the server reports the touch.
         let (track, _) = flight.so_far();
         let shown = track.iter().find(|sight| sight.p_m.x >= at_m.x - 1e-3 && sight.p_m.z > 0.3);
         let shown = shown.expect("the motion capture saw it there").at;
-        wait("LAND", || flight.told_to_land().is_some());
-        let told = flight.told_to_land().expect("it was told");
-        let took = told.saturating_duration_since(shown);
+        wait("LAND", || flight.ordered_to_land().is_some());
+        let ordered = flight.ordered_to_land().expect("LAND was ordered");
+        let took = ordered.saturating_duration_since(shown);
         assert!((at_m.x - (WALL_X_M - 0.12)).abs() < 0.1, "touched at {at_m}");
         assert!(took.as_secs_f64() < LAND_WITHIN_S, "LAND came {took:?} after the pose");
         took_ms.push(took.as_secs_f64() * 1e3);
@@ -75,7 +75,7 @@ fn a_wall_of_the_twin_is_answered_by_land() {
     for flight in flights {
         let seen = flight.wait();
         assert_eq!(seen.report["outcome"], "collided", "{}", seen.report);
-        assert_eq!(seen.count("\"collision\""), 0, "told once, and then nothing counts");
+        assert_eq!(seen.count("\"collision\""), 0, "reported once, and then nothing counts");
         let (height_m, _) = seen.end();
         assert!(height_m < 0.1, "down, at {height_m} m");
         let furthest_m = seen.track.iter().map(|sight| sight.p_m.x).fold(0.0, f64::max);
@@ -83,7 +83,7 @@ fn a_wall_of_the_twin_is_answered_by_land() {
     }
 }
 
-/// Reads where a line of the runtime says that the body's centre was. [m, world]
+/// Reads the position of the body's centre from a line of the runtime. [m, world]
 fn collision(line: &Value) -> DVec3 {
     fn find(value: &Value) -> Option<&Value> {
         match value {
@@ -140,9 +140,9 @@ fn fly_on(flight: &Flight) {
         let motion = GuidedMotion::Velocity(DVec3::X);
         let setpoint = GuidedSetpoint { motion, yaw: YawTarget::Angle(0.0) };
         let target = guided_to_mavlink(&setpoint, (1, 1), 0);
-        tell(flight, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(target), &mut sequence);
+        send(flight, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(target), &mut sequence);
         if sequence % 20 == 1 {
-            tell(flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
+            send(flight, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), &mut sequence);
         }
         // The setpoints' own rate, not a wait for something.
         std::thread::sleep(Duration::from_millis(25));
@@ -162,7 +162,7 @@ fn forbid(folder: &Path) {
 #[test]
 fn with_neither_server_nor_guard_the_autopilot_lands_at_a_no_fly_box() {
     let mut lab = Lab::open_in(1, forbid);
-    // Its circle and its ceiling would not notice; the runtime has told it of the box.
+    // Its circle and its ceiling would not notice; the runtime has uploaded the box.
     let mut flight = outward_with(&lab, &["--param=FENCE_TYPE=4"]);
     lab.kill_server();
     flight.kill_runtime();
@@ -219,7 +219,7 @@ fn is_landing(flight: &Flight) -> bool {
     modes.last().is_some_and(|&(_, mode)| mode == CopterMode::Land as u32)
 }
 
-fn tell(flight: &Flight, message: &MavMessage, sequence: &mut u8) {
+fn send(flight: &Flight, message: &MavMessage, sequence: &mut u8) {
     let header = MavHeader { system_id: 255, component_id: 190, sequence: *sequence };
     *sequence = sequence.wrapping_add(1);
     flight.tell_vehicle(encode(header, message, &mut [0; MAX_PACKET]));

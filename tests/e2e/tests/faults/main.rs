@@ -48,7 +48,7 @@ fn the_table_of_faults() {
     for (case, row) in cases.iter().zip(&rows) {
         let name = &row.name;
         assert_eq!((row.lost, row.doubled), (0, 0), "{name}: events");
-        assert!(row.events > 40, "{name}: events are told");
+        assert!(row.events > 40, "{name}: events are sent");
         assert_eq!(row.backwards, 0, "{name}: images go backwards");
         if case.congestion == Congestion::Auto {
             assert!(row.delivered >= 50.0, "{name}: what nobody chose delivers:\n{found}");

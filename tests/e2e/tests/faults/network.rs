@@ -1,4 +1,4 @@
-//! A network in memory: two directions of one path, each impaired as told, by seeded chance.
+//! A network in memory: two directions of one path, each impaired as configured, by a seeded random generator.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;
@@ -129,7 +129,7 @@ impl Network {
         Arc::new(Self { world, start, server, inboxes: Mutex::default(), down, up })
     }
 
-    /// Returns a socket; whatever had its address hears nothing any more.
+    /// Returns a socket; whatever had its address receives nothing any more.
     pub(crate) fn socket(self: &Arc<Self>, address: SocketAddr) -> Arc<Socket> {
         let inbox = Arc::new(Inbox::default());
         lock(&self.inboxes).insert(address, inbox.clone());
@@ -190,7 +190,7 @@ impl Socket {
         inboxes.insert(address, self.inbox.clone());
     }
 
-    /// Neither sends nor hears any more, as when its process is killed.
+    /// Neither sends nor receives any more, as when its process is killed.
     pub(crate) fn kill(&self) {
         let mut inboxes = lock(&self.network.inboxes);
         let address = *lock(&self.address);

@@ -110,8 +110,8 @@ fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
 /// What came of it all.
 #[derive(Debug, Default)]
 pub(crate) struct Notes {
-    /// Stamps of images drawn.
-    pub(crate) drawn: Vec<ServerTime>,
+    /// Stamps of rendered images.
+    pub(crate) rendered: Vec<ServerTime>,
     /// Pose stamp and arrival of each image taken.
     pub(crate) images: Vec<(ServerTime, ServerTime)>,
     /// Age of each pose on its arrival. [s]
@@ -120,9 +120,9 @@ pub(crate) struct Notes {
     pub(crate) events_down: Vec<BTreeMap<u32, u32>>,
     /// The same of the runtime's events, by all processes of the server.
     pub(crate) events_up: BTreeMap<u32, u32>,
-    /// Events told by the server.
+    /// Events sent by the server.
     pub(crate) told_down: u32,
-    /// Events told by the runtime.
+    /// Events sent by the runtime.
     pub(crate) told_up: u32,
     /// Times that the runtime lost its connection.
     pub(crate) downs: Vec<String>,
@@ -260,7 +260,7 @@ async fn render(rooms: Rooms, source: Source, notes: Arc<Mutex<Notes>>) {
             due += period;
             seq += 1;
             let now = clock::now();
-            lock(&notes).drawn.push(now);
+            lock(&notes).rendered.push(now);
             rooms.streaming.vehicles[0].images.cameras[0].count_rendered();
             if seq % u64::from(rooms.streaming.vehicles[0].level().keep_one_in) == 0 {
                 newest = Some((seq, now));
@@ -359,7 +359,7 @@ impl Runtime {
             Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(TokioRuntime))
         };
         let noted = notes.clone();
-        let tell = move |event| {
+        let handle = move |event| {
             let mut notes = lock(&noted);
             match event {
                 StreamEvent::Pose(sample, _) => {
@@ -378,7 +378,7 @@ impl Runtime {
             true
         };
         let tasks = vec![
-            tokio::spawn(run_over(open, settings, shared.clone(), outbox.clone(), tell)),
+            tokio::spawn(run_over(open, settings, shared.clone(), outbox.clone(), handle)),
             tokio::spawn(take(shared, notes.clone())),
             tokio::spawn(report(outbox, notes.clone())),
         ];
@@ -406,20 +406,20 @@ impl Runtime {
 /// Takes images as the decoder does.
 async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
     let mut look = interval(Duration::from_millis(1));
-    let mut drawn = ServerTime::ZERO;
+    let mut rendered = ServerTime::ZERO;
     loop {
         look.tick().await;
         while let Some((_, step)) = shared.mailbox.next(Duration::ZERO, |_| true) {
             match step {
                 // As the decoder does with what was overtaken on its way.
-                Step::Begin(arrival) if arrival.header.pose_stamp() <= drawn => {
+                Step::Begin(arrival) if arrival.header.pose_stamp() <= rendered => {
                     shared.mailbox.give_up(0);
                 }
-                Step::Begin(arrival) => drawn = arrival.header.pose_stamp(),
+                Step::Begin(arrival) => rendered = arrival.header.pose_stamp(),
                 Step::Piece(piece) => shared.mailbox.recycle(piece),
                 Step::End(whole) => {
                     let received = ServerTime::from_ns(whole.received.as_ns());
-                    lock(&notes).images.push((drawn, received));
+                    lock(&notes).images.push((rendered, received));
                 }
                 Step::Drop => {}
             }
@@ -440,7 +440,7 @@ async fn report(outbox: Arc<Outbox>, notes: Arc<Mutex<Notes>>) {
                 notes.told_up - 1
             };
             let (stamp, text) = (clock::now(), bounded(&text(number)));
-            outbox.tell(Event { stamp, kind: EventKind::Note, text });
+            outbox.send_event(Event { stamp, kind: EventKind::Note, text });
         }
     }
 }

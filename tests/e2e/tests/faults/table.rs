@@ -47,11 +47,11 @@ pub(crate) enum Script {
 /// One row.
 pub(crate) struct Row {
     pub(crate) name: String,
-    /// Images that came, of those drawn while a server ran. [%]
+    /// Images that came, of those rendered while a server ran. [%]
     pub(crate) delivered: f64,
     /// Drawn to received. [ms]
     pub(crate) age_ms: [f64; 2],
-    /// From the fault's end to an image drawn after it. [ms]
+    /// From the fault's end to an image rendered after it. [ms]
     pub(crate) newest_ms: Option<f64>,
     /// Age of poses. [ms]
     pub(crate) pose_ms_p99: f64,
@@ -120,8 +120,11 @@ impl Case {
     }
 
     fn row(&self, notes: Notes, [_, back]: [ServerTime; 2]) -> Row {
-        let mut ages: Vec<f64> =
-            notes.images.iter().map(|(drawn, came)| came.seconds_since(*drawn) * 1e3).collect();
+        let mut ages: Vec<f64> = notes
+            .images
+            .iter()
+            .map(|(rendered, came)| came.seconds_since(*rendered) * 1e3)
+            .collect();
         ages.sort_unstable_by(f64::total_cmp);
         let mut poses = notes.poses_s;
         poses.sort_unstable_by(f64::total_cmp);
@@ -129,10 +132,10 @@ impl Case {
             let index = (share * values.len() as f64) as usize;
             values.get(index.min(values.len().saturating_sub(1))).copied().unwrap_or(f64::NAN)
         };
-        let newest = notes.images.iter().find(|(drawn, _)| *drawn >= back);
+        let newest = notes.images.iter().find(|(rendered, _)| *rendered >= back);
         let gaps = notes.images.windows(2).map(|pair| pair[1].1.seconds_since(pair[0].1) * 1e3);
         // The newest may still be on its way at the end.
-        let events = |told: u32| told.saturating_sub(2);
+        let events = |sent: u32| sent.saturating_sub(2);
         let (down, up) = (&notes.events_down, &notes.events_up);
         let came = |n: &u32| down.iter().any(|process| process.contains_key(n));
         let lost = (0..events(notes.told_down)).filter(|n| !came(n)).count()
@@ -141,7 +144,7 @@ impl Case {
         let doubled = counts.filter(|&&count| count > 1).count();
         Row {
             name: self.name.clone(),
-            delivered: 100.0 * notes.images.len() as f64 / notes.drawn.len() as f64,
+            delivered: 100.0 * notes.images.len() as f64 / notes.rendered.len() as f64,
             age_ms: [at(&ages, 0.5), at(&ages, 0.99)],
             newest_ms: (self.script != Script::Nothing)
                 .then(|| newest.map_or(f64::NAN, |(_, came)| came.seconds_since(back) * 1e3)),

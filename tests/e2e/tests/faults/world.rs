@@ -2,7 +2,7 @@
 //!
 //! Tokio's held clock jumps to the next timer when every task waits, but its timers are of whole
 //! milliseconds; a packet takes less than one. So a conductor keeps what happens in between: when
-//! every task waits, which tokio tells by parking, it moves the clock to the next happening, or
+//! every task waits, which tokio shows by parking, it moves the clock to the next timed event, or
 //! to the next whole millisecond, where tokio's own timers go on.
 
 use std::collections::BTreeMap;
@@ -14,13 +14,13 @@ use std::time::Duration;
 use tokio::sync::Notify;
 use tokio::time::{Instant, advance, sleep_until};
 
-type Happening = Box<dyn FnOnce() + Send>;
+type TimedEvent = Box<dyn FnOnce() + Send>;
 
 /// The clock and what is due.
 #[derive(Default)]
 pub(crate) struct World {
     /// By time, and in the order of being planned.
-    planned: Mutex<BTreeMap<(Instant, u64), Happening>>,
+    planned: Mutex<BTreeMap<(Instant, u64), TimedEvent>>,
     count: Mutex<u64>,
     sooner: Notify,
     idle: Notify,

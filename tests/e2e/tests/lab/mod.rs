@@ -1,6 +1,6 @@
 //! A lab in which several plugins fly at once: one render server, and for each flight a simulated
 //! vehicle and a runtime, all real processes. The motion capture's packets and the vehicle's MAVLink go
-//! through this test on their way, so it sees where each vehicle is, whatever the runtime says, and
+//! through this test on their way, so it sees where each vehicle is, whatever the runtime reports, and
 //! can cut either.
 //!
 //! Of `misbehave`, `linkloss` and `chain`: what one does not use, another does.
@@ -79,7 +79,7 @@ pub(crate) struct Flight {
     bridge: Option<Bridge>,
     runtime: Process,
     track: Track,
-    /// Modes that the vehicle's own heartbeats told of.
+    /// Modes in the vehicle's own heartbeats.
     modes: Modes,
     /// When the runtime commanded to land.
     lands: Lands,
@@ -400,12 +400,12 @@ impl Flight {
 
     /// Sends a packet to the vehicle that the runtime knows nothing of.
     pub(crate) fn tell_vehicle(&self, packet: &[u8]) {
-        let vehicle = lock(&self.aside.vehicle).expect("the vehicle has been heard");
+        let vehicle = lock(&self.aside.vehicle).expect("the vehicle has sent a packet");
         self.aside.socket.send_to(packet, vehicle).unwrap();
     }
 
     /// Returns when the runtime first commanded to land, if it has.
-    pub(crate) fn told_to_land(&self) -> Option<Instant> {
+    pub(crate) fn ordered_to_land(&self) -> Option<Instant> {
         lock(&self.lands).first().copied()
     }
 

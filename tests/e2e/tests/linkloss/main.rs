@@ -149,7 +149,7 @@ const CASES: [Case; 13] = [
 /// Vehicles that fly at a time; the server is the last row's, alone.
 const TOGETHER: usize = 4;
 /// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
-/// for an autopilot that does not hear it.
+/// for an autopilot that does not receive it.
 const PARAMETERS: [&str; 22] = [
     "FS_GCS_ENABLE",
     "FS_GCS_TIMEOUT",
@@ -178,7 +178,7 @@ const PARAMETERS: [&str; 22] = [
 const DOWN_M: f64 = 0.05;
 /// The promise. [s], [m]
 const DOWN_WITHIN_S: f64 = 6.0;
-const DRIFT_AT_MOST_M: f64 = 1.0;
+const MAX_DRIFT_M: f64 = 1.0;
 /// How long a vehicle that shall fly on is watched after the loss is over. [s]
 const WATCH_S: f64 = 3.0;
 /// The room's fence, which the lab draws in. [m, world]
@@ -243,7 +243,7 @@ fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
     })
 }
 
-/// Returns the simulator's arguments for a vehicle set up as `hardware/airframe` says, with a pilot.
+/// Returns the simulator's arguments for a vehicle set up by the files in `hardware/airframe`, with a pilot.
 fn vehicle() -> Vec<String> {
     let path = vizflyt_e2e::root().join("hardware/airframe/whippet-copter-4.8.param");
     let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
@@ -385,7 +385,7 @@ impl Row {
     /// Returns what breaks the promise.
     fn complaint(&self) -> Option<String> {
         let name = self.case.name;
-        if !(self.drift_m <= DRIFT_AT_MOST_M) {
+        if !(self.drift_m <= MAX_DRIFT_M) {
             return Some(format!("{name}: drifted by {:.2} m", self.drift_m));
         }
         match (self.case.lands, self.down_s) {

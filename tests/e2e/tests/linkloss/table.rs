@@ -59,7 +59,7 @@ pub(crate) fn compare(rows: &[Row]) {
     assert_eq!(lines.len(), rows.len(), "the guide has other rows; {WRITE}");
     for (line, row) in lines.iter().zip(rows) {
         let begins = format!("| {} | {} |", row.case.name, row.case.does);
-        assert!(line.starts_with(&begins), "the guide says {line:?}, not {begins:?}; {WRITE}");
+        assert!(line.starts_with(&begins), "the guide has {line:?}, not {begins:?}; {WRITE}");
     }
 }
 

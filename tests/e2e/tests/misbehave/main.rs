@@ -28,7 +28,7 @@ struct Case {
 
 /// The plugin is gone: the runtime brakes and lands without being asked.
 const AT_ONCE_S: (f64, Option<f64>) = (1.0, Some(1.5));
-/// It says nothing: half a second, braking; two seconds, landing.
+/// It sends nothing: half a second, braking; two seconds, landing.
 const SILENT_S: (f64, Option<f64>) = (1.0, Some(2.0));
 /// Why: the times are the vehicle's, but this machine may be short of processors, and lines and
 /// packets late at this test.
@@ -135,9 +135,9 @@ impl Case {
             return complain(format!("it ended as {}", seen.report["outcome"]));
         }
         // One sentence, not a hundred.
-        let said = seen.count(self.sentence);
-        if !(1..=12).contains(&said) {
-            return complain(format!("'{}' was said {said} times", self.sentence));
+        let count = seen.count(self.sentence);
+        if !(1..=12).contains(&count) {
+            return complain(format!("'{}' was reported {count} times", self.sentence));
         }
         self.particular(seen).and_then(complain)
     }

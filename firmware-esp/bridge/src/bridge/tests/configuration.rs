@@ -140,10 +140,10 @@ fn parameters_are_listed_and_set_by_who_signs_with_the_key() {
         ms += 100;
         bridge.handle_datagram(at(ms), address(2), packet);
         assert_eq!(bridge.settings().loss_ms, expected);
-        let told = datagrams(&mut bridge, at(ms + 10)).iter().flat_map(|(_, b)| decode(b)).any(|packet| {
+        let reported = datagrams(&mut bridge, at(ms + 10)).iter().flat_map(|(_, b)| decode(b)).any(|packet| {
             matches!(packet.message, MavMessage::PARAM_VALUE(v) if v.param_value == f32::from(expected))
         });
-        assert!(told, "the answer says what holds");
+        assert!(reported, "the reply has the setting in force");
     };
     let plain = bytes(0, RUNTIME, &set(600.0));
     check(&plain, 1000);

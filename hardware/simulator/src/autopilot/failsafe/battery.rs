@@ -1,6 +1,6 @@
-//! What the power module says, and what a low battery does (BATT_*).
+//! The power module's readings, and what a low battery does (BATT_*).
 //!
-//! ArduCopter counts charge from boot: a half-empty pack reads 100 %. Only the voltage tells.
+//! ArduCopter counts charge from boot: a half-empty pack reads 100 %. Only the voltage is reliable.
 
 use vizflyt_protocol::time::AutopilotTime;
 

@@ -91,9 +91,9 @@ impl Autopilot {
 
     fn check_ground_station(&mut self, now: AutopilotTime) {
         let action = self.params.value(Param::FsGcsEnable) as u8;
-        // Counts only after a ground station has been heard at all.
-        let Some(heard) = self.last_ground_station else { return };
-        if action == 0 || now.seconds_since(heard) <= self.params.value(Param::FsGcsTimeout) {
+        // Counts only after a ground station has sent something at all.
+        let Some(received_at) = self.last_ground_station else { return };
+        if action == 0 || now.seconds_since(received_at) <= self.params.value(Param::FsGcsTimeout) {
             if self.failsafe.gcs {
                 self.failsafe.gcs = false;
                 self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, "GCS Failsafe Cleared");

@@ -84,7 +84,7 @@ fn an_empty_battery_lands_by_voltage() {
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), FAILED);
     assert!(c.texts_contain("low voltage failsafe"));
-    // A third was in it at the start; the autopilot, who counts from boot, believes otherwise.
+    // A third was in it at the start; the autopilot, which counts from boot, estimates otherwise.
     let Some(MavMessage::SYS_STATUS(m)) = c.newest.get(&1) else { panic!() };
     assert!(m.battery_remaining > 60, "{}", m.battery_remaining);
 }
@@ -135,7 +135,7 @@ fn a_lost_radio_control_acts_after_its_timeout() {
     }
 }
 
-/// A landing goes on when more is lost, if FS_OPTIONS says so; else the later failsafe has its way.
+/// A landing goes on when more is lost, if FS_OPTIONS is set so; else the later failsafe acts.
 #[test]
 fn a_landing_continues_if_configured() {
     for (options, expected) in [(8.0, CopterMode::Land), (0.0, CopterMode::Rtl)] {
@@ -158,7 +158,7 @@ fn a_reboot_in_flight_is_a_fall_and_a_new_clock() {
     let (before, sent) = (c.lab.autopilot_now(), c.counts[&0]);
     assert_eq!(before.as_ns(), 0);
     c.wait(1.4);
-    assert_eq!(c.counts[&0], sent, "nothing is said while it boots");
+    assert_eq!(c.counts[&0], sent, "nothing is sent while it boots");
     assert!(c.p().z < 0.05 && (c.p() - start).truncate().length() < 0.3, "{:?}", c.p());
     c.wait(4.0);
     let Some(MavMessage::ATTITUDE(m)) = c.newest.get(&30) else { panic!() };
@@ -244,17 +244,17 @@ fn a_bad_wifi_is_flown_over() {
     let wifi = WifiConfig { seed: 3, loss: 0.1, latency_s: 0.01, ..Default::default() };
     let mut c = Companion::new(SimulationConfig { wifi: Some(wifi), ..Default::default() });
     c.wait(2.5);
-    // Any packet may be lost: all is said again until its effect is heard.
+    // Any packet may be lost: all is sent again until its effect is received.
     let until_heard =
-        |c: &mut Companion, ask: &dyn Fn(&mut Companion), heard: &dyn Fn(&Companion) -> bool| {
+        |c: &mut Companion, ask: &dyn Fn(&mut Companion), received: &dyn Fn(&Companion) -> bool| {
             for _ in 0..40 {
                 ask(c);
                 c.wait(0.5);
-                if heard(c) {
+                if received(c) {
                     return;
                 }
             }
-            panic!("not heard; said {:?}", c.texts);
+            panic!("not received; texts {:?}", c.texts);
         };
     let one = |param1: f32, param2: f32, param7: f32| [param1, param2, 0.0, 0.0, 0.0, 0.0, param7];
     until_heard(&mut c, &Companion::set_origin, &|c| c.newest.contains_key(&49));

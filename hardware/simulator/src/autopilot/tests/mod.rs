@@ -192,7 +192,7 @@ fn lost_heartbeats_land_after_five_seconds() {
     assert!(c.texts_contain("GCS Failsafe - Landing"));
     c.until(15.0, "the disarm", |c| !c.armed());
 
-    // Never heard, never missed.
+    // Never received, never missed.
     let mut c = Companion::new(SimulationConfig::default());
     c.heartbeats = false;
     c.prepare();

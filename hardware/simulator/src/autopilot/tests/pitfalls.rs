@@ -173,7 +173,7 @@ fn p7_another_system_s_heartbeats_do_not_count() {
     c.system_id = 42;
     let seconds = c.until(8.0, "LAND", |c| c.mode() == CopterMode::Land);
     assert!((4.0..6.1).contains(&seconds), "{seconds}");
-    // Told to listen to it, the failsafe is content.
+    // With its system id configured, the failsafe is satisfied.
     let mut c = Companion::new(config(&[("MAV_GCS_SYSID", 42.0)]));
     c.system_id = 42;
     c.prepare();

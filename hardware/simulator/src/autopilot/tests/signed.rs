@@ -1,4 +1,4 @@
-//! A key given over USB, and what is heard afterwards.
+//! A key given over USB, and what is accepted afterwards.
 
 use super::*;
 use vizflyt_protocol::mavlink::dialect::SETUP_SIGNING_DATA;
@@ -60,7 +60,7 @@ fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
 
     // What it sends is signed, with stamps that go on after a reboot.
     let mut judge = Verifier::new(key);
-    let mut heard = |c: &mut Companion| {
+    let mut received = |c: &mut Companion| {
         let mut buffer = [0; MAX_PACKET];
         let mut count = 0;
         for _ in 0..800 {
@@ -72,12 +72,12 @@ fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
         }
         count
     };
-    assert!(heard(&mut c) > 10);
+    assert!(received(&mut c) > 10);
     c.lab.reboot();
     for _ in 0..4000 {
         c.lab.tick();
     }
-    assert!(heard(&mut c) > 10);
+    assert!(received(&mut c) > 10);
     assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is kept");
 
     setup_signing(&mut c, [0; 32], 0);

@@ -4,7 +4,7 @@
 //! it stands -> lift it -> push it forward -> turn it left -> raise its nose
 //! ```
 //! A motion is over when the vehicle rests again; how far it went does not matter, so that wrong units
-//! are no hindrance. What was seen at rest is taken back to what the stream said, and every setting
+//! are no hindrance. The poses at rest are converted back to the stream's own values, and every setting
 //! that there is (units, axes, nose, order of angles) is tried on it: the smallest change under which
 //! all motions look as they were done is the answer.
 
@@ -17,7 +17,7 @@ use vizflyt_server::poses::settings::{
     Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis,
 };
 
-use super::words::direction;
+use super::description::direction;
 
 /// What is to be done next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,10 +62,10 @@ impl Step {
     }
 }
 
-/// What came of it.
+/// The result of the check.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Verdict {
-    /// What looked wrong, in words; empty if nothing did.
+pub(super) struct Diagnosis {
+    /// The faults, in sentences; empty if there are none.
     pub(super) faults: Vec<String>,
     /// Settings to change: key and value. Empty, too, if none would help.
     pub(super) change: Vec<(&'static str, String)>,
@@ -118,7 +118,7 @@ impl Check {
     /// Returns where it rests, if it does.
     fn rest(&self) -> Option<Pose<World, Body>> {
         let (first, last) = (self.window.front()?, self.window.back()?);
-        if self.window.len() < LEAST_SAMPLES || last.0 - first.0 < REST_S * 0.9 {
+        if self.window.len() < MIN_SAMPLES || last.0 - first.0 < REST_S * 0.9 {
             return None;
         }
         let mean = |from: usize, to: usize| {
@@ -156,8 +156,8 @@ impl Check {
             Step::Lift => moved > 20.0 * noise + f64::MIN_POSITIVE,
             // The lift has shown how much a motion is.
             Step::Push => moved > 0.3 * self.lifted(),
-            Step::Turn => turned_rad > LEAST_TURN_RAD,
-            Step::Nose => turned_rad > LEAST_NOSE_RAD,
+            Step::Turn => turned_rad > MIN_TURN_RAD,
+            Step::Nose => turned_rad > MIN_NOSE_RAD,
         }
     }
 
@@ -190,16 +190,16 @@ impl Check {
     }
 
     /// Returns what is wrong, when all was seen.
-    pub(super) fn verdict(&self) -> Verdict {
+    pub(super) fn diagnosis(&self) -> Diagnosis {
         let faults = faults(&self.rests);
         if faults.is_empty() {
-            return Verdict::default();
+            return Diagnosis::default();
         }
         let best = self
             .trials()
             .filter(|trial| self::faults(&self.under(trial)).is_empty())
             .min_by(|a, b| self.cost(a).total_cmp(&self.cost(b)));
-        Verdict { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
+        Diagnosis { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
     }
 
     /// Returns every combination of settings.
@@ -344,7 +344,7 @@ fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
         ));
     }
     let (nose_z, side_z) = (raised.rotate(DVec3::X).z, raised.rotate(DVec3::Y).z);
-    if !(nose_z > LEAST_NOSE_RAD.sin() * 0.8 && side_z.abs() < 0.5 * nose_z) {
+    if !(nose_z > MIN_NOSE_RAD.sin() * 0.8 && side_z.abs() < 0.5 * nose_z) {
         faults.push(format!(
             "with its nose raised, its nose points {:.0} degrees up and its left side {:.0}",
             nose_z.clamp(-1.0, 1.0).asin().to_degrees(),
@@ -364,12 +364,12 @@ const REST_S: f64 = 0.8;
 /// The window's samples are this far apart; 40 Hz at most. [s]
 const SAMPLE_S: f64 = 0.025;
 /// 10 Hz is enough.
-const LEAST_SAMPLES: usize = 7;
+const MIN_SAMPLES: usize = 7;
 /// A hand trembles by less. [rad]
 const STILL_RAD: f64 = 0.06;
 /// A turn is at least 40 degrees, a raised nose 12. [rad]
-const LEAST_TURN_RAD: f64 = 0.7;
-const LEAST_NOSE_RAD: f64 = 0.21;
+const MIN_TURN_RAD: f64 = 0.7;
+const MIN_NOSE_RAD: f64 = 0.21;
 /// How far a quarter turn by hand may be off: 35 degrees. [rad]
 const QUARTER_OFF_RAD: f64 = 0.61;
 /// Cosine of 30 degrees: so far a hand's motion may be off an axis.

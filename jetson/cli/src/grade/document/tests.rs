@@ -137,8 +137,8 @@ fn shards_hold_every_flight_once() {
     let flights: Vec<_> = subject.flights().collect();
     assert_eq!((flights.len(), flights[0], flights[7]), (8, ("day", 1), ("night", 4)));
     let shards: Vec<Shard> = ["1/3", "2/3", "3/3"].map(|text| text.parse().unwrap()).to_vec();
-    for place in 0..flights.len() {
-        assert_eq!(shards.iter().filter(|shard| shard.holds(place)).count(), 1);
+    for index in 0..flights.len() {
+        assert_eq!(shards.iter().filter(|shard| shard.holds(index)).count(), 1);
     }
     for wrong in ["1/100001", "0/3", "4/3", "1/0", "1", "a/b", "-1/2"] {
         assert!(wrong.parse::<Shard>().is_err(), "{wrong}");

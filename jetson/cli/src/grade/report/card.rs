@@ -48,10 +48,10 @@ pub(crate) fn write(
             plot::top_view(arena, &field.obstacle_slice(height_m), last, way)
         );
     }
-    let told = flown.events.iter().filter(|event| event.kind != EventKind::PluginOutput);
-    let told: Vec<_> = told.filter(|event| at.is_none_or(|at| event.stamp <= at)).collect();
+    let events = flown.events.iter().filter(|event| event.kind != EventKind::PluginOutput);
+    let events: Vec<_> = events.filter(|event| at.is_none_or(|at| event.stamp <= at)).collect();
     let mut story = String::new();
-    for event in told.iter().skip(told.len().saturating_sub(EVENTS)) {
+    for event in events.iter().skip(events.len().saturating_sub(EVENTS)) {
         let before_s = at.map_or(0.0, |at| at.seconds_since(event.stamp));
         let _ = writeln!(story, "{:>8.2} s  {}", -before_s, escape(event.text.as_str()));
     }
@@ -70,7 +70,7 @@ pub(crate) fn write(
 /// Returns the card of a failed flight that another computer has flown, of which only the grade is here.
 pub(crate) fn without_images(run: &Run) -> String {
     head(run)
-        + "<p class=\"faint\">Merged from parts: its images, clearance and place are in the report of \
+        + "<p class=\"faint\">Merged from parts: its images, clearance and map are in the report of \
            the part that flew it, if that was given <code>--report</code>; or fly this seed again.</p>\
            </section>\n"
 }
@@ -139,10 +139,10 @@ mod tests {
     #[test]
     fn a_card_without_images_says_so_and_holds_no_markup_of_a_plugin() {
         let mut failed = run(3, OutcomeKind::Collided);
-        failed.reason = "said <script>".to_owned();
+        failed.reason = "bad <script>".to_owned();
         let card = without_images(&failed);
         assert!(card.starts_with("<section class=\"card\" id=\"day-3\">"), "{card}");
-        assert!(card.contains("too fast") && card.contains("said &lt;script&gt;"), "{card}");
+        assert!(card.contains("too fast") && card.contains("bad &lt;script&gt;"), "{card}");
         assert!(
             card.contains("report of the part that flew it") && !card.contains("<img"),
             "{card}"

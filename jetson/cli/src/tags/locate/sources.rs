@@ -207,7 +207,7 @@ impl Mailbox {
     }
 }
 
-/// Reads one live camera until told to stop.
+/// Reads one live camera until it is stopped.
 fn read(
     index: usize,
     name: &str,
@@ -273,7 +273,7 @@ fn spawn_listener(
     });
 }
 
-/// Draws what one camera sees until told to stop.
+/// Renders what one camera sees until it is stopped.
 fn draw(
     index: usize,
     mut camera: SimulatedCamera,

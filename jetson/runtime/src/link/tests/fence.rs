@@ -24,7 +24,7 @@ fn fence() -> Vec<FencePolygon> {
 }
 
 impl Script {
-    /// One that has been told the fence.
+    /// One whose fence is being uploaded.
     fn fenced() -> Self {
         let mut script = Self::ready();
         script.link.set_fence(script.now, fence());
@@ -42,7 +42,7 @@ impl Script {
     fn ask(&mut self, seq: u16) -> Option<MISSION_ITEM_INT_DATA> {
         let mission_type = MavMissionType::MAV_MISSION_TYPE_FENCE;
         let (target_system, target_component) = (255, 191);
-        self.say(&if self.kind == MavAutopilot::MAV_AUTOPILOT_PX4 || seq.is_multiple_of(2) {
+        self.inject(&if self.kind == MavAutopilot::MAV_AUTOPILOT_PX4 || seq.is_multiple_of(2) {
             MavMessage::MISSION_REQUEST_INT(MISSION_REQUEST_INT_DATA {
                 seq,
                 target_system,
@@ -64,7 +64,7 @@ impl Script {
     }
 
     fn acknowledge(&mut self, result: MavMissionResult) {
-        self.say(&MavMessage::MISSION_ACK(MISSION_ACK_DATA {
+        self.inject(&MavMessage::MISSION_ACK(MISSION_ACK_DATA {
             target_system: 255,
             target_component: 191,
             mavtype: result,
@@ -85,14 +85,14 @@ impl Script {
 }
 
 #[test]
-fn each_corner_goes_where_the_autopilot_s_origin_puts_it() {
+fn corners_are_placed_by_the_autopilots_origin() {
     let mut script = Script::new();
     script.link.set_fence(script.now, fence());
     script.heartbeat();
     script.run(3.0);
     assert_eq!(script.offers(), 0, "no origin, no place on the globe");
     let origin = GlobalPoint { latitude_e7: 480_000_000, longitude_e7: 110_000_000 };
-    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA {
+    script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA {
         latitude: origin.latitude_e7,
         longitude: origin.longitude_e7,
         ..Default::default()
@@ -117,7 +117,7 @@ fn each_corner_goes_where_the_autopilot_s_origin_puts_it() {
     }
     assert!(script.link.is_busy_with_fence());
     script.acknowledge(ACCEPTED);
-    assert_eq!(script.fence_events(), [&FenceEvent::Kept(2)]);
+    assert_eq!(script.fence_events(), [&FenceEvent::Accepted(2)]);
     // Repeating the same, and a repeated origin, change nothing.
     let offers = script.offers();
     script.link.set_fence(script.now, fence());
@@ -126,10 +126,10 @@ fn each_corner_goes_where_the_autopilot_s_origin_puts_it() {
 }
 
 #[test]
-fn arming_waits_for_it_and_an_armed_vehicle_is_left_alone() {
+fn arming_waits_for_the_upload_and_an_armed_vehicle_gets_none() {
     let mut script = Script::fenced();
     script.run(4.0);
-    assert!(script.missing().contains("told the arena's fence"), "{}", script.missing());
+    assert!(script.missing().contains("fence is being uploaded"), "{}", script.missing());
     for seq in 0..7 {
         script.ask(seq);
     }
@@ -150,7 +150,7 @@ fn arming_waits_for_it_and_an_armed_vehicle_is_left_alone() {
 }
 
 #[test]
-fn what_is_lost_is_offered_again_and_silence_ends_it() {
+fn lost_offers_are_repeated_and_silence_ends_the_upload() {
     let mut script = Script::fenced();
     script.run(3.5);
     assert_eq!(script.offers(), 3);
@@ -164,19 +164,19 @@ fn what_is_lost_is_offered_again_and_silence_ends_it() {
     assert_eq!(script.fence_events(), [] as [&FenceEvent; 0]);
     script.run(10.0);
     assert_eq!(script.offers(), 5);
-    let [FenceEvent::NotKept(why)] = script.fence_events()[..] else {
+    let [FenceEvent::Rejected(why)] = script.fence_events()[..] else {
         panic!("{:?}", script.fence_events())
     };
     assert_eq!(why, "it does not answer");
     // The flight goes on without: guard and referee are there.
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     let warnings: Vec<_> = script.events.iter().filter_map(LinkEvent::warning).collect();
-    let told = "own fence is not the arena's: it does not answer";
-    assert!(warnings.iter().any(|warning| warning.contains(told)), "{warnings:?}");
+    let expected = "own fence is not the arena's: it does not answer";
+    assert!(warnings.iter().any(|warning| warning.contains(expected)), "{warnings:?}");
 }
 
 #[test]
-fn a_refusal_is_told_in_words_and_a_busy_autopilot_asked_again() {
+fn refusal_is_reported_and_a_busy_autopilot_is_offered_again() {
     let mut script = Script::fenced();
     script.run(1.0);
     script.acknowledge(DENIED);
@@ -184,14 +184,14 @@ fn a_refusal_is_told_in_words_and_a_busy_autopilot_asked_again() {
     script.run(2.0);
     assert_eq!(script.offers(), offers + 1);
     script.acknowledge(MavMissionResult::MAV_MISSION_NO_SPACE);
-    let no_room = FenceEvent::NotKept("it has no room for as many corners".into());
+    let no_room = FenceEvent::Rejected("it has no room for as many corners".into());
     assert_eq!(script.fence_events(), [&no_room]);
     script.run(5.0);
     assert_eq!(script.offers(), offers + 1);
 }
 
 #[test]
-fn a_restarted_autopilot_is_told_again() {
+fn fence_is_uploaded_again_after_a_restart() {
     let mut script = Script::fenced();
     for seq in 0..7 {
         script.ask(seq);
@@ -200,20 +200,20 @@ fn a_restarted_autopilot_is_told_again() {
     let offers = script.offers();
     script.run_silently(3.5);
     script.heartbeat();
-    script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     script.run(5.0);
     assert!(script.offers() > offers);
 }
 
 #[test]
-fn px4_is_not_asked() {
+fn px4_gets_no_fence() {
     let mut script = Script::new();
     script.kind = MavAutopilot::MAV_AUTOPILOT_PX4;
     script.link.set_fence(script.now, fence());
     script.heartbeat();
     script.run(2.0);
     assert_eq!(script.offers(), 0);
-    let [FenceEvent::NotKept(why)] = script.fence_events()[..] else {
+    let [FenceEvent::Rejected(why)] = script.fence_events()[..] else {
         panic!("{:?}", script.fence_events())
     };
     assert!(why.contains("no place on the globe"), "{why}");

@@ -27,11 +27,11 @@ fn relate_clocks(script: &mut Script) {
     let asked = script.now.as_ns() as i64;
     script.now = script.now.plus_ns(2_000_000);
     let tc1 = asked + AHEAD_NS + 1_000_000;
-    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1: asked, ..Default::default() }));
+    script.inject(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1: asked, ..Default::default() }));
 }
 
 fn raw(script: &mut Script, time_usec: u64, zacc: i16) {
-    script.say(&MavMessage::RAW_IMU(RAW_IMU_DATA { time_usec, zacc, ..Default::default() }));
+    script.inject(&MavMessage::RAW_IMU(RAW_IMU_DATA { time_usec, zacc, ..Default::default() }));
 }
 
 fn newest(script: &Script) -> ImuSample {
@@ -81,16 +81,16 @@ fn stamps_rise_and_the_newest_are_kept() {
     let last: Vec<i64> = (140 - MAX_IMU as i64..140).collect();
     assert_eq!(seen(&script), last);
     let poison = HIGHRES_IMU_DATA { xacc: f32::NAN, ..Default::default() };
-    script.say(&MavMessage::HIGHRES_IMU(poison));
+    script.inject(&MavMessage::HIGHRES_IMU(poison));
     assert_eq!(seen(&script), last);
 }
 
 #[test]
-fn the_finer_message_is_preferred_until_a_restart() {
+fn highres_imu_is_preferred_until_a_restart() {
     let mut script = Script::ready();
     let fine = |script: &mut Script| {
         script.now = script.now.plus_ns(10_000_000);
-        script.say(&MavMessage::HIGHRES_IMU(HIGHRES_IMU_DATA {
+        script.inject(&MavMessage::HIGHRES_IMU(HIGHRES_IMU_DATA {
             zacc: -5.0,
             zgyro: -0.25,
             ..Default::default()
@@ -107,7 +107,7 @@ fn the_finer_message_is_preferred_until_a_restart() {
     assert_eq!(newest(&script).accel_mps2, DVec3::Z * 5.0, "the coarse one is left aside");
     assert_eq!(script.link.imu().len(), 2);
     for time_boot_ms in [90_000, 10] {
-        script.say(&MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() }));
+        script.inject(&MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() }));
     }
     assert!(script.link.imu().is_empty(), "the clock of these is gone");
     script.now = script.now.plus_ns(10_000_000);

@@ -11,13 +11,13 @@ fn px4() -> Script {
     let mut script = Script::new();
     script.kind = MavAutopilot::MAV_AUTOPILOT_PX4;
     script.heartbeat();
-    script.say(&MavMessage::ESTIMATOR_STATUS(ESTIMATOR_STATUS_DATA {
+    script.inject(&MavMessage::ESTIMATOR_STATUS(ESTIMATOR_STATUS_DATA {
         flags: EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_REL,
         ..Default::default()
     }));
     script.prearm(true);
     let position = local_position_to_mavlink(DVec3::new(1.0, 2.0, 0.1), DVec3::ZERO, 7);
-    script.say(&MavMessage::LOCAL_POSITION_NED(position));
+    script.inject(&MavMessage::LOCAL_POSITION_NED(position));
     script.run(3.0);
     script
 }
@@ -37,7 +37,7 @@ fn order(script: &Script) -> Vec<&'static str> {
 }
 
 #[test]
-fn it_rises_by_setpoints_that_stream_before_offboard() {
+fn takes_off_by_setpoints_that_stream_before_offboard() {
     let mut script = px4();
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     let origins = script.count(|m| matches!(m, MavMessage::SET_GPS_GLOBAL_ORIGIN(_)));
@@ -73,7 +73,7 @@ fn it_rises_by_setpoints_that_stream_before_offboard() {
 }
 
 #[test]
-fn its_setpoints_keep_coming_while_the_mode_is_refused() {
+fn setpoints_keep_streaming_while_the_mode_is_refused() {
     let mut script = px4();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_DO_SET_MODE => Some(MavResult::MAV_RESULT_DENIED),

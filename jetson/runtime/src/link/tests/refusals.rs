@@ -14,7 +14,7 @@ fn companion(own: u32) -> MavMessage {
 }
 
 fn param(script: &mut Script, name: &str, value: f32) {
-    script.say(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+    script.inject(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
         param_value: value,
         param_count: 900,
         param_index: u16::MAX,
@@ -24,10 +24,10 @@ fn param(script: &mut Script, name: &str, value: f32) {
 }
 
 #[test]
-fn failing_pre_arm_checks_are_said_in_words() {
+fn reports_failing_pre_arm_checks() {
     let mut script = Script::ready();
     let battery = MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_BATTERY;
-    script.say(&MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+    script.inject(&MavMessage::SYS_STATUS(SYS_STATUS_DATA {
         onboard_control_sensors_present: battery,
         onboard_control_sensors_enabled: battery,
         ..Default::default()
@@ -59,7 +59,7 @@ fn failing_pre_arm_checks_are_said_in_words() {
 }
 
 #[test]
-fn an_autopilot_that_cannot_say_why_is_asked_once() {
+fn autopilot_without_pre_arm_texts_is_asked_once() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_RUN_PREARM_CHECKS => Some(MavResult::MAV_RESULT_UNSUPPORTED),
@@ -71,9 +71,9 @@ fn an_autopilot_that_cannot_say_why_is_asked_once() {
     assert_eq!(asked, 1);
 }
 
-/// Refusals that ArduCopter gives without a word.
+/// Refusals that ArduCopter sends without a text.
 #[test]
-fn a_silent_refusal_is_explained_by_what_is_seen() {
+fn silent_refusal_is_explained_by_the_observed_state() {
     let check = |spoil: fn(&mut Script), expected: &str| {
         let mut script = Script::new();
         script.heartbeat();
@@ -91,7 +91,7 @@ fn a_silent_refusal_is_explained_by_what_is_seen() {
     };
     check(|_| {}, "no EKF origin");
     let origin = |script: &mut Script| {
-        script.say(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+        script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
         param(script, "VISO_TYPE", 0.0);
     };
     check(origin, "VISO_TYPE is 0, it must be 1");
@@ -107,15 +107,15 @@ fn a_second_companion_is_refused_by_name() {
     let own = own.unwrap();
     for _ in 0..5 {
         script.run(1.0);
-        script.say_from((255, 191), &companion(own));
+        script.inject_from((255, 191), &companion(own));
     }
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()), "that was our own echo");
     for _ in 0..3 {
         script.run(1.0);
-        script.say_from((255, 191), &companion(own + 1));
+        script.inject_from((255, 191), &companion(own + 1));
     }
     assert!(script.missing().contains("another companion (system 255, component 191)"));
-    script.say_from(
+    script.inject_from(
         (255, 191),
         &MavMessage::STATUSTEXT(STATUSTEXT_DATA {
             text: "companion bee on jetson-2".into(),
@@ -132,7 +132,7 @@ fn a_second_companion_is_refused_by_name() {
 }
 
 #[test]
-fn answers_to_questions_of_others_betray_them() {
+fn replies_to_others_reveal_them() {
     let mut script = Script::ready();
     let answer = |ts1| {
         MavMessage::TIMESYNC(TIMESYNC_DATA {
@@ -144,7 +144,7 @@ fn answers_to_questions_of_others_betray_them() {
     };
     for i in 0..3 {
         script.run(1.0);
-        script.say(&answer(900 + i));
+        script.inject(&answer(900 + i));
     }
     assert!(script.link.clock().offset_ns(script.now).is_none(), "another's clock is not ours");
     assert!(script.missing().contains("another companion"));
@@ -152,7 +152,7 @@ fn answers_to_questions_of_others_betray_them() {
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     // Arming that we never asked for.
     for _ in 0..3 {
-        script.say(&MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
+        script.inject(&MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
             command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
             target_system: 255,
             target_component: 191,
@@ -163,24 +163,24 @@ fn answers_to_questions_of_others_betray_them() {
 }
 
 #[test]
-fn our_name_is_told_once_and_again_to_another() {
+fn name_is_announced_once_and_again_to_another() {
     let name = "wasp on jetson-1".to_owned();
     let mut script = Script::with(LinkSettings { name, ..LinkSettings::default() });
-    let told = |script: &Script| {
+    let announced = |script: &Script| {
         script.count(|m| matches!(m, MavMessage::STATUSTEXT(m) if m.text.to_str() == Ok("companion wasp on jetson-1")))
     };
     script.heartbeat();
     script.run(10.0);
-    assert_eq!(told(&script), 1);
+    assert_eq!(announced(&script), 1);
     for _ in 0..12 {
-        script.say_from((255, 191), &companion(1));
+        script.inject_from((255, 191), &companion(1));
         script.run(1.0);
     }
-    assert!((2..=4).contains(&told(&script)), "{}", told(&script));
+    assert!((2..=4).contains(&announced(&script)), "{}", announced(&script));
 }
 
 #[test]
-fn streams_that_come_too_seldom_are_asked_for_again_then_told() {
+fn slow_streams_are_requested_again_then_reported() {
     let mut script = Script::ready();
     script.run(12.0);
     let asked = script.count(|m| {
@@ -204,7 +204,7 @@ fn the_latency_of_external_navigation_is_measured_and_suggested() {
     });
     let ts1 = request.unwrap();
     script.now = HostTime::from_ns(ts1 as u64).plus_ns(4_000_000);
-    script.say(&MavMessage::TIMESYNC(TIMESYNC_DATA {
+    script.inject(&MavMessage::TIMESYNC(TIMESYNC_DATA {
         tc1: 9_000_000_000,
         ts1,
         ..Default::default()
@@ -226,7 +226,7 @@ fn the_latency_of_external_navigation_is_measured_and_suggested() {
 }
 
 #[test]
-fn nothing_rises_again_by_itself_after_a_restart() {
+fn does_not_take_off_by_itself_after_a_restart() {
     let mut script = Script::ready();
     script.link.set_goal(script.now, Goal::TakeOff(1.0));
     script.run(1.0);
@@ -234,10 +234,10 @@ fn nothing_rises_again_by_itself_after_a_restart() {
     let at = |ms| {
         MavMessage::LOCAL_POSITION_NED(local_position_to_mavlink(DVec3::ZERO, DVec3::ZERO, ms))
     };
-    script.say(&at(90_000));
+    script.inject(&at(90_000));
     (script.armed, script.mode) = (false, 0);
     script.sent.clear();
-    script.say(&at(100));
+    script.inject(&at(100));
     script.heartbeat();
     script.run(5.0);
     assert!(script.events.contains(&LinkEvent::Rebooted));
@@ -254,11 +254,11 @@ fn nothing_rises_again_by_itself_after_a_restart() {
     script.link.set_goal(script.now, Goal::Prepare);
     script.link.set_goal(script.now, Goal::TakeOff(1.0));
     script.run(1.0);
-    assert_eq!(script.commands().len(), 3, "a new wish counts");
+    assert_eq!(script.commands().len(), 3, "a new goal counts");
 }
 
 #[test]
-fn one_of_two_vehicles_may_be_chosen() {
+fn one_of_two_vehicles_may_be_selected() {
     let settings = LinkSettings { system: Some(2), ..LinkSettings::default() };
     let mut script = Script::with(settings);
     script.run(2.0);
@@ -267,7 +267,7 @@ fn one_of_two_vehicles_may_be_chosen() {
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         ..Default::default()
     };
-    script.say_from((2, 1), &MavMessage::HEARTBEAT(beat));
+    script.inject_from((2, 1), &MavMessage::HEARTBEAT(beat));
     assert_eq!(script.link.system(), Some(2));
     script.run(1.0);
     assert!(script.missing().contains("origin"), "{}", script.missing());

@@ -1,4 +1,4 @@
-//! A link that signs: what is unsigned, forged or said before is refused.
+//! A link that signs: unsigned, forged and replayed packets are refused.
 
 use vizflyt_protocol::mavlink::{Signer, SigningKey, SigningTime, Verifier};
 
@@ -11,7 +11,7 @@ fn key() -> SigningKey {
 }
 
 fn link(now: HostTime) -> Link {
-    let signing = Some(LinkSigning { key: key(), start: START, trusts_wire: false });
+    let signing = Some(LinkSigning { key: key(), start: START, accepts_unsigned: false });
     Link::with(now, LinkSettings { signing, ..LinkSettings::default() })
 }
 
@@ -32,7 +32,7 @@ fn beat(signer: Option<&mut Signer>, at: SigningTime) -> Vec<u8> {
 }
 
 #[test]
-fn only_what_is_signed_anew_is_believed() {
+fn accepts_only_signed_packets_with_new_stamps() {
     let now = HostTime::from_ns(5_000_000_000);
     let mut link = link(now);
     link.handle_input(now, &beat(None, START));
@@ -58,7 +58,7 @@ fn only_what_is_signed_anew_is_believed() {
 }
 
 #[test]
-fn all_that_is_sent_is_signed() {
+fn signs_every_packet() {
     let now = HostTime::from_ns(5_000_000_000);
     let mut link = link(now);
     let mut signer = Signer::new(key(), 0);
@@ -74,18 +74,18 @@ fn all_that_is_sent_is_signed() {
 }
 
 #[test]
-fn a_trusted_wire_need_not_sign() {
+fn accepts_unsigned_packets_over_a_trusted_wire() {
     let now = HostTime::from_ns(5_000_000_000);
-    let signing = Some(LinkSigning { key: key(), start: START, trusts_wire: true });
+    let signing = Some(LinkSigning { key: key(), start: START, accepts_unsigned: true });
     let mut link = Link::with(now, LinkSettings { signing, ..LinkSettings::default() });
     link.handle_input(now, &beat(None, START));
     assert!(link.is_connected());
 }
 
 #[test]
-fn a_key_is_handed_over() {
+fn sends_the_key_to_the_autopilot() {
     let mut script = Script::new();
-    let signing = LinkSigning { key: key(), start: START, trusts_wire: false };
+    let signing = LinkSigning { key: key(), start: START, accepts_unsigned: false };
     assert!(!script.link.setup_signing(script.now, Some(&signing)), "to nobody");
     script.heartbeat();
     assert!(script.link.setup_signing(script.now, Some(&signing)));

@@ -15,7 +15,7 @@ pub enum Database {
 }
 
 impl Database {
-    /// Returns the file where runs are kept if nothing else is said, after the XDG base directory
+    /// Returns the file where runs are stored by default, after the XDG base directory
     /// specification; `None` without a home.
     pub fn default_file() -> Option<PathBuf> {
         let set = |name: &str| {

@@ -1,7 +1,7 @@
 //! Who flew what how well: runs of lab flights, teams and their standings, in a database that outlives the server.
 //!
 //! ```text
-//! recorder (a task for each vehicle) -> begin, heard, end -> runs
+//! recorder (a task for each vehicle) -> begin, keep_alive, end -> runs
 //! `vizflyt leaderboard team add`     -> teams, their tokens
 //! `vizflyt leaderboard add`          -> grades, their signatures verified
 //! runs -> standings (pure) -> page, wall view, command line;  runs -> CSV
@@ -23,7 +23,7 @@ pub use database_url::{Database, UnknownDatabase};
 pub use export::write_csv;
 pub use grades::{GradeBoard, GradeEntry, GradePlace, grade_boards};
 pub use standings::{Standing, standings};
-pub use store::{Leaderboard, LeaderboardError, MOST_RUNS};
+pub use store::{Leaderboard, LeaderboardError, MAX_RUNS};
 
 use serde::{Deserialize, Serialize};
 

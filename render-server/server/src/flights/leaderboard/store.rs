@@ -40,7 +40,7 @@ pub enum LeaderboardError {
     Query(Database, sqlx::Error),
     /// A team's name that is none.
     #[error(
-        "{0:?} is no name for a team; give 1 to {MOST_NAME} characters, none of them a control character"
+        "{0:?} is no name for a team; give 1 to {MAX_NAME} characters, none of them a control character"
     )]
     Name(String),
     /// A team of that name is there.
@@ -133,7 +133,7 @@ impl Leaderboard {
     /// # Errors
     /// A name that is taken or none.
     pub async fn add_team(&self, name: &str) -> Result<String, LeaderboardError> {
-        let is_name = (1..=MOST_NAME).contains(&name.chars().count());
+        let is_name = (1..=MAX_NAME).contains(&name.chars().count());
         if !is_name || name.trim() != name || name.chars().any(char::is_control) {
             return Err(LeaderboardError::Name(name.to_owned()));
         }
@@ -193,7 +193,7 @@ impl Leaderboard {
     /// # Errors
     /// Of the database.
     pub async fn team_of(&self, token: &str) -> Result<Option<String>, LeaderboardError> {
-        // Looked up by its hash: how long that takes says nothing about the token.
+        // Looked up by its hash: how long that takes reveals nothing about the token.
         let row = sqlx::query("SELECT name FROM teams WHERE token_hash = $1 AND retired = 0")
             .bind(hash(token))
             .fetch_optional(&self.pool)
@@ -248,11 +248,11 @@ impl Leaderboard {
         }
     }
 
-    /// Says that a run is still flown. Call every few seconds: what is not heard of for a minute is cut off.
+    /// Marks a run as still flown. Call every few seconds: a run without a mark for a minute is cut off.
     ///
     /// # Errors
     /// Of the database.
-    pub async fn heard(&self, id: &str) -> Result<(), LeaderboardError> {
+    pub async fn keep_alive(&self, id: &str) -> Result<(), LeaderboardError> {
         sqlx::query("UPDATE runs SET heard_unix_ms = $1 WHERE id = $2 AND state = 'flying'")
             .bind(unix_ms())
             .bind(id)
@@ -287,7 +287,7 @@ impl Leaderboard {
         Ok(())
     }
 
-    /// Returns the newest [`MOST_RUNS`] runs, newest first; of one course, if it is named.
+    /// Returns the newest [`MAX_RUNS`] runs, newest first; of one course, if it is named.
     ///
     /// # Errors
     /// Of the database.
@@ -300,7 +300,7 @@ impl Leaderboard {
         )
         .bind(i64::from(course.is_some()))
         .bind(course.unwrap_or(""))
-        .bind(MOST_RUNS)
+        .bind(MAX_RUNS)
         .fetch_all(&self.pool)
         .await
         .map_err(|error| self.failed(error))?;
@@ -424,9 +424,9 @@ pub(super) fn unix_ms() -> i64 {
 }
 
 /// Runs that are listed at most: some terms of a large class.
-pub const MOST_RUNS: i64 = 20_000;
+pub const MAX_RUNS: i64 = 20_000;
 /// Characters of a team's name.
-const MOST_NAME: usize = 40;
+const MAX_NAME: usize = 40;
 /// A run whose server is silent for so long has no server any more.
 const UNHEARD: Duration = Duration::from_mins(1);
 /// How long the database may take to be there.

@@ -69,7 +69,7 @@ async fn behaves(board: &Leaderboard) {
     assert!(spent.to_string().contains("has flown its 1 official attempts on 'race'"), "{spent}");
     let nobody = board.begin(&new(None, Attempt::Practice), None).await.unwrap();
     board.end(&official, &end(4)).await.unwrap();
-    board.heard(&practice).await.unwrap();
+    board.keep_alive(&practice).await.unwrap();
 
     let runs = board.runs(Some("race")).await.unwrap();
     let state = |id: &str| runs.iter().find(|run| run.id == id).unwrap();
@@ -84,7 +84,7 @@ async fn behaves(board: &Leaderboard) {
     assert_eq!(board.verdict("none").await.unwrap(), None);
     assert_eq!(standings(&runs, "race", Attempt::Official)[0].seconds, Some(33.5));
 
-    // Two minutes on, nobody has heard of the runs that still fly.
+    // Two minutes on, no mark of the runs that still fly has come.
     board.cut_off_unheard(state(&practice).began_unix_ms + 120_000).await.unwrap();
     let runs = board.runs(None).await.unwrap();
     let cut_off = runs.iter().filter(|run| run.state == RunState::CutOff).count();

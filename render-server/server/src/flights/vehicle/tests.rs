@@ -69,7 +69,7 @@ async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_even
     assert_eq!((first.first_event, first.resumed, vehicle.flights()), (1, false, 1));
     vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
     vehicle.publish(EventKind::EmergencyStop, "stop");
-    // As if it had last been heard two seconds ago.
+    // As if its last message had come two seconds ago.
     first.renew(clock::now().plus_seconds(-2.0));
     let second = vehicle.take_control(&hello(5), address()).unwrap();
     first.evicted().await;

@@ -31,7 +31,7 @@ impl FrameClock {
     pub fn stamp(&mut self, frame: u32, arrival: ServerTime) -> ServerTime {
         let jumped = self.window.back().is_some_and(|&(last, last_arrival)| {
             let ahead = frame.wrapping_sub(last);
-            ahead == 0 || ahead > MOST_GAP || arrival.seconds_since(last_arrival) > MOST_SILENCE_S
+            ahead == 0 || ahead > MAX_GAP || arrival.seconds_since(last_arrival) > MAX_SILENCE_S
         });
         if jumped {
             self.restart();
@@ -42,7 +42,7 @@ impl FrameClock {
         }
         let lateness_s = self.lateness_s();
         // The counter's clock slipped against ours for good (the source paused): start over. Time
-        // tells this from a burst after a pause of our own, which is over in an instant.
+        // separates this from a burst after a pause of our own, which is over in an instant.
         self.late_since =
             if lateness_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
         if self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S) {
@@ -73,7 +73,9 @@ impl FrameClock {
             (f64::from(frame.wrapping_sub(first.0)), arrival.seconds_since(first.1))
         };
         // The period hardly changes: every few frames is often enough.
-        if self.window.len() >= LEAST && (self.period_s.is_none() || newest.0.is_multiple_of(8)) {
+        if self.window.len() >= MIN_SAMPLES
+            && (self.period_s.is_none() || newest.0.is_multiple_of(8))
+        {
             self.points.clear();
             self.points.extend(self.window.iter().map(|&p| point(p)));
             self.period_s = slope_of_the_prompt(&mut self.points).or(self.period_s);
@@ -107,7 +109,7 @@ fn slope_of_the_prompt(points: &mut [(f64, f64)]) -> Option<f64> {
         }
         let period_s = cross / square;
         slope = Some(period_s);
-        kept = points.len().div_ceil(2).max(LEAST / 2).min(points.len());
+        kept = points.len().div_ceil(2).max(MIN_SAMPLES / 2).min(points.len());
         points.select_nth_unstable_by(kept - 1, |p, q| {
             (p.1 - period_s * p.0).total_cmp(&(q.1 - period_s * q.0))
         });
@@ -118,11 +120,11 @@ fn slope_of_the_prompt(points: &mut [(f64, f64)]) -> Option<f64> {
 /// Two seconds at 200 Hz. The slope's error is then 1 us a frame for 2 ms of jitter.
 const WINDOW: usize = 400;
 /// Fewer frames than this give no slope worth using: the last one holds.
-const LEAST: usize = 20;
+const MIN_SAMPLES: usize = 20;
 /// A gap in the counter beyond this is another recording: a second at 200 Hz.
-const MOST_GAP: u32 = 200;
+const MAX_GAP: u32 = 200;
 /// Silence after which the counter is trusted no more. [s]
-const MOST_SILENCE_S: f64 = 1.0;
+const MAX_SILENCE_S: f64 = 1.0;
 /// Enough for a burst of a quarter of the window.
 const STEPS: usize = 4;
 /// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
@@ -197,7 +199,7 @@ mod tests {
         for frame in 0..300 {
             clock.stamp(frame, truth(frame));
         }
-        // From here on every frame comes 60 ms later than its number says.
+        // From here on every frame comes 60 ms later than its number implies.
         let late = |frame| truth(frame).plus_ns(60_000_000);
         let stamps: Vec<_> = (300..400).map(|frame| clock.stamp(frame, late(frame))).collect();
         let last = *stamps.last().unwrap();

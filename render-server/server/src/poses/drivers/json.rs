@@ -7,7 +7,7 @@
 //! ```
 //! `seq`, `stamp_ns`, `clock` and the sigmas may be left out. Stamps are of this computer's
 //! CLOCK_MONOTONIC (`"clock": "server"`), or of any clock of the sender's (`"sender"`, also if
-//! nothing is said), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
+//! nothing is given), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
 //! rhythm; without either, a pose is as old as its arrival. `quality` is what `vizflyt tags locate` saw:
 //! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. What else the object
 //! holds is ignored.
@@ -58,7 +58,7 @@ pub struct PosePacket<'a> {
     pub quality: Option<TagsSeen>,
 }
 
-/// Reads what `vizflyt tags locate` says; what another program means by `quality` is its own affair.
+/// Reads the `quality` of `vizflyt tags locate`; what another program means by `quality` is its own affair.
 fn tags_if_any<'de, D: serde::Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<TagsSeen>, D::Error> {
@@ -116,7 +116,7 @@ impl<'a> PosePacket<'a> {
             return Err(JsonError::Version(packet.vizflyt_pose));
         }
         // JSON has no NaN, but numbers that overflow.
-        if !packet.position_m.iter().all(|value| value.abs() <= MOST) {
+        if !packet.position_m.iter().all(|value| value.abs() <= MAX_VALUE) {
             return Err(JsonError::Position(packet.position_m));
         }
         let length = DQuat::from_array(packet.rotation_xyzw).length();
@@ -129,7 +129,7 @@ impl<'a> PosePacket<'a> {
             ("rotation_sigma_rad", packet.rotation_sigma_rad),
         ] {
             if let Some(value) = value
-                && !value.iter().all(|sigma| *sigma > 0.0 && *sigma <= MOST)
+                && !value.iter().all(|sigma| *sigma > 0.0 && *sigma <= MAX_VALUE)
             {
                 return Err(JsonError::Sigma { key, value });
             }
@@ -258,10 +258,10 @@ impl PoseStream for JsonStream {
     }
 }
 
-/// Who sends where nobody said.
+/// The default sender.
 const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// No lab is a thousand kilometres wide, not in millimetres either.
-const MOST: f64 = 1e9;
+const MAX_VALUE: f64 = 1e9;
 /// Two readings of one clock, rounded. [s]
 const FUTURE_S: f64 = 0.001;
 /// A pose that took longer is another clock's. [s]

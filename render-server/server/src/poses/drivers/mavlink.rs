@@ -45,7 +45,7 @@ struct System {
     /// Who it is, and where it is.
     from: Option<(MavHeader, SocketAddr)>,
     asked: Option<ServerTime>,
-    /// ODOMETRY comes: the other messages say the same, less well.
+    /// ODOMETRY comes: the other messages have the same, less precisely.
     has_odometry: bool,
     /// The newest stamp used. [ns, autopilot]
     last_ns: u64,
@@ -164,7 +164,7 @@ impl MavlinkStream {
         (p_m, rotation): (DVec3, DQuat),
         sigma: Option<PoseSigma>,
     ) {
-        if !(p_m.abs().cmple(DVec3::splat(MOST)).all() && rotation.is_normalized()) {
+        if !(p_m.abs().cmple(DVec3::splat(MAX_POSITION_M)).all() && rotation.is_normalized()) {
             let error = format!("position {p_m} with rotation {rotation} is no pose");
             return self.roster.bad(&error, "has the autopilot an estimate yet?");
         }
@@ -292,7 +292,7 @@ const ASK_EVERY_S: f64 = 5.0;
 /// Attitudes turn on evenly for so long. [ms]
 const OLDEST_ATTITUDE_MS: u32 = 100;
 /// No room is wider. [m]
-const MOST: f64 = 1e6;
+const MAX_POSITION_M: f64 = 1e6;
 
 #[cfg(test)]
 mod tests;

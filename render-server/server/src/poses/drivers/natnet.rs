@@ -8,7 +8,7 @@
 //! The wire format is the crate `natnet`'s: no unsafe code, no dependency, every count checked
 //! against the bytes that are there, tested against captures of Motive 3.1; its sockets stay out. What
 //! is ours is the conversation, and time: Motive's clock is related to ours by the packets' `transmit`
-//! stamps, and a pose is as old as `transmit - mid exposure` says.
+//! stamps, and a pose is as old as `transmit - mid exposure`.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -51,7 +51,7 @@ pub struct NatnetStream {
     asked: Option<ServerTime>,
     asked_names: Option<ServerTime>,
     kept_alive: Option<ServerTime>,
-    heard: Option<ServerTime>,
+    received_at: Option<ServerTime>,
     warned_of_version: bool,
 }
 
@@ -82,7 +82,7 @@ impl NatnetStream {
             asked: None,
             asked_names: None,
             kept_alive: None,
-            heard: None,
+            received_at: None,
             warned_of_version: false,
         }
     }
@@ -130,7 +130,7 @@ impl NatnetStream {
         };
         talk.vehicles.clear();
         talk.has_names = true;
-        for (name, id) in model.rigid_bodies().take(MOST_BODIES) {
+        for (name, id) in model.rigid_bodies().take(MAX_BODIES) {
             talk.vehicles.insert(id, self.roster.find(name.as_bytes()));
         }
         if !talk.vehicles.values().any(Option::is_some) {
@@ -148,13 +148,13 @@ impl NatnetStream {
             Ok(_) => return,
             Err(error) => return self.roster.bad(&error, NOT_MOTIVE),
         };
-        self.heard = Some(now);
+        self.received_at = Some(now);
         let unknown = |body: &RigidBody| !talk.vehicles.contains_key(&body.id);
         if frame.params & LIST_CHANGED != 0 || frame.rigid_bodies.iter().any(unknown) {
             talk.has_names = false;
         }
         let stamp = self.stamp(&frame, now);
-        for body in frame.rigid_bodies.iter().take(MOST_BODIES) {
+        for body in frame.rigid_bodies.iter().take(MAX_BODIES) {
             let named = self.talk.as_ref().and_then(|talk| *talk.vehicles.get(&body.id)?);
             // A person may name a rigid body by its streaming id, too.
             let vehicle = named.or_else(|| self.roster.find(body.id.to_string().as_bytes()));
@@ -183,7 +183,9 @@ impl NatnetStream {
         let p = DVec3::from(body.position.map(f64::from));
         let rotation = DQuat::from_array(body.orientation.map(f64::from));
         // Single precision, so a few digits of unit length.
-        if !(p.abs().cmple(DVec3::splat(MOST)).all() && (rotation.length() - 1.0).abs() <= 0.01) {
+        if !(p.abs().cmple(DVec3::splat(MAX_VALUE)).all()
+            && (rotation.length() - 1.0).abs() <= 0.01)
+        {
             let error =
                 format!("rigid body {} at {p} with rotation {rotation} is no pose", body.id);
             return self.roster.bad(&error, NOT_MOTIVE);
@@ -192,7 +194,7 @@ impl NatnetStream {
         self.roster.measure(vehicle, (stamp, now), (p, rotation.normalize()), None);
     }
 
-    /// Returns when the cameras were exposed for a frame; `None` if it does not say.
+    /// Returns when the cameras were exposed for a frame; `None` if it does not state it.
     fn stamp(&mut self, frame: &FrameOfData, now: ServerTime) -> Option<ServerTime> {
         let ticks_hz = self.talk.as_ref()?.ticks_hz;
         let timing = &frame.timing;
@@ -221,8 +223,8 @@ impl NatnetStream {
     fn ask(&mut self, now: ServerTime) {
         let unicast = matches!(self.motive, Motive::Unicast(_));
         // Motive was restarted, or the network was away: it has forgotten us.
-        if unicast && self.heard.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
-            (self.talk, self.heard) = (None, None);
+        if unicast && self.received_at.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
+            (self.talk, self.received_at) = (None, None);
         }
         let Some(talk) = &self.talk else {
             let options = ConnectOptions { bitstream_version: self.wanted, ..Default::default() };
@@ -253,7 +255,7 @@ impl PoseStream for NatnetStream {
             Ok(NAT_MODELDEF) => self.handle_names(bytes),
             Ok(NAT_FRAMEOFDATA) => self.handle_frame(now, bytes),
             // Chat between Motive and its clients.
-            Ok(id) if id <= MOST_ID => {}
+            Ok(id) if id <= MAX_ID => {}
             Ok(id) => self.roster.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
             Err(error) => self.roster.bad(&error, NOT_MOTIVE),
         }
@@ -312,11 +314,11 @@ const RENAME: &str = "rename the rigid body in Motive's Assets pane, or set `obj
 /// Bit of a frame's parameters: rigid bodies were added or renamed.
 const LIST_CHANGED: u16 = 2;
 /// The highest id of a NatNet message (NAT_UNRECOGNIZED_REQUEST).
-const MOST_ID: u16 = 100;
+const MAX_ID: u16 = 100;
 /// Rigid bodies of one Motive at most, as far as we look.
-const MOST_BODIES: usize = 256;
+const MAX_BODIES: usize = 256;
 /// No lab is a thousand kilometres wide, not in millimetres either.
-const MOST: f64 = 1e9;
+const MAX_VALUE: f64 = 1e9;
 /// A frame is not sent later after its exposure. [ns]
 const OLDEST_NS: u64 = 1_000_000_000;
 /// How often is asked who is there, and for names. [s]

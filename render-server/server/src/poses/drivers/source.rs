@@ -14,13 +14,13 @@ pub struct Measurement {
     pub vehicle: usize,
     /// Index of the source, in the order in which they were set up.
     pub source: u8,
-    /// When the pose was true, as well as the source lets one tell.
+    /// When the pose was true, as precisely as the source states it.
     pub stamp: ServerTime,
     /// When it reached this computer.
     pub arrival: ServerTime,
     /// Where the vehicle was.
     pub world_from_body: Pose<World, Body>,
-    /// How far that may be off, where the source says.
+    /// Its standard deviations, where the source states them.
     pub sigma: Option<PoseSigma>,
 }
 

@@ -117,7 +117,7 @@ impl UdpPort {
             from: None,
             stream,
             buffer: vec![0; 65536].into_boxed_slice(),
-            heard: clock::now(),
+            received_at: clock::now(),
             silence_warned: false,
             warnings: VecDeque::new(),
         }
@@ -132,7 +132,7 @@ pub struct UdpPoses<S> {
     stream: S,
     buffer: Box<[u8]>,
     /// When anything last arrived; the start, before anything did.
-    heard: ServerTime,
+    received_at: ServerTime,
     silence_warned: bool,
     warnings: VecDeque<String>,
 }
@@ -146,7 +146,7 @@ impl<S: PoseStream> UdpPoses<S> {
     }
 
     fn notice_silence(&mut self, now: ServerTime) {
-        let silence_s = now.seconds_since(self.heard);
+        let silence_s = now.seconds_since(self.received_at);
         let allowed_s = if self.from.is_some() { SILENCE_S } else { FIRST_SILENCE_S };
         if self.silence_warned || !(silence_s > allowed_s) {
             return;
@@ -181,7 +181,7 @@ impl<S: PoseStream> PoseSource for UdpPoses<S> {
             self.notice_silence(now);
             return &[];
         };
-        self.heard = now;
+        self.received_at = now;
         self.from = Some(from);
         self.silence_warned = false;
         self.stream.handle_packet_from(now, from, &self.buffer[..length])
@@ -234,6 +234,6 @@ mod tests {
             format!("vicon: no sample for 1000 ms from {from}; set Tracker to Live, then retry")
         );
         source.notice_silence(pose.arrival.plus_seconds(2.0));
-        assert_eq!(source.next_warning(), None, "said once");
+        assert_eq!(source.next_warning(), None, "reported once");
     }
 }

@@ -194,7 +194,7 @@ impl VehicleNames {
         }
         self.warned_of_others = true;
         let quoted = |name: &str| format!("'{name}'");
-        let others: Vec<_> = names.take(MOST_NAMES).map(quoted).collect();
+        let others: Vec<_> = names.take(MAX_NAMES).map(quoted).collect();
         let ours: Vec<_> = self.objects.iter().map(|object| quoted(&object.name)).collect();
         let (driver, others, ours) = (self.driver, others.join(", "), ours.join(", "));
         self.warnings.push_back(format!(
@@ -205,7 +205,7 @@ impl VehicleNames {
     /// Tells a person something.
     pub(super) fn warn(&mut self, text: String) {
         // What nobody reads must not pile up.
-        if self.warnings.len() < MOST_WARNINGS {
+        if self.warnings.len() < MAX_WARNINGS {
             self.warnings.push_back(text);
         }
     }
@@ -235,9 +235,9 @@ fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
 /// Ten seconds at 200 Hz: beyond any reordering on a LAN.
 const RESTART_FRAMES: i32 = 2000;
 /// Names in a warning.
-pub(super) const MOST_NAMES: usize = 8;
-/// Things to tell that may wait.
-const MOST_WARNINGS: usize = 16;
+pub(super) const MAX_NAMES: usize = 8;
+/// Maximum number of warnings that wait.
+const MAX_WARNINGS: usize = 16;
 /// No lab is wider. [m]
 const FAR_M: f64 = 100.0;
 /// A repeated frame for so long is no hiccup. [s]

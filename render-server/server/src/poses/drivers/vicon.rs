@@ -9,7 +9,7 @@
 //! Tracker pads packets to a block size: bytes after the last item are ignored. Items with
 //! another id are skipped by their size.
 //!
-//! Rotation: unless the setting `euler` says otherwise, turns about the fixed x, then the fixed y,
+//! Rotation: unless the setting `euler` overrides it, turns about the fixed x, then the fixed y,
 //! then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on
 //! site.
 //!
@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
-use super::vehicle_names::{MOST_NAMES, VehicleNames};
+use super::vehicle_names::{MAX_NAMES, VehicleNames};
 use crate::poses::settings::{Euler, LocalizationConfig};
 
 /// One object of a packet.
@@ -105,7 +105,7 @@ fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
     let mut values = [0.0f64; 6];
     for (value, bytes) in values.iter_mut().zip(numbers.chunks_exact(8)) {
         *value = f64::from_le_bytes(bytes.try_into().ok()?);
-        if !(value.abs() <= MOST) {
+        if !(value.abs() <= MAX_VALUE) {
             return None;
         }
     }
@@ -138,7 +138,7 @@ impl PoseStream for ViconStream {
     fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
         self.roster.begin();
         let mut found = [None; MAX_VEHICLES];
-        let mut others = heapless::Vec::<_, MOST_NAMES>::new();
+        let mut others = heapless::Vec::<_, MAX_NAMES>::new();
         let parsed = parse(bytes, |object| match self.roster.find(object.name) {
             Some(vehicle) => found[vehicle] = Some(object),
             None => drop(others.push(object.name)),
@@ -194,7 +194,7 @@ const OBJECT_ID: u8 = 0;
 const NAME_SIZE: usize = 24;
 const OBJECT_SIZE: usize = 72;
 /// No lab is a thousand kilometres wide [mm], and no angle has this many turns [rad].
-const MOST: f64 = 1e9;
+const MAX_VALUE: f64 = 1e9;
 
 #[cfg(test)]
 mod tests;

@@ -31,22 +31,22 @@ use crate::scene;
 pub struct LocalizationConfig {
     /// What sends them.
     pub driver: Driver,
-    /// Where they come from or arrive, as the driver reads it; its usual address if not said.
+    /// Where they come from or arrive, as the driver reads it; its usual address by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
-    /// Length unit of the stream; the driver's own if not said.
+    /// Length unit of the stream; the driver's own by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub units: Option<Units>,
     /// The stream's axis that points up; a short form of `axes`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<UpAxis>,
-    /// Which of the stream's axes the world's x, y and z are: `xyz` if not said, `x-zy` for y up.
+    /// Which of the stream's axes the world's x, y and z are: `xyz` by default, `x-zy` for y up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
     /// Vicon: the order in which its three angles turn about the fixed axes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub euler: Option<Euler>,
-    /// Which of the object's axes points along the vehicle's nose; x if not said.
+    /// Which of the object's axes points along the vehicle's nose; x by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub nose: Nose,
     /// Where the stream's origin is in the world, and how it is turned there.
@@ -121,7 +121,7 @@ impl UpAxis {
     }
 }
 
-/// Which of the stream's axes the world's x, y and z are, each possibly turned round: `x-zy` says
+/// Which of the stream's axes the world's x, y and z are, each possibly reversed: `x-zy` means
 /// that the world's y is the stream's -z, and its z the stream's y.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Axes([(usize, bool); 3]);
@@ -470,7 +470,7 @@ impl LocalizationConfig {
         self.address.as_deref().unwrap_or(self.driver.usual_address())
     }
 
-    /// Returns the axes, said in either way.
+    /// Returns the axes, given in either form.
     pub fn stream_axes(&self) -> Axes {
         self.axes.unwrap_or_else(|| self.up.map_or(Axes::IDENTITY, UpAxis::axes))
     }

@@ -113,7 +113,7 @@ proptest! {
         prop_assert!(q_back.dot(q).abs() > 1.0 - 1e-9);
     }
 
-    /// Whatever the axes: a point of the object is where its streamed coordinates say, and the sense
+    /// Whatever the axes: a point of the object is at its streamed coordinates, and the sense
     /// of turns is right in a mirror too.
     #[test]
     fn points_of_the_object_are_carried_along(a in alignment(), q in rotation(), v in prop::array::uniform3(-1.0..1.0f64)) {

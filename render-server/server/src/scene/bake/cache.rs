@@ -3,7 +3,7 @@
 //! A file's name is the hash of the splats' geometry and of how they are baked, so a scene or a
 //! setting that changed is another file. It begins with a checksum: what does not match, or does
 //! not read, is baked anew and replaced. Files come whole (written aside, then renamed); the ones
-//! used longest ago go when the folder grows over [`MOST_BYTES`].
+//! used longest ago go when the folder grows over [`MAX_BYTES`].
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -21,13 +21,13 @@ pub struct BakeCache {
     folder: PathBuf,
 }
 
-/// What a bake is known by.
+/// The identity of a bake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BakeKey([u8; SHA256_OUTPUT_LEN]);
 
-/// What the cache has of a key.
+/// The cache's entry of a key.
 #[derive(Debug)]
-pub(super) enum Kept {
+pub(super) enum CachedField {
     Field(DistanceField),
     Nothing,
     /// Why the file is no good.
@@ -109,20 +109,20 @@ impl BakeCache {
         }
     }
 
-    pub(super) fn read(&self, key: &BakeKey) -> Kept {
+    pub(super) fn read(&self, key: &BakeKey) -> CachedField {
         let path = self.path(key);
         let bytes = match fs::read(&path) {
             Ok(bytes) => bytes,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Kept::Nothing,
-            Err(error) => return Kept::Broken(error.to_string()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return CachedField::Nothing,
+            Err(error) => return CachedField::Broken(error.to_string()),
         };
         match parse(&bytes) {
             Ok(field) => {
                 // What was used last is thrown away last; a clock that cannot be set costs a bake.
                 let _ = File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
-                Kept::Field(field)
+                CachedField::Field(field)
             }
-            Err(why) => Kept::Broken(why),
+            Err(why) => CachedField::Broken(why),
         }
     }
 
@@ -159,7 +159,7 @@ impl BakeCache {
         files.sort();
         let mut bytes: u64 = files.iter().map(|(_, len, _)| len).sum();
         for (_, len, path) in files {
-            if bytes <= MOST_BYTES {
+            if bytes <= MAX_BYTES {
                 break;
             }
             if path != newest && fs::remove_file(&path).is_ok() {
@@ -204,4 +204,4 @@ const EXTENSION: &str = "field";
 const SPLATS_AT_ONCE: usize = 4096;
 const SPLAT_BYTES: usize = 44;
 /// A forest is 24 MB. [bytes]
-const MOST_BYTES: u64 = 1 << 30;
+const MAX_BYTES: u64 = 1 << 30;

@@ -12,7 +12,7 @@ use vizflyt_arena::occupancy::BakeCounts;
 use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::Splats;
 
-use cache::Kept;
+use cache::CachedField;
 pub use cache::{BakeCache, BakeKey, parse as parse_kept};
 
 /// Obstacles, and how they came about.
@@ -62,13 +62,13 @@ pub fn bake_with(
     let key = cache.map(|cache| (cache, BakeKey::of(splats, spec)));
     if let Some((cache, key)) = &key {
         match cache.read(key) {
-            Kept::Field(field) => {
+            CachedField::Field(field) => {
                 progress(1.0);
                 let kept_at = Some(cache.path(key));
                 return Baked { field, counts: None, kept_at, took: start.elapsed() };
             }
-            Kept::Nothing => {}
-            Kept::Broken(why) => {
+            CachedField::Nothing => {}
+            CachedField::Broken(why) => {
                 warn!("{} is no good and is baked anew: {why}", cache.path(key).display());
             }
         }

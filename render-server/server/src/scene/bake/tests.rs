@@ -26,14 +26,15 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
     let folder = tempfile::tempdir().unwrap();
     let cache = BakeCache::at(folder.path().join("a/b"));
     let (splats, spec) = scene(0.9);
-    let heard = Mutex::new(Vec::new());
-    let first = bake_with(&splats, &spec, Some(&cache), &|share| heard.lock().unwrap().push(share));
+    let reported = Mutex::new(Vec::new());
+    let first =
+        bake_with(&splats, &spec, Some(&cache), &|share| reported.lock().unwrap().push(share));
     assert!(first.counts.unwrap().occupied > 0);
     assert!(first.field.obstacle_distance_m(DVec3::new(1.0, 1.0, 0.5)) < 0.0);
-    let mut heard = heard.into_inner().unwrap();
-    assert_eq!(heard.last(), Some(&1.0));
-    heard.sort_by(f64::total_cmp);
-    assert!(heard.len() > 3 && heard[0] >= 0.0, "{heard:?}");
+    let mut reported = reported.into_inner().unwrap();
+    assert_eq!(reported.last(), Some(&1.0));
+    reported.sort_by(f64::total_cmp);
+    assert!(reported.len() > 3 && reported[0] >= 0.0, "{reported:?}");
 
     let again = bake_with(&splats, &spec, Some(&cache), &|_| ());
     assert_eq!((again.counts, &again.field), (None, &first.field));

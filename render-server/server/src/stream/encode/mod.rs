@@ -1,7 +1,7 @@
-//! The encode thread: drawn ticks in, image packets out; the ticks then go to the previews.
+//! The encode thread: rendered ticks in, image packets out; the ticks then go to the previews.
 //!
-//! Waits for room in the [`Subscriptions`](crate::stream::subscriptions), then takes the newest drawn tick: what was
-//! drawn meanwhile is skipped unencoded. How one image becomes bytes: [`crate::stream::encode::slices`].
+//! Waits for room in the [`Subscriptions`](crate::stream::subscriptions), then takes the newest rendered tick: what was
+//! rendered meanwhile is skipped unencoded. How one image becomes bytes: [`crate::stream::encode::slices`].
 
 pub mod slices;
 

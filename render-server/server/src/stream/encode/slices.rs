@@ -1,4 +1,4 @@
-//! One drawn image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
+//! One rendered image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
 //! before is on its way already.
 //!
 //! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms (feature `turbo`) a slice, so
@@ -20,7 +20,7 @@ use crate::render::rendered::RenderedImage;
 use crate::render::schedule::withholds_depth;
 use crate::stream::subscriptions::{Broadcast, Subscriptions};
 
-/// Turns drawn images into bytes for [`Subscriptions`]; owns the scratch memory.
+/// Turns rendered images into bytes for [`Subscriptions`]; owns the scratch memory.
 #[derive(Debug)]
 pub struct SliceEncoder {
     encoder: Encoder,
@@ -44,7 +44,7 @@ impl SliceEncoder {
             depth_mm: Vec::new(),
             scratch: Vec::new(),
             buffers: Vec::new(),
-            room: LEAST_BUFFER,
+            room: MIN_BUFFER,
             broadcast: Broadcast::default(),
         }
     }
@@ -105,7 +105,7 @@ impl SliceEncoder {
         let mut buffer = self.buffer();
         let mut len = 0;
         self.scratch.clear();
-        let slices = (width * height / LEAST_SLICE_PIXELS).clamp(1, self.options.slices.into());
+        let slices = (width * height / MIN_SLICE_PIXELS).clamp(1, self.options.slices.into());
         self.encoder.set_options(EncodeOptions { slices: slices as u8, ..self.options });
         // The header leaves with the first slice: alone it would only wake the other end.
         let info = self.encoder.start(width, height, parts, &mut self.scratch)?;
@@ -132,7 +132,7 @@ impl SliceEncoder {
         if len > self.room {
             self.room = (len + len / 4).next_power_of_two();
         }
-        if self.buffers.len() < MOST_BUFFERS {
+        if self.buffers.len() < MAX_BUFFERS {
             self.buffers.push(buffer);
         }
         Ok(())
@@ -148,8 +148,8 @@ impl SliceEncoder {
 
 /// A slice is three wake-ups on its way: below a quarter of 640x480 they cost more than the overlap
 /// gains. [px]
-const LEAST_SLICE_PIXELS: u32 = 320 * 240;
+const MIN_SLICE_PIXELS: u32 = 320 * 240;
 /// A small image; larger ones teach the encoder their size. [bytes]
-const LEAST_BUFFER: usize = 64 << 10;
+const MIN_BUFFER: usize = 64 << 10;
 /// Eight cameras of four vehicles with two images each in flight.
-const MOST_BUFFERS: usize = 64;
+const MAX_BUFFERS: usize = 64;

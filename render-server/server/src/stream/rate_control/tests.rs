@@ -136,7 +136,7 @@ fn quality_goes_first_then_rate_then_size() {
         // A link just fast enough for the level of this number, from above and from below; from
         // above only, where the better level needs so little more that it would be kept.
         let load = LEVELS[index].load();
-        let close = index > 0 && LEVELS[index - 1].load() * RAISE < 1.05 * load * MOST;
+        let close = index > 0 && LEVELS[index - 1].load() * RAISE < 1.05 * load * MAX_LOAD;
         let capacity = if close { 1.02 * load / AIM } else { 1.03 * load / RAISE };
         let bps = capacity * 8.0 * FULL_BYTES * RATE_HZ;
         let mut link = Bottleneck::new(Adaptation::All, FULL_BYTES, RATE_HZ, 0.002);

@@ -80,5 +80,5 @@ pub(super) fn gone(error: &dyn std::fmt::Display) -> Ending {
     (END, error.to_string())
 }
 
-/// How long a runtime may take for its next word where it must say one.
+/// Maximum time for a runtime's next message where one is due.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);

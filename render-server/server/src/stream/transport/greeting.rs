@@ -64,9 +64,9 @@ async fn talk(
     let (mut send, recv, preamble) = match opened.await {
         Ok(Ok(opened)) => opened,
         Ok(Err(ending)) => return ending,
-        Err(_) => return (FOREIGN, "nothing was said for 5 s".to_owned()),
+        Err(_) => return (FOREIGN, "nothing was received for 5 s".to_owned()),
     };
-    // Ours goes out even to another version: its layout never changes, so that both can tell.
+    // Ours goes out even to another version: its layout never changes, so that both can check it.
     if let Err(error) = send.write_all(Preamble::of(PeerRole::Server).as_bytes()).await {
         return gone(&error);
     }
@@ -129,7 +129,7 @@ pub(super) fn peer(connection: &Connection) -> Option<Fingerprint> {
 }
 
 fn unpaired(connection: &Connection, port: u16) -> String {
-    // The address by which the client reached us, as far as the system tells.
+    // The address by which the client reached us, as far as the system reports it.
     let host = match connection.local_ip().map(|ip| ip.to_canonical()) {
         Some(IpAddr::V6(ip)) => format!("[{ip}]"),
         Some(ip) => ip.to_string(),

@@ -27,7 +27,7 @@ use crate::clock;
 use crate::lock::lock;
 use crate::stream::Rooms;
 use crate::stream::rate_control::{DECIDE_EVERY, RateController, SentImage};
-use crate::stream::subscriptions::{InFlightImage, MOST_IN_FLIGHT, Part, Slots};
+use crate::stream::subscriptions::{InFlightImage, MAX_IN_FLIGHT, Part, Slots};
 use crate::stream::vehicle::VehicleStream;
 use crate::timing::RateMeter;
 
@@ -45,7 +45,7 @@ struct SenderContext {
     vehicle: usize,
     connection: Connection,
     id: u64,
-    /// The runtime's; a watcher far away says nothing of the flight.
+    /// The runtime's; a watcher far away has no influence on the flight.
     rate_controller: Option<Arc<Mutex<RateController>>>,
 }
 
@@ -94,7 +94,7 @@ impl ImageSenders {
                 }
                 _ = decide.tick() => {
                     let cameras = self.context.stream().images.cameras.iter();
-                    let rendered = cameras.map(|counters| counters.counts().drawn).sum();
+                    let rendered = cameras.map(|counters| counters.counts().rendered).sum();
                     self.context.decide(rendered_rate.of(rendered, clock::now()));
                 }
             }
@@ -118,7 +118,7 @@ impl SenderContext {
         &self.rooms.streaming.vehicles[self.vehicle]
     }
 
-    /// Lowers or raises how images are made; `wanted_hz` are drawn, of all cameras.
+    /// Lowers or raises how images are made; `wanted_hz` are rendered, of all cameras.
     fn decide(&self, wanted_hz: f64) {
         let Some(rate_controller) = &self.rate_controller else { return };
         let change = lock(rate_controller).decide(clock::now(), wanted_hz);
@@ -139,7 +139,7 @@ impl Drop for ImageSenders {
 /// Returns K: one image being acknowledged, and as many as a round trip spans.
 fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
     let spanned = (min_rtt.as_secs_f64() * rate_hz).ceil();
-    1 + (spanned as u32).clamp(1, MOST_IN_FLIGHT - 1)
+    1 + (spanned as u32).clamp(1, MAX_IN_FLIGHT - 1)
 }
 
 /// Sends the images that come to one place, for ever.

@@ -61,7 +61,7 @@ impl Lan {
         }
         let silent = now.saturating_duration_since(self.last_ack);
         let steps = (silent.as_millis() / GROWTH_EVERY.as_millis()) as u64;
-        base + (steps * GROWTH).min(MOST_GROWTH)
+        base + (steps * GROWTH).min(MAX_GROWTH)
     }
 
     /// Returns the window while acknowledgements come: what is under way in a round trip, and the
@@ -69,7 +69,7 @@ impl Lan {
     fn usual(&self) -> u64 {
         let beyond = self.min_rtt.saturating_sub(SHORT);
         let more = beyond.as_micros() as u64 * PER_US;
-        self.base + more.min(MOST_MORE)
+        self.base + more.min(MAX_MORE)
     }
 }
 
@@ -123,13 +123,13 @@ const SHORT: Duration = Duration::from_millis(1);
 /// At 20 ms 3 MB were measured best: 2 MB more for 19 ms, a gigabit nearly. [bytes/us]
 const PER_US: u64 = 110;
 /// The transport's send window ends what is gained: 4 MB in all. [bytes]
-const MOST_MORE: u64 = 3 << 20;
+const MAX_MORE: u64 = 3 << 20;
 /// Two images of 100 KB. [bytes]
 const GROWTH: u64 = 200 << 10;
 /// Longer than any round trip of a LAN with its acknowledgement delay.
 const GROWTH_EVERY: Duration = Duration::from_millis(100);
 /// The idle time-out ends a connection after five seconds of growth at most. [bytes]
-const MOST_GROWTH: u64 = 50 * GROWTH;
+const MAX_GROWTH: u64 = 50 * GROWTH;
 
 #[cfg(test)]
 mod tests {
@@ -162,7 +162,7 @@ mod tests {
         assert_eq!(lan.window_at(after(start, 1050)), 1 << 20);
         assert_eq!(lan.window_at(after(start, 1100)), (1 << 20) + GROWTH);
         assert_eq!(lan.window_at(after(start, 3000)), (1 << 20) + 20 * GROWTH);
-        assert_eq!(lan.window_at(after(start, 600_000)), (1 << 20) + MOST_GROWTH);
+        assert_eq!(lan.window_at(after(start, 600_000)), (1 << 20) + MAX_GROWTH);
         lan.on_end_acks(after(start, 3000), 100_000, false, Some(1));
         assert_eq!(lan.window_at(after(start, 3050)), 1 << 20);
         lan.on_end_acks(after(start, 3060), 0, true, Some(2));

@@ -118,7 +118,7 @@ pub fn endpoint_config(identity: &Identity) -> Result<EndpointConfig> {
     let mut endpoint = EndpointConfig::new(Arc::new(reset));
     endpoint.cid_generator(move || Box::new(HashedConnectionIdGenerator::from_key(ids)));
     // Jumbo packets from a peer whose network carries them.
-    endpoint.max_udp_payload_size(MOST_MTU).context("cannot set the packet size")?;
+    endpoint.max_udp_payload_size(MAX_MTU).context("cannot set the packet size")?;
     Ok(endpoint)
 }
 
@@ -140,7 +140,7 @@ pub async fn serve(
         };
         let Some(incoming) = incoming else { break };
         let address = incoming.remote_address();
-        if sessions.len() >= MOST_CONNECTIONS {
+        if sessions.len() >= MAX_CONNECTIONS {
             debug!("{} connections already: refused {address}", sessions.len());
             incoming.refuse();
             continue;
@@ -217,7 +217,7 @@ struct UnknownPeers {
 impl Default for UnknownPeers {
     fn default() -> Self {
         let (limiter, handshakes) = (Mutex::default(), Arc::default());
-        Self { limiter, handshakes, pairings: Semaphore::new(MOST_PAIRINGS) }
+        Self { limiter, handshakes, pairings: Semaphore::new(MAX_PAIRINGS) }
     }
 }
 
@@ -236,7 +236,7 @@ impl UnknownPeers {
         // Counted from here on, so that every way out gives the place back.
         let handshake = Handshake { under_way, count };
         let may_try = lock(&self.limiter).may_try(Instant::now(), address);
-        (may_try && under_way <= MOST_HANDSHAKES).then_some(handshake)
+        (may_try && under_way <= MAX_HANDSHAKES).then_some(handshake)
     }
 
     fn charge(&self, address: IpAddr) {
@@ -264,7 +264,7 @@ fn transport_config(congestion: Congestion) -> TransportConfig {
     let mut ack = AckFrequencyConfig::default();
     ack.ack_eliciting_threshold(VarInt::from_u32(10)).max_ack_delay(Some(Duration::from_millis(2)));
     let mut mtu = MtuDiscoveryConfig::default();
-    mtu.upper_bound(MOST_MTU - 48); // less the IPv6 and UDP headers
+    mtu.upper_bound(MAX_MTU - 48); // less the IPv6 and UDP headers
     let mut config = TransportConfig::default();
     config
         .max_concurrent_bidi_streams(VarInt::from_u32(1)) // the control stream
@@ -293,11 +293,11 @@ const UNPAIRED: VarInt = VarInt::from_u32(close::UNPAIRED);
 /// Measured: 600 KB images from 2.7 to 1.8 ms, no packets lost in the socket.
 const SOCKET_BUFFER: usize = 4 << 20;
 /// Jumbo frames. [bytes]
-const MOST_MTU: u16 = 9000;
+const MAX_MTU: u16 = 9000;
 /// Handshakes under way at most: each costs some 10 KB and a signature, before we know whose it is.
-const MOST_HANDSHAKES: usize = 16;
+const MAX_HANDSHAKES: usize = 16;
 /// Conversations about pairing at a time; a person looks at one.
-const MOST_PAIRINGS: usize = 4;
+const MAX_PAIRINGS: usize = 4;
 /// Above this many under way, addresses must prove themselves first (RFC 9000, section 8.1).
 const RETRY_ABOVE: usize = 4;
 /// Far more than a network of 50 ms and some loss needs.
@@ -305,7 +305,7 @@ const HANDSHAKE_WITHIN: Duration = Duration::from_secs(4);
 /// A few poses; when more wait for the network, the oldest go. [bytes]
 const POSES_WAITING: usize = 1024;
 /// A vehicle needs one; unknown peers must not exhaust memory.
-const MOST_CONNECTIONS: usize = 32;
+const MAX_CONNECTIONS: usize = 32;
 
 #[cfg(test)]
 mod tests {

@@ -32,7 +32,7 @@ pub(super) async fn run(authorizer: &Authorizer, connection: &Connection) {
 }
 
 async fn talk(authorizer: &Authorizer, connection: &Connection) -> Ending {
-    match converse(authorizer, connection).await {
+    match pair(authorizer, connection).await {
         Ok(name) => {
             info!("{}: '{name}' is paired", connection.remote_address());
             linger(connection, (END, "paired".to_owned())).await
@@ -42,7 +42,7 @@ async fn talk(authorizer: &Authorizer, connection: &Connection) -> Ending {
 }
 
 /// Returns the client's name once it is paired and knows it.
-async fn converse(authorizer: &Authorizer, connection: &Connection) -> Result<String, Ending> {
+async fn pair(authorizer: &Authorizer, connection: &Connection) -> Result<String, Ending> {
     let foreign = |what: &str| (FOREIGN, what.to_owned());
     let mut exporter = [0; 32];
     connection
@@ -112,7 +112,7 @@ impl Talk {
             };
             // After `None` there is room for a byte at least; messages here are far shorter.
             if self.deframer.push(&bytes[..count]) < count {
-                return Err((FOREIGN, "more was said than pairing needs".to_owned()));
+                return Err((FOREIGN, "more was sent than pairing needs".to_owned()));
             }
         }
     }

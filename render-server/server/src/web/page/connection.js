@@ -33,7 +33,7 @@ export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
     showLink("bad", "server gone, reconnecting");
     document.body.dataset.stale = "";
     if (!opened) explainRefusal();
-    setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MOST_WAIT_MS, wait_ms * 1.6));
+    setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MAX_WAIT_MS, wait_ms * 1.6));
   };
 }
 
@@ -51,7 +51,7 @@ async function explainRefusal() {
     showVehicles(names, null);
     showOutcome("warn", `No vehicle '${wanted}'`, `here fly ${names.join(", ")}`);
   } catch {
-    // The server is gone: the link says so already.
+    // The server is gone: the link shows it already.
   }
 }
 
@@ -65,4 +65,4 @@ function showLink(tone, text) {
 }
 
 const FIRST_WAIT_MS = 250;
-const MOST_WAIT_MS = 3000;
+const MAX_WAIT_MS = 3000;

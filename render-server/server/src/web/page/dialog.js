@@ -25,14 +25,14 @@ export function makeDialog(title, ...content) {
 }
 
 /**
- * Returns a dialog with a form: its fields, a line that says what came of it, and two buttons.
+ * Returns a dialog with a form: its fields, a status line, and two buttons.
  * @param {string} title
  * @param {string} action the name of the button that submits
  * @param {"alert" | "status"} role of the status line
  * @param {(Node | string)[]} fields
  */
 export function makeFormDialog(title, action, role, ...fields) {
-  const status = make("p", { className: "said", role });
+  const status = make("p", { className: "dialog-status", role });
   const close = makeButton("close", { onclick: () => dialog.close() });
   const submit = makeButton(action, { type: "submit" });
   const form = make("form", {}, ...fields, status, make("p", { className: "choices" }, submit, close));

@@ -2,7 +2,7 @@
 
 /** @typedef {import("./messages").EventLine} EventLine */
 
-/** The colours of the kinds that end no flight; of those that do, the server says it. @type {Record<string, string>} */
+/** The colours of the kinds that end no flight; of those that do, the server sends it. @type {Record<string, string>} */
 const TONES = {
   pose_lost: "bad",
   pose_regained: "good",

@@ -1,4 +1,4 @@
-// The line at the top and the one at the bottom: which vehicle, its phase and clock; who draws, who flies.
+// The line at the top and the one at the bottom: which vehicle, its phase and clock; who renders, who flies.
 
 import { $, clockText, setText } from "./dom.js";
 

@@ -2,7 +2,7 @@
 
 import { $ } from "./dom.js";
 import { send, vehicleUrl } from "./session.js";
-import { say } from "./stop.js";
+import { announce } from "./stop.js";
 
 const ORDERS = ["start", "land", "reset"];
 const AIRBORNE = ["taking_off", "flying", "holding"];
@@ -13,8 +13,8 @@ for (const order of ORDERS) {
   button.addEventListener("click", async () => {
     button.disabled = true;
     const { ok, text } = await send("POST", `${vehicleUrl(vehicle)}/${order}`);
-    say(text);
-    $("order-said").textContent = ok ? "" : text;
+    announce(text);
+    $("order-status").textContent = ok ? "" : text;
     button.disabled = false;
   });
 }

@@ -13,7 +13,7 @@ export async function fetchSession() {
     const answer = await fetch("/api/session");
     if (answer.ok) session = await answer.json();
   } catch {
-    // The server is gone: the connection's state says so already.
+    // The server is gone: the connection's state shows it already.
   }
   document.body.dataset.role = session.role ?? "";
   // No login where none is needed, nor where there is no password.

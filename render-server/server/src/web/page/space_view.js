@@ -11,7 +11,7 @@ import { speedColour } from "./top_view.js";
 /** @typedef {import("./top_view.js").TrackPoint} TrackPoint */
 
 /** The most points of the track; as many as the top view keeps. */
-const MOST_POINTS = 3000;
+const MAX_POINTS = 3000;
 /** Thirty images a second are smooth, and leave a machine without a card to the flight. [ms] */
 const EVERY_MS = 1000 / 31;
 
@@ -84,7 +84,7 @@ export class SpaceView {
     this.drawnTrack = { length, end };
     const { position, color } = this.track.geometry.attributes;
     const fastest_mps = Math.max(1, this.room.arena.max_speed_mps), colour = new THREE.Color();
-    const count = Math.min(length, MOST_POINTS);
+    const count = Math.min(length, MAX_POINTS);
     for (let k = 0; k < count; k++) {
       const [x, y, z, speed] = track[k];
       position.setXYZ(k, x, y, z);
@@ -262,8 +262,8 @@ export class SpaceView {
 /** Returns the track: a line with a colour for each point, none drawn yet. */
 function makeTrack() {
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * MOST_POINTS), 3));
-  geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * MOST_POINTS), 3));
+  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * MAX_POINTS), 3));
+  geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * MAX_POINTS), 3));
   geometry.setDrawRange(0, 0);
   const track = new THREE.Line(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
   track.frustumCulled = false;

@@ -1,4 +1,4 @@
-// The leaderboard: what the server says of it, and rows of a table for the page and the wall.
+// The leaderboard: the server's standings, and rows of a table for the page and the wall.
 
 import { make } from "./dom.js";
 

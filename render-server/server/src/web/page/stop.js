@@ -16,7 +16,7 @@ const RETRIES = 20, RETRY_MS = 250;
 async function stop(all) {
   const button = $(all ? "estop-all" : "estop");
   button.dataset.pressed = "";
-  say("stopping");
+  announce("stopping");
   try {
     // Before the page knows which vehicle it shows, the button stops whoever flies.
     const url = all || vehicle == null ? "/api/estop" : `${vehicleUrl(vehicle)}/estop`;
@@ -27,7 +27,7 @@ async function stop(all) {
       answer = await fetch(url, { method: "POST" });
     }
     const text = await answer.text();
-    say(text);
+    announce(text);
     if (!answer.ok) showOutcome("warn", "Not stopped", text);
   } catch {
     showOutcome("bad", "Not stopped", "the server cannot be reached: use the pilot's transmitter");
@@ -49,11 +49,11 @@ addEventListener("keydown", (event) => {
 });
 
 /**
- * Tells a screen reader.
+* Announces a text to screen readers.
  * @param {string} text
  */
-export function say(text) {
-  $("said").textContent = text;
+export function announce(text) {
+  $("announcement").textContent = text;
 }
 
 /** @type {import("./panels.js").Part} */

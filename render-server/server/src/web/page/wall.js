@@ -9,7 +9,7 @@ const EVERY_MS = 1000;
 async function refresh() {
   try {
     const board = await fetchLeaderboard();
-    $("said").textContent = board ? "" : "no standings: are runs kept here, and are you logged in?";
+    $("announcement").textContent = board ? "" : "no standings: are runs kept here, and are you logged in?";
     if (board) {
       $("course").textContent = board.course;
       document.title = `${board.course} – VizFlyt leaderboard`;
@@ -20,7 +20,7 @@ async function refresh() {
       $("flying").textContent = flyingText(board.vehicles);
     }
   } catch {
-    $("said").textContent = "the server cannot be reached";
+    $("announcement").textContent = "the server cannot be reached";
   }
   setTimeout(refresh, EVERY_MS);
 }

@@ -2,13 +2,13 @@
 //!
 //! ```text
 //! GET /     the page; asks over /ws for a picture from where it is, one at a time
-//! GET /ws   in: Request (JSON); out: what was drawn (JSON), then the picture (JPEG)
+//! GET /ws   in: Request (JSON); out: the picture's description (JSON), then the picture (JPEG)
 //! ```
-//! Nothing is drawn unless a page asks, and a page asks only when its camera has moved and the last
+//! Nothing is rendered unless a page asks, and a page asks only when its camera has moved and the last
 //! picture has come: the newest wins by itself, however slow the machine. One renderer serves all
 //! viewers in turn.
 
-mod draw;
+mod engine;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -30,7 +30,7 @@ use tracing::debug;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
-use self::draw::{Drawn, Engine, Request};
+use self::engine::{Engine, Picture, Request};
 use crate::lock::lock;
 use crate::render::{RendererInfo, RendererKind, choose};
 use crate::scene::{self, Scene, Up};
@@ -96,14 +96,14 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
     result
 }
 
-/// What the handlers share.
-struct View {
+/// State that the handlers share.
+struct ViewState {
     engine: Mutex<Engine>,
     welcome: Welcome,
     stop: Stop,
 }
 
-/// Said to each page first.
+/// The first message to each page.
 #[derive(Debug, Serialize)]
 struct Welcome {
     name: String,
@@ -122,7 +122,7 @@ struct Welcome {
 async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
     let stop = Stop::default();
     stop.on_signals(false)?;
-    // First: a taken port is told before the scene is loaded.
+    // First: a taken port is reported before the scene is loaded.
     let listener = web::bind(args.http).await?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
@@ -132,7 +132,7 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
-    let view = Arc::new(View { engine: Mutex::new(engine), welcome, stop: stop.clone() });
+    let view = Arc::new(ViewState { engine: Mutex::new(engine), welcome, stop: stop.clone() });
     tokio::select! {
         served = axum::serve(listener, router(view)) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
@@ -159,7 +159,7 @@ fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
     Ok((Engine::new(rasterizer, moving, world_from_scene), welcome))
 }
 
-fn router(view: Arc<View>) -> Router {
+fn router(view: Arc<ViewState>) -> Router {
     use web::file;
     Router::new()
         .route("/", get(async || file("text/html; charset=utf-8", INDEX)))
@@ -171,7 +171,7 @@ fn router(view: Arc<View>) -> Router {
 }
 
 async fn watch(
-    State(view): State<Arc<View>>,
+    State(view): State<Arc<ViewState>>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Response {
@@ -181,21 +181,21 @@ async fn watch(
     match upgrade {
         Ok(upgrade) => upgrade
             .max_message_size(4096)
-            .on_upgrade(async move |socket| converse(view, socket).await),
+            .on_upgrade(async move |socket| serve_socket(view, socket).await),
         Err(rejection) => rejection.into_response(),
     }
 }
 
-async fn converse(view: Arc<View>, mut socket: WebSocket) {
+async fn serve_socket(view: Arc<ViewState>, mut socket: WebSocket) {
     tokio::select! {
-        _ = answer(&view, &mut socket) => {}
+        _ = serve_requests(&view, &mut socket) => {}
         () = view.stop.wait() => {}
     }
     let _ = timeout(Duration::from_millis(200), socket.send(Message::Close(None))).await;
 }
 
 /// Returns `None` when the page is gone.
-async fn answer(view: &Arc<View>, socket: &mut WebSocket) -> Option<()> {
+async fn serve_requests(view: &Arc<ViewState>, socket: &mut WebSocket) -> Option<()> {
     send_json(socket, &view.welcome).await?;
     loop {
         let request: Request = match socket.recv().await?.ok()? {
@@ -209,11 +209,11 @@ async fn answer(view: &Arc<View>, socket: &mut WebSocket) -> Option<()> {
             Message::Close(_) => return None,
             _ => continue,
         };
-        let drawing = view.clone();
-        let drawn = tokio::task::spawn_blocking(move || lock(&drawing.engine).draw(&request));
-        match drawn.await.ok()? {
-            Ok(Drawn { told, jpeg }) => {
-                send_json(socket, &told).await?;
+        let rendering = view.clone();
+        let picture = tokio::task::spawn_blocking(move || lock(&rendering.engine).render(&request));
+        match picture.await.ok()? {
+            Ok(Picture { info, jpeg }) => {
+                send_json(socket, &info).await?;
                 send(socket, Message::Binary(Bytes::from(jpeg))).await?;
             }
             Err(error) => {

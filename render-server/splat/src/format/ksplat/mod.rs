@@ -26,9 +26,9 @@ const HEADER_BYTES: usize = 4096;
 const SECTION_BYTES: usize = 1024;
 /// A bucket's centre, three f32. [byte]
 const BUCKET_BYTES: usize = 12;
-/// The middle of the u16 that position within a bucket is written as, where a file says nothing.
+/// The middle of the u16 that position within a bucket is written as, where a file has none.
 const DEFAULT_RANGE: u32 = 32767;
-/// Bounds of level 2's harmonics where a file says nothing.
+/// Bounds of level 2's harmonics where a file has none.
 const DEFAULT_HARMONIC: f32 = 1.5;
 
 /// Where the parts of a splat start at a level of compression. [byte]

@@ -148,7 +148,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
     meter.expect(count);
     sections.retain(|section| section.count > 0);
 
-    // Zero means that the writer had nothing to say.
+    // Zero means that the writer stated none.
     let bound = |at: usize, default: f32| match f32_at(bytes, at) {
         0.0 => default,
         bound => bound,

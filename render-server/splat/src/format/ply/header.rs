@@ -124,7 +124,7 @@ impl Element {
     }
 }
 
-/// Everything the text on top says.
+/// The content of the header text.
 #[derive(Clone, Debug)]
 pub(super) struct Header {
     pub(super) format: Format,

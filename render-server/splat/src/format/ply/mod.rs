@@ -62,7 +62,7 @@ pub fn parse(bytes: &[u8]) -> Result<Loaded, PlyError> {
     decode(bytes, &Meter::SILENT)
 }
 
-/// [`parse`], telling how far it came.
+/// [`parse`], reporting its progress.
 pub(super) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, PlyError> {
     let header = header::Header::parse(bytes)?;
     meter.expect(header.vertex().count);

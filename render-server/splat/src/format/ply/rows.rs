@@ -161,7 +161,7 @@ fn minimum_length(bytes: &[u8], offset: usize, element: &Element) -> Result<(), 
     fixed_length(bytes, offset, element, element.min_row_bytes()).map(|_| ())
 }
 
-/// Walks the rows of an element with lists; tells `visit` (column, byte) of every property and
+/// Walks the rows of an element with lists; calls `visit` with (column, byte) of every property and
 /// returns where the element ends. Every row takes a byte or more, so the file bounds the time.
 fn variable_rows(
     bytes: &[u8],

@@ -33,9 +33,9 @@ pub(super) struct Meta {
 
 /// The harmonics beyond the constant.
 pub(super) struct Palette {
-    /// Degree, where the meta says it; otherwise the texture's width tells.
+    /// Degree, where the meta has it; otherwise it follows from the texture's width.
     pub(super) bands: Option<u8>,
-    /// Entries, where the meta says it.
+    /// Entries, where the meta has them.
     pub(super) count: Option<usize>,
     pub(super) values: Table,
     /// Palette, indices.
@@ -55,7 +55,7 @@ impl Meta {
         let meta: Json =
             serde_json::from_slice(bytes).map_err(|error| invalid(META, error.to_string()))?;
         match meta.version {
-            // Version 1 says nothing; early writers of what became version 2 none either, but they
+            // Version 1 has none; early writers of what became version 2 none either, but they
             // have codebooks.
             None | Some(1 | 2) => {}
             Some(version) => {

@@ -28,7 +28,7 @@ const MAX_TRAILER_BYTES: u64 = 1 << 20;
 /// The window that any zstd stream may ask for; longer ones only for longer attributes. [byte]
 const FREE_WINDOW_BYTES: u64 = 8 << 20;
 
-/// What the header says.
+/// The header.
 struct Header {
     version: u32,
     count: usize,
@@ -91,7 +91,7 @@ fn parse_header(bytes: &[u8]) -> Result<Header, FormatError> {
     Ok(header)
 }
 
-/// Checks the inflated size against the file's and says how much work there is.
+/// Checks the inflated size against the file's and reports the amount of work.
 fn check_size(header: &Header, file_bytes: usize, meter: &Meter) -> Result<(), FormatError> {
     let each: usize = Widths::of(header.version, header.sh_degree).in_order().iter().sum();
     limit::inflated(Format::Spz, header.count as u64, each as u64, file_bytes)?;

@@ -39,30 +39,31 @@ fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body
     poses
 }
 
-/// Carries a vehicle whose stream is as `stream` says before a server that is set as `set` says.
-fn verdict(stream: &LocalizationConfig, set: &LocalizationConfig, yaw_rad: f64) -> Verdict {
+/// Carries a vehicle whose stream has the settings `stream` before a server that has the settings `set`.
+fn diagnosis(stream: &LocalizationConfig, set: &LocalizationConfig, yaw_rad: f64) -> Diagnosis {
     let start = Pose::new(DVec3::new(1.0, -2.0, 0.02), DQuat::from_rotation_z(yaw_rad));
     let mut check = Check::new(set.clone());
     for (at_s, pose) in carried(&start, 2e-4) {
         let (p_stream, rotation) = stream.alignment().streamed(&pose);
         let rotation = match stream.driver {
             Driver::Vicon => {
-                let said = stream.euler.unwrap_or_default().angles(rotation);
-                set.euler.unwrap_or_default().rotation(said)
+                let angles = stream.euler.unwrap_or_default().angles(rotation);
+                set.euler.unwrap_or_default().rotation(angles)
             }
             _ => rotation,
         };
         check.handle_pose(at_s, &set.alignment().world_from_body(p_stream, rotation));
     }
     assert_eq!(check.step(), Step::Done, "{stream:?} as {set:?}: {:?}", check.rests);
-    check.verdict()
+    check.diagnosis()
 }
 
 fn check(stream: &str, set: &str, expected: &[(&str, &str)]) {
-    let verdict = verdict(&config(stream), &config(set), 0.3);
-    let found: Vec<_> = verdict.change.iter().map(|(key, value)| (*key, value.as_str())).collect();
-    assert_eq!(found, expected, "{stream} as {set}: {:#?}", verdict.faults);
-    assert_eq!(verdict.faults.is_empty(), expected.is_empty(), "{:#?}", verdict.faults);
+    let diagnosis = diagnosis(&config(stream), &config(set), 0.3);
+    let found: Vec<_> =
+        diagnosis.change.iter().map(|(key, value)| (*key, value.as_str())).collect();
+    assert_eq!(found, expected, "{stream} as {set}: {:#?}", diagnosis.faults);
+    assert_eq!(diagnosis.faults.is_empty(), expected.is_empty(), "{:#?}", diagnosis.faults);
 }
 
 #[test]
@@ -105,11 +106,11 @@ fn the_setting_to_change_is_named() {
 
 #[test]
 fn findings_are_described() {
-    let found = verdict(&config("natnet,up=y"), &config("natnet"), 0.0);
+    let found = diagnosis(&config("natnet,up=y"), &config("natnet"), 0.0);
     assert!(found.faults[0].starts_with("lifted, it went along +y, not up"), "{:#?}", found.faults);
-    let found = verdict(&config("json,axes=x-yz"), &config("json"), 0.0);
+    let found = diagnosis(&config("json,axes=x-yz"), &config("json"), 0.0);
     assert!(found.faults.iter().any(|fault| fault.contains("it turned right by")), "{found:?}");
-    let found = verdict(&config("json,units=mm"), &config("json"), 0.0);
+    let found = diagnosis(&config("json,units=mm"), &config("json"), 0.0);
     assert_eq!(found.faults, ["lifted by half a metre or so, it went 449.50 m"]);
 }
 
@@ -146,13 +147,13 @@ proptest! {
         stream.axes = Axes::all().nth(axes);
         stream.nose = Nose::ALL[nose];
         stream.units = Some(Units::ALL[unit]);
-        let first = verdict(&stream, &config("json"), yaw_rad);
+        let first = diagnosis(&stream, &config("json"), yaw_rad);
         let mut text = "json".to_owned();
         for (key, value) in &first.change {
             let _ = write!(text, ",{key}={value}");
         }
         prop_assert!(first.faults.is_empty() || !first.change.is_empty(), "{:?}", first);
-        let second = verdict(&stream, &config(&text), yaw_rad);
-        prop_assert_eq!(second, Verdict::default(), "{}", text);
+        let second = diagnosis(&stream, &config(&text), yaw_rad);
+        prop_assert_eq!(second, Diagnosis::default(), "{}", text);
     }
 }

@@ -155,18 +155,18 @@ proptest! {
 fn what_tags_a_pose_rests_on_is_told_with_where_to_look() {
     let mut stream = stream("");
     let from = "192.168.1.7:4000".parse().unwrap();
-    let mut told = |ms: u64, quality: &str| {
+    let mut quality_of = |ms: u64, quality: &str| {
         let text = packet(&format!(r#","quality":{quality}"#));
         assert_eq!(stream.handle_packet_from(at(ms), from, text.as_bytes()).len(), 1, "{quality}");
         stream.counters(0).tags
     };
     let seen = r#"{"tags":3,"cameras":2,"rms_px":0.25,"image_ms":1.5,"view_port":8091}"#;
-    let seen = told(10, seen).expect("tags are told");
+    let seen = quality_of(10, seen).expect("tags are reported");
     assert_eq!((seen.tags, seen.cameras, seen.rms_px), (3, 2, 0.25));
     assert_eq!(seen.view, Some("192.168.1.7:8091".parse().unwrap()));
     // An address of the sender's choice is no link of ours.
     let seen = r#"{"tags":1,"cameras":1,"rms_px":0.2,"image_ms":1,"view":"10.0.0.1:80"}"#;
-    assert_eq!(told(20, seen).expect("tags are told").view, None);
+    assert_eq!(quality_of(20, seen).expect("tags are reported").view, None);
     // Another program's quality is no reason to refuse its pose.
-    assert_eq!(told(30, r#""good""#), None);
+    assert_eq!(quality_of(30, r#""good""#), None);
 }

@@ -57,7 +57,7 @@ function number(name) {
 const required = { required: true };
 const pixels = { min: "1", max: "8192", step: "1", ...required };
 const model = make("select", { name: "model" }, ...MODELS.map(([value, text]) => new Option(text, value)));
-const status = make("span", { id: "camera-said", role: "status" });
+const status = make("span", { id: "camera-status", role: "status" });
 const submit = make("p", {}, make("button", { type: "submit", textContent: "apply from the next image on" }), status);
 submit.dataset.for = "instructor";
 const calibrated = MODELS.slice(1).map(([value]) => value);

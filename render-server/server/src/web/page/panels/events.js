@@ -4,7 +4,7 @@ import { clockText, make } from "../dom.js";
 import { kindName, toneOf } from "../event_kinds.js";
 
 /** Lines kept on the page. */
-const MOST_LINES = 400;
+const MAX_LINES = 400;
 /** What the buttons leave in the list: all, those of the flight, those of the plugin. */
 const FEEDS = [["all", "all"], ["flight", "flight"], ["code", "plugin"]];
 
@@ -52,12 +52,12 @@ export const events = {
       const { index, kind, text, at_s } = entry;
       if (shown.has(index)) continue;
       shown.add(index);
-      const said = text || kindName(kind).replaceAll("_", " ");
-      const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: said }));
+      const shown = text || kindName(kind).replaceAll("_", " ");
+      const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: shown }));
       line.dataset.tone = toneOf(entry);
       list.append(line);
     }
-    while (list.childElementCount > MOST_LINES) list.firstChild?.remove();
+    while (list.childElementCount > MAX_LINES) list.firstChild?.remove();
     follow();
   },
 };

@@ -6,7 +6,7 @@ import { cssColours } from "../theme.js";
 /** @typedef {import("../messages").State} State */
 
 /** Time that a line spans, at most and at least. [ms] */
-const SPAN_MS = 30_000, LEAST_SPAN_MS = 5000;
+const SPAN_MS = 30_000, MIN_SPAN_MS = 5000;
 /** The lines are drawn so often. [ms] */
 const EVERY_MS = 100;
 /** A pose older than this is lost. [s] */
@@ -66,7 +66,7 @@ class Figure {
     g.clearRect(0, 0, w, h);
     if (points.length < 2) return;
     const top = Math.max(...points.map(([, value]) => value), 1e-3) * 1.15;
-    const span_ms = Math.max(LEAST_SPAN_MS, Math.min(SPAN_MS, now_ms - points[0][0]));
+    const span_ms = Math.max(MIN_SPAN_MS, Math.min(SPAN_MS, now_ms - points[0][0]));
     const x = (/** @type {number} */ t_ms) => w - ((now_ms - t_ms) / span_ms) * w;
     const fade = g.createLinearGradient(0, 0, w, 0);
     fade.addColorStop(0, "transparent");

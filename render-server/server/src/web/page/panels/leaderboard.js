@@ -8,7 +8,7 @@ const checkedIn = make("span", { id: "checked-in" });
 const checkOut = makeButton("check out", { id: "check-out", hidden: true });
 const token = make("input", { name: "token", type: "password", required: true });
 const attempt = make("select", { name: "attempt" }, ...["practice", "official"].map((name) => new Option(name, name)));
-const status = make("span", { id: "team-said", role: "status" });
+const status = make("span", { id: "team-status", role: "status" });
 const form = make("form", { id: "team-form", autocomplete: "off" },
   make("label", {}, "token ", token), make("label", {}, "as ", attempt),
   make("button", { type: "submit", textContent: "check in" }), " ", status);

@@ -7,7 +7,7 @@ const context = canvas.getContext("2d");
 const eye = { p: [0, 0, 1], yaw: 0, pitch: 0, fov: 75, depth: false, at_s: 0 };
 const keys = new Set();
 let playing = false; // The clock of what moves runs.
-let start = null, told = null, socket = null;
+let start = null, info = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
 
@@ -15,21 +15,21 @@ let stale = true, waiting = false, movedAt = 0, before = performance.now();
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
   socket.binaryType = "arraybuffer";
-  socket.onmessage = ({ data }) => (typeof data === "string" ? hear(JSON.parse(data)) : show(data));
+  socket.onmessage = ({ data }) => (typeof data === "string" ? handleMessage(JSON.parse(data)) : show(data));
   socket.onclose = () => {
     waiting = false;
-    say("the server is gone; start it again and this page goes on", true);
+    announce("the server is gone; start it again and this page goes on", true);
     setTimeout(connect, 1000);
   };
 }
 
-function hear(message) {
+function handleMessage(message) {
   if (message.error) {
     waiting = false;
-    return say(message.error);
+    return announce(message.error);
   }
   if (message.start_m) {
-    $("said").hidden = true;
+    $("announcement").hidden = true;
     document.title = `${message.name} · VizFlyt`;
     $("name").textContent = message.name;
     $("facts").textContent = `${message.splats.toLocaleString("en")} splats · ${message.renderer.name} (${message.renderer.reason})`;
@@ -42,7 +42,7 @@ function hear(message) {
     stale = true;
     return;
   }
-  told = message;
+  info = message;
 }
 
 async function show(data) {
@@ -57,14 +57,14 @@ async function show(data) {
     stale = true; // A picture that does not decode is followed by another.
   }
   waiting = false;
-  const middle = told.middle_m == null ? "" : ` · ${told.middle_m.toFixed(2)} m ahead`;
+  const middle = info.middle_m == null ? "" : ` · ${info.middle_m.toFixed(2)} m ahead`;
   $("where").textContent = `x ${eye.p[0].toFixed(2)}  y ${eye.p[1].toFixed(2)}  z ${eye.p[2].toFixed(2)} m${middle}`;
-  $("figures").textContent = `${told.camera.w} × ${told.camera.h} in ${told.ms.toFixed(1)} ms · ${told.visible.toLocaleString("en")} splats in sight`;
+  $("figures").textContent = `${info.camera.w} × ${info.camera.h} in ${info.ms.toFixed(1)} ms · ${info.visible.toLocaleString("en")} splats in sight`;
   document.body.dataset.pictures = +(document.body.dataset.pictures ?? 0) + 1;
   if (moving()) {
     // Some 20 pictures a second, as sharp as that allows.
-    if (told.ms > 45) share = Math.max(0.2, share * 0.85);
-    else if (told.ms < 25) share = Math.min(1, share * 1.12);
+    if (info.ms > 45) share = Math.max(0.2, share * 0.85);
+    else if (info.ms < 25) share = Math.min(1, share * 1.12);
   }
 }
 
@@ -201,22 +201,22 @@ $("fov").oninput = ({ target }) => {
   changed();
 };
 $("copy").onclick = async () => {
-  if (!told) return;
-  const text = JSON.stringify(told.camera);
+  if (!info) return;
+  const text = JSON.stringify(info.camera);
   try {
     await navigator.clipboard.writeText(text);
     const at = $("clock").hidden ? "" : ` --at ${eye.at_s.toFixed(2)}`;
-    say(`copied; save it as cam.json, then: vizflyt scene render SCENE --camera cam.json${at}`);
+    announce(`copied; save it as cam.json, then: vizflyt scene render SCENE --camera cam.json${at}`);
   } catch {
-    say(text, true);
+    announce(text, true);
   }
 };
-let saidUntil = 0;
-function say(text, stays) {
-  $("said").textContent = text;
-  $("said").hidden = false;
-  clearTimeout(saidUntil);
-  if (!stays) saidUntil = setTimeout(() => ($("said").hidden = true), 6000);
+let hideTimer = 0;
+function announce(text, stays) {
+  $("announcement").textContent = text;
+  $("announcement").hidden = false;
+  clearTimeout(hideTimer);
+  if (!stays) hideTimer = setTimeout(() => ($("announcement").hidden = true), 6000);
 }
 
 connect();

@@ -1,17 +1,17 @@
-//! The arena, as the autopilot's own fence can be told of it: FENCE_* for heights and a circle about
-//! the start, polygons for the net and for what stands in the room. A polygon has no height.
+//! The arena as the autopilot's own fence can express it: FENCE_* for heights and a circle about the
+//! start, polygons for the net and for no-fly boxes. A polygon has no height.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::mavlink::FenceSide;
 use vizflyt_protocol::messages::ArenaInfo;
 
-use super::names::{Version, known};
+use super::names::{Version, param_spec};
 use crate::link::FencePolygon;
 
-/// The room, where it differs from the one that the parameter files were written for.
+/// The cylindrical part of the fence, where it differs from the one in the parameter files.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Room {
+pub struct FenceCylinder {
     /// Height over the take-off point at which the fence ends. [m]
     pub ceiling_m: Option<f64>,
     /// Height over the take-off point below which the vehicle is too low. [m]
@@ -20,12 +20,12 @@ pub struct Room {
     pub radius_m: Option<f64>,
 }
 
-impl Room {
+impl FenceCylinder {
     /// Returns the cylinder about the start that holds the arena's fence: the autopilot's own fence
     /// acts where the guard's did not, never before it. `None` of a fence that is no upright box.
     /// `start_m` is in the world.
     pub fn of(arena: &ArenaInfo, start_m: DVec3) -> Option<Self> {
-        let plan = Plan::of(&arena.geofence)?;
+        let plan = Footprint::of(&arena.geofence)?;
         let from_start_m = |corner_m: DVec2| (corner_m - start_m.truncate()).length();
         let radius_m = plan.corners_m(0.0).into_iter().map(from_start_m).fold(0.0, f64::max);
         Some(Self {
@@ -35,7 +35,7 @@ impl Room {
         })
     }
 
-    /// Puts the room's measures in the place of the file's.
+    /// Returns this cylinder's value of a parameter; `right`, the file's, where it has none.
     pub(super) fn fit(self, version: Version, name: &str, right: f64) -> f64 {
         let measure = match name {
             "FENCE_ALT_MAX" => self.ceiling_m,
@@ -43,27 +43,27 @@ impl Room {
             "FENCE_RADIUS" => self.radius_m,
             _ => None,
         };
-        let fitted = measure.zip(known(version, name));
-        fitted.map_or(right, |(newest, known)| known.value_in(version, newest))
+        let fitted = measure.zip(param_spec(version, name));
+        fitted.map_or(right, |(newest, spec)| spec.value_in(version, newest))
     }
 }
 
-/// What of an arena polygons can say.
+/// The part of an arena that polygons can express.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct ArenaFence {
+pub struct AutopilotFence {
     /// The net, and each no-fly box that reaches from the floor to the ceiling; for the body's centre.
     pub polygons: Vec<FencePolygon>,
     /// Indices of no-fly boxes that a vehicle may fly over or under: a polygon would forbid that, so
-    /// the autopilot is not told of them.
-    pub untold: Vec<usize>,
+    /// they are left out.
+    pub omitted: Vec<usize>,
 }
 
-impl ArenaFence {
-    /// Returns what polygons can say of `arena`.
+impl AutopilotFence {
+    /// Returns the polygons of `arena`.
     pub fn of(arena: &ArenaInfo) -> Self {
         let radius_m = arena.body_radius_m;
         let mut fence = Self::default();
-        let net = Plan::of(&arena.geofence).filter(|net| net.half_m.min_element() > radius_m);
+        let net = Footprint::of(&arena.geofence).filter(|net| net.half_m.min_element() > radius_m);
         let (mut low_m, mut high_m) = (arena.floor_z_m + radius_m, f64::INFINITY);
         if let Some(net) = &net {
             low_m = low_m.max(net.bottom_m + radius_m);
@@ -74,29 +74,30 @@ impl ArenaFence {
         high_m = below_ceiling_m(arena, high_m);
         for (index, volume) in arena.no_fly.iter().enumerate() {
             // Heights of the body's centre: from `low_m` to `high_m` it may fly.
-            let spans =
-                |plan: &Plan| plan.bottom_m - radius_m <= low_m && plan.top_m + radius_m >= high_m;
-            match Plan::of(volume).filter(spans) {
+            let spans = |plan: &Footprint| {
+                plan.bottom_m - radius_m <= low_m && plan.top_m + radius_m >= high_m
+            };
+            match Footprint::of(volume).filter(spans) {
                 Some(plan) => {
                     let corners_m = plan.corners_m(radius_m);
                     fence.polygons.push(FencePolygon { side: FenceSide::Outside, corners_m });
                 }
-                None => fence.untold.push(index),
+                None => fence.omitted.push(index),
             }
         }
         fence
     }
 
-    /// Returns a sentence about the boxes that the autopilot does not know, if there are some.
-    pub fn gap(&self, arena: &ArenaInfo) -> Option<String> {
-        if self.untold.is_empty() {
+    /// Returns a sentence about the omitted boxes, if there are any.
+    pub fn warning(&self, arena: &ArenaInfo) -> Option<String> {
+        if self.omitted.is_empty() {
             return None;
         }
         let place = |&index: &usize| {
             let place_m = arena.no_fly.get(index).map_or(DVec2::ZERO, place_m);
             format!("({:.1}, {:.1})", place_m.x, place_m.y)
         };
-        let places: Vec<_> = self.untold.iter().map(place).collect();
+        let places: Vec<_> = self.omitted.iter().map(place).collect();
         Some(format!(
             "the autopilot's own fence does not know the no-fly boxes about {}: one can fly over or under \
              them, and its polygons have no height; guard and referee keep them",
@@ -105,8 +106,8 @@ impl ArenaFence {
     }
 }
 
-/// The floor plan of an upright box.
-struct Plan {
+/// The footprint of an upright box.
+struct Footprint {
     center_m: DVec2,
     /// Of the sides along `axis` and across it. [m]
     half_m: DVec2,
@@ -115,7 +116,7 @@ struct Plan {
     top_m: f64,
 }
 
-impl Plan {
+impl Footprint {
     fn of(volume: &Volume) -> Option<Self> {
         let Volume::Cuboid { center_m, half_m, rotation } = *volume else { return None };
         let is_upright = (rotation * DVec3::Z).z.abs() > 1.0 - UPRIGHT;
@@ -129,7 +130,7 @@ impl Plan {
         })
     }
 
-    /// Returns the corners of the plan, grown by so much on each side. [m, world]
+    /// Returns the corners, grown by so much on each side. [m, world]
     fn corners_m(&self, grown_m: f64) -> Vec<DVec2> {
         let half_m = self.half_m + grown_m;
         let (along, across) = (self.axis * half_m.x, self.axis.perp() * half_m.y);
@@ -143,10 +144,10 @@ const UPRIGHT: f64 = 1.5e-6;
 
 /// Returns the lower of `top_m` and the arena's own ceiling. [m, world]
 fn below_ceiling_m(arena: &ArenaInfo, top_m: f64) -> f64 {
-    arena.limits.max_altitude_m.map_or(top_m, |most_m| most_m.min(top_m))
+    arena.limits.max_altitude_m.map_or(top_m, |max_m| max_m.min(top_m))
 }
 
-/// Returns where on the floor people find a volume. [m, world]
+/// Returns the floor position at which a message names a volume. [m, world]
 fn place_m(volume: &Volume) -> DVec2 {
     match *volume {
         Volume::Sphere { center_m, .. } | Volume::Cuboid { center_m, .. } => center_m.truncate(),
@@ -175,35 +176,35 @@ mod tests {
     }
 
     #[test]
-    fn the_cylinder_holds_the_arena_s_fence() {
+    fn cylinder_contains_the_arenas_fence() {
         // The furthest corner is 4 m east and 3 m south.
-        let room = Room::of(&arena(), DVec3::new(1.0, 0.0, 0.1)).unwrap();
+        let cylinder = FenceCylinder::of(&arena(), DVec3::new(1.0, 0.0, 0.1)).unwrap();
         let close = |value: Option<f64>, right: f64| (value.unwrap() - right).abs() < 1e-9;
-        assert!(close(room.ceiling_m, 2.5) && close(room.radius_m, 5.0), "{room:?}");
-        assert!(close(room.floor_m, 0.0), "{room:?}");
+        assert!(close(cylinder.ceiling_m, 2.5) && close(cylinder.radius_m, 5.0), "{cylinder:?}");
+        assert!(close(cylinder.floor_m, 0.0), "{cylinder:?}");
     }
 
     #[test]
-    fn the_net_is_a_polygon_for_the_body_s_centre() {
-        let fence = ArenaFence::of(&arena());
+    fn net_becomes_a_polygon_for_the_bodys_centre() {
+        let fence = AutopilotFence::of(&arena());
         let corners_m = [(0.1, -2.9), (4.9, -2.9), (4.9, 1.9), (0.1, 1.9)];
         let [net] = &fence.polygons[..] else { panic!("{fence:?}") };
         assert_eq!(net.side, FenceSide::Inside);
         for (corner_m, right) in net.corners_m.iter().zip(corners_m) {
             assert!((*corner_m - DVec2::from(right)).length() < 1e-9, "{corner_m}");
         }
-        assert_eq!(fence.gap(&arena()), None);
+        assert_eq!(fence.warning(&arena()), None);
     }
 
     #[test]
-    fn only_boxes_that_one_cannot_fly_past_are_told() {
-        let check = |bottom_m: f64, top_m: f64, told: bool| {
+    fn boxes_that_one_can_fly_over_or_under_are_omitted() {
+        let check = |bottom_m: f64, top_m: f64, sent: bool| {
             let (min_m, max_m) = (DVec3::new(2.0, -1.0, bottom_m), DVec3::new(3.0, 1.0, top_m));
             let arena = with_box(min_m, max_m);
-            let fence = ArenaFence::of(&arena);
-            assert_eq!(fence.untold.is_empty(), told, "{bottom_m} to {top_m}");
-            assert_eq!(fence.polygons.len(), 1 + usize::from(told));
-            assert_eq!(fence.gap(&arena).is_none(), told);
+            let fence = AutopilotFence::of(&arena);
+            assert_eq!(fence.omitted.is_empty(), sent, "{bottom_m} to {top_m}");
+            assert_eq!(fence.polygons.len(), 1 + usize::from(sent));
+            assert_eq!(fence.warning(&arena).is_none(), sent);
         };
         // The body's centre may fly from 0.1 m to 2.6 m; its radius is 0.1 m.
         check(0.0, 3.6, true);
@@ -212,24 +213,24 @@ mod tests {
         check(0.0, 0.9, false);
         check(1.5, 3.6, false);
         let table = with_box(DVec3::new(4.0, 1.0, 0.0), DVec3::new(4.6, 1.6, 0.9));
-        let text = ArenaFence::of(&table).gap(&table).unwrap();
+        let text = AutopilotFence::of(&table).warning(&table).unwrap();
         assert!(text.contains("about (4.3, 1.3)"), "{text}");
     }
 
     #[test]
-    fn boxes_may_be_turned_but_must_be_upright() {
+    fn rotated_boxes_must_be_upright() {
         let turned = |rotation| {
             let mut arena = arena();
             let (center_m, half_m) = (DVec3::new(2.0, 0.0, 1.5), DVec3::new(1.0, 0.2, 2.5));
             arena.no_fly.push(Volume::Cuboid { center_m, half_m, rotation }).unwrap();
-            ArenaFence::of(&arena)
+            AutopilotFence::of(&arena)
         };
         let fence = turned(DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2));
         let first_m = fence.polygons[1].corners_m[0];
         assert!((first_m - DVec2::new(2.3, -1.1)).length() < 1e-9, "{first_m}");
-        assert_eq!(turned(DQuat::from_rotation_x(0.1)).untold, [0]);
+        assert_eq!(turned(DQuat::from_rotation_x(0.1)).omitted, [0]);
         let mut arena = arena();
         arena.geofence = Volume::Sphere { center_m: DVec3::ZERO, radius_m: 3.0 };
-        assert_eq!(ArenaFence::of(&arena), ArenaFence::default());
+        assert_eq!(AutopilotFence::of(&arena), AutopilotFence::default());
     }
 }

@@ -1,4 +1,4 @@
-//! What the link tells people: what arming waits for, and why a command was refused.
+//! Messages for people: what arming waits for, and why a command was refused.
 
 use std::borrow::Cow;
 
@@ -10,12 +10,12 @@ use super::commands::Command;
 use super::dialect::Rise;
 use super::{LOST_AFTER_S, Link, events};
 
-/// Texts of the autopilot this young belong to a refusal. [s]
-const TEXT_BELONGS_S: f64 = 3.0;
+/// A text of the autopilot belongs to a refusal if it is no older than this. [s]
+const TEXT_WINDOW_S: f64 = 3.0;
 /// A pre-arm text this old has been taken back: ArduCopter repeats them every 30 s. [s]
-const PREARM_KEPT_S: f64 = 35.0;
+const PREARM_TEXT_S: f64 = 35.0;
 
-/// Whether asking again is of no use.
+/// Whether a retry cannot succeed.
 pub(super) fn is_final(result: MavResult) -> bool {
     matches!(result, MavResult::MAV_RESULT_UNSUPPORTED)
 }
@@ -36,8 +36,8 @@ impl Link {
         {
             let ours = self.system().unwrap_or(0);
             let text = format!(
-                "two autopilots are on this link, systems {ours} and {rival}; say which one is to fly \
-                 with `system` of [vehicle] in jetson.toml"
+                "two autopilots are on this link, systems {ours} and {rival}; select one with \
+                 `system` of [vehicle] in jetson.toml"
             );
             return Some(text.into());
         }
@@ -49,11 +49,11 @@ impl Link {
             return Some(missing);
         }
         if self.fence.is_under_way() {
-            return Some("the autopilot is being told the arena's fence".into());
+            return Some("the arena's fence is being uploaded to the autopilot".into());
         }
         match self.prearm.ok {
             Some(true) => None,
-            Some(false) => Some(self.prearm_words(now).into()),
+            Some(false) => Some(self.prearm_message(now).into()),
             None => Some("the autopilot has not reported its pre-arm checks yet".into()),
         }
     }
@@ -75,7 +75,7 @@ impl Link {
             return None;
         }
         let mut text = "the autopilot's estimator has no position yet; ".to_owned();
-        // Say what is wrong rather than what might be.
+        // A wrong setting that is known goes before general advice.
         let off = |name: &str, right: f64| {
             let value = self.params().get(name)?.value;
             (value != right).then(|| format!("{name} is {value}, it must be {right}"))
@@ -85,8 +85,8 @@ impl Link {
         Some(text.into())
     }
 
-    fn prearm_words(&self, now: HostTime) -> String {
-        let fresh = |(at, _): &&(HostTime, String)| now.seconds_since(*at) < PREARM_KEPT_S;
+    fn prearm_message(&self, now: HostTime) -> String {
+        let fresh = |(at, _): &&(HostTime, String)| now.seconds_since(*at) < PREARM_TEXT_S;
         let reason = |(_, why): &(HostTime, String)| match events::advice(why) {
             Some(advice) => format!("\"{why}\" ({advice})"),
             None => format!("\"{why}\""),
@@ -108,18 +108,18 @@ impl Link {
 
     /// Returns the sentence for a command that was given up.
     pub(super) fn refusal(&self, now: HostTime, command: Command, why: &str) -> String {
-        let said: Vec<&str> = self
+        let texts: Vec<&str> = self
             .texts
             .iter()
-            .filter(|(at, _)| now.seconds_since(*at) <= TEXT_BELONGS_S)
+            .filter(|(at, _)| now.seconds_since(*at) <= TEXT_WINDOW_S)
             .map(|(_, text)| text.as_str())
             .collect();
-        let guess = if said.is_empty() { self.cause(command) } else { None };
-        events::refusal(command.name(), why, &said, guess)
+        let guess = if texts.is_empty() { self.cause(command) } else { None };
+        events::refusal(command.name(), why, &texts, guess)
     }
 
-    /// Returns why the autopilot refuses, as far as its state tells: ArduCopter refuses some commands
-    /// without a word.
+    /// Returns why the autopilot refuses, as far as its state shows: ArduCopter refuses some commands
+    /// without a text.
     fn cause(&self, command: Command) -> Option<Cow<'static, str>> {
         let guided = self.state.mode == CopterMode::Guided as u32;
         match command {
@@ -127,7 +127,7 @@ impl Link {
                 Some(format!("{height_m} m is no height; set takeoff_height_m of the arena").into())
             }
             Command::TakeOff(_) if self.dialect.needs_origin() && self.origin.is_none() => Some(
-                "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the way to the \
+                "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the link to the \
                  autopilot, or set AHRS_OPTIONS=16 and AHRS_ORIGIN_*"
                     .into(),
             ),

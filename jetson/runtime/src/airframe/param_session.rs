@@ -1,5 +1,5 @@
-//! A short conversation with an autopilot: who it is, what it has, what it is to have. The link's own
-//! state machine, driven by one thread.
+//! A parameter session with an autopilot: identifies it, reads and writes its parameters, uploads a fence
+//! and a signing key. Drives the link's own state machine on one thread.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -13,36 +13,36 @@ use crate::link::{
     FenceEvent, FencePolygon, Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent,
 };
 
-/// Why a visit came to nothing.
+/// Why a session failed.
 #[derive(Debug, thiserror::Error)]
-pub enum VisitError {
-    /// The way cannot be opened.
+pub enum ParamSessionError {
+    /// The port cannot be opened.
     #[error("{address}: {why}")]
-    Way {
-        /// Which.
+    Open {
+        /// The address.
         address: MavlinkAddress,
         /// The system's reason.
         why: io::Error,
     },
-    /// Nobody answers.
+    /// No heartbeat came.
     #[error(
         "no heartbeat from an autopilot on {address} within {within_s} s; check power, link and address"
     )]
-    Nobody {
-        /// Where.
+    NoHeartbeat {
+        /// The address.
         address: MavlinkAddress,
-        /// How long was waited. [s]
+        /// The time limit. [s]
         within_s: f64,
     },
-    /// The reading was not completed.
+    /// Parameters are missing.
     #[error(
-        "the autopilot did not send its parameters within {within_s} s; {have} have come, try again nearer or by USB"
+        "the autopilot did not send its parameters within {within_s} s; {received} came; try again nearer or by USB"
     )]
     NoParams {
-        /// How long was waited. [s]
+        /// The time limit. [s]
         within_s: f64,
         /// How many came.
-        have: usize,
+        received: usize,
     },
     /// Motors may turn.
     #[error("the vehicle is armed; land and disarm it before its parameters are written")]
@@ -52,55 +52,58 @@ pub enum VisitError {
     OtherProgram(Firmware),
 }
 
-/// An autopilot that answers.
-pub struct Visit {
+/// A session with an autopilot that answers.
+pub struct ParamSession {
     port: Port,
     link: Link,
 }
 
-/// Heartbeats come every second.
-const GREETING_S: f64 = 8.0;
-/// The version comes after the streams are set up.
-const VERSION_S: f64 = 4.0;
-/// A thousand parameters at 57600 baud, and some lost.
-const LIST_S: f64 = 90.0;
-/// A value is asked for five times.
-const WRITE_S: f64 = 5.0;
-/// The origin comes within some seconds of a start, and a fence is offered for eight.
-const FENCE_S: f64 = 20.0;
-/// A message is with the autopilot by then, over any link. [s]
-const TAKES_S: f64 = 1.0;
+/// Time limit for a heartbeat; one comes every second. [s]
+const HEARTBEAT_WITHIN_S: f64 = 8.0;
+/// Time limit for the version, which comes after the streams are set up. [s]
+const VERSION_WITHIN_S: f64 = 4.0;
+/// Time limit for all parameters: a thousand at 57600 baud, and some lost. [s]
+const LIST_WITHIN_S: f64 = 90.0;
+/// Time limit for one write; it is requested five times. [s]
+const WRITE_WITHIN_S: f64 = 5.0;
+/// Time limit for a fence: the origin comes within some seconds of a start, a fence is offered for eight. [s]
+const FENCE_WITHIN_S: f64 = 20.0;
+/// A message has reached the autopilot by then, over any link. [s]
+const DELIVERY_S: f64 = 1.0;
 
-impl Visit {
-    /// Finds the autopilot.
+impl ParamSession {
+    /// Opens the port, and waits for a heartbeat and the version.
     ///
     /// # Errors
-    /// [`VisitError::Way`], [`VisitError::Nobody`].
-    pub fn open(address: &MavlinkAddress, settings: LinkSettings) -> Result<Self, VisitError> {
-        let port =
-            Port::open(address).map_err(|why| VisitError::Way { address: address.clone(), why })?;
-        let mut visit = Self { port, link: Link::with(host_now(), settings) };
-        let within_s = GREETING_S;
-        visit
+    /// [`ParamSessionError::Open`], [`ParamSessionError::NoHeartbeat`].
+    pub fn open(
+        address: &MavlinkAddress,
+        settings: LinkSettings,
+    ) -> Result<Self, ParamSessionError> {
+        let port = Port::open(address)
+            .map_err(|why| ParamSessionError::Open { address: address.clone(), why })?;
+        let mut session = Self { port, link: Link::with(host_now(), settings) };
+        let within_s = HEARTBEAT_WITHIN_S;
+        session
             .until(within_s, |_, link| link.is_connected().then_some(()))
-            .ok_or_else(|| VisitError::Nobody { address: address.clone(), within_s })?;
-        visit.until(VERSION_S, |_, link| link.firmware().map(|_| ()));
-        Ok(visit)
+            .ok_or_else(|| ParamSessionError::NoHeartbeat { address: address.clone(), within_s })?;
+        session.until(VERSION_WITHIN_S, |_, link| link.firmware().map(|_| ()));
+        Ok(session)
     }
 
-    /// Returns the link, to ask what it knows.
+    /// Returns the link, for its state.
     pub fn link(&self) -> &Link {
         &self.link
     }
 
-    /// Returns which names the autopilot uses: by its version, or by the names themselves.
+    /// Returns the version of the parameter names: by the firmware, or by the names themselves.
     ///
     /// # Errors
-    /// [`VisitError::OtherProgram`].
-    pub fn version(&self) -> Result<Version, VisitError> {
+    /// [`ParamSessionError::OtherProgram`].
+    pub fn version(&self) -> Result<Version, ParamSessionError> {
         match self.link.firmware() {
             Some(firmware) if firmware.name != "ArduCopter" => {
-                Err(VisitError::OtherProgram(firmware))
+                Err(ParamSessionError::OtherProgram(firmware))
             }
             Some(firmware) if firmware.version.0 > 0 => Ok(Version::of(firmware)),
             _ => {
@@ -119,13 +122,13 @@ impl Visit {
     /// Reads all parameters; returns their values.
     ///
     /// # Errors
-    /// [`VisitError::NoParams`].
-    pub fn read(&mut self) -> Result<BTreeMap<String, f64>, VisitError> {
+    /// [`ParamSessionError::NoParams`].
+    pub fn read(&mut self) -> Result<BTreeMap<String, f64>, ParamSessionError> {
         // The few that a link reads by itself come first.
-        self.until(VERSION_S, |_, link| (!link.is_busy_with_params()).then_some(()));
+        self.until(VERSION_WITHIN_S, |_, link| (!link.is_busy_with_params()).then_some(()));
         while self.link.poll_event().is_some() {}
         self.link.read_params(host_now());
-        let complete = self.until(LIST_S, |event, _| match event {
+        let complete = self.until(LIST_WITHIN_S, |event, _| match event {
             Some(LinkEvent::Param(ParamEvent::Read { lost, .. })) => Some(*lost == 0),
             _ => None,
         });
@@ -133,25 +136,25 @@ impl Visit {
         if complete == Some(true) {
             Ok(params.iter().map(|(name, param)| (name.clone(), param.value)).collect())
         } else {
-            Err(VisitError::NoParams { within_s: LIST_S, have: params.len() })
+            Err(ParamSessionError::NoParams { within_s: LIST_WITHIN_S, received: params.len() })
         }
     }
 
-    /// Writes parameters; returns for each what the autopilot has then, `None` without an answer.
+    /// Writes parameters; returns for each the value that the autopilot confirms, `None` without a reply.
     ///
     /// # Errors
-    /// [`VisitError::Armed`]; nothing is written then.
+    /// [`ParamSessionError::Armed`]; nothing is written then.
     pub fn write(
         &mut self,
         values: &[(String, f64)],
-    ) -> Result<Vec<(String, Option<f64>)>, VisitError> {
+    ) -> Result<Vec<(String, Option<f64>)>, ParamSessionError> {
         let mut written = Vec::new();
         for (name, value) in values {
             if self.link.state().armed {
-                return Err(VisitError::Armed);
+                return Err(ParamSessionError::Armed);
             }
             self.link.write_param(host_now(), name, *value);
-            let has = self.until(WRITE_S, |event, _| match event {
+            let has = self.until(WRITE_WITHIN_S, |event, _| match event {
                 Some(LinkEvent::Param(ParamEvent::Written { name: done, value }))
                     if done == name =>
                 {
@@ -169,45 +172,45 @@ impl Visit {
         Ok(written)
     }
 
-    /// Has the autopilot keep these polygons as its own fence; returns how many it keeps, or why it does
-    /// not.
+    /// Uploads polygons as the autopilot's own fence; returns how many it accepts, or why it rejects
+    /// them.
     ///
     /// # Errors
-    /// [`VisitError::Armed`].
+    /// [`ParamSessionError::Armed`].
     pub fn upload_fence(
         &mut self,
         polygons: Vec<FencePolygon>,
-    ) -> Result<Result<usize, String>, VisitError> {
+    ) -> Result<Result<usize, String>, ParamSessionError> {
         if self.link.state().armed {
-            return Err(VisitError::Armed);
+            return Err(ParamSessionError::Armed);
         }
         self.link.set_fence(host_now(), polygons);
-        let done = self.until(FENCE_S, |event, _| match event {
-            Some(LinkEvent::Fence(FenceEvent::Kept(polygons))) => Some(Ok(*polygons)),
-            Some(LinkEvent::Fence(FenceEvent::NotKept(why))) => Some(Err(why.clone())),
+        let done = self.until(FENCE_WITHIN_S, |event, _| match event {
+            Some(LinkEvent::Fence(FenceEvent::Accepted(polygons))) => Some(Ok(*polygons)),
+            Some(LinkEvent::Fence(FenceEvent::Rejected(why))) => Some(Err(why.clone())),
             _ => None,
         });
         let silent = "it has no origin yet; start it in its localization, and try again";
         Ok(done.unwrap_or_else(|| Err(silent.to_owned())))
     }
 
-    /// Hands the key for signing over, or takes signing back.
+    /// Sends the signing key, or turns signing off with `None`.
     ///
     /// # Errors
-    /// [`VisitError::Armed`].
-    pub fn sign(&mut self, signing: Option<&LinkSigning>) -> Result<(), VisitError> {
+    /// [`ParamSessionError::Armed`].
+    pub fn sign(&mut self, signing: Option<&LinkSigning>) -> Result<(), ParamSessionError> {
         if self.link.state().armed {
-            return Err(VisitError::Armed);
+            return Err(ParamSessionError::Armed);
         }
         self.link.setup_signing(host_now(), signing);
-        // The autopilot gets the time to take it: a connection closed at once, with telemetry in it that
-        // nobody has read, is reset, and the key is lost with it.
-        self.until(TAKES_S, |_, _| None::<()>);
+        // The autopilot needs time to receive it: a connection closed at once, with unread telemetry in it,
+        // is reset, and the key is lost with it.
+        self.until(DELIVERY_S, |_, _| None::<()>);
         Ok(())
     }
 
-    /// Talks until `done` returns something, `within_s` at most. It is asked at every event, and once
-    /// without one at every turn.
+    /// Runs the link until `done` returns something, for `within_s` at most. `done` is called with every
+    /// event, and once per turn without one.
     fn until<T>(
         &mut self,
         within_s: f64,
@@ -218,7 +221,7 @@ impl Visit {
         while Instant::now() < end {
             self.link.handle_timeout(host_now());
             self.transmit();
-            // A socket in trouble is silent; the time limit says so.
+            // A failed socket receives nothing; the time limit reports it.
             if let Ok(Some(len)) = self.port.receive(&mut buffer) {
                 self.link.handle_input(host_now(), &buffer[..len]);
                 self.transmit();

@@ -1,10 +1,10 @@
-//! Poses and motions in plain words.
+//! Descriptions of poses and motions for people.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
 /// Returns where a vehicle is and which way it points.
-pub(super) fn pose_in_words(pose: &Pose<World, Body>) -> String {
+pub(super) fn describe_pose(pose: &Pose<World, Body>) -> String {
     let p = pose.translation_m;
     format!(
         "nose points {}, up is {}, drone is {:.2} m above the floor, at x {:.2}, y {:.2}",
@@ -40,10 +40,10 @@ mod tests {
     use glam::DQuat;
 
     #[test]
-    fn a_pose_is_described_in_plain_words() {
+    fn describes_a_pose() {
         let pose = Pose::new(DVec3::new(1.0, 2.0, 1.02), DQuat::IDENTITY);
         assert_eq!(
-            pose_in_words(&pose),
+            describe_pose(&pose),
             "nose points +x, up is +z, drone is 1.02 m above the floor, at x 1.00, y 2.00"
         );
         assert_eq!(direction(DVec3::new(0.0, -1.0, 0.02)), "-y");

@@ -34,9 +34,9 @@ pub(super) struct Request {
     at_s: f64,
 }
 
-/// What is said of a picture before it comes.
+/// The description of a picture, sent before it.
 #[derive(Debug, Serialize)]
-pub(super) struct Told {
+pub(super) struct PictureInfo {
     ms: f32,
     visible: usize,
     /// Median depth in the middle of the picture; none where nothing is hit. [m]
@@ -58,9 +58,9 @@ pub(super) struct OracleCamera {
     near_m: f64,
 }
 
-/// A picture.
-pub(super) struct Drawn {
-    pub(super) told: Told,
+/// A rendered picture.
+pub(super) struct Picture {
+    pub(super) info: PictureInfo,
     pub(super) jpeg: Vec<u8>,
 }
 
@@ -84,9 +84,9 @@ impl Engine {
         Self { rasterizer, moving, world_from_scene, image, rgb, depth_mm }
     }
 
-    pub(super) fn draw(&mut self, request: &Request) -> Result<Drawn> {
+    pub(super) fn render(&mut self, request: &Request) -> Result<Picture> {
         let camera = request.camera();
-        // What no clock can say stands where it began.
+        // A time beyond the clock's range shows the start.
         let placements = self.moving.placements((request.at_s * 1e9) as i64);
         let times = self.rasterizer.render(&placements, &[camera], &mut self.image)?;
         let [image] = &self.image;
@@ -102,13 +102,13 @@ impl Engine {
         encode_jpeg(&self.rgb, width, height, QUALITY, &mut jpeg).context("no picture")?;
         let middle = (height / 2) as usize * width as usize + (width / 2) as usize;
         let middle_m = image.depth_median_m[middle];
-        let told = Told {
+        let info = PictureInfo {
             ms: times.total_ms,
             visible: self.rasterizer.workload().visible,
             middle_m: (middle_m > 0.0).then_some(middle_m),
             camera: in_scene(&camera, &self.world_from_scene),
         };
-        Ok(Drawn { told, jpeg })
+        Ok(Picture { info, jpeg })
     }
 }
 
@@ -116,7 +116,7 @@ impl Request {
     /// Returns the camera, its size held to what a page can show.
     fn camera(&self) -> Camera {
         let [width, height] =
-            [self.width_px, self.height_px].map(|side| side.clamp(16, MOST_SIDE_PX));
+            [self.width_px, self.height_px].map(|side| side.clamp(16, MAX_SIDE_PX));
         let fov_rad = self.fov_deg.clamp(5.0, 150.0).to_radians();
         let world_from_body: Pose<World, Body> =
             Pose::new(self.p_m.into(), DQuat::from_rotation_z(self.yaw_rad));
@@ -160,7 +160,7 @@ fn in_scene(camera: &Camera, world_from_scene: &WorldFromScene) -> OracleCamera 
 /// A hand's breadth: one flies through things here. [m]
 const NEAR_M: f32 = 0.05;
 /// Full HD on a screen that is wider than high.
-const MOST_SIDE_PX: u32 = 1920;
+const MAX_SIDE_PX: u32 = 1920;
 const QUALITY: u8 = 85;
 
 #[cfg(test)]
@@ -222,7 +222,7 @@ mod tests {
         let mut engine = Engine::new(renderer, moving, WorldFromScene::IDENTITY);
         let mut middle_m = |p_y_m: f64, at_s: f64| {
             let looking = Request { p_m: [0.0, p_y_m, 1.0], at_s, ..request() };
-            engine.draw(&looking).unwrap().told.middle_m
+            engine.render(&looking).unwrap().info.middle_m
         };
         assert_eq!((middle_m(1.0, 0.0), middle_m(1.0, 4.0)), (Some(3.0), None));
         assert_eq!((middle_m(5.0, 0.0), middle_m(5.0, 4.0)), (None, Some(3.0)));
@@ -232,14 +232,14 @@ mod tests {
     fn the_page_sees_what_is_ahead_and_how_far() {
         let splats = ball();
         let mut engine = still(&splats);
-        let drawn = engine.draw(&request()).unwrap();
-        assert_eq!((drawn.told.visible, drawn.told.middle_m), (1, Some(3.0)));
-        assert_eq!(drawn.jpeg[..2], [0xff, 0xd8]);
+        let picture = engine.render(&request()).unwrap();
+        assert_eq!((picture.info.visible, picture.info.middle_m), (1, Some(3.0)));
+        assert_eq!(picture.jpeg[..2], [0xff, 0xd8]);
         let behind = Request { yaw_rad: std::f64::consts::PI, depth: true, ..request() };
-        let drawn = engine.draw(&behind).unwrap();
-        assert_eq!((drawn.told.visible, drawn.told.middle_m), (0, None));
+        let picture = engine.render(&behind).unwrap();
+        assert_eq!((picture.info.visible, picture.info.middle_m), (0, None));
         let lost = Request { p_m: [1e30, 0.0, 0.0], ..request() };
-        assert!(engine.draw(&lost).is_err());
+        assert!(engine.render(&lost).is_err());
         let huge = Request { width_px: u32::MAX, height_px: 0, ..request() };
         assert_eq!(huge.camera().intrinsics.pixels(), 1920 * 16);
     }

@@ -1,0 +1,140 @@
+//! Why and how the flight ends: its own reasons, the guard's holds and landings, and a pilot who takes over.
+
+use vizflyt_protocol::flight_end::{Boundary, EndReason, FenceBreach, PluginFault};
+use vizflyt_protocol::mavlink::CopterMode;
+use vizflyt_protocol::messages::{EventKind, FlightPhase, Name, bounded};
+use vizflyt_protocol::time::HostTime;
+
+use super::Flight;
+use crate::guard::{GuardMode, HoldReason, LandReason, RESTART_WITHIN_S, SETPOINT_HOLD_S};
+
+impl Flight {
+    /// Sets and reports why the flight ends, if nothing has ended it yet.
+    pub(super) fn decide(&mut self, now: HostTime, reason: EndReason) {
+        if self.end.reason().is_none() {
+            let text = reason.to_string();
+            let kind = EventKind::Ended(reason);
+            self.end.handle(now, &kind);
+            self.notice(kind, text);
+        }
+    }
+
+    /// Ends the flight, for a reason of our own.
+    pub(super) fn end_for(&mut self, now: HostTime, reason: EndReason) {
+        let brakes_first = reason.brakes_first();
+        self.decide(now, reason);
+        self.come_down(now, brakes_first);
+    }
+
+    /// Lands, by LAND or after braking; on the ground the flight is over.
+    pub(super) fn come_down(&mut self, now: HostTime, brakes_first: bool) {
+        match self.phase {
+            FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting => {
+                self.landed_at = Some(now);
+                let why = self.end.reason().map_or(String::new(), ToString::to_string);
+                self.enter(now, FlightPhase::Landed, &why);
+            }
+            FlightPhase::TakingOff | FlightPhase::Flying | FlightPhase::Holding => {
+                match &mut self.guard {
+                    Some(guard) if brakes_first => return guard.brake_and_land(now),
+                    Some(guard) => guard.land(),
+                    None => {}
+                }
+                self.enter(now, FlightPhase::Landing, &self.landing_text());
+            }
+            FlightPhase::Landing | FlightPhase::Landed => {}
+        }
+    }
+
+    pub(super) fn landing_text(&self) -> String {
+        self.end.reason().map_or("landing".to_owned(), |reason| format!("landing: {reason}"))
+    }
+
+    /// Someone else changed the mode: a failsafe of the autopilot, or a pilot.
+    pub(super) fn taken_over(&mut self, now: HostTime, mode: u32) {
+        if CopterMode::from_number(mode) != Some(CopterMode::Land) {
+            // The pilot has priority.
+            self.pilot_flies = true;
+        }
+        self.end_for(now, EndReason::TakenOver { mode });
+    }
+
+    /// Follows the guard's mode: its holds and landings are the flight's.
+    pub(super) fn follow_guard(&mut self, now: HostTime, mode: GuardMode) {
+        let former = self.guard_mode.replace(mode);
+        match mode {
+            GuardMode::Landing(reason) => {
+                if let Some(reason) = self.guard_end_reason(now, reason) {
+                    self.decide(now, reason);
+                }
+                if self.phase != FlightPhase::Landing {
+                    self.enter(now, FlightPhase::Landing, &self.landing_text());
+                }
+            }
+            GuardMode::Holding(HoldReason::Requested) | GuardMode::Following => {
+                if self.phase == FlightPhase::Holding {
+                    self.enter(now, FlightPhase::Flying, "the plugin flies again");
+                }
+            }
+            GuardMode::Holding(reason) => {
+                if former != Some(mode) {
+                    let why = match reason {
+                        HoldReason::Requested => "the plugin asks to hold".to_owned(),
+                        HoldReason::NoSetpoint => self.why_silent(now).to_string(),
+                        HoldReason::Restarting => "the plugin is being started again".to_owned(),
+                        HoldReason::PoseStale => {
+                            format!("the pose is older than {} s", self.pose_ages().hold_after_s)
+                        }
+                        HoldReason::Ending => {
+                            self.end.reason().map_or(String::new(), ToString::to_string)
+                        }
+                    };
+                    self.enter(now, FlightPhase::Holding, &format!("holding: {why}"));
+                }
+            }
+        }
+    }
+
+    /// Returns why the guard lands; `None` where the flight ordered it.
+    fn guard_end_reason(&self, now: HostTime, reason: LandReason) -> Option<EndReason> {
+        let breach = |beyond_m: f64, boundary| {
+            let vehicle = self.vehicle.as_ref();
+            EndReason::Geofence(FenceBreach {
+                p_world_m: vehicle.map(|vehicle| vehicle.p_world_m).unwrap_or_default(),
+                margin_m: -beyond_m,
+                boundary,
+                speed_mps: vehicle.map_or(0.0, |vehicle| vehicle.v_world_mps.length()),
+                overshoot_m: beyond_m,
+            })
+        };
+        Some(match reason {
+            LandReason::Requested => EndReason::PluginLanded,
+            LandReason::NoPlugin => {
+                let why = self.restart_reason.as_deref().unwrap_or("it was to be started again");
+                let why = bounded(why);
+                EndReason::Plugin(PluginFault::NotBack { within_s: RESTART_WITHIN_S, why })
+            }
+            LandReason::NoSetpoint(_) => self.why_silent(now),
+            LandReason::PoseLost(age_s) => EndReason::PoseLost { age_s },
+            LandReason::OutsideFence(outside_m) => breach(outside_m, Boundary::Geofence),
+            LandReason::InNoFly(inside_m) => breach(inside_m, Boundary::NoFly(Name::new())),
+            LandReason::Ordered => return None,
+        })
+    }
+
+    /// Returns why no setpoint comes: the plugin failed, or no image comes.
+    fn why_silent(&self, now: HostTime) -> EndReason {
+        EndReason::Plugin(match self.unanswered {
+            Some((image, at)) => PluginFault::NoAnswer { image, silent_s: now.seconds_since(at) },
+            None if self.sees_nothing(now) => return EndReason::NoImage,
+            None if let Some(fault) = self.refused => PluginFault::Refused(fault),
+            None => PluginFault::NoSetpoint,
+        })
+    }
+
+    /// Whether the plugin is idle because no image comes.
+    fn sees_nothing(&self, now: HostTime) -> bool {
+        self.unanswered.is_none()
+            && self.replied_at.is_none_or(|at| now.seconds_since(at) >= SETPOINT_HOLD_S)
+    }
+}

@@ -1,0 +1,106 @@
+//! Inputs of the flight: the arena, the server's events, the link, and the plugin's replies.
+
+use vizflyt_protocol::flight_end::EndReason;
+use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint, bounded};
+use vizflyt_protocol::time::HostTime;
+
+use super::Flight;
+use crate::guard::check_arena;
+use crate::link::{LOST_AFTER_S, LinkEvent};
+
+/// STATUSTEXT of this severity or worse is worth a person's attention.
+const SEVERITY_WARNING: u8 = 4;
+
+impl Flight {
+    pub(super) fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
+        self.settings.tighten(&mut arena);
+        if let Err(why) = check_arena(&arena) {
+            return self.end_for(now, EndReason::ArenaRefused(bounded(&why)));
+        }
+        match &self.arena {
+            Some(known) if **known != *arena => {
+                // The guard must not keep a fence that is no longer the room's.
+                self.end_for(now, EndReason::ArenaChanged { name: arena.name.clone() });
+            }
+            _ => self.arena = Some(arena),
+        }
+    }
+
+    pub(super) fn handle_server(&mut self, now: HostTime, at: HostTime, event: &Event) {
+        self.end.handle(at, &event.kind);
+        match event.kind {
+            EventKind::Start if self.phase == FlightPhase::Waiting => {
+                self.waits_for_start = false;
+            }
+            // Not kept for later: what made it unready may be a person in the net.
+            EventKind::Start if self.waits_for_start => {
+                let why = "start was pressed before the vehicle was ready; press it again then";
+                self.notice(EventKind::Note, why.to_owned());
+            }
+            _ => {
+                // What cannot end it on the ground does not.
+                if let (Some(reason), Some(_)) = (event.kind.end_reason(), self.end.reason()) {
+                    self.come_down(now, reason.brakes_first());
+                }
+            }
+        }
+    }
+
+    pub(super) fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
+        match event {
+            LinkEvent::Refused(why) => {
+                self.end_for(now, EndReason::AutopilotRefused(bounded(&why)));
+            }
+            LinkEvent::Lost if self.is_airborne() => {
+                self.end_for(now, EndReason::AutopilotSilent { silent_s: LOST_AFTER_S });
+            }
+            LinkEvent::Rebooted if self.is_airborne() => {
+                self.end_for(now, EndReason::AutopilotRestarted);
+            }
+            LinkEvent::Text { severity, text } if severity <= SEVERITY_WARNING => {
+                self.notice(EventKind::Note, format!("autopilot: {text}"));
+            }
+            event => {
+                if let Some(warning) = event.warning() {
+                    self.notice(EventKind::Note, warning);
+                }
+            }
+        }
+    }
+
+    pub(super) fn handle_reply(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
+        self.replied_at = Some(now);
+        if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
+            self.unanswered = None;
+        }
+        let (Some(guard), None) = (&mut self.guard, self.end.reason()) else { return };
+        let Some(setpoint) = setpoint else { return guard.handle_empty_reply(now) };
+        match guard.handle_setpoint(now, setpoint) {
+            Ok(()) => {
+                self.accepted_seq = Some(seq);
+                self.refused = None;
+            }
+            // Once per series; the hold and the landing that follow name it again.
+            Err(fault) if self.refused.is_none() => {
+                self.refused = Some(fault);
+                self.notice(EventKind::Note, format!("setpoint refused: {fault}"));
+            }
+            Err(_) => {}
+        }
+    }
+
+    pub(super) fn handle_restart(&mut self, now: HostTime, why: String) {
+        if !self.can_wait_for_plugin() {
+            return;
+        }
+        (self.plugin_ready, self.unanswered, self.replied_at) = (false, None, None);
+        if let Some(guard) = &mut self.guard {
+            guard.wait_for_plugin(now);
+        }
+        self.notice(EventKind::Note, format!("{why}; the plugin is started again"));
+        if matches!(self.phase, FlightPhase::Preparing | FlightPhase::Waiting) {
+            self.enter(now, FlightPhase::Connecting, "waiting for the plugin");
+        }
+        self.restart_reason = Some(why);
+    }
+}

@@ -1,0 +1,206 @@
+//! What the flight does at a tick, by phase.
+
+use vizflyt_protocol::flight_end::{EndReason, Missing};
+use vizflyt_protocol::mavlink::CopterMode;
+use vizflyt_protocol::messages::{EventKind, FlightPhase, bounded};
+use vizflyt_protocol::time::HostTime;
+
+use super::{Flight, LinkView, Orders};
+use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason};
+
+/// Share of the take-off height that counts as reached: ArduCopter hands over at 90 cm of a metre
+/// as it eases into the height.
+const REACHED: f64 = 0.9;
+/// From the accepted take-off to the height. ArduCopter climbs at 0.5 m/s or more. [s]
+const CLIMB_WITHIN_S: f64 = 20.0;
+/// Disarmed for this long: landed. Longer than packets take to overtake each other. [s]
+const DISARMED_S: f64 = 0.5;
+/// A landing that takes longer than this ends the flight all the same. From 4 m at ArduCopter's
+/// 0.3 to 0.5 m/s, plus the wait for touch-down. [s]
+const LAND_WITHIN_S: f64 = 60.0;
+/// Without a link, whether the vehicle has landed cannot be known; wait this long. [s]
+const LOST_WHILE_LANDING_S: f64 = 10.0;
+/// After an interrupt: time for LAND to be confirmed. [s]
+const INTERRUPT_S: f64 = 1.0;
+/// Minimum time between two notices of the same kind. [s]
+const REMIND_S: f64 = 5.0;
+
+impl Flight {
+    /// Lands a vehicle that a former runtime has left in the air, and returns whether there is one: our
+    /// heartbeats would keep the autopilot's own failsafe from landing it.
+    fn lands_former_flight(&mut self, now: HostTime, link: &LinkView) -> bool {
+        let left = link.connected && link.armed && link.mode == CopterMode::Guided as u32;
+        if left {
+            self.decide(now, EndReason::LeftInAir);
+            self.enter(now, FlightPhase::Landing, &self.landing_text());
+        }
+        left
+    }
+
+    pub(super) fn connecting(&mut self, now: HostTime, link: &LinkView) {
+        if self.lands_former_flight(now, link) {
+            return;
+        }
+        let missing = if self.arena.is_none() {
+            Some(Missing::Server)
+        } else if !self.plugin_ready {
+            Some(Missing::Plugin)
+        } else if !link.connected {
+            Some(Missing::Heartbeat)
+        } else {
+            None
+        };
+        match missing {
+            Some(missing) => self.wait_for(now, missing),
+            None => self.enter(now, FlightPhase::Preparing, "all are here; preparing"),
+        }
+    }
+
+    pub(super) fn preparing(&mut self, now: HostTime, link: &LinkView) {
+        if self.lands_former_flight(now, link) {
+            return;
+        }
+        let pose_age_s = self.vehicle.map(|vehicle| now.seconds_since(vehicle.stamp));
+        let hold_after_s = self.pose_ages().hold_after_s;
+        let missing = if link.armed {
+            Some(Missing::Disarmed)
+        } else if pose_age_s.is_none_or(|age_s| age_s > hold_after_s) {
+            Some(Missing::Pose)
+        } else if self.replied_at.is_none() {
+            Some(Missing::Answer)
+        } else {
+            link.ready_to_arm.as_ref().err().map(|message| Missing::PreArm(bounded(message)))
+        };
+        match (missing, self.vehicle) {
+            (None, Some(_)) if self.waits_for_start => {
+                if self.phase != FlightPhase::Waiting {
+                    self.enter(now, FlightPhase::Waiting, "ready; waiting for start to be pressed");
+                }
+            }
+            (None, Some(vehicle)) => {
+                self.start_z_m = vehicle.p_world_m.z;
+                self.enter(now, FlightPhase::TakingOff, "pre-arm checks passed; taking off");
+            }
+            (missing, _) => {
+                let missing = missing.unwrap_or(Missing::Pose);
+                if self.phase == FlightPhase::Waiting {
+                    // The time to get ready counts anew: it was ready.
+                    self.started_at = now;
+                    let why = format!("no longer ready: {missing}");
+                    self.enter(now, FlightPhase::Preparing, &why);
+                }
+                self.wait_for(now, missing);
+            }
+        }
+    }
+
+    pub(super) fn taking_off(&mut self, now: HostTime, link: &LinkView) {
+        let (Some(arena), Some(vehicle)) = (&self.arena, &self.vehicle) else { return };
+        if link.took_off && self.took_off_at.is_none() {
+            self.took_off_at = Some(now);
+        }
+        let pose_age_s = now.seconds_since(vehicle.stamp);
+        if pose_age_s > arena.pose_ages.land_after_s {
+            return self.end_for(now, EndReason::PoseLost { age_s: pose_age_s });
+        }
+        let Some(took_off_at) = self.took_off_at else { return };
+        let risen_m = vehicle.p_world_m.z - self.start_z_m;
+        if risen_m >= REACHED * arena.takeoff_height_m {
+            self.guard = Some(Guard::new(arena, vehicle, now));
+            self.unanswered = None;
+            self.enter(now, FlightPhase::Flying, "the plugin flies");
+        } else if now.seconds_since(took_off_at) > CLIMB_WITHIN_S {
+            self.end_for(now, EndReason::ClimbFailed { risen_m, within_s: CLIMB_WITHIN_S });
+        }
+    }
+
+    pub(super) fn flying(&mut self, now: HostTime, link: &LinkView) -> Orders {
+        let (asked_s, arena_s) = self.time_limits_s();
+        if self.seconds(now) > asked_s.min(arena_s) {
+            let reason = if asked_s < arena_s {
+                EndReason::TimeAsked { seconds: asked_s }
+            } else {
+                EndReason::TimeLimit { limit_s: arena_s }
+            };
+            self.end_for(now, reason);
+        }
+        if link.connected && !link.armed {
+            self.end_for(now, EndReason::Disarmed);
+        } else if link.connected && link.mode != CopterMode::Guided as u32 {
+            self.taken_over(now, link.mode);
+        }
+        let flies = self.phase_flies();
+        let (Some(guard), Some(vehicle), true) = (&mut self.guard, &self.vehicle, flies) else {
+            return Orders { goal: self.goal(), setpoint: None, replies_to: None };
+        };
+        let (output, mode) = guard.tick(now, vehicle);
+        let fence_stops = guard.fence_stops();
+        self.follow_guard(now, mode);
+        if fence_stops {
+            self.notice_fence(now);
+        }
+        let setpoint = match output {
+            GuardOutput::Guided(setpoint) => Some(setpoint),
+            GuardOutput::Land => None,
+        };
+        // In any other mode the setpoint is the guard's own.
+        let is_reply =
+            matches!(mode, GuardMode::Following | GuardMode::Holding(HoldReason::Requested));
+        let replies_to = self.accepted_seq.filter(|_| is_reply && setpoint.is_some());
+        Orders { goal: self.goal(), setpoint, replies_to }
+    }
+
+    pub(super) fn landing(&mut self, now: HostTime, link: &LinkView) {
+        if link.armed || !link.connected {
+            self.disarmed_at = None;
+        } else {
+            self.disarmed_at.get_or_insert(now);
+        }
+        let landed = self.disarmed_at.is_some_and(|at| now.seconds_since(at) >= DISARMED_S);
+        let in_land = link.mode == CopterMode::Land as u32;
+        let released = self
+            .interrupted_at
+            .is_some_and(|at| (link.connected && in_land) || now.seconds_since(at) > INTERRUPT_S);
+        let landing_s = now.seconds_since(self.phase_at);
+        let silent = !link.connected && now.seconds_since(self.connected_at) > LOST_WHILE_LANDING_S;
+        if landed {
+            self.landed_at = self.disarmed_at;
+            self.enter(now, FlightPhase::Landed, "on the ground, disarmed");
+        } else if released {
+            self.enter(now, FlightPhase::Landed, "leaving; the autopilot lands by itself");
+        } else if landing_s > LAND_WITHIN_S {
+            self.enter(now, FlightPhase::Landed, "still armed a minute after landing began");
+        } else if silent {
+            self.enter(now, FlightPhase::Landed, "the autopilot stays silent; its failsafe lands");
+        }
+    }
+
+    /// Reports that the fence stops the vehicle; once, until it has not for [`REMIND_S`].
+    fn notice_fence(&mut self, now: HostTime) {
+        let former = self.fence_stopped_at.replace(now);
+        if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
+            let text = "the plugin asks to leave the geofence; the vehicle stops before it";
+            self.notice(EventKind::Note, text.to_owned());
+        }
+    }
+
+    /// Reports what is being waited for every [`REMIND_S`], and gives up at the time limit.
+    fn wait_for(&mut self, now: HostTime, missing: Missing) {
+        let limit_s = self.settings.ready_within_s;
+        if limit_s > 0.0 && now.seconds_since(self.started_at) > limit_s {
+            return self.end_for(now, EndReason::NotReady { within_s: limit_s, missing });
+        }
+        let due = self.reminded_at.unwrap_or(self.phase_at).plus_seconds(REMIND_S);
+        if now >= due {
+            self.reminded_at = Some(now);
+            self.notice(EventKind::Note, format!("waiting: {missing}"));
+        }
+    }
+
+    /// Returns the time limits of the person and of the arena; infinite without one. [s]
+    fn time_limits_s(&self) -> (f64, f64) {
+        let arena_s = self.arena.as_ref().map_or(0.0, |arena| arena.time_limit_s);
+        let limit_s = |given_s: f64| if given_s > 0.0 { given_s } else { f64::INFINITY };
+        (limit_s(self.settings.time_limit_s), limit_s(arena_s))
+    }
+}
