@@ -88,7 +88,7 @@ struct RenderLoop<'a, D> {
     known: NewestPoses,
     /// The cameras of one tick, all vehicles'; which of them are whose.
     cameras: Vec<Camera>,
-    views: [View; MAX_VEHICLES],
+    ranges: [CameraRange; MAX_VEHICLES],
     /// Their images side by side, as the renderer wants them.
     images: Vec<RgbdImage>,
     placements: Vec<Placement>,
@@ -115,7 +115,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             poses: NewestPoses::default(),
             known: NewestPoses::default(),
             cameras: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
-            views: Default::default(),
+            ranges: Default::default(),
             images: Vec::new(),
             placements: Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES),
             seq: 0,
@@ -160,7 +160,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         let mut stamp = ServerTime::ZERO;
         self.cameras.clear();
         let atmosphere = atmosphere(&self.rendering.environment.now());
-        self.views = Default::default();
+        self.ranges = Default::default();
         for (vehicle, set) in self.sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
             // A vehicle's pose is kept until a camera of it is due.
@@ -197,7 +197,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 std::mem::swap(&mut images[self.cameras.len() - 1], &mut slot.image);
             }
             let at = shown.map_or(ServerTime::ZERO, |exposure| exposure.at);
-            self.views[vehicle] = View { first, end: self.cameras.len(), at };
+            self.ranges[vehicle] = CameraRange { first, end: self.cameras.len(), at };
         }
         stamp
     }
@@ -218,8 +218,8 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 return renderer.render(&[], cameras, images).map(|_| ());
             }
             // Each vehicle sees the moment that its images show, and not itself.
-            let mut views = self.views.iter().enumerate().filter(|(_, view)| view.first < view.end);
-            views.try_for_each(|(vehicle, &View { first, end, at })| {
+            let mut ranges = self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
+            ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
                 placements.clear();
                 rendering.dynamic_objects.place(at, vehicle, known, placements);
                 let images = &mut images[first..end];
@@ -252,20 +252,20 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
     /// Logs the first tick that the renderer refuses.
     fn report_refused(&mut self, error: &RenderError) {
         if !std::mem::replace(&mut self.refused, true) {
-            warn!("tick {} is not rendered: {error}; more of these are not logged", self.seq);
+            warn!("tick {} is not rendered: {error}; further errors are not logged", self.seq);
         }
     }
 }
 
 /// Which of a tick's cameras are a vehicle's, and the instant that they show.
 #[derive(Clone, Copy, Debug, Default)]
-struct View {
+struct CameraRange {
     first: usize,
     end: usize,
     at: ServerTime,
 }
 
-/// Tells when another renderer has taken over, as the processor does from a lost graphics device.
+/// Reports when another renderer has taken over, as the processor does from a lost graphics device.
 fn note_renderer(rendering: &Rendering, flights: &Flights, renderer: &dyn Rasterizer) {
     let name = renderer.name();
     let mut info = lock(&rendering.renderer);
