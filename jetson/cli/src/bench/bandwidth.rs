@@ -91,17 +91,17 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
     let sizes = if args.size.is_empty() { USUAL_SIZES.to_vec() } else { args.size.clone() };
     let mut rows = Vec::new();
     for size in sizes {
-        let mut images = Vec::new();
+        let mut pixels = Vec::new();
         for view in &views {
             let mut images = [RgbdImage::default()];
             let view = camera::resized(view, size)?;
             rasterizer.render(&[], std::slice::from_ref(&view), &mut images)?;
             let [image] = images;
-            images.push(Pixels::of(&image));
+            pixels.push(Pixels::of(&image));
         }
         rows.extend(
             levels()
-                .map(|(name, options)| row(&images, name, options))
+                .map(|(name, options)| row(&pixels, name, options))
                 .collect::<Result<Vec<_>>>()?,
         );
     }

@@ -497,7 +497,7 @@ fn an_offset_counts_from_where_it_was_taken() {
     guard.handle_setpoint(time(0), offset(Axes::Heading)).unwrap();
     let from_m = vehicle.p_m;
     for tick in 1..400 {
-        guard.asked_at = time(tick);
+        guard.setpoint_at = time(tick);
         vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
     }
     let ahead = DVec3::new(0.3_f64.cos(), 0.3_f64.sin(), 0.0);

@@ -247,7 +247,7 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
         let record = ObservationRecord { at, seq: tick, head, images: vec![image], home };
         writer.take(Record::Observation(Box::new(record))).unwrap();
         if tick % 60 == 59 {
-            writer.look_after().unwrap();
+            writer.check_health().unwrap();
             writer.outlet.flush().unwrap();
         }
     }
@@ -360,7 +360,7 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     let disk = RealFile::new(File::create(&path).unwrap()).unwrap();
     let outlet = Outlet::new(Some(disk), None, None).unwrap();
     let mut writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(|| Some(1 << 20)));
-    writer.look_after().unwrap();
+    writer.check_health().unwrap();
     let trouble = queue.poll_trouble().unwrap();
     assert!(trouble.contains("no longer logged: only 1 MB"), "{trouble}");
     let home = Arc::default();

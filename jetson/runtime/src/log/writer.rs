@@ -228,7 +228,7 @@ impl<D: Disk> LogWriter<D> {
                 }
                 if is_due {
                     flushed = Instant::now();
-                    self.look_after()?;
+                    self.check_health()?;
                 }
                 self.outlet.flush()
             });

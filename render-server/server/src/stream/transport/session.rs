@@ -88,8 +88,8 @@ impl Session<'_> {
         let senders = ImageSenders::open(rooms, vehicle, self.connection.clone(), id, purpose);
         let received_events =
             lease.map_or_else(ReceivedEvents::default, |lease| lease.received_events);
-        let received = self.hello.received_events.of(self.rooms.flights.instance_id);
-        let cursor = first_event.max(received);
+        let client_received = self.hello.received_events.of(self.rooms.flights.instance_id);
+        let cursor = first_event.max(client_received);
         tokio::select! {
             ending = self.send(send, received_events, cursor, clock_requests, received) => ending,
             ending = self.receive(lease, incoming, &clock_sender, &received_sender) => ending,
