@@ -145,7 +145,7 @@ fn flies(event: &Event) -> Option<bool> {
 }
 
 /// A plugin that goes round the SDK's loop: it floods the runtime with setpoints, or with bytes
-/// that are none.
+/// that are invalid.
 fn go_round(how: &str, service: &str) -> ExitCode {
     let end = PluginEnd::open(service).expect("the runtime is there");
     let (mut flying, mut images) = (false, 0);

@@ -15,7 +15,7 @@ use vizflyt_tags::detect::{Detector, DetectorSettings};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{CORNERS, TagLayout};
 use vizflyt_tags::simulated::{Sensor, belly_camera, cube, mat, webcams};
-use vizflyt_tags::synth::{Placed, Renderer, Shot};
+use vizflyt_tags::synth::{Placed, Renderer, SyntheticExposure};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::env::args_os().nth(1).ok_or("give a folder to write to")?;
@@ -44,12 +44,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             Mounting::Unknown => return Err("the simulated cameras have places".into()),
         };
         let Sensor { light, blur_px, noise, .. } = Sensor::default();
-        let image = Renderer::new(camera.intrinsics).render(&Shot {
+        let image = Renderer::new(camera.intrinsics).render(&SyntheticExposure {
             light,
             blur_px,
             noise,
             seed: index.into(),
-            ..Shot::still(&[placed], world_from_cam)
+            ..SyntheticExposure::still(&[placed], world_from_cam)
         });
         let mut bytes =
             format!("P5\n{} {}\n255\n", image.width_px(), image.height_px()).into_bytes();

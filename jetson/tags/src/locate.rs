@@ -43,7 +43,7 @@ pub struct LocateSettings {
     /// Poses that leave corners further off than this are refused: a layout, a lens or a camera's place is
     /// wrong. Root mean square. [px]
     pub most_rms_px: f64,
-    /// The vehicle never leans further than this: rules out answers on their heads. [rad]
+    /// The maximum tilt of the vehicle: rejects inverted poses. [rad]
     pub most_tilt_rad: f64,
     /// Uncertainty of print, survey and lens, independent of the corners; added to the covariance. [m]
     pub floor_m: f64,

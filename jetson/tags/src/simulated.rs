@@ -15,7 +15,7 @@ use crate::camera::{Mounting, TagCamera};
 use crate::family::TagFamily;
 use crate::image::Gray;
 use crate::layout::{LayoutFrame, Tag, TagLayout};
-use crate::synth::{Light, Placed, Renderer, Shot};
+use crate::synth::{Light, Placed, Renderer, SyntheticExposure};
 
 /// The vehicle's true poses, of the last second.
 #[derive(Clone, Debug, Default)]
@@ -192,13 +192,16 @@ impl SimulatedCamera {
         };
         let middle = world_from_cam[0].interpolate(&world_from_cam[1], 0.5);
         let background = self.behind.as_mut().map(|behind| (behind.0)(&middle));
-        let image = self.renderer.render(&Shot {
+        let image = self.renderer.render(&SyntheticExposure {
             background: background.as_ref(),
             light: self.sensor.light,
             blur_px: self.sensor.blur_px,
             noise: self.sensor.noise,
             seed: stamp.as_ns(),
-            ..Shot { world_from_cam, ..Shot::still(&placed, world_from_cam[0]) }
+            ..SyntheticExposure {
+                world_from_cam,
+                ..SyntheticExposure::still(&placed, world_from_cam[0])
+            }
         });
         Some((stamp, image))
     }

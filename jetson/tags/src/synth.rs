@@ -92,9 +92,9 @@ impl Default for Light {
     }
 }
 
-/// One exposure.
+/// One synthetic exposure.
 #[derive(Clone, Copy, Debug)]
-pub struct Shot<'a> {
+pub struct SyntheticExposure<'a> {
     /// What is there.
     pub placed: &'a [Placed<'a>],
     /// The camera at the beginning and at the end of the exposure.
@@ -111,7 +111,7 @@ pub struct Shot<'a> {
     pub seed: u64,
 }
 
-impl<'a> Shot<'a> {
+impl<'a> SyntheticExposure<'a> {
     /// A sharp still of these, without noise, in even light.
     pub fn still(placed: &'a [Placed<'a>], world_from_cam: Pose<World, Cam>) -> Self {
         Self {
@@ -160,7 +160,7 @@ impl Renderer {
     ///
     /// # Panics
     /// If a background is of another size.
-    pub fn render(&self, shot: &Shot<'_>) -> Gray {
+    pub fn render(&self, shot: &SyntheticExposure<'_>) -> Gray {
         // Brightness of everything in even light: 0 is black ink, 1 white paper.
         let mut albedo = match shot.background {
             None => self.wall.clone(),
@@ -180,7 +180,7 @@ impl Renderer {
     }
 
     /// Returns the tags that face the camera, those behind others first.
-    fn farthest_first(shot: &Shot<'_>) -> Vec<(Vec<DMat3>, Tag)> {
+    fn farthest_first(shot: &SyntheticExposure<'_>) -> Vec<(Vec<DMat3>, Tag)> {
         let mut quads = Vec::new();
         for placed in shot.placed {
             for tag in &placed.layout.tags {
@@ -298,7 +298,7 @@ impl Renderer {
     }
 
     /// Returns what the sensor makes of the brightness.
-    fn expose(&self, albedo: &[f32], shot: &Shot<'_>) -> Gray {
+    fn expose(&self, albedo: &[f32], shot: &SyntheticExposure<'_>) -> Gray {
         let (width, height) = (self.intrinsics.width_px, self.intrinsics.height_px);
         let mut image = Gray::plain(width, height, 0);
         let mut random = Random::new(shot.seed);

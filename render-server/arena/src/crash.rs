@@ -18,35 +18,35 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::verdict::{Sample, Verdict};
 
-/// An answer of the plugin.
+/// A reply of the plugin, and its image's time.
 #[derive(Clone, Debug)]
-pub struct Asked {
+pub struct TimedSetpoint {
     /// When the plugin was given the image.
     pub stamp: ServerTime,
-    /// What it asked for.
+    /// Its setpoint, if it sent one.
     pub setpoint: Option<Setpoint>,
 }
 
-/// What was ahead in an image of the first camera.
+/// The free distance ahead in an image of the first camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Seen {
+pub struct ClearanceAhead {
     /// When the image was new.
     pub stamp: ServerTime,
     /// By [`ahead_m`]. [m, cam]
     pub ahead_m: Option<f64>,
 }
 
-/// A flight that is over, as far as it was written down.
+/// The record of a flight that is over.
 #[derive(Clone, Copy, Debug)]
 pub struct Flight<'a> {
-    /// What it was worth.
+    /// Its verdict.
     pub verdict: &'a Verdict,
     /// Where it was, in order.
     pub samples: &'a [Sample],
-    /// What the plugin answered, in order; `None` where nobody wrote it down, as in a lab.
-    pub asked: Option<&'a [Asked]>,
-    /// What was ahead, in order.
-    pub seen: &'a [Seen],
+    /// The plugin's replies, in order; `None` where they were not recorded, as in a lab.
+    pub asked: Option<&'a [TimedSetpoint]>,
+    /// The distances ahead, in order.
+    pub seen: &'a [ClearanceAhead],
     /// The last line that the plugin printed.
     pub last_line: Option<&'a str>,
     /// From when an image is rendered until its reply counts. [s]

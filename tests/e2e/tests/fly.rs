@@ -19,9 +19,9 @@ const BUILT: Duration = Duration::from_mins(9);
 const OPT_LEVEL: (&str, &str) = ("CARGO_PROFILE_RELEASE_OPT_LEVEL", "0");
 
 /// A folder of a student's.
-struct Desk(TempDir);
+struct StudentFolder(TempDir);
 
-impl Desk {
+impl StudentFolder {
     fn new() -> Self {
         Self(tempfile::tempdir().unwrap())
     }
@@ -86,16 +86,16 @@ fn text(path: &Path) -> &str {
 
 #[test]
 fn a_new_rust_plugin_is_tested_and_flies() {
-    let desk = Desk::new();
-    let folder = desk.path("my-first");
-    let made = desk.run(&["new", text(&folder), "--lang", "rust"]);
+    let student = StudentFolder::new();
+    let folder = student.path("my-first");
+    let made = student.run(&["new", text(&folder), "--lang", "rust"]);
     assert!(made.status.success(), "{made:?}");
-    let mut flight = desk.fly(&folder, &["--seconds", "12", "--seed", "4"]);
+    let mut flight = student.fly(&folder, &["--seconds", "12", "--seed", "4"]);
     let lab = flight.wait_for("lab ", BUILT);
     assert!(lab.contains("simulated"), "{lab}");
     flight.wait_for("plugin flies", AIRBORNE);
     let code = flight.wait(FLIGHT);
-    let report = desk.report();
+    let report = student.report();
     assert_eq!(report["outcome"], "landed", "{report:#} {:#?}", flight.seen);
     assert_eq!(code, Some(0));
     assert!(report["mean_speed_mps"].as_f64().unwrap() > 0.1, "it moves: {report:#}");
@@ -110,9 +110,9 @@ fn a_new_rust_plugin_is_tested_and_flies() {
 
 #[test]
 fn which_lab_it_is_stands_before_everything_else() {
-    let desk = Desk::new();
+    let student = StudentFolder::new();
     let fingerprint = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
-    let config = desk.write(
+    let config = student.write(
         "jetson.toml",
         &format!(
             "[server]\naddress = \"127.0.0.1:9\"\nfingerprint = \"{fingerprint}\"\n\
@@ -120,7 +120,7 @@ fn which_lab_it_is_stands_before_everything_else() {
         ),
     );
     // The file in the folder where it is called, without being named.
-    let output = desk.run(&["fly", "--ready-within", "1"]);
+    let output = student.run(&["fly", "--ready-within", "1"]);
     let output_text = String::from_utf8(output.stdout).unwrap();
     let first = output_text.lines().next().unwrap();
     for part in ["lab ", "real: server 127.0.0.1:9", "vehicle red", "jetson.toml"] {
@@ -130,30 +130,30 @@ fn which_lab_it_is_stands_before_everything_else() {
     assert!(output_text.contains("error: not in the air after 1 s"), "{output_text}");
 
     // The same file, and the simulated lab all the same.
-    let mut flight = desk.fly(
+    let mut flight = student.fly(
         Path::new("avoid"),
         &["--config", text(&config), "--sim", "--scene", "room", "--seconds", "2"],
     );
     assert!(flight.wait_for("lab ", AIRBORNE).contains("simulated"));
     flight.wait_for("plugin flies", AIRBORNE);
     assert_eq!(flight.wait(FLIGHT), Some(0), "{:#?}", flight.seen);
-    assert_eq!(desk.report()["outcome"], "landed");
+    assert_eq!(student.report()["outcome"], "landed");
 }
 
 #[test]
 fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
-    let desk = Desk::new();
+    let student = StudentFolder::new();
     // A program that can be saved: the built-in example, under a name of its own.
     let save = |version: &str| {
         let text =
             format!("#!/bin/sh\n# {version}\nexec {} plugin avoid \"$@\"\n", text(&vizflyt()));
-        let path = desk.write("mine", &text);
+        let path = student.write("mine", &text);
         std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o755))
             .unwrap();
         path
     };
     let plugin = save("one");
-    let mut flight = desk.fly(&plugin, &["--watch", "--scene", "room", "--seconds", "20"]);
+    let mut flight = student.fly(&plugin, &["--watch", "--scene", "room", "--seconds", "20"]);
     flight.wait_for("plugin flies", AIRBORNE);
     let before = flight.descendants("plugin avoid");
     save("number two");
@@ -164,65 +164,66 @@ fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
     assert_eq!((before.len(), after.len()), (1, 1), "one plugin at a time");
     assert_ne!(before, after, "another process flies");
     assert_eq!(flight.wait(FLIGHT), Some(0), "{:#?}", flight.seen);
-    let report = desk.report();
+    let report = student.report();
     assert!(report["outcome"] == "landed" || report["outcome"] == "finished", "{report:#}");
 }
 
 #[test]
 fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
-    let desk = Desk::new();
-    assert!(desk.run(&["new", "first", "--lang", "python"]).status.success());
+    let student = StudentFolder::new();
+    assert!(student.run(&["new", "first", "--lang", "python"]).status.success());
     for file in ["plugin.py", "test_plugin.py", "README.md", "vizflyt.toml", "requirements.txt"] {
-        let text = std::fs::read_to_string(desk.path("first").join(file)).unwrap();
+        let text = std::fs::read_to_string(student.path("first").join(file)).unwrap();
         assert!(!text.contains("{{"), "{file}: {text}");
     }
-    let required = std::fs::read_to_string(desk.path("first/requirements.txt")).unwrap();
+    let required = std::fs::read_to_string(student.path("first/requirements.txt")).unwrap();
     assert!(required.contains(text(&root().join("jetson/python").canonicalize().unwrap())));
     // A Python without the package: what is missing, and the command that brings it.
-    let python = desk.write(
+    let python = student.write(
         "first/.venv/bin/python3",
         "#!/bin/sh\necho \"ModuleNotFoundError: No module named 'vizflyt'\" >&2\nexit 1\n",
     );
     std::fs::set_permissions(&python, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     let parts = ["first/.venv/bin/python3 cannot import", "ModuleNotFoundError", "pip install"];
-    desk.check_refused(&["fly", "first"], &parts);
+    student.check_refused(&["fly", "first"], &parts);
 }
 
 #[test]
 fn mistakes_are_explained() {
-    let desk = Desk::new();
-    desk.check_refused(&["fly"], &["no plugin given", "[plugin]"]);
-    desk.check_refused(&["fly", "./none"], &["no plugin at ./none", "vizflyt new", "avoid"]);
-    desk.check_refused(&["fly", "none.py"], &["no plugin at none.py"]);
-    desk.write("notes.txt", "");
-    desk.check_refused(&["fly", "notes.txt"], &["chmod +x notes.txt"]);
-    desk.check_refused(
+    let student = StudentFolder::new();
+    student.check_refused(&["fly"], &["no plugin given", "[plugin]"]);
+    student.check_refused(&["fly", "./none"], &["no plugin at ./none", "vizflyt new", "avoid"]);
+    student.check_refused(&["fly", "none.py"], &["no plugin at none.py"]);
+    student.write("notes.txt", "");
+    student.check_refused(&["fly", "notes.txt"], &["chmod +x notes.txt"]);
+    student.check_refused(
         &["fly", "avoid", "--mavlink", "udpin:127.0.0.1:0"],
         &["--mavlink is for the real lab", "--server"],
     );
     let with_server = ["fly", "avoid", "--server", "127.0.0.1:9", "--scene", "race"];
-    desk.check_refused(&with_server, &["--scene", "simulated lab", "--sim"]);
-    desk.check_refused(&["fly", "avoid", "--scene", "forrest"], &["forrest", "forest, race"]);
-    desk.write("bad.toml", "[limits]\nmax_sped_mps = 2\n");
-    desk.check_refused(
+    student.check_refused(&with_server, &["--scene", "simulated lab", "--sim"]);
+    student.check_refused(&["fly", "avoid", "--scene", "forrest"], &["forrest", "forest, race"]);
+    student.write("bad.toml", "[limits]\nmax_sped_mps = 2\n");
+    student.check_refused(
         &["fly", "avoid", "--config", "bad.toml"],
         &["bad.toml: line 2", "did you mean 'max_speed_mps'"],
     );
-    desk.check_refused(&["fly", "avoid", "--config", "gone.toml"], &["gone.toml"]);
+    student.check_refused(&["fly", "avoid", "--config", "gone.toml"], &["gone.toml"]);
 
-    desk.check_refused(&["new", "2nd", "--lang", "rust"], &["'2nd' is no name"]);
-    desk.check_refused(&["new", "avoid", "--lang", "rust"], &["built-in"]);
-    desk.check_refused(&["new", "x", "--lang", "cobol"], &["cobol"]);
-    desk.check_refused(&["new", "x", "--lang", "rust", "--project", "p99"], &["no project 'p99'"]);
-    assert!(!desk.path("x").exists(), "nothing is left behind");
-    desk.write("full/file", "");
-    desk.check_refused(&["new", "full", "--lang", "python"], &["there already"]);
-    desk.write("projects/p99/arena.toml", "");
-    let made = desk.run(&["new", "x", "--lang", "rust", "--project", "p99"]);
+    student.check_refused(&["new", "2nd", "--lang", "rust"], &["'2nd' is no name"]);
+    student.check_refused(&["new", "avoid", "--lang", "rust"], &["built-in"]);
+    student.check_refused(&["new", "x", "--lang", "cobol"], &["cobol"]);
+    student
+        .check_refused(&["new", "x", "--lang", "rust", "--project", "p99"], &["no project 'p99'"]);
+    assert!(!student.path("x").exists(), "nothing is left behind");
+    student.write("full/file", "");
+    student.check_refused(&["new", "full", "--lang", "python"], &["there already"]);
+    student.write("projects/p99/arena.toml", "");
+    let made = student.run(&["new", "x", "--lang", "rust", "--project", "p99"]);
     assert!(made.status.success(), "{made:?}");
-    let lab = std::fs::read_to_string(desk.path("x/vizflyt.toml")).unwrap();
+    let lab = std::fs::read_to_string(student.path("x/vizflyt.toml")).unwrap();
     assert!(lab.contains("projects/p99"), "{lab}");
-    desk.write("y/Cargo.toml", "[package]\nname = \"y\"\nversion = \"0.1.0\"\n[workspace]\n");
-    desk.write("y/src/main.rs", "fn main() { not rust }");
-    desk.check_refused(&["fly", "y"], &["y does not build"]);
+    student.write("y/Cargo.toml", "[package]\nname = \"y\"\nversion = \"0.1.0\"\n[workspace]\n");
+    student.write("y/src/main.rs", "fn main() { not rust }");
+    student.check_refused(&["fly", "y"], &["y does not build"]);
 }

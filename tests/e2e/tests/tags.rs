@@ -9,7 +9,7 @@ use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::layout::TagLayout;
-use vizflyt_tags::synth::{Light, Placed, Renderer, Shot};
+use vizflyt_tags::synth::{Light, Placed, Renderer, SyntheticExposure};
 
 fn tags(folder: &Path, args: &[&str]) -> Output {
     let mut command = Command::new(vizflyt_e2e::vizflyt());
@@ -56,13 +56,17 @@ fn wobble(i: u32, rate: f64) -> f64 {
     (f64::from(i) * rate).sin()
 }
 
-fn shot<'a>(placed: &'a [Placed<'a>], world_from_cam: Pose<World, Cam>, seed: u32) -> Shot<'a> {
-    Shot {
+fn shot<'a>(
+    placed: &'a [Placed<'a>],
+    world_from_cam: Pose<World, Cam>,
+    seed: u32,
+) -> SyntheticExposure<'a> {
+    SyntheticExposure {
         blur_px: 0.6,
         noise: 2.5,
         seed: seed.into(),
         light: Light { vignette: 0.2, ..Light::default() },
-        ..Shot::still(placed, world_from_cam)
+        ..SyntheticExposure::still(placed, world_from_cam)
     }
 }
 

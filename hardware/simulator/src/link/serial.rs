@@ -35,7 +35,7 @@ pub struct SerialPort {
     baud: u32,
     line: Option<File>,
     /// Ours to keep open, so that a client that leaves does not hang up the line.
-    made: Option<Made>,
+    made: Option<PseudoTerminal>,
     waiting: Vec<u8>,
     /// Bytes that may leave now.
     allowance: f64,
@@ -47,13 +47,13 @@ pub struct SerialPort {
 }
 
 /// A pseudo-terminal made by us.
-struct Made {
+struct PseudoTerminal {
     _client: OwnedFd,
     link: PathBuf,
     target: PathBuf,
 }
 
-impl Drop for Made {
+impl Drop for PseudoTerminal {
     fn drop(&mut self) {
         // Only if it is still ours: another simulator may have taken the name over.
         if std::fs::read_link(&self.link).is_ok_and(|target| target == self.target) {
@@ -86,7 +86,7 @@ impl SerialPort {
         }
         std::os::unix::fs::symlink(&target, path)?;
         let mut port = Self::new(path, baud);
-        port.made = Some(Made { _client: ends.slave, link: path.to_owned(), target });
+        port.made = Some(PseudoTerminal { _client: ends.slave, link: path.to_owned(), target });
         port.line = Some(File::from(ends.master));
         Ok(port)
     }

@@ -42,7 +42,7 @@ use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
 use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, Subject, hex};
 use self::progress::Progress;
-use self::trial::{Delays, Flown, Trial};
+use self::trial::{Delays, Trial, TrialResult};
 use crate::fly::plugin::Plugin;
 use crate::terminal::{print_error, print_line, stop_flag};
 
@@ -336,7 +336,7 @@ fn run_of(
     delays: &Delays,
     seed: u64,
     variant: Variant,
-    flown: &Flown,
+    flown: &TrialResult,
 ) -> Run {
     let verdict = &flown.verdict;
     Run {

@@ -19,7 +19,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use glam::DVec3;
 use sha2::{Digest, Sha256};
-use vizflyt_arena::crash::{Asked, Flight as Record, Seen, ahead_m};
+use vizflyt_arena::crash::{ClearanceAhead, Flight as Record, TimedSetpoint, ahead_m};
 use vizflyt_arena::pose::{Measured, Predict};
 use vizflyt_arena::verdict::{Sample, Verdict, judge_ended};
 use vizflyt_arena::{ArenaConfig, Referee};
@@ -72,7 +72,7 @@ pub(crate) struct Trial<'a> {
 
 /// One image that the plugin was given, for the report.
 #[derive(Clone, Debug)]
-pub(crate) struct Shot {
+pub(crate) struct TrialImage {
     /// The instant that it shows.
     pub stamp: ServerTime,
     /// H x W x 3.
@@ -81,10 +81,10 @@ pub(crate) struct Shot {
     pub size_px: (u32, u32),
 }
 
-/// What a flight leaves behind.
+/// The result of a trial.
 #[derive(Clone, Debug)]
-pub(crate) struct Flown {
-    /// What it was worth.
+pub(crate) struct TrialResult {
+    /// The score.
     pub verdict: Verdict,
     /// Over all samples, setpoints, events and images.
     pub hash: [u8; 32],
@@ -92,12 +92,12 @@ pub(crate) struct Flown {
     pub events: Vec<Event>,
     /// Where it was, 200 a second.
     pub samples: Vec<Sample>,
-    /// What the plugin asked for.
-    pub asked: Vec<Asked>,
+    /// The plugin's setpoints.
+    pub asked: Vec<TimedSetpoint>,
     /// What was ahead in the images that it answered.
-    pub seen: Vec<Seen>,
+    pub seen: Vec<ClearanceAhead>,
     /// The newest images until the flight was decided.
-    pub shots: VecDeque<Shot>,
+    pub shots: VecDeque<TrialImage>,
     /// The last lines that the plugin printed.
     pub lines: VecDeque<String>,
     /// Images that the plugin answered.
@@ -106,7 +106,7 @@ pub(crate) struct Flown {
     pub virtual_s: f64,
 }
 
-impl Flown {
+impl TrialResult {
     /// Returns the record from which its probable cause is found.
     pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
         Record {
@@ -144,7 +144,7 @@ impl Trial<'_> {
     /// # Errors
     /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
     /// verdict.
-    pub(crate) fn fly(&self) -> Result<Option<Flown>> {
+    pub(crate) fn fly(&self) -> Result<Option<TrialResult>> {
         let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
         let mut flight = Flight::new(self, process)?;
         let result = flight.run();
@@ -208,10 +208,10 @@ struct Flight<'a> {
     hash: Sha256,
     events: Vec<Event>,
     samples: Vec<Sample>,
-    asked: Vec<Asked>,
-    seen: Vec<Seen>,
+    asked: Vec<TimedSetpoint>,
+    seen: Vec<ClearanceAhead>,
     scratch: Vec<u16>,
-    shots: VecDeque<Shot>,
+    shots: VecDeque<TrialImage>,
     lines: VecDeque<String>,
     answered: u64,
     /// How it ends, by all that happened so far.
@@ -435,8 +435,8 @@ impl<'a> Flight<'a> {
         let k = self.cameras.first().map(|camera| camera.intrinsics);
         let ahead_m = front.and_then(|picture| picture.ahead_m);
         let stamp = self.server_now();
-        self.asked.push(Asked { stamp, setpoint });
-        self.seen.push(Seen { stamp, ahead_m });
+        self.asked.push(TimedSetpoint { stamp, setpoint });
+        self.seen.push(ClearanceAhead { stamp, ahead_m });
         let (Some(picture), Some(k)) = (front, k) else { return };
         let is_due = self.shots.back().is_none_or(|shot| {
             pending.shown.seconds_since(shot.stamp) >= SHOT_PERIOD_S - 0.5 * 2.5e-3
@@ -444,7 +444,7 @@ impl<'a> Flight<'a> {
         if is_due {
             let size_px = (k.width_px, k.height_px);
             let rgb = picture.rgb.clone();
-            self.shots.push_back(Shot { stamp: pending.shown, rgb, size_px });
+            self.shots.push_back(TrialImage { stamp: pending.shown, rgb, size_px });
             while self.shots.front().is_some_and(|oldest| {
                 pending.shown.seconds_since(oldest.stamp) > SHOWN_S + 0.5 * SHOT_PERIOD_S
             }) {
@@ -483,11 +483,11 @@ impl<'a> Flight<'a> {
         self.now.seconds_since(HostTime::from_ns(START_NS))
     }
 
-    fn end(mut self) -> Flown {
+    fn end(mut self) -> TrialResult {
         let virtual_s = self.virtual_s();
         // Server's and runtime's, each in order, become one story.
         self.events.sort_by_key(|event| event.stamp);
-        Flown {
+        TrialResult {
             verdict: judge_ended(self.arena, &self.end, &self.events, &self.samples),
             hash: self.hash.finalize().into(),
             events: self.events,

@@ -176,8 +176,8 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let result = show.fly(flight, &stage, &keys);
     show.end();
     match result? {
-        Flown::To { log } => Ok(Some(show.parts.join(seed, memory.peak_mb(), &log))),
-        Flown::Interrupted => {
+        LabEnd::To { log } => Ok(Some(show.parts.join(seed, memory.peak_mb(), &log))),
+        LabEnd::Interrupted => {
             if !flight.json {
                 print_line("ended on request");
             }
@@ -192,7 +192,7 @@ const READY_LIMIT: Duration = Duration::from_mins(2);
 const END_LIMIT: Duration = Duration::from_millis(1500);
 
 /// How the flight part ended.
-enum Flown {
+enum LabEnd {
     /// The runtime ended; the log is there.
     To { log: String },
     /// A person ended it.
@@ -212,7 +212,7 @@ struct Show {
 }
 
 impl Show {
-    fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<Flown> {
+    fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<LabEnd> {
         let lab = flight.lab;
         let page = format!("127.0.0.1:{}", lab.port);
         // The server would name an option of its own.
@@ -239,7 +239,7 @@ impl Show {
             self.log_level.clone(),
         ];
         let Some(server) = self.start(Role::Server, &serve)? else {
-            return Ok(Flown::Interrupted);
+            return Ok(LabEnd::Interrupted);
         };
         let url = text(&server, "http")?;
         if self.json {
@@ -277,7 +277,7 @@ impl Show {
             fly.extend(flight.plugin_arguments.iter().cloned());
         }
         let Some(runtime) = self.start(Role::Runtime, &fly)? else {
-            return Ok(Flown::Interrupted);
+            return Ok(LabEnd::Interrupted);
         };
 
         let mavlink = text(&runtime, "mavlink")?;
@@ -292,7 +292,7 @@ impl Show {
                 self.log_level.clone(),
             ];
             let Some(bridge) = self.start(Role::Bridge, &bridge)? else {
-                return Ok(Flown::Interrupted);
+                return Ok(LabEnd::Interrupted);
             };
             format!("--serial={}", text(&bridge, "uart")?)
         } else {
@@ -304,7 +304,7 @@ impl Show {
             let mut tags = Localization::of_tags(poses);
             tags.push(self.log_level.clone());
             let Some(tags) = self.start(Role::Tags, &tags)? else {
-                return Ok(Flown::Interrupted);
+                return Ok(LabEnd::Interrupted);
             };
             if !self.json {
                 print_line(format!("tags        {}", text(&tags, "http")?));
@@ -328,12 +328,12 @@ impl Show {
             sim.push(truth.clone().into());
         }
         if self.start(Role::Simulator, &sim)?.is_none() {
-            return Ok(Flown::Interrupted);
+            return Ok(LabEnd::Interrupted);
         }
         if self.watch() {
-            Ok(Flown::To { log: text(&runtime, "log").unwrap_or_default() })
+            Ok(LabEnd::To { log: text(&runtime, "log").unwrap_or_default() })
         } else {
-            Ok(Flown::Interrupted)
+            Ok(LabEnd::Interrupted)
         }
     }
 

@@ -74,7 +74,7 @@ enum FileFormat {
 /// Runs `vizflyt scene render`.
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
     // Cameras first: a mistake in one is reported before the scene is loaded.
-    let shots = shots(args)?;
+    let jobs = jobs(args)?;
     let (scene, loaded) = load_as_it_is(&args.scene)?;
     let environment = args.environment.environment();
     if environment.fog_visibility_m > 0.0 && !is_in_an_arena(&args.scene) {
@@ -100,7 +100,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     print_fmt!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
     let atmosphere = atmosphere(&environment);
-    for Shot { camera, folder } in shots {
+    for RenderJob { camera, folder } in jobs {
         let camera = Camera { atmosphere, ..camera };
         let times = rasterizer.render(&placements, &[camera], &mut images)?;
         let [image] = &images;
@@ -130,28 +130,28 @@ fn seconds(text: &str) -> Result<f64, String> {
     good.then_some(value).ok_or_else(|| format!("{value} s is beyond any flight"))
 }
 
-struct Shot {
+struct RenderJob {
     camera: Camera,
     folder: PathBuf,
 }
 
-fn shots(args: &RenderArgs) -> Result<Vec<Shot>> {
-    let mut shots: Vec<Shot> = Vec::new();
+fn jobs(args: &RenderArgs) -> Result<Vec<RenderJob>> {
+    let mut jobs: Vec<RenderJob> = Vec::new();
     for path in &args.cameras {
         let camera = camera::read(path)?;
         let folder = match &args.cameras[..] {
             [_] => args.out.clone(),
             _ => args.out.join(path.file_stem().unwrap_or(path.as_os_str())),
         };
-        if shots.iter().any(|shot| shot.folder == folder) {
+        if jobs.iter().any(|job| job.folder == folder) {
             bail!(
                 "two cameras would write to {}; give their files different names",
                 folder.display()
             );
         }
-        shots.push(Shot { camera, folder });
+        jobs.push(RenderJob { camera, folder });
     }
-    Ok(shots)
+    Ok(jobs)
 }
 
 fn write_png(image: &RgbdImage, folder: &Path) -> Result<()> {

@@ -20,7 +20,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, StampedImage, Unlocated};
 
-use self::sources::{Shot, Sources};
+use self::sources::{CameraImage, Sources};
 use self::view::LiveView;
 use crate::terminal::{print_line, stop_flag};
 
@@ -102,7 +102,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let mut locator = Locator::new(setup.cameras.clone(), &setup.layouts, setup.settings.clone())?;
     let live = args.http.map(|address| LiveView::serve(address, &setup.cameras)).transpose()?;
     let view_port = live.as_ref().map(|live| live.address().port());
-    let outlet = PoseSender::open(&args.to, &setup.object, view_port)?;
+    let sender = PoseSender::open(&args.to, &setup.object, view_port)?;
     let mut sources = Sources::open(&setup, args.truth, &stop)?;
     let page = live.as_ref().map(|live| format!("http://{}", live.address()));
     let names: Vec<&str> = setup.cameras.iter().map(|camera| camera.name.as_str()).collect();
@@ -141,7 +141,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
             let outcome = locator.handle_images(&views);
             let image_ms = begun.elapsed().as_secs_f64() * 1e3 / views.len() as f64;
             if let Ok(located) = &outcome.located {
-                let sent = outlet.send(located, image_ms, sources.is_live());
+                let sent = sender.send(located, image_ms, sources.is_live());
                 if args.poses {
                     print_line(sent);
                 }
@@ -178,7 +178,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
 
 /// Cuts shots, which are in the order of their stamps, where their stamps are apart or a camera comes
 /// again.
-fn together(shots: &[Shot]) -> impl Iterator<Item = &[Shot]> {
+fn together(shots: &[CameraImage]) -> impl Iterator<Item = &[CameraImage]> {
     let mut rest = shots;
     std::iter::from_fn(move || {
         let first = rest.first()?;
@@ -389,14 +389,15 @@ mod tests {
 
     #[test]
     fn shots_are_cut_where_they_are_apart_and_where_a_camera_comes_again() {
-        let shot = |camera, ms: u64| Shot {
+        let shot = |camera, ms: u64| CameraImage {
             camera,
             stamp: HostTime::from_ns(ms * 1_000_000),
             image: Gray::plain(1, 1, 0),
         };
         let check = |cameras: &[(usize, u64)], expected: &[usize]| {
-            let shots: Vec<Shot> = cameras.iter().map(|&(camera, ms)| shot(camera, ms)).collect();
-            let sizes: Vec<usize> = together(&shots).map(<[Shot]>::len).collect();
+            let shots: Vec<CameraImage> =
+                cameras.iter().map(|&(camera, ms)| shot(camera, ms)).collect();
+            let sizes: Vec<usize> = together(&shots).map(<[CameraImage]>::len).collect();
             assert_eq!(sizes, expected, "{cameras:?}");
         };
         check(&[], &[]);

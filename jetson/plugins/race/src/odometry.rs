@@ -51,7 +51,7 @@ struct Cell {
 
 /// The result of aligning an image with the key image.
 #[derive(Clone, Copy, Debug)]
-struct Found {
+struct Alignment {
     p_m: DVec3,
     turn_rad: DVec3,
     /// Share of the image's samples that met the key.
@@ -123,7 +123,7 @@ impl Odometry {
         };
         self.turn_rad *= STEADY;
         grid.turn(DQuat::from_scaled_axis(self.turn_rad));
-        let Found { mut p_m, turn_rad, overlap } = key.locate(expected_m, grid);
+        let Alignment { mut p_m, turn_rad, overlap } = key.locate(expected_m, grid);
         grid.turn(DQuat::from_scaled_axis(turn_rad));
         self.turn_rad = (self.turn_rad + turn_rad).clamp_length_max(MAX_TURN_RAD);
         p_m.z -= floor_error_m(grid, p_m.z);
@@ -176,7 +176,7 @@ impl Key {
     }
 
     /// Returns where a camera with this grid is, near `expected_m`. [m, home]
-    fn locate(&self, expected_m: DVec3, grid: &PixelGrid) -> Found {
+    fn locate(&self, expected_m: DVec3, grid: &PixelGrid) -> Alignment {
         let (mut p_m, mut turn_rad, mut overlap) = (expected_m, DVec3::ZERO, 0.0);
         for round in 0..ROUNDS {
             let gate_m = GATE_M / f64::from(1 << round.min(2));
@@ -223,7 +223,7 @@ impl Key {
             }
             overlap = f64::from(met) / self.surfaces.max(1) as f64;
             let Some(x) = sums.solve() else {
-                return Found { p_m: expected_m, turn_rad: DVec3::ZERO, overlap: 0.0 };
+                return Alignment { p_m: expected_m, turn_rad: DVec3::ZERO, overlap: 0.0 };
             };
             let move_m = DVec3::new(x[0], x[1], x[2]);
             p_m += move_m;
@@ -232,7 +232,7 @@ impl Key {
                 break;
             }
         }
-        Found { p_m, turn_rad, overlap }
+        Alignment { p_m, turn_rad, overlap }
     }
 
     /// Returns the cell that a point [m, home axes, from the key's camera] is seen in, and where in

@@ -110,7 +110,7 @@ pub struct Control {
 
 /// The results of a flight.
 #[derive(Debug)]
-pub struct Flown {
+pub struct FlightResult {
     /// How it ended.
     pub outcome: EndReason,
     /// The images.
@@ -145,7 +145,11 @@ struct ControlLoop {
 
 impl Control {
     /// Flies to the end. Call it on a thread that lives as long: the plugin dies with it.
-    pub fn run(self, sender: SyncSender<ControlInput>, inputs: &Receiver<ControlInput>) -> Flown {
+    pub fn run(
+        self,
+        sender: SyncSender<ControlInput>,
+        inputs: &Receiver<ControlInput>,
+    ) -> FlightResult {
         let mut state = ControlLoop::new(host_now(), self, sender);
         let outcome = loop {
             let wait_s = state.companion.poll_timeout().seconds_since(host_now()).max(0.0);
@@ -409,7 +413,7 @@ impl ControlLoop {
         now: HostTime,
         outcome: EndReason,
         inputs: &Receiver<ControlInput>,
-    ) -> Flown {
+    ) -> FlightResult {
         self.report(now);
         self.report_timing(now);
         self.pass_on(now);
@@ -445,6 +449,6 @@ impl ControlLoop {
             clock,
             cameras: self.times.arrivals(&arrived).to_vec(),
         };
-        Flown { outcome, times: self.times, counters, log: self.control.log }
+        FlightResult { outcome, times: self.times, counters, log: self.control.log }
     }
 }

@@ -66,14 +66,14 @@ const WINDOW: usize = 8;
 const MAX_PARAMS: usize = 4096;
 
 #[derive(Clone, Debug)]
-enum Wanted {
+enum ParamKey {
     Index(u16),
     Name(String),
 }
 
 #[derive(Clone, Debug)]
 struct PendingRead {
-    wanted: Wanted,
+    key: ParamKey,
     tries: u8,
     due_at: HostTime,
 }
@@ -99,7 +99,7 @@ struct List {
 pub(super) struct Params {
     known: BTreeMap<String, Param>,
     list: Option<List>,
-    queue: VecDeque<Wanted>,
+    queue: VecDeque<ParamKey>,
     asked: Vec<PendingRead>,
     writes: VecDeque<(String, f64)>,
     writing: Option<Writing>,
@@ -128,7 +128,7 @@ impl Params {
 
     /// Reads some by name.
     pub(super) fn read(&mut self, names: &[&str]) {
-        self.queue.extend(names.iter().map(|&name| Wanted::Name(name.to_owned())));
+        self.queue.extend(names.iter().map(|&name| ParamKey::Name(name.to_owned())));
         self.open = true;
     }
 
@@ -158,9 +158,9 @@ impl Params {
         let param = Param { value, kind: message.param_type };
         self.known.insert(name.clone(), param);
         self.note(now, message.param_index, message.param_count);
-        self.asked.retain(|asked| match &asked.wanted {
-            Wanted::Name(wanted) => *wanted != name,
-            Wanted::Index(index) => *index != message.param_index,
+        self.asked.retain(|asked| match &asked.key {
+            ParamKey::Name(key) => *key != name,
+            ParamKey::Index(index) => *index != message.param_index,
         });
         let writing = self.writing.as_mut().filter(|writing| writing.name == name)?;
         if same(value, writing.value) {
@@ -226,7 +226,7 @@ impl Params {
         }
         // The holes one by one.
         let holes = list.got.iter().enumerate().filter(|(_, got)| !**got);
-        self.queue.extend(holes.map(|(index, _)| Wanted::Index(index as u16)));
+        self.queue.extend(holes.map(|(index, _)| ParamKey::Index(index as u16)));
         if list.got.is_empty() {
             self.lost += 1;
         }
@@ -243,24 +243,24 @@ impl Params {
                 return true;
             }
             if asked.tries >= TRIES {
-                match &asked.wanted {
-                    Wanted::Name(name) => missing.push(name.clone()),
-                    Wanted::Index(_) => lost += 1,
+                match &asked.key {
+                    ParamKey::Name(name) => missing.push(name.clone()),
+                    ParamKey::Index(_) => lost += 1,
                 }
                 return false;
             }
             asked.tries += 1;
             asked.due_at = now.plus_seconds(REPEAT_S);
-            send(request(&asked.wanted));
+            send(request(&asked.key));
             true
         });
         self.missing.append(&mut missing);
         self.lost += lost;
         while self.asked.len() < WINDOW
-            && let Some(wanted) = self.queue.pop_front()
+            && let Some(key) = self.queue.pop_front()
         {
-            send(request(&wanted));
-            self.asked.push(PendingRead { wanted, tries: 1, due_at: now.plus_seconds(REPEAT_S) });
+            send(request(&key));
+            self.asked.push(PendingRead { key, tries: 1, due_at: now.plus_seconds(REPEAT_S) });
         }
     }
 
@@ -293,10 +293,10 @@ impl Params {
     }
 }
 
-fn request(wanted: &Wanted) -> Request {
-    match wanted {
-        Wanted::Index(index) => Request::ByIndex(*index),
-        Wanted::Name(name) => Request::ByName(name.clone()),
+fn request(key: &ParamKey) -> Request {
+    match key {
+        ParamKey::Index(index) => Request::ByIndex(*index),
+        ParamKey::Name(name) => Request::ByName(name.clone()),
     }
 }
 
@@ -321,7 +321,7 @@ mod tests {
     };
 
     /// An autopilot with 40 parameters on a line that loses every `loses`-th answer.
-    struct Line {
+    struct LossyLink {
         params: Params,
         now: HostTime,
         values: Vec<(String, f32)>,
@@ -331,7 +331,7 @@ mod tests {
         events: Vec<ParamEvent>,
     }
 
-    impl Line {
+    impl LossyLink {
         fn new(loses: usize) -> Self {
             let name = |(i, n): (usize, &&str)| (format!("{n}_{i}"), i as f32);
             let values = NAMES.iter().enumerate().map(name).collect();
@@ -392,7 +392,7 @@ mod tests {
     #[test]
     fn list_is_read_completely_despite_loss() {
         for loses in [0, 2, 3, 7] {
-            let mut line = Line::new(loses);
+            let mut line = LossyLink::new(loses);
             line.params.read_all(line.now);
             line.run(20.0);
             assert_eq!(line.events, [ParamEvent::Read { missing: vec![], lost: 0 }], "{loses}");
@@ -403,7 +403,7 @@ mod tests {
 
     #[test]
     fn reports_names_that_do_not_exist() {
-        let mut line = Line::new(2);
+        let mut line = LossyLink::new(2);
         line.params.read(&["A_0", "NO_SUCH", "C_2"]);
         line.run(5.0);
         let missing = vec!["NO_SUCH".to_owned()];
@@ -413,7 +413,7 @@ mod tests {
 
     #[test]
     fn silence_ends_a_read() {
-        let mut line = Line::new(1);
+        let mut line = LossyLink::new(1);
         line.params.read_all(line.now);
         line.run(30.0);
         assert_eq!(line.events, [ParamEvent::Read { missing: vec![], lost: 1 }]);
@@ -421,7 +421,7 @@ mod tests {
 
     #[test]
     fn value_is_written_when_the_autopilot_confirms_it() {
-        let mut line = Line::new(2);
+        let mut line = LossyLink::new(2);
         line.params.write("B_1", 0.3);
         line.params.write("C_2", 500.0);
         line.params.write("NO_SUCH", 1.0);

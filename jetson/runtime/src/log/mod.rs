@@ -54,7 +54,7 @@ pub use self::queue::{Dropped, LoggedImage};
 use self::queue::{ObservationRecord, Queue, Record};
 pub use self::read::read_timing;
 pub use self::retention::Retention;
-use self::writer::{LogWriter, Outlet};
+use self::writer::{LogSinks, LogWriter};
 use crate::stream::Mailbox;
 
 /// How much a line matters, as foxglove.Log has it.
@@ -148,10 +148,10 @@ impl FlightLog {
         images: LoggedImages,
     ) -> mcap::McapResult<(Arc<Queue>, JoinHandle<()>)> {
         let budget = (images == LoggedImages::Reduced).then(Budget::default);
-        let outlet = Outlet::new(disk, live, budget)?;
+        let sinks = LogSinks::new(disk, live, budget)?;
         let (queue, records) = Queue::new();
         let free_bytes = move || probe.as_ref().and_then(file::free_bytes);
-        let writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(free_bytes));
+        let writer = LogWriter::new(sinks, Arc::clone(&queue), Box::new(free_bytes));
         let handle =
             thread::Builder::new().name("flight-log".into()).spawn(move || writer.run(&records))?;
         Ok((queue, handle))

@@ -228,8 +228,8 @@ impl Disk for Counting {
 /// and all that is logged beside them.
 fn minute_mb(budget: Option<Budget>) -> f64 {
     let disk = Counting::default();
-    let outlet = Outlet::new(Some(disk.clone()), None, budget).unwrap();
-    let mut writer = LogWriter::new(outlet, Queue::new().0, Box::new(|| None));
+    let sinks = LogSinks::new(Some(disk.clone()), None, budget).unwrap();
+    let mut writer = LogWriter::new(sinks, Queue::new().0, Box::new(|| None));
     let sample = PoseSample::still(ServerTime::ZERO, Pose::IDENTITY);
     for tick in 0..3600 {
         let at = HostTime::from_ns(tick * 1_000_000_000 / 60);
@@ -248,7 +248,7 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
         writer.take(Record::Observation(Box::new(record))).unwrap();
         if tick % 60 == 59 {
             writer.check_health().unwrap();
-            writer.outlet.flush().unwrap();
+            writer.sinks.flush().unwrap();
         }
     }
     disk.0.load(Ordering::Relaxed) as f64 / 1e6
@@ -335,7 +335,7 @@ impl Disk for Failing {
 #[test]
 fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     let (queue, records) = Queue::of(64);
-    let outlet = Outlet::new(Some(Failing(100_000)), None, None).unwrap();
+    let sinks = LogSinks::new(Some(Failing(100_000)), None, None).unwrap();
     let home = Arc::new(Mailbox::default());
     // More than the disk holds, of which a chunk is made at once.
     let big = "x".repeat(5 << 20).into_bytes();
@@ -345,7 +345,7 @@ fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     let record = ObservationRecord { at, seq: 1, head, images, home: Arc::clone(&home) };
     queue.push(Record::Observation(Box::new(record)));
     queue.end();
-    LogWriter::new(outlet, Arc::clone(&queue), Box::new(|| None)).run(&records);
+    LogWriter::new(sinks, Arc::clone(&queue), Box::new(|| None)).run(&records);
     let trouble = queue.poll_trouble().unwrap();
     assert!(trouble.contains("not logged any further"), "{trouble}");
     assert_eq!(queue.poll_trouble(), None, "once");
@@ -358,8 +358,8 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     let path = folder.path().join("log.mcap");
     let (queue, records) = Queue::of(64);
     let disk = RealFile::new(File::create(&path).unwrap()).unwrap();
-    let outlet = Outlet::new(Some(disk), None, None).unwrap();
-    let mut writer = LogWriter::new(outlet, Arc::clone(&queue), Box::new(|| Some(1 << 20)));
+    let sinks = LogSinks::new(Some(disk), None, None).unwrap();
+    let mut writer = LogWriter::new(sinks, Arc::clone(&queue), Box::new(|| Some(1 << 20)));
     writer.check_health().unwrap();
     let trouble = queue.poll_trouble().unwrap();
     assert!(trouble.contains("no longer logged: only 1 MB"), "{trouble}");

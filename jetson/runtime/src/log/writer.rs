@@ -41,8 +41,8 @@ const ENOUGH_FREE: u64 = 512 << 20;
 /// A camera's calibration is written this often, for viewers that connect later.
 const CALIBRATION_PERIOD_NS: u64 = 1_000_000_000;
 
-/// Where messages go.
-pub(super) struct Outlet<D: Disk> {
+/// The sinks of messages: the file and the live viewers.
+pub(super) struct LogSinks<D: Disk> {
     file: Option<Writer<SafeFile<D>>>,
     live: Option<Live>,
     ids: BTreeMap<Channel, u16>,
@@ -54,7 +54,7 @@ pub(super) struct Outlet<D: Disk> {
     budget: Option<Budget>,
 }
 
-impl<D: Disk> Outlet<D> {
+impl<D: Disk> LogSinks<D> {
     /// Begins a file, if there is one, with all fixed channels.
     pub(super) fn new(
         disk: Option<D>,
@@ -74,13 +74,12 @@ impl<D: Disk> Outlet<D> {
         });
         let ids = BTreeMap::new();
         let file = file.transpose()?;
-        let mut outlet =
-            Self { file, live, ids, sequence: 0, waiting: 0, written_bytes: 0, budget };
+        let mut sinks = Self { file, live, ids, sequence: 0, waiting: 0, written_bytes: 0, budget };
         for channel in Channel::FIXED {
-            outlet.offer(channel, "")?;
+            sinks.offer(channel, "")?;
         }
-        outlet.flush()?;
-        Ok(outlet)
+        sinks.flush()?;
+        Ok(sinks)
     }
 
     fn offer(&mut self, channel: Channel, camera: &str) -> McapResult<()> {
@@ -172,9 +171,9 @@ impl<D: Disk> Outlet<D> {
 /// Name of the metadata record that identifies the flight.
 pub(super) const FLIGHT: &str = "vizflyt.flight";
 
-/// What the thread keeps besides the outlet.
+/// The thread's state besides the sinks.
 pub(super) struct LogWriter<D: Disk> {
-    pub(super) outlet: Outlet<D>,
+    pub(super) sinks: LogSinks<D>,
     queue: Arc<Queue>,
     /// From this computer's clock to time since 1970. [ns]
     offset_ns: u64,
@@ -191,7 +190,7 @@ pub(super) struct LogWriter<D: Disk> {
 impl<D: Disk> LogWriter<D> {
     /// `free_bytes` returns the free space on the disk, if it is known.
     pub(super) fn new(
-        outlet: Outlet<D>,
+        sinks: LogSinks<D>,
         queue: Arc<Queue>,
         free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
     ) -> Self {
@@ -199,7 +198,7 @@ impl<D: Disk> LogWriter<D> {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH);
         let wall_ns = wall.map_or(0, |since| since.as_nanos() as u64);
         Self {
-            outlet,
+            sinks,
             queue,
             offset_ns: wall_ns.wrapping_sub(host_now().as_ns()),
             free_bytes,
@@ -223,14 +222,14 @@ impl<D: Disk> LogWriter<D> {
             };
             let is_due = flushed.elapsed() >= CHUNK_PERIOD;
             let result = result.and_then(|()| {
-                if !is_due && self.outlet.waiting < CHUNK_BYTES {
+                if !is_due && self.sinks.waiting < CHUNK_BYTES {
                     return Ok(());
                 }
                 if is_due {
                     flushed = Instant::now();
                     self.check_health()?;
                 }
-                self.outlet.flush()
+                self.sinks.flush()
             });
             if let Err(error) = result {
                 self.fail(&error);
@@ -239,17 +238,17 @@ impl<D: Disk> LogWriter<D> {
         let (queue, offset_ns) = (Arc::clone(&self.queue), self.offset_ns);
         let result = self.status("the flight is over");
         tracing::debug!("flight log: closed at {} ns", offset_ns.wrapping_add(host_now().as_ns()));
-        if let Err(error) = result.and_then(|()| self.outlet.finish()) {
+        if let Err(error) = result.and_then(|()| self.sinks.finish()) {
             queue.complain(format!("it could not be completed: {error}"));
         }
     }
 
     fn fail(&mut self, error: &mcap::McapError) {
-        if self.outlet.file.is_none() {
+        if self.sinks.file.is_none() {
             return;
         }
-        self.outlet.abandon();
-        let megabytes = self.outlet.written_bytes as f64 / 1e6;
+        self.sinks.abandon();
+        let megabytes = self.sinks.written_bytes as f64 / 1e6;
         self.queue.complain(format!(
             "the flight is not logged any further: {error}; the first {megabytes:.1} MB are a whole \
              file"
@@ -258,7 +257,7 @@ impl<D: Disk> LogWriter<D> {
 
     /// Checks the free disk space and reports drops, once a second.
     pub(super) fn check_health(&mut self) -> McapResult<()> {
-        let free = if self.outlet.file.is_some() { (self.free_bytes)() } else { None };
+        let free = if self.sinks.file.is_some() { (self.free_bytes)() } else { None };
         let fit = images_fit(self.images_fit, free);
         if fit != self.images_fit {
             self.images_fit = fit;
@@ -291,12 +290,12 @@ impl<D: Disk> LogWriter<D> {
     fn status(&mut self, text: &str) -> McapResult<()> {
         let Dropped { images, records } = self.queue.dropped();
         let status = json!({
-            "written_bytes": self.outlet.written_bytes, "dropped_images": images,
+            "written_bytes": self.sinks.written_bytes, "dropped_images": images,
             "dropped_records": records, "left_out_images": self.left_out,
             "free_bytes": (self.free_bytes)(), "text": text
         });
         let at_ns = self.wall_ns(host_now());
-        self.outlet.put(Channel::Log, "", at_ns, status.to_string().as_bytes())
+        self.sinks.put(Channel::Log, "", at_ns, status.to_string().as_bytes())
     }
 
     fn wall_ns(&self, at: HostTime) -> u64 {
@@ -306,7 +305,7 @@ impl<D: Disk> LogWriter<D> {
     pub(super) fn take(&mut self, record: Record) -> McapResult<()> {
         match record {
             Record::Json { channel, at, json } => {
-                self.outlet.put(channel, "", self.wall_ns(at), &json)
+                self.sinks.put(channel, "", self.wall_ns(at), &json)
             }
             Record::Pose { at, stamp, sample } => self.pose(at, stamp, &sample),
             Record::Text { channel, at, level, name, text } => {
@@ -318,13 +317,13 @@ impl<D: Disk> LogWriter<D> {
                     name,
                     ..fox::Log::default()
                 };
-                self.outlet.put(channel, "", at_ns, &log.encode_to_vec())
+                self.sinks.put(channel, "", at_ns, &log.encode_to_vec())
             }
             Record::Plugin { at, is_to_plugin, body } => {
                 let protocol = PROTOCOL_VERSION.into();
                 let at_ns = at.as_ns();
                 let message = PluginMessage { is_to_plugin, protocol, body, at_ns };
-                self.outlet.put(Channel::Plugin, "", self.wall_ns(at), &message.encode_to_vec())
+                self.sinks.put(Channel::Plugin, "", self.wall_ns(at), &message.encode_to_vec())
             }
             Record::Observation(record) => {
                 self.queue.taken(record.len());
@@ -334,9 +333,9 @@ impl<D: Disk> LogWriter<D> {
             }
             Record::Flight(values) => {
                 let own = |(name, value): (&str, String)| (name.to_owned(), value);
-                let images = if self.outlet.budget.is_some() { "reduced" } else { "full" };
+                let images = if self.sinks.budget.is_some() { "reduced" } else { "full" };
                 let values = values.into_iter().chain([("images", images.to_owned())]);
-                self.outlet.metadata(values.map(own).collect())
+                self.sinks.metadata(values.map(own).collect())
             }
             Record::End => Ok(()),
         }
@@ -351,22 +350,22 @@ impl<D: Disk> LogWriter<D> {
             frame_id: WORLD.into(),
             pose: Some(fox::Pose { position: Some(position), orientation: Some(orientation) }),
         };
-        self.outlet.put(Channel::Pose, "", at_ns, &pose.encode_to_vec())?;
+        self.sinks.put(Channel::Pose, "", at_ns, &pose.encode_to_vec())?;
         let transform = transform(at_ns, WORLD, BODY, world_from_body);
-        self.outlet.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())?;
+        self.sinks.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())?;
         let motion = json!({
             "stamp_ns": stamp.as_ns(),
             "v_world_mps": twist.linear_mps.to_array(),
             "omega_body_radps": twist.angular_radps.to_array(),
             "age_ms": at.seconds_since(stamp) * 1e3
         });
-        self.outlet.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())
+        self.sinks.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())
     }
 
     fn observation(&mut self, record: &ObservationRecord) -> McapResult<()> {
         let at_ns = self.wall_ns(record.at);
         let is_kept =
-            self.outlet.budget.as_mut().is_none_or(|budget| budget.allows_image(record.at));
+            self.sinks.budget.as_mut().is_none_or(|budget| budget.allows_image(record.at));
         let mut images = Vec::new();
         if is_kept {
             for image in &record.images {
@@ -383,19 +382,19 @@ impl<D: Disk> LogWriter<D> {
             head: record.head.clone(),
             images,
         };
-        self.outlet.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
+        self.sinks.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
     }
 
     /// Shows images that are not written to viewers.
     fn show_images(&mut self, at_ns: u64, images: &[LoggedImage]) -> McapResult<()> {
-        if self.outlet.live.is_none() {
+        if self.sinks.live.is_none() {
             return Ok(());
         }
         for image in images {
             self.calibration(at_ns, image)?;
             if let Some(color) = self.color(image) {
                 let channel = Channel::Color(image.camera as u8);
-                self.outlet.show(channel, &image.name, at_ns, &color)?;
+                self.sinks.show(channel, &image.name, at_ns, &color)?;
             }
         }
         Ok(())
@@ -409,7 +408,7 @@ impl<D: Disk> LogWriter<D> {
         let bitstream = match color {
             Some(color) => {
                 let channel = Channel::Color(image.camera as u8);
-                self.outlet.put(channel, &image.name, at_ns, &color)?;
+                self.sinks.put(channel, &image.name, at_ns, &color)?;
                 self.rest.clone()
             }
             None => image.pieces.concat(),
@@ -458,9 +457,9 @@ impl<D: Disk> LogWriter<D> {
         }
         self.calibrations.insert(image.camera, (key, at_ns));
         let channel = Channel::Calibration(image.camera as u8);
-        self.outlet.put(channel, &image.name, at_ns, &calibration.encode_to_vec())?;
+        self.sinks.put(channel, &image.name, at_ns, &calibration.encode_to_vec())?;
         let transform = transform(at_ns, BODY, &image.name, &body_from_cam);
-        self.outlet.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())
+        self.sinks.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())
     }
 }
 

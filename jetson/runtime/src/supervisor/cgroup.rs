@@ -40,11 +40,11 @@ impl Controller {
 /// The plugin's groups: one in version 2, up to three in version 1. Removed when dropped.
 #[derive(Debug, Default)]
 pub(super) struct Cgroup {
-    parts: Vec<Part>,
+    parts: Vec<GroupFolder>,
 }
 
 #[derive(Debug)]
-struct Part {
+struct GroupFolder {
     folder: PathBuf,
     version: u8,
     limits: Vec<Controller>,
@@ -62,16 +62,16 @@ impl Cgroup {
     pub(super) fn make(limits: &PluginLimits) -> Self {
         let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
         let own = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-        let places = places(&mounts, &own);
+        let hierarchies = hierarchies(&mounts, &own);
         let mut group = Self::default();
-        for place in &places {
+        for place in &hierarchies {
             let missing: Vec<_> =
                 place.offers.iter().copied().filter(|&c| !group.limits(c)).collect();
             // A group of version 2 is of use even without controllers: it knows its processes.
             if missing.is_empty() && (place.version == 1 || group.has_version_2()) {
                 continue;
             }
-            group.parts.extend(Part::make(place, &missing, limits));
+            group.parts.extend(GroupFolder::make(place, &missing, limits));
         }
         group
     }
@@ -106,7 +106,7 @@ impl Cgroup {
     fn events(
         &self,
         controller: Controller,
-        place: impl Fn(&Part) -> (&'static str, &'static str),
+        place: impl Fn(&GroupFolder) -> (&'static str, &'static str),
     ) -> bool {
         let part = self.parts.iter().find(|part| part.limits.contains(&controller));
         part.is_some_and(|part| {
@@ -153,9 +153,9 @@ impl Drop for Cgroup {
     }
 }
 
-impl Part {
+impl GroupFolder {
     /// Makes a group at the nearest place above us where it can be made and used.
-    fn make(place: &Place, wanted: &[Controller], limits: &PluginLimits) -> Option<Self> {
+    fn make(place: &Hierarchy, wanted: &[Controller], limits: &PluginLimits) -> Option<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let name = format!("{NAME}{}-{count}", std::process::id());
@@ -247,7 +247,7 @@ fn remove_left_behind(parent: &Path) {
 
 /// A hierarchy and where we are in it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Place {
+struct Hierarchy {
     root: PathBuf,
     own: String,
     version: u8,
@@ -256,8 +256,8 @@ struct Place {
 
 /// Returns the hierarchies of `/proc/self/mountinfo` (proc_pid_mountinfo(5)) and this process's
 /// place in each by `/proc/self/cgroup` (cgroups(7)), version 2 first.
-fn places(mounts: &str, own: &str) -> Vec<Place> {
-    let mut places: Vec<Place> = mounts
+fn hierarchies(mounts: &str, own: &str) -> Vec<Hierarchy> {
+    let mut hierarchies: Vec<Hierarchy> = mounts
         .lines()
         .filter_map(|line| {
             let (mount, kind) = line.split_once(" - ")?;
@@ -288,11 +288,11 @@ fn places(mounts: &str, own: &str) -> Vec<Place> {
             })?;
             // Inside a container the mount shows a part of the hierarchy only.
             let path = path.strip_prefix(inner.trim_end_matches('/')).unwrap_or(path);
-            Some(Place { root: root.into(), own: path.to_owned(), version, offers })
+            Some(Hierarchy { root: root.into(), own: path.to_owned(), version, offers })
         })
         .collect();
-    places.sort_by_key(|place| std::cmp::Reverse(place.version));
-    places
+    hierarchies.sort_by_key(|place| std::cmp::Reverse(place.version));
+    hierarchies
 }
 
 /// Returns the number after `key` in lines of `KEY NUMBER`.
@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn hierarchies_of_both_versions_are_found() {
         let own = "4:memory:/a/b\n2:cpu,cpuacct:/\n3:blkio:/\n0::/user.slice";
-        let found = places(MOUNTS_1, own);
+        let found = hierarchies(MOUNTS_1, own);
         let seen: Vec<_> =
             found.iter().map(|p| (p.root.to_str().unwrap(), p.own.as_str(), p.version)).collect();
         assert_eq!(
@@ -327,8 +327,10 @@ mod tests {
         );
         assert_eq!(found[2].offers, [Controller::Cpu]);
         let inside = "36 35 0:31 /docker/x /sys/fs/cgroup rw - cgroup2 cgroup rw";
-        assert_eq!(places(inside, "0::/docker/x/y")[0].own, "/y");
-        assert!(places("", "0::/").is_empty() && places("nonsense - cgroup", "").is_empty());
+        assert_eq!(hierarchies(inside, "0::/docker/x/y")[0].own, "/y");
+        assert!(
+            hierarchies("", "0::/").is_empty() && hierarchies("nonsense - cgroup", "").is_empty()
+        );
     }
 
     #[test]

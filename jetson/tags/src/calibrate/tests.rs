@@ -3,7 +3,7 @@ use crate::family::TagFamily;
 use crate::image::Gray;
 use crate::layout::TagLayout;
 use crate::print::{BAR_MM, Mat, Paper};
-use crate::synth::{Light, Placed, Random, Renderer, Shot};
+use crate::synth::{Light, Placed, Random, Renderer, SyntheticExposure};
 use vizflyt_protocol::geometry::Pose;
 
 fn board() -> TagLayout {
@@ -120,12 +120,12 @@ fn a_lens_is_found_from_images() {
         let board = board();
         let placed = [Placed::anywhere(&board, Pose::new(t_m, q))];
         let light = Light { gradient: DVec2::new(0.3, -0.2), vignette: 0.2, ..Light::default() };
-        let shot = Shot {
+        let shot = SyntheticExposure {
             blur_px: 0.6,
             noise: 2.5,
             seed: i.into(),
             light,
-            ..Shot::still(&placed, Pose::IDENTITY)
+            ..SyntheticExposure::still(&placed, Pose::IDENTITY)
         };
         session.take(renderer.render(&shot), false).unwrap();
     }

@@ -1,6 +1,6 @@
 use super::*;
 use crate::layout::{CORNERS, LayoutFrame, Square, Tag, TagLayout};
-use crate::synth::{Light, Placed, Renderer, Shot};
+use crate::synth::{Light, Placed, Renderer, SyntheticExposure};
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Pose, World};
 
@@ -43,12 +43,12 @@ fn errors(distance_m: f64, views: u32) -> (usize, f64, f64) {
         let tilt = DVec3::new(0.6 * turn(3.3), 0.6 * turn(0.7), 3.0 * turn(5.1));
         let (layout, world_from_cam, cam_from_tag) = tag_at(p_cam, tilt);
         let placed = [Placed::fixed(&layout)];
-        let image = renderer.render(&Shot {
+        let image = renderer.render(&SyntheticExposure {
             light: Light { gradient: DVec2::new(0.4, -0.2), vignette: 0.3, ..Light::default() },
             blur_px: 0.6,
             noise: 4.0,
             seed: view.into(),
-            ..Shot::still(&placed, world_from_cam)
+            ..SyntheticExposure::still(&placed, world_from_cam)
         });
         let truth = CORNERS
             .map(|c| camera.project(cam_from_tag.transform_point((c * 0.16).extend(0.0))).unwrap());
@@ -91,10 +91,10 @@ fn the_whole_image_is_searched_in_a_coarser_raster() {
     let mut detector = Detector::new(&[TagFamily::Tag36h11], DetectorSettings::default());
     let (layout, world_from_cam, cam_from_tag) =
         tag_at(DVec3::new(1.2, -0.5, 3.0), DVec3::new(0.3, -0.4, 1.0));
-    let image = renderer.render(&Shot {
+    let image = renderer.render(&SyntheticExposure {
         blur_px: 0.6,
         noise: 3.0,
-        ..Shot::still(&[Placed::fixed(&layout)], world_from_cam)
+        ..SyntheticExposure::still(&[Placed::fixed(&layout)], world_from_cam)
     });
     let found = detector.search(&image, &camera, false);
     assert_eq!(found.iter().map(|tag| tag.id).collect::<Vec<_>>(), [17]);
@@ -144,9 +144,9 @@ fn a_family_with_data_outside_its_border_has_the_corners_of_its_border() {
         let (mut layout, world_from_cam, cam_from_tag) =
             tag_at(DVec3::new(0.1, 0.05, 1.2), DVec3::new(0.3, 0.2, -2.0));
         layout.tags[0].family = family;
-        let image = renderer.render(&Shot {
+        let image = renderer.render(&SyntheticExposure {
             blur_px: 0.5,
-            ..Shot::still(&[Placed::fixed(&layout)], world_from_cam)
+            ..SyntheticExposure::still(&[Placed::fixed(&layout)], world_from_cam)
         });
         let found = detector.search(&image, &camera, false);
         let [tag] = found[..] else { panic!("{family}: {found:?}") };

@@ -3,7 +3,7 @@ use crate::detect::{Detector, DetectorSettings};
 use crate::detection::Detection;
 use crate::layout::{LayoutFrame, Tag, TagLayout};
 use crate::print::{BAR_MM, Cube, Mat, Paper};
-use crate::synth::{Placed, Random, Renderer, Shot};
+use crate::synth::{Placed, Random, Renderer, SyntheticExposure};
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::Distortion;
 
@@ -147,8 +147,12 @@ fn a_mat_is_surveyed_from_images() {
             let tilt = DVec3::new(random.normal(), random.normal(), random.normal()) * 0.2;
             let camera =
                 over(0.05 * (f64::from(i % 3) - 1.0), 0.06 * f64::from(i / 3) - 0.1, 0.5, tilt);
-            let shot =
-                Shot { blur_px: 0.6, noise: 3.0, seed: i.into(), ..Shot::still(&placed, camera) };
+            let shot = SyntheticExposure {
+                blur_px: 0.6,
+                noise: 3.0,
+                seed: i.into(),
+                ..SyntheticExposure::still(&placed, camera)
+            };
             detector.search(&renderer.render(&shot), &lens, true)
         })
         .collect();

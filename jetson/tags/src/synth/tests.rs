@@ -23,7 +23,8 @@ fn cells_appear_where_the_lens_puts_them() {
     let mat = one_tag(0.4);
     let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.2, 0.5);
     let world_from_cam = Pose::new(DVec3::new(0.1, -0.2, 0.8), turn * above(1.0).rotation);
-    let image = Renderer::new(k).render(&Shot::still(&[Placed::fixed(&mat)], world_from_cam));
+    let image =
+        Renderer::new(k).render(&SyntheticExposure::still(&[Placed::fixed(&mat)], world_from_cam));
     let cells = TagFamily::Tag36h11.cells(3).unwrap();
     let mut seen = 0;
     for row in 0..10 {
@@ -54,7 +55,7 @@ fn an_edge_lies_where_it_is_projected_within_a_thirtieth_of_a_pixel() {
     for i in 0..7 {
         let shift_m = f64::from(i) * 0.0007;
         let pose = Pose::new(DVec3::new(shift_m, 0.0, 1.0), above(1.0).rotation);
-        let image = renderer.render(&Shot::still(&[Placed::fixed(&mat)], pose));
+        let image = renderer.render(&SyntheticExposure::still(&[Placed::fixed(&mat)], pose));
         // The black square's left edge along a row through its rim of black.
         let y = k.project(pose.inverse().transform_point(DVec3::new(0.0, 0.175, 0.0))).unwrap().y;
         let edge = k.project(pose.inverse().transform_point(DVec3::new(-0.2, 0.0, 0.0))).unwrap().x;
@@ -72,11 +73,11 @@ fn blur_of_optics_and_of_motion_soften_an_edge_and_leave_it_in_place() {
     let renderer = Renderer::new(k);
     let mat = one_tag(0.4);
     let placed = [Placed::fixed(&mat)];
-    let still = Shot::still(&placed, above(1.0));
+    let still = SyntheticExposure::still(&placed, above(1.0));
     // Moves by 6 px during the exposure, about the same middle.
     let shift = DVec3::X * 3.0 / k.fx_px;
     let moving = [-shift, shift].map(|s| Pose::new(DVec3::Z + s, above(1.0).rotation));
-    let row = |shot: &Shot<'_>| -> (f64, usize) {
+    let row = |shot: &SyntheticExposure<'_>| -> (f64, usize) {
         let image = renderer.render(shot);
         let y = (120.0 - 0.175 * k.fx_px) as u32;
         let greys: Vec<f64> =
@@ -85,8 +86,8 @@ fn blur_of_optics_and_of_motion_soften_an_edge_and_leave_it_in_place() {
         (greys.iter().sum(), between)
     };
     let (sharp_at, sharp) = row(&still);
-    let (blurred_at, blurred) = row(&Shot { blur_px: 1.2, ..still });
-    let (moved_at, moved) = row(&Shot { world_from_cam: moving, ..still });
+    let (blurred_at, blurred) = row(&SyntheticExposure { blur_px: 1.2, ..still });
+    let (moved_at, moved) = row(&SyntheticExposure { world_from_cam: moving, ..still });
     assert!(sharp <= 2 && blurred >= 4 && moved >= 5, "{sharp}, {blurred}, {moved}");
     // Each is within 1/30 px of the truth.
     assert!((blurred_at - sharp_at).abs() < 0.07, "{blurred_at} instead of {sharp_at}");
@@ -99,16 +100,16 @@ fn light_and_noise_are_as_asked_and_repeat_by_seed() {
     let renderer = Renderer::new(k);
     let paper = Gray::plain(320, 240, 120);
     let light = Light { gradient: DVec2::new(0.5, 0.0), ..Light::default() };
-    let shot = Shot {
+    let shot = SyntheticExposure {
         background: Some(&paper),
         noise: 5.0,
         seed: 7,
         light,
-        ..Shot::still(&[], above(1.0))
+        ..SyntheticExposure::still(&[], above(1.0))
     };
     let image = renderer.render(&shot);
     assert_eq!(image, renderer.render(&shot));
-    assert_ne!(image, renderer.render(&Shot { seed: 8, ..shot }));
+    assert_ne!(image, renderer.render(&SyntheticExposure { seed: 8, ..shot }));
     let column = |x: u32| (0..240).map(move |y| (x, y));
     let mean = |x: u32| column(x).map(|(x, y)| f64::from(image.at(x, y))).sum::<f64>() / 240.0;
     assert!((mean(2) - 120.0 * 0.754).abs() < 2.0 && (mean(317) - 120.0 * 1.246).abs() < 2.0);
@@ -127,9 +128,9 @@ fn faces_are_seen_from_where_they_point_and_hide_what_is_behind() {
     let floor = Placed::fixed(&mat);
     let placed = [floor];
     let back = |height_m: f64| {
-        let shot = Shot {
+        let shot = SyntheticExposure {
             background: Some(&wall),
-            ..Shot::still(&placed, Pose::new(DVec3::Z * height_m, DQuat::IDENTITY))
+            ..SyntheticExposure::still(&placed, Pose::new(DVec3::Z * height_m, DQuat::IDENTITY))
         };
         renderer.render(&shot)
     };
@@ -143,7 +144,7 @@ fn faces_are_seen_from_where_they_point_and_hide_what_is_behind() {
         tags: vec![Tag::new(TagFamily::Tag36h11, 9, 0.08, body_from_tag)],
     };
     let lid = Placed::on_vehicle(&lid, [world_from_body; 2]);
-    let one = renderer.render(&Shot::still(&[lid, floor], above(1.0)));
-    assert_eq!(one, renderer.render(&Shot::still(&[floor, lid], above(1.0))));
-    assert_ne!(one, renderer.render(&Shot::still(&[floor], above(1.0))));
+    let one = renderer.render(&SyntheticExposure::still(&[lid, floor], above(1.0)));
+    assert_eq!(one, renderer.render(&SyntheticExposure::still(&[floor, lid], above(1.0))));
+    assert_ne!(one, renderer.render(&SyntheticExposure::still(&[floor], above(1.0))));
 }

@@ -109,17 +109,17 @@ fn cause_of(case: &Case) -> Option<String> {
     let ended = case.end.clone().map(|end| Event::ending(at(END_S), EventKind::Ended(end)));
     let events: Vec<Event> = [took_off].into_iter().chain(ended).collect();
     let verdict = judge(&arena, &events, &samples);
-    let answer = |&s: &f64| Asked { stamp: at(END_S - s), setpoint: case.setpoint.clone() };
-    let asked: Option<Vec<Asked>> =
+    let answer = |&s: &f64| TimedSetpoint { stamp: at(END_S - s), setpoint: case.setpoint.clone() };
+    let asked: Option<Vec<TimedSetpoint>> =
         case.asked_before_s.as_ref().map(|times| times.iter().map(answer).collect());
     // Two seconds of images at 30 Hz, oldest first.
     let image = |number: u32| {
         let before_s = f64::from(number) / 30.0;
         let left_m = case.v_mps.length() * before_s;
         let ahead_m = if left_m <= case.in_sight_m { left_m + arena.body_radius_m } else { 20.0 };
-        Seen { stamp: at(END_S - before_s), ahead_m: Some(ahead_m) }
+        ClearanceAhead { stamp: at(END_S - before_s), ahead_m: Some(ahead_m) }
     };
-    let seen: Vec<Seen> = (0..=60).rev().map(image).collect();
+    let seen: Vec<ClearanceAhead> = (0..=60).rev().map(image).collect();
     let flight = Flight {
         verdict: &verdict,
         samples: &samples,

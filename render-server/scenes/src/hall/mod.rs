@@ -32,7 +32,7 @@ use crate::solids::Solids;
 use gap::GapWall;
 use gate::Gate;
 use light::HallLight;
-use moving::{HAND_M, Made, Movers};
+use moving::{GeneratedMover, HAND_M, Movers};
 use panel::{Block, Grain, Look, Painter};
 use pillars::Pillars;
 use shell::{NET_MAX_M, NET_MIN_M, Shell};
@@ -255,7 +255,7 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         objects: made.iter().map(|made| made.config.clone()).collect(),
     };
     let (objects, true_objects) =
-        made.into_iter().map(|Made { object, truth, .. }| (object, truth)).unzip();
+        made.into_iter().map(|GeneratedMover { object, truth, .. }| (object, truth)).unzip();
     Generated {
         splats,
         arena,

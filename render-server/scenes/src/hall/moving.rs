@@ -39,7 +39,7 @@ enum Shape {
 }
 
 /// A mover as a scene has it.
-pub(crate) struct Made {
+pub(crate) struct GeneratedMover {
     pub(crate) config: ObjectConfig,
     pub(crate) object: RigidObject,
     /// [m, object]
@@ -136,14 +136,14 @@ impl Movers {
     }
 
     /// Makes all of them; objects are numbered from 1.
-    pub(crate) fn make(&self, painter: &mut Painter) -> Vec<Made> {
+    pub(crate) fn make(&self, painter: &mut Painter) -> Vec<GeneratedMover> {
         let numbered = self.movers.iter().zip(1..);
         numbered.map(|(mover, id)| mover.make(id, painter)).collect()
     }
 }
 
 impl Mover {
-    fn make(&self, id: u16, painter: &mut Painter) -> Made {
+    fn make(&self, id: u16, painter: &mut Painter) -> GeneratedMover {
         let rest = self.rest();
         let (splats, truth) = match &self.shape {
             Shape::Quadrotor => {
@@ -171,7 +171,7 @@ impl Mover {
             phase_s: Some(self.phase_s),
             motion: self.motion.clone(),
         };
-        Made { config, object: RigidObject { id, splats }, truth }
+        GeneratedMover { config, object: RigidObject { id, splats }, truth }
     }
 
     /// As in the arena file: degrees, and back.
@@ -242,7 +242,7 @@ mod tests {
     use vizflyt_arena::objects::MovingObjects;
 
     /// Paints in plain light.
-    fn made(add: impl FnOnce(&mut Movers)) -> Made {
+    fn made(add: impl FnOnce(&mut Movers)) -> GeneratedMover {
         let mut movers = Movers::default();
         add(&mut movers);
         let solids = crate::solids::Solids::new(Vec::new());
@@ -260,7 +260,7 @@ mod tests {
             |movers: &mut Movers| movers.add_pendulum(3, 6.0),
             |movers: &mut Movers| movers.add_drone(3, 9.0),
         ] {
-            let Made { config, object, truth } = made(add);
+            let GeneratedMover { config, object, truth } = made(add);
             assert!(object.splats.len() > 300 && object.id == 1, "{}", config.name);
             for mean_m in &object.splats.means_m {
                 let of = |volume: &Volume| volume.signed_distance_m(mean_m.as_dvec3());
@@ -274,7 +274,7 @@ mod tests {
     fn nothing_that_moves_leaves_the_net() {
         for seed in 0..10 {
             for add in [Movers::add_door, Movers::add_pendulum, Movers::add_drone] {
-                let Made { config, truth, .. } = made(|movers| add(movers, seed, 5.5));
+                let GeneratedMover { config, truth, .. } = made(|movers| add(movers, seed, 5.5));
                 let objects = MovingObjects::of(std::slice::from_ref(&config), 0);
                 for n in 0..200 {
                     let placement = objects.placement(0, n * 61_000_000);

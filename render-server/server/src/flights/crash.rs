@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use tracing::warn;
-use vizflyt_arena::crash::{Flight, Seen, plot, probable_cause, since};
+use vizflyt_arena::crash::{ClearanceAhead, Flight, plot, probable_cause, since};
 use vizflyt_arena::verdict::Sample;
 use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::messages::{Event, EventKind};
@@ -86,9 +86,9 @@ fn card(
     let events = vehicle.events_of_flight();
     let verdict = vehicle.verdict(arena);
     let front = shots.first().map_or(&[][..], Vec::as_slice);
-    let seen: Vec<Seen> = front
+    let seen: Vec<ClearanceAhead> = front
         .iter()
-        .map(|shot| Seen { stamp: shot.shown, ahead_m: shot.preview.ahead_m })
+        .map(|shot| ClearanceAhead { stamp: shot.shown, ahead_m: shot.preview.ahead_m })
         .collect();
     let reported: Vec<&Event> = events.iter().filter(|event| event.stamp <= at).collect();
     let (printed, reported): (Vec<&Event>, Vec<&Event>) =

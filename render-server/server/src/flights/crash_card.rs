@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::Serialize;
 use vizflyt_arena::verdict::Verdict;
 
-use super::recent_previews::{Preview, Shot};
+use super::recent_previews::{Preview, TimedPreview};
 
 /// What a failed flight looked like at its end.
 #[derive(Debug, Serialize)]
@@ -39,7 +39,7 @@ pub struct CrashCard {
     /// The last lines that the plugin printed.
     pub(super) printed: Vec<String>,
     #[serde(skip)]
-    pub(super) shots: Vec<Vec<Shot>>,
+    pub(super) shots: Vec<Vec<TimedPreview>>,
 }
 
 /// The images of a camera.

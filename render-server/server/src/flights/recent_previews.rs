@@ -20,11 +20,11 @@ pub struct Preview {
 
 /// The newest previews of a vehicle, by camera.
 #[derive(Debug, Default)]
-pub struct RecentPreviews(Vec<VecDeque<Shot>>);
+pub struct RecentPreviews(Vec<VecDeque<TimedPreview>>);
 
 /// A preview, and the instant that it shows.
 #[derive(Clone, Debug)]
-pub struct Shot {
+pub struct TimedPreview {
     pub(super) shown: ServerTime,
     pub(super) preview: Arc<Preview>,
 }
@@ -32,21 +32,22 @@ pub struct Shot {
 impl RecentPreviews {
     /// Makes room for all that this many cameras will ever keep.
     pub fn of(cameras: usize) -> Self {
-        Self((0..cameras).map(|_| VecDeque::with_capacity(MAX_SHOTS)).collect())
+        Self((0..cameras).map(|_| VecDeque::with_capacity(MAX_PREVIEWS)).collect())
     }
 
     /// Adds a camera's preview, in place of the oldest where there is no room.
     pub fn add(&mut self, camera: usize, shown: ServerTime, preview: Arc<Preview>) {
         let Some(kept) = self.0.get_mut(camera) else { return };
-        if kept.len() == MAX_SHOTS {
+        if kept.len() == MAX_PREVIEWS {
             kept.pop_front();
         }
-        kept.push_back(Shot { shown, preview });
+        kept.push_back(TimedPreview { shown, preview });
     }
 
     /// Returns what each camera showed in the last [`SHOWN_S`] until `at`, oldest first.
-    pub(super) fn until(&self, at: ServerTime) -> Vec<Vec<Shot>> {
-        let is_shown = |shot: &&Shot| (0.0..=SHOWN_S).contains(&at.seconds_since(shot.shown));
+    pub(super) fn until(&self, at: ServerTime) -> Vec<Vec<TimedPreview>> {
+        let is_shown =
+            |shot: &&TimedPreview| (0.0..=SHOWN_S).contains(&at.seconds_since(shot.shown));
         self.0.iter().map(|kept| kept.iter().filter(is_shown).cloned().collect()).collect()
     }
 }
@@ -54,7 +55,7 @@ impl RecentPreviews {
 /// Images are shown over so long. [s]
 const SHOWN_S: f64 = 2.0;
 /// Previews kept of a camera: [`SHOWN_S`] and the delay until a card is made, at 15 Hz.
-const MAX_SHOTS: usize = 36;
+const MAX_PREVIEWS: usize = 36;
 
 #[cfg(test)]
 mod tests {
@@ -74,7 +75,7 @@ mod tests {
             // A camera that is not there is nobody's.
             shots.add(7, shown(f64::from(k) / 15.0), preview);
         }
-        assert_eq!((shots.0[1].len(), shots.0[1].capacity()), (MAX_SHOTS, room));
+        assert_eq!((shots.0[1].len(), shots.0[1].capacity()), (MAX_PREVIEWS, room));
         // The end was 0.3 s ago: what came after it is not shown, what came in time is.
         let end = shown(199.0 / 15.0 - 0.3);
         let found = shots.until(end);

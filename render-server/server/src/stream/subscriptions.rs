@@ -23,19 +23,19 @@ use vizflyt_protocol::time::ServerTime;
 use crate::clock;
 pub use crate::stream::in_flight::{InFlightImage, Part};
 
-/// What the encode thread may do now.
+/// The images that the encode thread may make now.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
     /// By vehicle and camera: someone has room for an image.
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
     /// By vehicle and camera: the runtime has room for an image.
     pub fly: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
-    /// No runtime wants anything, but a page does: rendered ticks go on to the previews.
+    /// No runtime wants images, but a page does: rendered ticks go on to the previews.
     pub pass_on: bool,
 }
 
 impl Wanted {
-    /// Whether anyone wants anything.
+    /// Whether anyone wants images.
     pub fn anything(&self) -> bool {
         self.pass_on || self.stream.as_flattened().contains(&true)
     }

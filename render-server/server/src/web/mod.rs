@@ -106,7 +106,7 @@ pub(crate) struct Page {
     pub(crate) authorizer: Arc<Authorizer>,
     /// Where runtimes connect.
     pub(crate) quic_port: u16,
-    /// Who tried team tokens that are none.
+    /// Rate limiter for invalid team tokens.
     pub(crate) team_tries: Mutex<RateLimiter>,
     /// The scenes to choose from.
     pub(crate) scenes: Arc<Scenes>,

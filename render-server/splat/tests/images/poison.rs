@@ -89,7 +89,7 @@ pub(crate) fn check_scales_and_opacities(make: Make<'_>) {
     }
 }
 
-/// What is not finite, and rotations that are none, are left out.
+/// Values that are not finite, and invalid rotations, are left out.
 pub(crate) fn check_what_is_not_finite(make: Make<'_>) {
     let good = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.3), 0.8);
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
@@ -232,7 +232,7 @@ pub(crate) fn check_empty_scenes(make: Make<'_>) {
     }
 }
 
-/// Cameras that are none are refused by name, and no image is touched.
+/// Invalid cameras are refused by name, and no image is touched.
 pub(crate) fn check_cameras_that_are_none(make: Make<'_>) {
     let good = looking_ahead(20, 10, 60.0);
     let splats = one(Vec3::new(0.0, 0.0, 2.0), Vec3::splat(0.5), 0.9);

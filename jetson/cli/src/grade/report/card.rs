@@ -11,7 +11,7 @@ use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::messages::EventKind;
 
 use super::super::document::Run;
-use super::super::trial::Flown;
+use super::super::trial::TrialResult;
 use super::escape;
 
 /// Folder of the images, in the report's.
@@ -29,7 +29,7 @@ pub(crate) fn write(
     arena: &ArenaConfig,
     field: &DistanceField,
     run: &Run,
-    flown: &Flown,
+    flown: &TrialResult,
 ) -> Result<String> {
     let mut card = head(run);
     let at = flown.verdict.ended;
@@ -97,7 +97,7 @@ fn head(run: &Run) -> String {
 fn strip(
     folder: &Path,
     run: &Run,
-    flown: &Flown,
+    flown: &TrialResult,
     before_s: impl Fn(vizflyt_protocol::time::ServerTime) -> f64,
 ) -> Result<String> {
     if flown.shots.is_empty() {

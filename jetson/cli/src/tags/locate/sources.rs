@@ -18,7 +18,7 @@ use vizflyt_tags::simulated::{SimulatedCamera, Truth};
 
 /// An image of one camera.
 #[derive(Clone, Debug)]
-pub(super) struct Shot {
+pub(super) struct CameraImage {
     /// Its index.
     pub(super) camera: usize,
     /// Middle of the exposure.
@@ -46,7 +46,7 @@ struct Recording {
 /// The newest image of each camera that was not yet taken.
 #[derive(Default)]
 struct Mailbox {
-    shots: Mutex<Vec<Shot>>,
+    shots: Mutex<Vec<CameraImage>>,
     arrived: Condvar,
     /// Why a camera gives no more images.
     failed: Mutex<Option<String>>,
@@ -159,7 +159,7 @@ impl Sources {
 
     /// Returns the newest images in the order of their stamps, none if none came in time; `None` at the
     /// end of all.
-    pub(super) fn next(&mut self, wait: Duration) -> Result<Option<Vec<Shot>>> {
+    pub(super) fn next(&mut self, wait: Duration) -> Result<Option<Vec<CameraImage>>> {
         if !self.recorded.is_empty() {
             return self.next_recorded();
         }
@@ -179,7 +179,7 @@ impl Sources {
     }
 
     /// Returns the earliest images of the recordings, those of one instant together.
-    fn next_recorded(&mut self) -> Result<Option<Vec<Shot>>> {
+    fn next_recorded(&mut self) -> Result<Option<Vec<CameraImage>>> {
         let heads = self.recorded.iter().filter_map(|r| r.head.as_ref());
         let Some(first) = heads.map(|head| head.stamp_ns).min() else { return Ok(None) };
         let mut shots = Vec::new();
@@ -189,7 +189,7 @@ impl Sources {
                 && let Some(Exposure { stamp_ns, image }) = recording.head.take()
             {
                 check_size(&recording.name, recording.size, &image)?;
-                shots.push(Shot { camera, stamp: HostTime::from_ns(stamp_ns), image });
+                shots.push(CameraImage { camera, stamp: HostTime::from_ns(stamp_ns), image });
                 recording.head = recording.source.next()?;
             }
         }
@@ -199,7 +199,7 @@ impl Sources {
 }
 
 impl Mailbox {
-    fn put(&self, shot: Shot) {
+    fn put(&self, shot: CameraImage) {
         let mut shots = lock(&self.shots);
         shots.retain(|kept| kept.camera != shot.camera);
         shots.push(shot);
@@ -222,7 +222,7 @@ fn read(
             bail!("camera {name:?} gives no more images");
         };
         check_size(name, size, &image)?;
-        mailbox.put(Shot { camera: index, stamp: HostTime::from_ns(stamp_ns), image });
+        mailbox.put(CameraImage { camera: index, stamp: HostTime::from_ns(stamp_ns), image });
     }
     Ok(())
 }
@@ -297,7 +297,7 @@ fn draw(
             known.clone_from(&truth);
         }
         if let Some((stamp, image)) = camera.expose(&known, layouts, true) {
-            mailbox.put(Shot { camera: index, stamp, image });
+            mailbox.put(CameraImage { camera: index, stamp, image });
         }
     }
 }

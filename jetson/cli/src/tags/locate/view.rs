@@ -18,7 +18,7 @@ use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::locate::{CameraResult, LocateOutcome};
 
-use super::Shot;
+use super::CameraImage;
 
 /// The page and its server.
 pub(super) struct LiveView {
@@ -79,7 +79,7 @@ impl LiveView {
     }
 
     /// Shows a set of images and what came of it.
-    pub(super) fn show(&self, shots: &[Shot], outcome: &LocateOutcome, image_ms: f64) {
+    pub(super) fn show(&self, shots: &[CameraImage], outcome: &LocateOutcome, image_ms: f64) {
         let mut shown = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
         if shown.asked.is_none_or(|asked| asked.elapsed() > FORGET_AFTER) {
             return;

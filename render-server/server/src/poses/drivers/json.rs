@@ -97,7 +97,7 @@ pub enum JsonError {
     /// A quaternion that is no rotation.
     #[error("rotation_xyzw {0:?} is not of unit length")]
     Rotation([f64; 4]),
-    /// Sigmas that are none.
+    /// Invalid sigmas.
     #[error("{key} {value:?}: give positive numbers")]
     Sigma {
         /// Which.
@@ -141,7 +141,7 @@ impl<'a> PosePacket<'a> {
 /// Selects our vehicles from the packets.
 #[derive(Debug)]
 pub struct JsonStream {
-    roster: VehicleNames,
+    names: VehicleNames,
     /// Of each vehicle: its packets may come from different programs.
     clocks: Vec<SenderClock>,
     /// What the newest pose of each vehicle rests on.
@@ -152,10 +152,10 @@ pub struct JsonStream {
 impl JsonStream {
     /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
-        let roster = VehicleNames::new(config, source, vehicles);
-        let clocks = vec![SenderClock::default(); roster.len()];
-        let tags = vec![None; roster.len()];
-        Self { roster, clocks, tags, warned_of_clock: false }
+        let names = VehicleNames::new(config, source, vehicles);
+        let clocks = vec![SenderClock::default(); names.len()];
+        let tags = vec![None; names.len()];
+        Self { names, clocks, tags, warned_of_clock: false }
     }
 
     fn stamp(&mut self, vehicle: usize, packet: &PosePacket<'_>, now: ServerTime) -> ServerTime {
@@ -167,7 +167,7 @@ impl JsonStream {
                     return stamp.min(now);
                 }
                 if !std::mem::replace(&mut self.warned_of_clock, true) {
-                    self.roster.warn(format!(
+                    self.names.warn(format!(
                         "json: '{}' is stamped {age_s:.3} s before it came; `\"clock\": \"server\"` \
                          means CLOCK_MONOTONIC of this very computer: leave `clock` out if the sender \
                          runs elsewhere; till then poses are stamped as they come",
@@ -180,7 +180,7 @@ impl JsonStream {
                 let clock = &mut self.clocks[vehicle];
                 let stamp = clock.map_in_order(stamp_ns, now);
                 if let Some(jump_s) = clock.take_jump_s() {
-                    self.roster.warn(format!(
+                    self.names.warn(format!(
                         "json: the clock that stamps '{}' has jumped by {jump_s:.3} s; use a \
                          monotonic one (in Python time.monotonic_ns())",
                         packet.object
@@ -189,7 +189,7 @@ impl JsonStream {
                 stamp
             }
             (None, _) => match packet.seq {
-                Some(seq) => self.roster.stamp(vehicle, seq as u32, now),
+                Some(seq) => self.names.stamp(vehicle, seq as u32, now),
                 None => now,
             },
         }
@@ -207,21 +207,21 @@ impl PoseStream for JsonStream {
         from: SocketAddr,
         bytes: &[u8],
     ) -> &[Measurement] {
-        self.roster.begin();
+        self.names.begin();
         let packet = match PosePacket::parse(bytes) {
             Ok(packet) => packet,
             Err(error) => {
                 let advice = "docs/guides/localization.md shows a packet";
-                self.roster.bad(&error, advice);
+                self.names.bad(&error, advice);
                 return &[];
             }
         };
-        let Some(vehicle) = self.roster.find(packet.object.as_bytes()) else {
+        let Some(vehicle) = self.names.find(packet.object.as_bytes()) else {
             let advice = "correct `object` in the sender, or start the server with --vehicle";
-            self.roster.others(std::iter::once(&*packet.object), advice);
+            self.names.others(std::iter::once(&*packet.object), advice);
             return &[];
         };
-        if packet.seq.is_some_and(|seq| !self.roster.is_next(vehicle, seq as u32, now)) {
+        if packet.seq.is_some_and(|seq| !self.names.is_next(vehicle, seq as u32, now)) {
             return &[];
         }
         let stamp = self.stamp(vehicle, &packet, now);
@@ -237,17 +237,17 @@ impl PoseStream for JsonStream {
         });
         let rotation = DQuat::from_array(packet.rotation_xyzw).normalize();
         let pose = (DVec3::from(packet.position_m), rotation);
-        self.roster.measure(vehicle, (stamp, now), pose, sigma);
-        self.roster.measured()
+        self.names.measure(vehicle, (stamp, now), pose, sigma);
+        self.names.measured()
     }
 
     fn next_warning(&mut self) -> Option<String> {
-        self.roster.next_warning()
+        self.names.next_warning()
     }
 
     fn counters(&self, vehicle: usize) -> SourceCounters {
         let tags = self.tags.get(vehicle).copied().flatten();
-        SourceCounters { tags, ..self.roster.counters(vehicle) }
+        SourceCounters { tags, ..self.names.counters(vehicle) }
     }
 
     fn silence(&self) -> Silence {

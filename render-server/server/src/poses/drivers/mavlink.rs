@@ -29,7 +29,7 @@ use crate::poses::settings::LocalizationConfig;
 
 /// Selects our vehicles' autopilots.
 pub struct MavlinkStream {
-    roster: VehicleNames,
+    names: VehicleNames,
     decoder: StreamDecoder,
     /// Packets of one datagram, until they are looked at.
     packets: Vec<Packet>,
@@ -61,15 +61,15 @@ struct Attitude {
 impl MavlinkStream {
     /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
-        let roster = VehicleNames::new(config, source, vehicles);
-        let systems = vec![System::default(); roster.len().min(MAX_VEHICLES)];
+        let names = VehicleNames::new(config, source, vehicles);
+        let systems = vec![System::default(); names.len().min(MAX_VEHICLES)];
         let decoder = StreamDecoder::default();
-        Self { roster, decoder, packets: Vec::new(), systems, asks: 0 }
+        Self { names, decoder, packets: Vec::new(), systems, asks: 0 }
     }
 
     fn vehicle_of(&self, header: MavHeader) -> Option<usize> {
-        let named = self.roster.find(header.system_id.to_string().as_bytes());
-        named.or((self.roster.len() == 1).then_some(0))
+        let named = self.names.find(header.system_id.to_string().as_bytes());
+        named.or((self.names.len() == 1).then_some(0))
     }
 
     fn handle(&mut self, now: ServerTime, from: Option<SocketAddr>, packet: &Packet) {
@@ -89,7 +89,7 @@ impl MavlinkStream {
             let name = packet.header.system_id.to_string();
             let advice =
                 "set `objects` to the autopilots' system numbers: objects = { bee = \"2\" }";
-            return self.roster.others(std::iter::once(name.as_str()), advice);
+            return self.names.others(std::iter::once(name.as_str()), advice);
         };
         let system = &mut self.systems[vehicle];
         if let Some(from) = from {
@@ -130,7 +130,7 @@ impl MavlinkStream {
     fn handle_odometry(&mut self, vehicle: usize, now: ServerTime, message: &ODOMETRY_DATA) {
         if message.frame_id != MavFrame::MAV_FRAME_LOCAL_NED {
             let error = format!("ODOMETRY is in {:?}", message.frame_id);
-            return self.roster.bad(&error, "only MAV_FRAME_LOCAL_NED is known");
+            return self.names.bad(&error, "only MAV_FRAME_LOCAL_NED is known");
         }
         self.systems[vehicle].has_odometry = true;
         let [w, x, y, z] = message.q.map(f64::from);
@@ -138,7 +138,7 @@ impl MavlinkStream {
         let p = DVec3::new(message.x.into(), message.y.into(), message.z.into());
         if !((rotation.length() - 1.0).abs() <= 0.01) {
             let error = format!("ODOMETRY's rotation {rotation} is not of unit length");
-            return self.roster.bad(&error, "does the autopilot know its attitude yet?");
+            return self.names.bad(&error, "does the autopilot know its attitude yet?");
         }
         // The diagonal of an upper triangle; NaN in its first place means unknown.
         let variance = |[a, b, c]: [usize; 3]| {
@@ -166,23 +166,23 @@ impl MavlinkStream {
     ) {
         if !(p_m.abs().cmple(DVec3::splat(MAX_POSITION_M)).all() && rotation.is_normalized()) {
             let error = format!("position {p_m} with rotation {rotation} is no pose");
-            return self.roster.bad(&error, "has the autopilot an estimate yet?");
+            return self.names.bad(&error, "has the autopilot an estimate yet?");
         }
         let system = &mut self.systems[vehicle];
         // A routed link may bring a packet twice.
         if stamp_ns == system.last_ns
-            || self.roster.measured().iter().any(|measured| measured.vehicle == vehicle)
+            || self.names.measured().iter().any(|measured| measured.vehicle == vehicle)
         {
             return;
         }
         system.last_ns = stamp_ns;
         let stamp = system.clock.map_in_order(stamp_ns, now);
         if let Some(jump_s) = system.clock.take_jump_s() {
-            self.roster.warn(format!(
+            self.names.warn(format!(
                 "mavlink: the autopilot's clock has jumped by {jump_s:.3} s; has it rebooted?"
             ));
         }
-        self.roster.measure(vehicle, (stamp, now), (p_m, rotation), sigma);
+        self.names.measure(vehicle, (stamp, now), (p_m, rotation), sigma);
     }
 
     fn handle_bytes(
@@ -191,13 +191,13 @@ impl MavlinkStream {
         from: Option<SocketAddr>,
         bytes: &[u8],
     ) -> &[Measurement] {
-        self.roster.begin();
+        self.names.begin();
         let mut packets = std::mem::take(&mut self.packets);
         let before = self.decoder.stats();
         self.decoder.push(bytes, |packet| packets.push(packet));
         let after = self.decoder.stats();
         if after.packets + after.unknown == before.packets + before.unknown {
-            self.roster.bad(
+            self.names.bad(
                 &format!("{} bytes hold no MAVLink packet", bytes.len()),
                 "is something else sent to this port?",
             );
@@ -206,7 +206,7 @@ impl MavlinkStream {
             self.handle(now, from, &packet);
         }
         self.packets = packets;
-        self.roster.measured()
+        self.names.measured()
     }
 }
 
@@ -263,11 +263,11 @@ impl PoseStream for MavlinkStream {
     }
 
     fn next_warning(&mut self) -> Option<String> {
-        self.roster.next_warning()
+        self.names.next_warning()
     }
 
     fn counters(&self, vehicle: usize) -> SourceCounters {
-        self.roster.counters(vehicle)
+        self.names.counters(vehicle)
     }
 
     fn silence(&self) -> Silence {

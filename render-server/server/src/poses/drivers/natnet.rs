@@ -39,11 +39,11 @@ pub enum Motive {
 /// The conversation with Motive.
 #[derive(Debug)]
 pub struct NatnetStream {
-    roster: VehicleNames,
+    names: VehicleNames,
     motive: Motive,
     /// Where commands go.
     server: Option<SocketAddr>,
-    talk: Option<Talk>,
+    session: Option<MotiveSession>,
     /// What the server is asked to speak, if its own version is not known here.
     wanted: Option<Version>,
     clock: SenderClock,
@@ -55,9 +55,9 @@ pub struct NatnetStream {
     warned_of_version: bool,
 }
 
-/// What Motive has said of itself.
+/// What is known of the Motive that sends.
 #[derive(Debug)]
-struct Talk {
+struct MotiveSession {
     decoder: Decoder,
     ticks_hz: u64,
     /// Whose rigid body has this id; none: nobody's.
@@ -69,13 +69,13 @@ impl NatnetStream {
     /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str], motive: Motive) -> Self {
         Self {
-            roster: VehicleNames::new(config, source, vehicles),
+            names: VehicleNames::new(config, source, vehicles),
             motive,
             server: match motive {
                 Motive::Multicast => None,
                 Motive::Unicast(server) => Some(server),
             },
-            talk: None,
+            session: None,
             wanted: None,
             clock: SenderClock::default(),
             outbox: VecDeque::new(),
@@ -90,7 +90,7 @@ impl NatnetStream {
     fn handle_info(&mut self, bytes: &[u8]) {
         let info = match ServerInfo::parse(bytes) {
             Ok(info) => info,
-            Err(error) => return self.roster.bad(&error, NOT_MOTIVE),
+            Err(error) => return self.names.bad(&error, NOT_MOTIVE),
         };
         let options = ConnectOptions { bitstream_version: self.wanted, ..Default::default() };
         let version = options.stream_version(&info);
@@ -100,7 +100,7 @@ impl NatnetStream {
                 self.wanted = Some(Version::V4_1);
                 self.asked = None;
             } else if !std::mem::replace(&mut self.warned_of_version, true) {
-                self.roster.warn(format!(
+                self.names.warn(format!(
                     "natnet: {} streams NatNet {version}, this server knows 3.0, 3.1, 4.0 and 4.1; \
                      stream by unicast, where it can be asked for 4.1, or update VizFlyt",
                     info.application_name
@@ -109,10 +109,10 @@ impl NatnetStream {
             return;
         };
         let decoder = decoder.with_policy(ParsePolicy::Compatible);
-        if self.talk.as_ref().is_some_and(|talk| talk.decoder == decoder) {
+        if self.session.as_ref().is_some_and(|session| session.decoder == decoder) {
             return;
         }
-        self.talk = Some(Talk {
+        self.session = Some(MotiveSession {
             decoder,
             ticks_hz: info.high_res_clock_frequency,
             vehicles: HashMap::new(),
@@ -122,42 +122,43 @@ impl NatnetStream {
     }
 
     fn handle_names(&mut self, bytes: &[u8]) {
-        let Some(talk) = &mut self.talk else { return };
-        let model = match talk.decoder.parse(bytes).map(natnet::DecodedMessage::into_message) {
+        let Some(session) = &mut self.session else { return };
+        let model = match session.decoder.parse(bytes).map(natnet::DecodedMessage::into_message) {
             Ok(Message::ModelDef(model)) => model,
             Ok(_) => return,
-            Err(error) => return self.roster.bad(&error, NOT_MOTIVE),
+            Err(error) => return self.names.bad(&error, NOT_MOTIVE),
         };
-        talk.vehicles.clear();
-        talk.has_names = true;
+        session.vehicles.clear();
+        session.has_names = true;
         for (name, id) in model.rigid_bodies().take(MAX_BODIES) {
-            talk.vehicles.insert(id, self.roster.find(name.as_bytes()));
+            session.vehicles.insert(id, self.names.find(name.as_bytes()));
         }
-        if !talk.vehicles.values().any(Option::is_some) {
+        if !session.vehicles.values().any(Option::is_some) {
             let names: Vec<_> = model.rigid_bodies().map(|(name, _)| name).collect();
             if !names.is_empty() {
-                self.roster.others(names.into_iter(), RENAME);
+                self.names.others(names.into_iter(), RENAME);
             }
         }
     }
 
     fn handle_frame(&mut self, now: ServerTime, bytes: &[u8]) {
-        let Some(talk) = &mut self.talk else { return };
-        let frame = match talk.decoder.parse(bytes).map(natnet::DecodedMessage::into_message) {
+        let Some(session) = &mut self.session else { return };
+        let frame = match session.decoder.parse(bytes).map(natnet::DecodedMessage::into_message) {
             Ok(Message::FrameOfData(frame)) => frame,
             Ok(_) => return,
-            Err(error) => return self.roster.bad(&error, NOT_MOTIVE),
+            Err(error) => return self.names.bad(&error, NOT_MOTIVE),
         };
         self.received_at = Some(now);
-        let unknown = |body: &RigidBody| !talk.vehicles.contains_key(&body.id);
+        let unknown = |body: &RigidBody| !session.vehicles.contains_key(&body.id);
         if frame.params & LIST_CHANGED != 0 || frame.rigid_bodies.iter().any(unknown) {
-            talk.has_names = false;
+            session.has_names = false;
         }
         let stamp = self.stamp(&frame, now);
         for body in frame.rigid_bodies.iter().take(MAX_BODIES) {
-            let named = self.talk.as_ref().and_then(|talk| *talk.vehicles.get(&body.id)?);
+            let named =
+                self.session.as_ref().and_then(|session| *session.vehicles.get(&body.id)?);
             // A person may name a rigid body by its streaming id, too.
-            let vehicle = named.or_else(|| self.roster.find(body.id.to_string().as_bytes()));
+            let vehicle = named.or_else(|| self.names.find(body.id.to_string().as_bytes()));
             if let Some(vehicle) = vehicle {
                 self.handle_body(vehicle, &frame, body, (stamp, now));
             }
@@ -172,13 +173,13 @@ impl NatnetStream {
         (stamp, now): (Option<ServerTime>, ServerTime),
     ) {
         let number = frame.frame_number.cast_unsigned();
-        if self.roster.measured().iter().any(|measured| measured.vehicle == vehicle)
-            || !self.roster.is_next(vehicle, number, now)
+        if self.names.measured().iter().any(|measured| measured.vehicle == vehicle)
+            || !self.names.is_next(vehicle, number, now)
         {
             return;
         }
         if !body.tracking_valid() {
-            return self.roster.occluded(vehicle);
+            return self.names.occluded(vehicle);
         }
         let p = DVec3::from(body.position.map(f64::from));
         let rotation = DQuat::from_array(body.orientation.map(f64::from));
@@ -188,15 +189,15 @@ impl NatnetStream {
         {
             let error =
                 format!("rigid body {} at {p} with rotation {rotation} is no pose", body.id);
-            return self.roster.bad(&error, NOT_MOTIVE);
+            return self.names.bad(&error, NOT_MOTIVE);
         }
-        let stamp = stamp.unwrap_or_else(|| self.roster.stamp(vehicle, number, now));
-        self.roster.measure(vehicle, (stamp, now), (p, rotation.normalize()), None);
+        let stamp = stamp.unwrap_or_else(|| self.names.stamp(vehicle, number, now));
+        self.names.measure(vehicle, (stamp, now), (p, rotation.normalize()), None);
     }
 
     /// Returns when the cameras were exposed for a frame; `None` if it does not state it.
     fn stamp(&mut self, frame: &FrameOfData, now: ServerTime) -> Option<ServerTime> {
-        let ticks_hz = self.talk.as_ref()?.ticks_hz;
+        let ticks_hz = self.session.as_ref()?.ticks_hz;
         let timing = &frame.timing;
         if ticks_hz == 0 || timing.transmit == 0 || timing.camera_mid_exposure == 0 {
             return None;
@@ -204,7 +205,7 @@ impl NatnetStream {
         let ns = |ticks: u64| (u128::from(ticks) * 1_000_000_000 / u128::from(ticks_hz)) as u64;
         let sent = self.clock.map_in_order(ns(timing.transmit), now);
         if let Some(jump_s) = self.clock.take_jump_s() {
-            self.roster.warn(format!(
+            self.names.warn(format!(
                 "natnet: Motive's clock has jumped by {jump_s:.3} s; was Motive restarted?"
             ));
         }
@@ -224,9 +225,9 @@ impl NatnetStream {
         let unicast = matches!(self.motive, Motive::Unicast(_));
         // Motive was restarted, or the network was away: it has forgotten us.
         if unicast && self.received_at.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
-            (self.talk, self.received_at) = (None, None);
+            (self.session, self.received_at) = (None, None);
         }
-        let Some(talk) = &self.talk else {
+        let Some(session) = &self.session else {
             let options = ConnectOptions { bitstream_version: self.wanted, ..Default::default() };
             if Self::is_due(&mut self.asked, now, ASK_EVERY_S)
                 && let Ok(request) = connect_request_with(options)
@@ -235,7 +236,7 @@ impl NatnetStream {
             }
             return;
         };
-        if !talk.has_names
+        if !session.has_names
             && Self::is_due(&mut self.asked_names, now, NAMES_EVERY_S)
             && let Ok(request) = request_modeldef()
         {
@@ -249,17 +250,17 @@ impl NatnetStream {
 
 impl PoseStream for NatnetStream {
     fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
-        self.roster.begin();
+        self.names.begin();
         match MessageHeader::parse(bytes).map(|header| header.message_id) {
             Ok(NAT_SERVERINFO) => self.handle_info(bytes),
             Ok(NAT_MODELDEF) => self.handle_names(bytes),
             Ok(NAT_FRAMEOFDATA) => self.handle_frame(now, bytes),
             // Chat between Motive and its clients.
             Ok(id) if id <= MAX_ID => {}
-            Ok(id) => self.roster.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
-            Err(error) => self.roster.bad(&error, NOT_MOTIVE),
+            Ok(id) => self.names.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
+            Err(error) => self.names.bad(&error, NOT_MOTIVE),
         }
-        self.roster.measured()
+        self.names.measured()
     }
 
     fn handle_packet_from(
@@ -283,11 +284,11 @@ impl PoseStream for NatnetStream {
     }
 
     fn next_warning(&mut self) -> Option<String> {
-        self.roster.next_warning()
+        self.names.next_warning()
     }
 
     fn counters(&self, vehicle: usize) -> SourceCounters {
-        self.roster.counters(vehicle)
+        self.names.counters(vehicle)
     }
 
     fn silence(&self) -> Silence {

@@ -43,7 +43,7 @@ struct Object {
 }
 
 impl VehicleNames {
-    /// Makes a roster of the vehicles named, the first at index 0, and so on; at most
+    /// Makes the table of the vehicles named, the first at index 0, and so on; at most
     /// [`MAX_VEHICLES`]. Its measurements are of `source`.
     pub(super) fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let object = |vehicle: &&str| Object {

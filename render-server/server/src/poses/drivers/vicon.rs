@@ -121,7 +121,7 @@ fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
 /// Selects our vehicles from the stream, keeps the counters, and notices what is wrong.
 #[derive(Debug)]
 pub struct ViconStream {
-    roster: VehicleNames,
+    names: VehicleNames,
     euler: Euler,
 }
 
@@ -129,17 +129,17 @@ impl ViconStream {
     /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on;
     /// at most [`MAX_VEHICLES`].
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
-        let roster = VehicleNames::new(config, source, vehicles);
-        Self { roster, euler: config.euler.unwrap_or_default() }
+        let names = VehicleNames::new(config, source, vehicles);
+        Self { names, euler: config.euler.unwrap_or_default() }
     }
 }
 
 impl PoseStream for ViconStream {
     fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement] {
-        self.roster.begin();
+        self.names.begin();
         let mut found = [None; MAX_VEHICLES];
         let mut others = heapless::Vec::<_, MAX_NAMES>::new();
-        let parsed = parse(bytes, |object| match self.roster.find(object.name) {
+        let parsed = parse(bytes, |object| match self.names.find(object.name) {
             Some(vehicle) => found[vehicle] = Some(object),
             None => drop(others.push(object.name)),
         });
@@ -148,36 +148,36 @@ impl PoseStream for ViconStream {
             Err(error) => {
                 let advice =
                     "is something other than Tracker's UDP object stream sent to this port?";
-                self.roster.bad(&error, advice);
+                self.names.bad(&error, advice);
                 return &[];
             }
         };
         if found.iter().all(Option::is_none) && !others.is_empty() {
             let names = others.iter().filter_map(|name| std::str::from_utf8(name).ok());
-            self.roster.others(names, "rename the object in Tracker, or set `objects`");
+            self.names.others(names, "rename the object in Tracker, or set `objects`");
         }
         for (vehicle, object) in found.into_iter().enumerate() {
             let Some(object) = object else { continue };
-            if !self.roster.is_next(vehicle, frame, now) {
+            if !self.names.is_next(vehicle, frame, now) {
                 continue;
             }
             let Some(angles_rad) = object.angles_rad else {
-                self.roster.occluded(vehicle);
+                self.names.occluded(vehicle);
                 continue;
             };
-            let stamp = self.roster.stamp(vehicle, frame, now);
+            let stamp = self.names.stamp(vehicle, frame, now);
             let pose = (object.p_stream, self.euler.rotation(angles_rad));
-            self.roster.measure(vehicle, (stamp, now), pose, None);
+            self.names.measure(vehicle, (stamp, now), pose, None);
         }
-        self.roster.measured()
+        self.names.measured()
     }
 
     fn next_warning(&mut self) -> Option<String> {
-        self.roster.next_warning()
+        self.names.next_warning()
     }
 
     fn counters(&self, vehicle: usize) -> SourceCounters {
-        self.roster.counters(vehicle)
+        self.names.counters(vehicle)
     }
 
     fn silence(&self) -> Silence {

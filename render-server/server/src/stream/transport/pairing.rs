@@ -52,7 +52,7 @@ async fn pair(authorizer: &Authorizer, connection: &Connection) -> Result<String
     let binding = Binding { client, server: authorizer.identity.fingerprint(), exporter };
 
     let (send, mut recv) = connection.accept_bi().await.map_err(|error| gone(&error))?;
-    let mut stream = Talk { send, deframer: Box::default() };
+    let mut stream = PairingStream { send, deframer: Box::default() };
     let mut preamble = [0; Preamble::SIZE];
     recv.read_exact(&mut preamble).await.map_err(|error| gone(&error))?;
     let ours = Preamble::of(PeerRole::Server);
@@ -79,12 +79,12 @@ async fn pair(authorizer: &Authorizer, connection: &Connection) -> Result<String
     }
 }
 
-struct Talk {
+struct PairingStream {
     send: SendStream,
     deframer: Box<Deframer>,
 }
 
-impl Talk {
+impl PairingStream {
     async fn write(&mut self, message: &PairingReply) -> Result<(), Ending> {
         let mut buffer = [0; MAX_FRAMED];
         self.send.write_all(encode(message, &mut buffer)).await.map_err(|error| gone(&error))

@@ -146,7 +146,7 @@ fn what_is_odd_is_told_and_counted() {
     let asked = ConnectOptions::parse(&again[natnet::HEADER_LEN..]).unwrap();
     assert_eq!(asked.bitstream_version, Some(Version::V4_1));
     s.handle_packet(at(3), &info(future));
-    assert!(s.talk.is_some());
+    assert!(s.session.is_some());
     let mut s = stream("", Motive::Multicast);
     s.handle_packet(at(1), &info(future));
     assert!(s.next_warning().unwrap().contains("streams NatNet 5.2.0.0, this server knows"));
