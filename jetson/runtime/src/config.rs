@@ -140,7 +140,7 @@ pub struct PluginConfig {
     /// Processes and threads; without it 128.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub processes: Option<u32>,
-    /// Time that `on_image` shall take at most, without it 100; what is beyond is shown. [ms]
+    /// Maximum time of `on_image`, without it 100; what is beyond is shown. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<f64>,
     /// When it is started again: `never`, `on_ground` (without it), `in_flight`.
@@ -211,7 +211,7 @@ pub enum ConfigError {
     /// The file cannot be read.
     #[error("{path}: {why}", path = .path.display())]
     Unreadable {
-        /// Which.
+        /// The file.
         path: PathBuf,
         /// The system's reason.
         why: std::io::Error,
@@ -238,9 +238,9 @@ pub enum ConfigError {
     /// What is wrong in which file.
     #[error("{path}: {error}", path = .path.display())]
     In {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// What.
+        /// The error.
         error: Box<Self>,
     },
 }

@@ -44,7 +44,7 @@ pub fn fly(mut args: FlyArgs) -> anyhow::Result<EndReason> {
 }
 
 /// As [`fly`], with `args` settled and the plugin's command given as a list; [`FlyArgs::plugin`]
-/// only names it. For everything that comes from `reloads` the plugin is started anew, while the
+/// only names it. For everything that comes from `reloads` the plugin is restarted, while the
 /// vehicle holds.
 ///
 /// # Errors

@@ -38,7 +38,7 @@ impl Steering {
         self.reply_waits = true;
     }
 
-    /// Returns when the next setpoint shall leave.
+    /// Returns when the next setpoint is due.
     pub fn due(&self) -> HostTime {
         self.last.plus_seconds(if self.reply_waits { MIN_PERIOD_S } else { MAX_PERIOD_S })
     }

@@ -9,14 +9,14 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::yaw_of;
 use vizflyt_protocol::messages::{Axes, Path, PathYaw, Trajectory, YawTarget};
 
-/// Where the vehicle shall be, and how it shall move there.
+/// The desired position, velocity and heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reference {
     /// Position. [m, world]
     pub p_world_m: DVec3,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
-    /// Where the nose shall point.
+    /// Desired heading.
     pub yaw: YawTarget,
 }
 

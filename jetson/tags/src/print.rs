@@ -84,7 +84,7 @@ pub enum PrintError {
     /// A number that makes no sense.
     #[error("{name} = {value}: {advice}")]
     Invalid {
-        /// Which.
+        /// The name.
         name: &'static str,
         /// What it is.
         value: f64,

@@ -25,7 +25,7 @@ pub struct ServeArgs {
     #[arg(required = false, required_unless_present_any = ["config", "print_config"])]
     pub arena: PathBuf,
 
-    /// A file with these settings: each flag is a key of its name, with `_` for `-`; flags go before it
+    /// A file with these settings: each flag is a key of its name, with `_` for `-`; flags override it
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
 

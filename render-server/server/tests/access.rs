@@ -8,7 +8,7 @@ use std::net::{SocketAddr, TcpStream};
 
 use serde_json::Value;
 use support::{PATIENCE, Server, write_arena};
-use vizflyt_server::web::Takes as Said;
+use vizflyt_server::web::Takes as DeclaredTakes;
 
 /// The server, and the cookies of those who were given a key.
 struct Lab {
@@ -276,11 +276,11 @@ fn every_route_of_the_server_is_walked() {
         assert!(!expected.is_empty(), "{method} {path} is walked by no test");
         for (asked, expected) in expected {
             let fits = match expected {
-                Takes::Nothing => takes == Said::Nothing,
-                Takes::AnyKey => takes == Said::Key,
-                Takes::Ants | Takes::Bees => takes == Said::Vehicle,
+                Takes::Nothing => takes == DeclaredTakes::Nothing,
+                Takes::AnyKey => takes == DeclaredTakes::Key,
+                Takes::Ants | Takes::Bees => takes == DeclaredTakes::Vehicle,
                 // A vehicle that is not named is any.
-                Takes::All => matches!(takes, Said::Everything | Said::Vehicle),
+                Takes::All => matches!(takes, DeclaredTakes::Everything | DeclaredTakes::Vehicle),
             };
             assert!(fits, "{asked}: {takes:?}, not {expected:?}");
         }

@@ -61,7 +61,7 @@ pub enum ControlInput {
     FromPlugin(Box<FromPlugin>),
     /// The plugin's process; the first is 0, each one started after it one more.
     Plugin(u32, PluginEvent),
-    /// A person wants the plugin started anew; the vehicle holds until it is back.
+    /// A person wants the plugin restarted; the vehicle holds until it is back.
     Reload,
     /// A person wants it to end.
     Interrupt,

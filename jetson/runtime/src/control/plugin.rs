@@ -194,7 +194,7 @@ impl ControlLoop {
         ours && is_there && self.restarts < limits.restarts && flight.can_wait_for_plugin()
     }
 
-    /// Has the plugin started anew, once its present process is gone; the vehicle holds meanwhile.
+    /// Restarts the plugin, once its present process is gone; the vehicle holds meanwhile.
     pub(super) fn replace_plugin(&mut self, now: HostTime, why: String) {
         let Some(side) = &mut self.plugin else { return };
         if side.leaving.is_some() || !self.companion.flight().can_wait_for_plugin() {

@@ -84,7 +84,7 @@ impl Flight {
             (missing, _) => {
                 let missing = missing.unwrap_or(Missing::Pose);
                 if self.phase == FlightPhase::Waiting {
-                    // The time to get ready counts anew: it was ready.
+                    // The time to get ready starts again: it was ready.
                     self.started_at = now;
                     let why = format!("no longer ready: {missing}");
                     self.enter(now, FlightPhase::Preparing, &why);

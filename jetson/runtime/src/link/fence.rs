@@ -1,6 +1,6 @@
 //! The arena's polygons for the autopilot's own fence, uploaded by the mission protocol: their number
 //! is offered, the autopilot requests one corner after the other, and acknowledges them all in the
-//! end. Only to a vehicle on the ground, anew after each restart, and again where an answer is lost.
+//! end. Only to a vehicle on the ground, again after each restart, and again where an answer is lost.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::dialect::{MISSION_ACK_DATA, MavMissionResult, MavMissionType};
@@ -27,7 +27,7 @@ pub enum FenceEvent {
     Rejected(String),
 }
 
-/// An offer or an item that nothing follows is offered anew after this; ArduCopter repeats a request
+/// An offer or an item that nothing follows is offered again after this; ArduCopter repeats a request
 /// after a second. [s]
 const REPEAT_S: f64 = 1.5;
 /// Offered this many times: given up.
@@ -63,7 +63,7 @@ impl Upload {
         }
     }
 
-    /// Begins anew, as after a restart of the autopilot.
+    /// Starts again, as after a restart of the autopilot.
     pub(super) fn restart(&mut self) {
         self.origin = None;
         let wanted = !self.polygons.is_empty();

@@ -29,14 +29,14 @@ pub enum ParamEvent {
     },
     /// The autopilot has the value now.
     Written {
-        /// Which.
+        /// The name.
         name: String,
         /// The value that it confirms.
         value: f64,
     },
     /// The autopilot kept another value, or does not answer.
     NotWritten {
-        /// Which.
+        /// The name.
         name: String,
         /// What was asked for.
         asked: f64,

@@ -106,7 +106,7 @@ pub enum SigningFileError {
     /// Not read or written.
     #[error("{path}: {why}", path = .path.display())]
     Unusable {
-        /// Which.
+        /// The file.
         path: PathBuf,
         /// The system's reason.
         why: std::io::Error,
@@ -117,13 +117,13 @@ pub enum SigningFileError {
         path = .path.display()
     )]
     NoKey {
-        /// Which.
+        /// The file.
         path: PathBuf,
     },
     /// Others can read it.
     #[error("{path} can be read by others; `chmod 600` it, and make a new key", path = .path.display())]
     Open {
-        /// Which.
+        /// The file.
         path: PathBuf,
     },
 }

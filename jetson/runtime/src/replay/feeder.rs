@@ -124,7 +124,7 @@ pub fn observation_len(head: &[u8]) -> Option<usize> {
     (head.len() <= len && len <= LARGEST).then_some(len)
 }
 
-/// Writes an observation as it was: the recorded head, the images decoded anew. `None` if the log
+/// Writes an observation as it was: the recorded head, the images decoded again. `None` if the log
 /// does not hold it whole, or it makes no sense.
 #[allow(clippy::implicit_hasher)] // Why: nobody brings another one.
 pub fn decode(

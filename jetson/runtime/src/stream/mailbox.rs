@@ -28,7 +28,7 @@ use vizflyt_protocol::time::HostTime;
 /// The head of an image, known from its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Arrival {
-    /// Which connection it came over, counted from 1: a server that restarted counts ticks anew.
+    /// Number of the connection it came over, from 1: a server that restarted counts ticks from 1 again.
     pub session: u64,
     /// Who, when, from where.
     pub header: ImageHeader,

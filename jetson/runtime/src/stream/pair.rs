@@ -1,5 +1,5 @@
-//! Pairs this computer with a server: carries [`vizflyt_trust::pairing`]'s messages, and keeps what
-//! came of it.
+//! Pairs this computer with a server: carries [`vizflyt_trust::pairing`]'s messages, and keeps
+//! the result.
 
 use std::sync::Arc;
 use std::time::Duration;

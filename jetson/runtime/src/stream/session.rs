@@ -16,7 +16,7 @@ use zerocopy::IntoBytes;
 use super::{Outbox, Past, SessionEnd, Shared, StreamEvent, StreamSettings, receive};
 use crate::clock;
 
-/// Nothing from the server for this long: connect anew. Longer than a blackout of two seconds: a
+/// Nothing from the server for this long: reconnect. Longer than a blackout of two seconds: a
 /// connection that lives on has the newest image through 15 ms after it, a new one would be in the
 /// middle of its handshake's time-outs. A server that was restarted reports it itself.
 const SILENCE: Duration = Duration::from_secs(3);

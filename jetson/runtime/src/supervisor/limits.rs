@@ -29,7 +29,7 @@ pub struct PluginLimits {
     pub cpus: f64,
     /// Processes and threads.
     pub processes: u32,
-    /// Time that `on_image` shall take at most; what is beyond is shown. [ms]
+    /// Maximum time of `on_image`; what is beyond is shown. [ms]
     pub deadline_ms: f64,
     /// When it is started again.
     pub restart: Restart,

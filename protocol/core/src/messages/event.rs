@@ -12,7 +12,7 @@ use crate::time::ServerTime;
 pub struct Event {
     /// When, on the server's clock; zero if the runtime made it before it knew that clock.
     pub stamp: ServerTime,
-    /// What.
+    /// The kind.
     pub kind: EventKind,
     /// One sentence for a person.
     pub text: Text,

@@ -98,7 +98,7 @@ pub enum ToServer {
     Event {
         /// Its number among this client's events, rising.
         seq: u64,
-        /// What.
+        /// The event.
         event: Event,
     },
     /// Every event of the server up to this number has been received.
@@ -123,7 +123,7 @@ pub enum ToRuntime {
     Event {
         /// Its number among this server's events, rising; not every number is for every client.
         seq: u64,
-        /// What.
+        /// The event.
         event: Event,
     },
     /// Every event of this client up to this number has been received.

@@ -154,7 +154,7 @@ fn lost_offers_are_repeated_and_silence_ends_the_upload() {
     let mut script = Script::fenced();
     script.run(3.5);
     assert_eq!(script.offers(), 3);
-    // One that stops in the middle is begun anew.
+    // One that stops in the middle is started again.
     script.ask(0);
     script.run(2.0);
     assert_eq!(script.offers(), 4);

@@ -100,7 +100,7 @@ pub enum JsonError {
     /// Invalid sigmas.
     #[error("{key} {value:?}: give positive numbers")]
     Sigma {
-        /// Which.
+        /// The key.
         key: &'static str,
         /// What it says.
         value: [f64; 3],
