@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn who_was_silent_for_longest_makes_room() {
+    fn the_oldest_lease_is_replaced() {
         let mut leases = Leases::new();
         for mac in 0..LEASES as u8 {
             let expected = Ipv4Addr::new(192, 168, 4, FIRST + mac);

@@ -146,7 +146,7 @@ mod tests {
     proptest! {
         /// Against a deque, over many turns of the ring and past the wrap of its places.
         #[test]
-        fn it_is_a_queue(lengths in prop::collection::vec((1..280usize, any::<bool>()), 1..300), start in any::<u32>()) {
+        fn behaves_like_a_queue(lengths in prop::collection::vec((1..280usize, any::<bool>()), 1..300), start in any::<u32>()) {
             let mut ring = Ring::<1024>::new();
             ring.head = start;
             ring.tail = start;

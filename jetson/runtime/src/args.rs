@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn the_log_is_reduced_unless_somebody_says_full() {
+    fn log_is_reduced_by_default() {
         let settle = |line: &[&str], config: &str| {
             let line = ["fly", "x"].iter().chain(line);
             let log = Program::try_parse_from(line).unwrap().fly.log;

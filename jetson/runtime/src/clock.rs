@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_the_clock_of_the_computer() {
+    fn matches_the_computers_clock() {
         // Interrupted anywhere, a reading lies between its neighbours; a microsecond covers the
         // anchor's own error.
         for _ in 0..1000 {
@@ -50,7 +50,7 @@ mod tests {
     }
 
     #[test]
-    fn it_stands_still_and_jumps_with_tokios() {
+    fn follows_tokios_paused_clock() {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
         runtime.unwrap().block_on(async {

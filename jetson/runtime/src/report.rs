@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn peak_memory_is_told() {
+    fn reports_peak_memory() {
         let mb = peak_rss_mb().unwrap();
         assert!(mb > 0.5 && mb < 100_000.0, "{mb}");
     }

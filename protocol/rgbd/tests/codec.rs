@@ -87,7 +87,7 @@ fn quality_trades_size_for_error_and_changes_from_image_to_image() {
 }
 
 #[test]
-fn slices_are_pushed_as_drawn_and_decoded_in_any_order() {
+fn slices_are_pushed_as_rendered_and_decoded_in_any_order() {
     let picture = Picture::new(200, 150);
     let mut encoder = Encoder::new(SMALLEST);
     let mut bytes = Vec::new();

@@ -104,7 +104,7 @@ fn strangers_are_refused_by_name() {
 }
 
 #[test]
-fn a_slice_says_its_length_and_must_keep_to_it() {
+fn slice_must_have_its_stated_length() {
     let bytes = Picture::new(8, 8).encode(FAST);
     let info = peek(&bytes).unwrap();
     let (header, slice) = bytes.split_at(info.header_len);

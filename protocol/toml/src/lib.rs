@@ -241,14 +241,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_right_is_read() {
+    fn reads_a_valid_file() {
         let text = "name = 'a'\nsize_m = [1, 2, 3]\n[[cameras]]\nwidth_px = 3\nheight_px = 2\n";
         let room = parse::<Room>(text).unwrap();
         assert_eq!((room.size_m, room.cameras.len()), ([1.0, 2.0, 3.0], 1));
     }
 
     #[test]
-    fn every_error_is_said_once_with_its_line_and_key() {
+    fn reports_every_error_once_with_its_line_and_key() {
         let text = "nam = 'a'\n\
                     size_m = [1, 'x', 3]\n\
                     [limits]\n\
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_keys_of_several_tables_are_said() {
+    fn reports_missing_keys_of_several_tables() {
         let text = "name = 'a'\nsize_m = [1, 2, 3]\n[[cameras]]\nwidth_px = 1\n[[cameras]]\n\
                     height_px = 2\n";
         check(text, &["line 3", "line 5"]);
@@ -289,13 +289,13 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_syntax_are_said_alone() {
+    fn reports_only_syntax_errors_if_there_are_any() {
         check("name = \n[limits\nx = 1\n", &["line 1, column", "line 2"]);
         check("name = 'a'\nname = 'b'\n", &["line 2, column 1: duplicate key"]);
     }
 
     #[test]
-    fn a_file_of_nonsense_says_20_errors_at_most() {
+    fn reports_at_most_20_errors() {
         let lines: Vec<String> = (0..100).map(|n| format!("k{n} = 1")).collect();
         let text = lines.join("\n");
         assert_eq!(parse::<Room>(&text).unwrap_err().0.len(), MAX_ERRORS);

@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn looser_permissions_are_an_error_that_says_what_to_do() {
+    fn looser_permissions_are_an_error_with_advice() {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("keys");
         let folder = KeysFolder::open(Some(&path)).unwrap();

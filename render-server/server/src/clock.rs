@@ -57,7 +57,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_the_clock_of_the_machine() {
+    fn matches_the_machines_clock() {
         let system = || {
             let time = clock_gettime(ClockId::CLOCK_MONOTONIC).unwrap();
             time.tv_sec() as u64 * 1_000_000_000 + time.tv_nsec() as u64
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn it_stands_still_and_jumps_with_tokios() {
+    fn follows_tokios_paused_clock() {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
         runtime.unwrap().block_on(async {

@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_says_what_flags_say_and_flags_go_before_it() {
+    fn file_is_equivalent_to_flags_and_flags_override_it() {
         let text = "arena = 'hall/arena.toml'\nquality = 80\nvehicle = ['ant', 'bee']\n\
                     apart = true\njson = false\nmax_rate = 60.5\nleaderboard = 'none'\n";
         let line = settled(text, &[]).unwrap();
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn all_that_is_wrong_is_said_at_once() {
+    fn reports_all_errors_at_once() {
         let text = "qualty = 80\nquality = 0\njson = 1\nmax_rate = [1]\nhttp = 'lab'\n\
                     vehicle = 'ant'\n[page]\n";
         let error = format!("{:#}", settled(text, &["x"]).unwrap_err());
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_printed_is_read_to_the_same() {
+    fn printed_settings_are_read_back() {
         let line = ["serve", "a.toml", "--quality=70", "--vehicle=ant", "--vehicle=7", "--apart"];
         let printed = to_toml(&matches(&line.map(OsString::from)));
         let table: toml::Table = printed.parse().unwrap();

@@ -367,7 +367,7 @@ fn the_password_opens_a_session_that_ends_with_it() {
 }
 
 #[test]
-fn what_is_too_large_or_climbs_out_of_its_folder_is_refused() {
+fn refuses_large_requests_and_paths_out_of_the_folder() {
     let lab = Lab::start();
     let address = lab.server.http;
     for path in [

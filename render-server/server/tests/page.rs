@@ -120,7 +120,7 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
 }
 
 #[test]
-fn light_and_fog_are_told_and_changed_by_our_own_page_only() {
+fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
     let folder = tempfile::tempdir().unwrap();
     let more = "[environment]\nlight = [0.5, 0.5, 0.5]\n";
     let server = Server::start(&write_arena(folder.path(), more), &[]);

@@ -27,7 +27,7 @@ async fn closed(connection: &quinn::Connection) -> (u64, String) {
 const UNPAIRED: u64 = vizflyt_protocol::messages::close::UNPAIRED as u64;
 
 #[tokio::test]
-async fn a_stranger_hears_how_to_pair_and_nothing_else() {
+async fn stranger_receives_how_to_pair_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");

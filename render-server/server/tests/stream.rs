@@ -227,7 +227,7 @@ async fn a_restarted_runtime_gets_images_again() {
 }
 
 #[tokio::test]
-async fn lost_poses_are_told_and_told_again_to_a_runtime_that_comes_back() {
+async fn lost_poses_are_sent_and_sent_again_to_a_runtime_that_comes_back() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let emitter = Emitter::start(server.vicon, "vizflyt");
@@ -413,7 +413,7 @@ position_m = [0.06, 0, 0.02]
 }
 
 #[tokio::test]
-async fn a_collision_with_the_twin_is_told_to_the_runtime_and_printed() {
+async fn collision_with_the_twin_is_sent_to_the_runtime_and_printed() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (mut client, _) = Client::welcomed(&server, usual()).await;

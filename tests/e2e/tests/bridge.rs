@@ -218,7 +218,7 @@ fn a_killed_bridge_comes_back_and_everything_goes_on() {
 }
 
 #[test]
-fn it_is_claimed_configured_and_keeps_its_settings() {
+fn bridge_is_claimed_configured_and_keeps_its_settings() {
     let folder = tempfile::tempdir().unwrap();
     let flash = format!("--flash={}", folder.path().join("flash").display());
     let mut rig = Rig::start(&[&flash]);

@@ -60,7 +60,7 @@ fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
 }
 
 #[test]
-fn two_runs_give_the_same_grade_whatever_runs_beside_them_and_parts_make_the_whole() {
+fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     let rig = Rig::new();
     let one = rig.grade(&with(&["--jobs=2"]));
     assert_eq!(one["hash"].as_str().unwrap().len(), 64);

@@ -24,7 +24,7 @@ const INSTANTS: i64 = 40;
 const PLACES: usize = 400;
 
 #[test]
-fn what_moves_is_touched_where_it_is() {
+fn moving_objects_are_touched_where_they_are() {
     for (kind, seed) in [(SceneKind::Race, 7), (SceneKind::Moving, 7), (SceneKind::Moving, 3)] {
         let scene = generate(kind, seed);
         let nothing = Grid::covering(DVec3::ZERO, DVec3::ONE, 0.5);

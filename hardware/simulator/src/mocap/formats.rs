@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn natnet_is_y_up_and_says_when() {
+    fn natnet_is_y_up_with_its_own_stamps() {
         let pose = Pose::new(DVec3::new(1.0, 2.0, 0.5), DQuat::from_rotation_z(0.5));
         let at = AutopilotTime::from_ns(2_000_000_000);
         let sight = Sight { frame: 3, at, world_from_body: pose };

@@ -211,8 +211,8 @@ impl Emulation {
         let at = self.host(now);
         let bridge = &mut self.bridge;
         self.port.receive(now, |bytes| bridge.handle_uart(at, bytes))?;
-        self.hear_udp(at);
-        self.hear_tcp(at);
+        self.receive_udp(at);
+        self.receive_tcp(at);
         if self.page.as_mut().is_some_and(|page| page.turn(&self.bridge, at, now)) {
             self.restart(at)?;
         }
@@ -232,7 +232,7 @@ impl Emulation {
                 self.bridge.note_not_sent();
             }
         }
-        self.say_tcp(at);
+        self.send_tcp(at);
         while let Some(event) = self.bridge.poll_event() {
             match event {
                 Event::Save => {
@@ -255,7 +255,7 @@ impl Emulation {
         Ok(())
     }
 
-    fn hear_udp(&mut self, at: HostTime) {
+    fn receive_udp(&mut self, at: HostTime) {
         let mut bytes = [0; 2048];
         // A flood must not stop the autopilot's side.
         for _ in 0..64 {
@@ -270,7 +270,7 @@ impl Emulation {
         }
     }
 
-    fn hear_tcp(&mut self, at: HostTime) {
+    fn receive_tcp(&mut self, at: HostTime) {
         if let Some((stream, _)) =
             self.listener.as_ref().and_then(|listener| listener.accept().ok())
             && let Some(slot) = self.streams.iter().position(Option::is_none)
@@ -300,7 +300,7 @@ impl Emulation {
         }
     }
 
-    fn say_tcp(&mut self, at: HostTime) {
+    fn send_tcp(&mut self, at: HostTime) {
         for (slot, place) in self.streams.iter_mut().enumerate() {
             let Some(connection) = place else { continue };
             let gone = loop {

@@ -71,7 +71,7 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
     if !runtime.lifeline {
         let server = runtime.server.address()?;
         let from = file.map_or("the command line".into(), |file| file.display().to_string());
-        say_lab(
+        print_lab(
             runtime.json,
             "real",
             &format!(
@@ -120,7 +120,7 @@ fn fly_simulated(
         }
         args.lab.seed = args.lab.seed.or(lab.seed);
     }
-    say_lab(runtime.json, "simulated", "all on this computer; nothing can break");
+    print_lab(runtime.json, "simulated", "all on this computer; nothing can break");
     let mut fly = vec![
         plugin.map_or("--attach".into(), |plugin| plugin.name().to_owned()),
         format!("--seconds={}", runtime.seconds).into(),
@@ -160,7 +160,7 @@ fn fly_simulated(
 }
 
 /// The line that reports which of the two labs it is.
-fn say_lab(json: bool, which: &str, what: &str) {
+fn print_lab(json: bool, which: &str, what: &str) {
     if json {
         print_line(json!({"lab": which, "text": what}));
     } else {

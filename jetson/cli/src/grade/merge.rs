@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn refuses_parts_that_do_not_fit() {
         let subject = subject();
         let (one, two) = (part(&subject, 1, 2, &[1, 3]), part(&subject, 2, 2, &[2, 4]));
         refused(&[], "nothing");

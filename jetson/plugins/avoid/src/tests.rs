@@ -71,7 +71,7 @@ fn after_a_second(plugin: &mut Avoid, from_ms: u64, depth_mm: u16) -> (DVec3, f6
 }
 
 #[test]
-fn it_sets_off_for_the_goal_and_looks_there() {
+fn flies_and_points_towards_the_goal() {
     let (v_mps, yaw_rad) = after_a_second(&mut started(Some(GOAL_M)), 1000, 20_000);
     assert!(v_mps.x > 1.0 && v_mps.y.abs() < 0.1 && yaw_rad.abs() < 0.05, "{v_mps} {yaw_rad}");
     assert!((v_mps.z - CLIMB_PER_S * 0.2).abs() < 1e-9, "climbs to the goal's height");

@@ -79,7 +79,7 @@ fn with_nothing_to_fly_through_it_stays_and_looks_about() {
 }
 
 #[test]
-fn without_depth_it_says_so_and_stays_on_the_ground() {
+fn without_depth_it_fails_on_the_ground_with_a_reason() {
     let mut plugin = Race::default();
     plugin.on_start(&arena());
     for step in 0..u64::from(PATIENCE) - 1 {

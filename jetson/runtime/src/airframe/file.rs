@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
+    fn errors_have_their_line() {
         let check = |text: &str, expected: &str| {
             assert_eq!(parse_params(text).unwrap_err().to_string(), expected);
         };

@@ -180,7 +180,7 @@ proptest! {
 
     /// Whatever a plugin asks, the vehicle stays inside, the limits hold and no NaN gets through.
     #[test]
-    fn whatever_is_asked_the_vehicle_stays_inside_and_within_limits(
+    fn stays_inside_and_within_limits_for_any_setpoints(
         geofence in volume(),
         max_speed_mps in 0.5..8.0f64,
         max_acceleration_mps2 in 2.0..10.0f64,
@@ -458,7 +458,7 @@ fn a_point_is_reached_and_held() {
 }
 
 #[test]
-fn it_slides_along_a_wall_rather_than_stopping() {
+fn slides_along_a_wall_instead_of_stopping() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(-4.0, 0.0, 2.0), 4.0);
     for tick in 1..200 {

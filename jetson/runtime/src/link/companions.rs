@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn its_name_is_told_where_it_told_it() {
+    fn reports_the_name_of_a_companion_that_announced_it() {
         let mut companions = Companions::new(1);
         let now = HostTime::from_ns(1);
         for _ in 0..SIGNS {

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_comes_in_the_rate_out_is_kept() {
+    fn output_rate_is_kept_for_any_input_rate() {
         for hz_in in [100.0, 120.0, 200.0, 240.0] {
             for hz_out in [30.0, 40.0, 50.0] {
                 let n = sent(hz_in, hz_out) as f64 / 10.0;

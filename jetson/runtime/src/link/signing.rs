@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_key_or_no_secret_is_refused() {
+    fn refuses_an_invalid_or_readable_key() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("key");
         let check = |text: &str, mode, expected: &str| {

@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_old_goes_whatever_its_size() {
+    fn old_logs_are_deleted_regardless_of_size() {
         let folder = folder(0..6);
         let retention = Retention { max_age: Some(Duration::from_hours(3)), ..Retention::FOREVER };
         assert_eq!(delete_old(folder.path(), retention, at(6)).unwrap().logs, 3);
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_logs_are_told_from_others() {
+    fn recognises_names_of_logs() {
         assert!(is_log_name(&name(3)));
         assert!(is_log_name(&format!("{}.mcap", super::super::utc_name(SystemTime::now()))));
         for other in

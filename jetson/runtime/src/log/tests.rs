@@ -69,7 +69,7 @@ fn names_are_utc() {
 }
 
 #[test]
-fn what_is_logged_is_read_back() {
+fn records_survive_the_log() {
     let folder = tempfile::tempdir().unwrap();
     let log = FlightLog::open(&LogSettings::full(folder.path().join("flights")), None);
     let path = log.path().unwrap().to_owned();

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_the_same_as_itself() {
+    fn nan_equals_itself() {
         let nan = || Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
         check(nan(), nan(), None);
         check(

@@ -166,7 +166,7 @@ fn separates_replies_of_a_restarted_plugin() {
 }
 
 #[test]
-fn logs_that_cannot_be_replayed_say_why() {
+fn logs_that_cannot_be_replayed_have_a_reason() {
     let check = |flight: Flight, expected: &str| {
         let (path, _folder) = flight.close();
         let error = plan(&path).unwrap_err().to_string();
@@ -206,7 +206,7 @@ fn foreign_log(path: &Path, metadata: Option<&str>, protocol: u32) {
 }
 
 #[test]
-fn a_log_of_another_version_says_which() {
+fn log_of_another_version_is_refused_with_its_version() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     let ours = u32::from(PROTOCOL_VERSION);
@@ -310,7 +310,7 @@ fn finds_where_another_plugin_replies_differently() {
 }
 
 #[test]
-fn of_a_reduced_log_the_images_that_it_holds_are_replayed() {
+fn replays_the_images_in_a_reduced_log() {
     let flight = Flight::new();
     flight.start(5);
     flight.event(6);

@@ -446,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_cut_off_is_dropped_and_the_next_begins() {
+    fn image_that_is_cut_off_is_dropped() {
         let mailbox = Mailbox::default();
         let old = mailbox.open(&arrival(0, 7)).unwrap();
         push(&mailbox, old, 1);

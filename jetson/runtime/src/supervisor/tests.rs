@@ -162,7 +162,7 @@ fn python(limits: &PluginLimits, program: &str) -> (String, String) {
 }
 
 #[test]
-fn there_is_no_network_unless_allowed_and_none_of_the_systems_own_calls() {
+fn network_needs_permission_and_system_calls_are_blocked() {
     let program = "
 import socket, ctypes, os
 for family in (socket.AF_INET, socket.AF_INET6):
@@ -187,7 +187,7 @@ socket.create_connection(('192.0.2.1', 80), timeout=1)
 }
 
 #[test]
-fn it_writes_in_its_own_folders_only_and_signals_nobody() {
+fn plugin_writes_in_its_own_folders_only_and_sends_no_signals() {
     let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/var/tmp").unwrap();
     let mode = std::os::unix::fs::PermissionsExt::from_mode(0o777);
     std::fs::set_permissions(folder.path(), mode).unwrap();
@@ -214,7 +214,7 @@ open({file:?}, 'w').write('x'); print('written')"
 }
 
 #[test]
-fn it_does_not_read_what_is_hidden_and_reads_the_rest() {
+fn plugin_cannot_read_hidden_folders() {
     let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/var/tmp").unwrap();
     let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
     std::fs::set_permissions(folder.path(), mode).unwrap();
@@ -241,7 +241,7 @@ fn it_does_not_read_what_is_hidden_and_reads_the_rest() {
 }
 
 #[test]
-fn it_is_not_root_and_has_no_powers() {
+fn plugin_is_not_root_and_has_no_capabilities() {
     let program = "
 import os
 status = open('/proc/self/status').read()

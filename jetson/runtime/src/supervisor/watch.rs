@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_kernels_line_is_read_whatever_the_name() {
+    fn parses_stat_lines_with_any_process_name() {
         let line = "12 (a) b (c) S 1 77 77 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 9 0 123 456 789";
         assert_eq!(parse_stat(line), Some((77, 9)));
         assert_eq!(parse_stat("nonsense"), None);

@@ -129,7 +129,7 @@ fn a_second_plugin_can_follow_the_first() {
 }
 
 #[test]
-fn without_a_runtime_it_says_so() {
+fn reports_a_missing_runtime() {
     let error = PluginEnd::open("vizflyt/nobody").unwrap_err();
     assert_eq!(
         error.to_string(),

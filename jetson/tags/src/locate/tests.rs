@@ -90,7 +90,7 @@ fn unknown_tags_are_ignored_and_absence_is_reported() {
 }
 
 #[test]
-fn it_is_found_again_elsewhere_and_old_images_are_refused() {
+fn finds_the_vehicle_again_elsewhere_and_refuses_old_images() {
     let camera = webcams(1).remove(0);
     // It is carried away between two images.
     let pose_at = |t_s: f64| {

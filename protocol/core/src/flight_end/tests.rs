@@ -113,7 +113,7 @@ fn before_the_take_off_only_people_plugin_and_autopilot_end_a_flight() {
 }
 
 #[test]
-fn a_take_off_that_is_heard_of_late_counts_all_the_same() {
+fn take_off_that_arrives_late_counts() {
     let mut end = FlightEnd::default();
     end.handle(at(5.0), &EventKind::Collision(collision()));
     assert_eq!(end.decided(), None);
@@ -163,7 +163,7 @@ fn a_reason_has_one_sentence() {
 }
 
 #[test]
-fn an_event_says_its_reason_in_what_fits() {
+fn event_text_is_cut_to_its_maximum() {
     let event = Event::ending(at(1.0), EventKind::Collision(collision()));
     assert!(event.text.starts_with("collision with an obstacle at"), "{}", event.text);
     let why = PluginFault::NotBack { within_s: 10.0, why: bounded(&"ä".repeat(96)) };
@@ -211,7 +211,7 @@ fn reasons_arrive_as_they_were_sent() {
 proptest! {
     /// The same events in another order have the same end.
     #[test]
-    fn the_order_of_hearing_does_not_matter(
+    fn the_order_of_arrival_does_not_matter(
         (events, received) in prop::collection::vec(0..each().len() + 3, 1..12).prop_flat_map(|kinds| {
             let kind = |kind: usize| match kind {
                 0 => EventKind::Phase(FlightPhase::Flying),

@@ -40,7 +40,7 @@ height_m = 1.0
 "#;
 
 #[test]
-fn rules_say_what_plugins_may_ask_for() {
+fn rules_restrict_setpoints() {
     let with = |more: &str| ArenaConfig::parse(&format!("{more}\n{FOREST}"));
     let usual = with("").unwrap();
     assert_eq!(usual.info().setpoints, SetpointKinds::USUAL);

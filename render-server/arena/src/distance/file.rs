@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn reports_errors_by_name() {
         let good = bytes(&field(DVec3::ONE));
         let check = |at: usize, new: &[u8], expected: &str| {
             let mut bad = good.clone();

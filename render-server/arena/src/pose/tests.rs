@@ -75,7 +75,7 @@ proptest! {
 }
 
 #[test]
-fn poison_and_old_poses_are_turned_away() {
+fn invalid_and_old_poses_are_rejected() {
     let mut filter = PoseFilter::default();
     let nan = measured(0.0, DVec3::new(f64::NAN, 0.0, 0.0));
     assert_eq!(filter.handle_pose(&nan), Err(Rejected::Invalid));
@@ -86,7 +86,7 @@ fn poison_and_old_poses_are_turned_away() {
 }
 
 #[test]
-fn a_jump_is_turned_away_until_it_proves_true() {
+fn jump_is_rejected_until_it_lasts() {
     let mut filter = PoseFilter::default();
     filter.handle_pose(&measured(0.0, DVec3::ZERO)).unwrap();
     let far = DVec3::new(5.0, 0.0, 0.0);
@@ -190,7 +190,7 @@ fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
 }
 
 #[test]
-fn the_loss_says_why() {
+fn lost_pose_has_a_reason() {
     let mut filter = flying(1.0);
     for i in 1..40 {
         let t = 1.0 + 0.005 * f64::from(i);
@@ -207,7 +207,7 @@ fn the_loss_says_why() {
 }
 
 #[test]
-fn a_stream_that_froze_at_rest_is_betrayed_by_the_gyroscope() {
+fn gyroscope_reveals_a_stream_that_froze_at_rest() {
     let mut filter = flying(0.0);
     let mut frozen = 0;
     for i in 1..100 {
@@ -235,7 +235,7 @@ fn clocks_that_jump_are_named() {
 }
 
 #[test]
-fn of_two_sources_that_disagree_the_one_is_kept_and_the_other_named() {
+fn rejects_one_of_two_sources_that_disagree() {
     let mut filter = flying(1.0);
     for i in 1..100 {
         let t = 1.0 + 0.01 * f64::from(i);

@@ -174,7 +174,7 @@ fn nothing_is_judged_on_the_floor() {
 }
 
 #[test]
-fn a_lost_pose_ends_the_run_at_once_and_a_restart_begins_anew() {
+fn lost_pose_ends_the_run_and_a_restart_begins_another() {
     let mut referee = referee(&arena());
     assert!(fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [1., 0., 1.]], 2.0, 1.0).is_empty());
     // A warning first; then the run is over, and its time with it.
@@ -220,7 +220,7 @@ fn time_is_up_after_the_time_limit() {
 }
 
 #[test]
-fn after_land_was_ordered_neither_course_nor_clock_runs_and_a_touch_is_still_said() {
+fn after_land_course_and_clock_stop_and_a_touch_is_still_reported() {
     for order in
         [EventKind::Land, EventKind::EmergencyStop, EventKind::Ended(EndReason::PluginLanded)]
     {
@@ -243,7 +243,7 @@ fn after_land_was_ordered_neither_course_nor_clock_runs_and_a_touch_is_still_sai
 }
 
 #[test]
-fn what_a_hand_did_before_the_take_off_is_no_flight() {
+fn carrying_the_vehicle_before_take_off_is_no_flight() {
     let mut referee = referee(&arena());
     // Carried into the post.
     let events = fly(&mut referee, &[[0., 1., 0.], [0., 1., 1.], [4., 1., 1.]], 2.0, 1.0);

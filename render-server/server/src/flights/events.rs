@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_falls_behind_is_told() {
+    fn reader_that_falls_behind_is_notified() {
         let log = EventLog::default();
         let mut cursor = 0;
         for number in 0..EventLog::KEPT + 5 {

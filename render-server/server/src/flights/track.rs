@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_trail_keeps_its_ends_and_stays_small() {
+    fn track_keeps_its_ends_and_stays_small() {
         let mut track = Track::default();
         for k in 0..20_000 {
             let along = Pose::new(DVec3::X * 0.02 * f64::from(k), DQuat::IDENTITY);

@@ -51,7 +51,7 @@ mod tests {
     use vizflyt_protocol::time::ServerTime;
 
     #[test]
-    fn what_waits_for_the_render_thread_is_every_vehicles_newest() {
+    fn render_thread_gets_every_vehicles_newest_pose() {
         let poses = |at_ns: [Option<u64>; 3]| {
             let mut poses = NewestPoses::default();
             for (pose, at_ns) in poses.iter_mut().zip(at_ns) {

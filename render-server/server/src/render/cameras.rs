@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_changes_what_it_says_and_nothing_else() {
+    fn patch_changes_only_its_keys() {
         let cameras = cameras();
         let mut watcher = cameras.subscribe();
         let new = cameras.patch("rear", br#"{"width_px": 640, "tilt_deg": 15}"#).unwrap();

@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_cameras_image_outlives_the_tick_it_was_drawn_in() {
+    fn slow_cameras_image_outlives_its_tick() {
         let mut old = RenderedTick { slots: vec![slot(7, true), slot(7, true), slot(3, false)] };
         let mut new = RenderedTick { slots: vec![slot(8, true), slot(1, false), slot(2, false)] };
         new.inherit(&mut old);

@@ -153,7 +153,7 @@ mod tests {
     }
 
     /// Runs a second in which each tick takes `tick_ms`; returns how often each camera was rendered.
-    fn drawn_in_a_second(rates_hz: &[Option<f64>], tick_ms: i64) -> Vec<usize> {
+    fn rendered_in_a_second(rates_hz: &[Option<f64>], tick_ms: i64) -> Vec<usize> {
         let (start, cameras) = (START, cameras(rates_hz));
         let mut schedule = CameraSchedule::new(start);
         let mut counts = vec![0; cameras.len()];
@@ -173,12 +173,12 @@ mod tests {
 
     #[test]
     fn every_camera_keeps_its_rate() {
-        assert!(drawn_in_a_second(&[None], 1)[0].abs_diff(120) <= 1);
-        let counts = drawn_in_a_second(&[Some(30.0), None, Some(10.0), Some(500.0)], 1);
+        assert!(rendered_in_a_second(&[None], 1)[0].abs_diff(120) <= 1);
+        let counts = rendered_in_a_second(&[Some(30.0), None, Some(10.0), Some(500.0)], 1);
         assert!(counts[0].abs_diff(30) <= 1 && counts[2].abs_diff(10) <= 1, "{counts:?}");
         assert!(counts[1].abs_diff(120) <= 1 && counts[3] == counts[1], "{counts:?}");
         // A machine that renders 40 ticks a second gives every one to the camera without a rate.
-        let counts = drawn_in_a_second(&[Some(30.0), None], 25);
+        let counts = rendered_in_a_second(&[Some(30.0), None], 25);
         assert!(counts[0].abs_diff(30) <= 1 && counts[1].abs_diff(40) <= 1, "{counts:?}");
     }
 

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_wrong_is_named_with_what_to_do() {
+    fn missing_and_wrong_files_have_advice() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         check(&at("nothing.toml"), "make a scene with: vizflyt scene generate");

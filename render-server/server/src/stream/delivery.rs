@@ -305,7 +305,7 @@ mod tests {
         /// Every image that is rendered is accounted for: at any moment by the sum, in the end by its
         /// own reason, though reports lag behind and the runtime is restarted in flight.
         #[test]
-        fn every_drawn_image_is_accounted_for(
+        fn every_rendered_image_is_accounted_for(
             script in prop::collection::vec((0usize..ENDS.len(), any::<bool>(), 0u8..20), 1..400),
             restart_at in 0usize..400,
             former in 0usize..50,

@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_session_lasts_while_it_is_used_and_ends_when_told() {
+    fn session_lasts_while_used_and_ends_at_logout() {
         let (mut sessions, start) = (Sessions::default(), Instant::now());
         let cookie = sessions.begin(start, None).unwrap();
         let mut now = start;

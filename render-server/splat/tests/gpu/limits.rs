@@ -132,7 +132,7 @@ fn a_device_lost_between_begin_and_finish_is_an_error() {
 }
 
 #[test]
-fn the_choice_says_why() {
+fn choice_has_a_reason() {
     let splats = twins::cloud(1500, 0, 8);
     let camera = [twins::camera(60, 40, 80.0)];
     let expected = render_all(&mut CpuRenderer::new(&splats), &camera);

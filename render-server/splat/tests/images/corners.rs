@@ -234,7 +234,7 @@ fn corners_of_a_checkerboard_land_where_the_formula_says() {
 }
 
 #[test]
-fn dots_land_where_the_formula_says_to_the_rim_of_a_fisheye_3840_px_wide() {
+fn dots_match_the_formula_to_the_rim_of_a_fisheye_3840_px_wide() {
     let f_px = 3840.0 / 170f64.to_radians();
     let k = Intrinsics {
         fx_px: f_px,

@@ -98,7 +98,7 @@ fn a_door_before_a_wall_hides_it_and_is_named() {
 }
 
 #[test]
-fn a_placement_that_is_none_is_refused() {
+fn invalid_placement_is_refused() {
     let still = wall(4.0, 3.0, 0.2);
     let door = [RigidObject { id: 7, splats: wall(0.0, 0.5, 0.9) }];
     let scene = Scene { splats: &still, objects: &door };

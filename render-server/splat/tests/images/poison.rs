@@ -309,7 +309,7 @@ fn a_scene_without_splats_is_the_background() {
 }
 
 #[test]
-fn cameras_that_are_none_are_refused() {
+fn invalid_cameras_are_refused() {
     check_cameras_that_are_none(&renderers::every);
 }
 

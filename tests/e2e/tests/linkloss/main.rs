@@ -202,7 +202,7 @@ struct Row {
 }
 
 #[test]
-fn whatever_is_lost_the_vehicle_is_down_in_time_or_flies_on() {
+fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
     let mut rows = Vec::new();
     let (last, others) = CASES.split_last().expect("there are rows");
     for batch in others.chunks(TOGETHER) {

@@ -77,7 +77,7 @@ const CASES: [Case; 14] = [
 const TOGETHER: usize = 5;
 
 #[test]
-fn whatever_a_plugin_does_the_vehicle_holds_or_lands() {
+fn vehicle_holds_or_lands_for_any_plugin_fault() {
     let mut lab = Lab::open(TOGETHER);
     let mut complaints = Vec::new();
     for batch in CASES.chunks(TOGETHER) {

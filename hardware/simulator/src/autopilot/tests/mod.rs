@@ -85,7 +85,7 @@ fn without_an_origin_it_arms_and_refuses_to_take_off() {
 }
 
 #[test]
-fn refusals_say_why() {
+fn refusals_have_their_reason() {
     let mut c = Companion::new(SimulationConfig::default());
     c.vision = false;
     assert_eq!(c.arm(), FAILED);
@@ -140,7 +140,7 @@ fn setpoints_on_the_ground_move_nothing() {
 }
 
 #[test]
-fn heartbeats_tell_mode_and_arming() {
+fn heartbeats_have_mode_and_arming() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.0);
     let Some(MavMessage::HEARTBEAT(m)) = c.newest.get(&0) else { panic!() };
     assert_eq!((m.mavtype as u8, m.autopilot as u8, m.custom_mode), (2, 3, 4));

@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_card_without_images_says_so_and_holds_no_markup_of_a_plugin() {
+    fn card_without_images_notes_it_and_escapes_a_plugins_markup() {
         let mut failed = run(3, OutcomeKind::Collided);
         failed.reason = "bad <script>".to_owned();
         let card = without_images(&failed);

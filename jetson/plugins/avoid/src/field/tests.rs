@@ -95,7 +95,7 @@ proptest! {
     }
 
     #[test]
-    fn it_is_finite_everywhere_asked(x in -50.0..90.0f64, y in -50.0..50.0f64) {
+    fn field_is_finite_everywhere(x in -50.0..90.0f64, y in -50.0..50.0f64) {
         let field = field(P_M, DVec2::new(38.0, 0.0), &wall(8.0, -4.0, 3.0));
         let p_m = DVec2::new(x, y);
         prop_assert!(field.clearance_m(p_m).is_finite() && field.to_go_m(p_m).is_finite());

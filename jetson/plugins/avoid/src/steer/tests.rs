@@ -51,19 +51,19 @@ fn least_distance_m(points_m: &[DVec2]) -> f64 {
 }
 
 #[test]
-fn it_swerves_around_what_stands_ahead() {
+fn swerves_around_an_obstacle_ahead() {
     assert!(least_distance_m(&[DVec2::new(3.0, 0.0)]) > 0.3);
     assert!(least_distance_m(&[DVec2::new(3.0, -0.1), DVec2::new(3.0, 0.3)]) > 0.3);
 }
 
 #[test]
-fn it_stops_before_a_wall() {
+fn stops_before_a_wall() {
     let wall_m: Vec<DVec2> = (-40..=40).map(|n| DVec2::new(3.5, f64::from(n) * 0.1)).collect();
     assert!(least_distance_m(&wall_m) > 0.15);
 }
 
 #[test]
-fn it_creeps_into_what_it_cannot_see() {
+fn flies_slowly_into_unseen_space() {
     let looking_back = Motion { heading_rad: PI, ..moving(DVec2::ZERO) };
     let v_mps = choose_velocity(&field(&[]), &looking_back, SPEED_MPS);
     assert!(v_mps.x > 0.5 && v_mps.length() <= UNSEEN_MPS + 1e-9, "{v_mps}");

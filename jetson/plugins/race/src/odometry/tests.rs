@@ -35,7 +35,7 @@ fn the_floor_gives_the_height_at_once() {
 }
 
 #[test]
-fn it_follows_a_flight_through_a_window_within_three_centimetres() {
+fn odometry_follows_a_flight_through_a_window_within_three_centimetres() {
     let (own_m, true_m) = fly(4.0, |at_s| {
         let aside_m = 0.4 * (at_s * 1.2).sin();
         (DVec3::new(1.0 * at_s, aside_m, 1.3 + 0.2 * at_s.sin()), 0.4 * at_s.sin())

@@ -18,7 +18,7 @@ fn a_window_is_found_where_it_stands() {
 }
 
 #[test]
-fn of_the_same_paint_the_frame_counts_and_not_the_wall_behind() {
+fn finds_the_frame_before_a_wall_of_the_same_colour() {
     let mut bricks = room();
     bricks.extend(frame(DVec3::new(2.0, 0.0, 1.3), 0.6, MAGENTA));
     bricks.push(Brick {

@@ -29,7 +29,7 @@ fn fly(from_m: DVec3, held: bool) -> (f64, DVec3) {
 }
 
 #[test]
-fn it_passes_near_the_middle_from_wherever_it_starts() {
+fn passes_near_the_middle_from_any_start() {
     for (y, z) in [(0.4, 1.5), (-0.9, 1.0), (1.5, 1.2), (0.2, 0.6)] {
         let (off_m, end_m) = fly(DVec3::new(0.4, y, z), false);
         assert!(end_m.x > 2.3 && off_m < 0.15, "from {y}, {z}: {off_m} m off, ends at {end_m}");

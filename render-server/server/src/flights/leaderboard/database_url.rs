@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_and_servers_are_told_apart_and_passwords_are_not_shown() {
+    fn parses_files_and_servers_and_hides_passwords() {
         let file: Database = "class of 26.sqlite".parse().unwrap();
         assert_eq!(file.url(), "sqlite://class%20of%2026.sqlite?mode=rwc");
         let server: Database =

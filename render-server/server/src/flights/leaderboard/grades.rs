@@ -246,7 +246,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_cannot_be_compared_is_ranked_apart() {
+    fn incomparable_grades_are_ranked_separately() {
         let own = grade("a", 4.0, 2, 20.0);
         let others = [
             GradeEntry { project: "p4".into(), ..own.clone() },

@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_count_has_no_place() {
+    fn practice_runs_are_not_ranked() {
         let ended = run("a", 2, 9.0);
         let others = [
             Run { team: None, ..ended.clone() },

@@ -164,7 +164,7 @@ async fn a_postgres_server_keeps_them_alike() {
 
 #[cfg(not(feature = "postgres"))]
 #[tokio::test]
-async fn a_program_without_postgres_says_how_to_build_one() {
+async fn program_without_postgres_explains_how_to_build_one() {
     let database = "postgres://me:secret@db.example/runs".parse().unwrap();
     let error = Leaderboard::open(&database).await.unwrap_err().to_string();
     assert!(error.contains("--features postgres") && !error.contains("secret"), "{error}");
@@ -189,7 +189,7 @@ async fn two_programs_share_a_file() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_opened_is_said() {
+async fn reports_databases_that_cannot_be_opened() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("notes.txt");
     std::fs::write(

@@ -62,7 +62,7 @@ fn one_vehicle_has_one_runtime() {
 }
 
 #[tokio::test]
-async fn a_silent_runtime_loses_its_seat_and_the_newcomer_hears_the_flights_events() {
+async fn silent_runtime_loses_its_lease_and_the_next_receives_the_flights_events() {
     let vehicle = vehicle();
     vehicle.publish(EventKind::Note, "before the flight");
     let first = vehicle.take_control(&hello(4), address()).unwrap();

@@ -108,7 +108,7 @@ mod tests {
         }
 
         #[test]
-        fn whatever_comes_nothing_is_from_the_future(input in prop::collection::vec((any::<u64>(), 0i64..1_000_000_000), 1..100)) {
+        fn no_stamp_is_in_the_future(input in prop::collection::vec((any::<u64>(), 0i64..1_000_000_000), 1..100)) {
             let (mut clock, mut now, mut last) = (SenderClock::default(), truth(0), ServerTime::ZERO);
             for (sent_ns, wait_ns) in input {
                 now = now.plus_ns(wait_ns);

@@ -7,7 +7,7 @@ fn check(text: &str, expected: &str) {
 }
 
 #[test]
-fn the_command_line_says_what_the_file_says() {
+fn command_line_and_file_are_equivalent() {
     let line = "natnet:0.0.0.0:1511,up=y,units=cm,nose=-y,offset.yaw_deg=90,pivot_m=[0.0;0.0]";
     check(line, "write a place as [x,y,z]");
     let line = line.split_once(",pivot").unwrap().0;
@@ -43,7 +43,7 @@ fn the_command_line_says_what_the_file_says() {
 }
 
 #[test]
-fn what_cannot_be_is_named() {
+fn reports_invalid_settings_by_name() {
     check("vicom:1.2.3.4", "drivers are vicon, natnet, json, mavlink");
     check("json,units=yd", "unknown variant `yd`");
     check("json,units", "write KEY=VALUE");

@@ -52,7 +52,7 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
 }
 
 #[test]
-fn whatever_happened_to_a_file_it_is_baked_anew() {
+fn damaged_cache_file_is_baked_again() {
     let folder = tempfile::tempdir().unwrap();
     let cache = BakeCache::at(folder.path());
     let (splats, spec) = scene(0.9);

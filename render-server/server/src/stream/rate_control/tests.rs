@@ -182,7 +182,7 @@ fn options_are_only_ever_lowered() {
 }
 
 #[test]
-fn changes_are_told_in_words() {
+fn changes_have_a_sentence() {
     let down = Change { from: 0, to: 2, capacity_bps: 9.6e7 };
     assert_eq!(
         down.text(),
@@ -198,7 +198,7 @@ proptest! {
     /// On a link of any steady speed: settled in 30 s, at most four changes in any later minute,
     /// and what is sent arrives; and back at the best level within 30 s of the link's return.
     #[test]
-    fn it_converges_rests_and_returns(
+    fn rate_control_converges_rests_and_returns(
         mbit in 6.0..400.0_f64,
         kilobytes in 40.0..400.0_f64,
         rate_hz in 20.0..120.0_f64,

@@ -5,7 +5,7 @@ fn vehicle(name: &str) -> Need {
 }
 
 #[test]
-fn a_vehicle_is_the_one_that_the_path_or_the_query_names_beyond_doubt() {
+fn vehicle_is_the_one_named_by_path_or_query() {
     let need = |path: &str, uri: &str| Need::of(Takes::Vehicle, path, &uri.parse().unwrap());
     for uri in ["/ws?vehicle=ant", "/ws?x=1&vehicle=ant", "/ws?vehicle=%61nt"] {
         assert_eq!(need("/ws", uri), vehicle("ant"), "{uri}");
@@ -38,7 +38,7 @@ fn a_team_meets_its_own_vehicles_needs_alone() {
 }
 
 #[test]
-fn who_shows_a_key_is_judged_by_it_and_who_shows_none_by_where_it_is() {
+fn requests_are_judged_by_key_else_by_address() {
     let root = tempfile::tempdir().unwrap();
     let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
     let access =
@@ -99,7 +99,7 @@ fn keys_are_kept_made_for_new_vehicles_and_checked() {
 proptest::proptest! {
     /// Whatever comes as address, cookie or token is taken apart without a slip, and opens nothing.
     #[test]
-    fn what_strangers_send_is_taken_apart_and_opens_nothing(
+    fn malformed_requests_open_nothing(
         text in "[ -~]{0,80}",
         bytes in proptest::collection::vec(32u8..=255, 0..80),
     ) {

@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_is_where_its_clock_says() {
+    fn moving_objects_follow_the_clock() {
         let authorizer = ObjectConfig {
             name: "door".into(),
             scene: "door.ply".into(),

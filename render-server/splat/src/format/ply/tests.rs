@@ -187,7 +187,7 @@ fn unrenderable_splats_are_dropped_and_counted() {
 }
 
 #[test]
-fn errors_say_where_and_what() {
+fn errors_have_position_and_cause() {
     let check = |bytes: &[u8], part: &str| {
         let message = error(bytes);
         assert!(message.contains(part), "{message:?} lacks {part:?}");

@@ -73,7 +73,7 @@ fn faults_are_named_once_and_counted() {
 }
 
 #[test]
-fn another_name_and_another_clock_are_told() {
+fn warns_of_other_names_and_clocks() {
     let mut s = stream("objects.vizflyt=drone");
     assert_eq!(only(&mut s, at(0), &packet("")), None);
     assert_eq!(
@@ -108,7 +108,7 @@ fn another_name_and_another_clock_are_told() {
 }
 
 #[test]
-fn what_came_twice_is_left_out_and_a_still_is_named() {
+fn repeated_poses_are_left_out_and_a_frozen_stream_is_reported() {
     let mut s = stream("");
     assert!(only(&mut s, at(0), &packet(r#","seq":5"#)).is_some());
     for ms in 1..1500 {
@@ -152,7 +152,7 @@ proptest! {
 }
 
 #[test]
-fn what_tags_a_pose_rests_on_is_told_with_where_to_look() {
+fn reports_the_tags_of_a_pose_and_the_view() {
     let mut stream = stream("");
     let from = "192.168.1.7:4000".parse().unwrap();
     let mut quality_of = |ms: u64, quality: &str| {

@@ -89,7 +89,7 @@ fn odometry_is_taken_instead_with_its_covariance() {
 }
 
 #[test]
-fn systems_are_told_apart_and_asked_for_their_messages() {
+fn systems_are_distinguished_and_asked_for_their_messages() {
     let mut s = stream("objects.ant=1,objects.bee=2", &["ant", "bee"]);
     let from = "10.0.0.9:14550".parse().unwrap();
     assert_eq!(s.poll_transmit(at(0)), None);
@@ -117,7 +117,7 @@ fn systems_are_told_apart_and_asked_for_their_messages() {
 }
 
 #[test]
-fn an_estimate_that_is_none_is_turned_away() {
+fn invalid_estimates_are_rejected() {
     let mut s = stream("", &["v"]);
     s.handle_packet(at(0), &quaternion(1, 10, DQuat::IDENTITY, 0.0));
     let nan = LOCAL_POSITION_NED_DATA { time_boot_ms: 20, x: f32::NAN, ..Default::default() };

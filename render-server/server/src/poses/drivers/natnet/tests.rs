@@ -110,7 +110,7 @@ fn by_multicast_whoever_streams_is_asked_for_names() {
 }
 
 #[test]
-fn what_is_odd_is_told_and_counted() {
+fn odd_packets_are_reported_and_counted() {
     let ready = || {
         let mut s = stream("objects.wasp=7", unicast());
         s.handle_packet(at(0), &info(Version::V4_1));
