@@ -279,7 +279,7 @@ def test_without_a_runtime_it_says_how_to_start_one(tmp_path):
         assert status == 2 and "no runtime waits for a plugin; start one with `vizflyt fly --attach`" in err
 
 
-def test_a_debugger_may_stop_it_for_longer_than_a_heartbeat(stage, start):
+def test_a_debugger_may_stop_it_for_seconds(stage, start):
     process = start(PLAIN)
     process.ready()
     process.child.send_signal(signal.SIGSTOP)

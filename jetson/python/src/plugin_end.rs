@@ -27,13 +27,9 @@ pub(crate) struct PluginEnd {
     imu_had: AtomicU64,
 }
 
-/// What a process that ends has not been read by then is lost with its memory. The runtime reads within a
-/// millisecond, on a busy computer within some tens.
-const LAST_WORDS: Duration = Duration::from_millis(200);
-
 #[pymethods]
 impl PluginEnd {
-    /// Attaches to the runtime that made `service`.
+    /// Attaches to the runtime at `service`.
     #[new]
     fn open(py: Python<'_>, service: &str) -> PyResult<Self> {
         let end =
@@ -42,7 +38,7 @@ impl PluginEnd {
         Ok(Self { end, lender: Lender::default(), names, imu_had: AtomicU64::default() })
     }
 
-    /// Waits until the runtime notifies, `timeout_s` at most; returns whether it did.
+    /// Waits until there is something to take, `timeout_s` at most; returns whether there is.
     fn wait(&self, py: Python<'_>, timeout_s: f64) -> PyResult<bool> {
         let timeout = Duration::try_from_secs_f64(timeout_s).unwrap_or_default();
         let woken = py.detach(|| self.end.wait(timeout)).map_err(|error| lost(&error))?;
@@ -51,9 +47,13 @@ impl PluginEnd {
     }
 
     /// Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
-    /// or None if there is none.
+    /// or None if there is none; ("gone", None) once the runtime has ended.
     fn receive(&self, py: Python<'_>) -> PyResult<Option<(&'static str, Py<PyAny>)>> {
-        Ok(match self.end.receive().map_err(|error| lost(&error))? {
+        let message = match self.end.receive() {
+            Err(IpcError::Gone(_)) => return Ok(Some(("gone", py.None()))),
+            message => message.map_err(|error| lost(&error))?,
+        };
+        Ok(match message {
             None => None,
             Some(ToPlugin::Start(info)) => {
                 *self.names.lock().unwrap_or_else(PoisonError::into_inner) =
@@ -99,11 +99,9 @@ impl PluginEnd {
         })
     }
 
-    /// Reports that the plugin has failed, with the reason; leaves the runtime a moment to read it.
-    fn failed(&self, py: Python<'_>, reason: &str) -> PyResult<()> {
-        self.send(&FromPlugin::Failed { reason: bounded(reason) })?;
-        py.detach(|| std::thread::sleep(LAST_WORDS));
-        Ok(())
+    /// Reports that the plugin has failed, with the reason.
+    fn failed(&self, reason: &str) -> PyResult<()> {
+        self.send(&FromPlugin::Failed { reason: bounded(reason) })
     }
 }
 

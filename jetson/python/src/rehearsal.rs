@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use vizflyt_sdk::ipc::{IpcError, Offer, RuntimeEnd, unique_service};
+use vizflyt_sdk::ipc::{IpcError, Offer, RuntimeEnd};
 use vizflyt_sdk::protocol::messages::{
     Event as SdkEvent, EventKind, FromPlugin, ToPlugin, bounded,
 };
@@ -20,11 +20,8 @@ use crate::setpoint::Setpoint;
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct Rehearsal {
     end: RuntimeEnd,
-    /// What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`.
-    #[pyo3(get)]
-    service: String,
     /// Stands as long as this lives.
-    _offer: Option<Offer>,
+    offer: Offer,
 }
 
 /// A message of a plugin: (kind, number of the observation, setpoint or text, entered [ns]).
@@ -36,11 +33,15 @@ impl Rehearsal {
     #[pyo3(signature = (cameras, *, waiting = false))]
     fn make(cameras: Vec<CameraInfo>, waiting: bool) -> PyResult<Self> {
         let cameras: Vec<_> = cameras.into_iter().map(|camera| camera.0).collect();
-        let service = unique_service();
-        let len = ObservationWriter::len_for(&cameras);
-        let end = RuntimeEnd::create(&service, len).map_err(|error| failed(&error))?;
-        let offer = waiting.then(|| Offer::make(&service)).transpose()?;
-        Ok(Self { end, service, _offer: offer })
+        let end = RuntimeEnd::new(ObservationWriter::len_for(&cameras));
+        let offer = if waiting { end.offer() } else { end.offer_unlisted() };
+        Ok(Self { offer: offer.map_err(|error| failed(&error))?, end })
+    }
+
+    /// What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`.
+    #[getter]
+    fn service(&self) -> String {
+        self.offer.service()
     }
 
     /// Whether a plugin has attached: from then on messages reach it.
@@ -72,11 +73,6 @@ impl Rehearsal {
         self.send(&ToPlugin::Stop)
     }
 
-    /// Shows it that the runtime lives; `receive` does so too. At least twice a second.
-    fn heartbeat(&self) {
-        self.end.heartbeat();
-    }
-
     /// Hands it the buffer's images, through shared memory.
     fn publish(&self, buffer: &ObservationBuffer) -> PyResult<()> {
         let mut loan = self
@@ -105,11 +101,10 @@ impl Rehearsal {
             if left.is_zero() {
                 return Ok(None);
             }
-            // Short, so that Ctrl-C is noticed, and the plugin gets heartbeats.
+            // Short, so that Ctrl-C is noticed.
             let wait = left.min(Duration::from_millis(200));
             py.detach(|| self.end.wait(wait)).map_err(|error| failed(&error))?;
             py.check_signals()?;
-            self.end.heartbeat();
         }
     }
 }

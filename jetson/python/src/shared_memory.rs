@@ -24,11 +24,6 @@ pub(crate) struct Memory {
     pub(crate) names: Arc<[Name]>,
 }
 
-// SAFETY: through `&Memory` a sample's payload can only be read, which is one dereference of a pointer
-// that never changes, to memory that nobody writes while it is borrowed. The sample itself is used
-// again only when it is dropped, by one thread; it is `Send`.
-unsafe impl Sync for Memory {}
-
 enum Bytes {
     Shared {
         sample: ObservationSample,

@@ -5,7 +5,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION};
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
 use vizflyt_sdk::protocol::messages::{FromPlugin, PoseAges, ToPlugin, bounded};
 use vizflyt_sdk::{
@@ -89,10 +89,10 @@ impl Drop for Rig {
 
 impl Rig {
     fn start(program: &Path) -> Self {
-        let service = unique_service();
-        let ipc = RuntimeEnd::create(&service, ObservationWriter::len_for(&arena().cameras));
+        let ipc = RuntimeEnd::new(ObservationWriter::len_for(&arena().cameras));
+        let offer = ipc.offer_unlisted().unwrap();
         let child = Command::new(program)
-            .arg(format!("{SERVICE_OPTION}={service}"))
+            .arg(format!("{SERVICE_OPTION}={}", offer.service()))
             .env(
                 vizflyt_sdk::MAP_VARIABLE,
                 r#"[{"sphere": {"center_m": [1, 2, 3], "radius_m": 0.5}}]"#,
@@ -100,7 +100,7 @@ impl Rig {
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut rig = Self { ipc: ipc.unwrap(), child, seq: 0 };
+        let mut rig = Self { ipc, child, seq: 0 };
         let until = Instant::now() + WAIT;
         while !rig.ipc.plugin_attached() {
             assert!(Instant::now() < until && rig.child.try_wait().unwrap().is_none());

@@ -6,7 +6,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::process::ExitCode;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use vizflyt_protocol::messages::{FromPlugin, Name, ToPlugin, bounded};
 use vizflyt_protocol::time::HostTime;
@@ -18,7 +18,7 @@ use crate::observation::Observation;
 
 /// Runs a plugin to the end of the flight; call it from `main`.
 ///
-/// The runtime passes `--vizflyt-service PREFIX` on the command line. Started by hand (`cargo run`, a
+/// The runtime passes `--vizflyt-service fd:N` on the command line. Started by hand (`cargo run`, a
 /// debugger) it attaches to the one runtime of yours that waits for a plugin: `vizflyt fly --attach`.
 /// Other arguments are left to the plugin.
 ///
@@ -52,7 +52,7 @@ fn the_one_that_waits(waiting: &[String], program: &str) -> Result<String, Strin
     }
 }
 
-/// As [`run`], with the service's prefix given directly.
+/// As [`run`], with the service given directly.
 pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
     let end = match PluginEnd::open(service) {
         Ok(end) => end,
@@ -86,8 +86,8 @@ pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
 const NOT_ATTACHED: u8 = 2;
 /// Exit status after a panic, as Rust's own.
 const PANICKED: u8 = 101;
-/// The runtime wakes its plugin at least twice a second; after this long it is gone.
-const RUNTIME_GONE_AFTER: Duration = Duration::from_secs(2);
+/// Between two looks at nothing: whatever comes wakes the plugin.
+const A_WHILE: Duration = Duration::from_secs(10);
 
 /// Why the loop ended.
 enum End {
@@ -99,15 +99,18 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
     // `None` until the runtime has sent the arena.
     let mut names: Option<Vec<Name>> = None;
     let mut imu_had = HostTime::ZERO;
-    let mut received_at = Instant::now();
     loop {
-        if end.wait(RUNTIME_GONE_AFTER / 4)? {
-            received_at = Instant::now();
-        } else if received_at.elapsed() > RUNTIME_GONE_AFTER {
-            plugin.on_stop();
-            return Ok(End::RuntimeGone);
-        }
-        while let Some(message) = end.receive()? {
+        end.wait(A_WHILE)?;
+        loop {
+            let message = match end.receive() {
+                Ok(Some(message)) => message,
+                Ok(None) => break,
+                Err(IpcError::Gone(_)) => {
+                    plugin.on_stop();
+                    return Ok(End::RuntimeGone);
+                }
+                Err(error) => return Err(error),
+            };
             match message {
                 ToPlugin::Start(info) => {
                     plugin.on_start(&info);

@@ -27,7 +27,7 @@ use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::images::ImagePublisher;
 use vizflyt_runtime::stream::{self, Mailbox, Outbox, ServerClock, Shared, Step, StreamSettings};
-use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
+use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd};
 use vizflyt_sdk::{Observation, ObservationWriter};
 use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
@@ -308,9 +308,8 @@ struct Plugin {
 impl Plugin {
     /// Starts it; `handed` reads from an observation when its image was handed over. [ns, server]
     fn start(len: usize, handed: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Result<Self> {
-        let service = unique_service();
-        let runtime = Arc::new(RuntimeEnd::create(&service, len)?);
-        let plugin = PluginEnd::open(&service)?;
+        let runtime = Arc::new(RuntimeEnd::new(len));
+        let plugin = PluginEnd::attach(runtime.connect()?)?;
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = stop.clone();
         let thread = thread::spawn(move || {

@@ -20,8 +20,6 @@ from ._plugin import Plugin
 from ._vizflyt import PluginEnd, Setpoint, waiting_services
 
 SERVICE_OPTION = "--vizflyt-service"
-# The runtime wakes its plugin at least twice a second; after this long it is gone. [s]
-RUNTIME_GONE_AFTER_S = 2.0
 # Short, so that Ctrl-C is heard. [s]
 WAIT_S = 0.1
 # Exit status: no runtime to attach to.
@@ -68,15 +66,8 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
     """Runs the flight; yields the name of each method before it is called."""
     started = False
     copied = False
-    silent = 0
     while True:
-        # Waits are counted, not the clock read: a breakpoint stops this process, not the runtime.
-        silent = 0 if end.wait(WAIT_S) else silent + 1
-        if silent * WAIT_S > RUNTIME_GONE_AFTER_S:
-            yield "on_stop"
-            plugin.on_stop()
-            print("plugin: the runtime is gone; ending", file=sys.stderr)
-            raise SystemExit(1)
+        end.wait(WAIT_S)
         while (message := end.receive()) is not None:
             what, content = message
             if what == "start":
@@ -90,7 +81,10 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
             else:
                 yield "on_stop"
                 plugin.on_stop()
-                return
+                if what == "stop":
+                    return
+                print("plugin: the runtime is gone; ending", file=sys.stderr)
+                raise SystemExit(1)
         if not started:
             continue
         obs = end.observation()

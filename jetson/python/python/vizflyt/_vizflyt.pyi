@@ -661,9 +661,6 @@ class Rehearsal:
     def stop(self) -> None:
         """Tells it to end."""
 
-    def heartbeat(self) -> None:
-        """Shows it that the runtime lives; `receive` does so too. At least twice a second."""
-
     def publish(self, buffer: ObservationBuffer) -> None:
         """Hands it the buffer's images, through shared memory."""
 
@@ -680,11 +677,11 @@ class PluginEnd:
 
     def __new__(cls, service: str) -> PluginEnd: ...
     def wait(self, timeout_s: float) -> bool:
-        """Waits until the runtime notifies, `timeout_s` at most; returns whether it did."""
+        """Waits until there is something to take, `timeout_s` at most; returns whether there is."""
 
-    def receive(self) -> tuple[Literal["start", "event", "stop"], Any] | None:
+    def receive(self) -> tuple[Literal["start", "event", "stop", "gone"], Any] | None:
         """Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
-        or None if there is none.
+        or None if there is none; ("gone", None) once the runtime has ended.
         """
 
     def observation(self) -> Observation | None:
@@ -697,7 +694,7 @@ class PluginEnd:
         """Sends the answer to one observation."""
 
     def failed(self, reason: str) -> None:
-        """Reports that the plugin has failed, with the reason; leaves the runtime a moment to read it."""
+        """Reports that the plugin has failed, with the reason."""
 
 def waiting_services() -> list[str]:
     """Returns the services of this user's runtimes that wait for a plugin, the longest waiting first."""

@@ -2,6 +2,7 @@
 //! given up.
 
 use std::ffi::OsString;
+use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
@@ -10,19 +11,15 @@ use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{CameraInfo, Setpoint, ToPlugin};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
-use vizflyt_sdk::ipc::{Offer, RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::ipc::{Offer, RuntimeEnd};
 
 use super::{ControlInput, ControlLoop};
 use crate::images::ImagePublisher;
 use crate::replies::PluginReplies;
 use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
-/// Maximum time between two messages to the plugin.
-const HEARTBEAT_TICKS: u64 = 20;
 /// A plugin that has reported a failure may still print why for this long, before it is started again. [s]
 const LAST_WORDS_S: f64 = 0.3;
-/// Whether a plugin that a person started still lives is looked up every 80 ms.
-const BY_HAND_TICKS: u64 = 4;
 /// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
 /// it would land. [s]
 const BREAKPOINT_S: f64 = 0.4;
@@ -57,33 +54,24 @@ impl ControlLoop {
         if let Some(camera) = cameras.first() {
             self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
-        let service = unique_service();
         let len = ObservationWriter::len_for(&cameras);
-        let mut command = self.control.plugin_command.clone();
+        let command = self.control.plugin_command.clone();
         let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
-        // Who starts a plugin by hand is its user.
         let by_hand = command.is_empty();
-        let owner = confinement.user_id().filter(|_| !by_hand);
-        let ipc = match RuntimeEnd::create_for(&service, len, owner) {
-            Ok(ipc) => Arc::new(ipc),
-            Err(error) => {
-                return self.companion.refuse(now, error.to_string());
-            }
-        };
+        let ipc = Arc::new(RuntimeEnd::new(len));
         let stop = Arc::default();
         let replies = Arc::new(PluginReplies::new(Arc::clone(&ipc)));
         let threads = self.start_threads(&ipc, cameras, &stop, &replies);
         let mut offer = None;
         if by_hand {
-            match Offer::make(&service) {
+            match ipc.offer() {
                 Ok(made) => offer = Some(made),
                 Err(error) => {
-                    let sentence = format!("no plugin can find this runtime: {error}");
+                    let error = anyhow::Error::new(error);
+                    let sentence = format!("no plugin can find this runtime: {error:#}");
                     self.companion.plugin_failed(now, PluginFault::ended(&sentence));
                 }
             }
-        } else {
-            command.push(format!("{SERVICE_OPTION}={service}").into());
         }
         self.plugin = Some(PluginSide {
             ipc,
@@ -111,14 +99,10 @@ impl ControlLoop {
     pub(super) fn tend_by_hand(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
         let Some(answered) = side.by_hand_replied else { return };
-        if self.ticks.is_multiple_of(BY_HAND_TICKS) {
-            // A killed process stays subscribed until its remains are cleared away.
-            side.ipc.clean_up();
-            if !side.ipc.plugin_attached() {
-                side.by_hand_replied = None;
-                let sentence = "the plugin that had attached has ended".to_owned();
-                return self.companion.plugin_failed(now, PluginFault::ended(&sentence));
-            }
+        if !side.ipc.plugin_attached() {
+            side.by_hand_replied = None;
+            let sentence = "the plugin that had attached has ended".to_owned();
+            return self.companion.plugin_failed(now, PluginFault::ended(&sentence));
         }
         if now.seconds_since(answered) > BREAKPOINT_S {
             side.by_hand_replied = Some(now);
@@ -140,7 +124,10 @@ impl ControlLoop {
             }
             let _ = sender.send(ControlInput::Plugin(run, event));
         };
-        match Supervisor::start(&side.command, &side.confinement, handle) {
+        let started = side.ipc.connect().map_err(io::Error::other).and_then(|socket| {
+            Supervisor::start(&side.command, &side.confinement, Some(socket), handle)
+        });
+        match started {
             Ok(supervisor) => side.supervisor = Some(supervisor),
             Err(error) => {
                 let program = side.command[0].to_string_lossy();
@@ -237,7 +224,7 @@ impl ControlLoop {
         images.into_iter().chain(reader).collect()
     }
 
-    /// Greets the plugin once it has attached; shows it that we live.
+    /// Greets the plugin once it has attached.
     pub(super) fn tend_plugin(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
         if side.leaving.is_some_and(|until| now > until)
@@ -251,8 +238,6 @@ impl ControlLoop {
                 side.by_hand_replied = Some(now);
             }
             self.companion.greet_plugin(now);
-        } else if self.ticks.is_multiple_of(HEARTBEAT_TICKS) {
-            side.ipc.heartbeat();
         }
     }
 

@@ -10,7 +10,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{ArenaInfo, Axes, Limits, PoseSample, Setpoint, YawTarget};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd, unique_service};
+use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 
 use super::*;
@@ -75,9 +75,8 @@ impl Drivers {
         };
         let mut control = ControlLoop::new(now, control, sender);
         // A plugin that has attached already, without a process of its own.
-        let service = unique_service();
-        let ipc = Arc::new(RuntimeEnd::create(&service, 1 << 16).unwrap());
-        let plugin = PluginEnd::open(&service).unwrap();
+        let ipc = Arc::new(RuntimeEnd::new(1 << 16));
+        let plugin = PluginEnd::attach(ipc.connect().unwrap()).unwrap();
         control.plugin = Some(PluginSide {
             replies: Arc::new(PluginReplies::new(Arc::clone(&ipc))),
             ipc,

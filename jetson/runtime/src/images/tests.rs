@@ -9,7 +9,7 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, peek, slice_len};
 use vizflyt_sdk::Observation;
 use vizflyt_sdk::glam::{DQuat, DVec3};
-use vizflyt_sdk::ipc::{PluginEnd, unique_service};
+use vizflyt_sdk::ipc::PluginEnd;
 
 fn camera(name: &str) -> CameraInfo {
     CameraInfo {
@@ -61,10 +61,9 @@ struct Rig {
 impl Rig {
     fn new(names: &[&str]) -> Self {
         let cameras: Vec<_> = names.iter().map(|name| camera(name)).collect();
-        let service = unique_service();
         let len = ObservationWriter::len_for(&cameras);
-        let ipc = Arc::new(RuntimeEnd::create(&service, len).unwrap());
-        let plugin = PluginEnd::open(&service).unwrap();
+        let ipc = Arc::new(RuntimeEnd::new(len));
+        let plugin = PluginEnd::attach(ipc.connect().unwrap()).unwrap();
         let names = cameras.iter().map(|camera| camera.name.clone()).collect();
         let publisher = ImagePublisher::new(ipc, cameras, Arc::default());
         Self { publisher, plugin, names, mailbox: Mailbox::default() }

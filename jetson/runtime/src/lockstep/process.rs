@@ -9,12 +9,10 @@ use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_sdk::ObservationTooLarge;
-use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
 
-/// Maximum time between two messages to the plugin.
-const HEARTBEAT: Duration = Duration::from_millis(400);
 /// How long a plugin may take to attach and to load what it needs: models take their time.
 const READY_WITHIN: Duration = Duration::from_mins(5);
 
@@ -44,7 +42,6 @@ pub struct PluginProcess {
     ipc: RuntimeEnd,
     supervisor: Supervisor,
     events: Receiver<PluginEvent>,
-    beaten: Instant,
     /// An answer, or the reading of an event, that takes longer is a failure.
     within: Duration,
 }
@@ -59,21 +56,19 @@ impl PluginProcess {
         limits: &PluginLimits,
         within: Duration,
     ) -> Result<Self, ProcessError> {
-        let service = unique_service();
-        let mut command = command.to_vec();
-        let confinement = Confinement::prepare(limits, &command);
-        let len = size_of::<ObservationHeader>();
-        let ipc = RuntimeEnd::create_for(&service, len, confinement.user_id())?;
-        command.push(format!("{SERVICE_OPTION}={service}").into());
+        let confinement = Confinement::prepare(limits, command);
+        let ipc = RuntimeEnd::new(size_of::<ObservationHeader>());
+        let socket = ipc.connect()?;
         let (sender, events) = channel();
         let handle = move |event| {
             let _ = sender.send(event);
         };
-        let supervisor = Supervisor::start(&command, &confinement, handle).map_err(|error| {
+        let supervisor = Supervisor::start(command, &confinement, Some(socket), handle);
+        let supervisor = supervisor.map_err(|error| {
             let program = command.first().map(|program| program.to_string_lossy().into_owned());
             ProcessError::Start(program.unwrap_or_default(), error)
         })?;
-        Ok(Self { ipc, supervisor, events, beaten: Instant::now(), within })
+        Ok(Self { ipc, supervisor, events, within })
     }
 
     /// Greets the plugin with `start` when it has attached, and waits until it is ready, five minutes
@@ -92,7 +87,7 @@ impl PluginProcess {
             }
             thread::sleep(Duration::from_millis(2));
         }
-        self.ipc.send(start)?;
+        self.send(start, line)?;
         loop {
             match self.next(line)? {
                 Some(FromPlugin::Ready { .. }) => return Ok(()),
@@ -113,9 +108,9 @@ impl PluginProcess {
         let deadline = Instant::now() + self.within;
         loop {
             match self.ipc.send(message) {
-                Ok(()) => return Ok(()),
+                // The end of one that is gone is noticed when the next image is not answered.
+                Ok(()) | Err(IpcError::Gone(_)) => return Ok(()),
                 Err(IpcError::QueueFull(_)) if Instant::now() < deadline => {
-                    self.ipc.heartbeat();
                     if let Some(why) = self.pass_lines(line) {
                         return Err(failed(&why));
                     }
@@ -169,16 +164,6 @@ impl PluginProcess {
         }
     }
 
-    /// Sends a heartbeat to the plugin, if it has received nothing for a while; its end is noticed when the
-    /// next image is not answered.
-    pub fn tend(&mut self, line: LineSink<'_>) {
-        if self.beaten.elapsed() >= HEARTBEAT {
-            self.beaten = Instant::now();
-            self.ipc.heartbeat();
-        }
-        self.pass_lines(line);
-    }
-
     /// Ends the plugin in order.
     pub fn stop(mut self, line: LineSink<'_>) {
         if self.ipc.plugin_attached() {
@@ -195,10 +180,6 @@ impl PluginProcess {
             return Ok(Some(message));
         }
         self.ipc.wait(Duration::from_millis(50))?;
-        if self.beaten.elapsed() >= HEARTBEAT {
-            self.beaten = Instant::now();
-            self.ipc.heartbeat();
-        }
         let ended = self.pass_lines(line);
         // Its messages before its end count.
         match (self.receive()?, ended) {
@@ -217,7 +198,7 @@ impl PluginProcess {
     }
 
     /// Passes on what the plugin printed; returns how it ended, if it has.
-    fn pass_lines(&mut self, line: LineSink<'_>) -> Option<String> {
+    pub fn pass_lines(&mut self, line: LineSink<'_>) -> Option<String> {
         let mut ended = None;
         for event in self.events.try_iter() {
             match event {

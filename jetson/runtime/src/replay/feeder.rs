@@ -14,8 +14,8 @@ use crate::lockstep::{PluginProcess, ProcessError};
 use crate::log::Observation;
 use crate::supervisor::{PluginLimits, Stream};
 
-/// Longest time between two messages to the plugin.
-const HEARTBEAT: Duration = Duration::from_millis(400);
+/// What the plugin prints is passed on this often.
+const LINES_EVERY: Duration = Duration::from_millis(400);
 /// Largest observation that is fed: what eight of the largest cameras need is a faulty log.
 /// [bytes]
 const LARGEST: usize = 1 << 30;
@@ -90,12 +90,12 @@ impl<'a> Feeder<'a> {
         Ok(answer.map_or_else(FeedOutcome::Failed, FeedOutcome::Replied))
     }
 
-    /// Waits until then, and sends heartbeats to the plugin.
+    /// Waits until then, and passes on what the plugin prints.
     pub(super) fn idle_until(&mut self, due: Instant, line: &mut dyn FnMut(Stream, &str)) {
         while Instant::now() < due {
-            sleep_until(due.min(Instant::now() + HEARTBEAT));
+            sleep_until(due.min(Instant::now() + LINES_EVERY));
             if let Some(process) = &mut self.process {
-                process.tend(line);
+                process.pass_lines(line);
             }
         }
     }

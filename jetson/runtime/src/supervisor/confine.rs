@@ -36,6 +36,8 @@ use seccompiler::{
     SeccompRule,
 };
 
+use vizflyt_sdk::ipc::PluginSocket;
+
 use super::cgroup::{Cgroup, Controller};
 use super::limits::PluginLimits;
 
@@ -91,7 +93,7 @@ impl Confinement {
         Self { limits, user, drops_powers, filters, landlock, own_folders, notes }
     }
 
-    /// Returns the user that the plugin becomes, if another; the shared memory must be its own.
+    /// Returns the user that the plugin becomes, if another.
     pub fn user_id(&self) -> Option<u32> {
         self.user.map(|(uid, _)| uid.as_raw())
     }
@@ -135,7 +137,12 @@ impl Confinement {
     }
 
     /// Makes `process` lose all this before its first instruction.
-    pub(super) fn apply(&self, process: &mut Command, bounds: &Bounds) {
+    pub(super) fn apply(
+        &self,
+        process: &mut Command,
+        bounds: &Bounds,
+        socket: Option<PluginSocket>,
+    ) {
         let parent = nix::unistd::getpid();
         let doors: Vec<i32> = bounds.group.doors().into_iter().map(File::as_raw_fd).collect();
         let landlock = self.landlock.as_ref().map(AsRawFd::as_raw_fd);
@@ -144,6 +151,9 @@ impl Confinement {
         let processors = bounds.processors;
         let filters = self.filters.clone();
         let steps = move || -> io::Result<()> {
+            if let Some(socket) = &socket {
+                socket.let_inherit()?;
+            }
             for &door in &doors {
                 // SAFETY: writes a byte that outlives the call to a file that our parent holds.
                 let written = unsafe { libc::write(door, b"0".as_ptr().cast(), 1) };

@@ -24,6 +24,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
+use vizflyt_sdk::ipc::PluginSocket;
 
 use confine::Bounds;
 use output::{Tracebacks, read_lines};
@@ -77,8 +78,8 @@ const END_WITHIN: Duration = Duration::from_millis(300);
 const WATCH_EVERY: Duration = Duration::from_millis(100);
 
 impl Supervisor {
-    /// Starts `command` (program, then arguments), confined. `handle` is called from the
-    /// supervisor's threads.
+    /// Starts `command` (program, then arguments), confined, with its end of the socket to the runtime.
+    /// `handle` is called from the supervisor's threads.
     ///
     /// The child dies with the thread that calls this (`PR_SET_PDEATHSIG`): call it from one that
     /// lives as long as the flight.
@@ -88,6 +89,7 @@ impl Supervisor {
     pub fn start(
         command: &[OsString],
         confinement: &Confinement,
+        socket: Option<PluginSocket>,
         handle: impl Fn(PluginEvent) + Clone + Send + 'static,
     ) -> io::Result<Self> {
         let (program, arguments) = command
@@ -108,7 +110,8 @@ impl Supervisor {
         if let Some(map) = &confinement.limits.map {
             process.env(vizflyt_sdk::MAP_VARIABLE, map);
         }
-        confinement.apply(&mut process, &bounds);
+        process.args(socket.as_ref().map(PluginSocket::argument));
+        confinement.apply(&mut process, &bounds, socket);
         let mut child = process.spawn()?;
         for note in notes {
             handle(PluginEvent::Note(note));

@@ -11,7 +11,7 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION, unique_service};
+use vizflyt_sdk::ipc::{PluginSocket, RuntimeEnd};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 
 use super::*;
@@ -25,13 +25,21 @@ fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
 }
 
 fn start_with(limits: &PluginLimits, command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
+    start_connected(limits, command, None)
+}
+
+fn start_connected(
+    limits: &PluginLimits,
+    command: &[&str],
+    socket: Option<PluginSocket>,
+) -> (Supervisor, Receiver<PluginEvent>) {
     let (sender, receiver) = channel();
     let command: Vec<OsString> = command.iter().map(OsString::from).collect();
     let handle = move |event| {
         let _ = sender.send(event);
     };
     let confinement = Confinement::prepare(limits, &command);
-    (Supervisor::start(&command, &confinement, handle).unwrap(), receiver)
+    (Supervisor::start(&command, &confinement, socket, handle).unwrap(), receiver)
 }
 
 /// Returns the lines and the last sentence of a child that ends by itself.
@@ -85,9 +93,9 @@ fn every_kind_of_exit_has_its_sentence() {
 fn a_program_that_is_not_there_is_an_error() {
     let command = [OsString::from("/nonexistent/plugin")];
     let confinement = Confinement::prepare(&PluginLimits::default(), &command);
-    let error = Supervisor::start(&command, &confinement, |_| {}).unwrap_err();
+    let error = Supervisor::start(&command, &confinement, None, |_| {}).unwrap_err();
     assert_eq!(error.kind(), io::ErrorKind::NotFound);
-    assert!(Supervisor::start(&[], &confinement, |_| {}).is_err());
+    assert!(Supervisor::start(&[], &confinement, None, |_| {}).is_err());
 }
 
 #[test]
@@ -141,7 +149,7 @@ fn the_child_dies_with_the_thread_that_started_it() {
         };
         // Forgotten, as by a runtime that is killed.
         let confinement = Confinement::prepare(&PluginLimits::default(), &command);
-        std::mem::forget(Supervisor::start(&command, &confinement, handle).unwrap());
+        std::mem::forget(Supervisor::start(&command, &confinement, None, handle).unwrap());
     });
     starter.join().unwrap();
     let end = std::iter::from_fn(|| receiver.recv_timeout(WAIT).ok())
@@ -329,14 +337,11 @@ struct Rig {
 
 impl Rig {
     fn start(how: &str) -> Self {
-        let service = unique_service();
+        let ipc = RuntimeEnd::new(ObservationWriter::len_for(&cameras()));
+        let socket = Some(ipc.connect().unwrap());
         let program = example();
-        let command = [program.clone().into_os_string()];
-        let owner = Confinement::prepare(&PluginLimits::default(), &command).user_id();
-        let len = ObservationWriter::len_for(&cameras());
-        let ipc = RuntimeEnd::create_for(&service, len, owner).unwrap();
-        let option = format!("{SERVICE_OPTION}={service}");
-        let (supervisor, events) = start(&[program.to_str().unwrap(), how, &option]);
+        let command = [program.to_str().unwrap(), how];
+        let (supervisor, events) = start_connected(&PluginLimits::default(), &command, socket);
         let mut rig = Self { ipc, supervisor, events, seq: 0 };
         rig.until(|rig| rig.ipc.plugin_attached());
         rig.ipc.send(&ToPlugin::Start(arena())).unwrap();

@@ -1,58 +1,95 @@
-//! How a plugin that a person starts finds the runtime that waits for it: a file per waiting runtime,
-//! in a folder of the user's own, named by the process and holding the service's prefix.
+//! How a plugin that a person starts finds the runtime that waits for it: a socket per waiting runtime, in a folder of
+//! the user's own, named by the process.
 
-use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::io;
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::{fs, process};
 
-use super::user_folder;
+use nix::sys::socket::{
+    AddressFamily, Backlog, SockFlag, SockType, UnixAddr, accept4, bind, connect as connect_to,
+    getsockopt, listen, socket, sockopt,
+};
+use nix::unistd::geteuid;
+
+use super::socket::owned;
+
+/// Begins the name of an offer that is not listed.
+const UNLISTED: &str = "unlisted-";
 
 /// A runtime's offer to a plugin that it waits for; withdrawn when dropped.
 #[derive(Debug)]
 pub struct Offer {
-    file: PathBuf,
+    path: PathBuf,
 }
 
+/// Where plugins connect.
+#[derive(Debug)]
+pub(super) struct Listener(OwnedFd);
+
 impl Offer {
-    /// Offers the service to whichever plugin of this user asks first.
-    ///
-    /// # Errors
-    /// If the file cannot be written, or the folder is another user's.
-    pub fn make(service: &str) -> io::Result<Self> {
-        Self::make_in(&folder(), service, process::id())
+    /// Returns what a plugin gives as `--vizflyt-service`.
+    pub fn service(&self) -> String {
+        self.path.display().to_string()
     }
 
-    fn make_in(folder: &Path, service: &str, pid: u32) -> io::Result<Self> {
+    /// Offers to whichever plugin of this user asks first; one that is not listed, to who knows its path.
+    pub(super) fn make(listed: bool) -> io::Result<(Self, Listener)> {
+        let prefix = if listed { "" } else { UNLISTED };
+        Self::make_in(&folder(), &format!("{prefix}{}", process::id()))
+    }
+
+    fn make_in(folder: &Path, name: &str) -> io::Result<(Self, Listener)> {
+        static MADE: AtomicU32 = AtomicU32::new(0);
         fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
         if !is_ours(folder) {
-            return Err(io::Error::new(
-                io::ErrorKind::PermissionDenied,
-                format!("{} belongs to another user", folder.display()),
-            ));
+            let text = format!(
+                "{} belongs to another user, or is no folder; have it removed",
+                folder.display()
+            );
+            return Err(io::Error::new(io::ErrorKind::PermissionDenied, text));
         }
-        // Written beside and moved into place, so that nobody reads half of it.
-        let (file, draft) = (folder.join(pid.to_string()), folder.join(format!(".{pid}")));
-        let mut writer = fs::OpenOptions::new()
-            .write(true)
-            .create(true)
-            .truncate(true)
-            .mode(0o600)
-            .open(&draft)?;
-        writer.write_all(service.as_bytes())?;
-        fs::rename(&draft, &file)?;
-        Ok(Self { file })
+        let path = folder.join(format!("{name}-{}", MADE.fetch_add(1, Ordering::Relaxed)));
+        let socket = new_socket(SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK)?;
+        // Of a killed process that had our number.
+        let _ = fs::remove_file(&path);
+        bind(socket.as_raw_fd(), &UnixAddr::new(&path)?)?;
+        let offer = Self { path };
+        listen(&socket, Backlog::new(1)?)?;
+        Ok((offer, Listener(socket)))
     }
 }
 
 impl Drop for Offer {
     fn drop(&mut self) {
         // What stays behind is ignored as soon as this process is gone.
-        let _ = fs::remove_file(&self.file);
+        let _ = fs::remove_file(&self.path);
     }
 }
 
-/// Returns the prefixes of this user's runtimes that wait for a plugin, the longest waiting first.
+impl Listener {
+    /// Returns the next plugin's socket, if one of this user has connected.
+    pub(super) fn accept(&mut self) -> Option<OwnedFd> {
+        let socket = owned(accept4(self.0.as_raw_fd(), SockFlag::SOCK_CLOEXEC).ok()?);
+        let peer = getsockopt(&socket, sockopt::PeerCredentials).ok()?;
+        (peer.uid() == geteuid().as_raw()).then_some(socket)
+    }
+}
+
+/// Connects to a runtime that offers.
+pub(super) fn connect(path: &Path) -> io::Result<OwnedFd> {
+    let socket = new_socket(SockFlag::SOCK_CLOEXEC)?;
+    connect_to(socket.as_raw_fd(), &UnixAddr::new(path)?)?;
+    Ok(socket)
+}
+
+fn new_socket(flags: SockFlag) -> io::Result<OwnedFd> {
+    Ok(socket(AddressFamily::Unix, SockType::SeqPacket, flags, None)?)
+}
+
+/// Returns the services of this user's runtimes that wait for a plugin, the longest waiting first.
 pub fn offers() -> Vec<String> {
     offers_in(&folder())
 }
@@ -65,14 +102,19 @@ fn offers_in(folder: &Path) -> Vec<String> {
     let mut found: Vec<_> = entries
         .flatten()
         .filter_map(|entry| {
-            let pid: u32 = entry.file_name().to_str()?.parse().ok()?;
+            let name = entry.file_name().into_string().ok()?;
+            let number = name.strip_prefix(UNLISTED).unwrap_or(&name);
+            let pid: u32 = number.split('-').next()?.parse().ok()?;
             if !Path::new(&format!("/proc/{pid}")).exists() {
                 // It was killed.
                 let _ = fs::remove_file(entry.path());
                 return None;
             }
+            if name.starts_with(UNLISTED) {
+                return None;
+            }
             let since = entry.metadata().ok()?.modified().ok()?;
-            Some((since, fs::read_to_string(entry.path()).ok()?))
+            Some((since, entry.path().to_str()?.to_owned()))
         })
         .collect();
     found.sort();
@@ -81,11 +123,11 @@ fn offers_in(folder: &Path) -> Vec<String> {
 
 fn is_ours(folder: &Path) -> bool {
     fs::symlink_metadata(folder)
-        .is_ok_and(|found| found.is_dir() && found.uid() == nix::unistd::geteuid().as_raw())
+        .is_ok_and(|found| found.is_dir() && found.uid() == geteuid().as_raw())
 }
 
 fn folder() -> PathBuf {
-    Path::new(&user_folder()).join("waiting")
+    PathBuf::from(format!("/tmp/vizflyt-{}/waiting", geteuid()))
 }
 
 #[cfg(test)]
@@ -111,8 +153,11 @@ mod tests {
     fn an_offer_stands_until_it_is_dropped() {
         let scratch = Scratch::new("stands");
         assert!(offers_in(&scratch.0).is_empty());
-        let offer = Offer::make_in(&scratch.0, "vizflyt/1", process::id()).unwrap();
-        assert_eq!(offers_in(&scratch.0), ["vizflyt/1"]);
+        let (offer, mut listener) = Offer::make_in(&scratch.0, &process::id().to_string()).unwrap();
+        assert_eq!(offers_in(&scratch.0), [offer.service()]);
+        assert!(listener.accept().is_none());
+        let _plugin = connect(&offer.path).unwrap();
+        assert!(listener.accept().is_some());
         drop(offer);
         assert!(offers_in(&scratch.0).is_empty());
     }
@@ -121,7 +166,7 @@ mod tests {
     fn the_offer_of_a_killed_runtime_does_not_count() {
         let scratch = Scratch::new("killed");
         // Larger than any process id Linux gives (2^22).
-        let offer = Offer::make_in(&scratch.0, "vizflyt/gone", u32::MAX).unwrap();
+        let (offer, _) = Offer::make_in(&scratch.0, &u32::MAX.to_string()).unwrap();
         std::mem::forget(offer);
         assert!(offers_in(&scratch.0).is_empty());
         assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 0);
@@ -130,9 +175,11 @@ mod tests {
     #[test]
     fn a_link_to_elsewhere_is_not_followed() {
         let (real, link) = (Scratch::new("real"), Scratch::new("link"));
-        let _offer = Offer::make_in(&real.0, "vizflyt/1", process::id()).unwrap();
+        let _offer = Offer::make_in(&real.0, "1").unwrap();
         std::os::unix::fs::symlink(&real.0, &link.0).unwrap();
         assert!(offers_in(&link.0).is_empty());
+        let error = Offer::make_in(&link.0, "1").unwrap_err();
+        assert!(error.to_string().contains("another user"), "{error}");
         fs::remove_file(&link.0).unwrap();
     }
 }

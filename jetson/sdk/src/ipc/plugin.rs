@@ -1,128 +1,224 @@
-//! The plugin's end: opens the services that the runtime made.
+//! The plugin's end: takes the newest observation, receives messages, sends replies.
 
+use std::collections::VecDeque;
+use std::os::fd::{AsFd, OwnedFd};
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use iceoryx2::node::Node;
-use iceoryx2::port::BackpressureAction;
-use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::Notifier;
-use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::prelude::PortFactory;
-use iceoryx2::sample::Sample;
-use iceoryx2::service::builder::event::EventOpenError;
-use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
+use memmap2::Mmap;
+use nix::errno::Errno;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
 use vizflyt_protocol::packet::PreambleError;
-use vizflyt_protocol::packet::framing::{self, MAX_FRAMED};
+use vizflyt_protocol::packet::framing::{self, FramingError, MAX_FRAMED};
 
-use super::{Ipc, IpcError, PROTOCOL_KEY, name, node, receive, send_bytes, slices, wait};
+use super::board::Board;
+use super::runtime::PluginSocket;
+use super::sealed::{map_read_only, take_inherited};
+use super::socket::{self, EMPTY, Kind, Received};
+use super::{BORROWED_OBSERVATIONS, IpcError, SLOTS, offer};
 
-/// The plugin's end of the shared memory.
+/// The plugin's end.
 #[derive(Debug)]
 pub struct PluginEnd {
-    observations: Subscriber<Ipc, [u8], ()>,
-    from_plugin: Publisher<Ipc, [u8], ()>,
-    wake_runtime: Notifier<Ipc>,
-    wake_plugin: Listener<Ipc>,
-    to_plugin: Subscriber<Ipc, [u8], ()>,
-    // Last, so that ports go before the node they belong to.
-    _node: Node<Ipc>,
+    socket: OwnedFd,
+    bell: OwnedFd,
+    borrowed: Arc<Borrowed>,
+    inbox: Mutex<Inbox>,
 }
 
 /// An observation in shared memory; as long as it lives, the runtime does not reuse the memory.
 #[derive(Debug)]
-pub struct ObservationSample(Sample<Ipc, [u8], ()>);
+pub struct ObservationSample {
+    memory: Arc<Mmap>,
+    len: usize,
+    slot: usize,
+    borrowed: Arc<Borrowed>,
+}
+
+/// What is lent, and where it is given back.
+#[derive(Debug)]
+struct Borrowed {
+    board: Board,
+    count: AtomicUsize,
+}
+
+/// What has come over the socket.
+#[derive(Debug, Default)]
+struct Inbox {
+    slots: [Option<Arc<Mmap>>; SLOTS],
+    messages: VecDeque<Result<ToPlugin, FramingError>>,
+    is_closed: bool,
+}
 
 impl PluginEnd {
-    /// Attaches to the runtime that made `prefix`.
+    /// Attaches to the runtime at `service`: `fd:N`, a socket that this process was started with, or the path of one.
     ///
     /// # Errors
-    /// [`IpcError::NoRuntime`] if there is none, [`IpcError::Version`] if it speaks another
-    /// protocol, [`IpcError::Transport`] if another plugin is attached.
-    pub fn open(prefix: &str) -> Result<Self, IpcError> {
-        let node = node()?;
-        let port = "attaching";
-        let open = |suffix| {
-            slices(&node, prefix, suffix)?.open().map_err(|error| match error {
-                PublishSubscribeOpenError::DoesNotExist => IpcError::NoRuntime(prefix.to_owned()),
-                error => IpcError::transport("opening a service")(error),
-            })
+    /// [`IpcError::NoRuntime`] if there is none or it has a plugin already, [`IpcError::Version`] if it speaks another
+    /// protocol.
+    pub fn open(service: &str) -> Result<Self, IpcError> {
+        let nobody = || IpcError::NoRuntime(service.to_owned());
+        let socket = match service.strip_prefix("fd:") {
+            Some(number) => {
+                let number = number.parse().map_err(|_| nobody())?;
+                take_inherited(number).map_err(|_| nobody())?
+            }
+            None => offer::connect(Path::new(service)).map_err(|_| nobody())?,
         };
-        let event = |suffix| {
-            let builder = node.service_builder(&name(prefix, suffix)?).event();
-            builder.open().map_err(|error| match error {
-                EventOpenError::DoesNotExist => IpcError::NoRuntime(prefix.to_owned()),
-                error => IpcError::transport("opening a service")(error),
-            })
-        };
-
-        let observation_service = open("observation")?;
-        let key = PROTOCOL_KEY.try_into().map_err(IpcError::transport("opening a service"))?;
-        let version = observation_service.attributes().key_value(&key, 0);
-        check_version(version.and_then(|value| value.to_string().parse().ok()).unwrap_or(0))?;
-
-        let observations =
-            observation_service.subscriber_builder().create().map_err(IpcError::transport(port))?;
-        let from_plugin = open("from_plugin")?
-            .publisher_builder()
-            .initial_max_slice_len(MAX_FRAMED)
-            // The runtime reads within milliseconds; after a second it is gone or stopped.
-            .set_backpressure_handler(|info| {
-                if info.elapsed_time < Duration::from_secs(1) {
-                    BackpressureAction::Retry
-                } else {
-                    BackpressureAction::DiscardDataAndFail
-                }
-            })
-            .create()
-            .map_err(IpcError::transport(port))?;
-        let wake_runtime = event("wake_runtime")?
-            .notifier_builder()
-            .create()
-            .map_err(IpcError::transport(port))?;
-        let wake_plugin =
-            event("wake_plugin")?.listener_builder().create().map_err(IpcError::transport(port))?;
-        // Last: its presence shows the runtime that the plugin is complete.
-        let to_plugin =
-            open("to_plugin")?.subscriber_builder().create().map_err(IpcError::transport(port))?;
-        Ok(Self { observations, from_plugin, wake_runtime, wake_plugin, to_plugin, _node: node })
+        Self::greet(socket)?.ok_or_else(nobody)
     }
 
-    /// Waits until the runtime notifies, `timeout` at most; returns whether it did.
+    /// Attaches to a runtime in this process.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn attach(socket: PluginSocket) -> Result<Self, IpcError> {
+        Self::greet(socket.into_inner())?.ok_or_else(|| IpcError::NoRuntime("this".to_owned()))
+    }
+
+    /// Takes the runtime's first packet, and answers it; `None` if none comes.
+    fn greet(socket: OwnedFd) -> Result<Option<Self>, IpcError> {
+        let attaching = "attaching to the runtime";
+        socket::wait_readable(&[socket.as_fd()], HELLO_WITHIN)
+            .map_err(IpcError::system(attaching))?;
+        let mut buffer = EMPTY;
+        let received = socket::receive_with_descriptors(socket.as_fd(), &mut buffer)
+            .map_err(IpcError::system(attaching))?;
+        let Received::Packet(Kind::Hello, version, descriptors) = received else {
+            return Ok(None);
+        };
+        check_version(version.try_into().map_or(0, u16::from_le_bytes))?;
+        let Ok([board, bell]) = <[OwnedFd; 2]>::try_from(descriptors) else { return Ok(None) };
+        let board = Board::open(board).map_err(IpcError::system(attaching))?;
+        let end = Self {
+            socket,
+            bell,
+            borrowed: Arc::new(Borrowed { board, count: AtomicUsize::default() }),
+            inbox: Mutex::default(),
+        };
+        end.send_packet(Kind::Hello, &[])?;
+        Ok(Some(end))
+    }
+
+    /// Waits until there is something to take, `timeout` at most; returns whether there is. The runtime's end counts: it
+    /// is what [`Self::receive`] then returns.
+    ///
+    /// # Errors
+    /// [`IpcError::System`].
     pub fn wait(&self, timeout: Duration) -> Result<bool, IpcError> {
-        wait(&self.wake_plugin, timeout)
+        let waiting = "waiting for the runtime";
+        let woken = socket::wait_readable(&[self.socket.as_fd(), self.bell.as_fd()], timeout)
+            .map_err(IpcError::system(waiting))?;
+        match nix::unistd::read(&self.bell, &mut [0; 8]) {
+            Ok(_) | Err(Errno::EAGAIN | Errno::EINTR) => Ok(woken),
+            Err(error) => Err(IpcError::system(waiting)(error)),
+        }
     }
 
-    /// Takes the runtime's next message.
+    /// Takes the runtime's next message, if there is one.
+    ///
+    /// # Errors
+    /// [`IpcError::Gone`] once the runtime has ended and all it had sent is taken.
     pub fn receive(&self) -> Result<Option<ToPlugin>, IpcError> {
-        receive(&self.to_plugin)
+        let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+        inbox.fill(&self.socket)?;
+        match inbox.messages.pop_front() {
+            Some(message) => Ok(Some(message?)),
+            None if inbox.is_closed => Err(IpcError::Gone("runtime")),
+            None => Ok(None),
+        }
     }
 
     /// Takes the newest observation, if there is one not taken yet.
-    pub fn observation(&self) -> Result<Option<ObservationSample>, IpcError> {
-        let sample = self.observations.receive().map_err(IpcError::transport("receiving"))?;
-        Ok(sample.map(ObservationSample))
-    }
-
-    /// Sends a message and wakes the runtime.
     ///
     /// # Errors
-    /// [`IpcError::QueueFull`] if the runtime has not read for a second.
+    /// [`IpcError::NoSlot`] if [`BORROWED_OBSERVATIONS`] are alive.
+    pub fn observation(&self) -> Result<Option<ObservationSample>, IpcError> {
+        let borrowed = &self.borrowed;
+        if borrowed.count.load(Ordering::Acquire) >= BORROWED_OBSERVATIONS {
+            return Err(IpcError::NoSlot(BORROWED_OBSERVATIONS));
+        }
+        let Some(place) = borrowed.board.take() else { return Ok(None) };
+        let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+        // The slot's memory was sent before anything was published in it.
+        inbox.fill(&self.socket)?;
+        let memory = inbox.slots[place.slot].clone().filter(|memory| memory.len() >= place.len);
+        let Some(memory) = memory else { return Ok(None) };
+        borrowed.count.fetch_add(1, Ordering::AcqRel);
+        let borrowed = Arc::clone(borrowed);
+        Ok(Some(ObservationSample { memory, len: place.len, slot: place.slot, borrowed }))
+    }
+
+    /// Sends a message; waits while the runtime is behind. What was sent is read even if this process ends at once.
+    ///
+    /// # Errors
+    /// [`IpcError::Gone`] if the runtime has ended.
     pub fn send(&self, message: &FromPlugin) -> Result<(), IpcError> {
         let mut buffer = [0; MAX_FRAMED];
         self.send_bytes(framing::encode_body(message, &mut buffer))
     }
 
-    /// Sends bytes as they are, and wakes the runtime: for plugins in other languages that encode
-    /// messages themselves, and to test what a runtime makes of nonsense.
+    /// Sends bytes as they are: for plugins in other languages that encode messages themselves, and to test what a
+    /// runtime makes of nonsense.
     ///
     /// # Errors
     /// As [`Self::send`].
     pub fn send_bytes(&self, body: &[u8]) -> Result<(), IpcError> {
-        send_bytes(&self.from_plugin, body, "runtime")?;
-        self.wake_runtime.notify().map_err(IpcError::transport("waking the runtime"))?;
+        self.send_packet(Kind::Message, body)
+    }
+
+    fn send_packet(&self, kind: Kind, body: &[u8]) -> Result<(), IpcError> {
+        loop {
+            match socket::send(self.socket.as_fd(), kind, body, &[]) {
+                Ok(()) => return Ok(()),
+                Err(Errno::EINTR) => {}
+                Err(Errno::EAGAIN) => {
+                    socket::wait_writable(&self.socket, A_WHILE)
+                        .map_err(IpcError::system("sending to the runtime"))?;
+                }
+                Err(Errno::EPIPE | Errno::ECONNRESET | Errno::ENOTCONN) => {
+                    return Err(IpcError::Gone("runtime"));
+                }
+                Err(error) => return Err(IpcError::system("sending to the runtime")(error)),
+            }
+        }
+    }
+}
+
+impl Inbox {
+    /// Takes all that has come.
+    fn fill(&mut self, socket: &OwnedFd) -> Result<(), IpcError> {
+        let mut buffer = EMPTY;
+        loop {
+            let received = socket::receive_with_descriptors(socket.as_fd(), &mut buffer)
+                .map_err(IpcError::system("receiving from the runtime"))?;
+            match received {
+                Received::Packet(Kind::Message, body, _) => {
+                    self.messages.push_back(framing::decode_body(body));
+                }
+                Received::Packet(Kind::Slot, index, descriptors) => {
+                    self.take_slot(index, descriptors)?;
+                }
+                // Of a newer runtime, perhaps; what counts comes as messages.
+                Received::Packet(Kind::Hello, ..) | Received::Garbage => {}
+                Received::Nothing => return Ok(()),
+                Received::Closed => {
+                    self.is_closed = true;
+                    return Ok(());
+                }
+            }
+        }
+    }
+
+    fn take_slot(&mut self, index: &[u8], descriptors: Vec<OwnedFd>) -> Result<(), IpcError> {
+        let slot = index.first().and_then(|&index| self.slots.get_mut(usize::from(index)));
+        if let (Some(slot), Some(descriptor)) = (slot, descriptors.into_iter().next()) {
+            let map = map_read_only(descriptor).map_err(IpcError::system("mapping images"))?;
+            *slot = Some(Arc::new(map));
+        }
         Ok(())
     }
 }
@@ -130,7 +226,14 @@ impl PluginEnd {
 impl ObservationSample {
     /// Returns the bytes, in the layout of [`vizflyt_protocol::packet::ObservationHeader`].
     pub fn bytes(&self) -> &[u8] {
-        self.0.payload()
+        &self.memory[..self.len]
+    }
+}
+
+impl Drop for ObservationSample {
+    fn drop(&mut self) {
+        self.borrowed.count.fetch_sub(1, Ordering::AcqRel);
+        self.borrowed.board.give_back(self.slot);
     }
 }
 
@@ -144,3 +247,8 @@ fn check_version(theirs: u16) -> Result<(), IpcError> {
     let error = PreambleError::Version { them, theirs, me, ours: PROTOCOL_VERSION, older };
     Err(IpcError::Version(error))
 }
+
+/// A runtime that is there sends its first packet before or as soon as somebody connects.
+const HELLO_WITHIN: Duration = Duration::from_secs(5);
+/// Between two looks whether there is room.
+const A_WHILE: Duration = Duration::from_secs(1);

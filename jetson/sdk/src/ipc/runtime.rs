@@ -1,227 +1,415 @@
-//! The runtime's end: creates the services, publishes observations, reads answers.
+//! The runtime's end: writes observations, sends messages, reads replies.
 
+use std::ffi::OsString;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use iceoryx2::node::Node;
-use iceoryx2::port::BackpressureAction;
-use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::Notifier;
-use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::prelude::{AllocationStrategy, AttributeSpecifier, PortFactory as _};
-use iceoryx2::sample_mut::SampleMut;
-use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use nix::unistd::Uid;
+use nix::errno::Errno;
+use nix::sys::eventfd::{EfdFlags, EventFd};
+use nix::sys::socket::{AddressFamily, SockFlag, SockType, socketpair};
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{FromPlugin, ToPlugin};
-use vizflyt_protocol::packet::framing::MAX_FRAMED;
+use vizflyt_protocol::packet::framing::{self, FramingError, MAX_FRAMED};
 
-use super::{
-    Acting, BORROWED_OBSERVATIONS, Ipc, IpcError, PROTOCOL_KEY, QUEUE_DEPTH, name, node, receive,
-    send, slices, wait,
-};
+use super::board::{Board, Place};
+use super::offer::{Listener, Offer};
+use super::sealed::{WrittenMemory, let_inherit};
+use super::socket::{self, EMPTY, Kind, Received};
+use super::{IpcError, SERVICE_OPTION, SLOTS};
 
-/// The runtime's end of the shared memory. All calls return at once, but for [`Self::wait`]; a
-/// plugin that hangs never blocks them.
+/// The runtime's end. All calls return at once, but for [`Self::wait`]; a plugin that hangs never blocks them.
 #[derive(Debug)]
 pub struct RuntimeEnd {
-    observations: Publisher<Ipc, [u8], ()>,
-    to_plugin: Publisher<Ipc, [u8], ()>,
-    from_plugin: Subscriber<Ipc, [u8], ()>,
-    wake_plugin: Notifier<Ipc>,
-    wake_runtime: Listener<Ipc>,
-    to_plugin_service: PortFactory<Ipc, [u8], ()>,
-    /// Whose the files are, if not ours.
-    owner: Option<Uid>,
-    // Last, so that ports go before the node they belong to.
-    node: Node<Ipc>,
+    slots: Arc<Mutex<Slots>>,
+    connection: Mutex<Option<Arc<Connection>>>,
+    /// Where a plugin that a person starts connects.
+    listener: Mutex<Option<Listener>>,
+    connections: AtomicU64,
 }
 
-/// Shared memory for one observation, to be written and then published. Dropped unpublished, it
-/// goes back to the pool.
+/// Memory for one observation, to be written and then published. Dropped unpublished, it can be
+/// lent again.
 #[derive(Debug)]
-pub struct LoanedObservation(SampleMut<Ipc, [u8], ()>);
+pub struct LoanedObservation {
+    slot: Option<Slot>,
+    len: usize,
+    slots: Arc<Mutex<Slots>>,
+}
+
+/// The plugin's end of the socket, to be handed to its process.
+#[derive(Debug)]
+pub struct PluginSocket(OwnedFd);
+
+/// The runtime's side of one plugin.
+#[derive(Debug)]
+struct Connection {
+    socket: OwnedFd,
+    board: Board,
+    bell: EventFd,
+    /// The plugin has said that it is complete.
+    attached: AtomicBool,
+    /// The plugin has closed its end.
+    closed: AtomicBool,
+    /// Held while a packet is looked at and taken.
+    reading: Mutex<()>,
+    /// Counts connections.
+    number: u64,
+}
+
+/// Memory for observations; each slot is in one place only.
+#[derive(Debug)]
+struct Slots {
+    free: heapless::Vec<Slot, SLOTS>,
+    /// Published: newest, or borrowed by the plugin.
+    published: [Option<Slot>; SLOTS],
+    made: usize,
+    observation_len: usize,
+}
+
+#[derive(Debug)]
+struct Slot {
+    index: usize,
+    memory: WrittenMemory,
+    /// The connection whose plugin has its descriptor.
+    known_to: Option<u64>,
+}
 
 impl RuntimeEnd {
-    /// Creates the services under `prefix`, with room for observations of `observation_len` bytes
-    /// to start with.
-    ///
-    /// # Errors
-    /// [`IpcError::Transport`], as when shared memory is full or the prefix is in use.
-    pub fn create(prefix: &str, observation_len: usize) -> Result<Self, IpcError> {
-        Self::create_for(prefix, observation_len, None)
+    /// Makes an end that no plugin has attached to, for observations of `observation_len` bytes; larger ones are
+    /// possible.
+    pub fn new(observation_len: usize) -> Self {
+        let slots = Slots {
+            free: heapless::Vec::new(),
+            published: Default::default(),
+            made: 0,
+            observation_len,
+        };
+        Self {
+            slots: Arc::new(Mutex::new(slots)),
+            connection: Mutex::default(),
+            listener: Mutex::default(),
+            connections: AtomicU64::default(),
+        }
     }
 
-    /// As [`Self::create`], for a plugin that runs as the user `owner`; only root can.
+    /// Connects the next plugin, in place of the one before.
     ///
     /// # Errors
-    /// As [`Self::create`].
-    pub fn create_for(
-        prefix: &str,
-        observation_len: usize,
-        owner: Option<u32>,
-    ) -> Result<Self, IpcError> {
-        let owner = owner.map(Uid::from_raw);
-        let _acting = Acting::as_user(owner);
-        let node = node()?;
-        let creating = "creating a service";
-        let port = "creating a port";
-
-        let version = AttributeSpecifier::new()
-            .define(
-                &PROTOCOL_KEY.try_into().map_err(IpcError::transport(creating))?,
-                &PROTOCOL_VERSION
-                    .to_string()
-                    .as_str()
-                    .try_into()
-                    .map_err(IpcError::transport(creating))?,
-            )
-            .map_err(IpcError::transport(creating))?;
-        // Newest wins: a buffer of one that overflows. Two readers at most: the plugin, and its
-        // successor while the slot of the dead one is being reclaimed.
-        let observations = slices(&node, prefix, "observation")?
-            .enable_safe_overflow(true)
-            .subscriber_max_buffer_size(1)
-            .subscriber_max_borrowed_samples(BORROWED_OBSERVATIONS)
-            .history_size(0)
-            .max_publishers(1)
-            .max_subscribers(2)
-            .max_nodes(4)
-            .create_with_attributes(&version)
-            .map_err(IpcError::transport(creating))?
-            .publisher_builder()
-            .initial_max_slice_len(observation_len)
-            // Cameras may grow while flying; the memory follows.
-            .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .max_loaned_samples(2)
-            .create()
-            .map_err(IpcError::transport(port))?;
-
-        // Nothing is lost: no overflow, and a full queue is an error at its sender.
-        let queue = |suffix| {
-            slices(&node, prefix, suffix)?
-                .enable_safe_overflow(false)
-                .subscriber_max_buffer_size(QUEUE_DEPTH)
-                .subscriber_max_borrowed_samples(2)
-                .history_size(0)
-                .max_publishers(2)
-                .max_subscribers(2)
-                .max_nodes(4)
-                .create()
-                .map_err(IpcError::transport(creating))
-        };
-        let to_plugin_service = queue("to_plugin")?;
-        let to_plugin = to_plugin_service
-            .publisher_builder()
-            .initial_max_slice_len(MAX_FRAMED)
-            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
-            .create()
-            .map_err(IpcError::transport(port))?;
-        let from_plugin = queue("from_plugin")?
-            .subscriber_builder()
-            .create()
-            .map_err(IpcError::transport(port))?;
-
-        let event = |suffix| {
-            node.service_builder(&name(prefix, suffix)?)
-                .event()
-                .max_nodes(4)
-                .max_listeners(2)
-                .max_notifiers(2)
-                .create()
-                .map_err(IpcError::transport(creating))
-        };
-        let wake_plugin =
-            event("wake_plugin")?.notifier_builder().create().map_err(IpcError::transport(port))?;
-        let wake_runtime = event("wake_runtime")?
-            .listener_builder()
-            .create()
-            .map_err(IpcError::transport(port))?;
-        Ok(Self {
-            observations,
-            to_plugin,
-            from_plugin,
-            wake_plugin,
-            wake_runtime,
-            to_plugin_service,
-            owner,
-            node,
-        })
+    /// [`IpcError::System`], as when too many files are open.
+    pub fn connect(&self) -> Result<PluginSocket, IpcError> {
+        let flags = SockFlag::SOCK_CLOEXEC;
+        let (ours, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, flags)
+            .map_err(IpcError::system("making a socket"))?;
+        self.greet(ours)?;
+        Ok(PluginSocket(theirs))
     }
 
-    /// Whether a plugin has attached: from then on messages reach it.
+    /// Offers to be found by a plugin that a person of the same user starts.
+    ///
+    /// # Errors
+    /// [`IpcError::System`] if the socket cannot be made, or its folder is another user's.
+    pub fn offer(&self) -> Result<Offer, IpcError> {
+        self.listen(true)
+    }
+
+    /// As [`Self::offer`], for a plugin that is told the service: it is not among [`offers`](super::offers).
+    ///
+    /// # Errors
+    /// As [`Self::offer`].
+    pub fn offer_unlisted(&self) -> Result<Offer, IpcError> {
+        self.listen(false)
+    }
+
+    fn listen(&self, listed: bool) -> Result<Offer, IpcError> {
+        let (offer, listener) =
+            Offer::make(listed).map_err(IpcError::system("waiting for a plugin"))?;
+        *lock(&self.listener) = Some(listener);
+        Ok(offer)
+    }
+
+    /// Whether a plugin is attached: messages reach it.
     pub fn plugin_attached(&self) -> bool {
-        let _acting = Acting::as_user(self.owner);
-        self.to_plugin_service.dynamic_config().number_of_subscribers() > 0
+        self.accept();
+        let Some(connection) = self.connection() else { return false };
+        if !connection.is_attached() {
+            let _reading = lock(&connection.reading);
+            if let Ok(Received::Packet(Kind::Hello, ..)) =
+                socket::peek(connection.socket.as_fd(), &mut [0])
+            {
+                let _ = connection.next();
+            }
+        }
+        connection.is_attached() && !connection.has_closed()
     }
 
-    /// Sends a message and wakes the plugin.
+    /// Sends a message.
     ///
     /// # Errors
-    /// [`IpcError::QueueFull`] if the plugin has left so many unread that it must be hung.
+    /// [`IpcError::QueueFull`] if the plugin has left so many unread that it must be hung, [`IpcError::Gone`] if there
+    /// is none.
     pub fn send(&self, message: &ToPlugin) -> Result<(), IpcError> {
-        let _acting = Acting::as_user(self.owner);
-        send(&self.to_plugin, message, "plugin")?;
-        self.heartbeat();
-        Ok(())
+        let connection = self.connection().ok_or(IpcError::Gone("plugin"))?;
+        let mut buffer = [0; MAX_FRAMED];
+        connection.send(Kind::Message, framing::encode_body(message, &mut buffer), &[])
     }
 
-    /// Wakes the plugin. At least twice a second, so that it knows the runtime is alive.
-    pub fn heartbeat(&self) {
-        let _acting = Acting::as_user(self.owner);
-        // A missing listener is no fault: the supervisor reports whether the plugin lives.
-        let _ = self.wake_plugin.notify();
-    }
-
-    /// Lends shared memory for one observation of `len` bytes: zeros, aligned to 64. More than ever
-    /// before takes longer once.
+    /// Lends memory for one observation of `len` bytes: zeros, aligned to 64. More than ever before takes longer
+    /// once.
     ///
     /// # Errors
-    /// [`IpcError::Transport`] if two are lent already, or there is not so much memory.
+    /// [`IpcError::NoSlot`] if two are lent already, [`IpcError::System`] if there is not so much memory.
     pub fn loan(&self, len: usize) -> Result<LoanedObservation, IpcError> {
-        let _acting = Acting::as_user(self.owner);
-        let sample = self.observations.loan_slice(len);
-        Ok(LoanedObservation(sample.map_err(IpcError::transport("lending memory"))?))
+        let mut slots = lock(&self.slots);
+        if let Some(connection) = self.connection() {
+            for index in connection.board.returned() {
+                slots.reclaim(index);
+            }
+        }
+        let slot = slots.take(len)?;
+        drop(slots);
+        let mut loan = LoanedObservation { slot: Some(slot), len, slots: Arc::clone(&self.slots) };
+        loan.memory().fill(0);
+        Ok(loan)
     }
 
-    /// Publishes an observation and wakes the plugin; the one before is replaced if unread.
-    pub fn publish(&self, observation: LoanedObservation) -> Result<(), IpcError> {
-        let _acting = Acting::as_user(self.owner);
-        observation.0.send().map_err(IpcError::transport("publishing"))?;
-        self.heartbeat();
+    /// Publishes an observation and rings the plugin's bell; the one before is replaced if nobody has taken it. Without a
+    /// plugin it is dropped.
+    ///
+    /// # Errors
+    /// [`IpcError::QueueFull`] if the plugin does not read, so that it cannot be told of new memory.
+    pub fn publish(&self, mut observation: LoanedObservation) -> Result<(), IpcError> {
+        let shared = Arc::clone(&self.slots);
+        let mut slots = lock(&shared);
+        let Some(connection) = self.connection() else {
+            slots.free.extend(observation.slot.take());
+            return Ok(());
+        };
+        let Some(slot) = &mut observation.slot else { return Ok(()) };
+        let place = Place { slot: slot.index, len: observation.len };
+        if slot.known_to != Some(connection.number) {
+            let descriptor = slot.memory.as_fd().as_raw_fd();
+            if let Err(error) = connection.send(Kind::Slot, &[slot.index as u8], &[descriptor]) {
+                slots.free.extend(observation.slot.take());
+                return if matches!(error, IpcError::Gone(_)) { Ok(()) } else { Err(error) };
+            }
+            slot.known_to = Some(connection.number);
+        }
+        slots.published[place.slot] = observation.slot.take();
+        if let Some(unseen) = connection.board.post(place).filter(|old| old.slot != place.slot) {
+            slots.reclaim(unseen.slot);
+        }
+        drop(slots);
+        // Full only after 2^64 - 2 of them.
+        let _ = connection.bell.write(1);
         Ok(())
     }
 
     /// Waits until the plugin sends something, `timeout` at most; returns whether it did.
+    ///
+    /// # Errors
+    /// [`IpcError::System`].
     pub fn wait(&self, timeout: Duration) -> Result<bool, IpcError> {
-        wait(&self.wake_runtime, timeout)
+        self.accept();
+        let Some(connection) = self.connection().filter(|connection| !connection.has_closed())
+        else {
+            // Until the next one connects.
+            std::thread::sleep(timeout.min(NOBODY_THERE));
+            return Ok(false);
+        };
+        socket::wait_readable(&[connection.socket.as_fd()], timeout)
+            .map_err(IpcError::system("waiting for the plugin"))
     }
 
-    /// Takes the plugin's next message.
+    /// Takes the plugin's next message, if there is one.
     ///
     /// # Errors
     /// [`IpcError::Message`] for one that does not decode; the next can still be read.
     pub fn receive(&self) -> Result<Option<FromPlugin>, IpcError> {
-        let _acting = Acting::as_user(self.owner);
-        receive(&self.from_plugin)
+        let Some(connection) = self.connection() else { return Ok(None) };
+        let _reading = lock(&connection.reading);
+        connection.next()
     }
 
-    /// Reclaims what a dead plugin held: its subscriptions and the samples it was reading. Call
-    /// after each exit of a plugin.
+    /// Forgets a plugin that has ended, and takes back what it had borrowed. Call after each exit.
     pub fn clean_up(&self) {
-        let _acting = Acting::as_user(self.owner);
-        self.node.try_cleanup_dead_nodes();
+        let mut slots = lock(&self.slots);
+        *lock(&self.connection) = None;
+        slots.reclaim_all();
+    }
+
+    fn connection(&self) -> Option<Arc<Connection>> {
+        lock(&self.connection).clone()
+    }
+
+    /// Accepts a plugin that a person has started, if there is none yet.
+    fn accept(&self) {
+        let mut listener = lock(&self.listener);
+        let Some(waiting) = &mut *listener else { return };
+        if self.connection().is_some_and(|connection| !connection.has_closed()) {
+            return;
+        }
+        if let Some(socket) = waiting.accept() {
+            // Refused, it reads that nobody is there, and the person tries again.
+            let _ = self.greet(socket);
+        }
+    }
+
+    /// Makes a socket the plugin's, and hands over board and bell.
+    fn greet(&self, socket: OwnedFd) -> Result<(), IpcError> {
+        let flags = EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK;
+        let bell =
+            EventFd::from_value_and_flags(0, flags).map_err(IpcError::system("making a bell"))?;
+        let connection = Connection {
+            socket,
+            board: Board::new().map_err(IpcError::system("making shared memory"))?,
+            bell,
+            attached: AtomicBool::default(),
+            closed: AtomicBool::default(),
+            reading: Mutex::default(),
+            number: self.connections.fetch_add(1, Ordering::Relaxed),
+        };
+        let descriptors =
+            [connection.board.as_fd().as_raw_fd(), connection.bell.as_fd().as_raw_fd()];
+        connection.send(Kind::Hello, &PROTOCOL_VERSION.to_le_bytes(), &descriptors)?;
+        let mut slots = lock(&self.slots);
+        *lock(&self.connection) = Some(Arc::new(connection));
+        slots.reclaim_all();
+        Ok(())
+    }
+}
+
+impl PluginSocket {
+    /// Returns the option that tells the plugin's process where its end is.
+    pub fn argument(&self) -> OsString {
+        format!("{SERVICE_OPTION}=fd:{}", self.0.as_raw_fd()).into()
+    }
+
+    /// Has a child inherit it. Call it between fork and exec, in the child.
+    ///
+    /// # Errors
+    /// The system's.
+    pub fn let_inherit(&self) -> std::io::Result<()> {
+        let_inherit(self.0.as_fd())
+    }
+
+    pub(super) fn into_inner(self) -> OwnedFd {
+        self.0
+    }
+}
+
+impl Connection {
+    fn send(
+        &self,
+        kind: Kind,
+        body: &[u8],
+        descriptors: &[std::os::fd::RawFd],
+    ) -> Result<(), IpcError> {
+        match socket::send(self.socket.as_fd(), kind, body, descriptors) {
+            Ok(()) => Ok(()),
+            Err(Errno::EAGAIN) => Err(IpcError::QueueFull("plugin")),
+            Err(Errno::EPIPE | Errno::ECONNRESET | Errno::ENOTCONN) => {
+                Err(IpcError::Gone("plugin"))
+            }
+            Err(error) => Err(IpcError::system("sending to the plugin")(error)),
+        }
+    }
+
+    /// Takes the next message; `reading` is held.
+    fn next(&self) -> Result<Option<FromPlugin>, IpcError> {
+        let mut buffer = EMPTY;
+        loop {
+            let received = socket::receive(self.socket.as_fd(), &mut buffer)
+                .map_err(IpcError::system("receiving from the plugin"))?;
+            match received {
+                Received::Packet(Kind::Hello, ..) => self.attached.store(true, Ordering::Release),
+                Received::Packet(Kind::Message, body, _) => {
+                    return Ok(Some(framing::decode_body(body)?));
+                }
+                Received::Packet(Kind::Slot, ..) | Received::Garbage => {
+                    return Err(FramingError::Body(0).into());
+                }
+                Received::Nothing => return Ok(None),
+                Received::Closed => {
+                    self.closed.store(true, Ordering::Release);
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    fn is_attached(&self) -> bool {
+        self.attached.load(Ordering::Acquire)
+    }
+
+    /// Whether the plugin has closed its end, and left nothing to be read.
+    fn has_closed(&self) -> bool {
+        if matches!(socket::peek(self.socket.as_fd(), &mut [0]), Ok(Received::Closed)) {
+            self.closed.store(true, Ordering::Release);
+        }
+        self.closed.load(Ordering::Acquire)
+    }
+}
+
+impl Slots {
+    /// Takes a slot with room for `len` bytes.
+    fn take(&mut self, len: usize) -> Result<Slot, IpcError> {
+        if let Some(fitting) = self.free.iter().position(|slot| slot.memory.len() >= len) {
+            return Ok(self.free.swap_remove(fitting));
+        }
+        let memory = || {
+            // Cameras may grow while flying; the memory follows in few steps.
+            let len = len.max(self.observation_len).next_power_of_two().max(LEAST_SLOT);
+            WrittenMemory::new(len).map_err(IpcError::system("making shared memory"))
+        };
+        if self.made < SLOTS {
+            let slot = Slot { index: self.made, memory: memory()?, known_to: None };
+            self.made += 1;
+            return Ok(slot);
+        }
+        let memory = memory()?;
+        let old = self.free.pop().ok_or(IpcError::NoSlot(SLOTS))?;
+        Ok(Slot { index: old.index, memory, known_to: None })
+    }
+
+    /// Takes back what was published in slot `index`, if anything was.
+    fn reclaim(&mut self, index: usize) {
+        // Each slot is in one place, so there is room.
+        self.free.extend(self.published[index].take());
+    }
+
+    /// Takes back all that was published.
+    fn reclaim_all(&mut self) {
+        (0..SLOTS).for_each(|index| self.reclaim(index));
     }
 }
 
 impl LoanedObservation {
     /// Returns what was written.
     pub fn bytes(&self) -> &[u8] {
-        self.0.payload()
+        self.slot.as_ref().map_or(&[], |slot| &slot.memory.bytes()[..self.len])
     }
 
     /// Returns the memory to write into.
     pub fn memory(&mut self) -> &mut [u8] {
-        self.0.payload_mut()
+        self.slot.as_mut().map_or(&mut [], |slot| &mut slot.memory.bytes_mut()[..self.len])
     }
 }
+
+impl Drop for LoanedObservation {
+    fn drop(&mut self) {
+        if let Some(slot) = self.slot.take() {
+            lock(&self.slots).free.extend([slot]);
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Where no plugin is connected, one is looked for this often.
+const NOBODY_THERE: Duration = Duration::from_millis(10);
+/// A page. [bytes]
+const LEAST_SLOT: usize = 4096;

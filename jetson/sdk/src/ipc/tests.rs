@@ -8,9 +8,13 @@ use vizflyt_protocol::messages::{
 use vizflyt_protocol::time::{HostTime, ServerTime};
 
 use super::*;
+use std::time::Duration;
+
 use crate::{ImageStamps, Observation, ObservationWriter};
 
 const WAIT: Duration = Duration::from_secs(10);
+/// What a plugin may leave unread while it thinks about one image.
+const MESSAGES: usize = 128;
 
 fn cameras() -> Vec<CameraInfo> {
     vec![CameraInfo {
@@ -21,23 +25,30 @@ fn cameras() -> Vec<CameraInfo> {
 }
 
 fn publish(runtime: &RuntimeEnd, seq: u64) {
+    publish_one(runtime, seq).unwrap();
+}
+
+fn publish_one(runtime: &RuntimeEnd, seq: u64) -> Result<(), IpcError> {
     let cameras = cameras();
-    let mut loan = runtime.loan(ObservationWriter::len_for(&cameras)).unwrap();
+    let mut loan = runtime.loan(ObservationWriter::len_for(&cameras))?;
     let mut writer = ObservationWriter::new(loan.memory(), seq, &cameras).unwrap();
     let planes = writer.planes(0, &cameras[0]).unwrap();
     planes.rgb.fill(seq as u8);
     planes.depth_mm.fill(1000 + seq as u16);
     writer.image_ready(0, &cameras[0], ImageStamps { seq, ..ImageStamps::default() });
-    runtime.publish(loan).unwrap();
+    runtime.publish(loan)
 }
 
 fn ends() -> (RuntimeEnd, PluginEnd) {
-    let prefix = unique_service();
-    let runtime = RuntimeEnd::create(&prefix, ObservationWriter::len_for(&cameras())).unwrap();
+    let runtime = RuntimeEnd::new(ObservationWriter::len_for(&cameras()));
     assert!(!runtime.plugin_attached());
-    let plugin = PluginEnd::open(&prefix).unwrap();
+    let plugin = attach(&runtime);
     assert!(runtime.plugin_attached());
     (runtime, plugin)
+}
+
+fn attach(runtime: &RuntimeEnd) -> PluginEnd {
+    PluginEnd::attach(runtime.connect().unwrap()).unwrap()
 }
 
 fn event(n: usize) -> ToPlugin {
@@ -51,11 +62,11 @@ fn event(n: usize) -> ToPlugin {
 #[test]
 fn messages_arrive_both_ways_in_order() {
     let (runtime, plugin) = ends();
-    for n in 0..QUEUE_DEPTH {
+    for n in 0..MESSAGES {
         runtime.send(&event(n)).unwrap();
     }
     assert!(plugin.wait(WAIT).unwrap());
-    for n in 0..QUEUE_DEPTH {
+    for n in 0..MESSAGES {
         assert_eq!(plugin.receive().unwrap(), Some(event(n)));
     }
     assert_eq!(plugin.receive().unwrap(), None);
@@ -74,19 +85,71 @@ fn messages_arrive_both_ways_in_order() {
 #[test]
 fn a_plugin_that_does_not_read_is_an_error_not_a_wait() {
     let (runtime, plugin) = ends();
-    for n in 0..QUEUE_DEPTH {
-        runtime.send(&event(n)).unwrap();
+    let full = (0..100_000).find_map(|n| runtime.send(&event(n)).err().map(|error| (n, error)));
+    let (sent, error) = full.expect("the socket has an end");
+    assert!(sent >= MESSAGES && matches!(error, IpcError::QueueFull("plugin")), "{sent}: {error}");
+    // Nor does a bell that nobody hears ever block, or images nobody looks at: but new memory cannot be handed over.
+    assert!(publish_one(&runtime, 0).is_err());
+    for n in 0..sent {
+        assert_eq!(plugin.receive().unwrap(), Some(event(n)));
     }
-    assert!(matches!(runtime.send(&event(0)), Err(IpcError::QueueFull("plugin"))));
-    // Nor do wake-ups that nobody takes ever block, or images nobody looks at.
-    for seq in 0..5_000 {
-        runtime.heartbeat();
-        if seq % 100 == 0 {
-            publish(&runtime, seq);
-        }
+    for seq in 1..5_000 {
+        publish(&runtime, seq);
     }
-    assert_eq!(plugin.receive().unwrap(), Some(event(0)));
     runtime.send(&event(1)).unwrap();
+    assert_eq!(plugin.receive().unwrap(), Some(event(1)));
+    assert!(plugin.observation().unwrap().is_some());
+}
+
+#[test]
+fn a_flood_of_replies_waits_for_the_runtime() {
+    let (runtime, plugin) = ends();
+    let failed = |n: usize| FromPlugin::Failed { reason: bounded(&n.to_string()) };
+    std::thread::scope(|scope| {
+        scope.spawn(|| (0..5_000).for_each(|n| plugin.send(&failed(n)).unwrap()));
+        for n in 0..5_000 {
+            let next = std::iter::repeat_with(|| {
+                assert!(runtime.wait(WAIT).unwrap());
+                runtime.receive().unwrap()
+            });
+            assert_eq!(next.flatten().next(), Some(failed(n)));
+        }
+    });
+}
+
+#[test]
+fn what_was_said_is_heard_after_the_end() {
+    let (runtime, plugin) = ends();
+    let last = FromPlugin::Failed { reason: bounded("last words") };
+    plugin.send(&last).unwrap();
+    drop(plugin);
+    assert_eq!(runtime.receive().unwrap(), Some(last));
+    assert_eq!(runtime.receive().unwrap(), None);
+    assert!(!runtime.plugin_attached());
+
+    let (runtime, plugin) = ends();
+    runtime.send(&ToPlugin::Stop).unwrap();
+    drop(runtime);
+    assert!(plugin.wait(WAIT).unwrap());
+    assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
+    assert!(plugin.wait(WAIT).unwrap(), "its end is worth waking up for");
+    assert!(matches!(plugin.receive(), Err(IpcError::Gone("runtime"))));
+    assert!(matches!(
+        plugin.send(&FromPlugin::Ready { name: bounded("x") }),
+        Err(IpcError::Gone(_))
+    ));
+}
+
+#[test]
+fn nonsense_is_refused_and_passed_over() {
+    let (runtime, plugin) = ends();
+    for bytes in [&[][..], &[255; 9], &[7; vizflyt_protocol::packet::framing::MAX_FRAMED]] {
+        plugin.send_bytes(bytes).unwrap();
+        assert!(matches!(runtime.receive(), Err(IpcError::Message(_))), "{} bytes", bytes.len());
+    }
+    let ready = FromPlugin::Ready { name: bounded("me") };
+    plugin.send(&ready).unwrap();
+    assert_eq!(runtime.receive().unwrap(), Some(ready));
 }
 
 #[test]
@@ -116,32 +179,93 @@ fn the_newest_observation_wins_without_a_copy() {
 }
 
 #[test]
-fn a_second_plugin_can_follow_the_first() {
-    let prefix = unique_service();
-    let runtime = RuntimeEnd::create(&prefix, 4096).unwrap();
-    for _ in 0..5 {
-        let plugin = PluginEnd::open(&prefix).unwrap();
-        runtime.send(&ToPlugin::Stop).unwrap();
-        assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
-        drop(plugin);
-        assert!(!runtime.plugin_attached());
+fn a_plugin_keeps_three_observations_and_no_more() {
+    let (runtime, plugin) = ends();
+    let mut kept = Vec::new();
+    for seq in 1..=BORROWED_OBSERVATIONS as u64 {
+        publish(&runtime, seq);
+        kept.push(plugin.observation().unwrap().unwrap());
+    }
+    publish(&runtime, 9);
+    assert!(matches!(plugin.observation(), Err(IpcError::NoSlot(BORROWED_OBSERVATIONS))));
+    // The runtime still has two to write, and no third.
+    let (_one, _two) = (runtime.loan(100).unwrap(), runtime.loan(100).unwrap());
+    assert!(matches!(runtime.loan(100), Err(IpcError::NoSlot(_))));
+    kept.remove(0);
+    let names = [bounded("front")];
+    let newest = plugin.observation().unwrap().unwrap();
+    assert_eq!(Observation::from_bytes(newest.bytes(), &names).unwrap().seq(), 9);
+    for (seq, sample) in [2, 3].into_iter().zip(&kept) {
+        assert_eq!(Observation::from_bytes(sample.bytes(), &names).unwrap().seq(), seq);
     }
 }
 
 #[test]
-fn reports_a_missing_runtime() {
-    let error = PluginEnd::open("vizflyt/nobody").unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "no runtime offers vizflyt/nobody; start the plugin with `vizflyt fly`"
-    );
+fn memory_grows_with_the_cameras() {
+    let (runtime, plugin) = ends();
+    for len in [100, 5_000, 1 << 20, 64, 3 << 20] {
+        let mut kept = Vec::new();
+        for fill in 1..=BORROWED_OBSERVATIONS as u8 {
+            let mut loan = runtime.loan(len).unwrap();
+            assert!(loan.bytes().iter().all(|&byte| byte == 0) && loan.bytes().len() == len);
+            loan.memory().fill(fill);
+            runtime.publish(loan).unwrap();
+            let sample = plugin.observation().unwrap().unwrap();
+            assert!(sample.bytes().as_ptr().addr().is_multiple_of(64));
+            kept.push((fill, sample));
+        }
+        for (fill, sample) in kept {
+            assert!(sample.bytes().len() == len && sample.bytes().iter().all(|&byte| byte == fill));
+        }
+    }
 }
 
 #[test]
-fn a_prefix_in_use_is_an_error() {
-    let prefix = unique_service();
-    let _first = RuntimeEnd::create(&prefix, 4096).unwrap();
-    assert!(matches!(RuntimeEnd::create(&prefix, 4096), Err(IpcError::Transport { .. })));
+fn a_second_plugin_can_follow_the_first() {
+    let runtime = RuntimeEnd::new(4096);
+    for seq in 1..=5 {
+        let plugin = attach(&runtime);
+        runtime.send(&ToPlugin::Stop).unwrap();
+        assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
+        publish(&runtime, seq);
+        let sample = plugin.observation().unwrap().unwrap();
+        // What the former plugin has not given back does not run out.
+        std::mem::forget(sample);
+        publish(&runtime, seq);
+        drop(plugin);
+        assert!(!runtime.plugin_attached());
+        runtime.clean_up();
+    }
+    // Without one, images go nowhere.
+    (1..100).for_each(|seq| publish(&runtime, seq));
+}
+
+#[test]
+fn a_plugin_that_a_person_starts_finds_the_offer() {
+    let runtime = RuntimeEnd::new(4096);
+    let offer = runtime.offer().unwrap();
+    assert!(offers().contains(&offer.service()));
+    assert!(!runtime.plugin_attached());
+    let service = offer.service();
+    let plugin = std::thread::spawn(move || PluginEnd::open(&service).unwrap());
+    while !runtime.plugin_attached() {
+        std::thread::yield_now();
+    }
+    let plugin = plugin.join().unwrap();
+    runtime.send(&ToPlugin::Stop).unwrap();
+    assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
+    let service = offer.service();
+    drop(offer);
+    assert!(!offers().contains(&service));
+}
+
+#[test]
+fn without_a_runtime_it_says_so() {
+    for nobody in ["/nowhere/at/all", "fd:987", "fd:-1", "fd:x", ""] {
+        let error = PluginEnd::open(nobody).unwrap_err().to_string();
+        let expected = format!("no runtime offers {nobody}; start the plugin with `vizflyt fly`");
+        assert_eq!(error, expected);
+    }
 }
 
 #[test]
