@@ -51,7 +51,7 @@ pub fn run<D: Demand>(
             continue;
         }
         render.follow_cameras();
-        let wait = render.until_due(&wanted);
+        let wait = render.until_due(wanted);
         if let Some(newer) = newest.take(wait) {
             merge(&newer, &mut render.poses);
             merge(&newer, &mut render.known);
@@ -60,7 +60,7 @@ pub fn run<D: Demand>(
             continue;
         }
         let mut tick = ticks.spare();
-        let stamp = render.expose(&wanted, &mut tick);
+        let stamp = render.expose(wanted, &mut tick);
         match render.rasterize(renderer, stamp, &mut tick) {
             Ok(()) => render.publish(tick, ticks, renderer),
             Err(error) => {
@@ -134,7 +134,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
 
     /// Returns how long no camera is due. Where nothing can be rendered, a newer pose is worth
     /// waking up for: it may be another vehicle's.
-    fn until_due(&mut self, wanted: &[bool; MAX_VEHICLES]) -> Duration {
+    fn until_due(&mut self, wanted: [bool; MAX_VEHICLES]) -> Duration {
         let now = clock::now();
         let mut next: Option<ServerTime> = None;
         for (vehicle, set) in self.sets.iter().enumerate() {
@@ -152,7 +152,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
 
     /// Collects the cameras that are due, each where its vehicle will be when the image is seen, and
     /// fills in what `tick` says of their images. Returns the newest pose's stamp.
-    fn expose(&mut self, wanted: &[bool; MAX_VEHICLES], tick: &mut RenderedTick) -> ServerTime {
+    fn expose(&mut self, wanted: [bool; MAX_VEHICLES], tick: &mut RenderedTick) -> ServerTime {
         self.seq += 1;
         let slots = self.sets.iter().map(|set| set.configs.len()).sum();
         tick.slots.resize_with(slots, Default::default);
@@ -218,7 +218,8 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 return renderer.render(&[], cameras, images).map(|_| ());
             }
             // Each vehicle sees the moment that its images show, and not itself.
-            let mut ranges = self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
+            let mut ranges =
+                self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
             ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
                 placements.clear();
                 rendering.dynamic_objects.place(at, vehicle, known, placements);
