@@ -52,8 +52,8 @@ export const events = {
       const { index, kind, text, at_s } = entry;
       if (shown.has(index)) continue;
       shown.add(index);
-      const shown = text || kindName(kind).replaceAll("_", " ");
-      const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: shown }));
+      const sentence = text || kindName(kind).replaceAll("_", " ");
+      const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: sentence }));
       line.dataset.tone = toneOf(entry);
       list.append(line);
     }
