@@ -13,7 +13,7 @@ pub const VARIABLE: &str = "VIZFLYT_MAP";
 pub enum MapError {
     /// It is not what `vizflyt scene generate` writes.
     #[error("{VARIABLE}: {0}; it must be a JSON array of volumes, as in map.json")]
-    Json(#[from] serde_json::Error),
+    Json(serde_json::Error),
     /// A number in it is not finite, a size not positive.
     #[error("{VARIABLE}: volume {0} is none; sizes must be positive and numbers finite")]
     Volume(usize),
@@ -39,7 +39,7 @@ pub fn map() -> Result<Option<Vec<Volume>>, MapError> {
 /// assert!(vizflyt_sdk::parse_map("[1]").unwrap_err().to_string().contains("map.json"));
 /// ```
 pub fn parse_map(text: &str) -> Result<Vec<Volume>, MapError> {
-    let volumes: Vec<Volume> = serde_json::from_str(text)?;
+    let volumes: Vec<Volume> = serde_json::from_str(text).map_err(MapError::Json)?;
     match volumes.iter().position(|volume| !volume.is_valid()) {
         Some(index) => Err(MapError::Volume(index)),
         None => Ok(volumes),

@@ -14,14 +14,14 @@ pub enum KeyError {
     #[error("no folder for keys: neither XDG_CONFIG_HOME nor HOME is set; pass --keys DIR")]
     NoHome,
     /// Reading or writing failed.
-    #[error("{}: cannot {what}: {source}", path.display())]
+    #[error("{}: cannot {what}: {cause}", path.display())]
     Io {
         /// What was tried.
         what: &'static str,
         /// On what.
         path: PathBuf,
         /// How it failed.
-        source: io::Error,
+        cause: io::Error,
     },
     /// Others may read or write it.
     #[error("{} is open to other users (mode {mode:03o}); run `chmod {fix} {}`, and make a new key if others had access", path.display(), path.display())]
@@ -63,7 +63,7 @@ impl KeysFolder {
             )
             .ok_or(KeyError::NoHome)?,
         };
-        let io = |what, source| KeyError::Io { what, path: path.clone(), source };
+        let io = |what, cause| KeyError::Io { what, path: path.clone(), cause };
         DirBuilder::new()
             .recursive(true)
             .mode(0o700)
@@ -104,7 +104,7 @@ impl KeysFolder {
 
     fn read_as(&self, name: &str, forbidden: u32) -> Result<Option<String>, KeyError> {
         let path = self.file(name);
-        let io = |what, source| KeyError::Io { what, path: path.clone(), source };
+        let io = |what, cause| KeyError::Io { what, path: path.clone(), cause };
         let file = match File::open(&path) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -164,9 +164,9 @@ impl KeysFolder {
         };
         match write() {
             Ok(()) => Ok(path),
-            Err(source) => {
+            Err(cause) => {
                 let _ = fs::remove_file(&path);
-                Err(KeyError::Io { what: "write it", path, source })
+                Err(KeyError::Io { what: "write it", path, cause })
             }
         }
     }
@@ -174,10 +174,10 @@ impl KeysFolder {
     fn settle(&self, path: PathBuf, draft: &Path, done: io::Result<()>) -> Result<(), KeyError> {
         let _ = fs::remove_file(draft);
         // The name, too, must survive a power cut.
-        done.and_then(|()| File::open(&self.0)?.sync_all()).map_err(|source| KeyError::Io {
+        done.and_then(|()| File::open(&self.0)?.sync_all()).map_err(|cause| KeyError::Io {
             what: "write it",
             path,
-            source,
+            cause,
         })
     }
 }

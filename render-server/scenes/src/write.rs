@@ -38,10 +38,10 @@ pub enum WriteError {
     Splats(#[from] ply::PlyError),
     /// The arena has no text form.
     #[error("cannot write the arena: {0}")]
-    Arena(#[from] ConfigError),
+    Arena(ConfigError),
     /// The truth has no text form.
     #[error("cannot write the truth: {0}")]
-    Truth(#[from] serde_json::Error),
+    Truth(serde_json::Error),
 }
 
 impl Generated {
@@ -68,15 +68,15 @@ impl Generated {
             ply::write(dir.join(&config.scene), &object.splats)?;
         }
         let objects = dir.join("truth-objects.json");
-        fs::write(&objects, serde_json::to_string(&self.true_objects)?)
-            .map_err(io_error(&objects))?;
-        let truth = serde_json::to_string(&self.truth)?;
+        let true_objects = serde_json::to_string(&self.true_objects).map_err(WriteError::Truth)?;
+        fs::write(&objects, true_objects).map_err(io_error(&objects))?;
+        let truth = serde_json::to_string(&self.truth).map_err(WriteError::Truth)?;
         if let Some(map) = &written.map {
             fs::write(map, &truth).map_err(io_error(map))?;
         }
         fs::write(&written.truth, truth).map_err(io_error(&written.truth))?;
         // The arena last: where it stands, the rest is complete.
-        let arena = self.arena.to_toml()?;
+        let arena = self.arena.to_toml().map_err(WriteError::Arena)?;
         fs::write(&written.arena, arena).map_err(io_error(&written.arena))?;
         Ok(written)
     }

@@ -27,13 +27,13 @@ const GROWTH: usize = 64 << 10;
 /// Why an image was given up.
 #[derive(Debug, thiserror::Error)]
 enum Lost {
-    #[error("{0}")]
+    #[error(transparent)]
     Cut(#[from] ReadExactError),
-    #[error("{0}")]
+    #[error(transparent)]
     Header(#[from] vizflyt_protocol::packet::InvalidImageHeader),
-    #[error("{0}")]
+    #[error(transparent)]
     Bitstream(#[from] vizflyt_rgbd::DecodeError),
-    #[error("{0}")]
+    #[error(transparent)]
     Trailer(#[from] vizflyt_protocol::packet::InvalidImageTrailer),
     #[error("more bytes than an image of its size can need")]
     Long,

@@ -70,7 +70,7 @@ pub enum IpcError {
     NoSlot(usize),
     /// A message does not decode.
     #[error("the socket holds no message: {0}")]
-    Message(#[from] FramingError),
+    Message(FramingError),
     /// The system refuses something.
     #[error("{what} failed")]
     System {
@@ -79,6 +79,12 @@ pub enum IpcError {
         /// The system's reason.
         source: io::Error,
     },
+}
+
+impl From<FramingError> for IpcError {
+    fn from(error: FramingError) -> Self {
+        Self::Message(error)
+    }
 }
 
 impl IpcError {

@@ -77,7 +77,7 @@ pub enum ChangeError {
     },
     /// The text is no camera.
     #[error("no camera: {0}")]
-    Json(#[from] serde_json::Error),
+    Json(serde_json::Error),
     /// A value that cannot work.
     #[error(transparent)]
     Value(#[from] ConfigError),
@@ -90,6 +90,12 @@ pub enum ChangeError {
          {MAX_PIXELS} pixels, as 3840x2160"
     )]
     Pixels(u32, u32),
+}
+
+impl From<serde_json::Error> for ChangeError {
+    fn from(error: serde_json::Error) -> Self {
+        Self::Json(error)
+    }
 }
 
 impl Cameras {

@@ -10,14 +10,14 @@ use super::ply::PlyError;
 #[non_exhaustive]
 pub enum FormatError {
     /// The operating system refused.
-    #[error("cannot {verb} {}: {source}", path.display())]
+    #[error("cannot {verb} {}: {cause}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
         /// `read` or `write`.
         verb: &'static str,
         /// The system's error.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// Neither the content nor the name has a known format.
     #[error("{what}; supported are {}", Format::list())]

@@ -244,10 +244,10 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError>
         what: format!("{} names no format to write", path.display()),
     })?;
     let place = |path: &Path, bytes: &[u8]| {
-        file::replace(path, bytes).map_err(|source| FormatError::Io {
+        file::replace(path, bytes).map_err(|cause| FormatError::Io {
             path: path.to_owned(),
             verb: "write",
-            source,
+            cause,
         })
     };
     if path.file_name().is_some_and(|name| name == sog::META) {
@@ -305,7 +305,7 @@ fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
     if is_meta || path.join(sog::META).is_file() {
         return sog::decode(sog::Files::from(path), meter);
     }
-    let io = |source| FormatError::Io { path: path.to_owned(), verb: "read", source };
+    let io = |cause| FormatError::Io { path: path.to_owned(), verb: "read", cause };
     if path.file_name().is_some_and(|name| name == "lod-meta.json") {
         return Err(FormatError::Unsupported {
             format: Format::Sog,

@@ -23,10 +23,10 @@ const LOG_SCALES: (f32, f32) = (-20.0, 20.0);
 /// If the vectors of `splats` differ in length.
 pub fn write_compressed(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
     let path = path.as_ref();
-    file::replace(path, &encode_compressed(splats)).map_err(|source| PlyError::Io {
+    file::replace(path, &encode_compressed(splats)).map_err(|cause| PlyError::Io {
         path: path.to_owned(),
         verb: "write",
-        source,
+        cause,
     })
 }
 

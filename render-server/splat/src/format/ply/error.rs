@@ -7,14 +7,14 @@ use std::path::PathBuf;
 #[non_exhaustive]
 pub enum PlyError {
     /// The operating system refused.
-    #[error("cannot {verb} {}: {source}", path.display())]
+    #[error("cannot {verb} {}: {cause}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
         /// `read` or `write`.
         verb: &'static str,
         /// The system's error.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file does not start with `ply`.
     #[error("not a PLY file: it starts with {found:?}, not \"ply\"")]

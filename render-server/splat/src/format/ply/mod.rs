@@ -45,10 +45,10 @@ use super::{Format, file};
 /// [`PlyError::Io`] with the path; otherwise as [`parse`].
 pub fn read(path: impl AsRef<Path>) -> Result<Loaded, PlyError> {
     let path = path.as_ref();
-    let mapped = file::map(path).map_err(|source| PlyError::Io {
+    let mapped = file::map(path).map_err(|cause| PlyError::Io {
         path: path.to_owned(),
         verb: "read",
-        source,
+        cause,
     })?;
     parse(&mapped)
 }

@@ -18,10 +18,10 @@ use crate::format::{assert_whole, file};
 /// If the vectors of `splats` differ in length.
 pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
     let path = path.as_ref();
-    file::replace(path, &encode(splats)).map_err(|source| PlyError::Io {
+    file::replace(path, &encode(splats)).map_err(|cause| PlyError::Io {
         path: path.to_owned(),
         verb: "write",
-        source,
+        cause,
     })
 }
 

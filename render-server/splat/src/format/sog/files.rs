@@ -61,7 +61,7 @@ impl<'a> Files<'a> {
             }
             Self::Folder(folder) => {
                 let path = folder.join(name);
-                let io = |source| FormatError::Io { path: path.clone(), verb: "read", source };
+                let io = |cause| FormatError::Io { path: path.clone(), verb: "read", cause };
                 let file = File::open(&path).map_err(io)?;
                 if !file.metadata().map_err(io)?.is_file() {
                     return Err(invalid(name, "not a regular file"));
