@@ -6,14 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use vizflyt_fixtures::CountingAllocator;
-use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_protocol::messages::{CameraInfo, bounded};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, peek, slice_len};
 use vizflyt_runtime::images::ImagePublisher;
 use vizflyt_runtime::stream::{Arrival, Mailbox, Whole};
-use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd};
 use vizflyt_sdk::{Observation, ObservationWriter, host_now};
 
@@ -46,11 +45,7 @@ fn pieces() -> Vec<Vec<u8>> {
 #[test]
 fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
     let (width, height) = SIZE;
-    let camera = CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(width, height, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    };
+    let camera = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(width, height, 1.5));
     let cameras = vec![camera.clone()];
     let runtime = RuntimeEnd::new(ObservationWriter::len_for(&cameras));
     let plugin = PluginEnd::attach(runtime.connect().unwrap()).unwrap();

@@ -6,8 +6,7 @@ use std::time::{Duration, Instant};
 
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION};
-use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::{FromPlugin, PoseAges, ToPlugin, bounded};
+use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin};
 use vizflyt_sdk::{
     ArenaInfo, Axes, CameraInfo, ImageStamps, Intrinsics, Limits, ObservationWriter, Setpoint,
     Volume, YawTarget,
@@ -48,29 +47,18 @@ fn build(folder: &Path) -> PathBuf {
 }
 
 fn arena() -> ArenaInfo {
+    let hall = Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0));
+    let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 1.5);
     ArenaInfo {
-        name: bounded("hall"),
-        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
         no_fly: [Volume::aabb(DVec3::ZERO, DVec3::ONE)].into_iter().collect(),
         floor_z_m: 0.25,
-        limits: Limits::new(3.0, 4.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
         ground_truth: false,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         // The plugin looks for its camera by name.
         cameras: ["rear", "front"]
-            .map(|name| CameraInfo {
-                name: bounded(name),
-                intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.5),
-                body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-            })
+            .map(|name| CameraInfo::forward(name, intrinsics))
             .into_iter()
             .collect(),
+        ..ArenaInfo::new("hall", hall, Limits::new(3.0, 4.0))
     }
 }
 

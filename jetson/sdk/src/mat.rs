@@ -36,11 +36,9 @@ impl<'a> CameraImage<'a> {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec3;
     use opencv::imgproc::{COLOR_RGB2GRAY, cvt_color_def};
     use opencv::prelude::*;
-    use vizflyt_protocol::geometry::{Intrinsics, body_from_forward_cam};
-    use vizflyt_protocol::messages::bounded;
+    use vizflyt_protocol::geometry::Intrinsics;
 
     use crate::{CameraInfo, ImageStamps, ObservationBuffer};
 
@@ -48,11 +46,7 @@ mod tests {
 
     #[test]
     fn matrices_lie_over_the_image_itself() {
-        let front = CameraInfo {
-            name: bounded("front"),
-            intrinsics: Intrinsics::from_horizontal_fov(7, 5, 1.5),
-            body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-        };
+        let front = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(7, 5, 1.5));
         let mut buffer = ObservationBuffer::new(&[front]);
         buffer.set_image(0, ImageStamps::default(), |planes| {
             planes.rgb.fill(0);

@@ -210,15 +210,8 @@ fn layout_of(cameras: &[CameraInfo]) -> ObservationLayout {
 /// One observation in memory of its own: for tests, replays and tools.
 ///
 /// ```
-/// use vizflyt_sdk::glam::DVec3;
-/// use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-/// use vizflyt_sdk::protocol::messages::bounded;
 /// use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, ObservationBuffer};
-/// let front = CameraInfo {
-///     name: bounded("front"),
-///     intrinsics: Intrinsics::from_horizontal_fov(4, 2, 1.5),
-///     body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-/// };
+/// let front = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(4, 2, 1.5));
 /// let mut buffer = ObservationBuffer::new(&[front]);
 /// buffer.set_image(0, ImageStamps::default(), |planes| {
 ///     planes.rgb.fill(128);

@@ -22,7 +22,7 @@ use glam::DVec3;
 use serde::Serialize;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::geometry::{Pose, Volume};
-use vizflyt_protocol::messages::{ArenaInfo, Limits, PoseAges, Purpose, bounded};
+use vizflyt_protocol::messages::{ArenaInfo, Limits, Purpose, bounded};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::images::ImagePublisher;
@@ -398,22 +398,8 @@ impl Link {
 }
 
 fn arena() -> ArenaInfo {
-    ArenaInfo {
-        name: bounded("bench"),
-        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(3.0, 4.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
-        cameras: [].into_iter().collect(),
-    }
+    let hall = Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0));
+    ArenaInfo::new("bench", hall, Limits::new(3.0, 4.0))
 }
 
 /// Returns a bitstream of 3.3 bits a pixel: 128 KB at 640x480.

@@ -70,17 +70,12 @@ fn main() -> std::process::ExitCode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-    use vizflyt_sdk::protocol::messages::bounded;
     use vizflyt_sdk::{CameraInfo, HostTime, ImageStamps, Intrinsics, ObservationBuffer};
 
     /// Steers by an image whose left and right half are that deep. [mm]
     fn see(left_mm: u16, right_mm: u16, height_m: Option<f64>) -> (DVec3, f64) {
-        let front = CameraInfo {
-            name: bounded("front"),
-            intrinsics: Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians()),
-            body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-        };
+        let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians());
+        let front = CameraInfo::forward("front", intrinsics);
         let mut buffer = ObservationBuffer::new(&[front]);
         let stamps = ImageStamps { seq: 1, ..ImageStamps::default() };
         buffer.set_image(0, stamps, |planes| {

@@ -1,30 +1,18 @@
-use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
-use vizflyt_sdk::protocol::messages::{PoseAges, bounded};
+use vizflyt_sdk::protocol::messages::bounded;
 use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, Limits, ObservationBuffer, Volume};
 
 use super::*;
 
 fn arena(goal_m: Option<DVec3>) -> ArenaInfo {
-    let front = CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians()),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    };
+    let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians());
+    let front = CameraInfo::forward("front", intrinsics);
+    let geofence = Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 };
     ArenaInfo {
-        name: bounded("test"),
-        geofence: Volume::Sphere { center_m: DVec3::ZERO, radius_m: 60.0 },
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         goal_m,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         cameras: [front].into_iter().collect(),
+        ..ArenaInfo::new("test", geofence, Limits::new(6.0, 8.0))
     }
 }
 

@@ -1,7 +1,7 @@
 //! The companion against inputs of an autopilot and a server, and what it lets a plugin know.
 
 use vizflyt_protocol::flight_end::{Collision, Obstacle};
-use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_protocol::messages::{FlightPhase, Limits};
 use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::{Observation, ObservationWriter};
@@ -12,11 +12,8 @@ fn arena(ground_truth: bool) -> ArenaInfo {
     let mut arena = crate::flight::tests::arena();
     arena.ground_truth = ground_truth;
     arena.cameras.clear();
-    let _ = arena.cameras.push(CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(8, 6, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    });
+    let intrinsics = Intrinsics::from_horizontal_fov(8, 6, 1.5);
+    let _ = arena.cameras.push(CameraInfo::forward("front", intrinsics));
     arena
 }
 

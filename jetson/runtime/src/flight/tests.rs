@@ -38,21 +38,11 @@ struct Script {
 }
 
 pub(crate) fn arena() -> ArenaInfo {
+    let net = Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0));
     ArenaInfo {
-        name: bounded("test"),
-        geofence: Volume::aabb(DVec3::new(-5.0, -5.0, -0.5), DVec3::new(5.0, 5.0, 4.0)),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(3.0, 5.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
         time_limit_s: 30.0,
-        ground_truth: true,
         pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
-        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
-        cameras: heapless::Vec::new(),
+        ..ArenaInfo::new("test", net, Limits::new(3.0, 5.0))
     }
 }
 

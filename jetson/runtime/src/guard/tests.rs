@@ -2,7 +2,7 @@ use glam::{DQuat, DVec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{
-    ArenaInfo, Axes, COEFFICIENTS, Limits, Path, PathYaw, Piece, Trajectory, Waypoint, bounded,
+    ArenaInfo, Axes, COEFFICIENTS, Limits, Path, PathYaw, Piece, Trajectory, Waypoint,
 };
 
 use super::limits::{FENCE_EXCESS, GRAVITY_MPS2, acceleration_within_tilt_mps2};
@@ -13,20 +13,10 @@ const TICK_S: f64 = 0.02;
 
 fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> ArenaInfo {
     ArenaInfo {
-        name: bounded("test"),
-        geofence,
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(max_speed_mps, max_acceleration_mps2),
         body_radius_m: 0.12,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
         pose_ages: PoseAges { hold_after_s: 0.5, land_after_s: 2.0 },
         setpoints: SetpointKinds::ALL,
-        cameras: heapless::Vec::new(),
+        ..ArenaInfo::new("test", geofence, Limits::new(max_speed_mps, max_acceleration_mps2))
     }
 }
 

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::stream::Ticket;
-use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
-use vizflyt_protocol::messages::{Name, bounded};
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_protocol::messages::Name;
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView, peek, slice_len};
@@ -12,11 +12,7 @@ use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::ipc::PluginEnd;
 
 fn camera(name: &str) -> CameraInfo {
-    CameraInfo {
-        name: bounded(name),
-        intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    }
+    CameraInfo::forward(name, Intrinsics::from_horizontal_fov(32, 24, 1.5))
 }
 
 struct TestImage {

@@ -6,7 +6,7 @@ use std::io::Cursor;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, ToPlugin, YawTarget, bounded};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::ServerTime;
@@ -20,11 +20,7 @@ use super::*;
 use crate::log::{FlightLog, LogSettings, LoggedImage, PluginMessage, observation_head};
 
 fn camera() -> CameraInfo {
-    CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    }
+    CameraInfo::forward("front", Intrinsics::from_horizontal_fov(32, 24, 1.5))
 }
 
 fn at(ms: u64) -> HostTime {

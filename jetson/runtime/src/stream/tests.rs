@@ -5,8 +5,8 @@ use std::sync::mpsc::{Receiver, channel};
 use quinn::{Connection, RecvStream, SendStream, ServerConfig};
 use vizflyt_protocol::geometry::{Intrinsics, Pose, Volume};
 use vizflyt_protocol::messages::{
-    ClockReply, Datagram, EventKind, Hello, Limits, PoseAges, Telemetry, ToRuntime, ToServer,
-    Welcome, bounded,
+    ClockReply, Datagram, EventKind, Hello, Limits, Telemetry, ToRuntime, ToServer, Welcome,
+    bounded,
 };
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode, encode_body};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, PeerRole, Preamble};
@@ -133,22 +133,8 @@ const BOOT: u64 = 77;
 const AHEAD_NS: u64 = 100_000_000_000;
 
 fn arena() -> ArenaInfo {
-    ArenaInfo {
-        name: bounded("test"),
-        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(3.0, 4.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
-        cameras: heapless::Vec::new(),
-    }
+    let hall = Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0));
+    ArenaInfo::new("test", hall, Limits::new(3.0, 4.0))
 }
 
 fn note(text: &str) -> Event {

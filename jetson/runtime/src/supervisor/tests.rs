@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Instant;
 
-use vizflyt_protocol::geometry::{Intrinsics, Volume, body_from_forward_cam};
+use vizflyt_protocol::geometry::{Intrinsics, Volume};
 use vizflyt_protocol::messages::{
-    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, Limits, PoseAges, Setpoint,
-    ToPlugin, bounded,
+    ArenaInfo, CameraInfo, Event, EventKind, FlightPhase, FromPlugin, Limits, Setpoint, ToPlugin,
+    bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::DVec3;
@@ -296,29 +296,14 @@ while True:
 // ---- the example plugin over real shared memory ----
 
 fn cameras() -> Vec<CameraInfo> {
-    vec![CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    }]
+    vec![CameraInfo::forward("front", Intrinsics::from_horizontal_fov(64, 48, 1.5))]
 }
 
 fn arena() -> ArenaInfo {
+    let hall = Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0));
     ArenaInfo {
-        name: bounded("test"),
-        geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(3.0, 4.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
         cameras: cameras().into_iter().collect(),
+        ..ArenaInfo::new("test", hall, Limits::new(3.0, 4.0))
     }
 }
 

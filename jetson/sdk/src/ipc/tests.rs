@@ -1,7 +1,6 @@
 //! Both ends in one process; the runtime's tests kill real plugin processes.
 
-use glam::DVec3;
-use vizflyt_protocol::geometry::{Intrinsics, body_from_forward_cam};
+use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_protocol::messages::{
     CameraInfo, Event, EventKind, FromPlugin, Setpoint, ToPlugin, bounded,
 };
@@ -17,11 +16,7 @@ const WAIT: Duration = Duration::from_secs(10);
 const MESSAGES: usize = 128;
 
 fn cameras() -> Vec<CameraInfo> {
-    vec![CameraInfo {
-        name: bounded("front"),
-        intrinsics: Intrinsics::from_horizontal_fov(32, 24, 1.5),
-        body_from_cam: body_from_forward_cam(DVec3::ZERO, 0.0),
-    }]
+    vec![CameraInfo::forward("front", Intrinsics::from_horizontal_fov(32, 24, 1.5))]
 }
 
 fn publish(runtime: &RuntimeEnd, seq: u64) {

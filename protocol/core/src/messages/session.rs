@@ -3,8 +3,10 @@
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-use super::{Event, MAX_CAMERAS, MAX_NO_FLY, Name, SetpointKinds, Telemetry, Text, Timing};
-use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
+use super::{
+    Event, MAX_CAMERAS, MAX_NO_FLY, Name, SetpointKinds, Telemetry, Text, Timing, bounded,
+};
+use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World, body_from_forward_cam};
 use crate::time::{HostTime, ServerTime};
 
 /// What a client is there for.
@@ -224,6 +226,14 @@ pub struct CameraInfo {
     pub body_from_cam: Pose<Body, Cam>,
 }
 
+impl CameraInfo {
+    /// Makes a camera at the body's centre that looks straight ahead.
+    pub fn forward(name: &str, intrinsics: Intrinsics) -> Self {
+        let body_from_cam = body_from_forward_cam(DVec3::ZERO, 0.0);
+        Self { name: bounded(name), intrinsics, body_from_cam }
+    }
+}
+
 /// Limits that the guard enforces whatever a plugin asks.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -307,6 +317,29 @@ pub struct ArenaInfo {
     pub setpoints: SetpointKinds,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
+}
+
+impl ArenaInfo {
+    /// Makes an arena of a fence [world] and limits alone: the floor at zero, no goal, no time limit, no
+    /// camera; a body of 0.1 m that rises by 1 m, and a plugin that gets its pose.
+    pub fn new(name: &str, geofence: Volume, limits: Limits) -> Self {
+        Self {
+            name: bounded(name),
+            geofence,
+            no_fly: heapless::Vec::new(),
+            floor_z_m: 0.0,
+            limits,
+            body_radius_m: 0.1,
+            takeoff_height_m: 1.0,
+            goal_m: None,
+            goal_radius_m: 1.0,
+            time_limit_s: 0.0,
+            ground_truth: true,
+            pose_ages: PoseAges::default(),
+            setpoints: SetpointKinds::USUAL,
+            cameras: heapless::Vec::new(),
+        }
+    }
 }
 
 #[cfg(test)]

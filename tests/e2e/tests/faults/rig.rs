@@ -14,8 +14,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, Volume};
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseAges, PoseSample, Purpose, Telemetry,
-    bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseSample, Purpose, Telemetry, bounded,
 };
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::ServerTime;
@@ -172,22 +171,11 @@ impl Server {
         source: &Source,
         notes: &Arc<Mutex<Notes>>,
     ) -> Self {
-        let arena = ArenaInfo {
-            name: bounded("virtual"),
-            geofence: Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
-            no_fly: [].into_iter().collect(),
-            floor_z_m: 0.0,
-            limits: Limits::new(3.0, 4.0),
-            body_radius_m: 0.1,
-            takeoff_height_m: 1.0,
-            goal_m: None,
-            goal_radius_m: 1.0,
-            time_limit_s: 0.0,
-            ground_truth: true,
-            pose_ages: PoseAges::default(),
-            setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
-            cameras: [].into_iter().collect(),
-        };
+        let arena = ArenaInfo::new(
+            "virtual",
+            Volume::aabb(DVec3::splat(-9.0), DVec3::splat(9.0)),
+            Limits::new(3.0, 4.0),
+        );
         let camera = CameraConfig {
             name: "front".to_owned(),
             width_px: source.size_px[0],

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use vizflyt_avoid::Avoid;
 use vizflyt_sdk::glam::{DMat3, DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::{body_from_forward_cam, wrap_pi};
-use vizflyt_sdk::protocol::messages::{PoseAges, bounded};
+use vizflyt_sdk::protocol::messages::bounded;
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, CameraInfo, HostTime, ImageStamps, Intrinsics, Limits, ObservationBuffer,
     Pose, Setpoint, Vehicle, Volume, World, YawTarget,
@@ -86,25 +86,18 @@ pub(crate) fn small_camera() -> CameraInfo {
 
 /// The arena of the forest, with a small camera so that tests are quick.
 pub(crate) fn arena() -> ArenaInfo {
+    let geofence = Volume::Cuboid {
+        center_m: DVec3::new(20.5, 0.0, 1.75),
+        half_m: DVec3::new(21.5, 7.0, 2.25),
+        rotation: DQuat::IDENTITY,
+    };
     ArenaInfo {
-        name: bounded("forest"),
-        geofence: Volume::Cuboid {
-            center_m: DVec3::new(20.5, 0.0, 1.75),
-            half_m: DVec3::new(21.5, 7.0, 2.25),
-            rotation: DQuat::IDENTITY,
-        },
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(6.0, 8.0),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         goal_m: Some(GOAL_M),
-        goal_radius_m: 1.0,
         time_limit_s: 60.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_sdk::SetpointKinds::USUAL,
         cameras: [small_camera()].into_iter().collect(),
+        ..ArenaInfo::new("forest", geofence, Limits::new(6.0, 8.0))
     }
 }
 

@@ -7,25 +7,11 @@ use crate::flights::control_lease::MAX_WATCHERS;
 use glam::DVec3;
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::geometry::Volume;
-use vizflyt_protocol::messages::{Limits, PoseAges, Purpose, ReceivedEvents};
+use vizflyt_protocol::messages::{Limits, Purpose, ReceivedEvents};
 
 pub(crate) fn named(index: usize, name: &str) -> VehicleFlight {
-    let arena = ArenaInfo {
-        name: bounded("test"),
-        geofence: Volume::aabb(DVec3::ZERO, DVec3::ONE),
-        no_fly: [].into_iter().collect(),
-        floor_z_m: 0.0,
-        limits: Limits::new(1.0, 1.0),
-        body_radius_m: 0.1,
-        takeoff_height_m: 1.0,
-        goal_m: None,
-        goal_radius_m: 1.0,
-        time_limit_s: 0.0,
-        ground_truth: true,
-        pose_ages: PoseAges::default(),
-        setpoints: vizflyt_protocol::messages::SetpointKinds::USUAL,
-        cameras: [].into_iter().collect(),
-    };
+    let arena =
+        ArenaInfo::new("test", Volume::aabb(DVec3::ZERO, DVec3::ONE), Limits::new(1.0, 1.0));
     VehicleFlight::new(index, name, arena)
 }
 
