@@ -6,12 +6,12 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 use vizflyt_e2e::{root, vizflyt};
+use vizflyt_fixtures::WebSocket;
 
 fn run(args: &[&str]) -> Output {
     Command::new(vizflyt()).args(args).output().unwrap()
@@ -332,18 +332,19 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     page.read_to_string(&mut text).unwrap();
     assert!(text.starts_with("HTTP/1.1 200") && text.contains("<canvas"), "{text}");
 
-    let mut socket = Socket::open(&address);
-    let welcome: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    let origin = format!("Origin: http://{address}\r\n");
+    let mut socket = WebSocket::open(address.parse().unwrap(), "/ws", &origin).ok().unwrap();
+    let welcome: Value = serde_json::from_slice(&socket.receive().1).unwrap();
     assert!(welcome["renderer"]["reason"].is_string(), "{welcome}");
     socket.send("{\"what\": 1}");
-    let error: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    let error: Value = serde_json::from_slice(&socket.receive().1).unwrap();
     assert!(error["error"].as_str().unwrap().contains("unknown field `what`"), "{error}");
     let ask = json!({"p_m": welcome["start_m"], "yaw_rad": 0.3, "pitch_rad": -0.1, "fov_deg": 80,
                      "width_px": 200, "height_px": 100, "depth": false, "at_s": 2.5});
     socket.send(&ask.to_string());
-    let info: Value = serde_json::from_slice(&socket.receive()).unwrap();
+    let info: Value = serde_json::from_slice(&socket.receive().1).unwrap();
     assert!(info["visible"].as_u64().unwrap() > 100, "{info}");
-    assert_eq!(socket.receive()[..2], [0xff, 0xd8], "a JPEG follows");
+    assert_eq!(socket.receive().1[..2], [0xff, 0xd8], "a JPEG follows");
 
     rig.write("copied.json", &info["camera"].to_string());
     let printed = good(&[
@@ -361,60 +362,4 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
 
     kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM).unwrap();
     assert!(child.wait().unwrap().success());
-}
-
-/// A browser's WebSocket (RFC 6455), as far as the viewer needs one.
-struct Socket(TcpStream);
-
-impl Socket {
-    fn open(address: &str) -> Self {
-        let mut stream = TcpStream::connect(address).unwrap();
-        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
-        write!(
-            stream,
-            "GET /ws HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n\
-             Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
-             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-        )
-        .unwrap();
-        let mut head = Vec::new();
-        while !head.ends_with(b"\r\n\r\n") {
-            let mut byte = [0];
-            stream.read_exact(&mut byte).unwrap();
-            head.push(byte[0]);
-        }
-        assert!(head.starts_with(b"HTTP/1.1 101"), "{}", String::from_utf8_lossy(&head));
-        Self(stream)
-    }
-
-    fn send(&mut self, text: &str) {
-        // A client masks; with zeros the text stays as it is.
-        let mut frame = vec![0x81, 0x80 | 0x7e];
-        frame.extend((text.len() as u16).to_be_bytes());
-        frame.extend([0; 4]);
-        frame.extend(text.as_bytes());
-        self.0.write_all(&frame).unwrap();
-    }
-
-    /// Returns the payload of the next frame.
-    fn receive(&mut self) -> Vec<u8> {
-        let mut head = [0; 2];
-        self.0.read_exact(&mut head).unwrap();
-        let len = match head[1] {
-            126 => {
-                let mut len = [0; 2];
-                self.0.read_exact(&mut len).unwrap();
-                u64::from(u16::from_be_bytes(len))
-            }
-            127 => {
-                let mut len = [0; 8];
-                self.0.read_exact(&mut len).unwrap();
-                u64::from_be_bytes(len)
-            }
-            len => u64::from(len),
-        };
-        let mut payload = vec![0; len as usize];
-        self.0.read_exact(&mut payload).unwrap();
-        payload
-    }
 }

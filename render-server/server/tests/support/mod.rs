@@ -18,6 +18,7 @@ use glam::{Quat, Vec3};
 use quinn::{ClientConfig, Connection, Endpoint, RecvStream, SendStream, TransportConfig, VarInt};
 use serde_json::Value;
 use tempfile::TempDir;
+use vizflyt_fixtures::{TEXT, WebSocket};
 use vizflyt_protocol::messages::{
     ArenaInfo, Datagram, Hello, PoseSample, Purpose, ReceivedEvents, ToRuntime, ToServer, Welcome,
     bounded,
@@ -506,8 +507,8 @@ fn status(answer: &str) -> u16 {
     answer.split(' ').nth(1).and_then(|code| code.parse().ok()).expect("a status line")
 }
 
-/// A browser's WebSocket.
-pub struct Socket(TcpStream);
+/// The page's WebSocket.
+pub struct Socket(WebSocket);
 
 impl Socket {
     /// Opens it as a page of `origin` would; the status if the server declines.
@@ -517,54 +518,19 @@ impl Socket {
 
     /// As [`Self::open`], with another path and query.
     pub fn open_at(address: SocketAddr, origin: &str, path: &str) -> Result<Self, u16> {
-        let mut stream = TcpStream::connect(address).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        write!(
-            stream,
-            "GET {path} HTTP/1.1\r\nHost: {address}\r\nOrigin: {origin}\r\nConnection: Upgrade\r\n\
-             Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
-             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-        )
-        .unwrap();
-        let mut head = Vec::new();
-        while !head.ends_with(b"\r\n\r\n") {
-            let mut byte = [0];
-            stream.read_exact(&mut byte).unwrap();
-            head.push(byte[0]);
-        }
-        match status(&String::from_utf8_lossy(&head)) {
-            101 => Ok(Self(stream)),
-            other => Err(other),
-        }
+        WebSocket::open(address, path, &format!("Origin: {origin}\r\n")).map(Self)
     }
 
     /// Returns the next message: opcode (1 text, 2 binary) and payload.
     pub fn next(&mut self) -> (u8, Vec<u8>) {
-        let mut head = [0; 2];
-        self.0.read_exact(&mut head).unwrap();
-        let length = match head[1] & 0x7f {
-            126 => {
-                let mut bytes = [0; 2];
-                self.0.read_exact(&mut bytes).unwrap();
-                u64::from(u16::from_be_bytes(bytes))
-            }
-            127 => {
-                let mut bytes = [0; 8];
-                self.0.read_exact(&mut bytes).unwrap();
-                u64::from_be_bytes(bytes)
-            }
-            short => u64::from(short),
-        };
-        let mut payload = vec![0; length as usize];
-        self.0.read_exact(&mut payload).unwrap();
-        (head[0] & 0x0f, payload)
+        self.0.receive()
     }
 
     /// Returns the next JSON message of a type.
     pub fn message(&mut self, kind: &str) -> Value {
         loop {
             let (opcode, payload) = self.next();
-            if opcode == 1 {
+            if opcode == TEXT {
                 let value: Value = serde_json::from_slice(&payload).unwrap();
                 if value["type"] == kind {
                     return value;
