@@ -183,8 +183,10 @@ impl Link {
     pub(super) fn every_second(&mut self, now: HostTime) {
         // Heartbeats also give our address to a bridge or an autopilot that waits for one.
         self.send_heartbeat(now);
-        if let Some(fault) = self.signatures.as_mut().and_then(super::Signatures::take_fault) {
-            self.events.push_back(LinkEvent::NotSigned(fault));
+        if let Some(signatures) = &mut self.signatures {
+            while let Some((fault, count)) = signatures.poll_refused(now) {
+                self.events.push_back(LinkEvent::NotSigned { fault, count });
+            }
         }
         let Some(target) = self.autopilot else { return };
         let request = TIMESYNC_DATA {

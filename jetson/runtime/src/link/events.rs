@@ -42,7 +42,12 @@ pub enum LinkEvent {
     /// External navigation is later than the autopilot's setting.
     Delay(Delay),
     /// Packets are refused for their signature.
-    NotSigned(SigningFault),
+    NotSigned {
+        /// What is wrong with it.
+        fault: SigningFault,
+        /// Packets refused for that since the start.
+        count: u64,
+    },
     /// The result of a fence upload.
     Fence(FenceEvent),
     /// The result of reading or writing parameters.
@@ -62,8 +67,8 @@ impl LinkEvent {
                 "external navigation reaches the autopilot {measured_ms:.0} ms after its measurement, and \
                  {parameter} is {set_ms:.0}; set {parameter}={measured_ms:.0}"
             )),
-            Self::NotSigned(fault) => Some(format!(
-                "packets on the link are refused: {fault}; see `vizflyt vehicle sign`"
+            Self::NotSigned { fault, count } => Some(format!(
+                "packets on the link are refused ({count} so far): {fault}; see `vizflyt vehicle sign`"
             )),
             Self::Fence(FenceEvent::Rejected(why)) => Some(format!(
                 "the autopilot's own fence is not the arena's: {why}; it flies within its FENCE_* \

@@ -61,7 +61,9 @@ impl Link {
     /// Returns why the autopilot does not know where it is.
     fn navigation_missing(&self) -> Option<Cow<'static, str>> {
         if self.dialect.needs_origin() && self.origin.is_none() {
-            return Some("the autopilot has not confirmed its origin yet".into());
+            // One that signs accepts only what is signed, but over USB.
+            let is_deaf = self.autopilot_signs && self.signatures.is_none();
+            return Some(if is_deaf { UNCONFIRMED_TO_UNSIGNED } else { UNCONFIRMED }.into());
         }
         // PX4 calls a position that external navigation gives relative.
         let position = if self.dialect.rise() == Rise::BySetpoint {
@@ -145,6 +147,10 @@ impl Link {
         }
     }
 }
+
+const UNCONFIRMED: &str = "the autopilot has not confirmed its origin yet";
+const UNCONFIRMED_TO_UNSIGNED: &str = "the autopilot has not confirmed its origin yet; it signs its \
+    packets and we do not, so it may refuse ours: set `signing_key` (`vizflyt vehicle sign`)";
 
 const SENSORS: [(MavSysStatusSensor, &str); 13] = [
     (MavSysStatusSensor::MAV_SYS_STATUS_SENSOR_3D_GYRO, "gyroscope"),

@@ -40,8 +40,8 @@ use vizflyt_protocol::mavlink::dialect::{
     EkfStatusFlags, MavCmd, MavMessage, MavSysStatusSensor, SETUP_SIGNING_DATA,
 };
 use vizflyt_protocol::mavlink::{
-    GlobalPoint, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
-    vision_to_mavlink,
+    GlobalPoint, GuidedSetpoint, MAX_PACKET, MavHeader, Packet, StreamDecoder, encode,
+    guided_to_mavlink, is_signed, vision_to_mavlink,
 };
 use vizflyt_protocol::messages::{PoseSample, VehicleState};
 use vizflyt_protocol::time::{Autopilot, Host, HostTime, OffsetFilter};
@@ -151,6 +151,13 @@ struct Target {
     component: u8,
 }
 
+impl Target {
+    /// Returns the sender of a packet.
+    fn of(packet: &Packet) -> Self {
+        Self { system: packet.header.system_id as u8, component: packet.header.component_id }
+    }
+}
+
 /// What is known of the pre-arm checks.
 #[derive(Clone, Debug)]
 struct Prearm {
@@ -206,6 +213,8 @@ pub struct Link {
     autopilot: Option<Target>,
     dialect: &'static dyn Dialect,
     firmware: Option<Firmware>,
+    /// It signs what it sends.
+    autopilot_signs: bool,
     /// Another autopilot on the same link, and when it last sent.
     rival: Option<(u8, HostTime)>,
     companions: Companions,
@@ -266,6 +275,7 @@ impl Link {
             autopilot: None,
             dialect: &dialect::ArduCopter,
             firmware: None,
+            autopilot_signs: false,
             rival: None,
             companions: Companions::new(nonce),
             announced_at: None,
@@ -303,11 +313,14 @@ impl Link {
         let signatures = &mut self.signatures;
         self.decoder.push_whole(bytes, |bytes, packet| {
             if signatures.as_mut().is_none_or(|s| s.accepts(now, bytes, &packet.message)) {
-                packets.push(packet);
+                packets.push((packet, is_signed(bytes)));
             }
         });
-        for packet in packets {
+        for (packet, signed) in packets {
             self.handle_packet(now, &packet);
+            if self.autopilot == Some(Target::of(&packet)) {
+                self.autopilot_signs = signed;
+            }
         }
         self.advance(now);
     }

@@ -38,8 +38,7 @@ const PREARM: &str = "PreArm: ";
 
 impl Link {
     pub(super) fn handle_packet(&mut self, now: HostTime, packet: &Packet) {
-        let from =
-            Target { system: packet.header.system_id as u8, component: packet.header.component_id };
+        let from = Target::of(packet);
         if let MavMessage::HEARTBEAT(heartbeat) = &packet.message {
             self.handle_heartbeat(now, from, heartbeat);
             return;

@@ -35,10 +35,25 @@ pub(super) struct Signatures {
     made_at: HostTime,
     start: SigningTime,
     accepts_unsigned: bool,
-    refused: u64,
-    /// Not reported yet.
-    unreported: Option<SigningFault>,
+    /// By their faults.
+    refused: Vec<Refused>,
 }
+
+/// Packets refused for one fault.
+#[derive(Clone, Copy, Debug)]
+struct Refused {
+    fault: SigningFault,
+    count: u64,
+    /// So many were reported.
+    reported: u64,
+    /// When others may be.
+    due_at: HostTime,
+    /// From that report to the next. [s]
+    pause_s: f64,
+}
+
+/// From the first report of a fault to the second; each further pause is twice as long. [s]
+const FIRST_PAUSE_S: f64 = 10.0;
 
 impl Signatures {
     pub(super) fn new(now: HostTime, signing: LinkSigning) -> Self {
@@ -48,8 +63,7 @@ impl Signatures {
             made_at: now,
             start: signing.start,
             accepts_unsigned: signing.accepts_unsigned,
-            refused: 0,
-            unreported: None,
+            refused: Vec::new(),
         }
     }
 
@@ -77,20 +91,35 @@ impl Signatures {
         match self.verifier.check(time, bytes) {
             Ok(()) => true,
             Err(fault) => {
-                self.refused += 1;
-                self.unreported = Some(fault);
+                self.refuse(now, fault);
                 false
             }
         }
     }
 
-    pub(super) fn refused(&self) -> u64 {
-        self.refused
+    fn refuse(&mut self, now: HostTime, fault: SigningFault) {
+        if let Some(refused) = self.refused.iter_mut().find(|refused| refused.fault == fault) {
+            refused.count += 1;
+        } else {
+            let (count, pause_s) = (1, FIRST_PAUSE_S);
+            self.refused.push(Refused { fault, count, reported: 0, due_at: now, pause_s });
+        }
     }
 
-    /// Returns why a packet was refused since the last call.
-    pub(super) fn take_fault(&mut self) -> Option<SigningFault> {
-        self.unreported.take()
+    pub(super) fn refused(&self) -> u64 {
+        self.refused.iter().map(|refused| refused.count).sum()
+    }
+
+    /// Returns a fault that is to be reported at `now`, and how many packets had it so far: each fault
+    /// at once, then at growing intervals, and only if more packets came with it.
+    pub(super) fn poll_refused(&mut self, now: HostTime) -> Option<(SigningFault, u64)> {
+        let is_due =
+            |refused: &&mut Refused| refused.count > refused.reported && now >= refused.due_at;
+        let refused = self.refused.iter_mut().find(is_due)?;
+        refused.reported = refused.count;
+        refused.due_at = now.plus_seconds(refused.pause_s);
+        refused.pause_s *= 2.0;
+        Some((refused.fault, refused.count))
     }
 }
 

@@ -27,7 +27,7 @@ pub use frames::{
 pub use setpoint::{
     GuidedMotion, GuidedSetpoint, UnsupportedSetpoint, guided_from_mavlink, guided_to_mavlink,
 };
-pub use signing::{SIGNATURE, Signer, SigningFault, SigningKey, SigningTime, Verifier};
+pub use signing::{SIGNATURE, Signer, SigningFault, SigningKey, SigningTime, Verifier, is_signed};
 pub use state::{
     attitude_from_mavlink, attitude_to_mavlink, highres_imu_from_mavlink,
     local_position_from_mavlink, local_position_to_mavlink, raw_imu_from_mavlink,

@@ -149,9 +149,7 @@ impl Verifier {
     /// # Errors
     /// [`SigningFault`].
     pub fn check(&mut self, now: SigningTime, packet: &[u8]) -> Result<(), SigningFault> {
-        let signed =
-            packet.len() >= 12 + SIGNATURE && packet[0] == STX_V2 && packet[2] & SIGNED != 0;
-        if !signed {
+        if !is_signed(packet) {
             return Err(SigningFault::Unsigned);
         }
         let (signed_bytes, theirs) = packet.split_at(packet.len() - 6);
@@ -180,6 +178,11 @@ impl Verifier {
 
 /// Incompatibility flag of MAVLink 2: a signature follows.
 const SIGNED: u8 = 0x01;
+
+/// Whether a whole packet carries a signature, right or wrong.
+pub fn is_signed(packet: &[u8]) -> bool {
+    packet.len() >= 12 + SIGNATURE && packet[0] == STX_V2 && packet[2] & SIGNED != 0
+}
 
 /// Returns the signature of a packet up to and with its stamp.
 fn signature(key: &SigningKey, signed_bytes: &[u8]) -> [u8; 6] {

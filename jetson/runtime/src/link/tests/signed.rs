@@ -1,6 +1,6 @@
 //! A link that signs: unsigned, forged and replayed packets are refused.
 
-use vizflyt_protocol::mavlink::{Signer, SigningKey, SigningTime, Verifier};
+use vizflyt_protocol::mavlink::{Signer, SigningFault, SigningKey, SigningTime, Verifier};
 
 use super::*;
 
@@ -55,6 +55,54 @@ fn accepts_only_signed_packets_with_new_stamps() {
     let faults: Vec<_> =
         std::iter::from_fn(|| link.poll_event()).filter_map(|event| event.warning()).collect();
     assert!(faults.iter().any(|text| text.contains("a replay")), "{faults:?}");
+}
+
+#[test]
+fn reports_refused_packets_at_growing_intervals() {
+    let mut now = HostTime::from_ns(5_000_000_000);
+    let mut link = link(now);
+    let mut reports = Vec::new();
+    for second in 0..100 {
+        now = now.plus_seconds(1.0);
+        link.handle_input(now, &beat(None, START));
+        link.handle_timeout(now);
+        while let Some(event) = link.poll_event() {
+            if let LinkEvent::NotSigned { fault, count } = event {
+                assert_eq!((fault, count), (SigningFault::Unsigned, second + 1));
+                reports.push(second);
+            }
+        }
+    }
+    assert_eq!(reports, [0, 10, 30, 70]);
+    // Another fault is news, and nothing is repeated once it is over.
+    let mut other = Signer::new(SigningKey::new([1; 32]), 0);
+    link.handle_input(now, &beat(Some(&mut other), START));
+    for _ in 0..100 {
+        now = now.plus_seconds(1.0);
+        link.handle_timeout(now);
+    }
+    let texts: Vec<_> =
+        std::iter::from_fn(|| link.poll_event()).filter_map(|event| event.warning()).collect();
+    let [forged, unsigned] = &texts[..] else { panic!("{texts:?}") };
+    assert!(forged.contains("(1 so far)") && forged.contains("another key"), "{forged}");
+    assert!(unsigned.contains("(100 so far)") && unsigned.contains("not signed"), "{unsigned}");
+}
+
+#[test]
+fn names_an_autopilot_that_signs_to_a_runtime_that_does_not() {
+    let now = HostTime::from_ns(5_000_000_000);
+    let mut link = Link::new(now);
+    let mut signer = Signer::new(key(), 0);
+    link.handle_input(now, &beat(Some(&mut signer), START));
+    assert!(link.is_connected(), "without a key, signatures are not looked at");
+    let waits_for = link.ready_to_arm(now).unwrap_err();
+    assert!(waits_for.contains("not confirmed its origin"), "{waits_for}");
+    assert!(waits_for.contains("it signs its packets and we do not"), "{waits_for}");
+    assert!(waits_for.len() < 165, "it fits into a report: {waits_for}");
+    // Signing was ended over USB.
+    link.handle_input(now, &beat(None, START));
+    let waits_for = link.ready_to_arm(now).unwrap_err();
+    assert!(!waits_for.contains("signs"), "{waits_for}");
 }
 
 #[test]
