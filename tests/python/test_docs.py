@@ -17,6 +17,14 @@ BLOCKS = [
 ]
 
 
+def test_the_guide_names_what_intrinsics_have():
+    guide = (ROOT / "docs/guides/plugin.md").read_text()
+    table = guide[guide.index("## What it sees") : guide.index("## What it answers")]
+    # How one is made by hand stands with the example of a test.
+    names = [name for name in dir(vizflyt.Intrinsics) if not name.startswith(("_", "from_"))]
+    assert "fx_px" in names and [name for name in names if f".{name}" not in table] == []
+
+
 def test_there_are_examples():
     assert {page for page, _ in BLOCKS} == set(PAGES)
 
