@@ -181,6 +181,12 @@ impl Companion {
         self.steering.hurry();
     }
 
+    /// Takes note that there is no connection to the server, or that it refuses us for now; `why` in a
+    /// sentence, which stands in for the server's answer until it comes.
+    pub fn server_down(&mut self, now: HostTime, why: String) {
+        self.flight.handle(now, FlightInput::ServerDown(why));
+    }
+
     /// Ends the flight because it cannot be flown: the server refused it, or the plugin's shared memory
     /// cannot be made; `why` in a sentence.
     pub fn refuse(&mut self, now: HostTime, why: String) {

@@ -283,7 +283,10 @@ impl ControlLoop {
                 }
             }
             StreamEvent::Refused(why) => self.companion.refuse(now, why),
-            StreamEvent::Down(why) => tracing::warn!("{why}; trying again"),
+            StreamEvent::Down(why) => {
+                tracing::warn!("{why}; trying again");
+                self.companion.server_down(now, why);
+            }
             StreamEvent::Pose(sample, stamp) => {
                 self.companion.handle_pose(now, &sample, stamp);
                 self.share_senses();

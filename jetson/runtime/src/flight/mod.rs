@@ -28,7 +28,8 @@ use std::collections::VecDeque;
 use vizflyt_protocol::flight_end::{EndReason, FlightEnd, PluginFault};
 use vizflyt_protocol::mavlink::GuidedSetpoint;
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Setpoint, bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Setpoint, Text,
+    bounded,
 };
 use vizflyt_protocol::time::{Host, HostTime};
 
@@ -79,6 +80,8 @@ pub enum FlightInput {
         /// Its setpoint, if it sent one.
         setpoint: Option<Setpoint>,
     },
+    /// There is no connection to the server, or it refuses us for now; why, in a sentence.
+    ServerDown(String),
     /// The server refuses us, and retrying will not help; why, in a sentence.
     ServerRefused(String),
     /// The plugin has failed for good.
@@ -146,6 +149,8 @@ pub struct Flight {
     phase_at: HostTime,
     started_at: HostTime,
     arena: Option<Box<ArenaInfo>>,
+    /// Why the last attempt to connect to the server failed.
+    server_down: Option<Text>,
     vehicle: Option<VehicleMotion>,
     start_z_m: f64,
     took_off_at: Option<HostTime>,
@@ -185,6 +190,7 @@ impl Flight {
             phase_at: now,
             started_at: now,
             arena: None,
+            server_down: None,
             vehicle: None,
             start_z_m: 0.0,
             took_off_at: None,
@@ -251,6 +257,7 @@ impl Flight {
             }
             FlightInput::Server(event, at) => self.handle_server(now, at.min(now), &event),
             FlightInput::Link(event) => self.handle_link(now, event),
+            FlightInput::ServerDown(why) => self.server_down = Some(bounded(&why)),
             FlightInput::ServerRefused(why) => {
                 self.end_for(now, EndReason::ServerRefused(bounded(&why)));
             }

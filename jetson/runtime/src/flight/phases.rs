@@ -42,7 +42,7 @@ impl Flight {
             return;
         }
         let missing = if self.arena.is_none() {
-            Some(Missing::Server)
+            Some(self.server_down.clone().map_or(Missing::Server, Missing::Connection))
         } else if !self.plugin_ready {
             Some(Missing::Plugin)
         } else if !link.connected {

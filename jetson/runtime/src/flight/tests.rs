@@ -233,6 +233,17 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
 }
 
 #[test]
+fn ends_with_the_words_of_a_server_that_refuses() {
+    let mut script = Script::new();
+    let why = "the server refuses: another runtime flies wasp".to_owned();
+    script.flight.handle(script.now, FlightInput::ServerDown(why));
+    script.run(21.0);
+    assert!(!script.notices.iter().any(|notice| notice.text.contains("no answer")));
+    let end = script.flight.outcome().expect("it gives up").to_string();
+    assert_eq!(end, "not in the air after 20 s: the server refuses: another runtime flies wasp");
+}
+
+#[test]
 fn each_event_has_its_outcome() {
     let check = |kind: EventKind, outcome| {
         let mut script = Script::flying();

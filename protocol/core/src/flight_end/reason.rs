@@ -197,6 +197,8 @@ pub enum Missing {
     Answer,
     /// The autopilot's pre-arm checks; in words.
     PreArm(Text),
+    /// A connection to the server, which failed; the last failure in words.
+    Connection(Text),
 }
 
 impl EndReason {

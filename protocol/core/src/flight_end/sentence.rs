@@ -143,7 +143,7 @@ impl fmt::Display for Missing {
                 "the server has no pose of the vehicle; check the localization and --vehicle"
             }
             Self::Answer => "the plugin has not answered an image yet",
-            Self::PreArm(words) => words,
+            Self::PreArm(words) | Self::Connection(words) => words,
         })
     }
 }
