@@ -415,13 +415,29 @@ impl std::fmt::Debug for Companion {
     }
 }
 
-/// Returns the event as the plugin may know it: without the place where the course withholds it.
+/// Returns the event as the plugin may know it: without the place, in words too, where the course withholds
+/// it.
 fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
     let mut event = event.clone();
-    if !arena.ground_truth
-        && let Some(p_world_m) = event.kind.place_mut()
-    {
-        *p_world_m = DVec3::ZERO;
+    if !arena.ground_truth {
+        if let Some(p_world_m) = event.kind.place_mut() {
+            *p_world_m = DVec3::ZERO;
+        }
+        event.text = bounded(&without_points(&event.text));
     }
     event
+}
+
+/// Returns `text` without the coordinates of points: "at (1.00, 2.00, 0.50) m" becomes "at (withheld) m". A
+/// phase's text repeats the sentence of what led to it, so all texts pass here.
+fn without_points(text: &str) -> String {
+    let mut parts = text.split('(');
+    let mut kept = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (inside, after) = part.split_at(part.find(')').unwrap_or(part.len()));
+        let is_point = inside.split(',').count() > 1
+            && inside.split(',').all(|number| number.trim().parse::<f64>().is_ok());
+        kept.extend(["(", if is_point { "withheld" } else { inside }, after]);
+    }
+    kept
 }

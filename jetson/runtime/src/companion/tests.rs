@@ -65,18 +65,41 @@ fn plugin_is_greeted_first_and_receives_events_in_order() {
 
 #[test]
 fn plugin_never_gets_what_the_course_withholds() {
-    let place = |messages: &[ToPlugin]| match &messages[1] {
-        ToPlugin::Event(Event { kind: EventKind::Collision(it), .. }) => it.p_world_m,
+    let event = |messages: &[ToPlugin]| match &messages[1] {
+        ToPlugin::Event(Event { kind: EventKind::Collision(it), text, .. }) => {
+            (it.p_world_m, text.to_string())
+        }
         other => panic!("{other:?}"),
     };
     let (companion, messages) = after_collision(true);
-    assert_eq!(place(&messages), DVec3::new(1.0, 2.0, 3.0));
+    let text = "collision with an obstacle at (1.00, 2.00, 3.00) m, at 1.0 m/s";
+    assert_eq!(event(&messages), (DVec3::new(1.0, 2.0, 3.0), text.to_owned()));
     observed(&companion, |observation| assert!(observation.vehicle().is_some()));
 
     let (companion, messages) = after_collision(false);
-    assert_eq!(place(&messages), DVec3::ZERO);
+    let text = "collision with an obstacle at (withheld) m, at 1.0 m/s";
+    assert_eq!(event(&messages), (DVec3::ZERO, text.to_owned()));
     // No attitude of the autopilot's has come, and the pose is not let out.
     observed(&companion, |observation| assert!(observation.vehicle().is_none()));
+}
+
+#[test]
+fn takes_points_out_of_texts_and_nothing_else() {
+    let check = |text: &str, expected: &str| assert_eq!(without_points(text), expected);
+    check(
+        "landing: hit at (-1.50, 2, 3.0) m, and at (1,2)",
+        "landing: hit at (withheld) m, and at (withheld)",
+    );
+    check("cut off at (1.00, 2.0", "cut off at (withheld");
+    check(
+        "the plugin ended by itself (exit status 0)",
+        "the plugin ended by itself (exit status 0)",
+    );
+    check(
+        "mode change not answered (5 times), (5), ()",
+        "mode change not answered (5 times), (5), ()",
+    );
+    check("", "");
 }
 
 #[test]

@@ -247,6 +247,18 @@ fn both_drivers_send_the_same_setpoints_and_events() {
 }
 
 #[test]
+fn no_event_tells_a_plugin_in_words_where_it_is() {
+    let p_world_m = DVec3::new(1.0, 2.0, 3.0);
+    let (clearance_m, with, speed_mps) = (-0.1, Obstacle::Scene, 1.0);
+    let collision = EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps });
+    let events = fly(false, &collision, 25);
+    let told: Vec<_> =
+        events.iter().filter(|event| event.text.contains("with an obstacle at")).collect();
+    assert!(told.len() > 1, "the collision, and the landing for it: {events:?}");
+    assert!(told.iter().all(|event| event.text.contains("at (withheld)")), "{told:?}");
+}
+
+#[test]
 fn both_drivers_withhold_the_pose_alike() {
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
     let outside = EventKind::Geofence(FenceBreach {
