@@ -203,7 +203,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("POST /api/login", Takes::Nothing),
     ("POST /api/logout", Takes::AnyKey),
     ("GET /api/map", Takes::AnyKey),
-    ("GET /api/shell", Takes::AnyKey),
+    ("GET /api/shell", Takes::All),
     ("GET /api/vehicles", Takes::AnyKey),
     ("GET /ws?vehicle=ant", Takes::Ants),
     ("GET /ws?vehicle=bee", Takes::Bees),

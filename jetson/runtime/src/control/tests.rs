@@ -125,7 +125,7 @@ impl Drivers {
 
     fn event(&mut self, now: HostTime, kind: EventKind) {
         let stamp = ServerTime::from_ns(now.as_ns());
-        let event = Event { stamp, kind, text: bounded("of the server") };
+        let event = Event::ending(stamp, kind);
         self.lockstep.companion.handle_event(now, event.clone());
         self.control.handle(now, ControlInput::Stream(StreamEvent::Event(event)));
     }

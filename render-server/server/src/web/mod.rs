@@ -6,7 +6,8 @@
 //!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
 //!                  vehicle, if none is named
 //! GET /api/map     the top view: a JPEG rendered at the start
-//! GET /api/shell   what is solid, as cells, for the view in space ([`crate::web::top_view::shell`])
+//! GET /api/shell   what is solid, as cells, for the instructor's view in space
+//!                  ([`crate::web::top_view::shell`])
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
 //! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one

@@ -2,6 +2,7 @@
 // y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
+import { known } from "./session.js";
 import { cssColours } from "./theme.js";
 
 /** @typedef {import("./messages").Arena} Arena */
@@ -165,8 +166,10 @@ export class Room {
     return shadow;
   }
 
-  /** Fetches what is solid, and adds it as boxes coloured by height. */
+  /** Fetches what is solid, and adds it as boxes coloured by height. The server gives it to the instructor alone. */
   async addSolid() {
+    await known;
+    if (document.body.dataset.role !== "instructor") return;
     try {
       const answer = await fetch(`/api/shell?${this.arena.boot}`);
       if (!answer.ok) return;
