@@ -12,6 +12,7 @@ import io
 import json
 import os
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -170,6 +171,17 @@ def replay(program, log, name):
     return answers, json.loads(report.read_text())["found"]
 
 
+def follow_guide(log):
+    """Runs the Python of the guide on a log."""
+    guide = (pathlib.Path(__file__).parents[2] / "docs/guides/logs.md").read_text()
+    [script] = re.findall(r"^```python\n(.*?)^```$", guide, re.M | re.S)
+    done = subprocess.run([sys.executable, "-c", script.replace("flight.mcap", str(log))],
+                          capture_output=True, text=True)
+    check(done.returncode == 0, f"the guide's script runs: {done.stderr}")
+    topics = {line.split()[1] for line in done.stdout.splitlines() if line[:1].isdigit()}
+    check({"/pose", "/motion"} <= topics, f"it decodes protobuf and JSON: {topics}")
+
+
 def main():
     program = str(pathlib.Path(sys.argv[1]).resolve())
     with tempfile.TemporaryDirectory() as scratch:
@@ -179,6 +191,7 @@ def main():
         minute = whole.stat().st_size / found["/observation"] * 60 * 60 / 1e6
         print(f"full: {sum(found.values())} messages, {whole.stat().st_size / 1e6:.1f} MB; "
               f"a minute at 60 Hz would be {minute:.0f} MB")
+        follow_guide(whole)
         one, first = replay(program, whole, "one")
         two, _ = replay(program, whole, "two")
         check(filecmp.cmp(one, two, shallow=False), "two replays answer the same, byte by byte")

@@ -380,7 +380,8 @@ impl Referee {
             }
             Some(PoseChange::ImuLeftOut) => {
                 let text = "the autopilot's IMU contradicts the poses and is left out: is the \
-                            object's frame turned against the autopilot?";
+                            object's frame turned against the autopilot, or does the vehicle \
+                            shake?";
                 self.report(now, EventKind::Note, text);
             }
             None => {}

@@ -331,3 +331,22 @@ fn another_vehicle_in_the_way_is_an_obstacle() {
     let text = &hit.expect("the bee").text;
     assert!(text.contains("collision with vehicle 'bee' at (4.7"), "{text}");
 }
+
+#[test]
+fn an_imu_left_out_is_put_down_to_a_turned_frame_or_to_shaking() {
+    let mut referee = referee(&arena());
+    let at = |s: f64| ServerTime::from_ns(0).plus_seconds(s);
+    for i in 0..1000 {
+        let t = 1.0 + 0.005 * f64::from(i);
+        let turned = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(2.0 * t));
+        let _ = referee.handle_measurement(&Measured::new(at(t), turned));
+        // Its z axis is taken for another.
+        let (accel_mps2, gyro_radps) = (DVec3::X * 9.81, DVec3::X * 2.0);
+        referee.handle_imu(&ImuReading { stamp: at(t + 0.001), accel_mps2, gyro_radps });
+    }
+    let texts: Vec<_> =
+        std::iter::from_fn(|| referee.poll_event()).map(|event| event.text).collect();
+    let told = texts.iter().find(|text| text.contains("is left out")).expect("it is told");
+    assert!(told.contains("turned against the autopilot"), "{told}");
+    assert!(told.ends_with("or does the vehicle shake?"), "it fits: {told}");
+}
