@@ -93,6 +93,41 @@ fn mistakes_are_explained() {
 }
 
 #[test]
+fn an_error_says_its_cause_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("a-file");
+    std::fs::write(&file, "").unwrap();
+    // Nothing can be made below a file, not even by root.
+    let below = file.join("below");
+    let (file, below) = (file.to_str().unwrap(), below.to_str().unwrap());
+    let (into, made) = (format!("{below}.ply"), folder.path().join("scene"));
+    let scene = made.join("scene.ply");
+    let made = ["scene", "generate", "race", "-o", made.to_str().unwrap()];
+    assert!(run(&made).status.success());
+    let missing = "No such file or directory (os error 2)";
+    let no_folder = "Not a directory (os error 20)";
+    let board = format!("{below}/board.sqlite");
+    let cases: [(&[&str], &str); 10] = [
+        (&["scene", "convert", "/nope.ply", &into], missing),
+        (&["scene", "convert", "/nope.spz", &into], missing),
+        (&["scene", "convert", scene.to_str().unwrap(), &into], no_folder),
+        (&["scene", "generate", "race", "-o", below], no_folder),
+        (&["arena", "check", "/nope/arena.toml"], missing),
+        (&["password", "--keys", below], no_folder),
+        (&["pair", "127.0.0.1:9", "--keys", below], no_folder),
+        (&["leaderboard", "--database", &board], no_folder),
+        (&["tags", "locate", "/nope/locate.toml"], missing),
+        (&["fly", "--config", "/nope/jetson.toml", file], missing),
+    ];
+    for (args, cause) in cases {
+        let output = run(args);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success(), "{args:?} succeeded");
+        assert_eq!(message.matches(cause).count(), 1, "{args:?}: {message}");
+    }
+}
+
+#[test]
 fn a_reader_that_leaves_is_no_panic() {
     // What reads the first line only, as `head -1` does, with both streams.
     for args in [["leaderboard", "--help"], ["arena", "check"], ["bench", "render"]] {
