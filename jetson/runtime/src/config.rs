@@ -314,15 +314,7 @@ impl JetsonConfig {
             check("log.keep_days", log.keep_days, "days", 0.01..=36_500.0),
             plugin.limits().check().map_err(ConfigError::Plugin),
         ];
-        let mut wrong: Vec<_> = checks.into_iter().filter_map(Result::err).collect();
-        match wrong.pop() {
-            None => Ok(()),
-            Some(only) if wrong.is_empty() => Err(only),
-            Some(last) => {
-                wrong.push(last);
-                Err(ConfigError::Several(wrong))
-            }
-        }
+        vizflyt_toml::join_errors(checks, ConfigError::Several)
     }
 }
 

@@ -378,5 +378,22 @@ const BOXES: usize = 40;
 /// Numbers in the table of noise; a row takes them from anywhere on.
 const NORMALS: usize = 1 << 16;
 
+/// A webcam of 1280x720, with the lens that tests look through.
+#[cfg(test)]
+pub(crate) fn webcam() -> Intrinsics {
+    use vizflyt_protocol::geometry::Distortion;
+
+    Intrinsics {
+        distortion: Distortion::BrownConrady {
+            k1: -0.12,
+            k2: 0.03,
+            p1: 0.001,
+            p2: -0.0005,
+            k3: 0.0,
+        },
+        ..Intrinsics::from_horizontal_fov(1280, 720, 1.2)
+    }
+}
+
 #[cfg(test)]
 mod tests;

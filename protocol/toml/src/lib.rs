@@ -53,6 +53,25 @@ impl TomlErrors {
     }
 }
 
+/// Joins the results of checks: one error stands for itself, more are `several`, in their order.
+///
+/// # Errors
+/// What failed.
+pub fn join_errors<E>(
+    checks: impl IntoIterator<Item = Result<(), E>>,
+    several: impl FnOnce(Vec<E>) -> E,
+) -> Result<(), E> {
+    let mut errors: Vec<E> = checks.into_iter().filter_map(Result::err).collect();
+    match errors.pop() {
+        None => Ok(()),
+        Some(only) if errors.is_empty() => Err(only),
+        Some(last) => {
+            errors.push(last);
+            Err(several(errors))
+        }
+    }
+}
+
 /// Returns an error at this byte of a text.
 pub fn error_at(text: &str, at: usize, what: String) -> TomlError {
     let before = text.get(..at).unwrap_or(text);

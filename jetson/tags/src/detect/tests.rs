@@ -1,21 +1,8 @@
 use super::*;
 use crate::layout::{CORNERS, LayoutFrame, Square, Tag, TagLayout};
-use crate::synth::{Light, Placed, Renderer, SyntheticExposure};
+use crate::synth::{Light, Placed, Renderer, SyntheticExposure, webcam};
 use glam::{DQuat, DVec3};
-use vizflyt_protocol::geometry::{Cam, Distortion, Pose, World};
-
-pub(crate) fn webcam() -> Intrinsics {
-    Intrinsics {
-        distortion: Distortion::BrownConrady {
-            k1: -0.12,
-            k2: 0.03,
-            p1: 0.001,
-            p2: -0.0005,
-            k3: 0.0,
-        },
-        ..Intrinsics::from_horizontal_fov(1280, 720, 1.2)
-    }
-}
+use vizflyt_protocol::geometry::{Cam, Pose, World};
 
 /// A tag of 0.16 m before a camera at the world's origin that looks along x.
 fn tag_at(p_cam: DVec3, tilt: DVec3) -> (TagLayout, Pose<World, Cam>, Pose<Cam, Square>) {

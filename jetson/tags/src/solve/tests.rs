@@ -1,22 +1,9 @@
 use super::*;
 use crate::layout::CORNERS;
+use crate::synth::webcam;
 use proptest::prelude::*;
-use vizflyt_protocol::geometry::Distortion;
 
 const SIZE_M: f64 = 0.16;
-
-fn webcam() -> Intrinsics {
-    Intrinsics {
-        distortion: Distortion::BrownConrady {
-            k1: -0.12,
-            k2: 0.03,
-            p1: 0.001,
-            p2: -0.0005,
-            k3: 0.0,
-        },
-        ..Intrinsics::from_horizontal_fov(1280, 720, 1.2)
-    }
-}
 
 /// A face of a cube of 0.2 m about the vehicle's origin: its printed side looks along `normal`.
 fn face(normal: DVec3) -> Pose<Body, Square> {

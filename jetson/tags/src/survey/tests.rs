@@ -3,22 +3,9 @@ use crate::detect::{Detector, DetectorSettings};
 use crate::detection::Detection;
 use crate::layout::{LayoutFrame, Tag, TagLayout};
 use crate::print::{BAR_MM, Cube, Mat, Paper};
-use crate::synth::{Placed, Random, Renderer, SyntheticExposure};
+use crate::synth::{Placed, Random, Renderer, SyntheticExposure, webcam};
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::Distortion;
-
-fn webcam() -> Intrinsics {
-    Intrinsics {
-        distortion: Distortion::BrownConrady {
-            k1: -0.12,
-            k2: 0.03,
-            p1: 0.001,
-            p2: -0.0005,
-            k3: 0.0,
-        },
-        ..Intrinsics::from_horizontal_fov(1280, 720, 1.2)
-    }
-}
 
 fn printed() -> TagLayout {
     let mat = Mat {

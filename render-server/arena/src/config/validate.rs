@@ -183,15 +183,7 @@ impl ArenaConfig {
             self.check_environment(),
             self.check_rules(),
         ];
-        let mut wrong: Vec<_> = checks.into_iter().filter_map(Result::err).collect();
-        match wrong.pop() {
-            None => Ok(()),
-            Some(only) if wrong.is_empty() => Err(only),
-            Some(last) => {
-                wrong.push(last);
-                Err(ConfigError::Several(wrong))
-            }
-        }
+        vizflyt_toml::join_errors(checks, ConfigError::Several)
     }
 
     fn check_scene(&self) -> Result<(), ConfigError> {
