@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{self, Receiver};
 use std::time::{Duration, Instant};
 
@@ -20,6 +20,39 @@ pub fn vizflyt() -> PathBuf {
         program.display()
     );
     program
+}
+
+/// Runs `vizflyt ARGS` to its end.
+///
+/// # Panics
+/// If the program cannot be started.
+pub fn run(args: &[&str]) -> Output {
+    Command::new(vizflyt()).args(args).output().expect("vizflyt starts")
+}
+
+/// Runs `vizflyt ARGS`, and returns standard output.
+///
+/// # Panics
+/// If it fails; the message is its standard error.
+pub fn good(args: &[&str]) -> String {
+    let output = run(args);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{args:?}: {errors}");
+    String::from_utf8(output.stdout).expect("standard output is text")
+}
+
+/// Runs `vizflyt ARGS`, which must fail with a message that contains every given text.
+///
+/// # Panics
+/// If it does otherwise.
+pub fn check_refused(args: &[&str], texts: &[&str]) {
+    let output = run(args);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{args:?} succeeded");
+    assert!(!message.contains("panicked"), "{args:?}: {message}");
+    for text in texts {
+        assert!(message.contains(text), "{args:?} does not contain '{text}': {message}");
+    }
 }
 
 /// Returns the root of the repository.

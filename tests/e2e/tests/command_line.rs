@@ -1,23 +1,8 @@
 //! The command line's output when used, and when used wrongly.
 
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 
-use vizflyt_e2e::vizflyt;
-
-fn run(args: &[&str]) -> Output {
-    Command::new(vizflyt()).args(args).output().unwrap()
-}
-
-/// Runs, expects failure, and a message that contains every given text.
-fn check_refused(args: &[&str], texts: &[&str]) {
-    let output = run(args);
-    let message = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{args:?} succeeded");
-    assert!(!message.contains("panicked"), "{args:?}: {message}");
-    for text in texts {
-        assert!(message.contains(text), "{args:?} does not contain '{text}': {message}");
-    }
-}
+use vizflyt_e2e::{check_refused, run, vizflyt};
 
 #[test]
 fn every_command_has_help() {

@@ -1,15 +1,10 @@
 //! Flight logs of the real program: replayed to the example, which answers as in flight.
 
 use std::path::Path;
-use std::process::{Command, Output};
 use std::time::Duration;
 
 use serde_json::Value;
-use vizflyt_e2e::{Demo, vizflyt};
-
-fn run(arguments: &[&str]) -> Output {
-    Command::new(vizflyt()).args(arguments).output().unwrap()
-}
+use vizflyt_e2e::{Demo, run};
 
 fn replay(log: &str, answers: &Path, more: &[&str]) -> Value {
     let report = answers.with_extension("report.json");

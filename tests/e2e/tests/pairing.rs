@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
 use serde_json::Value;
-use vizflyt_e2e::vizflyt;
+use vizflyt_e2e::{run, vizflyt};
 
 /// `vizflyt serve`, killed when dropped.
 struct Server {
@@ -47,10 +47,6 @@ impl Drop for Server {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
-}
-
-fn run(args: &[&str]) -> Output {
-    Command::new(vizflyt()).args(args).stdin(Stdio::null()).output().unwrap()
 }
 
 fn text_of(output: &Output) -> String {

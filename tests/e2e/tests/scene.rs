@@ -5,36 +5,13 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
-use vizflyt_e2e::{root, vizflyt};
+use vizflyt_e2e::{check_refused, good, root, vizflyt};
 use vizflyt_fixtures::WebSocket;
-
-fn run(args: &[&str]) -> Output {
-    Command::new(vizflyt()).args(args).output().unwrap()
-}
-
-/// Runs, expects success, and returns standard output.
-fn good(args: &[&str]) -> String {
-    let output = run(args);
-    let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{args:?}: {errors}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// Runs, expects failure, and a message that contains every given text.
-fn refused(args: &[&str], texts: &[&str]) {
-    let output = run(args);
-    let message = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{args:?} succeeded");
-    assert!(!message.contains("panicked"), "{args:?}: {message}");
-    for text in texts {
-        assert!(message.contains(text), "{args:?} does not contain '{text}': {message}");
-    }
-}
 
 /// A generated scene and a camera in it, in a folder that cleans up.
 struct Rig(tempfile::TempDir);
@@ -117,7 +94,7 @@ fn obstacles_are_baked_once_and_kept() {
     assert_eq!(bake(&["--force"])["kept"], json!(false));
     let coarse = bake(&["--voxel", "0.1"]);
     assert!(coarse["kept"] == json!(false) && coarse["voxel_m"] == json!(0.1), "{coarse}");
-    refused(&["scene", "bake", &rig.at("race"), "--voxel", "9"], &["occupancy.voxel_m = 9"]);
+    check_refused(&["scene", "bake", &rig.at("race"), "--voxel", "9"], &["occupancy.voxel_m = 9"]);
 }
 
 #[test]
@@ -184,7 +161,10 @@ fn moving_objects_are_rendered_at_their_time() {
     let (first, again, later) = (door("0"), door("0"), door("1"));
     assert!(first.len() > 500 && first == again, "{} pixels", first.len());
     assert!((middle(&first) - middle(&later)).abs() > 5.0, "{} {}", middle(&first), middle(&later));
-    refused(&["scene", "render", &scene, "--camera", &camera, "--at", "soon"], &["'soon' is no"]);
+    check_refused(
+        &["scene", "render", &scene, "--camera", &camera, "--at", "soon"],
+        &["'soon' is no"],
+    );
 }
 
 #[test]
@@ -193,7 +173,7 @@ fn mistakes_in_a_picture_are_explained() {
     let (scene, camera) = (rig.at("race"), rig.at("cam.json"));
     let out = rig.at("out");
     let render = |scene: &str, camera: &str, texts: &[&str]| {
-        refused(&["scene", "render", scene, "--camera", camera, "--out", &out], texts);
+        check_refused(&["scene", "render", scene, "--camera", camera, "--out", &out], texts);
     };
     render(&rig.at("gone.ply"), &camera, &["there is no", "vizflyt scene generate"]);
     render(&scene, &rig.at("gone.json"), &["cannot read", "gone.json", "as a camera"]);
@@ -203,16 +183,16 @@ fn mistakes_in_a_picture_are_explained() {
     render(&rig.at("notes.txt"), &camera, &["supported are", "PLY", "SPZ", ".splat", "SOG"]);
     fs::create_dir(rig.at("empty")).unwrap();
     render(&rig.at("empty"), &camera, &["is a folder without an arena.toml"]);
-    refused(&["scene", "render", &scene], &["--camera"]);
-    refused(
+    check_refused(&["scene", "render", &scene], &["--camera"]);
+    check_refused(
         &["scene", "render", &scene, "--camera", &camera, "--renderer", "voodoo"],
         &["voodoo", "auto, cpu, gpu"],
     );
-    refused(
+    check_refused(
         &["scene", "render", &scene, "--camera", &camera, "--camera", &camera, "--out", &out],
         &["two cameras would write to"],
     );
-    refused(
+    check_refused(
         &["bench", "render", &scene, "--camera", &camera, "--size", "big"],
         &["'big' is no size in pixels; write it as 640x480"],
     );

@@ -137,18 +137,12 @@ fn pnp(
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use vizflyt_protocol::geometry::Distortion;
 
     use super::super::{Motion, adjust, plane, solve};
     use super::*;
+    use crate::synth::webcam;
 
     const SIZE_M: f64 = 0.16;
-
-    fn webcam() -> Intrinsics {
-        let distortion =
-            Distortion::BrownConrady { k1: -0.12, k2: 0.03, p1: 0.001, p2: -0.0005, k3: 0.0 };
-        Intrinsics { distortion, ..Intrinsics::from_horizontal_fov(1280, 720, 1.2) }
-    }
 
     /// Corners of a tag seen from the front, each off by some of `noise_px`.
     fn corners(cam_from_tag: &Pose<Cam, Square>, noise_px: &[f64; 8]) -> Option<[DVec2; 4]> {
