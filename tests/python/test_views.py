@@ -121,7 +121,7 @@ def test_no_pixel_is_copied_between_the_decoder_and_numpy():
     assert runner.ended() is None
     assert len(seen) == 3
     for file in seen:
-        assert file.startswith("/dev/shm/vizflyt"), seen
+        assert file.startswith("/memfd:vizflyt-observation"), seen
 
 
 def test_kept_images_never_change_and_later_ones_are_copied_with_a_warning():
