@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use foxglove::messages::{CompressedImage, PoseInFrame};
 use glam::{DQuat, DVec3};
-use mcap::records::Record;
+use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use prost::Message as _;
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -145,7 +145,7 @@ impl<R: Read> LogReader<R> {
         if self.at < self.chunk.len() {
             let (record, rest) = split_record(&self.chunk[self.at..])?;
             self.at = self.chunk.len() - rest;
-            return Ok(take(&mut self.topics, record));
+            return Ok(record.and_then(|record| take(&mut self.topics, record)));
         }
         loop {
             match self.reader.next_event() {
@@ -162,9 +162,11 @@ impl<R: Read> LogReader<R> {
                     self.reader.notify_read(read);
                 }
                 Some(Ok(LinearReadEvent::Record { data, opcode })) => {
-                    let record = mcap::parse_record(opcode, data).map_err(Stop::Damaged)?;
-                    let Record::Chunk { header, data } = record else {
-                        return Ok(take(&mut self.topics, record));
+                    let (header, data) = match parse(opcode, data)? {
+                        Some(Record::Chunk { header, data }) => (header, data),
+                        record => {
+                            return Ok(record.and_then(|record| take(&mut self.topics, record)));
+                        }
                     };
                     if !header.compression.is_empty() {
                         let error = mcap::McapError::UnsupportedCompression(header.compression);
@@ -187,15 +189,56 @@ enum Stop {
     Io(std::io::Error),
 }
 
-/// Returns the first record of a chunk's bytes, and how many bytes are behind it.
-fn split_record(bytes: &[u8]) -> Result<(Record<'_>, usize), Stop> {
+/// Returns the first record of a chunk's bytes, if it is of interest, and how many bytes are behind it.
+fn split_record(bytes: &[u8]) -> Result<(Option<Record<'_>>, usize), Stop> {
     let cut = || Stop::Damaged(mcap::McapError::UnexpectedEoc);
     let (head, rest) = bytes.split_first_chunk::<9>().ok_or_else(cut)?;
     let [opcode, length @ ..] = *head;
     let length = usize::try_from(u64::from_le_bytes(length)).map_err(|_| cut())?;
     let (data, behind) = rest.split_at_checked(length).ok_or_else(cut)?;
-    let record = mcap::parse_record(opcode, data).map_err(Stop::Damaged)?;
-    Ok((record, behind.len()))
+    Ok((parse(opcode, data)?, behind.len()))
+}
+
+/// Parses a record; `None` if it is of no interest.
+///
+/// The library allocates what a text announces before it looks whether that many bytes are there, so the lengths are
+/// checked first.
+fn parse(opcode: u8, data: &[u8]) -> Result<Option<Record<'_>>, Stop> {
+    let fits = match opcode {
+        op::HEADER => skip_texts(data, 2).is_some(),
+        op::CHANNEL => data.get(4..).and_then(|data| skip_texts(data, 2)).is_some_and(is_map),
+        op::CHUNK => data.get(28..).and_then(|data| skip_texts(data, 1)).is_some(),
+        op::METADATA => skip_texts(data, 1).is_some_and(is_map),
+        op::MESSAGE => true,
+        _ => return Ok(None),
+    };
+    if !fits {
+        return Err(Stop::Damaged(mcap::McapError::UnexpectedEoc));
+    }
+    mcap::parse_record(opcode, data).map(Some).map_err(Stop::Damaged)
+}
+
+/// Returns what is behind the first texts, if they are there whole.
+fn skip_texts(mut data: &[u8], texts: usize) -> Option<&[u8]> {
+    for _ in 0..texts {
+        let (len, rest) = data.split_first_chunk::<4>()?;
+        data = rest.get(usize::try_from(u32::from_le_bytes(*len)).ok()?..)?;
+    }
+    Some(data)
+}
+
+/// Whether `data` begins with a map of texts, each there whole.
+fn is_map(data: &[u8]) -> bool {
+    let Some((len, rest)) = data.split_first_chunk::<4>() else { return false };
+    let len = usize::try_from(u32::from_le_bytes(*len)).ok();
+    let Some(mut pairs) = len.and_then(|len| rest.get(..len)) else { return false };
+    while !pairs.is_empty() {
+        match skip_texts(pairs, 2) {
+            Some(rest) => pairs = rest,
+            None => return false,
+        }
+    }
+    true
 }
 
 fn take(topics: &mut HashMap<u16, Arc<str>>, record: Record<'_>) -> Option<Entry> {
