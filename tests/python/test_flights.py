@@ -77,6 +77,28 @@ def test_a_plugin_that_raises_ends_in_a_landing_with_its_own_line(fly, tmp_path)
     ), flight.output
 
 
+def test_numbers_that_are_not_finite_end_in_a_landing_and_not_in_a_failure(fly, tmp_path):
+    plugin = tmp_path / "nan.py"
+    plugin.write_text(
+        "#!/usr/bin/env python3\n"
+        "import vizflyt\n"
+        "class Nan(vizflyt.Plugin):\n"
+        "    speed_mps = 0.0\n"
+        "    def on_event(self, event):\n"
+        "        if event.details.get('phase') == 'flying':\n"
+        "            self.speed_mps = float('nan')\n"
+        "    def on_image(self, obs):\n"
+        "        return vizflyt.Setpoint.velocity([self.speed_mps, 0, 0])\n"
+        "vizflyt.run(Nan)\n"
+    )
+    plugin.chmod(0o755)
+    flight = fly(plugin)
+    # Ignored, then held, then landed, as docs/guides/safety.md says.
+    assert "setpoints are refused: a number in it is not finite" in flight.report["reason"], flight.output
+    assert "nan.py:9 in on_image: NotFiniteError: v_mps is [NaN, 0.0, 0.0]" in flight.output
+    assert "holding: " in flight.output, flight.output
+
+
 def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
     others, report = set(waiting_services()), tmp_path / "report.json"
     lab = subprocess.Popen(

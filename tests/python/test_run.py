@@ -159,6 +159,30 @@ def test_a_failure_is_one_sentence_with_the_students_own_line(stage, start, line
         assert status == 1 and err.startswith("Traceback") and reason.split(": ")[1] in err
 
 
+def test_a_number_that_is_not_finite_is_refused_and_the_plugin_goes_on(stage, start):
+    process = start(
+        """
+        class Blind(vizflyt.Plugin):
+            def on_image(self, obs):
+                speed_mps = 1.0 if obs.seq > 12 else float("nan")
+                return Setpoint.velocity([speed_mps, 0, 0])
+        vizflyt.run(Blind)
+        """
+    )
+    process.ready()
+    for seq in range(1, 13):
+        what, answered, setpoint, _ = stage.answer(seq)
+        # What the runtime refuses, whichever language sends it.
+        assert (what, answered) == ("answer", seq) and "NaN" in repr(setpoint), setpoint
+    assert stage.answer(13)[:3] == ("answer", 13, Setpoint.velocity([1, 0, 0]))
+    stage.rehearsal.stop()
+    status, _, err = process.ended()
+    line = "plugin: my_plugin.py:7 in on_image: NotFiniteError: v_mps is [NaN, 0.0, 0.0]: every number must be finite"
+    assert status == 0
+    assert [told.startswith(line) for told in err.splitlines()] == [True, True], err
+    assert "(1 so far)" in err and "(10 so far)" in err, err
+
+
 CLASSES = {
     "not a plugin": ("class P:\n    pass", "P is no plugin: define it as class P(vizflyt.Plugin)"),
     "misspelt": (

@@ -6,6 +6,14 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use vizflyt_sdk::glam::{DQuat, DVec3};
 
+pyo3::create_exception!(
+    vizflyt,
+    NotFiniteError,
+    PyValueError,
+    "A NaN or an infinity where a number must be finite. Out of `on_image` it counts as an answer that the\n\
+     runtime refuses: the vehicle holds after 0.5 s and lands after 2 s without a better one."
+);
+
 /// Returns three finite numbers from a list, tuple, array or tensor called `name`.
 pub(crate) fn vector(value: &Bound<'_, PyAny>, name: &str) -> PyResult<DVec3> {
     let wanted = "three numbers [x, y, z]";
@@ -140,7 +148,7 @@ pub(crate) fn wrong_shape(value: &Bound<'_, PyAny>, name: &str, wanted: &str) ->
 
 fn not_finite(name: &str, numbers: &[f64]) -> PyErr {
     let shown = if let [number] = numbers { format!("{number}") } else { format!("{numbers:?}") };
-    PyValueError::new_err(format!(
+    NotFiniteError::new_err(format!(
         "{name} is {shown}: every number must be finite; look for a division by zero or the mean of \
          nothing"
     ))

@@ -39,10 +39,12 @@ mod _vizflyt {
     use crate::setpoint::Setpoint;
 
     use super::{Bound, PyModule, PyModuleMethods, PyResult};
+    use crate::arguments::NotFiniteError;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+        module.add("NotFiniteError", module.py().get_type::<NotFiniteError>())?;
         module.add("PROTOCOL_VERSION", vizflyt_sdk::protocol::PROTOCOL_VERSION)
     }
 }

@@ -6,10 +6,11 @@ use std::time::Duration;
 
 use pyo3::exceptions::{PyConnectionError, PyRuntimeError};
 use pyo3::prelude::*;
-use vizflyt_sdk::HostTime;
+use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::host_now;
 use vizflyt_sdk::ipc::{IpcError, PluginEnd as SdkPluginEnd};
 use vizflyt_sdk::protocol::messages::{FromPlugin, Name, ToPlugin, bounded};
+use vizflyt_sdk::{HostTime, Setpoint as SdkSetpoint, YawTarget};
 
 use crate::arena::ArenaInfo;
 use crate::event::Event;
@@ -97,6 +98,12 @@ impl PluginEnd {
             returned: host_now(),
             setpoint: setpoint.map(|setpoint| setpoint.0),
         })
+    }
+
+    /// Answers one observation with a setpoint that is not finite, which the runtime refuses by that name.
+    fn answer_not_finite(&self, seq: u64, entered_ns: u64) -> PyResult<()> {
+        let setpoint = SdkSetpoint::velocity(DVec3::NAN, YawTarget::Keep);
+        self.answer(seq, entered_ns, Some(Setpoint(setpoint)))
     }
 
     /// Reports that the plugin has failed, with the reason.

@@ -17,7 +17,7 @@ from types import FunctionType
 
 from ._failure import sentence, without_our_frames
 from ._plugin import Plugin
-from ._vizflyt import PluginEnd, Setpoint, waiting_services
+from ._vizflyt import NotFiniteError, PluginEnd, Setpoint, waiting_services
 
 SERVICE_OPTION = "--vizflyt-service"
 # Short, so that Ctrl-C is heard. [s]
@@ -43,7 +43,8 @@ def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
     ``plugin`` is a class derived from :class:`Plugin`, or an instance of one.
 
     An exception in the plugin ends the flight with a landing: the runtime gets the reason, and the exception
-    goes on to the caller.
+    goes on to the caller. Only a number that is not finite (:class:`NotFiniteError`) is printed and
+    counts as an answer that the runtime refuses: the vehicle holds, and flies on with the next good one.
     """
     end = _attach(service)
     where = "__init__"
@@ -66,6 +67,7 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
     """Runs the flight; yields the name of each method before it is called."""
     started = False
     copied = False
+    refused = 0
     while True:
         end.wait(WAIT_S)
         while (message := end.receive()) is not None:
@@ -96,9 +98,18 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
         seq = obs.seq
         yield "on_image"
         entered_ns = time.monotonic_ns()
-        answer = plugin.on_image(obs)
-        # The memory goes back to the runtime unless the plugin keeps an image.
-        del obs
+        try:
+            answer = plugin.on_image(obs)
+        except NotFiniteError as error:
+            refused += 1
+            # The first, the tenth, the hundredth: a NaN seldom comes alone.
+            if str(refused).strip("0") == "1":
+                print(f"plugin: {sentence(error, 'on_image')} ({refused} so far)", file=sys.stderr)
+            end.answer_not_finite(seq, entered_ns)
+            continue
+        finally:
+            # The memory goes back to the runtime unless the plugin keeps an image.
+            del obs
         if answer is not None and not isinstance(answer, Setpoint):
             raise TypeError(_wrong_answer(answer))
         end.answer(seq, entered_ns, answer)

@@ -671,6 +671,11 @@ class Rehearsal:
         ('failed', 0, reason, 0); None if none comes within this time. [s]
         """
 
+class NotFiniteError(ValueError):
+    """A NaN or an infinity where a number must be finite. Out of `on_image` it counts as an answer that the
+    runtime refuses: the vehicle holds after 0.5 s and lands after 2 s without a better one.
+    """
+
 @final
 class PluginEnd:
     """Not for plugins: what `vizflyt.run` is made of."""
@@ -692,6 +697,9 @@ class PluginEnd:
 
     def answer(self, seq: int, entered_ns: int, setpoint: Setpoint | None) -> None:
         """Sends the answer to one observation."""
+
+    def answer_not_finite(self, seq: int, entered_ns: int) -> None:
+        """Answers one observation with a setpoint that is not finite, which the runtime refuses by that name."""
 
     def failed(self, reason: str) -> None:
         """Reports that the plugin has failed, with the reason."""
