@@ -2,9 +2,14 @@
 //! what becomes of plugins that fail.
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 use vizflyt_e2e::{root, vizflyt};
@@ -108,6 +113,43 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     rig.refused(&["verify", &whole], "was changed after it was signed");
     let error = leaderboard(&rig, &["add", &whole, "--team=wasps", &keys_of(&rig)]).unwrap_err();
     assert!(error.contains("was changed after it was signed"), "{error}");
+}
+
+/// A machine that is suspended, swapped out or starved must not cost points: in lock-step a plugin knows its runtime by
+/// its socket, not by a clock.
+#[test]
+fn a_grader_that_is_stopped_for_seconds_gives_the_same_grade() {
+    let rig = Rig::new();
+    let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
+    let hash = rig.grade(&args)["hash"].clone();
+    let keys = format!("--keys={}", rig.at("keys"));
+    let mut command = Command::new(vizflyt());
+    command.arg("grade").args(args).arg(keys).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut grader = command.spawn().unwrap();
+    let id = Pid::from_raw(grader.id().cast_signed());
+    let done = AtomicBool::new(false);
+    let mut output = String::new();
+    let stops = std::thread::scope(|scope| {
+        let stopper = scope.spawn(|| {
+            let mut stops = 0;
+            while !done.load(Ordering::Relaxed) && stops < 3 {
+                std::thread::sleep(Duration::from_millis(1500));
+                if kill(id, Signal::SIGSTOP).is_ok() {
+                    std::thread::sleep(Duration::from_millis(3200));
+                    kill(id, Signal::SIGCONT).unwrap();
+                    stops += 1;
+                }
+            }
+            stops
+        });
+        // Not waited for yet: until then nobody else gets its number.
+        grader.stdout.take().unwrap().read_to_string(&mut output).unwrap();
+        done.store(true, Ordering::Relaxed);
+        stopper.join().unwrap()
+    });
+    assert!(grader.wait().unwrap().success() && stops > 0, "{stops} stops: {output}");
+    let graded: Value = serde_json::from_str(&output).unwrap();
+    assert_eq!(graded["hash"], hash, "{graded:#}");
 }
 
 fn keys_of(rig: &Rig) -> String {
