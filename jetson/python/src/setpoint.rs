@@ -4,16 +4,12 @@ use numpy::ndarray::ArrayViewD;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use vizflyt_sdk::glam::DVec3;
-use vizflyt_sdk::protocol::messages::{
-    COEFFICIENTS, InvalidSetpoint, MAX_PIECES, MAX_WAYPOINTS,
-};
+use vizflyt_sdk::protocol::messages::{COEFFICIENTS, InvalidSetpoint, MAX_PIECES, MAX_WAYPOINTS};
 use vizflyt_sdk::{
     Axes, Path, PathYaw, Piece, Setpoint as SdkSetpoint, Trajectory, Waypoint, YawTarget,
 };
 
-use crate::arguments::{
-    NotFiniteError, Points, numbers, scalar, vector, wrong_shape, wrong_type,
-};
+use crate::arguments::{NotFiniteError, Points, numbers, scalar, vector, wrong_shape, wrong_type};
 
 /// What a plugin asks of the vehicle; the newest one holds until the guard's deadline of 0.5 s.
 ///
