@@ -107,7 +107,7 @@ const brightness = (page) =>
 
 /** A flight: it waits for its start, is watched on three screens, and is stopped by the keyboard. */
 async function flight(browser) {
-  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--log", scratch, "--report", `${scratch}/report.json`);
+  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--log-dir", scratch, "--report", `${scratch}/report.json`);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
   await until(page, "phase-text", /ready to start/);
@@ -163,7 +163,7 @@ async function flight(browser) {
 async function crash(browser) {
   const plugin = path.join(path.dirname(vizflyt), "examples", "misbehave");
   assert.ok(fs.existsSync(plugin), `no ${plugin}: cargo build --release --examples`);
-  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--plugin", plugin, "--log", scratch);
+  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--plugin", plugin, "--log-dir", scratch);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
   await until(page, "phase-text", /ready to start/);
@@ -353,7 +353,7 @@ async function leaderboard(browser) {
   const vehicle = start("sim", "--vicon", vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
   const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
   const fly = start("fly", "race", "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
-    "--seconds", "3", "--log", at("flights"), "--json");
+    "--seconds", "3", "--log-dir", at("flights"), "--json");
   await until(wall, "flying", /wasps, official: \d/);
   assert.equal(await fly.ended, 0);
   // Neither page is loaded again.
