@@ -16,6 +16,9 @@ use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervis
 /// How long a plugin may take to attach and to load what it needs: models take their time.
 const READY_WITHIN: Duration = Duration::from_mins(5);
 
+/// How long the last lines of one that has ended are waited for.
+const LAST_LINES_WITHIN: Duration = Duration::from_secs(5);
+
 /// Why a plugin's process does not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
@@ -165,13 +168,21 @@ impl PluginProcess {
     }
 
     /// Ends the plugin in order.
-    pub fn stop(mut self, line: LineSink<'_>) {
+    pub fn stop(self, line: LineSink<'_>) {
         if self.ipc.plugin_attached() {
             let _ = self.ipc.send(&ToPlugin::Stop);
         }
         self.supervisor.end();
         self.ipc.clean_up();
-        self.pass_lines(line);
+        // Its last lines are on their way through pipes, which have closed with all that held them.
+        let until = Instant::now() + LAST_LINES_WITHIN;
+        while let Ok(event) =
+            self.events.recv_timeout(until.saturating_duration_since(Instant::now()))
+        {
+            if let PluginEvent::Line(stream, text) = event {
+                line(stream, &text);
+            }
+        }
     }
 
     /// Returns the plugin's next message; `None` after a while.
