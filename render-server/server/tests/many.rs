@@ -85,9 +85,9 @@ async fn images(client: &Client, vehicle: usize, count: usize) -> Vec<ImageHeade
     headers
 }
 
-/// Asserts that a vehicle's images go on with the ticks: most ticks between the first image and the
+/// Whether a vehicle's images go on with the ticks: most ticks between the first image and the
 /// last gave one of each camera.
-fn assert_steady(headers: &[ImageHeader]) {
+fn is_steady(headers: &[ImageHeader]) -> bool {
     let mut counts = BTreeMap::<u8, (u64, u64, u64)>::new();
     for header in headers {
         let seq = header.seq.get();
@@ -95,9 +95,22 @@ fn assert_steady(headers: &[ImageHeader]) {
         (*first, *last, *count) = ((*first).min(seq), (*last).max(seq), *count + 1);
     }
     assert_eq!(counts.len(), 2, "{counts:?}");
-    for (first, last, count) in counts.values() {
-        assert!(2 * count > last - first, "{count} images in {} ticks", last - first + 1);
+    println!("first tick, last tick, images of each camera: {counts:?}");
+    counts.values().all(|(first, last, count)| 2 * count > last - first)
+}
+
+/// Takes images until those of all are steady: a machine that is busy may cost some of them, a client that delays
+/// others costs them always.
+async fn steady<const N: usize>(
+    mut take: impl AsyncFnMut() -> [Vec<ImageHeader>; N],
+) -> [Vec<ImageHeader>; N] {
+    for _ in 0..5 {
+        let all = take().await;
+        if all.iter().all(|headers| is_steady(headers)) {
+            return all;
+        }
     }
+    panic!("most ticks give no image");
 }
 
 fn emergency(message: ToRuntime) -> Option<Event> {
@@ -125,11 +138,11 @@ async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
         assert_eq!(widths, [width_px(vehicle, 0), width_px(vehicle, 1)], "{name}");
         clients.push(client);
     }
-    let [a, b, c, d] = [0, 1, 2, 3].map(|vehicle| images(&clients[vehicle], vehicle, 30));
-    let all: [Vec<ImageHeader>; 4] = tokio::join!(a, b, c, d).into();
-    for headers in &all {
-        assert_steady(headers);
-    }
+    let all = steady(async || {
+        let [a, b, c, d] = [0, 1, 2, 3].map(|vehicle| images(&clients[vehicle], vehicle, 30));
+        tokio::join!(a, b, c, d).into()
+    })
+    .await;
     // All are drawn in the same ticks where all have a pose: nobody's share is another's.
     let spans = all.each_ref().map(|headers| {
         let seqs = headers.iter().map(|header| header.seq.get());
@@ -188,9 +201,7 @@ fn a_stopped_client_and_a_slow_one_delay_nobody() {
         let (slow, _) = Client::welcomed_to(&server, NAMES[1], no_images).await;
         let (ant, _) = Client::welcomed_to(&server, NAMES[2], TransportConfig::default()).await;
         let (fly, _) = Client::welcomed_to(&server, NAMES[3], TransportConfig::default()).await;
-        let (ants, flies) = tokio::join!(images(&ant, 2, 60), images(&fly, 3, 60));
-        assert_steady(&ants);
-        assert_steady(&flies);
+        steady(async || tokio::join!(images(&ant, 2, 60), images(&fly, 3, 60)).into()).await;
         drop(slow);
     });
     let _entered = still.enter();
@@ -213,7 +224,7 @@ async fn pages_that_read_nothing_slow_no_runtime() {
         })
         .collect();
     let (client, _) = Client::welcomed_to(&server, NAMES[3], TransportConfig::default()).await;
-    assert_steady(&images(&client, 3, 60).await);
+    steady(async || [images(&client, 3, 60).await]).await;
     drop(pages);
 }
 
