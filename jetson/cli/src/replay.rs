@@ -84,10 +84,10 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),
         None => flown(plan.flown.as_ref())?,
     };
-    let mut command = Plugin::find(&plugin)?.command()?;
-    command.extend(arguments);
     // Confined as in flight: what it could not do there it cannot do here.
     let mut limits = PluginLimits::default();
+    let mut command = Plugin::find(&plugin)?.command(&limits)?;
+    command.extend(arguments);
     if let Some(path) = &args.map {
         limits.hand_map_file(path)?;
     }

@@ -157,6 +157,10 @@ pub struct PluginConfig {
     /// Folders it may write in, beside its own, the working folder and `/tmp`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub write: Vec<PathBuf>,
+    /// Files and folders of yours that it reads, beside its own folder, the working folder, its interpreter and the
+    /// system.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub read: Vec<PathBuf>,
 }
 
 impl PluginConfig {
@@ -173,8 +177,8 @@ impl PluginConfig {
             network: self.network,
             user: self.user.clone(),
             write: self.write.clone(),
-            map: None,
-            hide: Vec::new(),
+            read: self.read.clone(),
+            ..fair
         }
     }
 }

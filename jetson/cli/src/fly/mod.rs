@@ -1,6 +1,7 @@
 //! `vizflyt fly PLUGIN`: the same command in the simulated lab and in the real one. Which of the two
 //! it is, one line reports before anything is armed.
 
+mod cargo;
 pub(crate) mod plugin;
 mod watch;
 
@@ -65,7 +66,8 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
     if args.lab.scene.is_some() || args.lab.seed.is_some() || args.lab.project.is_some() {
         bail!("--scene, --project and --seed are for the simulated lab; add --sim to fly there");
     }
-    let mut command = plugin.map_or(Ok(Vec::new()), Plugin::command)?;
+    let limits = runtime.jetson.plugin.limits();
+    let mut command = plugin.map_or(Ok(Vec::new()), |plugin| plugin.command(&limits))?;
     command.extend(runtime.plugin_arguments.iter().cloned());
     // The parent has reported which lab it is.
     if !runtime.lifeline {
@@ -82,7 +84,7 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
         );
     }
     let reloads = match plugin {
-        Some(plugin) if args.watch => Some(watch::watch(plugin.clone())?),
+        Some(plugin) if args.watch => Some(watch::watch(plugin.clone(), limits)?),
         _ => None,
     };
     let end = vizflyt_runtime::fly_command(runtime, command, reloads)?;
@@ -111,7 +113,7 @@ fn fly_simulated(
         }
     }
     // What is built here is not built again behind the server's back.
-    plugin.map(Plugin::command).transpose()?;
+    plugin.map(|plugin| plugin.command(&runtime.jetson.plugin.limits())).transpose()?;
     if let Some(lab) = plugin.and_then(Plugin::lab) {
         if args.lab.scene.is_none() && args.lab.project.is_none() {
             args.lab.scene.clone_from(&lab.scene);

@@ -8,14 +8,15 @@
 //! ```
 
 use std::ffi::{OsStr, OsString};
-use std::io::Read;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
+use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use serde_json::Value;
+use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 
-use super::sources;
+use super::{cargo, sources};
 use crate::manifest::{LabConfig, PluginManifest};
 use crate::plugins::{BuiltIn, is_built_in};
 
@@ -102,21 +103,22 @@ impl Plugin {
         }
     }
 
-    /// Returns the command that starts it; a Cargo project is built first.
+    /// Returns the command that starts it under `limits`. A script is checked and a Cargo project is built first, confined
+    /// as in flight: what runs then is student code too.
     ///
     /// # Errors
     /// A build that fails, a Python without the package `vizflyt`.
-    pub(crate) fn command(&self) -> Result<Vec<OsString>> {
+    pub(crate) fn command(&self, limits: &PluginLimits) -> Result<Vec<OsString>> {
         match &self.kind {
             Kind::BuiltIn => {
                 let program = std::env::current_exe().context("cannot find this program's path")?;
                 Ok(vec![program.into(), "plugin".into(), self.name.clone()])
             }
             Kind::Program => Ok(vec![self.name.clone()]),
-            Kind::Cargo(folder) => Ok(vec![build(folder)?.into()]),
+            Kind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
             Kind::Script(script) => {
                 let python = python_of(script);
-                check_python(&python, script)?;
+                check_python(&python, script, limits)?;
                 // Unbuffered: a print is seen when it is made, not when 8 kB are full.
                 Ok(vec![python.into(), "-u".into(), script.into()])
             }
@@ -168,8 +170,11 @@ import vizflyt
 vizflyt.run
 ";
 
+/// A package with a large library beside it, from a slow disk.
+const CHECK_WITHIN: Duration = Duration::from_mins(2);
+
 /// Finds out whether the plugin is Python and will find the package, before anything is started for it.
-fn check_python(python: &Path, script: &Path) -> Result<()> {
+fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<()> {
     let folder = script.parent().unwrap_or(Path::new(""));
     if folder.join("vizflyt.py").exists() {
         bail!(
@@ -177,14 +182,17 @@ fn check_python(python: &Path, script: &Path) -> Result<()> {
             folder.join("vizflyt.py").display()
         );
     }
-    let output = Command::new(python)
-        .args(["-c", CHECK])
-        .arg(script)
-        .arg(if folder == Path::new("") { Path::new(".") } else { folder })
-        .stdin(Stdio::null())
-        .output();
-    let output = match output {
+    let script = std::path::absolute(script).context("cannot find the working folder")?;
+    let folder = script.parent().unwrap_or(Path::new("/"));
+    let confinement = Confinement::prepare(limits, &[python.into(), script.clone().into()]);
+    let mut check = confinement.command(python);
+    check.args(["-c", CHECK]).args([&script, folder]);
+    check.stdout(Stdio::null()).stderr(Stdio::piped());
+    let output = match confinement.run(check, CHECK_WITHIN) {
         Ok(output) => output,
+        Err(error) if error.kind() == io::ErrorKind::TimedOut => {
+            bail!("{} cannot be checked: {error}", script.display())
+        }
         Err(error) => bail!(
             "{} is written in Python, and {} cannot be started: {error}; on Debian and Ubuntu: \
              sudo apt install python3 python3-venv",
@@ -211,47 +219,6 @@ fn check_python(python: &Path, script: &Path) -> Result<()> {
         python.display(),
         venv = venv.display(),
     )
-}
-
-/// Builds a Cargo project and returns its program. Cargo's own messages go to standard error.
-fn build(folder: &Path) -> Result<PathBuf> {
-    let mut cargo = Command::new("cargo")
-        .args(["build", "--release", "--message-format=json-render-diagnostics"])
-        .current_dir(folder)
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .spawn()
-        .with_context(|| {
-            format!("cannot start cargo to build {}; rustup.rs installs it", folder.display())
-        })?;
-    let mut messages = String::new();
-    if let Some(mut stdout) = cargo.stdout.take() {
-        stdout.read_to_string(&mut messages).context("cannot read cargo's messages")?;
-    }
-    if !cargo.wait().context("cannot wait for cargo")?.success() {
-        bail!("{} does not build; see the compiler's message above", folder.display());
-    }
-    let programs = programs(&messages);
-    match programs.as_slice() {
-        [program] => Ok(program.clone()),
-        [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
-        several => bail!(
-            "{} builds {} programs; fly one of them by its path, such as {}",
-            folder.display(),
-            several.len(),
-            several[0].display()
-        ),
-    }
-}
-
-/// Returns the programs in cargo's messages.
-fn programs(messages: &str) -> Vec<PathBuf> {
-    let artifact = |line: &str| {
-        let message: Value = serde_json::from_str(line).ok()?;
-        let is_program = message["target"]["kind"].as_array()?.contains(&Value::from("bin"));
-        message["executable"].as_str().filter(|_| is_program).map(PathBuf::from)
-    };
-    messages.lines().filter_map(artifact).collect()
 }
 
 #[cfg(test)]
@@ -312,7 +279,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(folder.path().join("vizflyt.py"), "").unwrap();
-        let error = check_python(Path::new("python3"), &script).unwrap_err().to_string();
+        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("vizflyt.py hides the package"), "{error}");
     }
 
@@ -321,19 +290,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(&script, "import vizflyt\nclass First(vizflyt.Plugin:\n").unwrap();
-        let error = check_python(Path::new("python3"), &script).unwrap_err().to_string();
+        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+            .unwrap_err()
+            .to_string();
         for part in ["plugin.py is not Python", "line 2", "class First", "SyntaxError"] {
             assert!(error.contains(part), "no {part:?} in {error}");
         }
-    }
-
-    #[test]
-    fn programs_are_found_in_what_cargo_says() {
-        let text = "noise\n{\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"lib\"]}}\n\
-            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"custom-build\"]},\"executable\":\"/b\"}\n\
-            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"bin\"]},\"executable\":\"/t/first\"}\n\
-            {\"reason\":\"build-finished\",\"success\":true}\n";
-        assert_eq!(programs(text), [PathBuf::from("/t/first")]);
-        assert!(programs("").is_empty());
     }
 }

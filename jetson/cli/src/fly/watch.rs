@@ -9,6 +9,7 @@ use std::thread;
 use std::time::{Duration, SystemTime};
 
 use anyhow::{Context, Result};
+use vizflyt_runtime::supervisor::PluginLimits;
 
 use super::plugin::Plugin;
 use crate::terminal::print_error;
@@ -23,7 +24,7 @@ const DEEPEST: usize = 8;
 ///
 /// # Errors
 /// If there is no thread for it.
-pub(crate) fn watch(plugin: Plugin) -> Result<Receiver<()>> {
+pub(crate) fn watch(plugin: Plugin, limits: PluginLimits) -> Result<Receiver<()>> {
     let (sender, receiver) = channel();
     let look = move || {
         let mut known = Sources::of(&plugin.watched());
@@ -40,7 +41,7 @@ pub(crate) fn watch(plugin: Plugin) -> Result<Receiver<()>> {
                 continue;
             }
             known = found;
-            match plugin.command() {
+            match plugin.command(&limits) {
                 Ok(_) if sender.send(()).is_err() => return,
                 Ok(_) => {}
                 Err(error) => print_error(format_args!("not reloaded: {error:#}")),

@@ -223,7 +223,6 @@ pub(crate) fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> R
 fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let plugin = Plugin::find(args.plugin.as_deref().context("no plugin is named")?)?;
     let project = CourseProject::named(&args.project)?;
-    let command = plugin.command()?;
     let delays = delays(args)?;
     let subject = subject(args, &plugin, &project)?;
     let flights: Vec<(Variant, u64)> = subject
@@ -236,7 +235,9 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     // What a plugin of the same user could read, forge or look up: keys, our memory (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
     nix::sys::prctl::set_dumpable(false).context("this process cannot be kept to itself")?;
-    let limits = PluginLimits { hide: vec![keys.file("")], ..PluginLimits::default() };
+    let hide = vec![keys.file("")];
+    let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
+    let command = plugin.command(&limits)?;
     let answer_within = Duration::try_from_secs_f64(args.answer_within)
         .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<Done>> {

@@ -4,8 +4,9 @@
 //! |---|---|---|
 //! | memory, processes | control group | `RLIMIT_DATA` and `RLIMIT_NPROC`, and counting by the supervisor |
 //! | processors | control group | it is kept off the first processor |
-//! | network, the system itself | seccomp | reported once |
+//! | network, other programs' sockets, the system itself | seccomp | reported once |
 //! | writing outside its folders, reading what is hidden, signalling others | Landlock | reported once |
+//! | other processes, people's homes, what is shared | a [cell](super::cell) | said once |
 //! | the runtime's user | another user, if root | it keeps root's name without root's powers |
 //!
 //! All is prepared before the fork; after it only system calls are made.
@@ -38,6 +39,7 @@ use seccompiler::{
 
 use vizflyt_sdk::ipc::PluginSocket;
 
+use super::cell::{Cell, Places};
 use super::cgroup::{Cgroup, Controller};
 use super::limits::PluginLimits;
 
@@ -50,6 +52,8 @@ pub struct Confinement {
     drops_powers: bool,
     filters: Vec<BpfProgram>,
     landlock: Option<OwnedFd>,
+    /// Or why there is none.
+    cell: Result<Cell, String>,
     own_folders: Vec<PathBuf>,
     notes: Vec<String>,
 }
@@ -60,15 +64,29 @@ pub(super) struct Bounds {
     memory: Option<u64>,
     processes: Option<u64>,
     processors: Option<CpuSet>,
+    in_cell: bool,
 }
 
 impl Confinement {
     /// Finds out what this kernel and this user offer for `command` under `limits`.
     pub fn prepare(limits: &PluginLimits, command: &[OsString]) -> Self {
         let mut notes = Vec::new();
-        let own_folders = own_folders(command);
-        let (user, drops_powers) = choose_user(limits, command, &mut notes);
-        let filters = match filters(limits) {
+        let own_folders = own_folders(limits, command);
+        let (mut user, mut drops_powers) = choose_user(limits, command, &mut notes);
+        let cell = cell(limits, command, &own_folders);
+        match &cell {
+            // Whatever people's folders allow: in a cell the way to what is shown is open.
+            Ok(cell) if geteuid().is_root() => {
+                (user, drops_powers) = (cell.user(), false);
+                notes.clear();
+            }
+            Ok(_) => {}
+            Err(why) => notes.push(format!(
+                "this computer gives the plugin no namespaces of its own ({why}); it sees other processes and \
+                 shared folders"
+            )),
+        }
+        let filters = match filters(limits, cell.is_ok()) {
             Ok(filters) if seccomp_is_there() => filters,
             result => {
                 let why = result.err().map(|error| format!(": {error}")).unwrap_or_default();
@@ -76,7 +94,7 @@ impl Confinement {
                 Vec::new()
             }
         };
-        let landlock = match files(&own_folders, limits) {
+        let landlock = match files(&own_folders, limits, cell.is_ok()) {
             Ok(Some(ruleset)) => Some(ruleset),
             Ok(None) => {
                 let note =
@@ -90,7 +108,7 @@ impl Confinement {
             }
         };
         let limits = limits.clone();
-        Self { limits, user, drops_powers, filters, landlock, own_folders, notes }
+        Self { limits, user, drops_powers, filters, landlock, cell, own_folders, notes }
     }
 
     /// Returns the user that the plugin becomes, if another.
@@ -100,7 +118,17 @@ impl Confinement {
 
     /// Whether the kernel lacks something that the plugin is confined by.
     pub fn is_partial(&self) -> bool {
-        self.landlock.is_none() || self.filters.is_empty()
+        self.landlock.is_none() || self.filters.is_empty() || self.cell.is_err()
+    }
+
+    /// Returns what keeps a grade from being worth a signature here, in a sentence: without a cell, or a filter of
+    /// system calls, a plugin can look for what it is not shown.
+    pub fn unsealed(&self) -> Option<String> {
+        match &self.cell {
+            Err(why) => Some(format!("plugins get no namespaces of their own here: {why}")),
+            Ok(_) if self.filters.is_empty() => Some("this kernel has no seccomp".to_owned()),
+            Ok(_) => None,
+        }
     }
 
     /// Returns the folders of the student's own code.
@@ -133,7 +161,8 @@ impl Confinement {
                 missing.join(" and ")
             ));
         }
-        (Bounds { group, memory, processes, processors }, notes)
+        let in_cell = self.cell.is_ok();
+        (Bounds { group, memory, processes, processors, in_cell }, notes)
     }
 
     /// Makes `process` lose all this before its first instruction.
@@ -147,6 +176,7 @@ impl Confinement {
         let doors: Vec<i32> = bounds.group.doors().into_iter().map(File::as_raw_fd).collect();
         let landlock = self.landlock.as_ref().map(AsRawFd::as_raw_fd);
         let (user, drops_powers) = (self.user, self.drops_powers);
+        let cell = self.cell.as_ref().ok().cloned();
         let (memory, processes) = (bounds.memory, bounds.processes);
         let processors = bounds.processors;
         let filters = self.filters.clone();
@@ -162,6 +192,16 @@ impl Confinement {
             if let Some(processors) = &processors {
                 nix::sched::sched_setaffinity(Pid::from_raw(0), processors)?;
             }
+            // Without the terminal, into which it could type; and a group of processes, which the supervisor ends.
+            nix::unistd::setsid()?;
+            nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
+            // The parent may have died before that.
+            if getppid() != parent {
+                return Err(io::ErrorKind::BrokenPipe.into());
+            }
+            if let Some(cell) = &cell {
+                cell.enter().or_else(|(step, error)| explained(Err(error), step))?;
+            }
             for (resource, most) in
                 [(Resource::RLIMIT_DATA, memory), (Resource::RLIMIT_NPROC, processes)]
             {
@@ -169,20 +209,19 @@ impl Confinement {
                     explained(lower(resource, most), "its limits cannot be set")?;
                 }
             }
-            if let Some((uid, gid)) = user {
+            if let Some((uid, gid)) = user.filter(|_| cell.is_none()) {
                 explained(become_user(uid, gid), "it cannot become another user")?;
+                // The change of user has cleared it.
+                nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
             }
             if drops_powers {
                 drop_capabilities();
             }
-            // After the change of user, which would clear it.
-            nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
-            // The parent may have died before that.
-            if getppid() != parent {
-                return Err(io::ErrorKind::BrokenPipe.into());
-            }
             nix::sys::prctl::set_no_new_privs()?;
             if let Some(landlock) = landlock {
+                if let Some(cell) = &cell {
+                    explained(cell.allow_scratch(landlock), "Landlock refuses its scratch space")?;
+                }
                 // SAFETY: landlock_restrict_self(2) with a ruleset that our parent holds.
                 let done = unsafe { libc::syscall(libc::SYS_landlock_restrict_self, landlock, 0) };
                 explained(check(done as isize), "Landlock refuses")?;
@@ -206,6 +245,10 @@ impl Confinement {
 impl Bounds {
     pub(super) fn group(&self) -> &Cgroup {
         &self.group
+    }
+
+    pub(super) fn in_cell(&self) -> bool {
+        self.in_cell
     }
 
     /// Whether memory and processes are to be counted by the supervisor, for want of a group.
@@ -251,6 +294,71 @@ fn drop_capabilities() {
         // an error that changes nothing.
         unsafe { libc::prctl(libc::PR_CAPBSET_DROP, capability, 0, 0, 0) };
     }
+}
+
+/// Makes the plugin's cell: it is shown its own folders, what it is started from, and where its interpreter finds packages.
+fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<Cell, String> {
+    let user = if geteuid().is_root() {
+        let name = limits.user.as_deref().filter(|&name| name != "root");
+        let names = name.map_or(vec!["vizflyt", "nobody"], |name| vec![name]);
+        let user = names.iter().find_map(|name| User::from_name(name).ok().flatten());
+        let user = user.ok_or_else(|| format!("there is no user {}", names.join(" or ")))?;
+        Some((user.uid, user.gid))
+    } else {
+        None
+    };
+    let mut readable = limits.read.clone();
+    for path in command.iter().map(PathBuf::from) {
+        if path.components().count() > 1 && path.exists() {
+            readable.extend(links(&path));
+        }
+    }
+    if let Some(program) = command.first().map(Path::new) {
+        let is_bare = program.components().count() == 1;
+        // What lies beside a program is its own, as models and libraries are.
+        let beside = program.parent().and_then(|folder| folder.canonicalize().ok());
+        readable.extend(beside.filter(|folder| !is_bare && is_somebodys(folder)));
+        let program = is_bare.then(|| on_path(program)).flatten().unwrap_or(program.to_owned());
+        for program in links(&program) {
+            readable.extend(installation(&program));
+            readable.push(program);
+        }
+    }
+    for name in ["PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH"] {
+        readable.extend(std::env::split_paths(&std::env::var_os(name).unwrap_or_default()));
+    }
+    readable.extend(std::env::home_dir().map(|home| home.join(".local/lib")));
+    if limits.network {
+        // Where names are looked up.
+        readable.extend(["/run/systemd/resolve", "/run/resolvconf"].map(PathBuf::from));
+    }
+    let mut writable = limits.write.clone();
+    if limits.graded { &mut readable } else { &mut writable }.extend_from_slice(own);
+    let folder = limits.folder.clone().or_else(|| {
+        if limits.graded { own.first().cloned() } else { std::env::current_dir().ok() }
+    });
+    let folder = folder.unwrap_or_else(|| PathBuf::from("/tmp"));
+    let places = Places { readable, writable, hidden: limits.hide.clone(), folder };
+    Cell::prepare(user, limits.network, &places, (limits.memory_mb / 4).max(16))
+}
+
+/// Returns `path`, and each file that it is a link to on the way to the last.
+fn links(path: &Path) -> Vec<PathBuf> {
+    let next = |path: &PathBuf| {
+        Some(path.parent().unwrap_or(Path::new("")).join(fs::read_link(path).ok()?))
+    };
+    std::iter::successors(Some(path.to_owned()), next).take(16).collect()
+}
+
+/// Returns the parts of the folder that a program was installed into with all that it needs, as Python's environments
+/// are: the one above its `bin`. Of managers of versions (pyenv, asdf, mise), who start another by a script in `shims`, all.
+fn installation(program: &Path) -> Vec<PathBuf> {
+    if let Some(shims) = program.parent().filter(|folder| folder.ends_with("shims")) {
+        return shims.parent().map(Path::to_owned).into_iter().collect();
+    }
+    let bin = program.parent().filter(|folder| folder.ends_with("bin"));
+    let Some(prefix) = bin.and_then(Path::parent) else { return Vec::new() };
+    ["bin", "lib", "lib64", "pyvenv.cfg"].map(|name| prefix.join(name)).to_vec()
 }
 
 /// Chooses whom the plugin runs as, and whether it stays root by name.
@@ -325,9 +433,8 @@ fn on_path(program: &Path) -> Option<PathBuf> {
 }
 
 /// Returns the folders that hold the student's own code: those of scripts and folders on the
-/// command line, and the working folder; never a whole home or the whole system.
-fn own_folders(command: &[OsString]) -> Vec<PathBuf> {
-    let home = std::env::home_dir();
+/// command line, and, if it is not graded, the working folder; never a whole home or the whole system.
+fn own_folders(limits: &PluginLimits, command: &[OsString]) -> Vec<PathBuf> {
     let scripts = command.iter().map(Path::new).filter_map(|path| {
         if path.is_dir() {
             return Some(path.to_owned());
@@ -336,23 +443,36 @@ fn own_folders(command: &[OsString]) -> Vec<PathBuf> {
         path.parent().filter(|_| is_script && path.is_file()).map(Path::to_owned)
     });
     let mut folders: Vec<PathBuf> = Vec::new();
-    for folder in scripts.chain(std::env::current_dir()) {
+    let working = std::env::current_dir().ok().filter(|_| !limits.graded);
+    for folder in scripts.chain(working) {
         let Ok(folder) = folder.canonicalize().or_else(|_| std::path::absolute(&folder)) else {
             continue;
         };
-        let holds_home = home.as_ref().is_some_and(|home| home.starts_with(&folder));
-        if !holds_home && folder.parent().is_some() && !folders.contains(&folder) {
+        if is_somebodys(&folder) && !folders.contains(&folder) {
             folders.push(folder);
         }
     }
     folders
 }
 
+/// Whether a folder is neither a whole home nor the whole system.
+fn is_somebodys(folder: &Path) -> bool {
+    let holds_home = std::env::home_dir().is_some_and(|home| home.starts_with(folder));
+    !holds_home && folder.parent().is_some()
+}
+
 /// Makes the rules of files: writing in the plugin's folders, scratch space, and devices that compute;
 /// reading everywhere but what is hidden.
-fn files(own: &[PathBuf], limits: &PluginLimits) -> Result<Option<OwnedFd>, RulesetError> {
+///
+/// In a cell what is hidden is covered, and scratch space is made there.
+fn files(
+    own: &[PathBuf],
+    limits: &PluginLimits,
+    in_cell: bool,
+) -> Result<Option<OwnedFd>, RulesetError> {
+    let own = if limits.graded { &[] } else { own };
     let mut places: Vec<PathBuf> = own.iter().chain(&limits.write).cloned().collect();
-    places.extend(scratch());
+    places.extend((!in_cell).then(scratch).into_iter().flatten());
     let devices = ["null", "zero", "full", "tty", "pts", "ptmx", "dri", "kfd"];
     places.extend(devices.map(|device| Path::new("/dev").join(device)));
     // Graphics and video engines of NVIDIA's cards and of the Jetson: /dev/nvidia0, nvmap, nvhost-*.
@@ -370,7 +490,7 @@ fn files(own: &[PathBuf], limits: &PluginLimits) -> Result<Option<OwnedFd>, Rule
     let hidden: Vec<PathBuf> =
         limits.hide.iter().filter_map(|path| path.canonicalize().ok()).collect();
     let hidden: Vec<PathBuf> = hidden.iter().filter(is_hideable).cloned().collect();
-    if hidden.is_empty() {
+    if hidden.is_empty() || in_cell {
         return Ok(rules.create()?.add_rules(path_beneath_rules(places, writing))?.into());
     }
     let reading = AccessFs::ReadFile | AccessFs::Execute;
@@ -417,28 +537,65 @@ fn seccomp_is_there() -> bool {
 }
 
 /// Makes the filters of system calls.
-fn filters(limits: &PluginLimits) -> Result<Vec<BpfProgram>, seccompiler::BackendError> {
+fn filters(
+    limits: &PluginLimits,
+    in_cell: bool,
+) -> Result<Vec<BpfProgram>, seccompiler::BackendError> {
     let compile = |rules: BTreeMap<i64, Vec<SeccompRule>>, errno: i32| {
         let refuse = SeccompAction::Errno(errno.unsigned_abs());
         let arch = std::env::consts::ARCH.try_into()?;
         SeccompFilter::new(rules, SeccompAction::Allow, refuse, arch)?.try_into()
     };
-    let mut filters =
-        vec![compile(FORBIDDEN.iter().map(|&call| (call, Vec::new())).collect(), libc::EPERM)?];
+    let when = |argument, operator, value: i32| {
+        let value = u64::from(value.cast_unsigned());
+        let condition = SeccompCondition::new(argument, SeccompCmpArgLen::Dword, operator, value)?;
+        SeccompRule::new(vec![condition])
+    };
+    let mut refused: BTreeMap<i64, Vec<SeccompRule>> =
+        FORBIDDEN.iter().map(|&call| (call, Vec::new())).collect();
+    for (call, argument) in OF_OTHERS {
+        refused.insert(call, vec![when(argument, SeccompCmpOp::Ne, 0)?]);
+    }
+    if !in_cell {
+        // In a cell the numbers are those of the plugin's own threads, which libraries bind to processors.
+        let others = when(0, SeccompCmpOp::Ne, 0)?;
+        refused.insert(libc::SYS_sched_setaffinity, vec![others]);
+    }
+    let namespaces = NAMESPACES
+        .iter()
+        .map(|&flag| when(0, SeccompCmpOp::MaskedEq(u64::from(flag.cast_unsigned())), flag));
+    refused.insert(libc::SYS_clone, namespaces.collect::<Result<_, _>>()?);
+    // A filter does not see into its arguments; libraries take clone(2) then.
+    let hidden = BTreeMap::from([(libc::SYS_clone3, Vec::new())]);
+    let mut filters = vec![compile(refused, libc::EPERM)?, compile(hidden, libc::ENOSYS)?];
     if !limits.network {
-        // Sockets between processes stay: shared memory wakes by them. All others, UDP to the
-        // autopilot too, are as if there were no network.
-        let other = SeccompCondition::new(
-            0,
-            SeccompCmpArgLen::Dword,
-            SeccompCmpOp::Ne,
-            libc::AF_UNIX.unsigned_abs().into(),
-        )?;
-        let rules = [(libc::SYS_socket, vec![SeccompRule::new(vec![other])?])];
-        filters.push(compile(rules.into_iter().collect(), libc::ENETUNREACH)?);
+        // Pairs of sockets stay: they reach nobody else. All others, to the autopilot, to a desktop, to another
+        // program's service, are as if there were no network.
+        let rules = BTreeMap::from([(libc::SYS_socket, Vec::new())]);
+        filters.push(compile(rules, libc::ENETUNREACH)?);
     }
     Ok(filters)
 }
+
+/// System calls that are for oneself alone, and which argument names another process. [0 is oneself]
+const OF_OTHERS: [(i64, u8); 6] = [
+    (libc::SYS_prlimit64, 0),
+    (libc::SYS_setpriority, 1),
+    (libc::SYS_ioprio_set, 1),
+    (libc::SYS_sched_setscheduler, 0),
+    (libc::SYS_sched_setparam, 0),
+    (libc::SYS_sched_setattr, 0),
+];
+
+const NAMESPACES: [i32; 7] = [
+    libc::CLONE_NEWNS,
+    libc::CLONE_NEWCGROUP,
+    libc::CLONE_NEWUTS,
+    libc::CLONE_NEWIPC,
+    libc::CLONE_NEWUSER,
+    libc::CLONE_NEWPID,
+    libc::CLONE_NEWNET,
+];
 
 /// System calls that no plugin needs: to look into other processes, to change the system, and io_uring, whose
 /// requests a filter does not see.

@@ -2,6 +2,7 @@
 //! `jetson.toml`.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::thread::available_parallelism;
 
 use anyhow::Context as _;
@@ -41,6 +42,13 @@ pub struct PluginLimits {
     pub user: Option<String>,
     /// Folders it may write in, beside its own, the working folder and `/tmp`.
     pub write: Vec<PathBuf>,
+    /// Files and folders that it sees beside its own, the system and its interpreter, in a cell.
+    pub read: Vec<PathBuf>,
+    /// Where it starts; without it the working folder.
+    pub folder: Option<PathBuf>,
+    /// It is graded: its own folder cannot be changed, the working folder is not seen, nothing it writes outlives it,
+    /// and of the environment it gets what programs need.
+    pub graded: bool,
     /// The map that it is handed, as JSON, where the course's map is known.
     pub map: Option<String>,
     /// Files and folders that it may not read, where the kernel has Landlock: what a grade must keep from
@@ -65,6 +73,9 @@ impl Default for PluginLimits {
             network: false,
             user: None,
             write: Vec::new(),
+            read: Vec::new(),
+            folder: None,
+            graded: false,
             map: None,
             hide: Vec::new(),
         }
@@ -73,6 +84,19 @@ impl Default for PluginLimits {
 
 /// Less than this, no interpreter starts. [MB]
 pub const MIN_MEMORY_MB: u64 = 64;
+
+/// Variables that a graded plugin gets.
+const KEPT: [&str; 9] = [
+    "PATH",
+    "HOME",
+    "LANG",
+    "TZ",
+    "PYTHONPATH",
+    "VIRTUAL_ENV",
+    "LD_LIBRARY_PATH",
+    "OMP_NUM_THREADS",
+    "RUST_BACKTRACE",
+];
 
 /// Linux takes environment variables of 128 KiB: some thousand obstacles.
 const MAX_MAP: usize = 120 * 1024;
@@ -106,6 +130,16 @@ impl PluginLimits {
             .with_context(|| format!("the map {} cannot be read", path.display()))?;
         let handed = self.hand_map(&text).map_err(anyhow::Error::msg);
         handed.with_context(|| path.display().to_string())
+    }
+
+    /// Leaves a graded plugin of our environment what programs need: tokens and courses may stand in the rest.
+    pub(super) fn choose_environment(&self, process: &mut Command) {
+        if self.graded {
+            let is_kept = |name: &str| KEPT.contains(&name) || name.starts_with("LC_");
+            let ours = std::env::vars_os();
+            process.env_clear();
+            process.envs(ours.filter(|(name, _)| name.to_str().is_some_and(is_kept)));
+        }
     }
 
     /// Checks that the limits leave a plugin room to live.

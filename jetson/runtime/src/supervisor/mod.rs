@@ -6,18 +6,20 @@
 //! [`Supervisor`] is one running process. When to start the next one is for the
 //! [control loop](crate::control) to decide.
 
+mod cell;
 mod cgroup;
 mod confine;
 mod limits;
 mod output;
 #[cfg(test)]
 mod tests;
+mod tool;
 mod watch;
 
 use std::ffi::OsString;
 use std::io;
-use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::os::unix::process::ExitStatusExt;
+use std::process::{Child, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -96,15 +98,8 @@ impl Supervisor {
             .split_first()
             .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no plugin given"))?;
         let (bounds, notes) = confinement.bounds();
-        let mut process = Command::new(program);
-        process
-            .args(arguments)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            // So that Ctrl-C at the terminal reaches the runtime first, and grandchildren can be
-            // ended with the plugin.
-            .process_group(0);
+        let mut process = confinement.command(program);
+        process.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped());
         // Not one that this process was handed itself.
         process.env_remove(vizflyt_sdk::MAP_VARIABLE);
         if let Some(map) = &confinement.limits.map {
@@ -223,7 +218,8 @@ impl SharedState {
     }
 
     fn beyond_limits(&self) -> Option<String> {
-        let counted = self.bounds.counts_itself().then(|| watch::count(self.group));
+        let counted =
+            self.bounds.counts_itself().then(|| watch::count(self.group, self.bounds.in_cell()));
         watch::beyond_limits(&self.limits, self.bounds.group(), counted)
     }
 
@@ -295,8 +291,10 @@ fn hint(last_error: &str) -> &'static str {
         " (memory_mb in [plugin] allows no more)"
     } else if mentions(&["Network is unreachable"]) {
         " (a plugin has no network unless [plugin] says network = true)"
-    } else if mentions(&["Permission denied", "PermissionError"]) {
+    } else if mentions(&["Permission denied", "PermissionError", "Read-only file system"]) {
         " (a plugin writes in its own folder, /tmp, and what [plugin] write lists)"
+    } else if mentions(&["No such file", "ModuleNotFoundError", "FileNotFoundError"]) {
+        " (a plugin sees its own folder, the working folder, its interpreter, the system, and what [plugin] read lists)"
     } else {
         ""
     }

@@ -1,5 +1,6 @@
 //! Whether a plugin is beyond its limits: by its control group, else by counting its processes.
 
+use std::collections::BTreeMap;
 use std::fs;
 
 use nix::unistd::Pid;
@@ -40,36 +41,60 @@ pub(super) fn beyond_limits(
     None
 }
 
-/// Counts the processes of a process group.
-pub(super) fn count(group: Pid) -> Usage {
+/// Counts the processes of a process group; in a cell, all that its init has started.
+pub(super) fn count(group: Pid, in_cell: bool) -> Usage {
     let page = nix::unistd::sysconf(nix::unistd::SysconfVar::PAGE_SIZE).ok().flatten();
     let page = page.map_or(4096, i64::unsigned_abs);
     let mut usage = Usage::default();
+    let mut all = BTreeMap::new();
     for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
         let folder = entry.path();
+        let id = entry.file_name().to_str().and_then(|name| name.parse::<i32>().ok());
         let stat = fs::read_to_string(folder.join("stat")).unwrap_or_default();
-        let Some((process_group, tasks)) = parse_stat(&stat) else { continue };
-        if process_group != group.as_raw() {
+        all.extend(id.and_then(|id| Some((id, parse_stat(&stat)?))));
+    }
+    let parent = |id: i32| all.get(&id).map(|stat: &Stat| stat.parent);
+    for (&id, stat) in &all {
+        // Keeper and init, which has the keeper's number as its parent's, hold copies of our own memory.
+        let counts = if in_cell {
+            let mut above = std::iter::successors(parent(id), |&id| parent(id)).skip(1);
+            above.any(|id| id == group.as_raw())
+        } else {
+            stat.group == group.as_raw()
+        };
+        if !counts {
             continue;
         }
+        let folder = format!("/proc/{id}");
         // Resident less shared (proc_pid_statm(5)): the images lie in the runtime's memory.
-        let statm = fs::read_to_string(folder.join("statm")).unwrap_or_default();
+        let statm = fs::read_to_string(format!("{folder}/statm")).unwrap_or_default();
         let mut pages = statm.split(' ').skip(1).map(|field| field.parse::<u64>().unwrap_or(0));
         let (resident, shared) = (pages.next().unwrap_or(0), pages.next().unwrap_or(0));
         usage.memory += resident.saturating_sub(shared) * page;
-        usage.tasks += tasks;
+        usage.tasks += stat.threads;
     }
     usage
 }
 
-/// Returns process group and number of threads from proc_pid_stat(5). The name in parentheses may
-/// hold anything.
-fn parse_stat(stat: &str) -> Option<(i32, u64)> {
+/// A process (proc_pid_stat(5)).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Stat {
+    parent: i32,
+    group: i32,
+    threads: u64,
+}
+
+/// Reads the kernel's line. The name in parentheses may hold anything.
+fn parse_stat(stat: &str) -> Option<Stat> {
     let (_, fields) = stat.rsplit_once(") ")?;
-    let mut fields = fields.split(' ');
-    let group = fields.nth(2)?.parse().ok()?;
-    let threads = fields.nth(14)?.parse().ok()?;
-    Some((group, threads))
+    let mut fields = fields.split(' ').skip(1);
+    let mut number = |skip| fields.nth(skip)?.parse::<i64>().ok();
+    let (parent, group, threads) = (number(0)?, number(0)?, number(14)?);
+    Some(Stat {
+        parent: parent.try_into().ok()?,
+        group: group.try_into().ok()?,
+        threads: threads.try_into().ok()?,
+    })
 }
 
 #[cfg(test)]
@@ -79,12 +104,12 @@ mod tests {
     #[test]
     fn parses_stat_lines_with_any_process_name() {
         let line = "12 (a) b (c) S 1 77 77 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 9 0 123 456 789";
-        assert_eq!(parse_stat(line), Some((77, 9)));
+        assert_eq!(parse_stat(line), Some(Stat { parent: 1, group: 77, threads: 9 }));
         assert_eq!(parse_stat("nonsense"), None);
         let own = fs::read_to_string("/proc/self/stat").unwrap();
         let group = nix::unistd::getpgrp();
-        assert_eq!(parse_stat(&own).unwrap().0, group.as_raw());
-        let usage = count(group);
+        assert_eq!(parse_stat(&own).unwrap().group, group.as_raw());
+        let usage = count(group, false);
         assert!(usage.tasks >= 1 && usage.memory > 100_000, "{usage:?}");
     }
 

@@ -1,0 +1,220 @@
+//! The build of a plugin that is a Cargo project: what its build scripts and macros do, they do confined.
+//!
+//! ```text
+//! cargo metadata   from the root folder, so that no setting of the project's counts: finds and fetches what it needs
+//! cargo build      confined, without the network
+//! ```
+
+use std::ffi::OsString;
+use std::os::unix::fs::chown;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+use std::{env, fs};
+
+use anyhow::{Context, Result, bail, ensure};
+use serde::Deserialize;
+use serde_json::Value;
+use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
+
+use super::sources;
+
+/// What Cargo says of a project.
+#[derive(Deserialize)]
+struct Metadata {
+    packages: Vec<Package>,
+    workspace_root: PathBuf,
+    target_directory: PathBuf,
+}
+
+#[derive(Deserialize)]
+struct Package {
+    name: String,
+    /// Where it comes from; none of a folder of this computer's.
+    source: Option<String>,
+    manifest_path: PathBuf,
+}
+
+/// A large library on a slow computer.
+const BUILD_WITHIN: Duration = Duration::from_mins(30);
+/// A compiler starts one for each processor, and each of these some more.
+const BUILD_PROCESSES: u32 = 4096;
+
+/// Builds a Cargo project and returns its program. Cargo's own messages go to standard error.
+///
+/// # Errors
+/// A build that fails, a project of no program or of several; of one that is graded, packages from elsewhere on this
+/// computer.
+pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
+    let folder = folder.canonicalize().with_context(|| format!("{}", folder.display()))?;
+    let metadata = metadata(&folder)?;
+    let own = &metadata.workspace_root;
+    let mut read = metadata.elsewhere(limits.graded)?;
+    read.push(own.clone());
+    read.extend(toolchain());
+    let target = metadata.target_directory.clone();
+    fs::create_dir_all(&target).with_context(|| format!("cannot make {}", target.display()))?;
+    let limits = PluginLimits {
+        processes: BUILD_PROCESSES,
+        network: false,
+        read,
+        write: vec![target.clone()],
+        folder: Some(folder.clone()),
+        graded: limits.graded,
+        hide: limits.hide.clone(),
+        user: limits.user.clone(),
+        ..PluginLimits::default()
+    };
+    let confinement = Confinement::prepare(&limits, &[OsString::from("cargo")]);
+    let target = match confinement.user_id() {
+        // Root has made the folder, and another user builds.
+        Some(user) => {
+            let target = target.join("confined");
+            fs::create_dir_all(&target)?;
+            chown(&target, Some(user), None).context("cannot hand the build its folder")?;
+            target
+        }
+        None => target,
+    };
+    let mut cargo = confinement.command("cargo");
+    cargo
+        .args(["build", "--release", "--offline", "--message-format=json-render-diagnostics"])
+        .arg("--target-dir")
+        .arg(&target)
+        // A service of another process, which is not there.
+        .env("RUSTC_WRAPPER", "")
+        .env("CARGO_HOME", home_of("CARGO_HOME", ".cargo"))
+        .env("RUSTUP_HOME", home_of("RUSTUP_HOME", ".rustup"))
+        .current_dir(&folder)
+        .stdout(Stdio::piped());
+    let output = confinement
+        .run(cargo, BUILD_WITHIN)
+        .with_context(|| format!("{} cannot be built", folder.display()))?;
+    if !output.status.success() {
+        bail!("{} does not build; see the compiler's message above", folder.display());
+    }
+    let programs = programs(&String::from_utf8_lossy(&output.stdout));
+    match programs.as_slice() {
+        // What the build says is student code's word.
+        [program] if program.starts_with(&target) => Ok(program.clone()),
+        [program] => bail!("{} builds {}, elsewhere", folder.display(), program.display()),
+        [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
+        several => bail!(
+            "{} builds {} programs; fly one of them by its path, such as {}",
+            folder.display(),
+            several.len(),
+            several[0].display()
+        ),
+    }
+}
+
+/// Asks Cargo what the project needs, and lets it fetch that. No code of the project's runs: its settings and its
+/// toolchain file count in its own folder only, and this is another.
+fn metadata(folder: &Path) -> Result<Metadata> {
+    let mut cargo = Command::new("cargo");
+    cargo.args(["metadata", "--format-version=1", "--quiet", "--manifest-path"]);
+    cargo.arg(folder.join("Cargo.toml")).current_dir("/").stdin(Stdio::null());
+    let output = cargo.stderr(Stdio::inherit()).output().with_context(|| {
+        format!("cannot start cargo to build {}; rustup.rs installs it", folder.display())
+    })?;
+    ensure!(
+        output.status.success(),
+        "{} does not build; see cargo's message above",
+        folder.display()
+    );
+    serde_json::from_slice(&output.stdout).context("cargo's description of the project")
+}
+
+impl Metadata {
+    /// Returns the folders of packages that lie outside the project.
+    ///
+    /// # Errors
+    /// If it is graded, and they are not of VizFlyt's own.
+    fn elsewhere(&self, graded: bool) -> Result<Vec<PathBuf>> {
+        let ours = sources().ok();
+        let mut folders = Vec::new();
+        for package in &self.packages {
+            let folder = package.manifest_path.parent().unwrap_or(Path::new("/"));
+            let is_cloned = package.source.as_ref().is_some_and(|from| from.contains("file:"));
+            let is_here = package.source.is_none() && !folder.starts_with(&self.workspace_root);
+            let is_ours = ours.as_ref().is_some_and(|ours| folder.starts_with(ours));
+            ensure!(
+                !graded || is_ours || !(is_cloned || is_here),
+                "its package {} lies outside it, at {}: what is graded holds all it needs, or takes it from a registry",
+                package.name,
+                package.source.clone().unwrap_or_else(|| folder.display().to_string())
+            );
+            folders.extend(is_here.then(|| folder.to_owned()));
+        }
+        // A package inherits from the manifest of its workspace.
+        folders.extend(ours.filter(|ours| folders.iter().any(|folder| folder.starts_with(ours))));
+        Ok(folders)
+    }
+}
+
+/// Returns what Cargo reads beside the project: compilers and packages, but not its credentials.
+fn toolchain() -> Vec<PathBuf> {
+    let cargo = home_of("CARGO_HOME", ".cargo");
+    let parts = ["bin", "registry", "git", "config.toml", "config"].map(|name| cargo.join(name));
+    parts.into_iter().chain([home_of("RUSTUP_HOME", ".rustup")]).collect()
+}
+
+fn home_of(variable: &str, folder: &str) -> PathBuf {
+    let given = env::var_os(variable).map(PathBuf::from);
+    given.unwrap_or_else(|| env::home_dir().unwrap_or_default().join(folder))
+}
+
+/// Returns the programs in cargo's messages.
+fn programs(messages: &str) -> Vec<PathBuf> {
+    let artifact = |line: &str| {
+        let message: Value = serde_json::from_str(line).ok()?;
+        let is_program = message["target"]["kind"].as_array()?.contains(&Value::from("bin"));
+        message["executable"].as_str().filter(|_| is_program).map(PathBuf::from)
+    };
+    messages.lines().filter_map(artifact).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn programs_are_found_in_what_cargo_says() {
+        let text = "noise\n{\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"lib\"]}}\n\
+            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"custom-build\"]},\"executable\":\"/b\"}\n\
+            {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"bin\"]},\"executable\":\"/t/first\"}\n\
+            {\"reason\":\"build-finished\",\"success\":true}\n";
+        assert_eq!(programs(text), [PathBuf::from("/t/first")]);
+        assert!(programs("").is_empty());
+    }
+
+    #[test]
+    fn what_is_graded_holds_all_it_needs() {
+        let package = |source: Option<&str>, manifest: &str| Package {
+            name: "help".into(),
+            source: source.map(str::to_owned),
+            manifest_path: manifest.into(),
+        };
+        let of = |package| Metadata {
+            packages: vec![package],
+            workspace_root: "/submission".into(),
+            target_directory: "/submission/target".into(),
+        };
+        let registry = "registry+https://github.com/rust-lang/crates.io-index";
+        for good in [
+            package(None, "/submission/Cargo.toml"),
+            package(None, "/submission/parts/help/Cargo.toml"),
+            package(Some(registry), "/home/x/.cargo/registry/src/help/Cargo.toml"),
+        ] {
+            assert_eq!(of(good).elsewhere(true).unwrap(), [PathBuf::new(); 0]);
+        }
+        let solution = || package(None, "/home/x/solution/Cargo.toml");
+        let cloned = package(Some("git+file:///home/x/solution"), "/home/x/.cargo/git/Cargo.toml");
+        for bad in [solution(), cloned] {
+            let error = of(bad).elsewhere(true).unwrap_err().to_string();
+            assert!(error.contains("lies outside it") && error.contains("solution"), "{error}");
+        }
+        let folders = of(solution()).elsewhere(false).unwrap();
+        assert_eq!(folders, [PathBuf::from("/home/x/solution")], "one's own computer");
+    }
+}

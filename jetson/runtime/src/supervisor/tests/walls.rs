@@ -1,0 +1,162 @@
+//! Attacks from within: what a plugin tries that was possible once.
+
+use std::fs;
+use std::os::unix::net::UnixListener;
+
+use super::*;
+
+/// Whether this computer gives cells; without them these tests say so, and pass.
+fn has_cells() -> bool {
+    let why = Confinement::prepare(&PluginLimits::default(), &[]).unsealed();
+    if let Some(why) = &why {
+        println!("skipped: {why}");
+    }
+    why.is_none()
+}
+
+fn graded() -> PluginLimits {
+    PluginLimits { graded: true, ..PluginLimits::default() }
+}
+
+#[test]
+fn it_sees_no_other_process_and_no_home() {
+    if !has_cells() {
+        return;
+    }
+    let home = std::env::home_dir().unwrap();
+    let private = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in(&home).unwrap();
+    let program = format!(
+        "
+import os, socket
+print([int(p) for p in os.listdir('/proc') if p.isdigit()])
+print(os.listdir('/tmp'), os.listdir('/dev/shm'), [n for n in os.listdir({home:?}) if 'vizflyt-test' in n])
+print(socket.gethostname() != '', os.listdir('/sys/class/net') and open('/proc/net/dev').read().count(':'))"
+    );
+    let (output, _) = python(&graded(), &program);
+    let lines: Vec<&str> = output.lines().collect();
+    assert_eq!(&lines[..2], ["[1, 2]", "[] [] []"], "{output}");
+    assert_eq!(lines[2], "True 1", "its network is `lo` alone");
+    drop(private);
+}
+
+#[test]
+fn a_daemon_that_it_leaves_behind_ends_with_it() {
+    let (_, sentence) = to_the_end(&["sh", "-c", "setsid sleep 1000.125 & sleep 0.2"]);
+    assert!(sentence.contains("exit status 0"), "{sentence}");
+    if has_cells() {
+        until_gone("1000.125");
+    }
+}
+
+#[test]
+fn other_programs_services_cannot_be_reached() {
+    let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/tmp").unwrap();
+    let path = folder.path().join("service");
+    let _service = UnixListener::bind(&path).unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    fs::set_permissions(folder.path(), open).unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    fs::set_permissions(&path, open).unwrap();
+    let program = format!("import socket; socket.socket(socket.AF_UNIX).connect({path:?})");
+    let (_, sentence) = python(&PluginLimits::default(), &program);
+    assert!(sentence.contains("Network is unreachable"), "{sentence}");
+    if has_cells() {
+        let limits = PluginLimits { network: true, ..PluginLimits::default() };
+        let (_, sentence) = python(&limits, &program);
+        assert!(sentence.contains("No such file"), "{sentence}");
+    }
+}
+
+#[test]
+fn it_changes_no_other_process_and_makes_no_namespaces() {
+    let program = "
+import ctypes, os, resource
+libc = ctypes.CDLL(None, use_errno=True)
+def call(name, *arguments):
+    ctypes.set_errno(0)
+    result = getattr(libc, name)(*arguments)
+    print(name, 'passed' if result >= 0 else os.strerror(ctypes.get_errno()))
+def refused(name, act):
+    try:
+        act(); print(name, 'passed')
+    except PermissionError as error:
+        print(name, error.strerror)
+parent = os.getppid()
+refused('prlimit', lambda: resource.prlimit(parent, resource.RLIMIT_CPU, (1, 1)))
+refused('setpriority', lambda: os.setpriority(os.PRIO_PROCESS, parent, 19))
+call('syscall', 56, 0x10000000 | 0x40000000 | 17, 0, 0, 0, 0)
+call('syscall', 435, 0, 0)
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0)); print('own limits')";
+    let program = if cfg!(target_arch = "aarch64") {
+        program.replace("'syscall', 56", "'syscall', 220")
+    } else {
+        program.to_owned()
+    };
+    let (output, _) = python(&PluginLimits::default(), &program);
+    let expected = "prlimit Operation not permitted\nsetpriority Operation not permitted\n\
+                    syscall Operation not permitted\nsyscall Function not implemented\nown limits";
+    assert_eq!(output, expected);
+}
+
+#[test]
+fn a_graded_flight_begins_with_nothing_and_leaves_nothing() {
+    let folder = tempfile::tempdir_in("/var/tmp").unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+    fs::set_permissions(folder.path(), open).unwrap();
+    let script = folder.path().join("plugin.py");
+    let program = "
+import os
+print(os.path.exists('/tmp/left'), os.path.exists('/dev/shm/left'), os.getcwd())
+for path in ('/tmp/left', '/dev/shm/left'): open(path, 'w').write('x')
+print(sorted(name for name in os.environ if 'SECRET' in name or name.startswith('CARGO')))
+open('left', 'w')";
+    fs::write(&script, program).unwrap();
+    for _ in 0..2 {
+        let command = ["python3", script.to_str().unwrap()];
+        let (lines, sentence) = to_the_end_with(&graded(), &command);
+        if has_cells() {
+            let lines: Vec<&str> = lines.iter().map(|(_, line)| line.as_str()).collect();
+            let expected = format!("False False {}", folder.path().display());
+            assert_eq!(&lines[..2], [&expected[..], "[]"], "{sentence}");
+            assert!(sentence.contains("Read-only file system"), "{sentence}");
+        }
+        assert!(!folder.path().join("left").exists());
+    }
+}
+
+#[test]
+fn memory_of_all_that_it_starts_counts() {
+    if !has_cells() {
+        return;
+    }
+    let limits = PluginLimits { memory_mb: 200, ..PluginLimits::default() };
+    let program = "
+import os, time
+for _ in range(4):
+    if os.fork() == 0:
+        os.setsid()
+        held = bytearray(b'x') * 100_000_000
+        time.sleep(1000)
+time.sleep(1000)";
+    let (_, sentence) = python(&limits, program);
+    assert!(sentence.contains("more than its 200 MB of memory"), "{sentence}");
+    let (output, sentence) = python(&limits, "open('/dev/shm/x', 'wb').write(bytes(60_000_000))");
+    assert!(sentence.contains("No space left on device"), "{output} {sentence}");
+}
+
+#[test]
+fn a_tool_is_run_to_its_end_and_no_longer() {
+    let confinement = Confinement::prepare(&PluginLimits::default(), &[]);
+    let shell = |script: &str| {
+        let mut shell = confinement.command("sh");
+        shell.args(["-c", script]).stdout(Stdio::piped()).stderr(Stdio::piped());
+        shell
+    };
+    let output = confinement.run(shell("echo out; echo err >&2; exit 3"), WAIT).unwrap();
+    assert_eq!((&output.stdout[..], &output.stderr[..]), (&b"out\n"[..], &b"err\n"[..]));
+    assert_eq!(output.status.code(), Some(3));
+    let soon = Duration::from_millis(300);
+    let error = confinement.run(shell("sleep 1000.25"), soon).unwrap_err();
+    assert_eq!(error.kind(), io::ErrorKind::TimedOut, "{error}");
+    until_gone("1000.25");
+}
