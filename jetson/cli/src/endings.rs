@@ -91,7 +91,12 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
     let vehicle = VehicleFlight::new(0, "vizflyt", info.clone());
     let at = |ns: u64| HostTime::from_ns(ns);
     let stamp = |ns: u64| ServerTime::from_ns(ns + AHEAD_NS);
-    let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let settings = FlightSettings {
+        ready_within_s: 20.0,
+        time_limit_s: 0.0,
+        limits: Limits::NONE,
+        slip_seed: 7,
+    };
     let mut flight = Flight::new(settings, at(0));
     flight.handle(at(0), FlightInput::Arena(Box::new(info)));
     flight.handle(at(0), FlightInput::PluginReady);

@@ -1,6 +1,7 @@
 //! Starts everything, flies, reports.
 
 use std::fs;
+use std::hash::{BuildHasher, RandomState};
 use std::io::Read;
 use std::net::SocketAddr;
 use std::process;
@@ -103,6 +104,7 @@ pub fn fly_command(
             ready_within_s: if args.attach { 0.0 } else { args.ready_within },
             time_limit_s: args.seconds,
             limits: args.limits,
+            slip_seed: RandomState::new().hash_one(()),
         },
         waits_for_start: args.wait,
         to_autopilot: Box::new(move |bytes| port.send(bytes)),

@@ -245,7 +245,9 @@ impl ArenaConfig {
 
     /// Returns what plugins may ask for.
     pub fn setpoints(&self) -> SetpointKinds {
-        let allowed = self.rules.setpoints.unwrap_or(SetpointKinds::USUAL);
+        let usual =
+            if self.ground_truth { SetpointKinds::USUAL } else { SetpointKinds::BY_OWN_SENSES };
+        let allowed = self.rules.setpoints.unwrap_or(usual);
         if self.attitude_rate { allowed.with(SetpointKind::AttitudeRate) } else { allowed }
     }
 

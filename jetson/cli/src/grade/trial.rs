@@ -234,6 +234,7 @@ impl<'a> Flight<'a> {
             ready_within_s: READY_WITHIN_S,
             time_limit_s: 0.0,
             limits: Limits::NONE,
+            slip_seed: trial.seed,
         };
         let info = arena.info();
         let (splats, objects) = (&trial.course.splats, &trial.course.objects[..]);

@@ -28,7 +28,8 @@ use std::f64::consts::TAU;
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::protocol::geometry::{wrap_pi, yaw_of};
 use vizflyt_sdk::{
-    ArenaInfo, Autonomy, CameraImage, Event, EventKind, Observation, Setpoint, Vehicle, YawTarget,
+    ArenaInfo, Autonomy, Axes, CameraImage, Event, EventKind, Observation, Setpoint, Vehicle,
+    YawTarget,
 };
 
 use color_class::ColorClass;
@@ -160,8 +161,12 @@ impl Race {
             + (self.setpoint_mps - self.odometry.v_mps).clamp_length_max(MAX_LEAD_MPS);
         self.setpoint_mps = from_mps + (wanted_mps - from_mps).clamp_length_max(SLEW_MPS2 * dt_s);
         let home_yaw_rad = self.home_yaw_rad.unwrap_or(0.0);
-        let v_world_mps = DQuat::from_rotation_z(home_yaw_rad) * self.setpoint_mps;
-        Setpoint::velocity(v_world_mps, YawTarget::Angle(wrap_pi(look_rad + home_yaw_rad)))
+        let heading_from_home = DQuat::from_rotation_z(home_yaw_rad - yaw_of(vehicle.attitude));
+        Setpoint::Velocity {
+            v_mps: heading_from_home * self.setpoint_mps,
+            axes: Axes::Heading,
+            yaw: YawTarget::Angle(wrap_pi(look_rad + home_yaw_rad)),
+        }
     }
 
     /// Takes an image in: what it shows, and from where.

@@ -22,7 +22,12 @@ fn at(ms: u64) -> HostTime {
 }
 
 fn companion(ground_truth: bool) -> Companion {
-    let settings = FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let settings = FlightSettings {
+        ready_within_s: 60.0,
+        time_limit_s: 0.0,
+        limits: Limits::NONE,
+        slip_seed: 7,
+    };
     let mut companion =
         Companion::new(at(0), settings, LinkSettings::default(), ServerClock::same());
     companion.handle_arena(at(0), Box::new(arena(ground_truth)));

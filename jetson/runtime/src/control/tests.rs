@@ -50,8 +50,12 @@ fn arena(ground_truth: bool) -> ArenaInfo {
 impl Drivers {
     /// Makes both at `now`, in the same arena, each with a plugin that is ready.
     fn new(now: HostTime, arena: &ArenaInfo) -> Self {
-        let settings =
-            FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+        let settings = FlightSettings {
+            ready_within_s: 60.0,
+            time_limit_s: 0.0,
+            limits: Limits::NONE,
+            slip_seed: 7,
+        };
         let mut lockstep = Lockstep::new(now, arena, settings, None, REPLY_NS);
         assert!(matches!(lockstep.companion.poll_plugin(), Some(ToPlugin::Start(_))));
         lockstep.companion.upload_fence(now);
@@ -182,13 +186,16 @@ impl Drivers {
 }
 
 /// What the plugin asks for in reply to image `seq`: one of everything.
-fn setpoint(seq: u64) -> Option<Setpoint> {
+fn setpoint(seq: u64, axes: Axes) -> Option<Setpoint> {
     let yaw = YawTarget::Keep;
     match seq / 40 % 5 {
         0 => None,
-        1 => Some(Setpoint::Velocity { v_mps: DVec3::X, axes: Axes::World, yaw }),
-        2 => Some(Setpoint::Position { p_world_m: DVec3::new(1.0, -1.0, 1.5), yaw }),
-        3 => Some(Setpoint::Velocity { v_mps: DVec3::NAN, axes: Axes::World, yaw }),
+        1 => Some(Setpoint::Velocity { v_mps: DVec3::X, axes, yaw }),
+        2 if axes == Axes::World => {
+            Some(Setpoint::Position { p_world_m: DVec3::new(1.0, -1.0, 1.5), yaw })
+        }
+        2 => Some(Setpoint::Offset { d_m: DVec3::new(0.5, -0.5, 0.0), axes, yaw }),
+        3 => Some(Setpoint::Velocity { v_mps: DVec3::NAN, axes, yaw }),
         _ => Some(Setpoint::Hold),
     }
 }
@@ -217,7 +224,8 @@ fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
         if tick.is_multiple_of(IMAGE_TICKS) {
             seq += 1;
             drivers.check_senses();
-            drivers.image(now, seq, setpoint(seq));
+            let axes = if ground_truth { Axes::World } else { Axes::Heading };
+            drivers.image(now, seq, setpoint(seq, axes));
         }
         for datagram in drivers.turn(now) {
             simulation.handle_mavlink(0, &datagram);

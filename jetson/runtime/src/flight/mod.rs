@@ -45,6 +45,8 @@ pub struct FlightSettings {
     pub time_limit_s: f64,
     /// This vehicle's own limits; of them and the arena's, the stricter wins.
     pub limits: Limits,
+    /// Another in each flight, and secret: where places slip that a plugin gives without knowing the pose.
+    pub slip_seed: u64,
 }
 
 impl FlightSettings {

@@ -106,7 +106,7 @@ impl Flight {
         let Some(took_off_at) = self.took_off_at else { return };
         let risen_m = vehicle.p_world_m.z - self.start_z_m;
         if risen_m >= REACHED * arena.takeoff_height_m {
-            self.guard = Some(Guard::new(arena, vehicle, now));
+            self.guard = Some(Guard::new(arena, vehicle, now, self.settings.slip_seed));
             self.unanswered = None;
             self.enter(now, FlightPhase::Flying, "the plugin flies");
         } else if now.seconds_since(took_off_at) > CLIMB_WITHIN_S {

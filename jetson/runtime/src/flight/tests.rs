@@ -49,7 +49,8 @@ pub(crate) fn arena() -> ArenaInfo {
 impl Script {
     fn new() -> Self {
         let now = HostTime::from_ns(1_000_000_000);
-        let settings = FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: OWN };
+        let settings =
+            FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: OWN, slip_seed: 7 };
         Self {
             flight: Flight::new(settings, now),
             now,

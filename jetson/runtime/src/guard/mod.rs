@@ -15,6 +15,7 @@
 
 mod fence;
 mod limits;
+mod slip;
 #[cfg(test)]
 mod tests;
 mod velocity;
@@ -30,6 +31,7 @@ use vizflyt_protocol::time::HostTime;
 
 use fence::Fence;
 pub use limits::check_arena;
+use slip::Slip;
 use velocity::Resolved;
 
 /// The motion of the vehicle at one instant, as localization gives it.
@@ -160,6 +162,8 @@ pub struct Guard {
     setpoint: Option<Setpoint>,
     /// `setpoint` in the world, once the vehicle's position was known.
     resolved: Resolved,
+    /// How it slips, where the course withholds the pose.
+    slip: Option<Slip>,
     /// Where the vehicle was when the plugin took over. [m, world]
     take_off_z_m: f64,
     allowed: SetpointKinds,
@@ -177,8 +181,9 @@ pub struct Guard {
 }
 
 impl Guard {
-    /// Makes the guard of a flight in `arena` that takes over the vehicle at `now`.
-    pub fn new(arena: &ArenaInfo, vehicle: &VehicleMotion, now: HostTime) -> Self {
+    /// Makes the guard of a flight in `arena` that takes over the vehicle at `now`. Of `slip_seed` depends where places
+    /// slip that a plugin gives without knowing the pose.
+    pub fn new(arena: &ArenaInfo, vehicle: &VehicleMotion, now: HostTime, slip_seed: u64) -> Self {
         let max_acceleration_mps2 = limits::acceleration_within_tilt_mps2(&arena.limits);
         Self {
             fence: Fence::new(arena, max_acceleration_mps2),
@@ -190,6 +195,7 @@ impl Guard {
             hold_point_m: None,
             setpoint: None,
             resolved: Resolved::Nothing,
+            slip: (!arena.ground_truth).then(|| Slip::new(slip_seed)),
             take_off_z_m: vehicle.p_world_m.z,
             allowed: arena.setpoints,
             pose_ages: arena.pose_ages,
@@ -218,6 +224,9 @@ impl Guard {
         if let Some(asked) = SetpointKind::of(&setpoint).filter(|&kind| !allowed.contains(kind)) {
             return Err(InvalidSetpoint::NotAllowed { asked, allowed });
         }
+        if self.slip.is_some() && setpoint.is_in_world_axes() {
+            return Err(InvalidSetpoint::WorldAxes);
+        }
         let goes_on = match (&setpoint, &self.resolved, &self.setpoint) {
             (Setpoint::Trajectory(new), Resolved::Path(follower), _) => {
                 *new == *follower.trajectory()
@@ -228,6 +237,7 @@ impl Guard {
         };
         if !goes_on {
             self.resolved = Resolved::Nothing;
+            self.slip.iter_mut().for_each(Slip::restart);
         }
         self.setpoint = Some(setpoint);
         self.setpoint_at = now;
@@ -275,6 +285,7 @@ impl Guard {
     pub fn tick(&mut self, now: HostTime, vehicle: &VehicleMotion) -> (GuardOutput, GuardMode) {
         let dt_s = now.seconds_since(self.ticked_at).clamp(0.0, MAX_TICK_S);
         self.ticked_at = now;
+        self.slip.iter_mut().for_each(|slip| slip.advance(vehicle.p_world_m));
         let mode = self.mode(now, vehicle);
         let v_target = match mode {
             GuardMode::Landing(reason) => {

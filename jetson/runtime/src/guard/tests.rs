@@ -185,7 +185,7 @@ proptest! {
         (arena.floor_z_m, arena.no_fly) = (floor_z_m, no_fly.iter().copied().collect());
         // It could do more than it may.
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
-        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), time(0));
+        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), time(0), 7);
         let mut v_before = DVec3::ZERO;
         let mut tick = 0;
         for (setpoint, ticks) in asked {
@@ -254,7 +254,7 @@ fn at_rest(tick: usize) -> VehicleMotion {
 }
 
 fn guard() -> Guard {
-    Guard::new(&arena(room(), 3.0, 4.0), &at_rest(0), time(0))
+    Guard::new(&arena(room(), 3.0, 4.0), &at_rest(0), time(0), 7)
 }
 
 fn velocity(v_mps: DVec3) -> Setpoint {
@@ -343,7 +343,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
     let mut arena = arena(room(), 3.0, 4.0);
     let pillar = Volume::aabb(DVec3::new(1.0, -0.5, 0.0), DVec3::new(1.5, 0.4, 4.0));
     arena.no_fly.push(pillar).unwrap();
-    let mut guard = Guard::new(&arena, &at_rest(0), time(0));
+    let mut guard = Guard::new(&arena, &at_rest(0), time(0), 7);
     let inside = VehicleMotion { p_world_m: DVec3::new(0.95, 0.0, 2.0), ..at_rest(1) };
     let (output, mode) = guard.tick(time(1), &inside);
     assert_eq!(output, GuardOutput::Land);
@@ -352,7 +352,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
         "{mode:?}"
     );
     // Straight at it: it stops before it. Past its edge: it goes round.
-    let mut guard = Guard::new(&arena, &at_rest(0), time(0));
+    let mut guard = Guard::new(&arena, &at_rest(0), time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let mut fly = |v_mps, ticks: std::ops::Range<usize>| {
         for tick in ticks {
@@ -372,7 +372,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
 fn a_plugin_does_not_fly_into_the_floor() {
     // The fence reaches below it, as every arena's does: vehicles land there.
     let deep = Volume::aabb(DVec3::new(-5.0, -3.0, -0.5), DVec3::new(5.0, 3.0, 4.0));
-    let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), time(0));
+    let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     for tick in 1..200 {
         guard.handle_setpoint(time(tick), velocity(DVec3::new(0.2, 0.0, -3.0))).unwrap();
@@ -540,7 +540,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
     };
     let mut strict = arena(room(), 3.0, 4.0);
     strict.setpoints = SetpointKinds::USUAL;
-    let mut forbidden = Guard::new(&strict, &at_rest(0), time(0));
+    let mut forbidden = Guard::new(&strict, &at_rest(0), time(0), 7);
     let allowed = SetpointKinds::USUAL;
     let refused = InvalidSetpoint::NotAllowed { asked: SetpointKind::AttitudeRate, allowed };
     assert_eq!(forbidden.handle_setpoint(time(1), rates(0.0, 1.0)), Err(refused));
@@ -566,7 +566,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
 fn only_what_the_course_allows_is_flown() {
     let mut course = arena(room(), 3.0, 4.0);
     course.setpoints = [SetpointKind::Position].into_iter().collect();
-    let mut guard = Guard::new(&course, &at_rest(0), time(0));
+    let mut guard = Guard::new(&course, &at_rest(0), time(0), 7);
     let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
     assert_eq!(guard.handle_setpoint(time(1), position), Ok(()));
     let refused =
@@ -577,6 +577,39 @@ fn only_what_the_course_allows_is_flown() {
     for always in [Setpoint::Hold, Setpoint::TakeOff, Setpoint::Land] {
         assert_eq!(guard.handle_setpoint(time(3), always), Ok(()));
     }
+}
+
+#[test]
+fn without_the_pose_places_count_from_the_vehicle_and_slip() {
+    let mut course = arena(room(), 3.0, 4.0);
+    (course.ground_truth, course.setpoints) = (false, SetpointKinds::BY_OWN_SENSES);
+    let fly = |seed| {
+        let mut guard = Guard::new(&course, &at_rest(0), time(0), seed);
+        let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
+        let d_m = DVec3::X * 2.0;
+        let ahead = Setpoint::Offset { d_m, axes: Axes::Heading, yaw: YawTarget::Keep };
+        for tick in 1..600 {
+            // Given once: what comes anew counts from where the vehicle is then.
+            if tick == 1 {
+                guard.handle_setpoint(time(tick), ahead.clone()).unwrap();
+            }
+            guard.setpoint_at = time(tick);
+            vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
+        }
+        vehicle.p_m
+    };
+    let goal_m = at_rest(0).p_world_m + DQuat::from_rotation_z(0.3) * DVec3::X * 2.0;
+    let missed: Vec<f64> = (0..6).map(|seed| (fly(seed) - goal_m).length()).collect();
+    assert!(missed.iter().all(|missed_m| (0.001..0.04).contains(missed_m)), "{missed:?}");
+    assert_ne!(fly(1), fly(2));
+
+    let mut guard = Guard::new(&course, &at_rest(0), time(0), 7);
+    let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
+    let refused = guard.handle_setpoint(time(1), position).unwrap_err();
+    assert!(matches!(refused, InvalidSetpoint::NotAllowed { .. }), "{refused}");
+    let refused = guard.handle_setpoint(time(1), velocity(DVec3::X)).unwrap_err();
+    assert_eq!(refused, InvalidSetpoint::WorldAxes);
+    assert!(refused.to_string().contains("give axes \"heading\""), "{refused}");
 }
 
 #[test]

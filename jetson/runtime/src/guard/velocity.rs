@@ -7,6 +7,7 @@ use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
 use vizflyt_protocol::messages::{Axes, Setpoint, YawTarget};
 
 use super::limits::GRAVITY_MPS2;
+use super::slip::Slip;
 use super::{Guard, HoldReason, STOPPED_MPS, VehicleMotion};
 use crate::trajectory::{Follower, Start};
 
@@ -81,7 +82,7 @@ impl Guard {
             }
             Some(&Setpoint::Offset { d_m, axes, yaw }) => {
                 let p_m = self.resolved_point(vehicle.p_world_m + in_world(d_m, axes));
-                (self.velocity_towards(vehicle, p_m), yaw)
+                (self.velocity_towards(vehicle, p_m + self.slip_m()), yaw)
             }
             Some(&Setpoint::TakeOff) => {
                 let p_m = self.resolved_point(vehicle.p_world_m.with_z(self.take_off_z_m));
@@ -111,6 +112,11 @@ impl Guard {
         }
         self.resolved = Resolved::Point(p_m);
         p_m
+    }
+
+    /// Returns by how much the place in force has slipped. [m, world]
+    fn slip_m(&self) -> DVec3 {
+        self.slip.as_ref().map_or(DVec3::ZERO, Slip::slip_m)
     }
 
     /// Returns the velocity that an acceleration of `a_mps2` leads to. [m/s, world]
@@ -149,13 +155,15 @@ impl Guard {
     /// Returns the velocity that follows the path, and the heading on it. [m/s, world]
     fn follow_path(&mut self, vehicle: &VehicleMotion, dt_s: f64) -> (DVec3, YawTarget) {
         let limits = (self.max_speed_mps, self.max_acceleration_mps2);
+        let slip_m = self.slip_m();
         let (reference, is_over) = match &mut self.resolved {
             Resolved::Path(follower) => {
-                (follower.advance(vehicle.p_world_m, limits, dt_s), follower.is_over())
+                (follower.advance(vehicle.p_world_m - slip_m, limits, dt_s), follower.is_over())
             }
             _ => return (DVec3::ZERO, YawTarget::Keep),
         };
-        let v_mps = reference.v_world_mps + self.velocity_towards(vehicle, reference.p_world_m);
+        let p_world_m = reference.p_world_m + slip_m;
+        let v_mps = reference.v_world_mps + self.velocity_towards(vehicle, p_world_m);
         (v_mps, if is_over { YawTarget::Keep } else { reference.yaw })
     }
 

@@ -72,6 +72,8 @@ impl SetpointKinds {
     pub const NONE: Self = Self(0);
     /// All but attitude rates: the default of a course.
     pub const USUAL: Self = Self(0b10_1111);
+    /// The default of a course that withholds the pose: what a vehicle flies by its own senses.
+    pub const BY_OWN_SENSES: Self = Self(0b10_1110);
     /// Every one.
     pub const ALL: Self = Self(0b11_1111);
 

@@ -130,12 +130,30 @@ pub enum InvalidSetpoint {
         /// What may be.
         allowed: SetpointKinds,
     },
+    /// It is given in the world's axes, and the course withholds the pose.
+    #[error(
+        "this course withholds the vehicle's pose, so setpoints count from the vehicle; give axes \"heading\" or \
+         \"body\""
+    )]
+    WorldAxes,
 }
 
 impl Setpoint {
     /// Returns a velocity setpoint in world axes.
     pub fn velocity(v_world_mps: DVec3, yaw: YawTarget) -> Self {
         Self::Velocity { v_mps: v_world_mps, axes: Axes::World, yaw }
+    }
+
+    /// Whether it counts in the world's axes; a heading does not matter.
+    pub fn is_in_world_axes(&self) -> bool {
+        match self {
+            Self::Position { .. } => true,
+            Self::Velocity { axes, .. }
+            | Self::Acceleration { axes, .. }
+            | Self::Offset { axes, .. } => *axes == Axes::World,
+            Self::Trajectory(trajectory) => trajectory.axes == Axes::World,
+            Self::Hold | Self::Land | Self::TakeOff | Self::AttitudeRate { .. } => false,
+        }
     }
 
     /// Checks that every number in it is finite, and that a trajectory can be followed.

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::messages::SetpointKinds;
+use vizflyt_protocol::messages::{SetpointKind, SetpointKinds};
 
 use super::validate::{ConfigError, check_number, check_position, invalid};
 use super::{ArenaConfig, Geofence};
@@ -82,6 +82,12 @@ impl ArenaConfig {
         if rules.setpoints == Some(SetpointKinds::NONE) {
             let advice = "name one kind or more, or leave it out".to_owned();
             return Err(invalid("rules.setpoints", "[]", advice));
+        }
+        let asks_for_pose =
+            rules.setpoints.is_some_and(|kinds| kinds.contains(SetpointKind::Position));
+        if asks_for_pose && !self.ground_truth {
+            let advice = "flies by the pose, which ground_truth = false withholds".to_owned();
+            return Err(invalid("rules.setpoints", "position", advice));
         }
         let Some(start) = &rules.start_box else { return Ok(()) };
         check_position("rules.start_box.min_m", start.min_m)?;

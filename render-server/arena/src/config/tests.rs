@@ -50,6 +50,11 @@ fn rules_restrict_setpoints() {
     assert_eq!(ArenaConfig::parse(&positions.to_toml().unwrap()).unwrap(), positions);
     let none = with("rules = { setpoints = [] }").unwrap_err().to_string();
     assert!(none.contains("rules.setpoints") && none.contains("name one kind"), "{none}");
+    let blind = with("ground_truth = false").unwrap();
+    assert_eq!(blind.info().setpoints, SetpointKinds::BY_OWN_SENSES);
+    assert!(!blind.info().setpoints.contains(SetpointKind::Position));
+    let error = with("ground_truth = false\nrules = { setpoints = [\"position\"] }").unwrap_err();
+    assert!(error.to_string().contains("which ground_truth = false withholds"), "{error}");
     let unknown = with("rules = { setpoints = [\"speed\"] }").unwrap_err().to_string();
     assert!(unknown.contains("`velocity`"), "{unknown}");
 }

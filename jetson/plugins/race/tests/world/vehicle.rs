@@ -2,7 +2,7 @@
 
 use vizflyt_sdk::glam::{DMat3, DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::wrap_pi;
-use vizflyt_sdk::{Body, HostTime, Pose, Setpoint, Vehicle, World, YawTarget};
+use vizflyt_sdk::{Axes, Body, HostTime, Pose, Setpoint, Vehicle, World, YawTarget};
 
 pub(crate) const DT_S: f64 = 0.0025;
 const GRAVITY_MPS2: f64 = 9.81;
@@ -65,7 +65,10 @@ impl Quadrotor {
 
     pub(crate) fn advance(&mut self, setpoint: &Setpoint, tick: u64) {
         let (wanted_mps, yaw) = match *setpoint {
-            Setpoint::Velocity { v_mps, yaw, .. } => (v_mps, yaw),
+            Setpoint::Velocity { v_mps, axes: Axes::Heading, yaw } => {
+                (DQuat::from_rotation_z(self.yaw_rad) * v_mps, yaw)
+            }
+            Setpoint::Velocity { v_mps, axes: Axes::World, yaw } => (v_mps, yaw),
             _ => (DVec3::ZERO, YawTarget::Keep),
         };
         let before = self.attitude();

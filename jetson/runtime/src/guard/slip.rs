@@ -1,0 +1,93 @@
+//! How places that a plugin gave from where it was slip away under it, where the course withholds the pose.
+//!
+//! The guard knows the true pose, a vehicle in such a course does not: it would fly a metre forward by what its own
+//! cameras and IMU say, and such odometry is off by about a hundredth of the way. So that nobody flies better blind than
+//! by looking, places slip by [`SHARE`] of the way flown, to a side that is another in each flight and turns on the way.
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::wrap_pi;
+
+/// Share of the way flown.
+const SHARE: f64 = 0.01;
+/// The side turns once in so much of the way. [m]
+const TURN_M: f64 = 3.0;
+
+/// The slip of the place in force.
+#[derive(Clone, Debug)]
+pub(super) struct Slip {
+    /// Another in each flight.
+    seed: u64,
+    /// Since the flight began. [m]
+    way_m: f64,
+    last_m: Option<DVec3>,
+    /// Since the place was given. [m, world]
+    slip_m: DVec3,
+}
+
+impl Slip {
+    pub(super) fn new(seed: u64) -> Self {
+        Self { seed, way_m: 0.0, last_m: None, slip_m: DVec3::ZERO }
+    }
+
+    /// Takes note that the vehicle is at `p_world_m`.
+    pub(super) fn advance(&mut self, p_world_m: DVec3) {
+        let Some(last_m) = self.last_m.replace(p_world_m) else { return };
+        let step_m = (p_world_m - last_m).length();
+        self.way_m += step_m;
+        self.slip_m += self.side() * (SHARE * step_m);
+    }
+
+    /// A new place was given: it is where it is.
+    pub(super) fn restart(&mut self) {
+        self.slip_m = DVec3::ZERO;
+    }
+
+    /// Returns by how much the place in force has slipped. [m, world]
+    pub(super) fn slip_m(&self) -> DVec3 {
+        self.slip_m
+    }
+
+    /// Returns where to places slip now: level, as floor and barometer keep the height.
+    fn side(&self) -> DVec3 {
+        let turns = self.way_m / TURN_M;
+        let (from, to) = (self.angle_rad(turns.floor()), self.angle_rad(turns.floor() + 1.0));
+        let angle_rad = from + wrap_pi(to - from) * turns.fract();
+        DVec3::new(angle_rad.cos(), angle_rad.sin(), 0.0)
+    }
+
+    /// Returns an angle that nobody guesses without the seed (splitmix64: G. Steele, D. Lea and C. Flood, "Fast
+    /// splittable pseudorandom number generators", OOPSLA 2014).
+    fn angle_rad(&self, number: f64) -> f64 {
+        let mut x = self.seed.wrapping_add((number as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        x = (x ^ x >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        x = (x ^ x >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+        (x ^ x >> 31) as f64 / u64::MAX as f64 * std::f64::consts::TAU
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(seed: u64, way_m: f64) -> DVec3 {
+        let mut slip = Slip::new(seed);
+        for step in 0..=(way_m * 100.0) as u32 {
+            slip.advance(DVec3::new(f64::from(step) * 0.01, 0.0, 1.0));
+        }
+        slip.slip_m()
+    }
+
+    #[test]
+    fn places_slip_by_a_hundredth_of_the_way_to_a_side_that_nobody_knows() {
+        let slips: Vec<DVec3> = (0..40).map(|seed| after(seed, 2.0)).collect();
+        for slip_m in &slips {
+            assert!((0.002..=0.0201).contains(&slip_m.length()) && slip_m.z == 0.0, "{slip_m}");
+        }
+        let mean_m = slips.iter().sum::<DVec3>() / slips.len() as f64;
+        assert!(mean_m.length() < 0.008, "no side is likelier: {mean_m}");
+        assert_eq!(after(7, 2.0), after(7, 2.0));
+        let mut still = Slip::new(7);
+        (0..100).for_each(|_| still.advance(DVec3::Z));
+        assert_eq!(still.slip_m(), DVec3::ZERO, "who stands does not slip");
+    }
+}
