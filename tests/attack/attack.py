@@ -1,0 +1,200 @@
+"""Runs hostile submissions through `vizflyt grade` and `vizflyt fly`, and looks at what they got. See `run`."""
+
+import json
+import os
+import pathlib
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+
+VIZFLYT = sys.argv[1]
+HERE = pathlib.Path(__file__).resolve().parent
+VARIABLE = "VIZFLYT_ATTACK_SECRET"
+failures = []
+
+
+def check(name, holds, why=""):
+    print(f"{'ok  ' if holds else 'FAIL'}  {name}{'' if holds else f': {why}'}", flush=True)
+    if not holds:
+        failures.append(name)
+
+
+def run(*arguments, within_s=300):
+    environment = os.environ | {VARIABLE: "secret"}
+    return subprocess.run([VIZFLYT, *map(str, arguments)], capture_output=True, text=True, timeout=within_s,
+                          env=environment, check=False)
+
+
+def attempts(text):
+    """What the submission said of its attempts."""
+    return re.findall(r"attempt ([^\n]+?): (PASSED|refused)([^\n<]*)", text)
+
+
+def check_attempts(where, text, least):
+    found = attempts(text)
+    for name, how, more in found:
+        if how == "PASSED":
+            check(f"{where}: {name}", False, more)
+    check(f"{where}: {len(found)} attempts, all refused", len(found) >= least and
+          not any(how == "PASSED" for _, how, _ in found), text[-3000:] if len(found) < least else "")
+
+
+class Scene:
+    """A computer with things that are none of a submission's business."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.keys = folder / "keys"
+        # Somebody's file in their home, in a folder of their own that anybody may enter.
+        self.home = pathlib.Path.home() / f".vizflyt-attack-{os.getpid()}"
+        self.home.mkdir()
+        self.private = self.home / "private"
+        self.private.write_text("private")
+        self.private.chmod(0o644)
+        self.service = folder / "service"
+        self.unix = socket.socket(socket.AF_UNIX)
+        self.unix.bind(str(self.service))
+        self.unix.listen()
+        self.service.chmod(0o777)
+        self.tcp = socket.create_server(("127.0.0.1", 0))
+
+    def submission(self, name, graded, reports=()):
+        folder = self.folder / name
+        folder.mkdir()
+        shutil.copy(HERE / "submission.py", folder / "submission")
+        targets = {
+            "secrets": [str(self.private), str(self.keys / "grading.key"), "/etc/shadow"],
+            "variable": VARIABLE, "service": str(self.service), "port": self.tcp.getsockname()[1],
+            "homes": [str(self.home.parent)], "reports": [str(path) for path in reports], "graded": graded,
+        }
+        (folder / "targets.json").write_text(json.dumps(targets))
+        # What it may do by the rights of files alone is not what is tried here.
+        for path in (folder, *folder.iterdir()):
+            path.chmod(0o777)
+        return folder / "submission"
+
+    def close(self):
+        shutil.rmtree(self.home)
+
+
+def graded_flights(scene):
+    """Secrets, other processes, what outlives a flight."""
+    run("grade", "key", "--keys", scene.keys)
+    out = scene.folder / "out"
+    report, junit = out / "index.html", scene.folder / "grade.xml"
+    out.mkdir()
+    out.chmod(0o777)
+    program = scene.submission("graded", True, [report, junit])
+    done = run("grade", program, "--project", "p4", "--seeds", 2, "--jobs", 1, "--report", out, "--junit", junit,
+               "--keys", scene.keys, "--json")
+    check("grade: ends in order", done.returncode == 0, done.stderr)
+    text = "".join(path.read_text(errors="replace") for path in out.rglob("*.html"))
+    check_attempts("grade", text, 30)
+    before = {path: path.read_bytes() for path in (report, junit)}
+    time.sleep(6)
+    after = {path: path.read_bytes() for path in (report, junit)}
+    check("grade: no daemon changes what was written", before == after, "changed")
+    left = subprocess.run(["pgrep", "-f", str(program)], capture_output=True, text=True, check=False).stdout
+    check("grade: nothing of it runs on", not left, left)
+    grade = json.loads(done.stdout)
+    check("grade: it has no points", grade["summary"]["score"]["value"] < 50, grade["summary"])
+
+
+def lab_flight(scene):
+    """The same in the simulated lab, where a person's plugin is less confined."""
+    program = scene.submission("lab", False)
+    report = scene.folder / "lab.json"
+    done = run("fly", program, "--scene", "forest", "--headless", "--seconds", 5, "--ready-within", 20, "--report", report,
+               "--no-config", "--log-dir", scene.folder / "flights")
+    check_attempts("fly", done.stdout + done.stderr, 14)
+    check("fly: the runtime lives and reports", report.exists() and "without a report" not in done.stderr,
+          done.stderr[-2000:])
+
+
+def submissions_that_run_before_they_fly(scene):
+    """Code of a submission that a check or a build would run."""
+    spy = f"""
+import pathlib, socket
+found = []
+for path in {[str(scene.private), str(scene.keys / 'grading.key')]!r}:
+    try:
+        found.append(pathlib.Path(path).read_text())
+    except OSError:
+        pass
+try:
+    socket.create_connection(("127.0.0.1", {scene.tcp.getsockname()[1]}), 1)
+    found.append("network")
+except OSError:
+    pass
+mark = pathlib.Path({str(scene.folder / 'mark')!r})
+try:
+    mark.write_text(repr(found))
+except OSError:
+    pass
+print("SPY", found, flush=True)
+import sys
+print("SPY", found, file=sys.stderr, flush=True)
+"""
+    own = scene.folder / "own-python"
+    (own / ".venv/bin").mkdir(parents=True)
+    python = own / ".venv/bin/python3"
+    python.write_text(f"#!/usr/bin/python3\n{spy}\nsys.exit(1)\n")
+    python.chmod(0o755)
+    (own / "plugin.py").write_text("import vizflyt\n")
+    package = scene.folder / "own-package"
+    (package / "vizflyt").mkdir(parents=True)
+    (package / "vizflyt/__init__.py").write_text(spy)
+    (package / "plugin.py").write_text("import vizflyt\n")
+    rust = scene.folder / "own-build"
+    (rust / "src").mkdir(parents=True)
+    (rust / "Cargo.toml").write_text('[package]\nname = "own-build"\nversion = "0.1.0"\nedition = "2024"\n[workspace]\n')
+    (rust / "src/main.rs").write_text("fn main() {}\n")
+    tries = ", ".join(f'"{path}"' for path in (scene.private, scene.keys / "grading.key"))
+    (rust / "build.rs").write_text(f"""fn main() {{
+    let mut found: Vec<String> = [{tries}].iter().filter_map(|path| std::fs::read_to_string(path).ok()).collect();
+    if std::net::TcpStream::connect(("127.0.0.1", {scene.tcp.getsockname()[1]})).is_ok() {{
+        found.push("network".into());
+    }}
+    let _ = std::fs::write("{scene.folder / 'mark'}", "x");
+    panic!("SPY {{found:?}}");
+}}
+""")
+    cases = {"its own Python": own, "its own package": package}
+    if shutil.which("cargo"):
+        cases["its own build"] = rust
+    else:
+        print("skipped: its own build, for want of cargo")
+    for name, folder in cases.items():
+        for path in (scene.folder, *folder.rglob("*")):
+            path.chmod(0o755 if path.is_dir() or path.parent.name == "bin" else 0o644)
+        scene.folder.chmod(0o777)
+        done = run("grade", folder, "--project", "p4", "--seeds", 1, "--keys", scene.keys, "--json")
+        text = done.stdout + done.stderr
+        got = re.findall(r"SPY (\[[^\n]*\])", text)
+        check(f"grade: {name} finds nothing", all(found == "[]" for found in got), got)
+        check(f"grade: {name} leaves no mark", not (scene.folder / "mark").exists(), "it wrote outside")
+        if name != "its own package":
+            check(f"grade: {name} was run, in its cell", bool(got) or "cannot" in text, text[-1500:])
+
+
+def main():
+    folder = pathlib.Path(tempfile.mkdtemp(prefix="vizflyt-attack-", dir="/var/tmp"))
+    folder.chmod(0o777)
+    scene = Scene(folder)
+    try:
+        graded_flights(scene)
+        lab_flight(scene)
+        submissions_that_run_before_they_fly(scene)
+    finally:
+        scene.close()
+        shutil.rmtree(folder)
+    if failures:
+        sys.exit(f"{len(failures)} attacks passed: {', '.join(failures)}")
+    print("every attack was refused")
+
+
+main()
