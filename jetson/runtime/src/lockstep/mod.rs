@@ -11,7 +11,10 @@
 //! is decided depends on what goes in, not on how fast a computer is. Server and companion are one
 //! computer here: their clocks are one.
 
+mod own_time;
 mod process;
+#[cfg(test)]
+mod tests;
 
 use std::collections::VecDeque;
 

@@ -11,9 +11,10 @@ use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_sdk::ObservationTooLarge;
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 
+use super::own_time::{OwnTime, look};
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
 
-/// How long a plugin may take to attach and to load what it needs: models take their time.
+/// How much of its own time a plugin may take to attach and to load what it needs: models take their time.
 const READY_WITHIN: Duration = Duration::from_mins(5);
 
 /// How long the last lines of one that has ended are waited for.
@@ -34,6 +35,9 @@ pub enum ProcessError {
     /// The plugin failed.
     #[error("{0}")]
     Failed(Box<PluginFault>),
+    /// The plugin was lost to something that is not its doing.
+    #[error("{0}")]
+    Lost(String),
 }
 
 /// Receives the lines that the plugin prints.
@@ -45,12 +49,13 @@ pub struct PluginProcess {
     ipc: RuntimeEnd,
     supervisor: Supervisor,
     events: Receiver<PluginEvent>,
-    /// An answer, or the reading of an event, that takes longer is a failure.
+    /// An answer, or the reading of an event, that takes more of the plugin's own time is a failure.
     within: Duration,
 }
 
 impl PluginProcess {
-    /// Starts `command` (program, then arguments), confined as in flight by `limits`.
+    /// Starts `command` (program, then arguments), confined as in flight by `limits`. An answer may take `within` of the
+    /// plugin's own time: what it computes, and what it sleeps by its own choice.
     ///
     /// # Errors
     /// [`ProcessError::Start`] and [`ProcessError::Ipc`].
@@ -74,18 +79,24 @@ impl PluginProcess {
         Ok(Self { ipc, supervisor, events, within })
     }
 
-    /// Greets the plugin with `start` when it has attached, and waits until it is ready, five minutes
-    /// at most.
+    /// Returns the process id.
+    pub fn id(&self) -> u32 {
+        self.supervisor.id()
+    }
+
+    /// Greets the plugin with `start` when it has attached, and waits until it is ready, five minutes of its own
+    /// time at most.
     ///
     /// # Errors
-    /// [`ProcessError::Failed`] if it ends, gives up or takes longer.
+    /// [`ProcessError::Failed`] if it ends, gives up or takes longer; [`ProcessError::Lost`] if somebody else ends or
+    /// stops it.
     pub fn begin(&mut self, start: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
-        let deadline = Instant::now() + READY_WITHIN;
+        let mut time = OwnTime::new(Instant::now());
         while !self.ipc.plugin_attached() {
             if let Some(why) = self.pass_lines(line) {
-                return Err(failed(&why));
+                return Err(end_of(why));
             }
-            if Instant::now() > deadline {
+            if self.has_taken(&mut time, READY_WITHIN)? {
                 return Err(failed("the plugin did not attach within five minutes"));
             }
             thread::sleep(Duration::from_millis(2));
@@ -95,10 +106,11 @@ impl PluginProcess {
             match self.next(line)? {
                 Some(FromPlugin::Ready { .. }) => return Ok(()),
                 Some(FromPlugin::Failed { reason }) => return Err(failed(reason.as_str())),
-                None if Instant::now() > deadline => {
-                    return Err(failed("`on_start` did not return within five minutes"));
+                Some(FromPlugin::Reply { .. }) | None => {
+                    if self.has_taken(&mut time, READY_WITHIN)? {
+                        return Err(failed("`on_start` did not return within five minutes"));
+                    }
                 }
-                Some(FromPlugin::Reply { .. }) | None => {}
             }
         }
     }
@@ -108,21 +120,21 @@ impl PluginProcess {
     /// # Errors
     /// [`ProcessError::Failed`] if it has ended, or reads nothing.
     pub fn send(&mut self, message: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
-        let deadline = Instant::now() + self.within;
+        let mut time = OwnTime::new(Instant::now());
         loop {
             match self.ipc.send(message) {
                 // The end of one that is gone is noticed when the next image is not answered.
                 Ok(()) | Err(IpcError::Gone(_)) => return Ok(()),
-                Err(IpcError::QueueFull(_)) if Instant::now() < deadline => {
+                Err(IpcError::QueueFull(_)) => {
                     if let Some(why) = self.pass_lines(line) {
+                        return Err(end_of(why));
+                    }
+                    if self.has_taken(&mut time, self.within)? {
+                        let seconds = self.within.as_secs_f64();
+                        let why = format!("the plugin has read no event for {seconds:.0} s");
                         return Err(failed(&why));
                     }
                     thread::sleep(Duration::from_millis(2));
-                }
-                Err(IpcError::QueueFull(_)) => {
-                    let seconds = self.within.as_secs_f64();
-                    let why = format!("the plugin has read no event for {seconds:.0} s");
-                    return Err(failed(&why));
                 }
                 Err(error) => return Err(error.into()),
             }
@@ -140,7 +152,8 @@ impl PluginProcess {
     /// Publishes observation `seq` and waits for its answer.
     ///
     /// # Errors
-    /// [`ProcessError::Failed`] if the plugin ends, gives up or takes longer than it may.
+    /// [`ProcessError::Failed`] if the plugin ends, gives up or takes longer than it may; [`ProcessError::Lost`] if
+    /// somebody else ends or stops it.
     pub fn ask(
         &mut self,
         seq: u64,
@@ -148,7 +161,7 @@ impl PluginProcess {
         line: LineSink<'_>,
     ) -> Result<Option<Setpoint>, ProcessError> {
         self.ipc.publish(observation)?;
-        let deadline = Instant::now() + self.within;
+        let mut time = OwnTime::new(Instant::now());
         loop {
             match self.next(line)? {
                 Some(FromPlugin::Reply { seq: found, setpoint, .. }) if found == seq => {
@@ -157,12 +170,14 @@ impl PluginProcess {
                 Some(FromPlugin::Failed { reason }) => {
                     return Err(failed(&format!("the plugin failed: {reason}")));
                 }
-                None if Instant::now() > deadline => {
-                    let silent_s = self.within.as_secs_f64();
-                    let fault = PluginFault::NoAnswer { image: seq, silent_s };
-                    return Err(ProcessError::Failed(Box::new(fault)));
+                // Also one that sends anything but the answer.
+                Some(_) | None => {
+                    if self.has_taken(&mut time, self.within)? {
+                        let silent_s = self.within.as_secs_f64();
+                        let fault = PluginFault::NoAnswer { image: seq, silent_s };
+                        return Err(ProcessError::Failed(Box::new(fault)));
+                    }
                 }
-                Some(_) | None => {}
             }
         }
     }
@@ -185,6 +200,20 @@ impl PluginProcess {
         }
     }
 
+    /// Whether the plugin has taken so much of its own time; it is looked at now and then.
+    fn has_taken(&self, time: &mut OwnTime, within: Duration) -> Result<bool, ProcessError> {
+        if time.is_due(Instant::now()) {
+            let sample = look(self.supervisor.id());
+            // Reading it took time, too.
+            time.take(Instant::now(), sample);
+        }
+        if time.is_lost() {
+            let why = "the plugin was given no time for ten minutes: it was stopped, or this computer is overloaded";
+            return Err(ProcessError::Lost(why.to_owned()));
+        }
+        Ok(time.taken() > within)
+    }
+
     /// Returns the plugin's next message; `None` after a while.
     fn next(&mut self, line: LineSink<'_>) -> Result<Option<FromPlugin>, ProcessError> {
         if let Some(message) = self.receive()? {
@@ -195,7 +224,7 @@ impl PluginProcess {
         // Its messages before its end count.
         match (self.receive()?, ended) {
             (Some(message), _) => Ok(Some(message)),
-            (None, Some(why)) => Err(failed(&why)),
+            (None, Some(why)) => Err(end_of(why)),
             (None, None) => Ok(None),
         }
     }
@@ -220,6 +249,15 @@ impl PluginProcess {
         }
         ended
     }
+}
+
+/// Returns what the end of a plugin is. SIGKILL comes from the kernel that is short of memory, or from a person: a plugin
+/// beyond its own limits ends with another sentence.
+fn end_of(why: String) -> ProcessError {
+    if why.starts_with("the plugin was killed by SIGKILL") {
+        return ProcessError::Lost(why);
+    }
+    failed(&why)
 }
 
 fn failed(why: &str) -> ProcessError {
