@@ -4,7 +4,7 @@
 use std::fs;
 use std::io::Read;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -92,10 +92,16 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     let report = rig.at("merged");
     rig.good(&["merge", &parts[1], &parts[0], "-o", &whole, "--report", &report]);
     let page = fs::read_to_string(Path::new(&report).join("index.html")).unwrap();
-    assert!(page.contains("2 of 2") && !page.contains("class=\"card\""), "all finished: no card");
+    assert!(page.contains("2 of 2") && page.contains("report of the part that flew it"), "{page}");
     rig.good(&["verify", Path::new(&report).join("grade.json").to_str().unwrap()]);
-    let merged: Value = serde_json::from_str(&fs::read_to_string(&whole).unwrap()).unwrap();
-    assert_eq!(merged, one);
+    rig.good(&["verify", &report]);
+    let mut merged: Value = serde_json::from_str(&fs::read_to_string(&whole).unwrap()).unwrap();
+    for field in ["hash", "subject", "summary", "runs"] {
+        assert_eq!(merged[field], one[field]);
+    }
+    // But for the report's files.
+    assert!(merged.as_object_mut().unwrap().remove("files").is_some());
+    assert_eq!(merged.as_object().unwrap().len(), one.as_object().unwrap().len());
 
     // As signed; not after a change, and not with another's key.
     rig.good(&["verify", &whole]);
@@ -150,6 +156,233 @@ fn a_grader_that_is_stopped_for_seconds_gives_the_same_grade() {
     assert!(grader.wait().unwrap().success() && stops > 0, "{stops} stops: {output}");
     let graded: Value = serde_json::from_str(&output).unwrap();
     assert_eq!(graded["hash"], hash, "{graded:#}");
+}
+
+/// Starts a grader in the background.
+fn start(rig: &Rig, args: &[&str]) -> Child {
+    let keys = format!("--keys={}", rig.at("keys"));
+    let mut command = Command::new(vizflyt());
+    command.arg("grade").args(args).arg(keys).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command.spawn().unwrap()
+}
+
+/// Returns the children of a process.
+fn children(id: u32) -> Vec<Pid> {
+    let stat = |entry: std::io::Result<fs::DirEntry>| {
+        let stat = fs::read_to_string(entry.ok()?.path().join("stat")).ok()?;
+        let child = stat.split(' ').next()?.parse().ok()?;
+        let parent: u32 = stat.rsplit_once(") ")?.1.split(' ').nth(1)?.parse().ok()?;
+        (parent == id).then_some(Pid::from_raw(child))
+    };
+    fs::read_dir("/proc").unwrap().filter_map(stat).collect()
+}
+
+/// Waits for a plugin of the grader's.
+fn plugin_of(grader: &Child) -> Pid {
+    loop {
+        if let Some(plugin) = children(grader.id()).first() {
+            return *plugin;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// A plugin's limit is counted in its own time, not by the clock on the wall: one that somebody else stops for longer
+/// than an answer may take has the same grade.
+#[test]
+fn a_plugin_that_is_stopped_for_seconds_gives_the_same_grade() {
+    let rig = Rig::new();
+    let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
+    let hash = rig.grade(&args)["hash"].clone();
+    let within = [&args[..], &["--answer-within=1"]].concat();
+    let grader = start(&rig, &within);
+    let plugin = plugin_of(&grader);
+    // As it starts, and at any moment after; once together with the grader, which goes on first.
+    let id = Pid::from_raw(grader.id().cast_signed());
+    for (after_ms, also) in [(30, None), (700, None), (900, Some(id))] {
+        std::thread::sleep(Duration::from_millis(after_ms));
+        if kill(plugin, Signal::SIGSTOP).is_err() {
+            break;
+        }
+        also.map(|also| kill(also, Signal::SIGSTOP));
+        std::thread::sleep(Duration::from_millis(2300));
+        also.map(|also| kill(also, Signal::SIGCONT));
+        std::thread::sleep(Duration::from_millis(100));
+        kill(plugin, Signal::SIGCONT).unwrap();
+    }
+    let output = grader.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let graded: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(graded["hash"], hash, "{graded:#}");
+}
+
+/// What somebody else did to a plugin is no grade: the flight is flown again, and in the end nothing is graded.
+#[test]
+fn a_flight_that_is_lost_is_flown_again_and_never_graded() {
+    let rig = Rig::new();
+    let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
+    let hash = rig.grade(&args)["hash"].clone();
+    let grader = start(&rig, &args);
+    let plugin = plugin_of(&grader);
+    std::thread::sleep(Duration::from_millis(600));
+    kill(plugin, Signal::SIGKILL).unwrap();
+    let output = grader.wait_with_output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && errors.contains("flown again (1 of 2)"), "{errors}");
+    let graded: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(graded["hash"], hash, "{graded:#}");
+    let always = script(&rig, "always", "kill -9 $$");
+    rig.refused(&[&always, "--project=forest", "--seeds=1"], "not flown to its end in 3 attempts");
+}
+
+/// Keeps two processors busy until it is dropped.
+struct Load(Vec<Child>);
+
+impl Load {
+    fn new() -> Self {
+        let busy = || Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
+        Self((0..4).map(|_| busy()).collect())
+    }
+}
+
+impl Drop for Load {
+    fn drop(&mut self) {
+        for busy in &mut self.0 {
+            let _ = busy.kill();
+            let _ = busy.wait();
+        }
+    }
+}
+
+#[test]
+fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
+    let rig = Rig::new();
+    let args = ["avoid", "--project=forest", "--seeds=3", "--image-rate=10", "--json"];
+    let loaded = {
+        let _load = Load::new();
+        rig.grade(&[&args[..], &["--jobs=8"]].concat())
+    };
+    let report = rig.at("report");
+    let one = [&args[..], &["--jobs=1", "--report", &report]].concat();
+    let mut grader = start(&rig, &one);
+    let record = Path::new(&report).join("flights/day-1.json");
+    while !record.exists() {
+        assert!(grader.try_wait().unwrap().is_none(), "{:?}", grader.wait_with_output());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    grader.kill().unwrap();
+    grader.wait().unwrap();
+    let kept = fs::read_to_string(&record).unwrap();
+
+    // Nothing is lost by accident, and nothing else is taken for it.
+    rig.refused(&one, "--resume keeps them");
+    let resumed = [&one[..], &["--resume"]].concat();
+    let other = |args: &[&str], word: &str| {
+        rig.refused(&[&resumed[..], args].concat(), &format!("with another {word}"));
+    };
+    other(&["--answer-delay=11"], "time model");
+    other(&["--log=full"], "--log");
+    rig.refused(&[&["race"], &resumed[1..]].concat(), "with another plugin");
+    let p4: Vec<&str> = resumed
+        .iter()
+        .map(|arg| if arg.contains("forest") { "--project=p4" } else { arg })
+        .collect();
+    rig.refused(&p4, "with another project");
+    fs::write(&record, kept.replacen("\"score\": ", "\"score\": 1", 1)).unwrap();
+    rig.refused(&resumed, "was changed after it was written");
+    fs::write(&record, &kept).unwrap();
+    let log = Path::new(&report).join("logs/day-1.mcap");
+    let logged = fs::read(&log).unwrap();
+    fs::write(&log, "other").unwrap();
+    rig.refused(&resumed, "changed after it was written: logs/day-1.mcap");
+    fs::write(&log, logged).unwrap();
+
+    let output = rig.run(&resumed);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(errors.contains("of 3 flights are finished already and are kept"), "{errors}");
+    let grade: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&grade["hash"], &grade["runs"]), (&loaded["hash"], &loaded["runs"]));
+    assert_eq!(fs::read_to_string(&record).unwrap(), kept, "it was not flown again");
+    rig.good(&["verify", &report]);
+    // Once more: all are there.
+    assert_eq!(rig.grade(&resumed)["hash"], loaded["hash"]);
+    rig.good(&["verify", &report]);
+}
+
+#[test]
+fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
+    let rig = Rig::new();
+    let (report, junit) = (rig.at("report"), rig.at("grade.xml"));
+    let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=10", "--log=full"];
+    let outputs = ["--report", &report, "--junit", &junit];
+    rig.good(&[&args[..], &outputs].concat());
+    let at = |path: &str| Path::new(&report).join(path);
+    let printed = rig.good(&["verify", &report, "--junit", &junit]);
+    assert!(printed.contains("files are as signed"), "{printed}");
+
+    // A finished flight shows how it was won.
+    let page = fs::read_to_string(at("index.html")).unwrap();
+    for part in ["Flights that finished", "images/day-1-00.jpg", "logs/day-1.mcap", "<svg"] {
+        assert!(page.contains(part), "no {part}: {page}");
+    }
+    let images = fs::read_dir(at("images")).unwrap().count();
+    assert!((9..=17).contains(&images), "{images}");
+
+    // Whatever is changed, missing or added is named.
+    for path in
+        ["index.html", "junit.xml", "images/day-1-03.jpg", "logs/day-1.mcap", "flights/day-1.json"]
+    {
+        let bytes = fs::read(at(path)).unwrap();
+        let mut changed = bytes.clone();
+        let middle = changed.len() / 2;
+        changed[middle] ^= 1;
+        fs::write(at(path), changed).unwrap();
+        rig.refused(&["verify", &report], &format!("changed: {path}"));
+        fs::remove_file(at(path)).unwrap();
+        rig.refused(&["verify", &report], &format!("missing: {path}"));
+        fs::write(at(path), bytes).unwrap();
+    }
+    fs::write(at("images/day-1-99.jpg"), "").unwrap();
+    rig.refused(&["verify", &report], "added: images/day-1-99.jpg");
+    fs::remove_file(at("images/day-1-99.jpg")).unwrap();
+    rig.good(&["verify", &report]);
+    fs::write(&junit, fs::read_to_string(&junit).unwrap().replace("errors=\"0\"", "errors=\"1\""))
+        .unwrap();
+    rig.refused(&["verify", &report, "--junit", &junit], "is not the JUnit XML of this grade");
+    // The document alone still counts, wherever it is.
+    let printed = rig.good(&["verify", at("grade.json").to_str().unwrap()]);
+    assert!(printed.contains("were not looked at"), "{printed}");
+
+    // The log is the flight: another plugin's process answers the same.
+    let log = at("logs/day-1.mcap");
+    let answers = rig.at("answers.jsonl");
+    let output = Command::new(vizflyt())
+        .args(["replay", log.to_str().unwrap(), "--answers", &answers])
+        .output()
+        .unwrap();
+    let printed = String::from_utf8(output.stdout).unwrap();
+    assert!(
+        output.status.success() && printed.contains("are those of the flight, bit by bit"),
+        "{printed} {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+
+    // Again, without logs: the same flight, and the earlier report is gone.
+    let hash = |report: &str| {
+        let text = fs::read_to_string(Path::new(report).join("grade.json")).unwrap();
+        serde_json::from_str::<Value>(&text).unwrap()["hash"].clone()
+    };
+    let first = hash(&report);
+    rig.good(&[&args[..4], &["--log=none", "--report", &report]].concat());
+    rig.good(&["verify", &report]);
+    assert!(hash(&report) == first && !at("logs/day-1.mcap").exists());
+    // What lies in a report is signed, so nothing else may.
+    fs::write(at("notes.txt"), "").unwrap();
+    rig.refused(&[&args[..4], &["--report", &report]].concat(), "notes.txt");
+    fs::remove_file(at("notes.txt")).unwrap();
+    let inside = at("me.json");
+    let output = ["--report", &report, "-o", inside.to_str().unwrap()];
+    rig.refused(&[&args[..4], &output].concat(), "give another folder");
 }
 
 fn keys_of(rig: &Rig) -> String {

@@ -1,4 +1,5 @@
-//! Grades, as `vizflyt grade verify` and `merge` read them: nothing counts that was not signed as it is.
+//! Grades, as `vizflyt grade verify` and `merge` read them, and records of flights, as `--resume` does: nothing counts
+//! that was not signed as it is.
 #![no_main]
 use ed25519_dalek::SigningKey;
 use libfuzzer_sys::fuzz_target;
@@ -9,18 +10,52 @@ use libfuzzer_sys::fuzz_target;
 mod grade {
     pub(crate) mod document;
     pub(crate) mod merge;
+    pub(crate) mod record;
     mod statistics;
 }
-use grade::document::Grade;
+use grade::document::{DelaysMs, Grade};
 use grade::merge::merge;
+use grade::record::{FlightRecord, FlownWith, SealingKey};
+
+/// A record of a flight: whatever it says, only our own counts, and only whole.
+fn record(text: &str, read: &Grade) {
+    let sealing = |byte| SealingKey::of(&SigningKey::from_bytes(&[byte; 32]));
+    let (own, other) = (sealing(7), sealing(8));
+    let with = FlownWith::new(&read.subject, 10.0, "reduced");
+    let Some(run) = read.runs.first() else { return };
+    let mut run = run.clone();
+    run.round();
+    let record = FlightRecord::new(with.clone(), run, text.to_owned(), read.files.clone());
+    let sealed = record.to_text(&own).unwrap();
+    assert!(FlightRecord::parse(&sealed, &other, &with).is_err());
+    // Numbers beyond all that is flown have no text.
+    if let Ok(found) = FlightRecord::parse(&sealed, &own, &with) {
+        assert_eq!((&found.run, &found.card), (&record.run, &record.card));
+    }
+}
 
 fuzz_target!(|text: &str| {
+    let key = SealingKey::of(&SigningKey::from_bytes(&[7; 32]));
+    let with = FlownWith {
+        plugin: String::new(),
+        plugin_sha256: String::new(),
+        project: String::new(),
+        level: String::new(),
+        delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
+        program_sha256: String::new(),
+        renderer: String::new(),
+        answer_within_s: 10.0,
+        log: String::new(),
+    };
+    assert!(FlightRecord::parse(text, &key, &with).is_err());
     let Ok(read) = Grade::parse(text) else { return };
+    record(text, &read);
     let key = SigningKey::from_bytes(&[7; 32]);
     // Nobody has our key: what comes from outside does not count.
     let public = SigningKey::from_bytes(&[8; 32]).verifying_key();
     assert!(read.verify(&public).is_err());
     let mut own = Grade::new(read.subject.clone(), read.shard, read.runs.clone());
+    own.files.clone_from(&read.files);
     own.sign(&key).unwrap();
     own.verify(&key.verifying_key()).unwrap();
     let _ = own.median_finish_s();

@@ -37,6 +37,9 @@ pub(crate) struct Grade {
     pub summary: Summary,
     /// The flights, by variant and seed.
     pub runs: Vec<Run>,
+    /// All other files of the report's folder, by path; none without a report.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<SignedFile>,
     /// Over all of the above; absent before it is signed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signature: Option<Signed>,
@@ -133,6 +136,18 @@ pub(crate) struct Run {
     pub hash: String,
 }
 
+/// A file of a report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct SignedFile {
+    /// Relative to the report's folder, with `/`.
+    pub path: String,
+    /// Its size. [bytes]
+    pub bytes: u64,
+    /// SHA-256 of what it holds.
+    pub sha256: String,
+}
+
 /// The figures over all flights.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -170,6 +185,14 @@ impl Subject {
         self.variants
             .iter()
             .flat_map(move |variant| seeds.clone().map(move |seed| (variant.as_str(), seed)))
+    }
+}
+
+impl SignedFile {
+    /// Returns what is signed of a file that holds these bytes.
+    pub(crate) fn of(path: &str, bytes: &[u8]) -> Self {
+        let sha256 = hex(&Sha256::digest(bytes));
+        Self { path: path.to_owned(), bytes: bytes.len() as u64, sha256 }
     }
 }
 
@@ -213,6 +236,7 @@ impl Grade {
             subject,
             shard,
             runs,
+            files: Vec::new(),
             signature: None,
         }
     }
@@ -293,6 +317,7 @@ impl Grade {
         if let Some(Shard { index, count }) = grade.shard {
             ensure!(Shard::is_one(index, count), "{index}/{count} is no part");
         }
+        check_files(&grade.files)?;
         Ok(grade)
     }
 
@@ -307,10 +332,24 @@ impl Grade {
     }
 }
 
+/// Checks that each path stays in the report's folder, and is there once, in order.
+///
+/// # Errors
+/// The first that does not.
+pub(crate) fn check_files(files: &[SignedFile]) -> Result<()> {
+    for SignedFile { path, .. } in files {
+        let is_inside = path.split('/').all(|part| !matches!(part, "" | "." | ".."));
+        ensure!(is_inside && !path.contains('\0'), "{path:?} is no file of a report");
+    }
+    let is_sorted = files.windows(2).all(|pair| pair[0].path < pair[1].path);
+    ensure!(is_sorted, "its files are not in the order of their paths, each once");
+    Ok(())
+}
+
 impl Run {
     /// Rounds every number to a millionth: such numbers come back from any reader of JSON to the last
     /// bit, and the signature is over the text.
-    fn round(&mut self) {
+    pub(crate) fn round(&mut self) {
         let numbers = [&mut self.seconds, &mut self.penalty_s, &mut self.score];
         let others = [&mut self.max_speed_mps, &mut self.path_m].into_iter();
         let optional = self.stages.iter_mut().filter_map(|stage| stage.passed_s.as_mut());

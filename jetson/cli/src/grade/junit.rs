@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use vizflyt_protocol::messages::OutcomeKind;
 
 use super::document::Grade;
@@ -14,7 +14,22 @@ pub(crate) fn write(path: &Path, grade: &Grade) -> Result<()> {
     std::fs::write(path, text(grade)).with_context(|| format!("cannot write {}", path.display()))
 }
 
-fn text(grade: &Grade) -> String {
+/// Checks that a file is what [`write`] makes of a grade.
+///
+/// # Errors
+/// If it cannot be read, or is not.
+pub(crate) fn verify(path: &Path, grade: &Grade) -> Result<()> {
+    let found = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    ensure!(
+        found == text(grade).as_bytes(),
+        "{} is not the JUnit XML of this grade: it was changed, or another version wrote it",
+        path.display()
+    );
+    Ok(())
+}
+
+/// Returns what the file holds.
+pub(crate) fn text(grade: &Grade) -> String {
     let subject = &grade.subject;
     let (plugin, project) = (escape(&subject.plugin), escape(&subject.project));
     let failed = grade.summary.runs - grade.summary.finished;
@@ -69,5 +84,11 @@ mod tests {
             assert!(text.contains(part), "no {part} in {text}");
         }
         assert_eq!(text.matches("<testcase").count(), 2);
+        let file = tempfile::NamedTempFile::new().unwrap();
+        write(file.path(), &grade).unwrap();
+        verify(file.path(), &grade).unwrap();
+        std::fs::write(file.path(), text.replace("failures=\"1\"", "failures=\"0\"")).unwrap();
+        let error = verify(file.path(), &grade).unwrap_err().to_string();
+        assert!(error.contains("is not the JUnit XML of this grade"), "{error}");
     }
 }

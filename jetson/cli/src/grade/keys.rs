@@ -72,11 +72,14 @@ pub(crate) fn program_sha256() -> Result<String> {
     Ok(hex(&hash.finalize()))
 }
 
-/// Returns the SHA-256 over a plugin's files: names and contents, in the order of their names.
-pub(crate) fn plugin_sha256(path: &Path) -> Result<String> {
+/// Returns the SHA-256 over a plugin's files: names and contents, in the order of their names. What a grade itself writes
+/// is none of them, wherever it lies: `outputs`.
+pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
     let mut files = Vec::new();
     if path.is_dir() {
-        gather(path, &mut files)?;
+        let outputs: Vec<PathBuf> =
+            outputs.iter().filter_map(|output| output.canonicalize().ok()).collect();
+        gather(path, &outputs, &mut files)?;
         files.sort();
     } else {
         files.push(found(path));
@@ -105,7 +108,7 @@ fn found(name: &Path) -> PathBuf {
     places.find(|place| place.is_file()).unwrap_or_else(|| name.to_owned())
 }
 
-fn gather(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
+fn gather(folder: &Path, outputs: &[PathBuf], files: &mut Vec<PathBuf>) -> Result<()> {
     let entries = fs::read_dir(folder).with_context(|| format!("{}", folder.display()))?;
     for entry in entries {
         let entry = entry.with_context(|| format!("{}", folder.display()))?;
@@ -114,9 +117,14 @@ fn gather(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
         if name.starts_with('.') || LEFT_ASIDE.contains(&name.as_ref()) {
             continue;
         }
+        if !outputs.is_empty()
+            && entry.path().canonicalize().is_ok_and(|path| outputs.contains(&path))
+        {
+            continue;
+        }
         // A link is what it leads to, but not a way out or round: links to folders are left aside.
         if kind.is_dir() {
-            gather(&entry.path(), files)?;
+            gather(&entry.path(), outputs, files)?;
         } else if entry.path().is_file() {
             files.push(entry.path());
         }
@@ -166,11 +174,13 @@ mod tests {
         };
         write("plugin.py", "import vizflyt");
         write("lib/steer.py", "x = 1");
-        let hash = || plugin_sha256(folder.path()).unwrap();
+        let out = folder.path().join("out");
+        let hash = || plugin_sha256(folder.path(), &[&out]).unwrap();
         let first = hash();
         write("__pycache__/plugin.pyc", "1");
         write(".venv/lib/numpy.py", "2");
         write("target/release/plugin", "3");
+        write("out/flights/day-1.json", "4");
         assert_eq!(hash(), first);
         write("lib/steer.py", "x = 2");
         let second = hash();
@@ -178,7 +188,7 @@ mod tests {
         // The same bytes under another name are another plugin.
         fs::rename(folder.path().join("lib"), folder.path().join("lib2")).unwrap();
         assert_ne!(hash(), second);
-        assert_ne!(plugin_sha256(&folder.path().join("plugin.py")).unwrap(), first);
-        assert!(plugin_sha256(&folder.path().join("gone.py")).is_err());
+        assert_ne!(plugin_sha256(&folder.path().join("plugin.py"), &[]).unwrap(), first);
+        assert!(plugin_sha256(&folder.path().join("gone.py"), &[]).is_err());
     }
 }

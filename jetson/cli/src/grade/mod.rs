@@ -5,6 +5,7 @@
 //! project, level, variant, seed -> course  in memory: splats, arena, distance field
 //!                               -> trial   one flight in lock-step, a plugin process of its own
 //!                               -> vizflyt_arena::crash  what a failure probably was
+//! each flight                   -> folder    its card's images, its log, its record (record)
 //! flights                       -> document  figures, hash, signature -> report/, junit, JSON
 //! parts of a grade              -> merge     the whole
 //! ```
@@ -12,27 +13,31 @@
 
 mod course;
 mod document;
+mod folder;
 mod junit;
 mod keys;
 mod merge;
 mod pool;
 mod progress;
+mod record;
 mod report;
 mod statistics;
 mod trial;
 
+use std::collections::{BTreeSet, HashMap};
 use std::ffi::OsString;
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::available_parallelism;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
-use clap::{Args, Subcommand};
+use anyhow::{Context, Error, Result, bail, ensure};
+use clap::{Args, Subcommand, ValueEnum};
 use ed25519_dalek::SigningKey;
 use vizflyt_arena::crash::probable_cause;
+use vizflyt_runtime::log::LoggedImages;
 use vizflyt_runtime::supervisor::PluginLimits;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
@@ -40,9 +45,11 @@ use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
-use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, Subject, hex};
+use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, hex};
+use self::folder::{FLIGHTS, ReportFolder};
 use self::progress::Progress;
-use self::trial::{Delays, Trial, TrialResult};
+use self::record::{FlightRecord, FlownWith, SealingKey};
+use self::trial::{Delays, Trial, TrialLog, TrialResult};
 use crate::fly::plugin::Plugin;
 use crate::terminal::{print_error, print_line, stop_flag};
 
@@ -56,6 +63,8 @@ use crate::terminal::{print_error, print_line, stop_flag};
   vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        an eighth of the flights, on a cluster
   vizflyt grade merge *.json -o whole.json --report out           all eighths make the whole
   vizflyt grade verify whole.json                                 checks its signature
+  vizflyt grade verify out                                        and every file of a report
+  vizflyt grade ./first --project p4 --report out --resume        goes on where it was interrupted
 
 The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
 1 if --least was not reached.")]
@@ -106,9 +115,22 @@ struct FlyArgs {
     /// Wall-clock limit of one answer: a plugin that takes longer has failed
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     answer_within: f64,
-    /// Writes a report there: index.html, a crash card for each failure, grade.json
+    /// Writes a report there: index.html with a card for each flight, its images, flight logs, junit.xml, and
+    /// grade.json, which signs them all
     #[arg(long, value_name = "DIR")]
     report: Option<PathBuf>,
+    /// Keeps the finished flights of a grade that was interrupted, and flies the others
+    #[arg(long, requires = "report")]
+    resume: bool,
+    /// Images in the report's flight logs: as many as fit into 60 MB a minute, all, or no log
+    #[arg(
+        long,
+        value_name = "reduced|full|none",
+        value_enum,
+        default_value_t,
+        hide_possible_values = true
+    )]
+    log: GradeLog,
     /// Writes JUnit XML there
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -117,6 +139,33 @@ struct FlyArgs {
     least: Option<f64>,
     #[command(flatten)]
     result: ResultArgs,
+}
+
+/// What a report holds of flight logs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+enum GradeLog {
+    #[default]
+    Reduced,
+    Full,
+    None,
+}
+
+impl GradeLog {
+    fn images(self) -> Option<LoggedImages> {
+        match self {
+            Self::Reduced => Some(LoggedImages::Reduced),
+            Self::Full => Some(LoggedImages::Full),
+            Self::None => None,
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Reduced => "reduced",
+            Self::Full => "full",
+            Self::None => "none",
+        }
+    }
 }
 
 /// Where a grade goes, and who signs it.
@@ -135,10 +184,14 @@ struct ResultArgs {
 
 #[derive(Subcommand, Clone, Debug)]
 enum GradeCommand {
-    /// Verifies the signature of a grade; status 1 if it is not valid
+    /// Verifies the signature of a grade, and all files of a report; status 1 if anything was changed
     Verify {
-        /// The grade
+        /// The grade, or the folder of its report
+        #[arg(value_name = "FILE|DIR")]
         file: PathBuf,
+        /// Also checks that this JUnit XML is the grade's
+        #[arg(long, value_name = "FILE")]
+        junit: Option<PathBuf>,
         /// Accepted signer: a public key or a file with one [default: this computer's own]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
@@ -172,8 +225,17 @@ enum GradeCommand {
 pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
     match &args.command {
         None => grade(&args.fly),
-        Some(GradeCommand::Verify { file, key, keys }) => {
-            let grade = verified(file, key.as_deref(), keys.as_deref())?;
+        Some(GradeCommand::Verify { file, junit, key, keys }) => {
+            let is_folder = file.is_dir();
+            let document = if is_folder { file.join(folder::GRADE) } else { file.clone() };
+            let grade = verified(&document, key.as_deref(), keys.as_deref())?;
+            if is_folder {
+                let cannot = || format!("{} does not count", file.display());
+                folder::verify(file, &grade).with_context(cannot)?;
+            }
+            if let Some(path) = junit {
+                junit::verify(path, &grade)?;
+            }
             print_line(format!(
                 "{}: as signed with {}; score {:.1}, {} of {} finished",
                 file.display(),
@@ -182,21 +244,33 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
                 grade.summary.finished,
                 grade.summary.runs
             ));
+            match grade.files.len() {
+                0 => {}
+                count if is_folder => print_line(format!("all {count} files are as signed")),
+                count => print_line(format!(
+                    "the report's {count} files were not looked at: give its folder for that"
+                )),
+            }
             Ok(ExitCode::SUCCESS)
         }
         Some(GradeCommand::Merge { files, key, report, result }) => {
             let read = |path: &PathBuf| Ok((path.display().to_string(), Grade::read(path)?));
             let parts = files.iter().map(read).collect::<Result<Vec<_>>>()?;
             let key = keys::verifying_key(key.as_deref(), result.keys.as_deref())?;
-            let grade = signed(merge::merge(&parts, &key)?, result)?;
-            if let Some(folder) = report {
-                let failed = grade.runs.iter().filter(|run| run.cause.is_some());
-                let cards: Vec<String> = failed.map(report::card::without_images).collect();
-                report::write(folder, &grade, &cards)?;
+            let mut grade = merge::merge(&parts, &key)?;
+            check_outputs(report.as_deref(), result, None)?;
+            let folder = report.as_deref().map(ReportFolder::begin).transpose()?;
+            let key = keys::signing_key(result.keys.as_deref())?;
+            if let Some(folder) = &folder {
+                let cards: Vec<String> =
+                    grade.runs.iter().map(report::card::without_images).collect();
+                report::write(folder, &mut grade, &key, &cards, Vec::new())?;
+            } else {
+                grade.sign(&key)?;
             }
             hand_over(&grade, result)?;
             if let (Some(folder), false) = (report, result.json) {
-                print_line(format!("report      {}", folder.join("index.html").display()));
+                print_line(format!("report      {}", folder.join(folder::PAGE).display()));
             }
             Ok(ExitCode::SUCCESS)
         }
@@ -221,7 +295,8 @@ pub(crate) fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> R
 
 /// Flies, judges, reports.
 fn grade(args: &FlyArgs) -> Result<ExitCode> {
-    let plugin = Plugin::find(args.plugin.as_deref().context("no plugin is named")?)?;
+    let typed = args.plugin.as_ref().context("no plugin is named")?;
+    let plugin = Plugin::find(typed)?;
     let project = CourseProject::named(&args.project)?;
     let delays = delays(args)?;
     let subject = subject(args, &plugin, &project)?;
@@ -231,6 +306,8 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         .filter(|(index, _)| args.shard.is_none_or(|shard| shard.holds(*index)))
         .map(|(_, (variant, seed))| Ok((variant.parse()?, seed)))
         .collect::<Result<_>>()?;
+    let answer_within = Duration::try_from_secs_f64(args.answer_within)
+        .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
     let stop: &AtomicBool = &*stop_flag(false)?;
     // What a plugin of the same user could read, forge or look up: keys, our memory (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
@@ -238,24 +315,35 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let hide = vec![keys.file("")];
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
     let command = plugin.command(&limits)?;
-    let answer_within = Duration::try_from_secs_f64(args.answer_within)
-        .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
-    let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<Done>> {
+    let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
+    let report = Report::open(args, flown_with, &flights)?;
+    let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<FlightDone>> {
+        if let Some(done) = report.as_ref().and_then(|report| report.kept(variant, seed)) {
+            return Ok(Some(done));
+        }
         let named = || format!("seed {seed}, {variant}");
         let course =
             CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
         let limits = PluginLimits { map: course.map.clone(), ..limits.clone() };
         let (course, command, limits) = (&course, &command[..], &limits);
-        let trial = Trial { course, seed, command, limits, answer_within, delays, stop };
-        let Some(flown) = trial.fly().with_context(named)? else { return Ok(None) };
-        let run = run_of(course, &delays, seed, variant, &flown);
-        let card = match (&args.report, &run.cause) {
-            (Some(folder), Some(_)) => {
-                Some(report::card::write(folder, &course.arena, &course.field, &run, &flown)?)
+        let attempt = || -> Result<Option<FlightDone>> {
+            let images = report.as_ref().and_then(|report| Some((report, args.log.images()?)));
+            let file = images.map(|(report, _)| report.folder.nameless()).transpose()?;
+            let log = file.as_ref().zip(images).map(|(file, (_, images))| TrialLog {
+                file,
+                images,
+                plugin: typed,
+            });
+            let trial = Trial { course, seed, command, limits, answer_within, delays, stop, log };
+            let Some(flown) = trial.fly()? else { return Ok(None) };
+            let run = run_of(course, &delays, seed, variant, &flown);
+            let mut done = FlightDone { virtual_s: flown.virtual_s, ..FlightDone::of(run) };
+            if let Some(report) = &report {
+                report.write(course, &flown, file.as_ref(), &mut done)?;
             }
-            _ => None,
+            Ok(Some(done))
         };
-        Ok(Some(Done { run, card, virtual_s: flown.virtual_s }))
+        again_if_lost(attempt, stop, &named()).with_context(named)
     };
     let jobs =
         args.jobs.unwrap_or_else(|| available_parallelism().unwrap_or(NonZero::<usize>::MIN));
@@ -263,33 +351,208 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let done =
         pool::run(&flights, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
     progress.end();
-    let Some(done) = done? else {
-        print_error("ended on request; nothing is graded");
+    let resumed = match &report {
+        Some(_) => "; --resume keeps the flights that are finished",
+        None => "",
+    };
+    let done = done.with_context(|| format!("nothing is graded{resumed}"))?;
+    let Some(done) = done else {
+        print_error(format_args!("ended on request; nothing is graded{resumed}"));
         return Ok(ExitCode::FAILURE);
     };
-    let (runs, cards): (Vec<Run>, Vec<Option<String>>) =
-        done.into_iter().map(|done| (done.run, done.card)).unzip();
-    let grade = signed(Grade::new(subject, args.shard, runs), &args.result)?;
-    if let Some(folder) = &args.report {
-        let cards: Vec<String> = cards.into_iter().flatten().collect();
-        report::write(folder, &grade, &cards)?;
+    let mut runs = Vec::with_capacity(done.len());
+    let (mut cards, mut files) = (HashMap::new(), Vec::new());
+    for FlightDone { run, card, files: own, .. } in done {
+        cards.insert((run.variant.clone(), run.seed), card);
+        files.extend(own);
+        runs.push(run);
+    }
+    let mut grade = Grade::new(subject, args.shard, runs);
+    // No plugin runs any more.
+    let key: SigningKey = keys::signing_key(args.result.keys.as_deref())?;
+    if let Some(report) = &report {
+        let card = |run: &Run| cards.remove(&(run.variant.clone(), run.seed)).unwrap_or_default();
+        let cards: Vec<String> = grade.runs.iter().map(card).collect();
+        report::write(&report.folder, &mut grade, &key, &cards, files)?;
+    } else {
+        grade.sign(&key)?;
     }
     if let Some(path) = &args.junit {
         junit::write(path, &grade)?;
     }
     hand_over(&grade, &args.result)?;
     if let (Some(folder), false) = (&args.report, args.result.json) {
-        print_line(format!("report      {}", folder.join("index.html").display()));
+        print_line(format!("report      {}", folder.join(folder::PAGE).display()));
     }
     let is_enough = args.least.is_none_or(|least| grade.summary.score.value >= least);
     Ok(if is_enough { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
+/// A flight is flown so often at most, where it fails for another reason than the plugin's.
+const ATTEMPTS: u32 = 3;
+/// So long after the first failure; longer after the second.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// Tries a flight again that failed for another reason than the plugin's: no memory, a process that somebody else
+/// killed. That is no grade; so it must not become one.
+fn again_if_lost<T>(
+    attempt: impl Fn() -> Result<Option<T>>,
+    stop: &AtomicBool,
+    named: &str,
+) -> Result<Option<T>> {
+    for tried in 1..ATTEMPTS {
+        let error: Error = match attempt() {
+            Ok(done) => return Ok(done),
+            Err(error) => error,
+        };
+        print_error(format_args!("{named}: {error:#}; flown again ({tried} of {})", ATTEMPTS - 1));
+        let until = Instant::now() + PAUSE * tried;
+        while Instant::now() < until && !stop.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+    }
+    attempt().with_context(|| format!("not flown to its end in {ATTEMPTS} attempts"))
+}
+
 /// A flight that was flown and judged.
-struct Done {
+#[derive(Clone)]
+struct FlightDone {
     run: Run,
-    card: Option<String>,
+    /// Its card, as HTML; empty without a report.
+    card: String,
+    /// What lies of it in the report.
+    files: Vec<SignedFile>,
+    /// Flown now: 0 if it is kept of an interrupted grade. [s]
     virtual_s: f64,
+}
+
+impl FlightDone {
+    fn of(mut run: Run) -> Self {
+        // As it will be signed, and so as it is written.
+        run.round();
+        Self { run, card: String::new(), files: Vec::new(), virtual_s: 0.0 }
+    }
+}
+
+/// The report while flights are flown.
+struct Report {
+    folder: ReportFolder,
+    flown_with: FlownWith,
+    key: SealingKey,
+    /// Flights of the grade that was interrupted.
+    kept: HashMap<(String, u64), FlightDone>,
+}
+
+impl Report {
+    /// Opens the report's folder, if there is to be one.
+    fn open(
+        args: &FlyArgs,
+        flown_with: FlownWith,
+        flights: &[(Variant, u64)],
+    ) -> Result<Option<Self>> {
+        let Some(root) = &args.report else { return Ok(None) };
+        check_outputs(Some(root), &args.result, args.junit.as_deref())?;
+        let folder =
+            if args.resume { ReportFolder::resume(root)? } else { ReportFolder::begin(root)? };
+        // The grading key itself stays where it is until the last plugin has ended.
+        let key = SealingKey::of(&keys::signing_key(args.result.keys.as_deref())?);
+        let mut report = Self { folder, flown_with, key, kept: HashMap::new() };
+        let mut there = BTreeSet::new();
+        for (variant, seed) in flights.iter().filter(|_| args.resume) {
+            let path = format!("{FLIGHTS}/{variant}-{seed}.json");
+            let text = match std::fs::read_to_string(report.folder.at(&path)) {
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
+                text => text.with_context(|| format!("cannot read {path}"))?,
+            };
+            let done = report.read(&path, &text, *variant, *seed);
+            let done = done
+                .with_context(|| format!("{} cannot be kept", report.folder.at(&path).display()))?;
+            there.extend(done.files.iter().map(|file| file.path.clone()));
+            report.kept.insert((variant.to_string(), *seed), done);
+        }
+        let other: Vec<String> =
+            report.folder.records()?.into_iter().filter(|path| !there.contains(path)).collect();
+        ensure!(
+            other.is_empty(),
+            "{} holds flights that are not asked for ({}): give the same seeds, variants and part, or another folder",
+            root.display(),
+            folder::list(&other)
+        );
+        report.folder.keep_only(&there)?;
+        if !report.kept.is_empty() {
+            print_error(format_args!(
+                "{} of {} flights are finished already and are kept",
+                report.kept.len(),
+                flights.len()
+            ));
+        }
+        Ok(Some(report))
+    }
+
+    fn read(&self, path: &str, text: &str, variant: Variant, seed: u64) -> Result<FlightDone> {
+        let record = FlightRecord::parse(text, &self.key, &self.flown_with)?;
+        let (run, card, mut files) = (record.run, record.card, record.files);
+        if (&*run.variant, run.seed) != (&*variant.to_string(), seed) {
+            bail!("it is the record of seed {}, {}", run.seed, run.variant);
+        }
+        self.folder.check(&files)?;
+        files.push(SignedFile::of(path, text.as_bytes()));
+        Ok(FlightDone { card, files, ..FlightDone::of(run) })
+    }
+
+    /// Returns a flight of the grade that was interrupted.
+    fn kept(&self, variant: Variant, seed: u64) -> Option<FlightDone> {
+        self.kept.get(&(variant.to_string(), seed)).cloned()
+    }
+
+    /// Writes what a flight leaves: images, log, and its record when they are on the medium.
+    fn write(
+        &self,
+        course: &CourseInstance,
+        flown: &TrialResult,
+        log: Option<&std::fs::File>,
+        done: &mut FlightDone,
+    ) -> Result<()> {
+        let (folder, run) = (&self.folder, &done.run);
+        let CourseInstance { arena, field, .. } = course;
+        let has_log = log.is_some();
+        let (card, mut files) = report::card::write(folder, arena, field, run, flown, has_log)?;
+        if let Some(log) = log {
+            files.push(folder.write_file(&report::card::log_path(run), log)?);
+        }
+        let files = folder::sorted(files);
+        let with = self.flown_with.clone();
+        let record = FlightRecord::new(with, run.clone(), card.clone(), files.clone());
+        let path = format!("{FLIGHTS}/{}.json", report::card::name(run));
+        let record = folder.write(&path, record.to_text(&self.key)?.as_bytes())?;
+        (done.card, done.files) = (card, files);
+        done.files.push(record);
+        Ok(())
+    }
+}
+
+/// Checks that what else is written does not lie in the report's folder, where all is signed.
+fn check_outputs(report: Option<&Path>, result: &ResultArgs, junit: Option<&Path>) -> Result<()> {
+    let Some(root) = report else { return Ok(()) };
+    let made = std::fs::create_dir_all(root).and_then(|()| root.canonicalize());
+    let root = made.with_context(|| format!("cannot make {}", root.display()))?;
+    let outputs = [("--output", result.output.as_deref(), folder::GRADE)];
+    for (option, path, own) in outputs.into_iter().chain([("--junit", junit, folder::JUNIT)]) {
+        let Some(path) = path else { continue };
+        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new(".")).canonicalize();
+        let Ok(parent) = parent else { continue };
+        let is_own = parent == root && path.file_name() == Some(own.as_ref());
+        ensure!(
+            is_own || !parent.starts_with(&root),
+            "{option} {}: all that lies in a report is signed, and it holds {own} already; give another folder",
+            path.display()
+        );
+    }
+    Ok(())
 }
 
 fn delays(args: &FlyArgs) -> Result<Delays> {
@@ -313,9 +576,11 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<S
         variants.push(variant);
     }
     let tenth = |ms: f64| (ms * 10.0).round() / 10.0;
+    let outputs = [&args.report, &args.junit, &args.result.output];
+    let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
     Ok(Subject {
         plugin: plugin.name().to_string_lossy().into_owned(),
-        plugin_sha256: keys::plugin_sha256(&plugin.watched())?,
+        plugin_sha256: keys::plugin_sha256(&plugin.watched(), &outputs)?,
         project: project.name().to_owned(),
         level: args.level.to_string(),
         variants,
@@ -359,13 +624,6 @@ fn run_of(
         rules_sha256: course.rules_sha256.clone(),
         hash: hex(&flown.hash),
     }
-}
-
-/// Signs a grade. The key is read only now that no plugin runs any more.
-fn signed(mut grade: Grade, args: &ResultArgs) -> Result<Grade> {
-    let key: SigningKey = keys::signing_key(args.keys.as_deref())?;
-    grade.sign(&key)?;
-    Ok(grade)
 }
 
 /// Prints a grade, and writes it where it was asked for.

@@ -13,6 +13,7 @@
 
 use std::collections::VecDeque;
 use std::ffi::OsString;
+use std::fs::File;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -24,12 +25,15 @@ use vizflyt_arena::pose::{Measured, Predict};
 use vizflyt_arena::verdict::{Sample, Verdict, judge_ended};
 use vizflyt_arena::{ArenaConfig, Referee};
 use vizflyt_protocol::flight_end::FlightEnd;
+use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Setpoint};
+use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
 use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
+use vizflyt_runtime::log::{GivenImage, LoggedImages, VirtualLog};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
@@ -68,6 +72,18 @@ pub(crate) struct Trial<'a> {
     pub delays: Delays,
     /// Ends it.
     pub stop: &'a AtomicBool,
+    /// Where it is logged, if it is.
+    pub log: Option<TrialLog<'a>>,
+}
+
+/// Where a flight is logged.
+pub(crate) struct TrialLog<'a> {
+    /// An empty file.
+    pub file: &'a File,
+    /// Which images it keeps.
+    pub images: LoggedImages,
+    /// The plugin as the command line names it.
+    pub plugin: &'a OsString,
 }
 
 /// One image that the plugin was given, for the report.
@@ -98,6 +114,8 @@ pub(crate) struct TrialResult {
     pub seen: Vec<ClearanceAhead>,
     /// The newest images until the flight was decided.
     pub shots: VecDeque<TrialImage>,
+    /// Images from take-off until then, evenly spread.
+    pub keyframes: Vec<TrialImage>,
     /// The last lines that the plugin printed.
     pub lines: VecDeque<String>,
     /// Images that the plugin answered.
@@ -134,6 +152,10 @@ const POSES_PER_SENT: u64 = 2;
 const SHOWN_S: f64 = 2.0;
 /// The time between two of them. [s]
 const SHOT_PERIOD_S: f64 = 0.1;
+/// Images of a whole flight that the report shows, at most; at least half as many of any that takes a few seconds.
+const KEYFRAMES: usize = 16;
+/// Two of them are at least so far apart. [s]
+const KEYFRAME_PERIOD_S: f64 = 0.25;
 /// Lines of the plugin that are kept.
 const LINES: usize = 200;
 
@@ -148,9 +170,13 @@ impl Trial<'_> {
         let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
         let mut flight = Flight::new(self, process)?;
         let result = flight.run();
-        flight.lockstep.stop(&mut lines(&mut flight.lines));
+        flight.lockstep.stop(&mut flight.lines.sink());
+        flight.log_lines();
         if !result? {
             return Ok(None);
+        }
+        if let Some(log) = flight.lockstep.take_log() {
+            log.finish().context("the flight's log cannot be written")?;
         }
         Ok(Some(flight.end()))
     }
@@ -165,6 +191,8 @@ struct Pending {
     pose: ServerTime,
     /// What it shows.
     shown: ServerTime,
+    /// Where the vehicle is by then.
+    world_from_body: Pose<World, Body>,
     /// By camera; those not rendered this time are `None`.
     rendered: Vec<Option<Picture>>,
 }
@@ -191,6 +219,35 @@ impl Picture {
     }
 }
 
+impl Pending {
+    /// Returns what the log says of each camera's image.
+    fn headers(&self, cameras: &[CameraInfo]) -> Vec<ImageHeader> {
+        let header = |(index, camera): (usize, &CameraInfo)| {
+            let CameraInfo { intrinsics, body_from_cam, .. } = camera;
+            let camera = index as u8;
+            let of = (intrinsics, body_from_cam, &self.world_from_body);
+            let mut header = ImageHeader::new(self.seq, camera, self.pose, of.0, of.1, of.2);
+            header.exposure_ns = self.shown.as_ns().into();
+            header
+        };
+        cameras.iter().enumerate().map(header).collect()
+    }
+
+    /// Returns the images that were rendered, for the log.
+    fn given<'a>(
+        &'a self,
+        cameras: &'a [CameraInfo],
+        headers: &'a [ImageHeader],
+    ) -> Vec<GivenImage<'a>> {
+        let pose = HostTime::from_ns(self.pose.as_ns());
+        let given = |((camera, header), picture): ((&'a CameraInfo, _), &'a Option<Picture>)| {
+            let Picture { rgb, depth_mm, .. } = picture.as_ref()?;
+            Some(GivenImage { header, name: camera.name.as_str(), pose, rgb, depth_mm })
+        };
+        cameras.iter().zip(headers).zip(&self.rendered).filter_map(given).collect()
+    }
+}
+
 struct Flight<'a> {
     trial: &'a Trial<'a>,
     arena: &'a ArenaConfig,
@@ -212,7 +269,8 @@ struct Flight<'a> {
     seen: Vec<ClearanceAhead>,
     scratch: Vec<u16>,
     shots: VecDeque<TrialImage>,
-    lines: VecDeque<String>,
+    keyframes: Keyframes,
+    lines: Lines,
     answered: u64,
     /// How it ends, by all that happened so far.
     end: FlightEnd,
@@ -241,12 +299,21 @@ impl<'a> Flight<'a> {
         let renderer = CpuRenderer::new(Scene { splats, objects });
         let mut hash = Sha256::new();
         hash.update(renderer.name().as_bytes());
+        let mut lockstep =
+            Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns);
+        if let Some(TrialLog { file, images, plugin }) = &trial.log {
+            let log = file
+                .try_clone()
+                .map_err(anyhow::Error::from)
+                .and_then(|file| Ok(VirtualLog::new(file, *images, plugin, now)?));
+            lockstep.set_log(log.context("the flight's log cannot be written")?);
+        }
         Ok(Self {
             trial,
             arena,
             cameras: info.cameras.to_vec(),
             simulation,
-            lockstep: Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns),
+            lockstep,
             referee: Referee::new(arena, trial.course.obstacles.clone())
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
@@ -263,15 +330,29 @@ impl<'a> Flight<'a> {
             seen: Vec::new(),
             scratch: Vec::new(),
             shots: VecDeque::new(),
-            lines: VecDeque::new(),
+            keyframes: Keyframes::default(),
+            lines: Lines::default(),
             answered: 0,
             end: FlightEnd::default(),
         })
     }
 
+    /// Logs what the plugin has printed since the last call.
+    fn log_lines(&mut self) {
+        let Some(log) = self.lockstep.log() else { return self.lines.fresh.clear() };
+        for (stream, text) in self.lines.fresh.drain(..) {
+            let stream = match stream {
+                Stream::Stdout => "stdout",
+                Stream::Stderr => "stderr",
+            };
+            log.line(self.now, stream, &text, self.seq);
+        }
+    }
+
     /// Flies to the end; false if it is stopped.
     fn run(&mut self) -> Result<bool> {
-        self.lockstep.begin(self.now, &mut lines(&mut self.lines))?;
+        self.lockstep.begin(self.now, &mut self.lines.sink())?;
+        self.log_lines();
         loop {
             if self.trial.stop.load(Ordering::Relaxed) {
                 return Ok(false);
@@ -336,6 +417,9 @@ impl<'a> Flight<'a> {
             if self.poses.is_multiple_of(POSES_PER_SENT) {
                 let stamp = HostTime::from_ns(sample.stamp.as_ns());
                 self.lockstep.companion.handle_pose(self.now, &sample, stamp);
+                if let Some(log) = self.lockstep.log() {
+                    log.pose(self.now, stamp, &sample);
+                }
             }
         }
         let now = self.server_now();
@@ -398,7 +482,8 @@ impl<'a> Flight<'a> {
         }
         self.seq += 1;
         let (due, pose, shown) = (self.now.plus_ns(image_ns), sample.stamp, exposure.at);
-        self.pending.push_back(Pending { due, seq: self.seq, pose, shown, rendered });
+        let (seq, world_from_body) = (self.seq, exposure.world_from_body);
+        self.pending.push_back(Pending { due, seq, pose, shown, world_from_body, rendered });
         Ok(())
     }
 
@@ -420,7 +505,12 @@ impl<'a> Flight<'a> {
             }
         };
         let (now, seq) = (self.now, pending.seq);
-        let reply = self.lockstep.show(now, seq, cameras, write, &mut lines(&mut self.lines))?;
+        let headers = pending.headers(cameras);
+        let images = pending.given(cameras, &headers);
+        let mut line = self.lines.sink();
+        let reply = self.lockstep.show(now, seq, cameras, write, &images, &mut line)?;
+        drop(line);
+        self.log_lines();
         let Some(reply) = reply else { return Ok(()) };
         self.answered += 1;
         self.hash.update(format!("{:?}", reply.setpoint).as_bytes());
@@ -439,13 +529,16 @@ impl<'a> Flight<'a> {
         self.asked.push(TimedSetpoint { stamp, setpoint });
         self.seen.push(ClearanceAhead { stamp, ahead_m });
         let (Some(picture), Some(k)) = (front, k) else { return };
+        let size_px = (k.width_px, k.height_px);
+        let image = || TrialImage { stamp: pending.shown, rgb: picture.rgb.clone(), size_px };
+        if self.is_airborne() {
+            self.keyframes.take(pending.shown, image);
+        }
         let is_due = self.shots.back().is_none_or(|shot| {
             pending.shown.seconds_since(shot.stamp) >= SHOT_PERIOD_S - 0.5 * 2.5e-3
         });
         if is_due {
-            let size_px = (k.width_px, k.height_px);
-            let rgb = picture.rgb.clone();
-            self.shots.push_back(TrialImage { stamp: pending.shown, rgb, size_px });
+            self.shots.push_back(image());
             while self.shots.front().is_some_and(|oldest| {
                 pending.shown.seconds_since(oldest.stamp) > SHOWN_S + 0.5 * SHOT_PERIOD_S
             }) {
@@ -454,7 +547,15 @@ impl<'a> Flight<'a> {
         }
     }
 
+    fn is_airborne(&self) -> bool {
+        let phase = self.lockstep.companion.flight().phase();
+        !matches!(phase, FlightPhase::Connecting | FlightPhase::Preparing)
+    }
+
     fn note(&mut self, event: Event) {
+        if let Some(log) = self.lockstep.log() {
+            log.event(self.now, &event);
+        }
         self.end.handle(event.stamp, &event.kind);
         self.hash.update(event.stamp.as_ns().to_le_bytes());
         self.hash.update(format!("{:?}", event.kind).as_bytes());
@@ -496,21 +597,89 @@ impl<'a> Flight<'a> {
             asked: self.asked,
             seen: self.seen,
             shots: self.shots,
-            lines: self.lines,
+            keyframes: self.keyframes.images,
+            lines: self.lines.kept,
             images: self.answered,
             virtual_s,
         }
     }
 }
 
-/// Hears what the plugin prints.
-fn lines(kept: &mut VecDeque<String>) -> impl FnMut(Stream, &str) {
-    move |_, text| keep(kept, text)
+/// What the plugin prints.
+#[derive(Debug, Default)]
+struct Lines {
+    /// The last lines.
+    kept: VecDeque<String>,
+    /// Those that are not logged yet.
+    fresh: Vec<(Stream, String)>,
 }
 
-fn keep(kept: &mut VecDeque<String>, text: &str) {
-    if kept.len() == LINES {
-        kept.pop_front();
+impl Lines {
+    /// Returns who hears them.
+    fn sink(&mut self) -> impl FnMut(Stream, &str) {
+        |stream, text| {
+            if self.kept.len() == LINES {
+                self.kept.pop_front();
+            }
+            self.kept.push_back(text.to_owned());
+            self.fresh.push((stream, text.to_owned()));
+        }
     }
-    kept.push_back(text.to_owned());
+}
+
+/// Images spread evenly over a flight, however long it takes.
+#[derive(Debug)]
+struct Keyframes {
+    images: Vec<TrialImage>,
+    period_s: f64,
+}
+
+impl Default for Keyframes {
+    fn default() -> Self {
+        Self { images: Vec::new(), period_s: KEYFRAME_PERIOD_S }
+    }
+}
+
+impl Keyframes {
+    /// Takes the image of this instant if one is due.
+    fn take(&mut self, stamp: ServerTime, image: impl FnOnce() -> TrialImage) {
+        let is_due = self
+            .images
+            .last()
+            .is_none_or(|last| stamp.seconds_since(last.stamp) >= self.period_s - 0.5 * 2.5e-3);
+        if !is_due {
+            return;
+        }
+        self.images.push(image());
+        if self.images.len() > KEYFRAMES {
+            let mut index = 0;
+            self.images.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.period_s *= 2.0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keyframes_are_spread_over_any_flight() {
+        for seconds in [3, 10, 60, 600] {
+            let mut keyframes = Keyframes::default();
+            for image in 0..seconds * 30 {
+                let stamp = ServerTime::from_ns(image * 33_333_333);
+                let image = || TrialImage { stamp, rgb: Vec::new(), size_px: (0, 0) };
+                keyframes.take(stamp, image);
+            }
+            let stamps: Vec<_> = keyframes.images.iter().map(|image| image.stamp).collect();
+            let gaps = || stamps.windows(2).map(|pair| pair[1].seconds_since(pair[0]));
+            let (least, most) = (gaps().reduce(f64::min), gaps().reduce(f64::max));
+            assert!((KEYFRAMES / 2..=KEYFRAMES).contains(&stamps.len()), "{seconds} s: {stamps:?}");
+            assert!(most.unwrap() < 1.4 * least.unwrap(), "{seconds} s: {least:?} {most:?}");
+        }
+    }
 }

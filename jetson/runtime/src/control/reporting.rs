@@ -3,13 +3,13 @@
 use std::io::Write;
 
 use serde_json::json;
-use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
-use vizflyt_protocol::messages::{Arrivals, Event, MAX_CAMERAS, Telemetry, YawTarget};
+use vizflyt_protocol::mavlink::GuidedSetpoint;
+use vizflyt_protocol::messages::{Arrivals, Event, MAX_CAMERAS, Telemetry};
 use vizflyt_protocol::time::HostTime;
 
 use super::ControlLoop;
 use crate::console::Status;
-use crate::log::Channel;
+use crate::log::{Channel, sent_message};
 
 /// The status line is renewed every so many ticks, a multiple of those of the reports: 2 Hz.
 const STATUS_TICKS: u64 = 25;
@@ -64,20 +64,9 @@ impl ControlLoop {
     }
 
     pub(super) fn log_sent(&self, now: HostTime, setpoint: &GuidedSetpoint) {
-        let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return };
-        let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
-            YawTarget::Angle(yaw_rad) => (Some(yaw_rad), None),
-            YawTarget::Rate(rate_radps) => (None, Some(rate_radps)),
-            YawTarget::Keep => (None, None),
-        };
-        self.control.log.write(
-            Channel::Sent,
-            now,
-            &json!({
-                "v_world_mps": v_mps.to_array(), "yaw_rad": yaw_rad,
-                "yaw_rate_radps": yaw_rate_radps
-            }),
-        );
+        if let Some(message) = sent_message(setpoint) {
+            self.control.log.write(Channel::Sent, now, &message);
+        }
     }
 }
 

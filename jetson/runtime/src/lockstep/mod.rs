@@ -18,13 +18,15 @@ mod tests;
 
 use std::collections::VecDeque;
 
-use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, Setpoint};
+use serde_json::json;
+use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, FromPlugin, Setpoint};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
 
 use crate::companion::{Companion, Senses};
 use crate::flight::FlightSettings;
 use crate::link::LinkSettings;
+use crate::log::{Channel, GivenImage, VirtualLog, observation_head, sent_message};
 use crate::stream::ServerClock;
 
 pub use process::{LineSink, PluginProcess, ProcessError};
@@ -49,6 +51,7 @@ pub struct Lockstep {
     reply_after_ns: i64,
     /// Replies on their way to the companion, and when they count.
     replies: VecDeque<(HostTime, Reply)>,
+    log: Option<VirtualLog>,
 }
 
 impl Lockstep {
@@ -66,7 +69,22 @@ impl Lockstep {
         companion.handle_arena(now, Box::new(arena.clone()));
         companion.greet_plugin(now);
         let (senses, replies) = (Senses::default(), VecDeque::new());
-        Self { companion, process, senses, reply_after_ns, replies }
+        Self { companion, process, senses, reply_after_ns, replies, log: None }
+    }
+
+    /// Logs this flight from now on.
+    pub fn set_log(&mut self, log: VirtualLog) {
+        self.log = Some(log);
+    }
+
+    /// Returns the log, for what only the caller knows: poses, events, lines of the plugin.
+    pub fn log(&mut self) -> Option<&mut VirtualLog> {
+        self.log.as_mut()
+    }
+
+    /// Returns the log, to be finished.
+    pub fn take_log(&mut self) -> Option<VirtualLog> {
+        self.log.take()
     }
 
     /// Greets the plugin and waits until it is ready. One that fails ends the flight.
@@ -77,6 +95,9 @@ impl Lockstep {
         let (Some(process), Some(start)) = (&mut self.process, self.companion.poll_plugin()) else {
             return Ok(());
         };
+        if let Some(log) = &mut self.log {
+            log.to_plugin(now, &start);
+        }
         let result = process.begin(&start, line);
         if self.unless_failed(now, result, line)?.is_some() {
             self.companion.plugin_ready(now);
@@ -85,7 +106,8 @@ impl Lockstep {
     }
 
     /// Shows the plugin observation `seq` and waits for its reply: `write` puts in the images, and the
-    /// senses are there already. Returns `None` if there is no plugin any more.
+    /// senses are there already; `images` are the same, for the log. Returns `None` if there is no plugin any
+    /// more.
     ///
     /// # Errors
     /// [`ProcessError`], except for a plugin that fails.
@@ -95,11 +117,15 @@ impl Lockstep {
         seq: u64,
         cameras: &[CameraInfo],
         write: impl FnOnce(&mut ObservationWriter<'_>),
+        images: &[GivenImage<'_>],
         line: LineSink<'_>,
     ) -> Result<Option<Reply>, ProcessError> {
         while let Some(process) = &mut self.process
             && let Some(message) = self.companion.poll_plugin()
         {
+            if let Some(log) = &mut self.log {
+                log.to_plugin(now, &message);
+            }
             let result = process.send(&message, line);
             self.unless_failed(now, result, line)?;
         }
@@ -109,10 +135,14 @@ impl Lockstep {
         self.companion.update_senses(&mut self.senses);
         self.senses.write(&mut writer);
         write(&mut writer);
+        if let Some(log) = &mut self.log {
+            log.observation(now, seq, observation_head(memory.memory()), images);
+        }
         self.companion.published(now, seq);
         let result = process.ask(seq, memory, line);
         let reply = self.unless_failed(now, result, line)?.map(|setpoint| Reply { seq, setpoint });
         if let Some(reply) = &reply {
+            self.log_reply(now, reply);
             self.take_reply(now, reply.clone());
         }
         Ok(reply)
@@ -125,7 +155,12 @@ impl Lockstep {
         {
             self.companion.replied(now, seq, setpoint);
         }
-        self.companion.handle_timeout(now);
+        let sent = self.companion.handle_timeout(now);
+        if let (Some(log), Some(sent)) = (&mut self.log, sent)
+            && let Some(message) = sent_message(&sent.setpoint)
+        {
+            log.write(Channel::Sent, now, &message);
+        }
         while let Some(event) = self.companion.poll_link_event() {
             tracing::debug!("link: {event:?}");
         }
@@ -141,6 +176,16 @@ impl Lockstep {
     /// Takes a reply to an observation that was shown at `now`; it counts later.
     pub(crate) fn take_reply(&mut self, now: HostTime, reply: Reply) {
         self.replies.push_back((now.plus_ns(self.reply_after_ns), reply));
+    }
+
+    /// Logs a reply to the observation that was shown at `now`: on the virtual clock it took no time. It stands behind
+    /// what was sent before it at the same instant, where a replay looks for it.
+    fn log_reply(&mut self, now: HostTime, reply: &Reply) {
+        let Some(log) = &mut self.log else { return };
+        let Reply { seq, setpoint } = reply.clone();
+        log.write(Channel::Requested, now, &json!({"seq": seq, "setpoint": &setpoint}));
+        let entered = now.plus_ns(1);
+        log.from_plugin(now, &FromPlugin::Reply { seq, entered, returned: entered, setpoint });
     }
 
     /// Returns the value, or `None` for a plugin that has failed: it is stopped, and the flight ends.

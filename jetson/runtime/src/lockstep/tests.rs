@@ -1,15 +1,23 @@
-//! Real plugin processes that are waited for: the example `misbehave`.
+//! Real plugin processes that are waited for: the example `misbehave`; and the log of what they were shown.
 
 use std::ffi::OsString;
+use std::fs::{self, File};
+use std::path::Path;
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use vizflyt_protocol::flight_end::PluginFault;
-use vizflyt_protocol::geometry::Intrinsics;
-use vizflyt_protocol::messages::ToPlugin;
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, Limits, ToPlugin, bounded};
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_sdk::ImageStamps;
 
 use super::*;
+use crate::log::read::{LogReader, RecordedFlight};
+use crate::log::{LoggedImages, VirtualLog};
+use crate::replay::{ReplayOptions, ReplayPlan, replay};
 use crate::supervisor::{PluginLimits, Stream};
 
 const NO_LINES: fn(Stream, &str) = |_, _| {};
@@ -30,6 +38,10 @@ fn arena() -> ArenaInfo {
     arena.cameras.clear();
     let _ = arena.cameras.push(camera());
     arena
+}
+
+fn at(ms: u64) -> HostTime {
+    HostTime::from_ns(10_000_000_000 + ms * 1_000_000)
 }
 
 /// Asks a plugin once; `meanwhile` is called when it has the image.
@@ -85,4 +97,79 @@ fn a_plugin_that_somebody_kills_is_lost_and_one_that_ends_has_failed() {
         let error = asked(how, Duration::from_mins(1), |_| ());
         assert!(matches!(error, Err(ProcessError::Failed(_))), "{how}: {error:?}");
     }
+}
+
+/// Shows a plugin twenty images in lock-step, and logs it.
+fn logged(path: &Path, images: LoggedImages) {
+    let command = misbehave("forward");
+    let process =
+        PluginProcess::start(&command, &PluginLimits::default(), Duration::from_mins(1)).unwrap();
+    let settings = FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let mut lockstep = Lockstep::new(at(0), &arena(), settings, Some(process), 10_000_000);
+    let file = File::create(path).unwrap();
+    let plugin = &"misbehave".into();
+    lockstep.set_log(VirtualLog::new(file, images, plugin, at(0)).unwrap());
+    lockstep.begin(at(0), &mut { NO_LINES }).unwrap();
+    let cameras = [camera()];
+    for seq in 1..=20 {
+        let now = at(seq * 33);
+        let (rgb, depth_mm) = (vec![seq as u8; 32 * 24 * 3], vec![seq as u16 * 100; 32 * 24]);
+        let stamp = ServerTime::from_ns(now.as_ns());
+        if seq == 7 {
+            let kind = EventKind::Phase(FlightPhase::Flying);
+            let event = Event { stamp, kind, text: bounded("the plugin flies") };
+            lockstep.companion.handle_event(now, event);
+        }
+        let (mount, body) = (&cameras[0].body_from_cam, Pose::IDENTITY);
+        let header = ImageHeader::new(seq, 0, stamp, &cameras[0].intrinsics, mount, &body);
+        let (pose, name) = (now, "front");
+        let image = GivenImage { header: &header, name, pose, rgb: &rgb, depth_mm: &depth_mm };
+        let stamps = ImageStamps { seq, pose: now, ahead_ns: 0, ready: now };
+        let write = |writer: &mut ObservationWriter<'_>| {
+            let planes = writer.planes(0, &cameras[0]).unwrap();
+            planes.rgb.copy_from_slice(&rgb);
+            planes.depth_mm.copy_from_slice(&depth_mm);
+            writer.image_ready(0, &cameras[0], stamps);
+        };
+        let reply = lockstep.show(now, seq, &cameras, write, &[image], &mut { NO_LINES }).unwrap();
+        assert!(reply.unwrap().setpoint.is_some());
+        lockstep.handle_timeout(now.plus_ns(20_000_000));
+    }
+    lockstep.stop(&mut { NO_LINES });
+    lockstep.take_log().unwrap().finish().unwrap();
+}
+
+#[test]
+fn a_log_on_the_virtual_clock_is_the_same_every_time_and_is_replayed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("one.mcap");
+    logged(&path, LoggedImages::Full);
+    let again = folder.path().join("again.mcap");
+    logged(&again, LoggedImages::Full);
+    assert!(fs::read(&path).unwrap() == fs::read(&again).unwrap(), "no clock is in it");
+    let plan = ReplayPlan::read(RecordedFlight::new(LogReader::open(&path).unwrap(), false));
+    let plan = plan.unwrap();
+    assert_eq!(plan.flown.as_ref().unwrap().plugin, "misbehave");
+    let options = ReplayOptions {
+        command: misbehave("forward"),
+        limits: PluginLimits::default(),
+        is_realtime: false,
+        all: false,
+        answer_within: Duration::from_mins(1),
+        answers: folder.path().join("answers.jsonl"),
+    };
+    let mut lines = Vec::new();
+    let line = &mut |_: Stream, text: &str| lines.push(text.to_owned());
+    let report = replay(&path, plan, &options, line).unwrap();
+    assert_eq!((report.images_fed, report.compared, report.differ), (20, 20, 0), "{report:?}");
+    assert_eq!((report.images_missing, report.log_is_cut), (0, false));
+    assert!(lines.contains(&"stopped after 20 images".to_owned()), "{lines:?}");
+    // Viewers find each image as JPEG.
+    let mut reader = LogReader::open(&path).unwrap();
+    let mut shown = 0;
+    while let Some(entry) = reader.next().unwrap() {
+        let crate::log::read::Entry::Message(message) = entry else { continue };
+        shown += u64::from(&*message.topic == "/camera/front/image");
+    }
+    assert_eq!(shown, 20);
 }

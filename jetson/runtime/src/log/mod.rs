@@ -26,6 +26,7 @@ pub mod read;
 mod retention;
 #[cfg(test)]
 mod tests;
+mod virtual_log;
 mod writer;
 
 use std::ffi::OsString;
@@ -39,7 +40,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::flight_end::EndReason;
-use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin};
+use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
+use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin, YawTarget};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::HostTime;
@@ -54,6 +56,7 @@ pub use self::queue::{Dropped, LoggedImage};
 use self::queue::{ObservationRecord, Queue, Record};
 pub use self::read::read_timing;
 pub use self::retention::Retention;
+pub use self::virtual_log::{GivenImage, VirtualLog};
 use self::writer::{LogSinks, LogWriter};
 use crate::stream::Mailbox;
 
@@ -182,13 +185,7 @@ impl FlightLog {
     /// Logs which flight this is.
     pub fn flight(&self, plugin: &OsString, arguments: &[OsString]) {
         let Some(queue) = &self.queue else { return };
-        let arguments: Vec<_> = arguments.iter().map(|text| text.to_string_lossy()).collect();
-        queue.push(Record::Flight(vec![
-            ("program", concat!("vizflyt ", env!("CARGO_PKG_VERSION")).to_owned()),
-            ("protocol", PROTOCOL_VERSION.to_string()),
-            ("plugin", plugin.to_string_lossy().into_owned()),
-            ("arguments", json!(arguments).to_string()),
-        ]));
+        queue.push(flight_record(plugin, arguments));
     }
 
     /// Logs a pose that came at `at` and was true at `stamp`.
@@ -199,37 +196,15 @@ impl FlightLog {
 
     /// Logs an event.
     pub fn event(&self, at: HostTime, event: &Event) {
-        let (name, level) = match &event.kind {
-            EventKind::Collision(_) => ("collision", Level::Error),
-            EventKind::Geofence(_) => ("geofence", Level::Error),
-            EventKind::EmergencyStop => ("stop button", Level::Error),
-            EventKind::Ended(EndReason::Plugin(_)) => ("plugin", Level::Error),
-            EventKind::Ended(reason) if reason.is_failure() => ("end", Level::Error),
-            EventKind::Ended(_) => ("end", Level::Info),
-            EventKind::PoseLost { .. } => ("pose", Level::Warning),
-            EventKind::PoseRegained => ("pose", Level::Info),
-            EventKind::Stage { .. } | EventKind::Finished { .. } => ("course", Level::Info),
-            EventKind::TimeLimit { .. } => ("course", Level::Warning),
-            EventKind::Phase(_) => ("phase", Level::Info),
-            EventKind::Start => ("start button", Level::Info),
-            EventKind::Land => ("land button", Level::Warning),
-            EventKind::PluginOutput => ("plugin", Level::Info),
-            EventKind::Note => ("note", Level::Warning),
-        };
-        self.text(Channel::Event, at, level, name, event.text.as_str());
+        let Some(queue) = &self.queue else { return };
+        queue.push(event_record(at, event));
     }
 
     /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it had the
     /// image of the server's `tick`.
     pub fn line(&self, at: HostTime, stream: &str, line: &str, tick: u64) {
-        let level = if stream == "stderr" { Level::Warning } else { Level::Info };
-        self.text(Channel::PluginOutput, at, level, &format!("{stream} at tick {tick}"), line);
-    }
-
-    fn text(&self, channel: Channel, at: HostTime, level: Level, name: &str, text: &str) {
         let Some(queue) = &self.queue else { return };
-        let (name, text) = (name.to_owned(), text.to_owned());
-        queue.push(Record::Text { channel, at, level, name, text });
+        queue.push(line_record(at, stream, line, tick));
     }
 
     /// Logs a message that was sent to the plugin at `at`; replay sends it again.
@@ -244,9 +219,7 @@ impl FlightLog {
 
     fn message(&self, at: HostTime, is_to_plugin: bool, message: &impl Serialize) {
         let Some(queue) = &self.queue else { return };
-        let mut buffer = [0; MAX_FRAMED];
-        let body = encode_body(message, &mut buffer).to_vec();
-        queue.push(Record::Plugin { at, is_to_plugin, body });
+        queue.push(plugin_record(at, is_to_plugin, message));
     }
 
     /// Returns the image thread's end of the log; the memory of images goes back to `home`.
@@ -288,6 +261,67 @@ impl ImageLog {
         let record = ObservationRecord { at, seq, head, images, home };
         self.queue.push(Record::Observation(Box::new(record)));
     }
+}
+
+/// Returns the record of which flight this is.
+fn flight_record(plugin: &OsString, arguments: &[OsString]) -> Record {
+    let arguments: Vec<_> = arguments.iter().map(|text| text.to_string_lossy()).collect();
+    Record::Flight(vec![
+        ("program", concat!("vizflyt ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("protocol", PROTOCOL_VERSION.to_string()),
+        ("plugin", plugin.to_string_lossy().into_owned()),
+        ("arguments", json!(arguments).to_string()),
+    ])
+}
+
+/// Returns the record of an event.
+fn event_record(at: HostTime, event: &Event) -> Record {
+    let (name, level) = match &event.kind {
+        EventKind::Collision(_) => ("collision", Level::Error),
+        EventKind::Geofence(_) => ("geofence", Level::Error),
+        EventKind::EmergencyStop => ("stop button", Level::Error),
+        EventKind::Ended(EndReason::Plugin(_)) => ("plugin", Level::Error),
+        EventKind::Ended(reason) if reason.is_failure() => ("end", Level::Error),
+        EventKind::Ended(_) => ("end", Level::Info),
+        EventKind::PoseLost { .. } => ("pose", Level::Warning),
+        EventKind::PoseRegained => ("pose", Level::Info),
+        EventKind::Stage { .. } | EventKind::Finished { .. } => ("course", Level::Info),
+        EventKind::TimeLimit { .. } => ("course", Level::Warning),
+        EventKind::Phase(_) => ("phase", Level::Info),
+        EventKind::Start => ("start button", Level::Info),
+        EventKind::Land => ("land button", Level::Warning),
+        EventKind::PluginOutput => ("plugin", Level::Info),
+        EventKind::Note => ("note", Level::Warning),
+    };
+    let (name, text) = (name.to_owned(), event.text.as_str().to_owned());
+    Record::Text { channel: Channel::Event, at, level, name, text }
+}
+
+/// Returns the record of a line that the plugin printed.
+fn line_record(at: HostTime, stream: &str, line: &str, tick: u64) -> Record {
+    let level = if stream == "stderr" { Level::Warning } else { Level::Info };
+    let (name, text) = (format!("{stream} at tick {tick}"), line.to_owned());
+    Record::Text { channel: Channel::PluginOutput, at, level, name, text }
+}
+
+/// Returns the record of a message to or from the plugin.
+fn plugin_record(at: HostTime, is_to_plugin: bool, message: &impl Serialize) -> Record {
+    let mut buffer = [0; MAX_FRAMED];
+    let body = encode_body(message, &mut buffer).to_vec();
+    Record::Plugin { at, is_to_plugin, body }
+}
+
+/// Returns what the log says of a setpoint that the guard let through; `None` of one that is no velocity.
+pub(crate) fn sent_message(setpoint: &GuidedSetpoint) -> Option<serde_json::Value> {
+    let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return None };
+    let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
+        YawTarget::Angle(yaw_rad) => (Some(yaw_rad), None),
+        YawTarget::Rate(rate_radps) => (None, Some(rate_radps)),
+        YawTarget::Keep => (None, None),
+    };
+    Some(json!({
+        "v_world_mps": v_mps.to_array(), "yaw_rad": yaw_rad, "yaw_rate_radps": yaw_rate_radps
+    }))
 }
 
 /// Returns the bytes of an observation before its first plane: header and what belongs to it.

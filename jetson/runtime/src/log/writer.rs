@@ -101,7 +101,7 @@ impl<D: Disk> LogSinks<D> {
     }
 
     /// Shows a message to viewers, and writes it.
-    fn put(
+    pub(super) fn put(
         &mut self,
         channel: Channel,
         camera: &str,
@@ -152,7 +152,13 @@ impl<D: Disk> LogSinks<D> {
         self.file.as_mut().map_or(Ok(()), Writer::flush)
     }
 
-    fn finish(mut self) -> McapResult<()> {
+    /// Whether so much waits that the chunk is to be completed.
+    pub(super) fn is_chunk_full(&self) -> bool {
+        self.waiting >= CHUNK_BYTES
+    }
+
+    /// Completes the file.
+    pub(super) fn finish(mut self) -> McapResult<()> {
         if let Some(live) = self.live.take() {
             live.stop();
         }
@@ -197,10 +203,20 @@ impl<D: Disk> LogWriter<D> {
         // MCAP wants times since 1970.
         let wall = SystemTime::now().duration_since(UNIX_EPOCH);
         let wall_ns = wall.map_or(0, |since| since.as_nanos() as u64);
+        Self::since(wall_ns.wrapping_sub(host_now().as_ns()), sinks, queue, free_bytes)
+    }
+
+    /// As [`Self::new`], with a clock whose zero is `offset_ns` after 1970. [ns]
+    pub(super) fn since(
+        offset_ns: u64,
+        sinks: LogSinks<D>,
+        queue: Arc<Queue>,
+        free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
+    ) -> Self {
         Self {
             sinks,
             queue,
-            offset_ns: wall_ns.wrapping_sub(host_now().as_ns()),
+            offset_ns,
             free_bytes,
             images_fit: true,
             left_out: 0,
@@ -222,7 +238,7 @@ impl<D: Disk> LogWriter<D> {
             };
             let is_due = flushed.elapsed() >= CHUNK_PERIOD;
             let result = result.and_then(|()| {
-                if !is_due && self.sinks.waiting < CHUNK_BYTES {
+                if !is_due && !self.sinks.is_chunk_full() {
                     return Ok(());
                 }
                 if is_due {
@@ -327,7 +343,7 @@ impl<D: Disk> LogWriter<D> {
             }
             Record::Observation(record) => {
                 self.queue.taken(record.len());
-                let result = if self.images_fit { self.observation(&record) } else { Ok(()) };
+                let result = self.queued(&record);
                 record.recycle();
                 result
             }
@@ -362,26 +378,41 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())
     }
 
-    fn observation(&mut self, record: &ObservationRecord) -> McapResult<()> {
-        let at_ns = self.wall_ns(record.at);
-        let is_kept =
-            self.sinks.budget.as_mut().is_none_or(|budget| budget.allows_image(record.at));
+    /// Writes what the image thread has sent, if there is room on the disk.
+    fn queued(&mut self, record: &ObservationRecord) -> McapResult<()> {
+        if !self.images_fit {
+            return Ok(());
+        }
+        let is_kept = self.keeps_image(record.at);
+        self.observation(record.at, record.seq, record.head.clone(), &record.images, is_kept)
+    }
+
+    /// Whether the images that came `at` are to be written.
+    pub(super) fn keeps_image(&mut self, at: HostTime) -> bool {
+        self.sinks.budget.as_mut().is_none_or(|budget| budget.allows_image(at))
+    }
+
+    /// Writes an observation, with its images if they are kept.
+    pub(super) fn observation(
+        &mut self,
+        at: HostTime,
+        seq: u64,
+        head: Vec<u8>,
+        logged: &[LoggedImage],
+        is_kept: bool,
+    ) -> McapResult<()> {
+        let at_ns = self.wall_ns(at);
         let mut images = Vec::new();
         if is_kept {
-            for image in &record.images {
+            for image in logged {
                 images.push(self.image(at_ns, image)?);
             }
         } else {
             self.left_out += 1;
-            self.show_images(at_ns, &record.images)?;
+            self.show_images(at_ns, logged)?;
         }
-        let observation = Observation {
-            seq: record.seq,
-            protocol: PROTOCOL_VERSION.into(),
-            published_ns: record.at.as_ns(),
-            head: record.head.clone(),
-            images,
-        };
+        let protocol = PROTOCOL_VERSION.into();
+        let observation = Observation { seq, protocol, published_ns: at.as_ns(), head, images };
         self.sinks.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
     }
 
@@ -471,7 +502,8 @@ fn images_fit(they_did: bool, free: Option<u64>) -> bool {
     free.is_none_or(|free| free >= if they_did { MIN_FREE } else { ENOUGH_FREE })
 }
 
-fn timestamp(at_ns: u64) -> fox::Timestamp {
+/// Returns a time since 1970 as Foxglove has it. [ns]
+pub(super) fn timestamp(at_ns: u64) -> fox::Timestamp {
     let (seconds, nanoseconds) = (at_ns / 1_000_000_000, at_ns % 1_000_000_000);
     fox::Timestamp::new(u32::try_from(seconds).unwrap_or(u32::MAX), nanoseconds as u32)
 }

@@ -48,8 +48,32 @@ pub(crate) fn grade() -> Grade {
     let runs = vec![run(3, OutcomeKind::Finished), run(1, OutcomeKind::Collided)];
     let shard = Some(Shard { index: 1, count: 2 });
     let mut grade = Grade::new(subject(), shard, runs);
+    let file =
+        |path: &str| SignedFile { path: path.to_owned(), bytes: 1000, sha256: "66".repeat(32) };
+    grade.files = ["index.html", "logs/day-1.mcap"].map(file).to_vec();
     grade.sign(&key()).unwrap();
     grade
+}
+
+#[test]
+fn paths_of_files_stay_in_the_folder() {
+    let with = |paths: &[&str]| {
+        let mut grade = grade();
+        let file = grade.files[0].clone();
+        grade.files = paths
+            .iter()
+            .map(|path| SignedFile { path: (*path).to_owned(), ..file.clone() })
+            .collect();
+        Grade::parse(&grade.to_text().unwrap())
+    };
+    assert!(with(&[]).is_ok() && with(&["a", "b/c", "b/d.e"]).is_ok());
+    for wrong in ["", "/etc/passwd", "../grade.json", "a/../../b", "a//b", "a/", "./a", "a\0b"] {
+        let error = with(&[wrong]).unwrap_err().to_string();
+        assert!(error.contains("is no file of a report"), "{wrong}: {error}");
+    }
+    for wrong in [&["a", "a"][..], &["b", "a"]] {
+        assert!(with(wrong).unwrap_err().to_string().contains("in the order of their paths"));
+    }
 }
 
 #[test]
@@ -118,13 +142,16 @@ fn flights_are_neither_left_out_nor_added_nor_is_anything_else() {
     let run = more["runs"][0].clone();
     more["runs"].as_array_mut().unwrap().push(run);
     assert!(is_refused(&more));
-    for path in ["", "/subject", "/summary", "/runs/0", "/signature", "/shard"] {
+    for path in ["", "/subject", "/summary", "/runs/0", "/files/0", "/signature", "/shard"] {
         let mut added = document.clone();
         let place = added.pointer_mut(path).unwrap().as_object_mut().unwrap();
         place.insert("bonus".into(), 1.into());
         assert!(is_refused(&added), "{path:?} takes another field");
     }
-    for field in ["shard", "signature"] {
+    let mut unsigned = document.clone();
+    unsigned["files"].as_array_mut().unwrap().pop();
+    assert!(is_refused(&unsigned), "a file can go");
+    for field in ["shard", "files", "signature"] {
         let mut without = document.clone();
         without.as_object_mut().unwrap().remove(field);
         assert!(is_refused(&without), "{field} can go");

@@ -1,57 +1,86 @@
-//! A crash card: what a failed flight looked like at its end.
+//! A flight's card: what a failed flight looked like at its end, and a finished one from take-off to its finish.
 
 use std::fmt::Write;
-use std::fs;
-use std::path::Path;
 
 use anyhow::{Context, Result};
 use jpeg_encoder::{ColorType, Encoder};
 use vizflyt_arena::crash::{plot, since};
+use vizflyt_arena::verdict::Sample;
 use vizflyt_arena::{ArenaConfig, DistanceField};
-use vizflyt_protocol::messages::EventKind;
+use vizflyt_protocol::messages::{EventKind, OutcomeKind};
+use vizflyt_protocol::time::ServerTime;
 
-use super::super::document::Run;
-use super::super::trial::TrialResult;
+use super::super::document::{Run, SignedFile};
+use super::super::folder::{IMAGES, LOGS, ReportFolder};
+use super::super::trial::{TrialImage, TrialResult};
 use super::escape;
 
-/// Folder of the images, in the report's.
-const IMAGES: &str = "images";
 /// Of the images. [0 to 100]
 const QUALITY: u8 = 85;
-/// Clearance and speed are plotted over so long. [s]
+/// Of a failed flight clearance and speed are plotted over so long. [s]
 const PLOTTED_S: f64 = 4.0;
-/// Events that are shown.
+/// Events that are shown of a failed flight, and of one that finished.
 const EVENTS: usize = 12;
+const EVENTS_OF_FINISHED: usize = 60;
 
-/// Writes the images of a failed flight into the report's folder; returns its card as HTML.
+/// Returns what a flight's files are called, without their endings.
+pub(crate) fn name(run: &Run) -> String {
+    format!("{}-{}", run.variant, run.seed)
+}
+
+/// Writes the images of a flight into the report's folder; returns its card as HTML, and the images. `log` says
+/// whether its flight log is there.
 pub(crate) fn write(
-    folder: &Path,
+    folder: &ReportFolder,
     arena: &ArenaConfig,
     field: &DistanceField,
     run: &Run,
     flown: &TrialResult,
-) -> Result<String> {
+    log: bool,
+) -> Result<(String, Vec<SignedFile>)> {
     let mut card = head(run);
+    let mut files = Vec::new();
     let at = flown.verdict.ended;
+    let is_finished = run.outcome == OutcomeKind::Finished;
     if let Some(at) = at {
-        card += &strip(folder, run, flown, |stamp| at.seconds_since(stamp))?;
-        let last = since(&flown.samples, at, PLOTTED_S);
         let way = since(&flown.samples, at, f64::INFINITY);
-        let height_m = last.last().map_or(arena.takeoff_height_m, |sample| sample.p_world_m.z);
+        let (strip, images) = if is_finished {
+            let shots = whole(flown);
+            strip(folder, run, &shots, "the flight", |stamp| after_take_off(run, at, stamp))?
+        } else {
+            let shots: Vec<&TrialImage> = flown.shots.iter().collect();
+            let ago = |stamp| format!("{:+.1} s", -at.seconds_since(stamp));
+            strip(folder, run, &shots, "its last images", ago)?
+        };
+        card += &strip;
+        files = images;
+        let shown = if is_finished {
+            since(&flown.samples, at, run.seconds)
+        } else {
+            since(&flown.samples, at, PLOTTED_S)
+        };
+        let height_m = if is_finished { middle_height_m(shown) } else { shown.last().map(height) };
+        let height_m = height_m.unwrap_or(arena.takeoff_height_m);
+        let (when, end) = if is_finished {
+            ("from take-off to the finish", "where it finished")
+        } else {
+            ("in its last seconds", "where it ended")
+        };
         let _ = write!(
             card,
             "<div class=\"plots\"><figure>{}<figcaption>Clearance of the body (blue) and speed (orange) \
-             in its last seconds</figcaption></figure><figure>{}<figcaption>From above: obstacles at \
-             {height_m:.2} m height, the way flown, and where it ended, with its nose</figcaption>\
+             {when}</figcaption></figure><figure>{}<figcaption>From above: obstacles at \
+             {height_m:.2} m height, the way flown, and {end}, with its nose</figcaption>\
              </figure></div>",
-            plot::clearance(last, at),
-            plot::top_view(arena, &field.obstacle_slice(height_m), last, way)
+            plot::clearance(shown, at),
+            plot::top_view(arena, &field.obstacle_slice(height_m), shown, way)
         );
     }
     let events = flown.events.iter().filter(|event| event.kind != EventKind::PluginOutput);
     let events: Vec<_> = events.filter(|event| at.is_none_or(|at| event.stamp <= at)).collect();
+    let most = if is_finished { EVENTS_OF_FINISHED } else { EVENTS };
     let mut story = String::new();
-    for event in events.iter().skip(events.len().saturating_sub(EVENTS)) {
+    for event in events.iter().skip(events.len().saturating_sub(most)) {
         let before_s = at.map_or(0.0, |at| at.seconds_since(event.stamp));
         let _ = writeln!(story, "{:>8.2} s  {}", -before_s, escape(event.text.as_str()));
     }
@@ -64,13 +93,58 @@ pub(crate) fn write(
             lines.join("\n")
         );
     }
-    Ok(card + "</section>\n")
+    if log {
+        let path = escape(&log_path(run));
+        let _ = write!(
+            card,
+            "<p class=\"faint\">Flight log: <a href=\"{path}\">{path}</a>, for Foxglove and \
+             <code>vizflyt replay {path}</code></p>"
+        );
+    }
+    Ok((card + "</section>\n", files))
 }
 
-/// Returns the card of a failed flight that another computer has flown, of which only the grade is here.
+/// Returns where a flight's log is in the report.
+pub(crate) fn log_path(run: &Run) -> String {
+    format!("{LOGS}/{}.mcap", name(run))
+}
+
+/// Returns the images of a whole flight, its last one included.
+fn whole(flown: &TrialResult) -> Vec<&TrialImage> {
+    let mut shots: Vec<&TrialImage> = flown.keyframes.iter().collect();
+    let last = flown.shots.back();
+    shots.extend(last.filter(|last| shots.last().is_none_or(|shot| shot.stamp < last.stamp)));
+    shots
+}
+
+/// Returns when it was, and the stages that had been passed by then.
+fn after_take_off(run: &Run, ended: ServerTime, stamp: ServerTime) -> String {
+    let at_s = (run.seconds - ended.seconds_since(stamp)).max(0.0);
+    let passed = |stage: &&vizflyt_arena::verdict::StageVerdict| {
+        stage.passed_s.is_some_and(|passed_s| passed_s <= at_s)
+    };
+    let passed = run.stages.iter().filter(passed).count();
+    match run.stages.len() {
+        0 => format!("{at_s:.1} s"),
+        stages => format!("{at_s:.1} s, {passed} of {stages} stages"),
+    }
+}
+
+fn height(sample: &Sample) -> f64 {
+    sample.p_world_m.z
+}
+
+/// Returns the median height of a way. [m]
+fn middle_height_m(way: &[Sample]) -> Option<f64> {
+    let mut heights: Vec<f64> = way.iter().map(height).collect();
+    heights.sort_by(f64::total_cmp);
+    heights.get(heights.len() / 2).copied()
+}
+
+/// Returns the card of a flight that another computer has flown, of which only the grade is here.
 pub(crate) fn without_images(run: &Run) -> String {
     head(run)
-        + "<p class=\"faint\">Merged from parts: its images, clearance and map are in the report of \
+        + "<p class=\"faint\">Merged from parts: its images, clearance, map and log are in the report of \
            the part that flew it, if that was given <code>--report</code>; or fly this seed again.</p>\
            </section>\n"
 }
@@ -80,53 +154,56 @@ fn head(run: &Run) -> String {
     let Run { seed, variant, outcome, .. } = run;
     // A part's text is another's: its variant is no name of ours until it is looked at.
     let variant = escape(variant);
+    let cause = run
+        .cause
+        .as_deref()
+        .map_or(String::new(), |cause| format!("<p class=\"cause\">{}</p>", escape(cause)));
+    let stages = match run.stages.len() {
+        0 => String::new(),
+        stages => format!(", {} of {stages} stages", run.stages_passed),
+    };
     format!(
         "<section class=\"card\" id=\"{variant}-{seed}\"><h3>Seed {seed}, {variant}: \
-         <span class=\"outcome {outcome}\">{}</span></h3><p class=\"cause\">{}</p>\
-         <p class=\"faint\">{}; {:.1} s after take-off, {} of {} stages</p>",
+         <span class=\"outcome {outcome}\">{}</span></h3>{cause}\
+         <p class=\"faint\">{}; {:.1} s after take-off{stages}</p>",
         outcome.name().replace('_', " "),
-        escape(run.cause.as_deref().unwrap_or_default()),
         escape(&run.reason),
-        run.seconds,
-        run.stages_passed,
-        run.stages.len()
+        run.seconds
     )
 }
 
-/// Writes the last images; returns them side by side.
+/// Writes images; returns them side by side, and their files.
 fn strip(
-    folder: &Path,
+    folder: &ReportFolder,
     run: &Run,
-    flown: &TrialResult,
-    before_s: impl Fn(vizflyt_protocol::time::ServerTime) -> f64,
-) -> Result<String> {
-    if flown.shots.is_empty() {
-        return Ok("<p class=\"faint\">No image was answered.</p>".to_owned());
+    shots: &[&TrialImage],
+    label: &str,
+    caption: impl Fn(ServerTime) -> String,
+) -> Result<(String, Vec<SignedFile>)> {
+    if shots.is_empty() {
+        return Ok(("<p class=\"faint\">No image was answered.</p>".to_owned(), Vec::new()));
     }
-    let images = folder.join(IMAGES);
-    fs::create_dir_all(&images).with_context(|| format!("cannot make {}", images.display()))?;
-    let mut strip =
-        "<div class=\"strip\" tabindex=\"0\" aria-label=\"its last images\">".to_owned();
-    for (index, shot) in flown.shots.iter().enumerate() {
-        let name = format!("{}-{}-{index:02}.jpg", run.variant, run.seed);
+    let mut files = Vec::new();
+    let whole = if run.outcome == OutcomeKind::Finished { " whole" } else { "" };
+    let mut strip = format!("<div class=\"strip{whole}\" tabindex=\"0\" aria-label=\"{label}\">");
+    for (index, shot) in shots.iter().enumerate() {
+        let path = format!("{IMAGES}/{}-{index:02}.jpg", name(run));
         let (width, height) = shot.size_px;
-        let path = images.join(&name);
         let sizes = u16::try_from(width).ok().zip(u16::try_from(height).ok());
         let (w, h) = sizes.context("an image of more than 65535 px")?;
         let mut bytes = Vec::new();
         Encoder::new(&mut bytes, QUALITY)
             .encode(&shot.rgb, w, h, ColorType::Rgb)
-            .with_context(|| format!("cannot encode {name}"))?;
-        fs::write(&path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
-        let ago_s = before_s(shot.stamp);
+            .with_context(|| format!("cannot encode {path}"))?;
+        files.push(folder.write(&path, &bytes)?);
+        let caption = caption(shot.stamp);
         let _ = write!(
             strip,
-            "<figure><img src=\"{IMAGES}/{name}\" width=\"{width}\" height=\"{height}\" \
-             alt=\"{ago_s:.1} s before the end\" loading=\"lazy\"><figcaption>{:+.1} s</figcaption></figure>",
-            -ago_s
+            "<figure><img src=\"{path}\" width=\"{width}\" height=\"{height}\" \
+             alt=\"{caption}\" loading=\"lazy\"><figcaption>{caption}</figcaption></figure>"
         );
     }
-    Ok(strip + "</div>")
+    Ok((strip + "</div>", files))
 }
 
 #[cfg(test)]

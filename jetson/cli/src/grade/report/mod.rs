@@ -1,30 +1,41 @@
 //! The report as one folder that opens in any browser, without a network: figures, a table of all
-//! flights, and a crash card for each that did not finish.
+//! flights, and a card for each: those that did not finish, then those that did.
 
 pub(crate) mod card;
 
 use std::fmt::Write;
-use std::fs;
-use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
+use ed25519_dalek::SigningKey;
 use vizflyt_protocol::messages::OutcomeKind;
 
-use super::document::{Grade, Run};
+use super::document::{Grade, Run, SignedFile};
+use super::folder::{GRADE, JUNIT, PAGE, ReportFolder, sorted};
+use super::junit;
 use super::statistics::Interval;
 
 const CSS: &str = include_str!("page.css");
 
-/// Writes `index.html` and `grade.json` into the folder. `cards` are those of [`card::write`], in the
-/// order in which they shall be read.
-pub(crate) fn write(folder: &Path, grade: &Grade, cards: &[String]) -> Result<()> {
-    fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
-    let write = |name: &str, text: &str| {
-        let path = folder.join(name);
-        fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
-    };
-    write("grade.json", &grade.to_text()?)?;
-    write("index.html", &page(grade, cards))
+/// Writes `index.html` and `junit.xml` into the folder, and signs the grade with all files: `files` are those that are
+/// there already, `cards` those of [`card::write`], as the flights are ordered. `grade.json` comes last.
+///
+/// # Errors
+/// If a file cannot be written.
+pub(crate) fn write(
+    folder: &ReportFolder,
+    grade: &mut Grade,
+    key: &SigningKey,
+    cards: &[String],
+    mut files: Vec<SignedFile>,
+) -> Result<()> {
+    // The page names the key.
+    grade.sign(key)?;
+    files.push(folder.write(PAGE, page(grade, cards).as_bytes())?);
+    files.push(folder.write(JUNIT, junit::text(grade).as_bytes())?);
+    grade.files = sorted(files);
+    grade.sign(key)?;
+    folder.write(GRADE, grade.to_text()?.as_bytes())?;
+    Ok(())
 }
 
 fn page(grade: &Grade, cards: &[String]) -> String {
@@ -44,10 +55,19 @@ fn page(grade: &Grade, cards: &[String]) -> String {
         escape(&subject.variants.join(", "))
     );
     text += &figures(grade);
-    text += &table(&grade.runs);
-    if !cards.is_empty() {
-        text += "<h2>Flights that did not finish</h2>\n";
-        text.extend(cards.iter().map(String::as_str));
+    text += &table(&grade.runs, !cards.is_empty());
+    let with_cards = || grade.runs.iter().zip(cards);
+    for (finished, title) in
+        [(false, "Flights that did not finish"), (true, "Flights that finished")]
+    {
+        let mut cards = with_cards()
+            .filter(|(run, _)| (run.outcome == OutcomeKind::Finished) == finished)
+            .map(|(_, card)| card.as_str())
+            .peekable();
+        if cards.peek().is_some() {
+            let _ = writeln!(text, "<h2>{title}</h2>");
+            text.extend(cards);
+        }
     }
     text += &origins(grade);
     text + "</body></html>\n"
@@ -83,7 +103,7 @@ fn figures(grade: &Grade) -> String {
     text + "</dl>\n"
 }
 
-fn table(runs: &[Run]) -> String {
+fn table(runs: &[Run], with_cards: bool) -> String {
     let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Seed</th>\
                     <th class=\"text\">Variant</th><th class=\"text\">Outcome</th><th>Stages</th>\
                     <th>Time</th><th>Clearance</th><th>Speed</th><th>Score</th>\
@@ -108,9 +128,10 @@ fn table(runs: &[Run]) -> String {
         if stages.is_empty() {
             stages += "-";
         }
-        let seed = match outcome {
-            OutcomeKind::Finished => seed.to_string(),
-            _ => format!("<a href=\"#{variant}-{seed}\">{seed}</a>"),
+        let seed = if with_cards {
+            format!("<a href=\"#{variant}-{seed}\">{seed}</a>")
+        } else {
+            seed.to_string()
         };
         let clearance =
             run.min_clearance_m.map_or("-".to_owned(), |clearance_m| format!("{clearance_m:.2} m"));
@@ -152,6 +173,11 @@ fn origins(grade: &Grade) -> String {
             ),
         ),
         (
+            "Signed",
+            "all files of this folder, in grade.json: vizflyt grade verify with this folder finds any change"
+                .to_owned(),
+        ),
+        (
             "Signed with",
             grade.signature.as_ref().map_or("not signed".to_owned(), |signed| signed.key.clone()),
         ),
@@ -186,7 +212,7 @@ pub(crate) fn escape(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::document::tests::{grade, run};
+    use super::super::document::tests::{grade, key, run};
     use super::*;
 
     #[test]
@@ -205,16 +231,30 @@ mod tests {
 
     #[test]
     fn the_page_needs_no_network_and_names_every_flight() {
-        let folder = tempfile::tempdir().unwrap();
-        write(folder.path(), &grade(), &["<section id=\"day-1\"></section>".to_owned()]).unwrap();
-        let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
+        let temporary = tempfile::tempdir().unwrap();
+        let folder = ReportFolder::begin(temporary.path()).unwrap();
+        let image = folder.write("images/day-1-00.jpg", b"image").unwrap();
+        let mut grade = Grade::new(grade().subject, None, grade().runs);
+        let cards = ["day-1", "day-3"].map(|id| format!("<section id=\"{id}\"></section>"));
+        super::write(&folder, &mut grade, &key(), &cards, vec![image]).unwrap();
+        let page = std::fs::read_to_string(folder.at(PAGE)).unwrap();
         assert!(!page.contains("://"), "it names no other place");
         for part in ["1 of 2", "href=\"#day-1\"", "id=\"day-1\"", "too fast", "reached the goal"] {
             assert!(page.contains(part), "no {part}");
         }
-        let read = Grade::read(&folder.path().join("grade.json")).unwrap();
-        assert_eq!(read, grade());
-        let flown = table(&[run(5, OutcomeKind::Finished)]);
+        // Those that failed come first.
+        let place = |text: &str| page.find(text).unwrap();
+        assert!(place("did not finish") < place("id=\"day-1\""));
+        assert!(place("id=\"day-1\"") < place("Flights that finished"));
+        assert!(place("Flights that finished") < place("id=\"day-3\""));
+        let read = Grade::read(&folder.at(GRADE)).unwrap();
+        assert_eq!(read, grade);
+        read.verify(&key().verifying_key()).unwrap();
+        assert!(page.contains(&read.signature.as_ref().unwrap().key));
+        super::super::folder::verify(temporary.path(), &read).unwrap();
+        let paths: Vec<&str> = read.files.iter().map(|file| file.path.as_str()).collect();
+        assert_eq!(paths, ["images/day-1-00.jpg", PAGE, JUNIT]);
+        let flown = table(&[run(5, OutcomeKind::Finished)], false);
         for part in ["<td class=\"text\">5</td>", "<th class=\"text\">Outcome</th>"] {
             assert!(flown.contains(part), "no {part}: {flown}");
         }

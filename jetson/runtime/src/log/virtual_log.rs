@@ -1,0 +1,219 @@
+//! The log of a flight on a virtual clock ([`crate::lockstep`]): the same file, written by the thread that flies.
+//!
+//! Nothing is dropped and no clock is read, so the same flight leaves the same bytes, but for where the plugin's own
+//! lines stand: they come as fast as a pipe brings them. Colour and depth are those that the plugin had, lossless; beside
+//! them each image that is kept stands as JPEG, for viewers. Times count as if the virtual clock began in 1970.
+
+use std::ffi::OsString;
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+
+use foxglove::messages as fox;
+use mcap::McapResult;
+use prost::Message;
+use serde::Serialize;
+use vizflyt_protocol::messages::{Event, FromPlugin, PoseSample, ToPlugin};
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::HostTime;
+use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, encode_jpeg};
+
+use super::budget::Budget;
+use super::file::{self, Disk};
+use super::queue::{LoggedImage, Queue, Record};
+use super::writer::{LogSinks, LogWriter, timestamp};
+use super::{Channel, LoggedImages, event_record, flight_record, line_record, plugin_record};
+
+/// A chunk is closed this often. [s]
+const CHUNK_PERIOD_S: f64 = 1.0;
+/// Of the images for viewers. [0 to 100]
+const QUALITY: u8 = 85;
+
+/// One camera's image as the plugin is given it.
+#[derive(Clone, Copy, Debug)]
+pub struct GivenImage<'a> {
+    /// What is known of it: camera, size, lens, stamps.
+    pub header: &'a ImageHeader,
+    /// The camera's name.
+    pub name: &'a str,
+    /// When the pose that it shows was measured. [host]
+    pub pose: HostTime,
+    /// H x W x 3.
+    pub rgb: &'a [u8],
+    /// H x W, camera z, 0 where there is no return. [mm]
+    pub depth_mm: &'a [u16],
+}
+
+/// The log of one flight on a virtual clock. [`Self::finish`] completes the file.
+pub struct VirtualLog {
+    writer: LogWriter<PlainFile>,
+    closed_at: HostTime,
+    encoder: Encoder,
+    /// What went wrong first: nothing is written from then on.
+    failed: Option<mcap::McapError>,
+}
+
+impl VirtualLog {
+    /// Begins the log of a flight by `plugin` at `now` in `file`, which is empty.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub fn new(
+        file: File,
+        images: LoggedImages,
+        plugin: &OsString,
+        now: HostTime,
+    ) -> McapResult<Self> {
+        let budget = (images == LoggedImages::Reduced).then(Budget::default);
+        let probe = file.try_clone()?;
+        let sinks = LogSinks::new(Some(PlainFile(file)), None, budget)?;
+        let (queue, _) = Queue::of(0);
+        let free_bytes = Box::new(move || file::free_bytes(&probe));
+        let writer = LogWriter::since(0, sinks, Arc::clone(&queue), free_bytes);
+        let options = EncodeOptions { color_mode: ColorMode::Lossless, ..EncodeOptions::default() };
+        let encoder = Encoder::new(options);
+        let mut log = Self { writer, closed_at: now, encoder, failed: None };
+        log.take(now, flight_record(plugin, &[]));
+        Ok(log)
+    }
+
+    /// Logs `message`, on a channel of ours.
+    pub fn write(&mut self, channel: Channel, at: HostTime, message: &impl Serialize) {
+        if let Ok(json) = serde_json::to_vec(message) {
+            self.take(at, Record::Json { channel, at, json });
+        }
+    }
+
+    /// Logs a pose that came at `at` and was true at `stamp`.
+    pub fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
+        self.take(at, Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs an event.
+    pub fn event(&mut self, at: HostTime, event: &Event) {
+        self.take(at, event_record(at, event));
+    }
+
+    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it had image `seq`.
+    pub fn line(&mut self, at: HostTime, stream: &str, line: &str, seq: u64) {
+        self.take(at, line_record(at, stream, line, seq));
+    }
+
+    /// Logs a message that was sent to the plugin; replay sends it again.
+    pub fn to_plugin(&mut self, at: HostTime, message: &ToPlugin) {
+        self.take(at, plugin_record(at, true, message));
+    }
+
+    /// Logs a message of the plugin; replay compares with it.
+    pub fn from_plugin(&mut self, at: HostTime, message: &FromPlugin) {
+        self.take(at, plugin_record(at, false, message));
+    }
+
+    /// Logs an observation: shared memory up to its first plane, and its images, if the log keeps them.
+    pub fn observation(&mut self, at: HostTime, seq: u64, head: &[u8], images: &[GivenImage<'_>]) {
+        if self.failed.is_some() {
+            return;
+        }
+        let result = self.write_observation(at, seq, head, images);
+        self.keep(at, result);
+    }
+
+    fn write_observation(
+        &mut self,
+        at: HostTime,
+        seq: u64,
+        head: &[u8],
+        images: &[GivenImage<'_>],
+    ) -> McapResult<()> {
+        let is_kept = self.writer.keeps_image(at);
+        let mut logged = Vec::new();
+        for image in images.iter().filter(|_| is_kept) {
+            let mut bitstream = Vec::new();
+            let (width, height) = (image.header.width_px.get(), image.header.height_px.get());
+            let GivenImage { header, name, pose, rgb, depth_mm } = *image;
+            let view = RgbdView { width, height, rgb, depth_mm };
+            let encoded = self.encoder.encode(&view, &mut bitstream);
+            encoded.map_err(io::Error::other)?;
+            self.show(at, image, (width, height))?;
+            logged.push(LoggedImage {
+                camera: header.camera.into(),
+                name: name.to_owned(),
+                header: *header,
+                pose,
+                received: at,
+                pieces: vec![bitstream],
+            });
+        }
+        self.writer.observation(at, seq, head.to_vec(), &logged, is_kept)
+    }
+
+    /// Writes an image's colour so that viewers open it.
+    fn show(
+        &mut self,
+        at: HostTime,
+        image: &GivenImage<'_>,
+        (width, height): (u32, u32),
+    ) -> McapResult<()> {
+        let mut jpeg = Vec::new();
+        encode_jpeg(image.rgb, width, height, QUALITY, &mut jpeg).map_err(io::Error::other)?;
+        let color = fox::CompressedImage {
+            timestamp: Some(timestamp(image.pose.as_ns())),
+            frame_id: image.name.to_owned(),
+            data: jpeg.into(),
+            format: "jpeg".into(),
+        };
+        let channel = Channel::Color(image.header.camera);
+        self.writer.sinks.put(channel, image.name, at.as_ns(), &color.encode_to_vec())
+    }
+
+    fn take(&mut self, at: HostTime, record: Record) {
+        if self.failed.is_some() {
+            return;
+        }
+        let result = self.writer.take(record);
+        self.keep(at, result);
+    }
+
+    fn keep(&mut self, at: HostTime, result: McapResult<()>) {
+        let is_due = at.seconds_since(self.closed_at) >= CHUNK_PERIOD_S;
+        let result = result.and_then(|()| {
+            if is_due || self.writer.sinks.is_chunk_full() {
+                self.closed_at = at;
+                return self.writer.sinks.flush();
+            }
+            Ok(())
+        });
+        self.failed = result.err();
+    }
+
+    /// Completes the file.
+    ///
+    /// # Errors
+    /// What went wrong first: a full disk, say. The file then lacks what came after.
+    pub fn finish(self) -> McapResult<()> {
+        match self.failed {
+            None => self.writer.sinks.finish(),
+            Some(error) => Err(error),
+        }
+    }
+}
+
+impl std::fmt::Debug for VirtualLog {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("VirtualLog").field("failed", &self.failed).finish_non_exhaustive()
+    }
+}
+
+/// A file that whoever flies hands to the medium when all is written.
+struct PlainFile(File);
+
+impl Disk for PlainFile {
+    fn write_at(&mut self, bytes: &[u8], offset: u64) -> io::Result<()> {
+        self.0.write_all_at(bytes, offset)
+    }
+
+    fn cut(&mut self, len: u64) -> io::Result<()> {
+        self.0.set_len(len)
+    }
+}
