@@ -10,15 +10,17 @@
 //! scene     files -> splats, obstacles      imports none of these
 //! ```
 //! Beneath the rooms lie small files that import no room: clock, stop, lock, mailbox, timing,
-//! rate limits, authorization. `tests/arrows.rs` fails on an import that runs upwards.
+//! rate limits, admission, descriptors, authorization. `tests/arrows.rs` fails on an import that runs upwards.
 //!
 //! Four threads (poses, render, encode, previews) and a tokio runtime for sockets share the rooms'
 //! states ([`stream::Rooms`]). Everything is latest-wins but events, which are a log. [`serve()`]
 //! runs it all.
 
+mod admission;
 pub mod args;
 pub mod authorization;
 pub mod clock;
+mod descriptors;
 pub mod flights;
 pub mod lock;
 pub mod mailbox;

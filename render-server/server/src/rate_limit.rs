@@ -53,7 +53,7 @@ impl Debt {
 }
 
 /// Whoever has an IPv6 address has a whole /64 of them (RFC 6177).
-fn place(address: IpAddr) -> IpAddr {
+pub(crate) fn place(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(v6) => Ipv6Addr::from_bits(v6.to_bits() >> 64 << 64).into(),
         v4 @ IpAddr::V4(_) => v4,

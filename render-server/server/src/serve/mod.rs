@@ -24,6 +24,7 @@ use self::print::{Ready, ReadySource, ReadyVehicle};
 use crate::args::{RunStorage, ServeArgs};
 use crate::authorization::Authorizer;
 use crate::clock;
+use crate::descriptors;
 use crate::flights::leaderboard::{Database, Leaderboard};
 use crate::flights::vehicle::VehicleFlight;
 use crate::flights::{self, Flights};
@@ -50,6 +51,7 @@ use crate::web::{self, Access, Logins, Page};
 /// Scene or arena that cannot be used, an address that cannot be bound.
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn serve(args: ServeArgs) -> Result<()> {
+    descriptors::raise_limit();
     let stop = Stop::default();
     let mut args = args;
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -159,13 +161,10 @@ async fn run(
         quic_port: quic.port(),
         scenes: scenes.clone(),
         team_tries: Mutex::default(),
+        watchers: Mutex::default(),
     };
     let mut tasks = JoinSet::new();
-    tasks.spawn(async move {
-        if let Err(error) = web::serve(page, listener).await {
-            warn!("{error:#}");
-        }
-    });
+    tasks.spawn(web::serve(page, listener));
     if let Some(grant) = args.pair.take() {
         open_pairing(&authorizer, &grant, quic.port(), args.json)?;
     }
@@ -204,7 +203,7 @@ async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) ->
     loop {
         let bound = async {
             let endpoint = transport::bind(args.quic, &authorizer.identity, args.congestion)?;
-            let listener = web::bind(args.http).await?;
+            let listener = web::bind(args.http)?;
             let sources = drivers::open(&args.localization(settings::of_arena(&args.arena)?))?;
             anyhow::Ok(Sockets { endpoint, listener, sources })
         };

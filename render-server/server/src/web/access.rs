@@ -14,17 +14,20 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
+use axum::body::{HttpBody, to_bytes};
 use axum::extract::{ConnectInfo, MatchedPath, Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use tokio::sync::Semaphore;
+use tokio::time::timeout;
 use tracing::warn;
 use vizflyt_trust::{Fingerprint, KeyError, KeysFolder, secret};
 
+use super::listener::ConnectionPlace;
 use super::routes::{Rights, Rule};
 use super::sessions::{Sessions, Tokens};
 use super::{Page, login, origin, refuse};
@@ -318,7 +321,7 @@ pub(super) async fn guard(
     let rule = rights.of(method, path);
     let need = Need::of(rule.takes, path, request.uri());
     if need == Need::Nothing {
-        return next.run(request).await;
+        return run(request, None, next).await;
     }
     // Reading too: a stranger's name that resolves to us would read as loopback.
     if let Err(refusal) = origin::check_host(request.headers()) {
@@ -332,12 +335,39 @@ pub(super) async fn guard(
             (StatusCode::FORBIDDEN, NO_TOKEN).into_response()
         }
         Some(shown) => {
-            request.extensions_mut().insert(shown.viewer.clone());
+            let viewer = shown.viewer.clone();
+            request.extensions_mut().insert(viewer.clone());
             request.extensions_mut().insert(shown);
-            next.run(request).await
+            run(request, Some(&viewer), next).await
         }
         None => (StatusCode::UNAUTHORIZED, NO_KEY).into_response(),
     }
+}
+
+/// Reads the rest of a request and hands it to its route. Until its body is here the connection keeps the
+/// place of whoever waits; a client that dawdles holds nobody up.
+async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response {
+    let place = request.extensions().get::<ConnectionPlace>().cloned();
+    let (parts, mut body) = request.into_parts();
+    if !body.is_end_stream() {
+        body = match timeout(BODY_WITHIN, to_bytes(body, MAX_BODY)).await {
+            Ok(Ok(bytes)) => bytes.into(),
+            // Too long, or the client has gone and hears nothing of it.
+            Ok(Err(_)) => return (StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE).into_response(),
+            Err(_) => {
+                let close = [(header::CONNECTION, "close")];
+                return (StatusCode::REQUEST_TIMEOUT, close, TOO_SLOW).into_response();
+            }
+        };
+    }
+    if let Some(place) = &place {
+        place.serve(viewer);
+    }
+    let response = next.run(Request::from_parts(parts, body)).await;
+    if let Some(place) = &place {
+        place.wait();
+    }
+    response
 }
 
 impl Rule {
@@ -469,6 +499,12 @@ const COOKIE_S: u32 = 180 * 24 * 3600;
 const NO_KEY: &str = "this page needs a key: open the address that the instructor gave you, which ends in \
      /enter?key=..., or log in with the instructor's password";
 const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session has it, or reload the page";
+const TOO_LARGE: &str = "length limit: a request has 16 KB at most";
+const TOO_SLOW: &str = "the request's body did not come within 5 s";
+/// A camera takes some hundred bytes. [bytes]
+pub(super) const MAX_BODY: usize = 16 << 10;
+/// A body of a few packets, over a bad link.
+const BODY_WITHIN: Duration = Duration::from_secs(5);
 /// More logins at once are nobody's.
 const MAX_WAITING: usize = 8;
 /// 80 bits, should somebody write one by hand.

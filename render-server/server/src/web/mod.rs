@@ -44,6 +44,7 @@ mod cameras;
 mod crash;
 mod environment;
 mod leaderboard;
+mod listener;
 mod login;
 pub(crate) mod messages;
 pub(crate) mod origin;
@@ -67,7 +68,7 @@ pub use view::{ViewArgs, view};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
@@ -82,6 +83,7 @@ use vizflyt_arena::config::StageConfig;
 use vizflyt_protocol::time::ServerTime;
 
 use self::access::Shown;
+use self::listener::ConnectionPlace;
 use self::previews::Previews;
 use crate::authorization::Authorizer;
 use crate::flights::vehicle::VehicleFlight;
@@ -111,13 +113,16 @@ pub(crate) struct Page {
     pub(crate) team_tries: Mutex<RateLimiter>,
     /// The scenes to choose from.
     pub(crate) scenes: Arc<Scenes>,
+    /// Who watches, by WebSocket.
+    pub(crate) watchers: Mutex<viewer::Watchers>,
 }
 
 /// Binds the page's address.
-pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
-    let listener = TcpListener::bind(address).await.with_context(|| {
-        format!("cannot listen on {address} (page); is the port taken? try --http 127.0.0.1:0")
-    })?;
+///
+/// # Errors
+/// An address that cannot be had.
+pub(crate) fn bind(address: SocketAddr) -> Result<TcpListener> {
+    let listener = listener::bind(address)?;
     if !address.ip().is_loopback() {
         warn!(
             "the page at {address} asks for keys, but plain HTTP lets everyone on that network read \
@@ -128,14 +133,9 @@ pub async fn bind(address: SocketAddr) -> Result<TcpListener> {
 }
 
 /// Serves the page until the server stops.
-pub(crate) async fn serve(page: Page, listener: TcpListener) -> Result<()> {
+pub(crate) async fn serve(page: Page, listener: TcpListener) {
     let stop = page.rooms.stop.clone();
-    let router = routes::router(Arc::new(page)).into_make_service_with_connect_info::<SocketAddr>();
-    // Dropped at the stop rather than drained: WebSockets would drain for ever.
-    tokio::select! {
-        served = axum::serve(listener, router) => served.context("the page's server failed"),
-        () = stop.wait() => Ok(()),
-    }
+    listener::serve(listener, routes::router(Arc::new(page)), stop).await;
 }
 
 pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {
@@ -201,6 +201,7 @@ async fn watch(
     State(page): State<Arc<Page>>,
     Query(watched): Query<Watched>,
     Extension(shown): Extension<Shown>,
+    place: Option<Extension<ConnectionPlace>>,
     headers: HeaderMap,
     upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
 ) -> Response {
@@ -214,9 +215,13 @@ async fn watch(
     };
     match upgrade {
         // Viewers have nothing to send: a byte limit keeps a hostile one small.
-        Ok(upgrade) => upgrade
-            .max_message_size(1024)
-            .on_upgrade(async move |socket| viewer::run(page, vehicle, shown, socket).await),
+        Ok(upgrade) => upgrade.max_message_size(1024).on_upgrade(async move |socket| {
+            // Held for as long as it watches, and not to be taken from it.
+            if let Some(Extension(place)) = &place {
+                place.serve(Some(&shown.viewer));
+            }
+            viewer::run(page, vehicle, shown, socket).await;
+        }),
         Err(rejection) => rejection.into_response(),
     }
 }

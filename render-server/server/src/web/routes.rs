@@ -159,8 +159,7 @@ pub(super) fn router(page: Arc<Page>) -> Router {
     router
         // Also before routes that are not there: what exists is nobody's business.
         .layer(middleware::from_fn_with_state((page.clone(), Arc::new(rights)), access::guard))
-        // A camera takes some hundred bytes.
-        .layer(DefaultBodyLimit::max(16 << 10))
+        .layer(DefaultBodyLimit::max(access::MAX_BODY))
         .with_state(page)
 }
 

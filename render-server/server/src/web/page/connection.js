@@ -29,9 +29,11 @@ export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
     const [kind, camera] = new Uint8Array(data, 0, 2);
     onImage(kind, camera, new Uint8Array(data, 2));
   };
-  socket.onclose = () => {
-    showLink("bad", "server gone, reconnecting");
+  socket.onclose = ({ code, reason }) => {
+    // The server says why it closes; of one that is gone nobody knows.
+    showLink(code === TRY_AGAIN_LATER ? "warn" : "bad", reason || "server gone, reconnecting");
     document.body.dataset.stale = "";
+    if (code === TRY_AGAIN_LATER) wait_ms = MAX_WAIT_MS;
     if (!opened) explainRefusal();
     setTimeout(connect, wait_ms, onMessage, onImage, Math.min(MAX_WAIT_MS, wait_ms * 1.6));
   };
@@ -64,5 +66,7 @@ function showLink(tone, text) {
   setText($("link-text"), text);
 }
 
+/** A close code (IANA's registry of RFC 6455): too many pages are open. */
+const TRY_AGAIN_LATER = 1013;
 const FIRST_WAIT_MS = 250;
 const MAX_WAIT_MS = 3000;
