@@ -1,4 +1,5 @@
-//! An identity: an Ed25519 key and its self-signed certificate, made once and kept.
+//! An identity: a key and its self-signed certificate, made once and kept. Keys are Ed25519, but for the
+//! page's, since browsers take none of those: ECDSA with P-256.
 
 use std::str::FromStr;
 
@@ -16,6 +17,8 @@ pub enum Owner {
     Server,
     /// The runtime, or another program that speaks to a server.
     Runtime,
+    /// The server's page, over HTTPS.
+    Page,
 }
 
 impl Owner {
@@ -24,7 +27,24 @@ impl Owner {
         match self {
             Self::Server => "server.key",
             Self::Runtime => "runtime.key",
+            Self::Page => "page.key",
         }
+    }
+
+    /// Returns the names that its certificate is for: clients of ours look at the fingerprint alone, browsers
+    /// at these too.
+    fn names(self) -> Vec<String> {
+        if self != Self::Page {
+            return vec!["vizflyt".to_owned()];
+        }
+        let mut names: Vec<String> = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
+        let own = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+        let own = own.trim();
+        let is_name = |byte: u8| byte.is_ascii_alphanumeric() || b"-.".contains(&byte);
+        if !own.is_empty() && own.len() < 64 && own.bytes().all(is_name) {
+            names.extend([own.to_owned(), format!("{own}.local")]);
+        }
+        names
     }
 }
 
@@ -52,7 +72,7 @@ impl Identity {
     pub fn load_or_create(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
         let name = owner.file();
         if folder.read_secret(name)?.is_none() {
-            let text = Self::make().map_err(|what| damaged(folder, owner, &what))?;
+            let text = Self::make(owner).map_err(|what| damaged(folder, owner, &what))?;
             // Another process may have been first; then its key counts, and is read below.
             folder.create(name, &text)?;
         }
@@ -65,7 +85,7 @@ impl Identity {
     /// # Errors
     /// If the system gives no random numbers.
     pub fn ephemeral() -> Result<Self, String> {
-        Self::parse(&Self::make()?)
+        Self::parse(&Self::make(Owner::Runtime)?)
     }
 
     /// Returns who this is.
@@ -73,10 +93,14 @@ impl Identity {
         Fingerprint::of(&self.certificate)
     }
 
-    fn make() -> Result<String, String> {
+    fn make(owner: Owner) -> Result<String, String> {
+        let kind = match owner {
+            Owner::Server | Owner::Runtime => &rcgen::PKCS_ED25519,
+            Owner::Page => &rcgen::PKCS_ECDSA_P256_SHA256,
+        };
         let make = || {
-            let key = rcgen::KeyPair::generate_for(&rcgen::PKCS_ED25519)?;
-            let params = rcgen::CertificateParams::new(vec!["vizflyt".to_owned()])?;
+            let key = rcgen::KeyPair::generate_for(kind)?;
+            let params = rcgen::CertificateParams::new(owner.names())?;
             Ok::<_, rcgen::Error>((params.self_signed(&key)?, key))
         };
         let (certificate, key) = make().map_err(|error| format!("cannot make a key: {error}"))?;
@@ -153,8 +177,12 @@ mod tests {
         let again = Identity::load_or_create(&folder, Owner::Server).unwrap();
         assert_eq!(first.fingerprint(), again.fingerprint());
         assert_eq!(first.key, again.key);
-        let other = Identity::load_or_create(&folder, Owner::Runtime).unwrap();
-        assert_ne!(first.fingerprint(), other.fingerprint());
+        for owner in [Owner::Runtime, Owner::Page] {
+            let other = Identity::load_or_create(&folder, owner).unwrap();
+            assert_ne!(first.fingerprint(), other.fingerprint());
+            let again = Identity::load_or_create(&folder, owner).unwrap();
+            assert_eq!(again.fingerprint(), other.fingerprint());
+        }
     }
 
     #[test]
@@ -162,7 +190,7 @@ mod tests {
         let (_root, folder) = folder();
         Identity::load_or_create(&folder, Owner::Server).unwrap();
         let good = folder.read("server.key").unwrap().unwrap();
-        let other = Identity::make().unwrap();
+        let other = Identity::make(Owner::Server).unwrap();
         let swapped = {
             let cut = |text: &str| text.find("-----BEGIN CERT").unwrap();
             format!("{}{}", &other[..cut(&other)], &good[cut(&good)..])
@@ -180,7 +208,7 @@ mod tests {
 
     #[test]
     fn a_flipped_letter_is_noticed() {
-        let good = Identity::make().unwrap();
+        let good = Identity::make(Owner::Server).unwrap();
         let stated = Identity::parse(&good).unwrap();
         for at in 0..good.len() {
             let mut bytes = good.clone().into_bytes();

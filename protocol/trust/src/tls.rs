@@ -4,12 +4,14 @@
 //! certificate may do anything is decided afterwards, by its fingerprint. Sessions are never
 //! resumed: each connection proves it again.
 
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rustls::client::Resumption;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::{CryptoProvider, WebPkiSupportedAlgorithms, verify_tls13_signature};
-use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, DistinguishedName, Error, ServerConfig,
@@ -28,6 +30,44 @@ pub fn server_config(identity: &Identity, alpn: &[&[u8]]) -> Result<ServerConfig
     config.send_tls13_tickets = 0;
     config.alpn_protocols = alpn.iter().map(|name| name.to_vec()).collect();
     Ok(config)
+}
+
+/// Returns the page's side: browsers show no certificate, and speak HTTP/1.1.
+///
+/// # Errors
+/// A key that is not the certificate's, or of a kind that TLS does not know.
+pub fn page_config(
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+) -> Result<ServerConfig, Error> {
+    let mut config = ServerConfig::builder_with_provider(provider())
+        .with_protocol_versions(&[&rustls::version::TLS13])?
+        .with_no_client_auth()
+        .with_single_cert(chain, key)?;
+    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    Ok(config)
+}
+
+/// As [`page_config`], from PEM files; with the fingerprint of the certificate.
+///
+/// # Errors
+/// What is wrong with which file.
+pub fn page_config_of_files(
+    certificate: &Path,
+    key: &Path,
+) -> Result<(ServerConfig, Fingerprint), String> {
+    let wrong = |path: &Path, what: String| format!("{}: {what}", path.display());
+    let chain: Result<Vec<_>, _> =
+        CertificateDer::pem_file_iter(certificate).and_then(Iterator::collect);
+    let chain = chain.map_err(|error| wrong(certificate, format!("no certificate: {error}")))?;
+    let Some(first) = chain.first() else {
+        return Err(wrong(certificate, "no certificate in it (PEM)".to_owned()));
+    };
+    let fingerprint = Fingerprint::of(first);
+    let der = PrivateKeyDer::from_pem_file(key)
+        .map_err(|error| wrong(key, format!("no private key: {error}")))?;
+    let config = page_config(chain, der).map_err(|error| wrong(key, error.to_string()))?;
+    Ok((config, fingerprint))
 }
 
 /// Which server a client takes for its own.

@@ -45,6 +45,19 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
 
+    /// HTTPS for the page: `auto` makes a certificate and keeps it with the server's keys, or name a
+    /// certificate's PEM file, with --tls-key [default: plain HTTP]
+    #[arg(long, value_name = "auto|CERT", value_hint = ValueHint::FilePath)]
+    pub tls: Option<PathBuf>,
+
+    /// The PEM file of the private key of --tls CERT
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub tls_key: Option<PathBuf>,
+
+    /// Serve the page over plain HTTP on a public address too: whoever is on the way reads keys and pictures
+    #[arg(long)]
+    pub plain_http: bool,
+
     /// Where Vicon Tracker's UDP object stream arrives [default: 0.0.0.0:51001, unless arena.toml has
     /// [[localization]] or --pose is given]
     #[arg(long, value_name = "ADDR")]

@@ -143,7 +143,7 @@ fn setting(argument: &Arg, value: &Spanned<DeValue<'_>>, folder: &Path) -> Resul
     };
     let is_path = matches!(argument.get_value_hint(), ValueHint::AnyPath | ValueHint::FilePath);
     let arguments = texts.into_iter().map(|text| {
-        let is_elsewhere = text == "none" || text.contains("://");
+        let is_elsewhere = text == "none" || text == "auto" || text.contains("://");
         let text =
             if is_path && !is_elsewhere { folder.join(text).into_os_string() } else { text.into() };
         let Some(long) = long else { return text };
@@ -220,6 +220,10 @@ mod tests {
         assert_eq!(line, ["--apart", "--leaderboard=none", "--max-rate=60.5"]);
         let line = settled("leaderboard = 'runs.sqlite'\n", &["x"]).unwrap();
         assert_eq!(line, ["--leaderboard=HERE/runs.sqlite"]);
+        let line = settled("tls = 'auto'\n", &["x"]).unwrap();
+        assert_eq!(line, ["--tls=auto"]);
+        let line = settled("tls = 'page.pem'\ntls_key = '/k.pem'\n", &["x"]).unwrap();
+        assert_eq!(line, ["--tls=HERE/page.pem", "--tls-key=/k.pem"]);
         let line = settled("up = '-y'\nleaderboard = 'postgres://lab@db/runs'\n", &["x"]).unwrap();
         assert_eq!(line, ["--leaderboard=postgres://lab@db/runs", "--up=-y"]);
     }

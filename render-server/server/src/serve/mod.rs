@@ -40,7 +40,7 @@ use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
 use crate::web::messages::Rates;
 use crate::web::previews::Previews;
-use crate::web::{self, Access, Logins, Page};
+use crate::web::{self, Access, Logins, Page, PageTls};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -101,7 +101,8 @@ async fn run(
 ) -> Result<()> {
     // Sockets first: a taken port is reported before the scene is loaded.
     let authorizer = Arc::new(Authorizer::open(KeysFolder::open(args.keys.as_deref())?)?);
-    let Sockets { endpoint, listener, sources } = open_sockets(args, &authorizer, again).await?;
+    let Sockets { endpoint, listener, tls, sources } =
+        open_sockets(args, &authorizer, again).await?;
     let quic = endpoint.local_addr().context("QUIC has no address")?;
     let http = listener.local_addr().context("the page has no address")?;
     let vicon = sources.iter().find(|source| source.driver() == Driver::Vicon);
@@ -127,13 +128,14 @@ async fn run(
     let threads = threads.start(args, scene.renderer.rasterizer, scene.referees, source)?;
 
     let renderer = lock(&rooms.rendering.renderer).clone();
-    let url = format!("http://{http}");
+    let url = format!("{}://{http}", if tls.is_some() { "https" } else { "http" });
     print::ready(
         args.json,
         &Ready {
             ready: "server",
             quic,
             http: url.clone(),
+            page_certificate: tls.as_ref().map(|tls| tls.fingerprint().to_string()),
             vicon,
             pose,
             fingerprint: authorizer.identity.fingerprint().to_string(),
@@ -164,7 +166,7 @@ async fn run(
         watchers: Mutex::default(),
     };
     let mut tasks = JoinSet::new();
-    tasks.spawn(web::serve(page, listener));
+    tasks.spawn(web::serve(page, listener, tls));
     if let Some(grant) = args.pair.take() {
         open_pairing(&authorizer, &grant, quic.port(), args.json)?;
     }
@@ -194,18 +196,21 @@ async fn run(
 struct Sockets {
     endpoint: Endpoint,
     listener: TcpListener,
+    tls: Option<PageTls>,
     sources: Vec<Opened>,
 }
 
 /// Binds all addresses; `again` means that a former round may still hold them for a moment.
 async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) -> Result<Sockets> {
+    let folder = &authorizer.folder;
+    let tls = PageTls::open(args.tls.as_deref(), args.tls_key.as_deref(), folder)?;
     let mut tries = if again { BIND_TRIES } else { 0 };
     loop {
         let bound = async {
             let endpoint = transport::bind(args.quic, &authorizer.identity, args.congestion)?;
-            let listener = web::bind(args.http)?;
+            let listener = web::bind(args.http, tls.as_ref(), args.plain_http)?;
             let sources = drivers::open(&args.localization(settings::of_arena(&args.arena)?))?;
-            anyhow::Ok(Sockets { endpoint, listener, sources })
+            anyhow::Ok(Sockets { endpoint, listener, tls: tls.clone(), sources })
         };
         match bound.await {
             Err(_) if tries > 0 => tries -= 1,

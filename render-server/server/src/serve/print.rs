@@ -27,6 +27,9 @@ pub(super) struct Ready<'a> {
     pub(super) ready: &'static str,
     pub(super) quic: SocketAddr,
     pub(super) http: String,
+    /// The SHA-256 of the page's certificate, if it is served over HTTPS.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) page_certificate: Option<String>,
     /// Where Vicon's stream must be sent, if that is a source.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) vicon: Option<SocketAddr>,
@@ -128,6 +131,9 @@ pub(super) fn ready(json: bool, ready: &Ready<'_>) {
     plain(&format!("arena        {}", ready.arena));
     plain(&format!("renderer     {} ({})", ready.renderer, ready.renderer_reason));
     plain(&format!("page         {}", ready.http));
+    if let Some(fingerprint) = &ready.page_certificate {
+        plain(&format!("certificate  {fingerprint} (the page's; compare it when a browser asks)"));
+    }
     for source in &ready.pose {
         plain(&format!("{:<12} {} (poses)", source.driver.name(), source.address));
     }

@@ -425,7 +425,7 @@ pub(super) fn cookie_line(
 ) -> String {
     let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
     let is_secure = text("origin").is_some_and(|origin| origin.starts_with("https://"))
-        || text("x-forwarded-proto") == Some("https");
+        || text(FORWARDED_PROTO) == Some("https");
     let age = age_s.map_or_else(String::new, |age_s| format!("; Max-Age={age_s}"));
     let secure = if is_secure { "; Secure" } else { "" };
     format!("{name}={value}; Path=/{age}; HttpOnly; SameSite=Strict{secure}")
@@ -492,6 +492,8 @@ const HEAD: &str = "\
 pub(super) const KEY: &str = "vizflyt_key";
 /// The cookie of a session; it ends with the browser's.
 pub(super) const SESSION: &str = "vizflyt_session";
+/// By which a proxy, or our own listener, says that the client speaks TLS.
+pub(super) const FORWARDED_PROTO: &str = "x-forwarded-proto";
 /// The header that bears the token.
 const TOKEN: &str = "x-vizflyt-token";
 /// A term. [s]

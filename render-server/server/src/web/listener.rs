@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use axum::Router;
 use axum::extract::ConnectInfo;
+use axum::http::HeaderValue;
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
@@ -26,7 +27,8 @@ use tokio::sync::Notify;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{debug, warn};
 
-use super::access::Viewer;
+use super::access::{self, Viewer};
+use super::https::PageTls;
 use crate::admission::{Admission, Holder, Limits, PlaceId};
 use crate::descriptors::{self, Reserve};
 use crate::lock::lock;
@@ -138,7 +140,7 @@ fn limits(descriptors: usize) -> Limits {
 }
 
 /// Accepts connections until the server stops. Those that are open then end by themselves.
-pub(super) async fn serve(listener: TcpListener, router: Router, stop: Stop) {
+pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: Router, stop: Stop) {
     let door = Door::new(descriptors::raise_limit());
     let mut reserve = Reserve::default();
     reserve.fill();
@@ -159,10 +161,10 @@ pub(super) async fn serve(listener: TcpListener, router: Router, stop: Stop) {
                 reserve.fill();
                 match door.admit(from.ip()) {
                     Some((place, gives_way)) => {
-                        let router = router.clone();
+                        let (tls, router) = (tls.clone(), router.clone());
                         tokio::spawn(async move {
                             tokio::select! {
-                                () = talk(stream, from, place, router) => {}
+                                () = talk(stream, from, place, tls, router) => {}
                                 () = gives_way.notified() => debug!("page: {from} gave way"),
                             }
                         });
@@ -188,13 +190,23 @@ pub(super) async fn serve(listener: TcpListener, router: Router, stop: Stop) {
 }
 
 /// Serves a connection until it ends, or becomes a WebSocket.
-async fn talk(stream: TcpStream, from: SocketAddr, place: ConnectionPlace, router: Router) {
+async fn talk(
+    stream: TcpStream,
+    from: SocketAddr,
+    place: ConnectionPlace,
+    tls: Option<PageTls>,
+    router: Router,
+) {
     // Small answers leave at once.
     let _ = stream.set_nodelay(true);
-    http(stream, from, place, router).await;
+    let Some(tls) = tls else { return http(stream, from, place, false, router).await };
+    match tls.accept(stream).await {
+        Ok(stream) => http(stream, from, place, true, router).await,
+        Err(error) => debug!("page: {from}: {error:#}"),
+    }
 }
 
-async fn http<S>(stream: S, from: SocketAddr, place: ConnectionPlace, router: Router)
+async fn http<S>(stream: S, from: SocketAddr, place: ConnectionPlace, is_tls: bool, router: Router)
 where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
@@ -202,6 +214,11 @@ where
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
         request.extensions_mut().insert(ConnectInfo(from));
         request.extensions_mut().insert(place.clone());
+        if is_tls {
+            // As a proxy that speaks TLS says it: cookies are Secure then.
+            let https = HeaderValue::from_static("https");
+            request.headers_mut().insert(access::FORWARDED_PROTO, https);
+        }
         router.call(request)
     });
     let mut builder = http1::Builder::new();

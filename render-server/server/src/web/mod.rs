@@ -43,6 +43,7 @@ mod access;
 mod cameras;
 mod crash;
 mod environment;
+mod https;
 mod leaderboard;
 mod listener;
 mod login;
@@ -83,6 +84,7 @@ use vizflyt_arena::config::StageConfig;
 use vizflyt_protocol::time::ServerTime;
 
 use self::access::Shown;
+pub(crate) use self::https::PageTls;
 use self::listener::ConnectionPlace;
 use self::previews::Previews;
 use crate::authorization::Authorizer;
@@ -117,25 +119,22 @@ pub(crate) struct Page {
     pub(crate) watchers: Mutex<viewer::Watchers>,
 }
 
-/// Binds the page's address.
+/// Binds the page's address, for HTTPS or for plain HTTP; the latter not on a public address, unless
+/// `plain` asks for it.
 ///
 /// # Errors
-/// An address that cannot be had.
-pub(crate) fn bind(address: SocketAddr) -> Result<TcpListener> {
-    let listener = listener::bind(address)?;
-    if !address.ip().is_loopback() {
-        warn!(
-            "the page at {address} asks for keys, but plain HTTP lets everyone on that network read \
-             them; use --http 127.0.0.1:8080 to keep it to this computer"
-        );
+/// An address that cannot be had, or is not to be had plainly.
+pub(crate) fn bind(address: SocketAddr, tls: Option<&PageTls>, plain: bool) -> Result<TcpListener> {
+    if tls.is_none() {
+        https::check_plain(address, plain)?;
     }
-    Ok(listener)
+    listener::bind(address)
 }
 
 /// Serves the page until the server stops.
-pub(crate) async fn serve(page: Page, listener: TcpListener) {
+pub(crate) async fn serve(page: Page, listener: TcpListener, tls: Option<PageTls>) {
     let stop = page.rooms.stop.clone();
-    listener::serve(listener, routes::router(Arc::new(page)), stop).await;
+    listener::serve(listener, tls, routes::router(Arc::new(page)), stop).await;
 }
 
 pub(crate) fn file(kind: &'static str, text: &'static str) -> Response {

@@ -139,7 +139,7 @@ impl Server {
             child,
             lines,
             quic: at("quic").parse().unwrap(),
-            http: at("http").strip_prefix("http://").unwrap().parse().unwrap(),
+            http: at("http").split_once("://").unwrap().1.parse().unwrap(),
             vicon: at("vicon").parse().unwrap(),
             ready,
             instructor,

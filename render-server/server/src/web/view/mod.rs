@@ -123,7 +123,7 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
     let stop = Stop::default();
     stop.on_signals(false)?;
     // First: a taken port is reported before the scene is loaded.
-    let listener = web::bind(args.http)?;
+    let listener = web::bind(args.http, None, true)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading));

@@ -1,0 +1,63 @@
+//! Handshakes that nobody finishes: a paired runtime comes in beside them, from the same address even.
+
+mod support;
+
+use std::net::UdpSocket;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use quinn::{ClientConfig, Endpoint, TransportConfig};
+use support::{Client, Server, write_arena};
+use vizflyt_trust::tls::Pin;
+use vizflyt_trust::{ALPN, Identity};
+
+/// Begins 40 handshakes a second; the server's answers reach nobody.
+fn begin_and_leave(server: &Server, stop: &Arc<AtomicBool>) {
+    let hole = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let (mouth, to) = (hole.local_addr().unwrap(), server.quic);
+    let onward = UdpSocket::bind("127.0.0.1:0").unwrap();
+    hole.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+    let ended = stop.clone();
+    std::thread::spawn(move || {
+        let mut packet = [0; 2048];
+        while !ended.load(Ordering::Relaxed) {
+            if let Ok((len, _)) = hole.recv_from(&mut packet) {
+                let _ = onward.send_to(&packet[..len], to);
+            }
+        }
+    });
+    let tls = Pin::none().client_config(&Identity::ephemeral().unwrap(), ALPN).unwrap();
+    let quic = quinn::crypto::rustls::QuicClientConfig::try_from(tls).unwrap();
+    let config = ClientConfig::new(Arc::new(quic));
+    let ended = stop.clone();
+    tokio::spawn(async move {
+        let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+        let mut begun = Vec::new();
+        let mut tick = tokio::time::interval(Duration::from_millis(25));
+        while !ended.load(Ordering::Relaxed) {
+            tick.tick().await;
+            begun.push(endpoint.connect_with(config.clone(), mouth, "vizflyt").unwrap());
+        }
+    });
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_runtime_comes_in_beside_forty_half_open_handshakes_a_second() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = Server::start(&write_arena(folder.path(), ""), &[]);
+    let stop = Arc::new(AtomicBool::new(false));
+    begin_and_leave(&server, &stop);
+    // Past the time that a handshake has.
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    let mut took = Vec::new();
+    for _ in 0..10 {
+        let start = Instant::now();
+        let (client, _) = Client::welcomed(&server, TransportConfig::default()).await;
+        took.push(start.elapsed().as_secs_f64() * 1e3);
+        client.close().await;
+    }
+    took.sort_by(f64::total_cmp);
+    println!("welcomed within {:.0} ms, at most {:.0} ms", took[5], took[9]);
+    stop.store(true, Ordering::Relaxed);
+}
