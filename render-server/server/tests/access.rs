@@ -407,10 +407,41 @@ fn a_stranger_neither_watches_nor_stops() {
     }
     assert_eq!(lab.status("POST /api/vehicles/ant/estop", STRANGER), 401);
     assert_eq!(lab.status("GET /ws?vehicle=ant", STRANGER), 401);
-    // A wrong key gives nothing, and takes away what the browser had.
+    // A wrong key gives nothing.
     let (status, head) = lab.ask("GET /enter?key=wrong", STRANGER);
-    assert_eq!(status, 401);
-    assert!(header(&head, "set-cookie").unwrap().starts_with("vizflyt_key=; "), "{head}");
+    assert_eq!((status, header(&head, "set-cookie")), (401, None), "{head}");
+}
+
+/// Any page on the Internet can open `/enter` in the instructor's browser.
+#[test]
+fn nobody_takes_the_instructors_key_out_of_its_browser() {
+    let lab = Lab::start();
+    let address = lab.server.http;
+    let (_, team_key) = lab.ants.split_once('=').unwrap();
+    for path in ["/enter", "/enter?key=", "/enter?key=wrong"] {
+        let (status, head) = ask(address, &format!("GET {path}"), &lab.instructor, "");
+        assert_eq!((status, header(&head, "set-cookie")), (401, None), "{path}: {head}");
+    }
+    let (status, head) = ask(address, &format!("GET /enter?key={team_key}"), &lab.instructor, "");
+    let set = header(&head, "set-cookie").unwrap();
+    let set = set.split(';').next().unwrap();
+    assert_eq!((status, set), (303, lab.ants.as_str()));
+    let both = [format!("{set}; {}", lab.instructor), format!("{}; {set}", lab.instructor)];
+    for both in &both {
+        assert_eq!(standing(address, both)["role"], "instructor", "{both}");
+        assert_eq!(lab.status("POST /api/estop", both), 409);
+    }
+    // With its own page's name, and not on behalf of a page elsewhere.
+    let elsewhere = "Origin: http://evil.example\r\n";
+    let (status, head) = ask(address, &format!("GET /enter?key={team_key}"), "", elsewhere);
+    assert_eq!((status, header(&head, "set-cookie")), (403, None), "{head}");
+    let request = format!(
+        "GET /enter?key={team_key} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n"
+    );
+    let (status, head) = raw(address, &request);
+    assert_eq!((status, header(&head, "set-cookie")), (403, None), "{head}");
+    // Out again: all of it.
+    assert_eq!(lab.status("POST /api/logout", &both[0]), 204);
 }
 
 #[test]

@@ -221,9 +221,19 @@ impl Access {
                 return Some(Shown { viewer: Viewer::Instructor, session, key: None });
             }
         }
-        if let Some(key) = cookie(headers, KEY) {
-            let viewer = self.keys.viewer(key)?.clone();
-            return Some(Shown { viewer, session: None, key: Some(key.to_owned()) });
+        // The instructor's first: whoever has it loses nothing by a team's.
+        let keys = [KEY, TEAM_KEY].map(|name| cookie(headers, name));
+        let mut known =
+            keys.into_iter().flatten().filter_map(|key| Some((self.keys.viewer(key)?, key)));
+        if let Some((viewer, key)) = known.next() {
+            return Some(Shown {
+                viewer: viewer.clone(),
+                session: None,
+                key: Some(key.to_owned()),
+            });
+        }
+        if keys.iter().any(Option::is_some) {
+            return None;
         }
         (self.login == Login::Remote && from.to_canonical().is_loopback()).then_some(Shown {
             viewer: Viewer::Instructor,
@@ -382,25 +392,27 @@ pub(super) struct Entering {
     key: String,
 }
 
-/// Exchanges a key for a cookie. A wrong key takes the cookie away: so one can also leave.
+/// Exchanges a key for a cookie. Any page can send a browser here, so nothing that the browser had is lost: a
+/// wrong key changes nothing, and a team's has a cookie of its own beside the instructor's.
 pub(super) async fn enter(
     State(page): State<Arc<Page>>,
     Query(entering): Query<Entering>,
     headers: HeaderMap,
 ) -> Response {
-    let (key, status, to) = match page.access.keys.viewer(&entering.key) {
-        Some(Viewer::Instructor) => (entering.key.as_str(), StatusCode::SEE_OTHER, "/".to_owned()),
-        Some(Viewer::Team(name)) => {
-            (entering.key.as_str(), StatusCode::SEE_OTHER, format!("/?vehicle={}", encoded(name)))
-        }
+    if let Err(refusal) = origin::check_navigation(&headers) {
+        return refuse(&refusal);
+    }
+    let (name, to) = match page.access.keys.viewer(&entering.key) {
+        Some(Viewer::Instructor) => (KEY, "/".to_owned()),
+        Some(Viewer::Team(name)) => (TEAM_KEY, format!("/?vehicle={}", encoded(name))),
         None => {
             warn!("page: somebody came with a wrong key");
-            ("", StatusCode::UNAUTHORIZED, String::new())
+            let no_store = [(header::CACHE_CONTROL, "no-store")];
+            return (StatusCode::UNAUTHORIZED, no_store, NO_KEY).into_response();
         }
     };
-    let age_s = if key.is_empty() { 0 } else { COOKIE_S };
-    let cookie = cookie_line(KEY, key, Some(age_s), &headers);
-    let mut response = (status, if key.is_empty() { NO_KEY } else { "" }).into_response();
+    let cookie = cookie_line(name, &entering.key, Some(COOKIE_S), &headers);
+    let mut response = StatusCode::SEE_OTHER.into_response();
     let headers = response.headers_mut();
     for (name, value) in [(header::SET_COOKIE, cookie), (header::LOCATION, to)] {
         if let Ok(value) = HeaderValue::from_str(&value)
@@ -488,8 +500,10 @@ const HEAD: &str = "\
 # Keys of the server's page: whoever has one opens it by http://SERVER/enter?key=KEY. Remove a line and start
 # the server again for a new key; all who had the old one are out.
 ";
-/// The cookie of a key.
+/// The cookie of the instructor's key; of a team's, where an earlier version has set it.
 pub(super) const KEY: &str = "vizflyt_key";
+/// The cookie of a team's key.
+pub(super) const TEAM_KEY: &str = "vizflyt_team_key";
 /// The cookie of a session; it ends with the browser's.
 pub(super) const SESSION: &str = "vizflyt_session";
 /// By which a proxy, or our own listener, says that the client speaks TLS.

@@ -219,7 +219,7 @@ pub(super) async fn logout(State(page): State<Arc<Page>>, headers: HeaderMap) ->
         lock(&page.access.logins.sessions).end(cookie);
     }
     let mut response = StatusCode::NO_CONTENT.into_response();
-    for name in [access::SESSION, access::KEY] {
+    for name in [access::SESSION, access::KEY, access::TEAM_KEY] {
         if let Ok(value) = HeaderValue::from_str(&access::cookie_line(name, "", Some(0), &headers))
         {
             response.headers_mut().append(header::SET_COOKIE, value);

@@ -39,6 +39,12 @@ pub(crate) fn check_host(headers: &HeaderMap) -> Result<(), Refusal> {
     check_name(host, own_name().trim())
 }
 
+/// Checks a request that a browser makes without `Origin` as well, as when somebody opens a link: if there is
+/// one, it must be our own.
+pub(crate) fn check_navigation(headers: &HeaderMap) -> Result<(), Refusal> {
+    if headers.contains_key(header::ORIGIN) { check(headers) } else { check_host(headers) }
+}
+
 fn own_name() -> String {
     std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default()
 }
