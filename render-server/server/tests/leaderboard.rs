@@ -2,6 +2,8 @@
 
 mod support;
 
+use std::io::{Read, Write};
+
 use quinn::TransportConfig;
 use serde_json::Value;
 use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
@@ -22,6 +24,41 @@ async fn until(board: &Leaderboard, wanted: impl Fn(&[Run]) -> bool) -> Vec<Run>
 
 fn put(server: &Server, body: &str) -> (u16, String) {
     send_json(server.http, "PUT /api/vehicles/vizflyt/team", None, body)
+}
+
+/// As [`send_json`], from another address of this computer and with a cookie and its token.
+fn send_json_as(
+    to: std::net::SocketAddr,
+    request: &str,
+    from: &str,
+    cookie: &str,
+    body: &str,
+) -> (u16, String) {
+    let (_, session) = http(to, &format!("GET /api/session HTTP/1.1\r\nCookie: {cookie}"));
+    let session: Value = serde_json::from_str(session.split_once("\r\n\r\n").unwrap().1).unwrap();
+    let token = session["token"].as_str().unwrap_or_default();
+    let socket = socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
+    socket.bind(&format!("{from}:0").parse::<std::net::SocketAddr>().unwrap().into()).unwrap();
+    socket.connect(&to.into()).unwrap();
+    let mut stream = std::net::TcpStream::from(socket);
+    let len = body.len();
+    write!(
+        stream,
+        "{request} HTTP/1.1\r\nHost: {to}\r\nOrigin: http://{to}\r\nCookie: {cookie}\r\n\
+         X-VizFlyt-Token: {token}\r\nContent-Type: application/json\r\nConnection: close\r\n\
+         Content-Length: {len}\r\n\r\n{body}"
+    )
+    .unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    let status = answer.split(' ').nth(1).unwrap().parse().unwrap();
+    (status, answer.split_once("\r\n\r\n").unwrap().1.to_owned())
+}
+
+fn standings_as(server: &Server, cookie: &str) -> Value {
+    let (_, answer) =
+        http(server.http, &format!("GET /api/leaderboard HTTP/1.1\r\nCookie: {cookie}"));
+    serde_json::from_str(answer.split_once("\r\n\r\n").unwrap().1).unwrap()
 }
 
 fn standings(server: &Server) -> Value {
@@ -106,6 +143,47 @@ fn the_instructor_names_teams_and_nobody_flies_for_a_stranger() {
         put(&server, r#"{"token": "guess"}"#);
     }
     assert_eq!(put(&server, r#"{"token": "guess"}"#).0, 429);
+}
+
+/// Team B, with its token and the vehicle's key, before team A takes off.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_team_keeps_its_check_in_until_it_has_flown() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("runs.sqlite");
+    let board = Leaderboard::open(&Database::File(file.clone())).await.unwrap();
+    let [ants, bees] =
+        [board.add_team("ants").await.unwrap(), board.add_team("bees").await.unwrap()];
+    let option = format!("--leaderboard={}", file.display());
+    let arena = write_arena(folder.path(), "");
+    let server = Server::start(&arena, &[&option, "--print-page-keys", "--login=always"]);
+    let [instructor, key] = ["instructor", "team of 'vizflyt'"].map(|whose| {
+        server.line(|line| {
+            let key = &line["page_key"];
+            let link = (key["for"] == whose).then(|| key["link"].as_str().unwrap())?;
+            Some(format!("vizflyt_key={}", link.split_once("key=").unwrap().1))
+        })
+    });
+    let ask = |from: &str, method: &str, cookie: &str, body: &str| {
+        let request = format!("{method} /api/vehicles/vizflyt/team");
+        send_json_as(server.http, &request, from, cookie, body)
+    };
+    let by = |token: &str| format!(r#"{{"token": "{token}", "attempt": "official"}}"#);
+    let (one, other) = ("127.0.0.1", "127.0.0.2");
+
+    let (status, text) = ask(other, "PUT", "", &by(&bees));
+    assert!(status == 403 && text.contains("on a page with that vehicle's key"), "{text}");
+    assert_eq!(ask(one, "PUT", &key, &by(&ants)).0, 200);
+    let (status, text) = ask(other, "PUT", &key, &by(&bees));
+    assert!(status == 403 && text.contains("ants is checked in and has not flown yet"), "{text}");
+    let (status, text) = ask(other, "DELETE", &key, "");
+    assert_eq!(status, 403, "{text}");
+    assert_eq!(standings_as(&server, &instructor)["vehicles"][0]["team"], "ants");
+    // The same team, the same computer, the instructor.
+    assert_eq!(ask(other, "PUT", &key, &by(&ants)).0, 200);
+    assert_eq!(ask(other, "DELETE", &key, "").0, 200);
+    assert_eq!(ask(one, "PUT", &key, &by(&ants)).0, 200);
+    let (status, text) = ask(other, "POST", &instructor, r#"{"team": "bees"}"#);
+    assert_eq!((status, text.as_str()), (200, "bees flies vizflyt next: practice"));
 }
 
 #[test]

@@ -7,6 +7,7 @@
 //! ```
 //! Imports none of the other rooms but the database's own files: they all report to this one.
 
+pub mod check_in;
 pub mod control_lease;
 pub mod crash;
 pub mod crash_card;

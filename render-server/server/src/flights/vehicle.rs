@@ -20,10 +20,10 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::ServerTime;
 
+use super::check_in::CheckIn;
 use super::control_lease::{ControlLease, Leases, RuntimeInfo, WatchLease};
 use super::crash_card::CrashCard;
 use super::events::{EventLog, Origin};
-use super::leaderboard::Attempt;
 use super::recent_previews::RecentPreviews;
 use super::samples::Samples;
 use super::track::Track;
@@ -55,15 +55,6 @@ pub struct VehicleFlight {
     pub checked_in: Mutex<Option<CheckIn>>,
     leases: Leases,
     flight: Mutex<Flight>,
-}
-
-/// A team that flies a vehicle.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct CheckIn {
-    /// Its name.
-    pub team: String,
-    /// What its flights count as.
-    pub attempt: Attempt,
 }
 
 /// How the present flight goes.

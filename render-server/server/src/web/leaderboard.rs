@@ -4,19 +4,21 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use axum::Json;
 use axum::extract::{ConnectInfo, Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use serde::{Deserialize, Serialize};
 use tracing::warn;
 use vizflyt_protocol::messages::FlightPhase;
 
+use super::access::{Shown, Viewer};
 use super::{Page, origin, refuse, vehicle};
+use crate::flights::check_in::{self, CheckIn, Claim};
 use crate::flights::leaderboard::{
     Attempt, GradeBoard, LeaderboardError, Run, Standing, grade_boards, standings,
 };
-use crate::flights::vehicle::{CheckIn, VehicleFlight};
+use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
 
 /// What the page and the wall show.
@@ -92,14 +94,18 @@ pub(super) struct CheckingIn {
     attempt: Attempt,
 }
 
-/// `PUT /api/vehicles/V/team`: a team checks in by its token, from wherever: no other page
-/// knows it.
-pub(super) async fn check_in(
+/// `PUT /api/vehicles/V/team`: a team checks in by its token, at its vehicle ([`crate::flights::check_in`]).
+pub(super) async fn put(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
+    headers: HeaderMap,
     Json(asked): Json<CheckingIn>,
 ) -> Response {
+    // Cookies count here, so another page must not use them.
+    if let Err(refusal) = origin::check_navigation(&headers) {
+        return refuse(&refusal);
+    }
     let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
     let Some(token) = &asked.token else {
         return (StatusCode::BAD_REQUEST, "give the team's token").into_response();
@@ -109,7 +115,22 @@ pub(super) async fn check_in(
             .into_response();
     }
     match board.team_of(token).await {
-        Ok(Some(team)) => take(&page, &name, Some(CheckIn { team, attempt: asked.attempt })),
+        Ok(Some(team)) => {
+            let viewer = page.access.judge(from.ip(), &headers).map(|shown| shown.viewer);
+            let claim = Claim {
+                team: Some(&team),
+                from: from.ip(),
+                is_instructor: viewer == Some(Viewer::Instructor),
+                has_vehicle: viewer.is_some_and(|viewer| viewer.may_see(&name)),
+            };
+            let by = CheckIn {
+                team: team.clone(),
+                attempt: asked.attempt,
+                at: crate::clock::now(),
+                from: Some(from.ip()),
+            };
+            take(&page, &name, claim, Some(by))
+        }
         Ok(None) => {
             lock(&page.team_tries).charge(Instant::now(), from.ip());
             warn!("page: {from} came with a wrong team token");
@@ -123,6 +144,7 @@ pub(super) async fn check_in(
 pub(super) async fn assign(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
+    ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     Json(asked): Json<CheckingIn>,
 ) -> Response {
@@ -136,7 +158,9 @@ pub(super) async fn assign(
     };
     let team = asked.team.unwrap_or_default();
     if teams.iter().any(|known| known.name == team && !known.retired) {
-        return take(&page, &name, Some(CheckIn { team, attempt: asked.attempt }));
+        let claim = Claim { team: None, from: from.ip(), is_instructor: true, has_vehicle: true };
+        let (attempt, at) = (asked.attempt, crate::clock::now());
+        return take(&page, &name, claim, Some(CheckIn { team, attempt, at, from: None }));
     }
     let names: Vec<_> = teams.iter().filter(|team| !team.retired).map(|team| &*team.name).collect();
     let text = match &*names {
@@ -150,26 +174,43 @@ pub(super) async fn assign(
 pub(super) async fn check_out(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
+    ConnectInfo(from): ConnectInfo<SocketAddr>,
+    Extension(shown): Extension<Shown>,
     headers: HeaderMap,
 ) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
-    take(&page, &name, None)
+    let is_instructor = shown.viewer == Viewer::Instructor;
+    take(
+        &page,
+        &name,
+        Claim { team: None, from: from.ip(), is_instructor, has_vehicle: true },
+        None,
+    )
 }
 
-fn take(page: &Page, name: &str, by: Option<CheckIn>) -> Response {
+fn take(page: &Page, name: &str, claim: Claim<'_>, by: Option<CheckIn>) -> Response {
     let vehicle = match vehicle(page, name) {
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
     };
+    let (flight, runtime) = (vehicle.flight(), vehicle.runtime());
+    let runtime = runtime.map(|runtime| runtime.address.ip());
+    let mut checked_in = lock(&vehicle.checked_in);
+    if let Err(refusal) = check_in::judge(checked_in.as_ref(), claim, &flight, runtime) {
+        let refused_at = vehicle.name.as_str();
+        warn!("page: {}: nobody else is checked in for {refused_at}: {refusal}", claim.from);
+        return (StatusCode::FORBIDDEN, refusal.to_string()).into_response();
+    }
     // The flight under way is whose it was at its take-off.
     let text = match &by {
         Some(by) => format!("{} flies {} next: {}", by.team, vehicle.name, by.attempt.name()),
         None => format!("nobody is checked in to fly {}", vehicle.name),
     };
+    *checked_in = by;
+    drop(checked_in);
     vehicle.note(&text);
-    *lock(&vehicle.checked_in) = by;
     text.into_response()
 }
 

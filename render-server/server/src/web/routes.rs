@@ -100,8 +100,8 @@ fn table() -> Vec<Route> {
         act(Method::PUT, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::put),
         act(Method::PATCH, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::patch),
         read("/api/leaderboard", Key, leaderboard::show),
-        // The team's token is all it takes, also from a script without a cookie.
-        at_once(Method::PUT, "/api/vehicles/{vehicle}/team", Nothing, leaderboard::check_in),
+        // By the team's token; the vehicle's computer has no cookie, and who else may is judged there.
+        at_once(Method::PUT, "/api/vehicles/{vehicle}/team", Nothing, leaderboard::put),
         act(Method::POST, "/api/vehicles/{vehicle}/team", Everything, leaderboard::assign),
         act(Method::DELETE, "/api/vehicles/{vehicle}/team", Vehicle, leaderboard::check_out),
         read("/api/scenes", Everything, scenes::list),
