@@ -155,6 +155,11 @@ impl<T> Admission<T> {
         self.places.extract_if(is_overdue).map(|(_, place)| place.tell).collect()
     }
 
+    /// Returns how many places are taken.
+    pub(crate) fn len(&self) -> usize {
+        self.places.len()
+    }
+
     fn count(&self, is_meant: impl Fn(&Holder) -> bool) -> usize {
         self.places.values().filter(|place| is_meant(&place.holder)).count()
     }
@@ -231,11 +236,11 @@ mod tests {
             let (_, out) = door.admit(ip(1)).unwrap();
             assert_ne!(out, Some(0), "another address gives no way");
         }
-        assert_eq!(door.admission.places.len(), 1 + LIMITS.by_address);
+        assert_eq!(door.admission.len(), 1 + LIMITS.by_address);
         let (_, out) = door.admit(ip(3)).unwrap();
         assert_eq!(out, None, "there is room for another address");
         door.admission.leave(other);
-        assert_eq!(door.admission.places.len(), 1 + LIMITS.by_address);
+        assert_eq!(door.admission.len(), 1 + LIMITS.by_address);
     }
 
     #[test]
@@ -245,7 +250,7 @@ mod tests {
             assert_eq!(door.admit(ip(last)).unwrap().1, None);
         }
         assert_eq!(door.admit(ip(6)).unwrap().1, Some(0), "of the most crowded the oldest");
-        assert_eq!(door.admission.places.len(), LIMITS.strangers);
+        assert_eq!(door.admission.len(), LIMITS.strangers);
     }
 
     #[test]
@@ -292,7 +297,7 @@ mod tests {
         let late = door.now() + patience;
         assert_eq!(door.admission.overdue(door.start + patience, patience), [0; 0]);
         assert_eq!(door.admission.overdue(late, patience), [1]);
-        assert_eq!(door.admission.places.len(), 1);
+        assert_eq!(door.admission.len(), 1);
     }
 
     proptest! {
@@ -322,7 +327,7 @@ mod tests {
                     (_, None) => {}
                 }
                 inside.retain(|(number, _)| !gone.contains(number));
-                prop_assert_eq!(inside.len(), door.admission.places.len());
+                prop_assert_eq!(inside.len(), door.admission.len());
                 let count = |kind: fn(&Holder) -> bool| door.admission.count(kind);
                 prop_assert!(count(|h| matches!(h, Holder::Stranger(_))) <= LIMITS.strangers);
                 prop_assert!(count(|h| matches!(h, Holder::Team(_))) <= LIMITS.teams);

@@ -12,27 +12,35 @@ use support::{Client, Server, write_arena};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Identity};
 
-/// Begins 40 handshakes a second; the server's answers reach nobody.
+/// Begins 40 handshakes a second, as somebody who can receive at its address: answers a Retry, and then says
+/// nothing more.
 fn begin_and_leave(server: &Server, stop: &Arc<AtomicBool>) {
-    let hole = UdpSocket::bind("127.0.0.1:0").unwrap();
-    let (mouth, to) = (hole.local_addr().unwrap(), server.quic);
-    let onward = UdpSocket::bind("127.0.0.1:0").unwrap();
-    hole.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
-    let ended = stop.clone();
-    std::thread::spawn(move || {
-        let mut packet = [0; 2048];
-        while !ended.load(Ordering::Relaxed) {
-            if let Ok((len, _)) = hole.recv_from(&mut packet) {
-                let _ = onward.send_to(&packet[..len], to);
+    let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+    let (own, to) = (endpoint.local_addr().unwrap(), server.quic);
+    let [near, far] = [(); 2].map(|()| Arc::new(UdpSocket::bind("127.0.0.1:0").unwrap()));
+    let mouth = near.local_addr().unwrap();
+    let pass = |from: &Arc<UdpSocket>, on: &Arc<UdpSocket>, to, is_passed: fn(u8) -> bool| {
+        let (from, on, ended) = (from.clone(), on.clone(), stop.clone());
+        from.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+        std::thread::spawn(move || {
+            let mut packet = [0; 65_536];
+            while !ended.load(Ordering::Relaxed) {
+                if let Ok((len, _)) = from.recv_from(&mut packet)
+                    && is_passed(packet[0])
+                {
+                    let _ = on.send_to(&packet[..len], to);
+                }
             }
-        }
-    });
+        });
+    };
+    pass(&near, &far, to, |_| true);
+    // A long header of type 3 is a Retry (RFC 9000, section 17.2).
+    pass(&far, &near, own, |first| first & 0xf0 == 0xf0);
     let tls = Pin::none().client_config(&Identity::ephemeral().unwrap(), ALPN).unwrap();
     let quic = quinn::crypto::rustls::QuicClientConfig::try_from(tls).unwrap();
     let config = ClientConfig::new(Arc::new(quic));
     let ended = stop.clone();
     tokio::spawn(async move {
-        let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
         let mut begun = Vec::new();
         let mut tick = tokio::time::interval(Duration::from_millis(25));
         while !ended.load(Ordering::Relaxed) {

@@ -1,7 +1,7 @@
 //! QUIC to the runtime: one endpoint, one session per connection.
 //!
 //! ```text
-//! accept -> limits: who may try at all; a few handshakes at once, unproved addresses prove themselves
+//! accept -> limits: who may try at all; under load addresses prove themselves; few handshakes of one address
 //!        -> pairing, if that is what it asks for; else
 //!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
@@ -19,7 +19,6 @@ mod session;
 pub use lan::{Lan, LanConfig};
 
 use std::net::{IpAddr, SocketAddr};
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -33,11 +32,12 @@ use quinn::{
 use quinn_proto::HashedConnectionIdGenerator;
 use ring::hmac;
 use socket2::{Domain, Protocol, Socket, Type};
-use tokio::sync::Semaphore;
+use tokio::sync::{Notify, Semaphore};
 use tracing::{debug, warn};
 use vizflyt_protocol::messages::close;
 use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 
+use crate::admission::{Admission, Limits, PlaceId};
 use crate::authorization::Authorizer;
 use crate::lock::lock;
 use crate::rate_limit::RateLimiter;
@@ -140,23 +140,27 @@ pub async fn serve(
         };
         let Some(incoming) = incoming else { break };
         let address = incoming.remote_address();
-        if sessions.len() >= MAX_CONNECTIONS {
+        if sessions.len() >= MAX_CONNECTIONS + MAX_HANDSHAKES {
             debug!("{} connections already: refused {address}", sessions.len());
             incoming.refuse();
             continue;
         }
-        let Some(handshake) = unknown_peers.handshake(address.ip()) else {
+        if !unknown_peers.may_try(address.ip()) {
             debug!("{address}: refused: too many attempts");
             incoming.refuse();
             continue;
-        };
-        // Under load an address must first show that packets reach it; that costs us no memory.
-        if handshake.under_way > RETRY_ABOVE && incoming.may_retry() {
+        }
+        // Under load an address must first show that packets reach it; that costs us no memory, and no place.
+        if unknown_peers.handshakes_under_way() >= RETRY_ABOVE && incoming.may_retry() {
             if let Err(error) = incoming.retry() {
                 debug!("{address}: {error}");
             }
             continue;
         }
+        let Some((handshake, gives_way)) = unknown_peers.handshake(address.ip()) else {
+            incoming.refuse();
+            continue;
+        };
         let chosen = congestion.toward(address.ip());
         let config = match server_config(&authorizer.identity, chosen) {
             Ok(config) => Arc::new(config),
@@ -168,9 +172,17 @@ pub async fn serve(
         let (rooms, authorizer, unknown_peers) =
             (rooms.clone(), authorizer.clone(), unknown_peers.clone());
         sessions.spawn(async move {
-            let connection = match incoming.accept_with(config) {
-                Ok(connecting) => tokio::time::timeout(HANDSHAKE_WITHIN, connecting).await,
-                Err(error) => Ok(Err(error)),
+            let shaken = async {
+                match incoming.accept_with(config) {
+                    Ok(connecting) => tokio::time::timeout(HANDSHAKE_WITHIN, connecting).await,
+                    Err(error) => Ok(Err(error)),
+                }
+            };
+            let connection = tokio::select! {
+                connection = shaken => connection,
+                () = gives_way.notified() => {
+                    return debug!("{address}: its handshake gave way to a newer one");
+                }
             };
             drop(handshake);
             let connection = match connection {
@@ -210,33 +222,48 @@ fn is_pairing(connection: &Connection) -> bool {
 #[derive(Debug)]
 struct UnknownPeers {
     limiter: Mutex<RateLimiter>,
-    handshakes: Arc<AtomicUsize>,
+    handshakes: Mutex<Admission<Arc<Notify>>>,
     pairings: Semaphore,
 }
 
 impl Default for UnknownPeers {
     fn default() -> Self {
-        let (limiter, handshakes) = (Mutex::default(), Arc::default());
-        Self { limiter, handshakes, pairings: Semaphore::new(MAX_PAIRINGS) }
+        let limits = Limits {
+            strangers: MAX_HANDSHAKES,
+            by_address: MAX_HANDSHAKES_BY_ADDRESS,
+            teams: 0,
+            by_team: 0,
+            instructors: 0,
+        };
+        let handshakes = Mutex::new(Admission::new(limits));
+        Self { limiter: Mutex::default(), handshakes, pairings: Semaphore::new(MAX_PAIRINGS) }
     }
 }
 
-/// A handshake under way; counts until it is dropped.
+/// A handshake under way; its place is free again when this is dropped.
 struct Handshake {
-    /// How many are under way, this one too.
-    under_way: usize,
-    count: Arc<AtomicUsize>,
+    peers: Arc<UnknownPeers>,
+    place: PlaceId,
 }
 
 impl UnknownPeers {
-    /// Begins a handshake with `address`, if it may have one.
-    fn handshake(&self, address: IpAddr) -> Option<Handshake> {
-        let count = self.handshakes.clone();
-        let under_way = count.fetch_add(1, Ordering::Relaxed) + 1;
-        // Counted from here on, so that every way out gives the place back.
-        let handshake = Handshake { under_way, count };
-        let may_try = lock(&self.limiter).may_try(Instant::now(), address);
-        (may_try && under_way <= MAX_HANDSHAKES).then_some(handshake)
+    fn may_try(&self, address: IpAddr) -> bool {
+        lock(&self.limiter).may_try(Instant::now(), address)
+    }
+
+    fn handshakes_under_way(&self) -> usize {
+        lock(&self.handshakes).len()
+    }
+
+    /// Begins a handshake with `address`; returns it, and what tells it to give way to a newer one.
+    fn handshake(self: &Arc<Self>, address: IpAddr) -> Option<(Handshake, Arc<Notify>)> {
+        let gives_way = Arc::new(Notify::new());
+        let admitted = lock(&self.handshakes).admit(Instant::now(), address, gives_way.clone());
+        let (place, oldest) = admitted?;
+        if let Some(oldest) = oldest {
+            oldest.notify_one();
+        }
+        Some((Handshake { peers: self.clone(), place }, gives_way))
     }
 
     fn charge(&self, address: IpAddr) {
@@ -246,7 +273,7 @@ impl UnknownPeers {
 
 impl Drop for Handshake {
     fn drop(&mut self) {
-        self.count.fetch_sub(1, Ordering::Relaxed);
+        lock(&self.peers.handshakes).leave(self.place);
     }
 }
 
@@ -295,7 +322,9 @@ const SOCKET_BUFFER: usize = 4 << 20;
 /// Jumbo frames. [bytes]
 const MAX_MTU: u16 = 9000;
 /// Handshakes under way at most: each costs some 10 KB and a signature, before we know whose it is.
-const MAX_HANDSHAKES: usize = 16;
+const MAX_HANDSHAKES: usize = 32;
+/// Of one address; the oldest gives way. At 40 half-open ones a second each has 0.2 s, many round trips.
+const MAX_HANDSHAKES_BY_ADDRESS: usize = 8;
 /// Conversations about pairing at a time; a person looks at one.
 const MAX_PAIRINGS: usize = 4;
 /// Above this many under way, addresses must prove themselves first (RFC 9000, section 8.1).
