@@ -21,7 +21,9 @@ use vizflyt_protocol::messages::{Purpose, bounded};
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
 use crate::control::{Control, ControlInput, QUEUE, print_line};
+use crate::descriptors;
 use crate::flight::FlightSettings;
+use crate::link::Wanted;
 use crate::link::port::Port;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
@@ -56,6 +58,7 @@ pub fn fly_command(
     reloads: Option<Receiver<()>>,
 ) -> anyhow::Result<EndReason> {
     keep_going_when_files_are_full();
+    descriptors::raise_limit();
     let mut plugin_limits = args.jetson.plugin.limits();
     if let Some(path) = &args.map {
         plugin_limits.hand_map_file(path)?;
@@ -63,8 +66,9 @@ pub fn fly_command(
     let server = args.server.address()?;
     let (fingerprint, identity) = args.server.known()?;
     let mavlink = args.mavlink_address();
+    let link = args.link_settings()?;
     let port = Arc::new(
-        Port::open(&mavlink)
+        Port::open(&mavlink, Wanted::of(&link))
             .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?,
     );
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
@@ -108,7 +112,7 @@ pub fn fly_command(
         },
         waits_for_start: args.wait,
         to_autopilot: Box::new(move |bytes| port.send(bytes)),
-        link: args.link_settings()?,
+        link,
         shared,
         to_server: Arc::clone(&outbox),
         log,
@@ -152,6 +156,10 @@ fn receive_mavlink(
         // Larger than any datagram of MAVLink packets on an Ethernet.
         let mut buffer = [0; 2048];
         while !stop.load(Ordering::Relaxed) {
+            if let Some(intruder) = port.poll_intruder() {
+                tracing::warn!("mavlink: {intruder}");
+                let _ = sender.try_send(ControlInput::Note(intruder.to_string()));
+            }
             match port.receive(&mut buffer) {
                 Ok(Some(len)) => {
                     // A full queue drops telemetry, as the network might.

@@ -11,6 +11,7 @@ use super::names::Version;
 use crate::link::port::{MavlinkAddress, Port};
 use crate::link::{
     FenceEvent, FencePolygon, Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent,
+    Wanted,
 };
 
 /// Why a session failed.
@@ -80,7 +81,7 @@ impl ParamSession {
         address: &MavlinkAddress,
         settings: LinkSettings,
     ) -> Result<Self, ParamSessionError> {
-        let port = Port::open(address)
+        let port = Port::open(address, Wanted::of(&settings))
             .map_err(|why| ParamSessionError::Open { address: address.clone(), why })?;
         let mut session = Self { port, link: Link::with(host_now(), settings) };
         let within_s = HEARTBEAT_WITHIN_S;
@@ -221,6 +222,9 @@ impl ParamSession {
         while Instant::now() < end {
             self.link.handle_timeout(host_now());
             self.transmit();
+            if let Some(intruder) = self.port.poll_intruder() {
+                tracing::warn!("mavlink: {intruder}");
+            }
             // A failed socket receives nothing; the time limit reports it.
             if let Ok(Some(len)) = self.port.receive(&mut buffer) {
                 self.link.handle_input(host_now(), &buffer[..len]);

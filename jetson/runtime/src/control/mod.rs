@@ -61,6 +61,8 @@ pub enum ControlInput {
     FromPlugin(Box<FromPlugin>),
     /// The plugin's process; the first is 0, each one started after it one more.
     Plugin(u32, PluginEvent),
+    /// A driver has noticed something that people should see.
+    Note(String),
     /// A person wants the plugin restarted; the vehicle holds until it is back.
     Reload,
     /// A person wants it to end.
@@ -213,6 +215,7 @@ impl ControlLoop {
             ControlInput::Plugin(run, PluginEvent::Exited(sentence)) => {
                 self.plugin_exited(now, run, sentence);
             }
+            ControlInput::Note(text) => self.companion.note(now, &text),
             ControlInput::Reload => self.replace_plugin(now, "reloading the plugin".to_owned()),
             ControlInput::Interrupt => self.companion.interrupt(now),
         }

@@ -9,14 +9,15 @@ use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
+use super::partner::{Intruder, Partner, Wanted};
 use super::serial::SerialPort;
 use super::tcp::TcpPort;
-use super::udp::{Partner, UdpPort};
+use super::udp::UdpPort;
 
 /// Where the autopilot is, as typed after `--mavlink`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum MavlinkAddress {
-    /// `udpin:ADDR:PORT`: binds, and answers whoever sends.
+    /// `udpin:ADDR:PORT`: binds, and answers the wanted autopilot.
     UdpIn(SocketAddr),
     /// `udpout:HOST:PORT`: sends there.
     UdpOut(SocketAddr),
@@ -128,14 +129,16 @@ enum Transport {
 }
 
 impl Port {
-    /// Opens it. A TCP server that is not there yet is no error: it is tried again.
+    /// Opens it, for the `wanted` autopilot. A TCP server that is not there yet is no error: it is tried
+    /// again.
     ///
     /// # Errors
     /// The system's refusal of the socket or the device.
-    pub fn open(address: &MavlinkAddress) -> io::Result<Self> {
+    pub fn open(address: &MavlinkAddress, wanted: Wanted) -> io::Result<Self> {
         Ok(Self(match address {
             MavlinkAddress::UdpIn(local) => {
-                Transport::Udp(UdpPort::bind(*local)?, Mutex::new(Partner::waited_for()))
+                let partner = Partner::waited_for(wanted, Instant::now());
+                Transport::Udp(UdpPort::bind(*local)?, Mutex::new(partner))
             }
             MavlinkAddress::UdpOut(to) => {
                 let any = if to.is_ipv4() {
@@ -166,8 +169,8 @@ impl Port {
         }
     }
 
-    /// Waits for bytes of the autopilot, 100 ms at most; `None` if none came, or if they are of a
-    /// second sender while the first one speaks.
+    /// Waits for bytes of the autopilot, 100 ms at most; `None` if none came, or if they are of somebody
+    /// else.
     ///
     /// # Errors
     /// An error that waiting longer does not solve.
@@ -176,11 +179,17 @@ impl Port {
             Transport::Udp(udp, partner) => {
                 let Some((len, from)) = udp.receive(buffer)? else { return Ok(None) };
                 let mut partner = partner.lock().unwrap_or_else(PoisonError::into_inner);
-                Ok(partner.accept(from, Instant::now()).then_some(len))
+                Ok(partner.accept(from, &buffer[..len], Instant::now()).then_some(len))
             }
             Transport::Tcp(tcp) => Ok(tcp.receive(buffer)),
             Transport::Serial(serial) => Ok(serial.receive(buffer)),
         }
+    }
+
+    /// Returns somebody whose datagrams are ignored, and who is to be reported now.
+    pub fn poll_intruder(&self) -> Option<Intruder> {
+        let Transport::Udp(_, partner) = &self.0 else { return None };
+        partner.lock().unwrap_or_else(PoisonError::into_inner).poll_intruder(Instant::now())
     }
 
     /// Sends whole packets, if anybody is there; loss is the protocol's concern.
@@ -200,6 +209,7 @@ impl Port {
 
 #[cfg(test)]
 mod tests {
+    use super::super::partner::tests::heartbeat;
     use super::*;
 
     #[test]
@@ -227,6 +237,10 @@ mod tests {
         }
     }
 
+    fn open(address: &str) -> Port {
+        Port::open(&address.parse().unwrap(), Wanted::default()).unwrap()
+    }
+
     /// Packets go both ways between two ports.
     fn check(here: &Port, there: &Port) {
         let mut buffer = [0; 64];
@@ -242,24 +256,44 @@ mod tests {
             }
             panic!("nothing came");
         };
-        exchange(there, here, b"ping");
+        exchange(there, here, &heartbeat(1, None));
         exchange(here, there, b"pong");
     }
 
     #[test]
     fn udp_carries_both_ways() {
-        let here = Port::open(&"udpin:127.0.0.1:0".parse().unwrap()).unwrap();
-        let there = format!("udpout:{}", here.local().unwrap()).parse().unwrap();
-        check(&here, &Port::open(&there).unwrap());
+        let here = open("udpin:127.0.0.1:0");
+        check(&here, &open(&format!("udpout:{}", here.local().unwrap())));
+    }
+
+    /// Somebody sends first, and goes on.
+    #[test]
+    fn a_stranger_keeps_no_autopilot_out() {
+        let here = open("udpin:127.0.0.1:0");
+        let to = here.local().unwrap();
+        let [stranger, autopilot] =
+            [(); 2].map(|()| std::net::UdpSocket::bind("127.0.0.1:0").unwrap());
+        let mut buffer = [0; 64];
+        let beat = heartbeat(1, None);
+        stranger.send_to(b"x", &to).unwrap();
+        while here.poll_intruder().is_none() {
+            assert_eq!(here.receive(&mut buffer).unwrap(), None);
+        }
+        stranger.send_to(b"x", &to).unwrap();
+        autopilot.send_to(&beat, &to).unwrap();
+        let received = std::iter::repeat_with(|| here.receive(&mut buffer).unwrap());
+        assert_eq!(received.flatten().next(), Some(beat.len()));
+        here.send(b"pong");
+        autopilot.set_read_timeout(Some(std::time::Duration::from_mins(1))).unwrap();
+        assert_eq!(autopilot.recv(&mut buffer).unwrap(), 4);
     }
 
     #[test]
     fn tcp_carries_both_ways_and_reconnects() {
-        let here = Port::open(&"tcpin:127.0.0.1:0".parse().unwrap()).unwrap();
-        let address = format!("tcpout:{}", here.local().unwrap()).parse().unwrap();
+        let here = open("tcpin:127.0.0.1:0");
+        let address = format!("tcpout:{}", here.local().unwrap());
         for _ in 0..2 {
-            let there = Port::open(&address).unwrap();
-            check(&here, &there);
+            check(&here, &open(&address));
         }
     }
 
@@ -268,8 +302,7 @@ mod tests {
         use std::io::{Read, Write};
         let pty = nix::pty::openpty(None, None).unwrap();
         let path = nix::unistd::ttyname(&pty.slave).unwrap();
-        let here = Port::open(&format!("serial:{}:3000000", path.display()).parse().unwrap());
-        let here = here.unwrap();
+        let here = open(&format!("serial:{}:3000000", path.display()));
         let mut far = std::fs::File::from(pty.master);
         // Raw: no byte is changed, none is echoed.
         let sent: Vec<u8> = (0..=255).collect();

@@ -1,0 +1,249 @@
+//! One open page: its WebSocket, from the welcome to the end.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Bytes;
+use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, close_code};
+use serde::Serialize;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use tracing::debug;
+
+use super::access::{Shown, Viewer};
+use super::{Page, messages};
+use crate::flights::recent_previews::Preview;
+use crate::flights::vehicle::VehicleFlight;
+use crate::lock::lock;
+
+/// Counts a viewer for as long as it lives.
+struct Presence<'a> {
+    page: &'a Page,
+    vehicle: usize,
+    viewer: &'a Viewer,
+}
+
+impl<'a> Presence<'a> {
+    /// Of a viewer that has entered.
+    fn new(page: &'a Page, vehicle: &VehicleFlight, viewer: &'a Viewer) -> Self {
+        page.rooms.streaming.subscriptions.viewer_came(vehicle.index);
+        Self { page, vehicle: vehicle.index, viewer }
+    }
+}
+
+impl Drop for Presence<'_> {
+    fn drop(&mut self) {
+        self.page.rooms.streaming.subscriptions.viewer_left(self.vehicle);
+        lock(&self.page.watchers).leave(self.viewer);
+    }
+}
+
+/// Who watches, by kind: pages of one team, however many, take no instructor's place.
+#[derive(Debug, Default)]
+pub(crate) struct Watchers {
+    instructors: usize,
+    teams: BTreeMap<String, usize>,
+}
+
+impl Watchers {
+    /// Takes a place for a viewer.
+    ///
+    /// # Errors
+    /// Why there is none, in words.
+    fn enter(&mut self, viewer: &Viewer) -> Result<(), String> {
+        match viewer {
+            Viewer::Instructor if self.instructors >= MAX_INSTRUCTORS => {
+                Err(format!("{MAX_INSTRUCTORS} pages of instructors are open already; close one"))
+            }
+            Viewer::Instructor => {
+                self.instructors += 1;
+                Ok(())
+            }
+            Viewer::Team(vehicle) => {
+                let own = self.teams.get(vehicle).copied().unwrap_or_default();
+                if own >= MAX_OF_TEAM {
+                    return Err(format!(
+                        "{MAX_OF_TEAM} pages are open with this team's key already; close one"
+                    ));
+                }
+                if self.teams.values().sum::<usize>() >= MAX_TEAMS {
+                    return Err(format!("{MAX_TEAMS} pages of teams are open already"));
+                }
+                self.teams.insert(vehicle.clone(), own + 1);
+                Ok(())
+            }
+        }
+    }
+
+    fn leave(&mut self, viewer: &Viewer) {
+        match viewer {
+            Viewer::Instructor => self.instructors -= 1,
+            Viewer::Team(vehicle) => {
+                if let Some(own) = self.teams.get_mut(vehicle) {
+                    *own -= 1;
+                }
+                self.teams.retain(|_, own| *own > 0);
+            }
+        }
+    }
+}
+
+/// Sends one viewer everything of a vehicle until it leaves, stalls, or the server stops; then tells it why.
+pub(super) async fn run(
+    page: Arc<Page>,
+    vehicle: Arc<VehicleFlight>,
+    shown: Shown,
+    mut socket: WebSocket,
+) {
+    let entered = lock(&page.watchers).enter(&shown.viewer);
+    let (code, reason) = match entered {
+        Err(full) => (close_code::AGAIN, full),
+        Ok(()) => {
+            let presence = Presence::new(&page, &vehicle, &shown.viewer);
+            let ending = tokio::select! {
+                _ = send_all(&page, &vehicle, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
+                () = right_ends(&page, &shown) => (close_code::POLICY, "logged out"),
+                () = page.rooms.stop.wait() => (close_code::RESTART, "the server ends or changes its scene"),
+            };
+            drop(presence);
+            (ending.0, ending.1.to_owned())
+        }
+    };
+    debug!("page: a viewer of {} leaves: {reason}", vehicle.name);
+    let close = Frame::Close(Some(CloseFrame { code, reason: reason.into() }));
+    let _ = timeout(Duration::from_millis(200), socket.send(close)).await;
+}
+
+/// Completes when the viewer is logged out.
+async fn right_ends(page: &Page, shown: &Shown) {
+    let mut look = interval(LOOK_EVERY);
+    while page.access.holds(shown) {
+        look.tick().await;
+    }
+}
+
+/// Returns `None` when the viewer is gone.
+async fn send_all(page: &Page, vehicle: &VehicleFlight, socket: &mut WebSocket) -> Option<()> {
+    let mut log = vehicle.events.subscribe();
+    let mut cameras = page.rooms.rendering.cameras[vehicle.index].subscribe();
+    let (entries, mut cursor) = vehicle.events.newest(HISTORY);
+    send_json(socket, &messages::arena(page, vehicle)).await?;
+    let points = lock(&vehicle.track).points.clone();
+    send_json(socket, &messages::Message::Track { points: &points }).await?;
+    send_json(socket, &messages::events(page, entries)).await?;
+    let mut previews = page.previews.subscribe(vehicle.index);
+    for preview in &mut previews {
+        preview.mark_changed();
+    }
+    log.mark_changed();
+    let mut tick = interval(EVERY);
+    tick.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    loop {
+        tokio::select! {
+            received = socket.recv() => match received {
+                Some(Ok(Frame::Close(_)) | Err(_)) | None => return None,
+                Some(Ok(_)) => {}
+            },
+            _ = log.changed() => {
+                log.mark_unchanged();
+                let entries = match vehicle.events.read(&mut cursor) {
+                    Ok(entries) => entries,
+                    Err(lagged) => {
+                        cursor = lagged.oldest;
+                        continue;
+                    }
+                };
+                if !entries.is_empty() {
+                    send_json(socket, &messages::events(page, entries)).await?;
+                }
+            }
+            _ = cameras.changed() => {
+                let newest = cameras.borrow_and_update().clone();
+                send_json(socket, &messages::cameras(&newest)).await?;
+            }
+            _ = tick.tick() => {
+                send_json(socket, &messages::state(page, vehicle)).await?;
+                // Polled with the state rather than awaited: one picture per turn at most, and
+                // whatever was drawn meanwhile is skipped.
+                for (index, preview) in previews.iter_mut().enumerate() {
+                    if !preview.has_changed().unwrap_or(false) {
+                        continue;
+                    }
+                    let newest = preview.borrow_and_update().clone();
+                    if let Some(newest) = newest {
+                        send_preview(socket, index, &newest).await?;
+                    }
+                }
+            }
+        }
+    }
+}
+
+async fn send_json(socket: &mut WebSocket, message: &impl Serialize) -> Option<()> {
+    let text = match serde_json::to_string(message) {
+        Ok(text) => text,
+        Err(error) => {
+            debug!("page: message not sent: {error}");
+            return Some(());
+        }
+    };
+    send(socket, Frame::Text(text.into())).await
+}
+
+/// Binary message: kind (0 colour, 1 depth, 2 objects), camera, then JPEG.
+async fn send_preview(socket: &mut WebSocket, camera: usize, preview: &Preview) -> Option<()> {
+    for (kind, jpeg) in [(0u8, &preview.colour), (1, &preview.depth), (2, &preview.ids)] {
+        if jpeg.is_empty() {
+            continue;
+        }
+        let mut bytes = Vec::with_capacity(2 + jpeg.len());
+        bytes.extend_from_slice(&[kind, camera as u8]);
+        bytes.extend_from_slice(jpeg);
+        send(socket, Frame::Binary(Bytes::from(bytes))).await?;
+    }
+    Some(())
+}
+
+async fn send(socket: &mut WebSocket, frame: Frame) -> Option<()> {
+    timeout(PATIENCE, socket.send(frame)).await.ok()?.ok()
+}
+
+/// Who is logged out sees no more after this long.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// 20 Hz: smooth to the eye.
+const EVERY: Duration = Duration::from_millis(50);
+/// A viewer that takes nothing for this long is gone.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// Events shown to a page that opens late.
+const HISTORY: usize = 200;
+/// Pages of instructors; each page costs some 3 Mbit/s.
+const MAX_INSTRUCTORS: usize = 32;
+/// Pages with one team's key.
+const MAX_OF_TEAM: usize = 16;
+/// Pages of all teams.
+const MAX_TEAMS: usize = 48;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_team_takes_no_place_of_an_instructor_or_another_team() {
+        let mut watchers = Watchers::default();
+        let team = |name: &str| Viewer::Team(name.to_owned());
+        let ants = (0..64).filter(|_| watchers.enter(&team("ant")).is_ok()).count();
+        assert_eq!(ants, MAX_OF_TEAM);
+        let full = watchers.enter(&team("ant")).unwrap_err();
+        assert!(full.contains("with this team's key already") && full.len() <= 123, "{full}");
+        assert_eq!(watchers.enter(&team("bee")), Ok(()));
+        assert_eq!(watchers.enter(&Viewer::Instructor), Ok(()));
+        watchers.leave(&team("ant"));
+        assert_eq!(watchers.enter(&team("ant")), Ok(()));
+        for name in 0..100 {
+            let _ = watchers.enter(&team(&name.to_string()));
+        }
+        assert_eq!(watchers.teams.values().sum::<usize>(), MAX_TEAMS);
+        let bosses = (0..64).filter(|_| watchers.enter(&Viewer::Instructor).is_ok()).count();
+        assert_eq!(1 + bosses, MAX_INSTRUCTORS);
+    }
+}
