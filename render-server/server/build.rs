@@ -6,7 +6,7 @@ use std::{env, fs, io};
 
 fn main() -> io::Result<()> {
     println!("cargo::rerun-if-changed={PAGE}");
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(PAGE);
+    let folder = env::current_dir()?.join(PAGE);
     let mut files = Vec::new();
     list(&folder, "", &mut files)?;
     files.sort();

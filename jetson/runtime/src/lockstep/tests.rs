@@ -104,7 +104,12 @@ fn logged(path: &Path, images: LoggedImages) {
     let command = misbehave("forward");
     let process =
         PluginProcess::start(&command, &PluginLimits::default(), Duration::from_mins(1)).unwrap();
-    let settings = FlightSettings { ready_within_s: 60.0, time_limit_s: 0.0, limits: Limits::NONE };
+    let settings = FlightSettings {
+        ready_within_s: 60.0,
+        time_limit_s: 0.0,
+        limits: Limits::NONE,
+        slip_seed: 7,
+    };
     let mut lockstep = Lockstep::new(at(0), &arena(), settings, Some(process), 10_000_000);
     let file = File::create(path).unwrap();
     let plugin = &"misbehave".into();
