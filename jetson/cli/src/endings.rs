@@ -11,7 +11,7 @@ use vizflyt_protocol::flight_end::{
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::messages::{Event, EventKind, Limits, OutcomeKind, Setpoint, bounded};
 use vizflyt_protocol::time::{HostTime, ServerTime};
-use vizflyt_runtime::flight::{Flight, FlightInput, FlightSettings, LinkView};
+use vizflyt_runtime::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
 use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::link::{Goal, LinkEvent};
 use vizflyt_server::flights::events::Origin;
@@ -96,6 +96,7 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
         time_limit_s: 0.0,
         limits: Limits::NONE,
         slip_seed: 7,
+        cameras: Vec::new(),
     };
     let mut flight = Flight::new(settings, at(0));
     flight.handle(at(0), FlightInput::Arena(Box::new(info)));
@@ -153,7 +154,9 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
             let motion = VehicleMotion { stamp, p_world_m: p_m, v_world_mps, rotation };
             flight.handle(at(now), FlightInput::Pose(motion));
         }
-        flight.handle(at(now), FlightInput::ImagePublished { seq: tick });
+        let mut views = Views::default();
+        views[0] = Some(at(now));
+        flight.handle(at(now), FlightInput::ImagePublished { seq: tick, views });
         if let Some(setpoint) = answer.clone() {
             flight.handle(at(now), FlightInput::Replied { seq: tick, setpoint: Some(setpoint) });
         }

@@ -161,6 +161,9 @@ pub struct PluginConfig {
     /// system.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub read: Vec<PathBuf>,
+    /// The cameras that it flies by: each must be fresh. Without it one fresh camera is enough.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<String>,
 }
 
 impl PluginConfig {

@@ -109,6 +109,7 @@ pub fn fly_command(
             time_limit_s: args.seconds,
             limits: args.limits,
             slip_seed: RandomState::new().hash_one(()),
+            cameras: args.jetson.plugin.cameras.clone(),
         },
         waits_for_start: args.wait,
         to_autopilot: Box::new(move |bytes| port.send(bytes)),

@@ -264,6 +264,7 @@ impl ArenaConfig {
             goal_m: self.goal.map(|goal| goal.position_m),
             goal_radius_m: self.goal.map_or(0.0, |goal| goal.radius_m),
             time_limit_s: self.time_limit_s,
+            start_box: self.rules.start_box.map(|start| Volume::aabb(start.min_m, start.max_m)),
             ground_truth: self.ground_truth,
             pose_ages: PoseAges {
                 hold_after_s: self.pose.hold_after_s,

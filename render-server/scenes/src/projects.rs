@@ -219,6 +219,7 @@ impl CourseProject {
             limits: plan.limits,
             rules: RulesConfig {
                 setpoints: suite.setpoints.or(plan.rules.setpoints),
+                start_box: plan.rules.start_box.or(arena.rules.start_box),
                 ..plan.rules
             },
             cameras: suite.cameras.clone(),

@@ -293,6 +293,7 @@ impl<'a> Flight<'a> {
             time_limit_s: 0.0,
             limits: Limits::NONE,
             slip_seed: trial.seed,
+            cameras: Vec::new(),
         };
         let info = arena.info();
         let (splats, objects) = (&trial.course.splats, &trial.course.objects[..]);

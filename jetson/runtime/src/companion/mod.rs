@@ -28,7 +28,7 @@ use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle};
 
 use crate::airframe::AutopilotFence;
-use crate::flight::{Flight, FlightInput, FlightSettings, LinkView};
+use crate::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
 use crate::guard::VehicleMotion;
 use crate::link::{Datagram, Link, LinkEvent, LinkSettings};
 use crate::steering::Steering;
@@ -81,10 +81,10 @@ impl Companion {
         clock: ServerClock,
     ) -> Self {
         Self {
+            flight: Flight::new(settings.clone(), now),
             settings,
             clock,
             link: Link::with(now, link),
-            flight: Flight::new(settings, now),
             steering: Steering::new(now),
             arena: None,
             tick_due: now,
@@ -225,9 +225,9 @@ impl Companion {
         self.flight.handle(now, FlightInput::PluginReady);
     }
 
-    /// Observation `seq` went to the plugin.
-    pub fn published(&mut self, now: HostTime, seq: u64) {
-        self.flight.handle(now, FlightInput::ImagePublished { seq });
+    /// Observation `seq` went to the plugin; `views` tells how old its images are.
+    pub fn published(&mut self, now: HostTime, seq: u64, views: Views) {
+        self.flight.handle(now, FlightInput::ImagePublished { seq, views });
     }
 
     /// Handles the plugin's reply to observation `seq`.

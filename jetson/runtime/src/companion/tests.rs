@@ -27,6 +27,7 @@ fn companion(ground_truth: bool) -> Companion {
         time_limit_s: 0.0,
         limits: Limits::NONE,
         slip_seed: 7,
+        cameras: Vec::new(),
     };
     let mut companion =
         Companion::new(at(0), settings, LinkSettings::default(), ServerClock::same());

@@ -35,7 +35,7 @@ use vizflyt_sdk::host_now;
 
 use crate::companion::Companion;
 use crate::console::Screen;
-use crate::flight::FlightSettings;
+use crate::flight::{FlightSettings, Views};
 use crate::images::{Published, SharedSenses};
 use crate::link::{LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
@@ -172,7 +172,7 @@ impl Control {
 impl ControlLoop {
     fn new(now: HostTime, control: Control, sender: SyncSender<ControlInput>) -> Self {
         let (link, clock) = (control.link.clone(), control.shared.clock.clone());
-        let mut companion = Companion::new(now, control.settings, link, clock);
+        let mut companion = Companion::new(now, control.settings.clone(), link, clock);
         if control.waits_for_start {
             companion.wait_for_start();
         }
@@ -325,8 +325,14 @@ impl ControlLoop {
         for image in &mut images {
             image.clock_error_ns = clock_error_ns;
         }
+        let mut views = Views::default();
+        for image in &images {
+            if let Some(view) = views.get_mut(usize::from(image.camera)) {
+                *view = Some(image.pose);
+            }
+        }
         self.times.published(seq, pose, ready, images);
-        self.companion.published(now, seq);
+        self.companion.published(now, seq, views);
         self.control.log.write(
             Channel::Image,
             published.ready,

@@ -20,6 +20,7 @@ use crate::log::LogSettings;
 use crate::replies::PluginReplies;
 use crate::stream::ServerClock;
 use crate::supervisor::Confinement;
+use crate::waterfall::Stamps;
 
 /// From an image until the plugin's reply to it. [ns]
 const REPLY_NS: i64 = 10_000_000;
@@ -55,8 +56,9 @@ impl Drivers {
             time_limit_s: 0.0,
             limits: Limits::NONE,
             slip_seed: 7,
+            cameras: Vec::new(),
         };
-        let mut lockstep = Lockstep::new(now, arena, settings, None, REPLY_NS);
+        let mut lockstep = Lockstep::new(now, arena, settings.clone(), None, REPLY_NS);
         assert!(matches!(lockstep.companion.poll_plugin(), Some(ToPlugin::Start(_))));
         lockstep.companion.upload_fence(now);
 
@@ -136,11 +138,25 @@ impl Drivers {
 
     /// The plugin is shown observation `seq`, and will ask for `setpoint`.
     fn image(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
-        let images = heapless::Vec::new();
+        let stamps = Stamps {
+            camera: 0,
+            pose: now,
+            render_start: now,
+            render_end: now,
+            encode_end: now,
+            send: now,
+            receive_first: now,
+            receive: now,
+            decode_end: now,
+            clock_error_ns: 0,
+        };
+        let images = [stamps].into_iter().collect();
         let (pose, received, ready) = (now, now, now);
         let published = Published { seq, tick: seq, pose, received, ready, images };
         let reply = Reply { seq, setpoint };
-        self.lockstep.companion.published(now, seq);
+        let mut views = Views::default();
+        views[0] = Some(now);
+        self.lockstep.companion.published(now, seq, views);
         self.lockstep.take_reply(now, reply.clone());
         self.control.handle(now, ControlInput::Published(published));
         self.replies.push_back((now.plus_ns(REPLY_NS), reply));

@@ -6,7 +6,9 @@ use vizflyt_protocol::messages::{EventKind, FlightPhase, Name, bounded};
 use vizflyt_protocol::time::HostTime;
 
 use super::Flight;
-use crate::guard::{GuardMode, HoldReason, LandReason, RESTART_WITHIN_S, SETPOINT_HOLD_S};
+use crate::guard::{
+    GuardMode, HoldReason, LandReason, RESTART_WITHIN_S, SETPOINT_HOLD_S, SIGHT_HOLD_S,
+};
 
 impl Flight {
     /// Sets and reports why the flight ends, if nothing has ended it yet.
@@ -85,6 +87,9 @@ impl Flight {
                         HoldReason::PoseStale => {
                             format!("the pose is older than {} s", self.pose_ages().hold_after_s)
                         }
+                        HoldReason::ImagesOld => {
+                            format!("what the plugin sees is older than {SIGHT_HOLD_S} s")
+                        }
                         HoldReason::Ending => {
                             self.end.reason().map_or(String::new(), ToString::to_string)
                         }
@@ -116,6 +121,7 @@ impl Flight {
             }
             LandReason::NoSetpoint(_) => self.why_silent(now),
             LandReason::PoseLost(age_s) => EndReason::PoseLost { age_s },
+            LandReason::ImagesOld(age_s) => EndReason::ImagesOld { age_s },
             LandReason::OutsideFence(outside_m) => breach(outside_m, Boundary::Geofence),
             LandReason::InNoFly(inside_m) => breach(inside_m, Boundary::NoFly(Name::new())),
             LandReason::Ordered => return None,

@@ -17,6 +17,9 @@ impl Flight {
         if let Err(why) = check_arena(&arena) {
             return self.end_for(now, EndReason::ArenaRefused(bounded(&why)));
         }
+        if let Err(why) = self.sight.use_cameras(&self.settings.cameras, &arena) {
+            return self.end_for(now, EndReason::ArenaRefused(bounded(&why)));
+        }
         match &self.arena {
             Some(known) if **known != *arena => {
                 // The guard must not keep a fence that is no longer the room's.
@@ -70,6 +73,7 @@ impl Flight {
 
     pub(super) fn handle_reply(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
         self.replied_at = Some(now);
+        self.sight.answered(seq);
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
             self.unanswered = None;
         }

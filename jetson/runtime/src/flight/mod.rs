@@ -13,12 +13,13 @@
 //! What ends the flight, and what its outcome is, [`vizflyt_protocol::flight_end`] decides; landing is
 //! never taken back.
 //!
-//! `inputs` handles what happens, `phases` has a function per phase, `ending` decides why and how the flight
-//! ends.
+//! `inputs` handles what happens, `phases` has a function per phase, `sight` knows how old is what the plugin sees,
+//! `ending` decides why and how the flight ends.
 
 mod ending;
 mod inputs;
 mod phases;
+mod sight;
 #[cfg(test)]
 pub(crate) mod tests;
 
@@ -36,8 +37,11 @@ use vizflyt_protocol::time::{Host, HostTime};
 use crate::guard::{Guard, GuardMode, VehicleMotion};
 use crate::link::{Goal, Link, LinkEvent};
 
+use sight::Sight;
+pub use sight::{MAX_IMAGE_AGE_S, MIN_IMAGE_RATE_HZ, Views};
+
 /// Settings of a person.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct FlightSettings {
     /// Give up if not in the air after this long; 0 waits for ever. [s]
     pub ready_within_s: f64,
@@ -47,6 +51,8 @@ pub struct FlightSettings {
     pub limits: Limits,
     /// Another in each flight, and secret: where places slip that a plugin gives without knowing the pose.
     pub slip_seed: u64,
+    /// The cameras that the plugin flies by, by name: each must be fresh. Empty: one fresh camera is enough.
+    pub cameras: Vec<String>,
 }
 
 impl FlightSettings {
@@ -74,6 +80,8 @@ pub enum FlightInput {
     ImagePublished {
         /// Its number.
         seq: u64,
+        /// How old it is, by camera.
+        views: Views,
     },
     /// The plugin replied to an image.
     Replied {
@@ -160,6 +168,7 @@ pub struct Flight {
     replied_at: Option<HostTime>,
     /// The image whose reply the guard accepted last.
     accepted_seq: Option<u64>,
+    sight: Sight,
     /// Oldest image that the plugin has not replied to: its number, and when it got it.
     unanswered: Option<(u64, HostTime)>,
     guard: Option<Guard>,
@@ -180,6 +189,8 @@ pub struct Flight {
     restart_reason: Option<String>,
     /// When the fence last limited the plugin's setpoint.
     fence_stopped_at: Option<HostTime>,
+    /// When old images last did.
+    slowed_at: Option<HostTime>,
     notices: VecDeque<FlightNotice>,
 }
 
@@ -199,6 +210,7 @@ impl Flight {
             plugin_ready: false,
             replied_at: None,
             accepted_seq: None,
+            sight: Sight::default(),
             unanswered: None,
             guard: None,
             guard_mode: None,
@@ -213,6 +225,7 @@ impl Flight {
             landed_at: None,
             restart_reason: None,
             fence_stopped_at: None,
+            slowed_at: None,
             notices: VecDeque::new(),
         }
     }
@@ -264,7 +277,8 @@ impl Flight {
                 self.end_for(now, EndReason::ServerRefused(bounded(&why)));
             }
             FlightInput::PluginReady => self.plugin_ready = true,
-            FlightInput::ImagePublished { seq } => {
+            FlightInput::ImagePublished { seq, views } => {
+                self.sight.shown(now, seq, &views);
                 self.unanswered.get_or_insert((seq, now));
             }
             FlightInput::Replied { seq, setpoint } => self.handle_reply(now, seq, setpoint),

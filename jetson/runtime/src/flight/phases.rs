@@ -6,11 +6,13 @@ use vizflyt_protocol::messages::{EventKind, FlightPhase, bounded};
 use vizflyt_protocol::time::HostTime;
 
 use super::{Flight, LinkView, Orders};
-use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason};
+use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason, Slowed};
 
 /// Share of the take-off height that counts as reached: ArduCopter hands over at 90 cm of a metre
 /// as it eases into the height.
 const REACHED: f64 = 0.9;
+/// A vehicle that stands still is measured at less than this. [m/s]
+const AT_REST_MPS: f64 = 0.3;
 /// From the accepted take-off to the height. ArduCopter climbs at 0.5 m/s or more. [s]
 const CLIMB_WITHIN_S: f64 = 20.0;
 /// Disarmed for this long: landed. Longer than packets take to overtake each other. [s]
@@ -66,8 +68,12 @@ impl Flight {
             Some(Missing::Disarmed)
         } else if pose_age_s.is_none_or(|age_s| age_s > hold_after_s) {
             Some(Missing::Pose)
+        } else if let Some(why) = self.why_not_at_start() {
+            Some(Missing::Start(bounded(&why)))
         } else if self.replied_at.is_none() {
             Some(Missing::Answer)
+        } else if let Some(why) = self.sight.why_unfit(now) {
+            Some(Missing::Images(bounded(&why)))
         } else {
             link.ready_to_arm.as_ref().err().map(|message| Missing::PreArm(bounded(message)))
         };
@@ -92,6 +98,21 @@ impl Flight {
                 self.wait_for(now, missing);
             }
         }
+    }
+
+    /// Returns why the vehicle does not stand where a flight begins; `None` if it does.
+    fn why_not_at_start(&self) -> Option<String> {
+        let (vehicle, arena) = (self.vehicle.as_ref()?, self.arena.as_ref()?);
+        let outside_m =
+            arena.start_box.map_or(0.0, |start| start.signed_distance_m(vehicle.p_world_m));
+        if outside_m > 0.0 {
+            return Some(format!(
+                "the vehicle is {outside_m:.1} m outside the start box; carry it there"
+            ));
+        }
+        let speed_mps = vehicle.v_world_mps.length();
+        (speed_mps > AT_REST_MPS)
+            .then(|| format!("the vehicle moves, at {speed_mps:.1} m/s; it must stand still"))
     }
 
     pub(super) fn taking_off(&mut self, now: HostTime, link: &LinkView) {
@@ -133,11 +154,15 @@ impl Flight {
         let (Some(guard), Some(vehicle), true) = (&mut self.guard, &self.vehicle, flies) else {
             return Orders { goal: self.goal(), setpoint: None, replies_to: None };
         };
+        guard.see(self.sight.answered_at());
         let (output, mode) = guard.tick(now, vehicle);
-        let fence_stops = guard.fence_stops();
+        let (fence_stops, slowed) = (guard.fence_stops(), guard.slowed());
         self.follow_guard(now, mode);
         if fence_stops {
             self.notice_fence(now);
+        }
+        if let Some(slowed) = slowed {
+            self.notice_slowed(now, slowed);
         }
         let setpoint = match output {
             GuardOutput::Guided(setpoint) => Some(setpoint),
@@ -181,6 +206,19 @@ impl Flight {
         if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
             let text = "the plugin asks to leave the geofence; the vehicle stops before it";
             self.notice(EventKind::Note, text.to_owned());
+        }
+    }
+
+    /// Reports that old images slow the vehicle down; once, until they have not for [`REMIND_S`].
+    fn notice_slowed(&mut self, now: HostTime, Slowed { age_s, share }: Slowed) {
+        let former = self.slowed_at.replace(now);
+        if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
+            let text = format!(
+                "what the plugin sees is {:.0} ms old: flown at {:.0} % of the speed limit until it is fresher",
+                age_s * 1e3,
+                share * 1e2
+            );
+            self.notice(EventKind::Note, text);
         }
     }
 

@@ -28,10 +28,14 @@ struct Script {
     link: LinkView,
     p_m: DVec3,
     v_mps: DVec3,
+    /// How a hand moves it. [m/s]
+    hand_mps: DVec3,
     poses: bool,
     /// Images are published, and answered so.
     images: bool,
     replies: Replies,
+    /// Age of the images when they come. [s]
+    image_age_s: f64,
     seq: u64,
     orders: Orders,
     notices: Vec<FlightNotice>,
@@ -49,8 +53,13 @@ pub(crate) fn arena() -> ArenaInfo {
 impl Script {
     fn new() -> Self {
         let now = HostTime::from_ns(1_000_000_000);
-        let settings =
-            FlightSettings { ready_within_s: 20.0, time_limit_s: 0.0, limits: OWN, slip_seed: 7 };
+        let settings = FlightSettings {
+            ready_within_s: 20.0,
+            time_limit_s: 0.0,
+            limits: OWN,
+            slip_seed: 7,
+            cameras: Vec::new(),
+        };
         Self {
             flight: Flight::new(settings, now),
             now,
@@ -63,9 +72,11 @@ impl Script {
             },
             p_m: DVec3::Z * 0.05,
             v_mps: DVec3::ZERO,
+            hand_mps: DVec3::ZERO,
             poses: true,
             images: true,
             replies: Replies::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
+            image_age_s: 0.03,
             seq: 0,
             orders: Orders { goal: Goal::Prepare, setpoint: None, replies_to: None },
             notices: Vec::new(),
@@ -99,14 +110,17 @@ impl Script {
                 let vehicle = VehicleMotion {
                     stamp: self.now.plus_ns(-10_000_000),
                     p_world_m: self.p_m,
-                    v_world_mps: self.v_mps,
+                    v_world_mps: self.v_mps + self.hand_mps,
                     rotation: DQuat::IDENTITY,
                 };
                 self.flight.handle(self.now, FlightInput::Pose(vehicle));
             }
             if self.images && self.flight.arena.is_some() {
                 self.seq += 1;
-                self.flight.handle(self.now, FlightInput::ImagePublished { seq: self.seq });
+                let mut views = Views::default();
+                views[0] = Some(self.now.plus_seconds(-self.image_age_s));
+                let shown = FlightInput::ImagePublished { seq: self.seq, views };
+                self.flight.handle(self.now, shown);
                 let setpoint = match self.replies.clone() {
                     Replies::Never => None,
                     Replies::Without => Some(None),
@@ -400,6 +414,66 @@ fn reports_why_no_setpoint_comes() {
     let mut script = Script::flying();
     script.images = false;
     script.check_end(OutcomeKind::Error, "no image has come");
+}
+
+#[test]
+fn takes_off_only_with_fresh_images() {
+    let mut script = Script::new();
+    script.image_age_s = 0.3;
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.run(8.0);
+    assert_eq!(script.flight.phase(), Preparing);
+    let told = "waiting: images are 300 ms old when they come; take-off allows 250";
+    assert!(script.notices.iter().any(|notice| notice.text == told), "{:?}", script.notices);
+    script.image_age_s = 0.03;
+    script.run(4.0);
+    assert_eq!(script.flight.phase(), Flying, "fresh ones, and it takes off");
+    // In flight they are shown to be old, and it is told.
+    script.image_age_s = 0.3;
+    script.run(1.0);
+    let told = "what the plugin sees is";
+    assert!(script.notices.iter().any(|notice| notice.text.starts_with(told)));
+    assert_eq!(script.flight.phase(), Flying);
+    script.image_age_s = 1.0;
+    script.run(1.0);
+    assert_eq!(script.flight.phase(), Holding);
+    script.check_end(OutcomeKind::Error, "what the plugin saw was 1.0 s old");
+}
+
+#[test]
+fn takes_off_only_from_the_start_box_and_at_rest() {
+    let mut script = Script::new();
+    let start = Volume::aabb(DVec3::splat(-0.5), DVec3::splat(0.5));
+    let arena = ArenaInfo { start_box: Some(start), ..arena() };
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena)));
+    script.flight.handle(script.now, FlightInput::PluginReady);
+    let told = |script: &Script, text: &str| {
+        script.notices.iter().any(|notice| notice.text == format!("waiting: {text}"))
+    };
+    script.p_m.x = 1.75;
+    script.run(8.0);
+    assert_eq!(script.flight.phase(), Preparing);
+    let outside = "the vehicle is 1.2 m outside the start box; carry it there";
+    assert!(told(&script, outside), "{:?}", script.notices);
+    // Carried there, it does not start in a hand that moves.
+    script.p_m.x = 0.0;
+    script.hand_mps = DVec3::Y;
+    script.run(6.0);
+    assert_eq!(script.flight.phase(), Preparing);
+    assert!(told(&script, "the vehicle moves, at 1.0 m/s; it must stand still"));
+    script.hand_mps = DVec3::ZERO;
+    script.run(4.0);
+    assert_eq!(script.flight.phase(), Flying);
+}
+
+#[test]
+fn a_camera_that_is_not_there_is_named() {
+    let mut script = Script::new();
+    script.flight.settings.cameras = vec!["left".into()];
+    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    let reason = script.flight.outcome().unwrap().to_string();
+    assert!(reason.contains("no camera here is called left"), "{reason}");
 }
 
 #[test]

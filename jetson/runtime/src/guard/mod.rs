@@ -3,12 +3,12 @@
 //!
 //! Called at 50 to 200 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
 //! 1. a landing, once begun, is never taken back;
-//! 2. deadlines: a pose older than the arena's `hold_after_s`, or no setpoint for 0.5 s, holds; a pose older
-//!    than `land_after_s`, or no setpoint for 2 s, lands;
+//! 2. deadlines: a pose older than the arena's `hold_after_s`, no setpoint for 0.5 s, or a setpoint by images older
+//!    than 0.7 s, holds; a pose older than `land_after_s`, no setpoint for 2 s, or 2 s of such images, lands;
 //! 3. the plugin's setpoint becomes a velocity in world axes (positions by a braking profile,
 //!    accelerations by integration, attitude rates by the acceleration that the attitude means,
 //!    trajectories by a moving point); numbers that are not finite were refused at [`Guard::handle_setpoint`];
-//! 4. speed limit, acceleration limit (which also bounds tilt), then the geofence, the ceiling, the
+//! 4. speed limit, which falls with the age of what the plugin sees, acceleration limit (which also bounds tilt), then the geofence, the ceiling, the
 //!    floor and the no-fly boxes: never faster towards a face than the vehicle can stop before it.
 //!
 //! Everything leaves as a velocity, so that one slew limit and one fence rule bound all motion.
@@ -90,6 +90,8 @@ pub enum HoldReason {
     NoSetpoint,
     /// The newest pose is older than [`PoseAges::hold_after_s`].
     PoseStale,
+    /// What the plugin has answered last is older than [`SIGHT_HOLD_S`].
+    ImagesOld,
     /// The plugin is being started again.
     Restarting,
     /// The flight is over; it brakes before it lands.
@@ -107,6 +109,8 @@ pub enum LandReason {
     NoPlugin,
     /// The newest pose is so old. [s]
     PoseLost(f64),
+    /// What the plugin has answered last has been too old for [`SIGHT_LAND_S`]; now it is so old. [s]
+    ImagesOld(f64),
     /// The body is outside the fence by so much. [m]
     OutsideFence(f64),
     /// The body reaches into a no-fly box by so much. [m]
@@ -134,6 +138,17 @@ pub const SETPOINT_LAND_S: f64 = 2.0;
 /// loads numpy and a small model. [s]
 pub const RESTART_WITHIN_S: f64 = 10.0;
 
+/// What the plugin sees may be so old at full speed: four images of a 30 Hz camera. Beyond, the speed limit falls as
+/// the age rises, so that in this age no more way is flown. [s]
+pub const SIGHT_FRESH_S: f64 = 0.15;
+/// What the plugin has answered last is older than this: hold. More than [`SETPOINT_HOLD_S`], so that a silent plugin
+/// is named as one. [s]
+pub const SIGHT_HOLD_S: f64 = 0.7;
+/// And for this long: land. [s]
+pub const SIGHT_LAND_S: f64 = 2.0;
+
+/// A share of the speed limit that is reported when images bring it down to less.
+const SLOWED_NOTICE: f64 = 0.8;
 /// Maximum time over which a pose is extrapolated by its velocity. [s]
 const MAX_EXTRAPOLATION_S: f64 = 0.5;
 /// A speed below which the vehicle counts as stopped. [m/s]
@@ -145,11 +160,27 @@ const FENCE_NOTICE_MPS: f64 = 0.1;
 /// Maximum time between two ticks that counts; after a stall the slew limit must not open. [s]
 const MAX_TICK_S: f64 = 0.1;
 
+/// The vehicle flies slower than the plugin asks, because of old images.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Slowed {
+    /// Age of what the plugin has answered last. [s]
+    pub age_s: f64,
+    /// What is left of the speed limit, 0 to 1.
+    pub share: f64,
+}
+
 /// The guard of one flight.
 #[derive(Clone, Debug)]
 pub struct Guard {
     fence: Fence,
     max_speed_mps: f64,
+    /// What is left of it by the age of what the plugin sees.
+    speed_limit_mps: f64,
+    /// When the pose was measured behind what the plugin has answered last; none: not known.
+    seen_at: Option<HostTime>,
+    /// Since when that has been too old.
+    blind_since: Option<HostTime>,
+    slowed: Option<Slowed>,
     /// What keeps the limits of acceleration and of tilt.
     max_acceleration_mps2: f64,
     /// The last command; the slew limit counts from it. [m/s, world]
@@ -188,6 +219,10 @@ impl Guard {
         Self {
             fence: Fence::new(arena, max_acceleration_mps2),
             max_speed_mps: arena.limits.max_speed_mps,
+            speed_limit_mps: arena.limits.max_speed_mps,
+            seen_at: None,
+            blind_since: None,
+            slowed: None,
             max_acceleration_mps2,
             v_command_mps: vehicle.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
             yaw: YawTarget::Angle(vehicle.yaw_rad()),
@@ -276,6 +311,17 @@ impl Guard {
         self.ending_until.get_or_insert(now.plus_seconds(MAX_BRAKING_S));
     }
 
+    /// Takes when the pose was measured behind what the plugin has answered last: speed falls with its age. `None`
+    /// leaves it as it is.
+    pub fn see(&mut self, seen_at: Option<HostTime>) {
+        self.seen_at = seen_at.or(self.seen_at);
+    }
+
+    /// Returns how old images slow down the plugin's setpoint, if much.
+    pub fn slowed(&self) -> Option<Slowed> {
+        self.slowed
+    }
+
     /// Whether the fence limits the plugin's setpoint.
     pub fn fence_stops(&self) -> bool {
         self.fence_stops
@@ -286,6 +332,10 @@ impl Guard {
         let dt_s = now.seconds_since(self.ticked_at).clamp(0.0, MAX_TICK_S);
         self.ticked_at = now;
         self.slip.iter_mut().for_each(|slip| slip.advance(vehicle.p_world_m));
+        let sight_age_s = self.seen_at.map_or(0.0, |at| now.seconds_since(at));
+        let share = if sight_age_s > SIGHT_FRESH_S { SIGHT_FRESH_S / sight_age_s } else { 1.0 };
+        self.speed_limit_mps = self.max_speed_mps * share;
+        self.blind_since = (sight_age_s > SIGHT_HOLD_S).then(|| self.blind_since.unwrap_or(now));
         let mode = self.mode(now, vehicle);
         let v_target = match mode {
             GuardMode::Landing(reason) => {
@@ -305,7 +355,11 @@ impl Guard {
             }
         };
         let slew_mps = self.max_acceleration_mps2 * dt_s;
-        let v_target = v_target.clamp_length_max(self.max_speed_mps);
+        let is_slowed = mode == GuardMode::Following
+            && share < SLOWED_NOTICE
+            && v_target.length() > self.speed_limit_mps;
+        self.slowed = is_slowed.then_some(Slowed { age_s: sight_age_s, share });
+        let v_target = v_target.clamp_length_max(self.speed_limit_mps);
         let change = (v_target - self.v_command_mps).clamp_length_max(slew_mps);
         let v_slewed = self.v_command_mps + change;
         // Where the vehicle is now, not when the pose was measured.
@@ -358,6 +412,12 @@ impl Guard {
         }
         if silent_s > SETPOINT_HOLD_S {
             return GuardMode::Holding(HoldReason::NoSetpoint);
+        }
+        if let (Some(since), Some(seen_at)) = (self.blind_since, self.seen_at) {
+            if now.seconds_since(since) > SIGHT_LAND_S {
+                return GuardMode::Landing(LandReason::ImagesOld(now.seconds_since(seen_at)));
+            }
+            return GuardMode::Holding(HoldReason::ImagesOld);
         }
         match self.setpoint {
             None | Some(Setpoint::Hold) => GuardMode::Holding(HoldReason::Requested),

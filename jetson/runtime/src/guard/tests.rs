@@ -311,6 +311,50 @@ fn numbers_that_are_not_finite_do_not_count() {
 }
 
 #[test]
+fn old_images_slow_then_hold_then_land() {
+    let mut guard = guard();
+    // It asks for more than the limit all the time, at 50 Hz; the images get old, a second each second.
+    let seen_at = time(0);
+    let (mut flown_mps, mut modes) = (Vec::new(), Vec::new());
+    for tick in 1..=140 {
+        guard.handle_setpoint(time(tick), velocity(DVec3::X * 100.0)).unwrap();
+        guard.see(Some(seen_at));
+        guard.see(None);
+        let (output, mode) = guard.tick(time(tick), &at_rest(tick));
+        let age_s = time(tick).seconds_since(seen_at);
+        match mode {
+            GuardMode::Following => {
+                let v_mps = output_velocity(output).length();
+                assert!(v_mps * age_s <= 3.0 * SIGHT_FRESH_S + 0.05, "{age_s} {v_mps}");
+                let slowed = guard.slowed();
+                assert_eq!(slowed.is_some(), age_s > SIGHT_FRESH_S / 0.8, "{age_s} {slowed:?}");
+                flown_mps.push(v_mps);
+            }
+            GuardMode::Holding(HoldReason::ImagesOld) => assert!(age_s > SIGHT_HOLD_S),
+            GuardMode::Landing(LandReason::ImagesOld(old_s)) => {
+                // It is latched.
+                assert!(old_s <= age_s && old_s > SIGHT_HOLD_S + SIGHT_LAND_S, "{old_s}");
+            }
+            other => panic!("{other:?}"),
+        }
+        modes.push(std::mem::discriminant(&mode));
+    }
+    modes.dedup();
+    assert_eq!(modes.len(), 3, "each once, and in this order");
+    assert!(flown_mps.len() > 30 && *flown_mps.last().unwrap() < 0.25 * 3.0);
+
+    // One that is shown fresh images again goes on.
+    let mut guard = self::guard();
+    for tick in 1..=100 {
+        guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        guard.see(Some(if tick > 60 { time(tick) } else { time(0) }));
+        let (_, mode) = guard.tick(time(tick), &at_rest(tick));
+        let holds = mode == GuardMode::Holding(HoldReason::ImagesOld);
+        assert_eq!(holds, (36..=60).contains(&tick), "{tick} {mode:?}");
+    }
+}
+
+#[test]
 fn a_stale_pose_holds_then_lands() {
     let mut guard = guard();
     for tick in 1..=102 {

@@ -154,7 +154,7 @@ impl Guard {
 
     /// Returns the velocity that follows the path, and the heading on it. [m/s, world]
     fn follow_path(&mut self, vehicle: &VehicleMotion, dt_s: f64) -> (DVec3, YawTarget) {
-        let limits = (self.max_speed_mps, self.max_acceleration_mps2);
+        let limits = (self.speed_limit_mps, self.max_acceleration_mps2);
         let slip_m = self.slip_m();
         let (reference, is_over) = match &mut self.resolved {
             Resolved::Path(follower) => {

@@ -24,7 +24,7 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
 
 use crate::companion::{Companion, Senses};
-use crate::flight::FlightSettings;
+use crate::flight::{FlightSettings, Views};
 use crate::link::LinkSettings;
 use crate::log::{Channel, GivenImage, VirtualLog, observation_head, sent_message};
 use crate::stream::ServerClock;
@@ -138,7 +138,13 @@ impl Lockstep {
         if let Some(log) = &mut self.log {
             log.observation(now, seq, observation_head(memory.memory()), images);
         }
-        self.companion.published(now, seq);
+        let mut views = Views::default();
+        for image in images {
+            if let Some(view) = views.get_mut(usize::from(image.header.camera)) {
+                *view = Some(image.pose);
+            }
+        }
+        self.companion.published(now, seq, views);
         let result = process.ask(seq, memory, line);
         let reply = self.unless_failed(now, result, line)?.map(|setpoint| Reply { seq, setpoint });
         if let Some(reply) = &reply {

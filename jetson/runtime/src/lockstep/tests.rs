@@ -44,6 +44,16 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(10_000_000_000 + ms * 1_000_000)
 }
 
+/// Returns the process that was started last of all that one has started: within a cell, the plugin.
+fn innermost(id: u32) -> Pid {
+    let children = std::fs::read_to_string(format!("/proc/{id}/task/{id}/children"));
+    let child = children.unwrap_or_default();
+    match child.split(' ').next().and_then(|child| child.parse().ok()) {
+        Some(child) => innermost(child),
+        None => Pid::from_raw(id.cast_signed()),
+    }
+}
+
 /// Asks a plugin once; `meanwhile` is called when it has the image.
 fn asked(
     how: &str,
@@ -56,7 +66,7 @@ fn asked(
     let cameras = [camera()];
     let mut memory = process.loan(ObservationWriter::len_for(&cameras))?;
     ObservationWriter::new(memory.memory(), 1, &cameras)?;
-    let plugin = Pid::from_raw(process.id().cast_signed());
+    let plugin = innermost(process.id());
     let beside = std::thread::spawn(move || meanwhile(plugin));
     let result = process.ask(1, memory, &mut { NO_LINES });
     beside.join().unwrap();
@@ -109,6 +119,7 @@ fn logged(path: &Path, images: LoggedImages) {
         time_limit_s: 0.0,
         limits: Limits::NONE,
         slip_seed: 7,
+        cameras: Vec::new(),
     };
     let mut lockstep = Lockstep::new(at(0), &arena(), settings, Some(process), 10_000_000);
     let file = File::create(path).unwrap();

@@ -90,6 +90,11 @@ pub enum EndReason {
     NeverTookOff,
     /// The record stops before the flight does.
     RecordEnds,
+    /// What the plugin saw was too old for too long.
+    ImagesOld {
+        /// Age of what it answered last. [s]
+        age_s: f64,
+    },
 }
 
 /// A contact of the vehicle's body.
@@ -199,6 +204,10 @@ pub enum Missing {
     PreArm(Text),
     /// A connection to the server, which failed; the last failure in words.
     Connection(Text),
+    /// Images often and fresh enough; in words.
+    Images(Text),
+    /// The vehicle to stand still in the start box; in words.
+    Start(Text),
 }
 
 impl EndReason {

@@ -68,6 +68,7 @@ impl fmt::Display for EndReason {
             }
             Self::NeverTookOff => f.write_str("the vehicle never took off"),
             Self::RecordEnds => f.write_str("not over when its record ends"),
+            Self::ImagesOld { age_s } => write!(f, "what the plugin saw was {age_s:.1} s old"),
         }
     }
 }
@@ -143,7 +144,10 @@ impl fmt::Display for Missing {
                 "the server has no pose of the vehicle; check the localization and --vehicle"
             }
             Self::Answer => "the plugin has not answered an image yet",
-            Self::PreArm(words) | Self::Connection(words) => words,
+            Self::PreArm(words)
+            | Self::Connection(words)
+            | Self::Images(words)
+            | Self::Start(words) => words,
         })
     }
 }

@@ -59,6 +59,7 @@ fn each() -> Vec<EndReason> {
         ArenaChanged { name: bounded("room") },
         NeverTookOff,
         RecordEnds,
+        ImagesOld { age_s: 2.9 },
     ]
 }
 

@@ -308,6 +308,8 @@ pub struct ArenaInfo {
     pub goal_radius_m: f64,
     /// From take-off; 0 is none. [s]
     pub time_limit_s: f64,
+    /// Where the body's centre must be for a take-off; anywhere without one. [world]
+    pub start_box: Option<Volume>,
     /// Whether plugins get the vehicle's pose and velocity. Where not, they are not in the plugin
     /// process's memory at all.
     pub ground_truth: bool,
@@ -334,6 +336,7 @@ impl ArenaInfo {
             goal_m: None,
             goal_radius_m: 1.0,
             time_limit_s: 0.0,
+            start_box: None,
             ground_truth: true,
             pose_ages: PoseAges::default(),
             setpoints: SetpointKinds::USUAL,

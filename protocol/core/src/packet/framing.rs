@@ -123,6 +123,7 @@ mod tests {
             goal_m: Some(DVec3::splat(9.9)),
             goal_radius_m: 1.0,
             time_limit_s: 99.0,
+            start_box: Some(volume),
             ground_truth: true,
             pose_ages: PoseAges::default(),
             setpoints: crate::messages::SetpointKinds::ALL,

@@ -12,7 +12,8 @@ use super::{ArenaConfig, Geofence};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RulesConfig {
-    /// The body's centre must be in this box at take-off. [m, world]
+    /// The body's centre must be in this box at take-off: the runtime waits for it. A flight that begins elsewhere
+    /// all the same is no official one. Of a vehicle with a spawn of its own the box lies about that. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start_box: Option<Geofence>,
     /// For a take-off outside of the start box. [s]
@@ -27,6 +28,18 @@ pub struct RulesConfig {
 }
 
 impl RulesConfig {
+    /// The start box of a vehicle that stands at a place: it may be carried there by hand, to half a metre. [m, world]
+    pub fn start_box_about(spawn_m: DVec3) -> Geofence {
+        let (below_m, above_m) = (DVec3::new(0.5, 0.5, 0.5), DVec3::new(0.5, 0.5, 1.0));
+        Geofence { min_m: spawn_m - below_m, max_m: spawn_m + above_m }
+    }
+
+    /// Whether a flight may begin at a place. [m, world]
+    pub fn starts_within(&self, p_m: DVec3) -> bool {
+        let within = |start: Geofence| p_m.cmpge(start.min_m).all() && p_m.cmple(start.max_m).all();
+        self.start_box.is_none_or(within)
+    }
+
     pub(super) fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -54,11 +67,7 @@ impl RulesConfig {
         took_off_m: Option<DVec3>,
         clearances_m: impl IntoIterator<Item = f64>,
     ) -> f64 {
-        let outside = |start: &Geofence, p_m: DVec3| {
-            !(p_m.cmpge(start.min_m).all() && p_m.cmple(start.max_m).all())
-        };
-        let false_start =
-            self.start_box.is_some_and(|start| took_off_m.is_some_and(|p_m| outside(&start, p_m)));
+        let false_start = took_off_m.is_some_and(|p_m| !self.starts_within(p_m));
         let (mut near_misses, mut near) = (0_u32, false);
         for clearance_m in clearances_m {
             let now_near = clearance_m < self.near_miss_m;
@@ -97,7 +106,7 @@ impl ArenaConfig {
             return Err(invalid("rules.start_box.max_m", start.max_m, advice));
         }
         let spawn_m = self.spawn.position_m;
-        if !(spawn_m.cmpge(start.min_m).all() && spawn_m.cmple(start.max_m).all()) {
+        if !rules.starts_within(spawn_m) {
             let advice =
                 format!("the vehicle starts at {spawn_m}, outside of it; move one of them");
             return Err(invalid("rules.start_box.min_m", start.min_m, advice));

@@ -57,6 +57,11 @@ impl ArenaConfig {
         let mut arena = self.clone();
         arena.vehicles.clear();
         arena.spawn = vehicle.spawn.unwrap_or(self.spawn);
+        if let Some(start) = &mut arena.rules.start_box {
+            // It lies about the spawn.
+            let way_m = arena.spawn.position_m - self.spawn.position_m;
+            (start.min_m, start.max_m) = (start.min_m + way_m, start.max_m + way_m);
+        }
         if let Some(names) = &vehicle.cameras {
             let named = |name: &String| self.cameras.iter().find(|camera| camera.name == *name);
             arena.cameras = names.iter().filter_map(named).cloned().collect();

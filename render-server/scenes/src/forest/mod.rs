@@ -56,6 +56,7 @@ fn build_layers(seed: u64, layers: &[fn(&mut Canvas, &Site, &Light)]) -> Generat
 }
 
 fn arena(site: &Site) -> ArenaConfig {
+    let spawn_m = DVec3::new(SPAWN_X_M, 0.0, 0.0);
     ArenaConfig {
         name: "forest".to_owned(),
         scene: "scene.ply".to_owned(),
@@ -64,7 +65,7 @@ fn arena(site: &Site) -> ArenaConfig {
         time_limit_s: 60.0,
         ground_truth: true,
         attitude_rate: false,
-        spawn: Spawn { position_m: DVec3::new(SPAWN_X_M, 0.0, 0.0), yaw_deg: 0.0 },
+        spawn: Spawn { position_m: spawn_m, yaw_deg: 0.0 },
         goal: Some(Goal { position_m: site.goal_m, radius_m: 1.0 }),
         geofence: Geofence {
             min_m: DVec3::new(-1.0, -FENCE_Y_M, -0.5),
@@ -81,7 +82,10 @@ fn arena(site: &Site) -> ArenaConfig {
         localization: Vec::new(),
         stages: Vec::new(),
         objects: Vec::new(),
-        rules: RulesConfig::default(),
+        rules: RulesConfig {
+            start_box: Some(RulesConfig::start_box_about(spawn_m)),
+            ..RulesConfig::default()
+        },
     }
 }
 

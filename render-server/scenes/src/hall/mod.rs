@@ -251,7 +251,10 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         vehicles: Vec::new(),
         localization: Vec::new(),
         stages: course.stages(),
-        rules: RulesConfig::default(),
+        rules: RulesConfig {
+            start_box: Some(RulesConfig::start_box_about(spawn_m)),
+            ..RulesConfig::default()
+        },
         objects: made.iter().map(|made| made.config.clone()).collect(),
     };
     let (objects, true_objects) =

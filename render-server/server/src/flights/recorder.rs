@@ -7,6 +7,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use glam::DVec3;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
 use vizflyt_arena::ArenaConfig;
@@ -75,8 +76,14 @@ impl Recorder {
         if self.run.as_ref().is_some_and(|run| run.flight != number) {
             self.run = None;
         }
-        if self.run.is_none() && flight.took_off.is_some() && self.last != Some(number) {
-            let id = self.begin().await?;
+        // Where it begins is known once it is in the air; one that never gets there begins when it has ended.
+        let start_m = lock(&self.vehicle.samples).kept().first().map(|sample| sample.p_world_m);
+        let has_begun = start_m.is_some()
+            || self.arena.rules.start_box.is_none()
+            || flight.end.decided().is_some();
+        let is_new = flight.took_off.is_some() && self.last != Some(number);
+        if self.run.is_none() && is_new && (has_begun || flight.landed.is_some()) {
+            let id = self.begin(start_m).await?;
             self.last = Some(number);
             self.run = Some(Running { id, flight: number, decided: None });
         }
@@ -96,13 +103,19 @@ impl Recorder {
         Ok(())
     }
 
-    async fn begin(&self) -> Result<String, LeaderboardError> {
+    async fn begin(&self, start_m: Option<DVec3>) -> Result<String, LeaderboardError> {
         let checked_in = lock(&self.vehicle.checked_in).clone();
+        let mut attempt = checked_in.as_ref().map_or(Attempt::Practice, |by| by.attempt);
+        let is_elsewhere = start_m.is_some_and(|p_m| !self.arena.rules.starts_within(p_m));
+        if is_elsewhere && attempt == Attempt::Official {
+            self.vehicle.note("it began outside the start box: this flight is practice");
+            attempt = Attempt::Practice;
+        }
         let new = NewRun {
             team: checked_in.as_ref().map(|by| by.team.clone()),
             course: self.arena.name.clone(),
             vehicle: self.vehicle.name.as_str().to_owned(),
-            attempt: checked_in.map_or(Attempt::Practice, |by| by.attempt),
+            attempt,
         };
         match self.board.begin(&new, self.most_official).await {
             Err(error @ LeaderboardError::Spent { .. }) => {
