@@ -23,7 +23,7 @@ fn begin_and_leave(server: &Server, stop: &Arc<AtomicBool>) {
         let (from, on, ended) = (from.clone(), on.clone(), stop.clone());
         from.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
         std::thread::spawn(move || {
-            let mut packet = [0; 65_536];
+            let mut packet = vec![0; 65_536];
             while !ended.load(Ordering::Relaxed) {
                 if let Ok((len, _)) = from.recv_from(&mut packet)
                     && is_passed(packet[0])

@@ -206,7 +206,7 @@ mod tests {
             package(None, "/submission/parts/help/Cargo.toml"),
             package(Some(registry), "/home/x/.cargo/registry/src/help/Cargo.toml"),
         ] {
-            assert_eq!(of(good).elsewhere(true).unwrap(), [PathBuf::new(); 0]);
+            assert!(of(good).elsewhere(true).unwrap().is_empty());
         }
         let solution = || package(None, "/home/x/solution/Cargo.toml");
         let cloned = package(Some("git+file:///home/x/solution"), "/home/x/.cargo/git/Cargo.toml");

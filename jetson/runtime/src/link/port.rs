@@ -123,7 +123,7 @@ pub struct Port(Transport);
 
 #[derive(Debug)]
 enum Transport {
-    Udp(UdpPort, Mutex<Partner>),
+    Udp(UdpPort, Box<Mutex<Partner>>),
     Tcp(TcpPort),
     Serial(SerialPort),
 }
@@ -138,7 +138,7 @@ impl Port {
         Ok(Self(match address {
             MavlinkAddress::UdpIn(local) => {
                 let partner = Partner::waited_for(wanted, Instant::now());
-                Transport::Udp(UdpPort::bind(*local)?, Mutex::new(partner))
+                Transport::Udp(UdpPort::bind(*local)?, Box::new(Mutex::new(partner)))
             }
             MavlinkAddress::UdpOut(to) => {
                 let any = if to.is_ipv4() {
@@ -147,7 +147,7 @@ impl Port {
                     SocketAddr::from(([0_u16; 8], 0))
                 };
                 let partner = Partner::fixed(*to, Instant::now());
-                Transport::Udp(UdpPort::bind(any)?, Mutex::new(partner))
+                Transport::Udp(UdpPort::bind(any)?, Box::new(Mutex::new(partner)))
             }
             MavlinkAddress::TcpIn(local) => Transport::Tcp(TcpPort::listen(*local)?),
             MavlinkAddress::TcpOut(to) => Transport::Tcp(TcpPort::connect(*to)),

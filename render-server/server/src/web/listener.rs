@@ -94,7 +94,9 @@ impl Door {
 
     fn send_away_overdue(&self) {
         let overdue = lock(&self.admission).overdue(Instant::now(), IDLE);
-        overdue.into_iter().for_each(|one| tell(Some(one)));
+        for one in overdue {
+            tell(Some(one));
+        }
     }
 }
 
@@ -159,18 +161,17 @@ pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: R
         match accepted {
             Ok((stream, from)) => {
                 reserve.fill();
-                match door.admit(from.ip()) {
-                    Some((place, gives_way)) => {
-                        let (tls, router) = (tls.clone(), router.clone());
-                        tokio::spawn(async move {
-                            tokio::select! {
-                                () = talk(stream, from, place, tls, router) => {}
-                                () = gives_way.notified() => debug!("page: {from} gave way"),
-                            }
-                        });
+                let Some((place, gives_way)) = door.admit(from.ip()) else {
+                    debug!("page: no place for {from}");
+                    continue;
+                };
+                let (tls, router) = (tls.clone(), router.clone());
+                tokio::spawn(async move {
+                    tokio::select! {
+                        () = talk(stream, from, place, tls, router) => {}
+                        () = gives_way.notified() => debug!("page: {from} gave way"),
                     }
-                    None => debug!("page: no place for {from}"),
-                }
+                });
             }
             Err(error) if descriptors::are_used_up(&error) => {
                 if !is_short {

@@ -96,18 +96,17 @@ pub(super) async fn run(
     mut socket: WebSocket,
 ) {
     let entered = lock(&page.watchers).enter(&shown.viewer);
-    let (code, reason) = match entered {
-        Err(full) => (close_code::AGAIN, full),
-        Ok(()) => {
-            let presence = Presence::new(&page, &vehicle, &shown.viewer);
-            let ending = tokio::select! {
-                _ = send_all(&page, &vehicle, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
-                () = right_ends(&page, &shown) => (close_code::POLICY, "logged out"),
-                () = page.rooms.stop.wait() => (close_code::RESTART, "the server ends or changes its scene"),
-            };
-            drop(presence);
-            (ending.0, ending.1.to_owned())
-        }
+    let (code, reason) = if let Err(full) = entered {
+        (close_code::AGAIN, full)
+    } else {
+        let presence = Presence::new(&page, &vehicle, &shown.viewer);
+        let ending = tokio::select! {
+            _ = send_all(&page, &vehicle, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
+            () = right_ends(&page, &shown) => (close_code::POLICY, "logged out"),
+            () = page.rooms.stop.wait() => (close_code::RESTART, "the server ends or changes its scene"),
+        };
+        drop(presence);
+        (ending.0, ending.1.to_owned())
     };
     debug!("page: a viewer of {} leaves: {reason}", vehicle.name);
     let close = Frame::Close(Some(CloseFrame { code, reason: reason.into() }));
