@@ -14,6 +14,7 @@
 mod course;
 mod document;
 mod folder;
+mod judge;
 mod junit;
 mod keys;
 mod merge;
@@ -26,19 +27,20 @@ mod trial;
 
 use std::collections::{BTreeSet, HashMap};
 use std::ffi::OsString;
+use std::hash::{BuildHasher, RandomState};
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::str::FromStr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, Result, bail, ensure};
 use clap::{Args, Subcommand, ValueEnum};
-use ed25519_dalek::SigningKey;
 use vizflyt_arena::crash::probable_cause;
 use vizflyt_runtime::log::LoggedImages;
-use vizflyt_runtime::supervisor::PluginLimits;
+use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
@@ -94,9 +96,9 @@ struct FlyArgs {
     /// Number of seeds: each is another course
     #[arg(long, value_name = "N", default_value_t = 10)]
     seeds: u64,
-    /// The first seed; keep it secret, so that nobody prepares for the courses
-    #[arg(long, value_name = "SEED", default_value_t = 1)]
-    first_seed: u64,
+    /// The first seed, or a file that holds it: keep it secret, so that nobody prepares for the courses
+    #[arg(long, value_name = "SEED|@FILE", default_value = "1")]
+    first_seed: FirstSeed,
     /// Only part I of N of the flights; `merge` makes the whole of all parts
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
@@ -139,6 +141,30 @@ struct FlyArgs {
     least: Option<f64>,
     #[command(flatten)]
     result: ResultArgs,
+}
+
+/// The first seed: typed, or of a file, so that it stands in no list of processes and no shell's history.
+#[derive(Clone, Debug)]
+struct FirstSeed {
+    value: u64,
+    file: Option<PathBuf>,
+}
+
+impl FromStr for FirstSeed {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = |text: &str| text.trim().parse();
+        let advice = "give a whole number from 0 on, or @FILE with one";
+        let Some(path) = text.strip_prefix('@') else {
+            let value = number(text).map_err(|error| format!("{error}; {advice}"))?;
+            return Ok(Self { value, file: None });
+        };
+        let held = std::fs::read_to_string(path).map_err(|error| format!("{path}: {error}"))?;
+        // What it holds is a secret, whatever it is.
+        let value = number(&held).map_err(|_| format!("{path} holds no seed; {advice}"))?;
+        Ok(Self { value, file: Some(path.into()) })
+    }
 }
 
 /// What a report holds of flight logs.
@@ -213,6 +239,8 @@ enum GradeCommand {
         #[command(flatten)]
         result: ResultArgs,
     },
+    /// Judges a logged flight of the lab by the rules that grades go by
+    Judge(judge::JudgeArgs),
     /// Prints the public key that this computer's grades are signed with
     Key {
         /// Folder of the key [default: ~/.config/vizflyt]
@@ -264,7 +292,7 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
             if let Some(folder) = &folder {
                 let cards: Vec<String> =
                     grade.runs.iter().map(report::card::without_images).collect();
-                report::write(folder, &mut grade, &key, &cards, Vec::new())?;
+                report::write(folder, &mut grade, Some(&key), &cards, Vec::new())?;
             } else {
                 grade.sign(&key)?;
             }
@@ -274,6 +302,7 @@ pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
             }
             Ok(ExitCode::SUCCESS)
         }
+        Some(GradeCommand::Judge(args)) => judge::run(args),
         Some(GradeCommand::Key { keys }) => {
             print_line(hex(&keys::signing_key(keys.as_deref())?.verifying_key().to_bytes()));
             Ok(ExitCode::SUCCESS)
@@ -312,7 +341,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     // What a plugin of the same user could read, forge or look up: keys, our memory (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
     nix::sys::prctl::set_dumpable(false).context("this process cannot be kept to itself")?;
-    let hide = vec![keys.file("")];
+    let hide = [keys.file("")].into_iter().chain(args.first_seed.file.clone()).collect();
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
     let command = plugin.command(&limits)?;
     let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
@@ -348,8 +377,11 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let jobs =
         args.jobs.unwrap_or_else(|| available_parallelism().unwrap_or(NonZero::<usize>::MIN));
     let mut progress = Progress::new(flights.len());
-    let done =
-        pool::run(&flights, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
+    // Which comes after which is nobody's business.
+    let (mut order, lots): (Vec<usize>, _) = ((0..flights.len()).collect(), RandomState::new());
+    order.sort_by_key(|index| lots.hash_one(index));
+    let fly = |&index: &usize| fly(&flights[index]);
+    let done = pool::run(&order, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
     progress.end();
     let resumed = match &report {
         Some(_) => "; --resume keeps the flights that are finished",
@@ -360,22 +392,31 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
         print_error(format_args!("ended on request; nothing is graded{resumed}"));
         return Ok(ExitCode::FAILURE);
     };
-    let mut runs = Vec::with_capacity(done.len());
+    let mut done: Vec<(usize, FlightDone)> = order.into_iter().zip(done).collect();
+    done.sort_by_key(|(index, _)| *index);
+    let mut runs = Vec::with_capacity(flights.len());
     let (mut cards, mut files) = (HashMap::new(), Vec::new());
-    for FlightDone { run, card, files: own, .. } in done {
+    for (_, FlightDone { run, card, files: own, .. }) in done {
         cards.insert((run.variant.clone(), run.seed), card);
         files.extend(own);
         runs.push(run);
     }
     let mut grade = Grade::new(subject, args.shard, runs);
     // No plugin runs any more.
-    let key: SigningKey = keys::signing_key(args.result.keys.as_deref())?;
+    let key = keys::signing_key(args.result.keys.as_deref())?;
+    let unsealed = Confinement::prepare(&limits, &command).unsealed();
+    if let Some(why) = &unsealed {
+        print_error(format_args!(
+            "this grade is NOT signed: a plugin here could have reached what it must not ({why})"
+        ));
+    }
+    let key = Some(&key).filter(|_| unsealed.is_none());
     if let Some(report) = &report {
         let card = |run: &Run| cards.remove(&(run.variant.clone(), run.seed)).unwrap_or_default();
         let cards: Vec<String> = grade.runs.iter().map(card).collect();
-        report::write(&report.folder, &mut grade, &key, &cards, files)?;
-    } else {
-        grade.sign(&key)?;
+        report::write(&report.folder, &mut grade, key, &cards, files)?;
+    } else if let Some(key) = key {
+        grade.sign(key)?;
     }
     if let Some(path) = &args.junit {
         junit::write(path, &grade)?;
@@ -584,7 +625,7 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<S
         project: project.name().to_owned(),
         level: args.level.to_string(),
         variants,
-        first_seed: args.first_seed,
+        first_seed: args.first_seed.value,
         seeds: args.seeds,
         delays: DelaysMs {
             image_period: tenth(1e3 / args.image_rate),

@@ -2,6 +2,8 @@
 //! ends with the flight.
 
 use std::ffi::OsString;
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 
 use anyhow::{Context, Result};
 use tempfile::TempDir;
@@ -19,6 +21,7 @@ impl Keys {
     pub(crate) fn make() -> Result<Self> {
         let scratch = tempfile::Builder::new()
             .prefix("vizflyt-keys-")
+            .permissions(Permissions::from_mode(0o700))
             .tempdir()
             .context("cannot make a folder for its keys")?;
         let folder = KeysFolder::open(Some(&scratch.path().join("keys")))?;

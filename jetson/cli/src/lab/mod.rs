@@ -44,7 +44,7 @@ use vizflyt_scenes::{SceneKind, Variant};
 
 use self::localization::Localization;
 use self::memory::MemoryWatch;
-use self::prepare::Stage;
+pub(crate) use self::prepare::Stage;
 use self::report::Parts;
 use crate::terminal::{on_interrupt, open_browser, print_line};
 

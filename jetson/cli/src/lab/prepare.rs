@@ -1,5 +1,7 @@
 //! Finds or makes what is flown in: an arena file, the spawn, and the truth if known.
 
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -39,6 +41,8 @@ impl Stage {
         if let Some(generated) = generated {
             let folder = tempfile::Builder::new()
                 .prefix("vizflyt-lab-")
+                // What is true of it is not for others on this computer.
+                .permissions(Permissions::from_mode(0o700))
                 .tempdir()
                 .context("cannot make a folder for the generated scene")?;
             let written = generated.write(folder.path())?;

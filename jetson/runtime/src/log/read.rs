@@ -14,8 +14,11 @@ use glam::{DQuat, DVec3};
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use prost::Message as _;
+use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::geometry::{Body, Pose, World};
-use vizflyt_protocol::messages::Timing;
+use vizflyt_protocol::messages::{Event, Timing, ToPlugin};
+use vizflyt_protocol::packet::framing::decode_body;
+use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{DecodeError, join_jpeg};
 
 use super::channels::Channel;
@@ -312,22 +315,61 @@ impl<R: Read> RecordedPoses<R> {
             if *message.topic != *self.topic {
                 continue;
             }
-            let Ok(logged) = PoseInFrame::decode(&*message.data) else { continue };
-            let Some((p, q)) = logged.pose.and_then(|pose| pose.position.zip(pose.orientation))
-            else {
-                continue;
-            };
-            let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
-            let pose = Pose::new(DVec3::new(p.x, p.y, p.z), rotation);
-            if pose.is_valid() {
-                return Ok(Some(RecordedPose {
-                    at_ns: message.log_time_ns,
-                    world_from_body: pose,
-                }));
+            if let Some(world_from_body) = pose_of(&message) {
+                return Ok(Some(RecordedPose { at_ns: message.log_time_ns, world_from_body }));
             }
         }
         Ok(None)
     }
+}
+
+/// What a flight is judged by: where the vehicle was, and what happened.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RecordedTrack {
+    /// Localized poses, as they came.
+    pub poses: Vec<(ServerTime, Pose<World, Body>)>,
+    /// What the plugin was told of, as it was told; without places where the course withholds them.
+    pub events: Vec<Event>,
+}
+
+impl RecordedTrack {
+    /// Reads it from a log. Poses stand there by this computer's clock, events by the server's too: the least
+    /// difference is that of the clocks.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub fn read<R: Read>(mut reader: LogReader<R>) -> Result<Self, LogError> {
+        let (of_poses, of_plugin) = (Channel::Pose.topic(""), Channel::Plugin.topic(""));
+        let (mut poses, mut events) = (Vec::new(), Vec::new());
+        let mut ahead_ns = i64::MAX;
+        while let Some(entry) = reader.next()? {
+            let Entry::Message(message) = entry else { continue };
+            if *message.topic == *of_poses {
+                poses.extend(pose_of(&message).map(|pose| (message.log_time_ns, pose)));
+            } else if *message.topic == *of_plugin
+                && let Ok(plugin) = PluginMessage::decode(&*message.data)
+                && plugin.is_to_plugin
+                && plugin.protocol == u32::from(PROTOCOL_VERSION)
+                && let Ok(ToPlugin::Event(event)) = decode_body(&plugin.body)
+            {
+                let event_ns = event.stamp.as_ns();
+                ahead_ns = ahead_ns.min(message.log_time_ns.wrapping_sub(event_ns).cast_signed());
+                events.push(event);
+            }
+        }
+        let stamp = |at_ns: u64| ServerTime::from_ns(at_ns.saturating_add_signed(-ahead_ns));
+        poses.retain(|_| !events.is_empty());
+        let poses = poses.into_iter().map(|(at_ns, pose)| (stamp(at_ns), pose)).collect();
+        Ok(Self { poses, events })
+    }
+}
+
+/// Returns the pose of a message of the channel of poses.
+fn pose_of(message: &LogMessage) -> Option<Pose<World, Body>> {
+    let logged = PoseInFrame::decode(&*message.data).ok()?;
+    let (p, q) = logged.pose.and_then(|pose| pose.position.zip(pose.orientation))?;
+    let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
+    Some(Pose::new(DVec3::new(p.x, p.y, p.z), rotation)).filter(Pose::is_valid)
 }
 
 /// What replay needs of a log.
