@@ -5,12 +5,13 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
-use vizflyt_e2e::{Demo, alive, descendants};
+use vizflyt_e2e::{Demo, alive, check_refused, descendants, good};
 
 /// Loading, baking, arming and climbing, on a loaded machine.
 const AIRBORNE: Duration = Duration::from_secs(90);
@@ -99,6 +100,52 @@ fn the_forest_is_flown_and_reported() {
     assert!(renderer.starts_with("cpu ") || renderer.starts_with("gpu "), "{renderer}");
     let log = std::fs::metadata(report["log"].as_str().unwrap()).unwrap();
     assert!(log.len() > 10_000, "the log has {} bytes", log.len());
+
+    // Judged again by the grader, from the log: the same.
+    let log = report["log"].as_str().unwrap();
+    let verdict: Value =
+        serde_json::from_str(&good(&["grade", "judge", log, "--seed=7", "--json"])).unwrap();
+    assert_eq!(verdict["outcome"], "finished", "{verdict:#}");
+    let reason = report["reason"].as_str().unwrap();
+    let live_s: f64 = reason.rsplit(' ').nth(1).unwrap().parse().unwrap();
+    let judged_s = verdict["seconds"].as_f64().unwrap();
+    assert!((live_s - judged_s).abs() < 0.11, "{reason}, and {judged_s} s");
+    assert!(verdict["min_clearance_m"].as_f64().unwrap() > 0.0, "{verdict:#}");
+    // In another forest it would have hit a tree, or not have come through in this way.
+    let other = good(&["grade", "judge", log, "--seed=8", "--json"]);
+    assert!(serde_json::from_str::<Value>(&other).unwrap() != verdict);
+    check_refused(&["grade", "judge", log, "--project=p5"], &["something moves in p5"]);
+}
+
+/// A server that gets a fifth of its processor, in slices: images are late and few.
+#[test]
+fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
+    let file = ReportFile::new();
+    let mut demo = file.demo(&["--seconds", "60"]);
+    demo.wait_for(FLYING, AIRBORNE);
+    let server = demo.descendants("vizflyt serve")[0];
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !over.load(Ordering::Relaxed) {
+                let id = Pid::from_raw(server.cast_signed());
+                // Less than poses may be silent.
+                if kill(id, Signal::SIGSTOP).is_err() {
+                    return;
+                }
+                std::thread::sleep(Duration::from_millis(110));
+                let _ = kill(id, Signal::SIGCONT);
+                std::thread::sleep(Duration::from_millis(25));
+            }
+        });
+        demo.wait(FLIGHT);
+        over.store(true, Ordering::Relaxed);
+    });
+    let report = file.read();
+    println!("{} after {} s", report["reason"], report["seconds"]);
+    assert_ne!(report["outcome"], "collided", "{report:#} {:#?}", demo.seen);
+    let is_told = |line: &String| line.contains("what the plugin sees is") || line.contains("hold");
+    assert!(demo.seen.iter().any(is_told), "{:#?}", demo.seen);
 }
 
 /// No motion capture: webcams, tags, the filter, and everything behind them as ever.

@@ -166,22 +166,24 @@ fn start(rig: &Rig, args: &[&str]) -> Child {
     command.spawn().unwrap()
 }
 
-/// Returns the children of a process.
-fn children(id: u32) -> Vec<Pid> {
-    let stat = |entry: std::io::Result<fs::DirEntry>| {
-        let stat = fs::read_to_string(entry.ok()?.path().join("stat")).ok()?;
-        let child = stat.split(' ').next()?.parse().ok()?;
-        let parent: u32 = stat.rsplit_once(") ")?.1.split(' ').nth(1)?.parse().ok()?;
-        (parent == id).then_some(Pid::from_raw(child))
-    };
-    fs::read_dir("/proc").unwrap().filter_map(stat).collect()
-}
-
-/// Waits for a plugin of the grader's.
+/// Waits for a built-in plugin of the grader's: another process in whose command line `plugin` comes first, and which
+/// the grader, or who keeps the plugin's cell, has started.
 fn plugin_of(grader: &Child) -> Pid {
+    let (grader, is_plugin) = (grader.id(), |id: u32| {
+        let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
+        line.split(|&byte| byte == 0).nth(1) == Some(b"plugin")
+    });
+    let parent = |id: u32| -> Option<u32> {
+        let stat = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
+        stat.rsplit_once(") ")?.1.split(' ').nth(1)?.parse().ok()
+    };
+    let is_of_grader =
+        |id: u32| std::iter::successors(Some(id), |&id| parent(id)).take(8).any(|id| id == grader);
     loop {
-        if let Some(plugin) = children(grader.id()).first() {
-            return *plugin;
+        let entries = fs::read_dir("/proc").unwrap().flatten();
+        let mut ids = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+        if let Some(id) = ids.find(|&id| is_plugin(id) && is_of_grader(id)) {
+            return Pid::from_raw(id.cast_signed());
         }
         std::thread::sleep(Duration::from_millis(20));
     }
@@ -235,6 +237,47 @@ fn a_flight_that_is_lost_is_flown_again_and_never_graded() {
     rig.refused(&[&always, "--project=forest", "--seeds=1"], "not flown to its end in 3 attempts");
 }
 
+/// Where a plugin gets no cell, its grade is worth no signature.
+#[test]
+fn without_namespaces_nothing_is_signed() {
+    let rig = Rig::new();
+    // Root without the right to make them. Whoever is not root is kept from them otherwise.
+    let is_root = nix::unistd::geteuid().is_root();
+    let drop = ["--bounding-set=-sys_admin", "--inh-caps=-sys_admin"];
+    let can_drop = is_root
+        && Command::new("setpriv").args(drop).arg("true").status().is_ok_and(|it| it.success());
+    if !can_drop {
+        return println!("skipped: no root, or no setpriv");
+    }
+    let keys = format!("--keys={}", rig.at("keys"));
+    let mut command = Command::new("setpriv");
+    command.args(drop).arg(vizflyt());
+    command.args(["grade", "avoid", "--project=forest", "--seeds=1", "--image-rate=10", "--json"]);
+    let output = command.arg(&keys).output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(errors.contains("this grade is NOT signed: a plugin here could"), "{errors}");
+    let grade: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&grade["signature"], &grade["summary"]["runs"]), (&Value::Null, &1.into()));
+    let file = rig.at("unsigned.json");
+    fs::write(&file, &output.stdout).unwrap();
+    rig.refused(&["verify", &file], "the grade is not signed");
+}
+
+#[test]
+fn a_seed_is_read_from_a_file_and_stands_on_no_command_line() {
+    let rig = Rig::new();
+    let file = rig.at("seed");
+    fs::write(&file, "4\n").unwrap();
+    let args = ["hover", "--project=forest", "--seeds=1", "--image-rate=5", "--json"];
+    let typed = rig.grade(&[&args[..], &["--first-seed=4"]].concat());
+    let read = rig.grade(&[&args[..], &[&format!("--first-seed=@{file}")]].concat());
+    assert_eq!((&read["hash"], &read["subject"]["first_seed"]), (&typed["hash"], &4.into()));
+    fs::write(&file, "a secret\n").unwrap();
+    let output = rig.run(&[&args[..], &[&format!("--first-seed=@{file}")]].concat());
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(errors.contains("holds no seed") && !errors.contains("a secret"), "{errors}");
+}
+
 /// Keeps two processors busy until it is dropped.
 struct Load(Vec<Child>);
 
@@ -265,11 +308,16 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     let report = rig.at("report");
     let one = [&args[..], &["--jobs=1", "--report", &report]].concat();
     let mut grader = start(&rig, &one);
-    let record = Path::new(&report).join("flights/day-1.json");
-    while !record.exists() {
-        assert!(grader.try_wait().unwrap().is_none(), "{:?}", grader.wait_with_output());
+    // Which is first is not told.
+    let record = |seed: u32| Path::new(&report).join(format!("flights/day-{seed}.json"));
+    let seed = loop {
+        match (1..=3).find(|&seed| record(seed).exists()) {
+            Some(seed) => break seed,
+            None => assert!(grader.try_wait().unwrap().is_none(), "it has ended already"),
+        }
         std::thread::sleep(Duration::from_millis(20));
-    }
+    };
+    let record = record(seed);
     grader.kill().unwrap();
     grader.wait().unwrap();
     let kept = fs::read_to_string(&record).unwrap();
@@ -291,10 +339,11 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     fs::write(&record, kept.replacen("\"score\": ", "\"score\": 1", 1)).unwrap();
     rig.refused(&resumed, "was changed after it was written");
     fs::write(&record, &kept).unwrap();
-    let log = Path::new(&report).join("logs/day-1.mcap");
+    let log_name = format!("logs/day-{seed}.mcap");
+    let log = Path::new(&report).join(&log_name);
     let logged = fs::read(&log).unwrap();
     fs::write(&log, "other").unwrap();
-    rig.refused(&resumed, "changed after it was written: logs/day-1.mcap");
+    rig.refused(&resumed, &format!("changed after it was written: {log_name}"));
     fs::write(&log, logged).unwrap();
 
     let output = rig.run(&resumed);
