@@ -7,26 +7,18 @@ import re
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 
-VIZFLYT = sys.argv[1]
+import checks
+from checks import check, end
+
 HERE = pathlib.Path(__file__).resolve().parent
 VARIABLE = "VIZFLYT_ATTACK_SECRET"
-failures = []
 
 
-def check(name, holds, why=""):
-    print(f"{'ok  ' if holds else 'FAIL'}  {name}{'' if holds else f': {why}'}", flush=True)
-    if not holds:
-        failures.append(name)
-
-
-def run(*arguments, within_s=300):
-    environment = os.environ | {VARIABLE: "secret"}
-    return subprocess.run([VIZFLYT, *map(str, arguments)], capture_output=True, text=True, timeout=within_s,
-                          env=environment, check=False)
+def run(*arguments):
+    return checks.run(*arguments, environment={VARIABLE: "secret"})
 
 
 def attempts(text):
@@ -102,17 +94,75 @@ def graded_flights(scene):
     check("grade: nothing of it runs on", not left, left)
     grade = json.loads(done.stdout)
     check("grade: it has no points", grade["summary"]["score"]["value"] < 50, grade["summary"])
+    verify = ("grade", "verify", out, "--keys", scene.keys)
+    check("grade: the report is as it was signed", run(*verify).returncode == 0, run(*verify).stderr)
+    report.write_bytes(before[report] + b"<p>100 of 100</p>")
+    found = run(*verify)
+    check("grade: a forged report is found out", found.returncode != 0 and report.name in found.stdout + found.stderr,
+          found.stdout + found.stderr)
+    junit.write_bytes(before[junit].replace(b"failure", b"success"))
+    found = run("grade", "verify", out / "grade.json", "--junit", junit, "--keys", scene.keys)
+    check("grade: a forged JUnit file is found out", found.returncode != 0, found.stdout + found.stderr)
 
 
 def lab_flight(scene):
     """The same in the simulated lab, where a person's plugin is less confined."""
     program = scene.submission("lab", False)
     report = scene.folder / "lab.json"
-    done = run("fly", program, "--scene", "forest", "--headless", "--seconds", 5, "--ready-within", 20, "--report", report,
-               "--no-config", "--log-dir", scene.folder / "flights")
+    done = run("fly", program, "--scene", "forest", "--headless", "--seconds", 5, "--ready-within", 20, "--report",
+               report, "--no-config", "--log-dir", scene.folder / "flights")
     check_attempts("fly", done.stdout + done.stderr, 14)
     check("fly: the runtime lives and reports", report.exists() and "without a report" not in done.stderr,
           done.stderr[-2000:])
+
+
+HOGS = {
+    "grandchildren": """
+import os, time
+for _ in range(4):
+    if os.fork() == 0:
+        os.setsid()
+        held = bytearray(b"x") * 100_000_000
+        time.sleep(1000)
+time.sleep(1000)
+""",
+    "shared memory": """
+import time
+try:
+    open("/dev/shm/hog", "wb").write(bytes(300_000_000))
+    print("HOG holds 300 MB", flush=True)
+except OSError as error:
+    print("HOG was refused:", error.strerror, flush=True)
+time.sleep(2)
+""",
+    "processes": """
+import os, time
+while True:
+    try:
+        os.fork()
+    except OSError:
+        time.sleep(1)
+""",
+}
+
+
+def more_than_its_share(scene):
+    """Memory and processes beyond the limits, where nobody looks."""
+    settings = scene.folder / "jetson.toml"
+    settings.write_text("[plugin]\nmemory_mb = 200\nprocesses = 32\nrestart = \"never\"\n")
+    said = {
+        "grandchildren": "more than its 200 MB of memory",
+        "shared memory": "HOG was refused: No space left on device",
+        "processes": "more than its 32 processes and threads",
+    }
+    for name, text in HOGS.items():
+        program = scene.folder / f"hog-{name.replace(' ', '-')}"
+        program.write_text(f"#!/usr/bin/python3\n{text}")
+        program.chmod(0o755)
+        done = run("fly", program, "--sim", "--config", settings, "--scene", "room", "--headless", "--seconds", 3,
+                   "--ready-within", 10, "--log-dir", scene.folder / "flights")
+        text = done.stdout + done.stderr
+        check(f"fly: the limit holds for {name}", said[name] in text, text[-1500:])
 
 
 def submissions_that_run_before_they_fly(scene):
@@ -151,7 +201,8 @@ print("SPY", found, file=sys.stderr, flush=True)
     (package / "plugin.py").write_text("import vizflyt\n")
     rust = scene.folder / "own-build"
     (rust / "src").mkdir(parents=True)
-    (rust / "Cargo.toml").write_text('[package]\nname = "own-build"\nversion = "0.1.0"\nedition = "2024"\n[workspace]\n')
+    manifest = '[package]\nname = "own-build"\nversion = "0.1.0"\nedition = "2024"\n[workspace]\n'
+    (rust / "Cargo.toml").write_text(manifest)
     (rust / "src/main.rs").write_text("fn main() {}\n")
     tries = ", ".join(f'"{path}"' for path in (scene.private, scene.keys / "grading.key"))
     (rust / "build.rs").write_text(f"""fn main() {{
@@ -188,13 +239,12 @@ def main():
     try:
         graded_flights(scene)
         lab_flight(scene)
+        more_than_its_share(scene)
         submissions_that_run_before_they_fly(scene)
     finally:
         scene.close()
         shutil.rmtree(folder)
-    if failures:
-        sys.exit(f"{len(failures)} attacks passed: {', '.join(failures)}")
-    print("every attack was refused")
+    end()
 
 
 main()

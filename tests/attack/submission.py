@@ -7,7 +7,6 @@
 import array
 import ctypes
 import json
-import mmap
 import os
 import pathlib
 import resource
@@ -124,7 +123,6 @@ def leave_daemon():
                     except OSError:
                         pass
         os._exit(0)
-    return None
 
 
 for path in TARGETS["secrets"]:
@@ -140,7 +138,8 @@ attempt("priority of the runtime", lower_parent)
 attempt("end of the runtime", kill_parent)
 attempt("memory of the runtime", break_memory)
 attempt("user namespace", lambda: call("unshare", 0x10000000))
-attempt("cloned namespace", lambda: call("syscall", 56 if os.uname().machine == "x86_64" else 220, 0x10000011, 0, 0, 0, 0))
+CLONE = 56 if os.uname().machine == "x86_64" else 220
+attempt("cloned namespace", lambda: call("syscall", CLONE, 0x10000011, 0, 0, 0, 0))
 attempt("mount", lambda: call("mount", b"x", b"/tmp", b"tmpfs", 0, None))
 attempt("homes", lambda: [name for home in TARGETS["homes"] for name in os.listdir(home)])
 attempt("root", lambda: os.geteuid() == 0)
