@@ -105,6 +105,16 @@ impl KeysFolder {
     fn read_as(&self, name: &str, forbidden: u32) -> Result<Option<String>, KeyError> {
         let path = self.file(name);
         let io = |what, cause| KeyError::Io { what, path: path.clone(), cause };
+        // First: to open a pipe is to wait for whoever writes into it.
+        match fs::metadata(&path) {
+            Ok(about) if about.is_file() => {}
+            Ok(_) => {
+                let what = "it is no file; move it away".to_owned();
+                return Err(KeyError::Damaged { path, what });
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(io("open it", error)),
+        }
         let file = match File::open(&path) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -237,6 +247,19 @@ mod tests {
         fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
         let error = KeysFolder::open(Some(&path)).unwrap_err().to_string();
         assert!(error.contains("mode 755") && error.contains("chmod 700 "), "{error}");
+    }
+
+    #[test]
+    fn what_is_no_file_is_not_waited_for() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
+        fs::create_dir(folder.file("folder")).unwrap();
+        let made = process::Command::new("mkfifo").arg(folder.file("pipe")).status().unwrap();
+        assert!(made.success());
+        for name in ["folder", "pipe"] {
+            let error = folder.read_secret(name).unwrap_err().to_string();
+            assert!(error.contains(name) && error.contains("it is no file"), "{error}");
+        }
     }
 
     #[test]
