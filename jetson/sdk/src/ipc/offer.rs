@@ -38,19 +38,14 @@ impl Offer {
     /// Offers to whichever plugin of this user asks first; one that is not listed, to who knows its path.
     pub(super) fn make(listed: bool) -> io::Result<(Self, Listener)> {
         let prefix = if listed { "" } else { UNLISTED };
+        // Whoever owns the outer folder could put another one into its place.
+        make_ours(&home())?;
         Self::make_in(&folder(), &format!("{prefix}{}", process::id()))
     }
 
     fn make_in(folder: &Path, name: &str) -> io::Result<(Self, Listener)> {
         static MADE: AtomicU32 = AtomicU32::new(0);
-        fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
-        if !is_ours(folder) {
-            let text = format!(
-                "{} belongs to another user, or is no folder; have it removed",
-                folder.display()
-            );
-            return Err(io::Error::new(io::ErrorKind::PermissionDenied, text));
-        }
+        make_ours(folder)?;
         let path = folder.join(format!("{name}-{}", MADE.fetch_add(1, Ordering::Relaxed)));
         let socket = new_socket(SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK)?;
         // Of a killed process that had our number.
@@ -91,7 +86,7 @@ fn new_socket(flags: SockFlag) -> io::Result<OwnedFd> {
 
 /// Returns the services of this user's runtimes that wait for a plugin, the longest waiting first.
 pub fn offers() -> Vec<String> {
-    offers_in(&folder())
+    if is_ours(&home()) { offers_in(&folder()) } else { Vec::new() }
 }
 
 fn offers_in(folder: &Path) -> Vec<String> {
@@ -121,13 +116,35 @@ fn offers_in(folder: &Path) -> Vec<String> {
     found.into_iter().map(|(_, service)| service).collect()
 }
 
+/// Makes a folder, unless it is there; follows no link.
+fn make_ours(folder: &Path) -> io::Result<()> {
+    match fs::DirBuilder::new().mode(0o700).create(folder) {
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+            let text = format!("cannot make {}: {error}", folder.display());
+            Err(io::Error::new(error.kind(), text))
+        }
+        _ if is_ours(folder) => Ok(()),
+        _ => {
+            let text = format!(
+                "{} belongs to another user, or is no folder; have it removed",
+                folder.display()
+            );
+            Err(io::Error::new(io::ErrorKind::PermissionDenied, text))
+        }
+    }
+}
+
 fn is_ours(folder: &Path) -> bool {
     fs::symlink_metadata(folder)
         .is_ok_and(|found| found.is_dir() && found.uid() == geteuid().as_raw())
 }
 
+fn home() -> PathBuf {
+    PathBuf::from(format!("/tmp/vizflyt-{}", geteuid()))
+}
+
 fn folder() -> PathBuf {
-    PathBuf::from(format!("/tmp/vizflyt-{}/waiting", geteuid()))
+    home().join("waiting")
 }
 
 #[cfg(test)]
