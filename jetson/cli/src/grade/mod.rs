@@ -114,7 +114,7 @@ struct FlyArgs {
     /// From then until the answer takes effect
     #[arg(long, value_name = "MS", default_value_t = 10.0)]
     answer_delay: f64,
-    /// Wall-clock limit of one answer: a plugin that takes longer has failed
+    /// A plugin that takes more of its own time for an answer has failed
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     answer_within: f64,
     /// Writes a report there: index.html with a card for each flight, its images, flight logs, junit.xml, and

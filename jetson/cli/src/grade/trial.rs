@@ -66,7 +66,7 @@ pub(crate) struct Trial<'a> {
     pub command: &'a [OsString],
     /// What it may use.
     pub limits: &'a PluginLimits,
-    /// By the wall clock: a plugin that takes longer for an answer has failed.
+    /// A plugin that takes more of its own time for an answer has failed.
     pub answer_within: Duration,
     /// The time model.
     pub delays: Delays,

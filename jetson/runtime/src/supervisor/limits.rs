@@ -51,8 +51,8 @@ pub struct PluginLimits {
     pub graded: bool,
     /// The map that it is handed, as JSON, where the course's map is known.
     pub map: Option<String>,
-    /// Files and folders that it may not read, where the kernel has Landlock: what a grade must keep from
-    /// it.
+    /// Files and folders that it may not read, where it has a cell or the kernel has Landlock: what a grade must keep
+    /// from it.
     pub hide: Vec<PathBuf>,
 }
 
