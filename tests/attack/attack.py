@@ -17,8 +17,8 @@ HERE = pathlib.Path(__file__).resolve().parent
 VARIABLE = "VIZFLYT_ATTACK_SECRET"
 
 
-def run(*arguments):
-    return checks.run(*arguments, environment={VARIABLE: "secret"})
+def run(*arguments, **more):
+    return checks.run(*arguments, environment={VARIABLE: "secret"}, **more)
 
 
 def attempts(text):
@@ -103,6 +103,15 @@ def graded_flights(scene):
     junit.write_bytes(before[junit].replace(b"failure", b"success"))
     found = run("grade", "verify", out / "grade.json", "--junit", junit, "--keys", scene.keys)
     check("grade: a forged JUnit file is found out", found.returncode != 0, found.stdout + found.stderr)
+
+
+def another_try(scene):
+    """A flight that goes badly, lost on purpose: as if somebody else had killed the plugin."""
+    program = scene.folder / "another-try"
+    program.write_text("#!/usr/bin/python3\nimport os\nos.kill(os.getpid(), 9)\n")
+    program.chmod(0o755)
+    done = run("grade", program, "--project", "p4", "--seeds", 1, "--keys", scene.keys)
+    check("grade: a plugin that kills itself is not flown again", "flown again" not in done.stderr, done.stderr)
 
 
 def lab_flight(scene):
@@ -228,7 +237,11 @@ print("SPY", found, file=sys.stderr, flush=True)
         got = re.findall(r"SPY (\[[^\n]*\])", text)
         check(f"grade: {name} finds nothing", all(found == "[]" for found in got), got)
         check(f"grade: {name} leaves no mark", not (scene.folder / "mark").exists(), "it wrote outside")
-        if name != "its own package":
+        if name == "its own package":
+            done = run("grade", folder.name, "--project", "p4", "--seeds", 1, "--keys", scene.keys, cwd=folder.parent)
+            text = done.stdout + done.stderr
+            check("grade: it is found by a relative path", "can't open file" not in text, text[-500:])
+        else:
             check(f"grade: {name} was run, in its cell", bool(got) or "cannot" in text, text[-1500:])
 
 
@@ -238,6 +251,7 @@ def main():
     scene = Scene(folder)
     try:
         graded_flights(scene)
+        another_try(scene)
         lab_flight(scene)
         more_than_its_share(scene)
         submissions_that_run_before_they_fly(scene)
