@@ -114,16 +114,25 @@ impl Plugin {
                 let program = std::env::current_exe().context("cannot find this program's path")?;
                 Ok(vec![program.into(), "plugin".into(), self.name.clone()])
             }
-            Kind::Program => Ok(vec![self.name.clone()]),
+            Kind::Program => {
+                let path = Path::new(&self.name);
+                // A graded plugin starts in another folder; what is on PATH is looked up there.
+                Ok(vec![if path.is_file() { absolute(path)?.into() } else { self.name.clone() }])
+            }
             Kind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
             Kind::Script(script) => {
-                let python = python_of(script);
-                check_python(&python, script, limits)?;
+                let script = absolute(script)?;
+                let python = python_of(&script);
+                check_python(&python, &script, limits)?;
                 // Unbuffered: a print is seen when it is made, not when 8 kB are full.
                 Ok(vec![python.into(), "-u".into(), script.into()])
             }
         }
     }
+}
+
+fn absolute(path: &Path) -> Result<PathBuf> {
+    std::path::absolute(path).context("cannot find the working folder")
 }
 
 /// Returns what an existing file is.
@@ -182,7 +191,7 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
             folder.join("vizflyt.py").display()
         );
     }
-    let script = std::path::absolute(script).context("cannot find the working folder")?;
+    let script = absolute(script)?;
     let folder = script.parent().unwrap_or(Path::new("/"));
     let confinement = Confinement::prepare(limits, &[python.into(), script.clone().into()]);
     let mut check = confinement.command(python);
