@@ -114,6 +114,19 @@ def another_try(scene):
     check("grade: a plugin that kills itself is not flown again", "flown again" not in done.stderr, done.stderr)
 
 
+def an_honest_one(scene):
+    """What the cell must not keep from its plugin: itself, by whatever name."""
+    folder = scene.folder / "honest"
+    (folder / "vizflyt").mkdir(parents=True)
+    (folder / "vizflyt/__init__.py").write_text("run = None\n")
+    (folder / "plugin.py").write_text("import sys\nsys.exit('HONEST here')\n")
+    names = {"its path": folder, "its name": "honest", "a relative path": "./honest", "its file": "honest/plugin.py"}
+    for kind, name in names.items():
+        done = run("grade", name, "--project", "p4", "--seeds", 1, "--keys", scene.keys, cwd=scene.folder)
+        text = done.stdout + done.stderr
+        check(f"grade: a plugin is started by {kind}", "HONEST here" in text, text[-500:])
+
+
 def lab_flight(scene):
     """The same in the simulated lab, where a person's plugin is less confined."""
     program = scene.submission("lab", False)
@@ -237,11 +250,7 @@ print("SPY", found, file=sys.stderr, flush=True)
         got = re.findall(r"SPY (\[[^\n]*\])", text)
         check(f"grade: {name} finds nothing", all(found == "[]" for found in got), got)
         check(f"grade: {name} leaves no mark", not (scene.folder / "mark").exists(), "it wrote outside")
-        if name == "its own package":
-            done = run("grade", folder.name, "--project", "p4", "--seeds", 1, "--keys", scene.keys, cwd=folder.parent)
-            text = done.stdout + done.stderr
-            check("grade: it is found by a relative path", "can't open file" not in text, text[-500:])
-        else:
+        if name != "its own package":
             check(f"grade: {name} was run, in its cell", bool(got) or "cannot" in text, text[-1500:])
 
 
@@ -252,6 +261,7 @@ def main():
     try:
         graded_flights(scene)
         another_try(scene)
+        an_honest_one(scene)
         lab_flight(scene)
         more_than_its_share(scene)
         submissions_that_run_before_they_fly(scene)
