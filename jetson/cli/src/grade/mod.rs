@@ -341,7 +341,10 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     // What a plugin of the same user could read, forge or look up: keys, our memory (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
     nix::sys::prctl::set_dumpable(false).context("this process cannot be kept to itself")?;
-    let hide = [keys.file("")].into_iter().chain(args.first_seed.file.clone()).collect();
+    let mut hide = vec![keys.file("")];
+    hide.extend(args.first_seed.file.clone());
+    // It may lie in the plugin's own folder, and holds the logs of flights that are over.
+    hide.extend(args.report.clone());
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
     let command = plugin.command(&limits)?;
     let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
