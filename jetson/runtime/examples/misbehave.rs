@@ -104,6 +104,18 @@ impl Autonomy for Misbehave {
                 let p_world_m = DVec3::new(1000.0, 1000.0, 1000.0);
                 Some(Setpoint::Position { p_world_m, yaw: YawTarget::Keep })
             }
+            "lots" => {
+                if self.images > 2 * GOOD_IMAGES {
+                    let _ = nix::sys::signal::raise(nix::sys::signal::Signal::SIGKILL);
+                }
+                let since = std::time::UNIX_EPOCH.elapsed().unwrap_or_default();
+                let drawn = f64::from(since.subsec_nanos()) * 1e-9;
+                Some(Setpoint::Velocity {
+                    v_mps: DVec3::X * drawn,
+                    axes: Axes::Heading,
+                    yaw: YawTarget::Keep,
+                })
+            }
             "silent" => None,
             "print" => loop {
                 println!("{}", "x".repeat(5000));

@@ -237,6 +237,17 @@ fn a_flight_that_is_lost_is_flown_again_and_never_graded() {
     rig.refused(&[&always, "--project=forest", "--seeds=1"], "not flown to its end in 3 attempts");
 }
 
+/// Who draws lots, and ends itself where the lot is a bad one, is found out by the way that it flew.
+#[test]
+fn who_draws_lots_and_kills_itself_gets_no_second_lot() {
+    let rig = Rig::new();
+    let program = vizflyt().with_file_name("examples/misbehave");
+    fs::copy(&program, rig.at("misbehave")).unwrap();
+    let lots = script(&rig, "lots", "exec \"$(dirname \"$0\")/misbehave\" lots \"$@\"");
+    let args = [&lots, "--project=forest", "--seeds=1", "--image-rate=10"];
+    rig.refused(&args, "it went another way before it came to where it was lost");
+}
+
 /// Where a plugin gets no cell, its grade is worth no signature.
 #[test]
 fn without_namespaces_nothing_is_signed() {

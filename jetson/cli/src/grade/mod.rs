@@ -25,6 +25,7 @@ mod report;
 mod statistics;
 mod trial;
 
+use std::cell::Cell;
 use std::collections::{BTreeSet, HashMap};
 use std::ffi::OsString;
 use std::hash::{BuildHasher, RandomState};
@@ -51,7 +52,7 @@ use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, hex};
 use self::folder::{FLIGHTS, ReportFolder};
 use self::progress::Progress;
 use self::record::{FlightRecord, FlownWith, SealingKey};
-use self::trial::{Delays, Trial, TrialLog, TrialResult};
+use self::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
 use crate::fly::plugin::Plugin;
 use crate::terminal::{print_error, print_line, stop_flag};
 
@@ -358,6 +359,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
             CourseInstance::make(&project, args.level, variant, seed).with_context(named)?;
         let limits = PluginLimits { map: course.map.clone(), ..limits.clone() };
         let (course, command, limits) = (&course, &command[..], &limits);
+        let reached = Cell::new(None);
         let attempt = || -> Result<Option<FlightDone>> {
             let images = report.as_ref().and_then(|report| Some((report, args.log.images()?)));
             let file = images.map(|(report, _)| report.folder.nameless()).transpose()?;
@@ -366,7 +368,9 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
                 images,
                 plugin: typed,
             });
-            let trial = Trial { course, seed, command, limits, answer_within, delays, stop, log };
+            let reached = &reached;
+            let trial =
+                Trial { course, seed, command, limits, answer_within, delays, stop, log, reached };
             let Some(flown) = trial.fly()? else { return Ok(None) };
             let run = run_of(course, &delays, seed, variant, &flown);
             let mut done = FlightDone { virtual_s: flown.virtual_s, ..FlightDone::of(run) };
@@ -447,6 +451,7 @@ fn again_if_lost<T>(
     for tried in 1..ATTEMPTS {
         let error: Error = match attempt() {
             Ok(done) => return Ok(done),
+            Err(error) if error.is::<AnotherWay>() => return Err(error),
             Err(error) => error,
         };
         print_error(format_args!("{named}: {error:#}; flown again ({tried} of {})", ATTEMPTS - 1));

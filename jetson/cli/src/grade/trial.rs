@@ -11,13 +11,14 @@
 //! all: the same program, plugin, course and seed give the same bits on the same kind of processor.
 //! [`Flown::hash`] is over all of them.
 
+use std::cell::Cell;
 use std::collections::VecDeque;
 use std::ffi::OsString;
 use std::fs::File;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use glam::DVec3;
 use sha2::{Digest, Sha256};
 use vizflyt_arena::crash::{ClearanceAhead, Flight as Record, TimedSetpoint, ahead_m};
@@ -74,7 +75,27 @@ pub(crate) struct Trial<'a> {
     pub stop: &'a AtomicBool,
     /// Where it is logged, if it is.
     pub log: Option<TrialLog<'a>>,
+    /// How far it came, until it is over: the next attempt has to come by there.
+    pub reached: &'a Cell<Option<Reached>>,
 }
+
+/// How far a flight came.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Reached {
+    /// Images that the plugin has answered.
+    images: u64,
+    /// Over all until then.
+    hash: [u8; 32],
+}
+
+/// A flight that was lost and flown again went another way: a plugin that draws lots could have ended itself to draw
+/// again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "flown again, it went another way before it came to where it was lost; a plugin that is not the same every time \
+     and is killed gets no grade"
+)]
+pub(crate) struct AnotherWay;
 
 /// Where a flight is logged.
 pub(crate) struct TrialLog<'a> {
@@ -167,6 +188,7 @@ impl Trial<'_> {
     /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
     /// verdict.
     pub(crate) fn fly(&self) -> Result<Option<TrialResult>> {
+        let expected = self.reached.get();
         let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
         let mut flight = Flight::new(self, process)?;
         let result = flight.run();
@@ -175,6 +197,7 @@ impl Trial<'_> {
         if !result? {
             return Ok(None);
         }
+        ensure!(expected.is_none_or(|expected| expected.images <= flight.answered), AnotherWay);
         if let Some(log) = flight.lockstep.take_log() {
             log.finish().context("the flight's log cannot be written")?;
         }
@@ -515,7 +538,19 @@ impl<'a> Flight<'a> {
         let Some(reply) = reply else { return Ok(()) };
         self.answered += 1;
         self.hash.update(format!("{:?}", reply.setpoint).as_bytes());
+        self.come_by()?;
         self.keep_for_report(pending, reply.setpoint);
+        Ok(())
+    }
+
+    /// Takes note of how far it came; an attempt before has come this far, too, and by the same way.
+    fn come_by(&self) -> Result<()> {
+        let here = Reached { images: self.answered, hash: self.hash.clone().finalize().into() };
+        match self.trial.reached.get() {
+            Some(before) if before.images > here.images => {}
+            Some(before) if before.images == here.images => ensure!(before == here, AnotherWay),
+            _ => self.trial.reached.set(Some(here)),
+        }
         Ok(())
     }
 
