@@ -279,7 +279,7 @@ fn a_seed_is_read_from_a_file_and_stands_on_no_command_line() {
     let rig = Rig::new();
     let file = rig.at("seed");
     fs::write(&file, "4\n").unwrap();
-    let args = ["hover", "--project=forest", "--seeds=1", "--image-rate=5", "--json"];
+    let args = ["avoid", "--project=forest", "--seeds=1", "--image-rate=5", "--json"];
     let typed = rig.grade(&[&args[..], &["--first-seed=4"]].concat());
     let read = rig.grade(&[&args[..], &[&format!("--first-seed=@{file}")]].concat());
     assert_eq!((&read["hash"], &read["subject"]["first_seed"]), (&typed["hash"], &4.into()));
