@@ -87,8 +87,6 @@ pub(crate) struct Flight {
     /// Sends to the vehicle what goes round the runtime.
     aside: Aside,
     report: PathBuf,
-    /// What the plugin has left to do.
-    kept: PathBuf,
 }
 
 /// What was seen of a flight.
@@ -237,7 +235,13 @@ impl Lab {
         let name = name(index);
         let at = |kind: &str| self.folder.path().join(format!("{name}-{kind}"));
         let config = at("jetson.toml");
-        fs::write(&config, format!("[plugin]\n{settings}\n")).unwrap();
+        // Which misdeeds are left to do, for a plugin that is started again: its user writes it.
+        let left = at("left");
+        let _ = fs::remove_dir_all(&left);
+        fs::create_dir(&left).unwrap();
+        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o777);
+        fs::set_permissions(&left, mode).unwrap();
+        fs::write(&config, format!("[plugin]\n{settings}\nwrite = [{left:?}]\n")).unwrap();
         let track = Track::default();
         let cuts = Arc::new(Cuts::default());
         let capture = self.capture(Arc::clone(&track), Arc::clone(&cuts));
@@ -254,10 +258,7 @@ impl Lab {
         args.extend(more.iter().map(|&text| text.to_owned()));
         args.push(plugin.to_str().unwrap().to_owned());
         args.extend(["--".to_owned(), how.to_owned()]);
-        // Which misdeeds are left to do, for a plugin that is started again: its user writes it.
-        let kept = format!("vizflyt-misbehave-{}-{name}", std::process::id());
-        let kept = std::env::temp_dir().join(kept);
-        args.push(kept.display().to_string());
+        args.push(left.join("to-do").display().to_string());
         let runtime = Process::start(&vizflyt().with_file_name("vizflyt-jetson"), &args);
         let mavlink = runtime.ready()["mavlink"].as_str().unwrap().to_owned();
 
@@ -294,7 +295,6 @@ impl Lab {
             cuts,
             aside,
             report: at("report"),
-            kept,
         }
     }
 
@@ -434,8 +434,6 @@ impl Flight {
         let _ = self.runtime.child.wait();
         let report = fs::read_to_string(&self.report).unwrap_or_else(|_| panic!("{lines:#?}"));
         let report = serde_json::from_str(&report).unwrap();
-        // Most leave none.
-        let _ = fs::remove_file(&self.kept);
         let (track, modes) = self.so_far();
         drop(self.simulator);
         Seen { lines, track, modes, report }
