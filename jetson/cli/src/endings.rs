@@ -101,8 +101,14 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
     let mut flight = Flight::new(settings, at(0));
     flight.handle(at(0), FlightInput::Arena(Box::new(info)));
     flight.handle(at(0), FlightInput::PluginReady);
-    let mut link =
-        LinkView { connected: true, armed: false, mode: 0, took_off: false, ready_to_arm: Ok(()) };
+    let mut link = LinkView {
+        connected: true,
+        armed: false,
+        mode: 0,
+        taken: None,
+        took_off: false,
+        ready_to_arm: Ok(()),
+    };
     let (mut p_m, mut answer, mut poses) = (DVec3::new(1.0, 2.0, 0.0), Some(Setpoint::Hold), true);
     // Each is a nanosecond off the runtime's ticks, and apart from the others.
     let mut waiting: Vec<(u64, Occurrence)> = occurrences
@@ -131,7 +137,10 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
                 }
                 Occurrence::PluginLands => answer = Some(Setpoint::Land),
                 Occurrence::PluginHangs => answer = None,
-                Occurrence::PilotTakesOver if link.armed => link.mode = CopterMode::Loiter as u32,
+                Occurrence::PilotTakesOver if link.armed => {
+                    link.mode = CopterMode::Loiter as u32;
+                    link.taken = Some(link.mode);
+                }
                 Occurrence::PilotTakesOver => {}
                 Occurrence::AutopilotRestarts => {
                     flight.handle(at(now), FlightInput::Link(LinkEvent::Rebooted));

@@ -49,16 +49,20 @@ impl Flight {
     }
 
     pub(super) fn landing_text(&self) -> String {
-        self.end.reason().map_or("landing".to_owned(), |reason| format!("landing: {reason}"))
+        let how = if self.pilot_flies { "hands off" } else { "landing" };
+        self.end.reason().map_or(how.to_owned(), |reason| format!("{how}: {reason}"))
     }
 
-    /// Someone else changed the mode: a failsafe of the autopilot, or a pilot.
+    /// Someone else changed the mode, in whichever phase: a failsafe of the autopilot, a ground station, or a pilot, who
+    /// has priority. A landing goes on, whoever ordered it.
     pub(super) fn taken_over(&mut self, now: HostTime, mode: u32) {
-        if CopterMode::from_number(mode) != Some(CopterMode::Land) {
-            // The pilot has priority.
-            self.pilot_flies = true;
+        self.taken = Some(mode);
+        self.pilot_flies |= mode != CopterMode::Land as u32;
+        let reason = EndReason::TakenOver { mode };
+        if self.end.reason().is_some() && self.pilot_flies {
+            self.notice(EventKind::Note, format!("hands off: {reason}"));
         }
-        self.end_for(now, EndReason::TakenOver { mode });
+        self.end_for(now, reason);
     }
 
     /// Follows the guard's mode: its holds and landings are the flight's.

@@ -111,6 +111,8 @@ pub struct LinkView {
     pub armed: bool,
     /// ArduCopter's mode number.
     pub mode: u32,
+    /// The mode that somebody else has chosen last, after ours was confirmed.
+    pub taken: Option<u32>,
     /// The take-off was accepted.
     pub took_off: bool,
     /// What arming still waits for.
@@ -125,6 +127,7 @@ impl LinkView {
             connected: link.is_connected(),
             armed: state.armed,
             mode: state.mode,
+            taken: link.taken_mode(),
             took_off: link.took_off(),
             ready_to_arm: link.ready_to_arm(now),
         }
@@ -174,6 +177,8 @@ pub struct Flight {
     guard: Option<Guard>,
     guard_mode: Option<GuardMode>,
     end: FlightEnd<Host>,
+    /// The mode that somebody else has chosen last.
+    taken: Option<u32>,
     /// A pilot flies: nothing is sent any more.
     pilot_flies: bool,
     interrupted_at: Option<HostTime>,
@@ -215,6 +220,7 @@ impl Flight {
             guard: None,
             guard_mode: None,
             end: FlightEnd::default(),
+            taken: None,
             pilot_flies: false,
             interrupted_at: None,
             disarmed_at: None,
@@ -295,6 +301,9 @@ impl Flight {
     pub fn tick(&mut self, now: HostTime, link: &LinkView) -> Orders {
         if link.connected {
             self.connected_at = now;
+        }
+        if let Some(mode) = link.taken.filter(|_| link.taken != self.taken) {
+            self.taken_over(now, mode);
         }
         match self.phase {
             FlightPhase::Connecting => self.connecting(now, link),

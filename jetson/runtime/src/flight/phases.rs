@@ -147,8 +147,6 @@ impl Flight {
         }
         if link.connected && !link.armed {
             self.end_for(now, EndReason::Disarmed);
-        } else if link.connected && link.mode != CopterMode::Guided as u32 {
-            self.taken_over(now, link.mode);
         }
         let flies = self.phase_flies();
         let (Some(guard), Some(vehicle), true) = (&mut self.guard, &self.vehicle, flies) else {
@@ -186,7 +184,8 @@ impl Flight {
         let released = self
             .interrupted_at
             .is_some_and(|at| (link.connected && in_land) || now.seconds_since(at) > INTERRUPT_S);
-        let landing_s = now.seconds_since(self.phase_at);
+        // Who flies it takes the time that it takes.
+        let landing_s = if self.pilot_flies { 0.0 } else { now.seconds_since(self.phase_at) };
         let silent = !link.connected && now.seconds_since(self.connected_at) > LOST_WHILE_LANDING_S;
         if landed {
             self.landed_at = self.disarmed_at;

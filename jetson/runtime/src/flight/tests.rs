@@ -67,6 +67,7 @@ impl Script {
                 connected: true,
                 armed: false,
                 mode: 0,
+                taken: None,
                 took_off: false,
                 ready_to_arm: Ok(()),
             },
@@ -167,6 +168,12 @@ impl Script {
             self.v_mps = v;
         }
         self.p_m += self.v_mps * 0.02;
+    }
+
+    /// Somebody else changes the mode.
+    fn take_over(&mut self, mode: CopterMode) {
+        self.link.mode = mode as u32;
+        self.link.taken = Some(mode as u32);
     }
 
     fn server(&mut self, kind: EventKind, text: &str) {
@@ -516,9 +523,69 @@ fn a_lost_link_or_a_restart_ends_the_flight() {
 }
 
 #[test]
+fn hands_are_off_in_every_phase_once_the_mode_is_another() {
+    let modes = [
+        CopterMode::AltHold,
+        CopterMode::Loiter,
+        CopterMode::Brake,
+        CopterMode::Stabilize,
+        CopterMode::Rtl,
+        CopterMode::Land,
+    ];
+    for phase in [TakingOff, Flying, Holding, Landing] {
+        for mode in modes.into_iter().filter(|&mode| (phase, mode) != (Landing, CopterMode::Land)) {
+            let mut script = Script::new();
+            script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+            script.flight.handle(script.now, FlightInput::PluginReady);
+            while script.flight.phase() != TakingOff {
+                script.run(0.02);
+            }
+            script.run(if phase == TakingOff { 0.6 } else { 4.0 });
+            match phase {
+                Holding => {
+                    script.replies = Replies::Never;
+                    script.run(0.7);
+                }
+                Landing => {
+                    script.server(EventKind::Land, "land");
+                    script.run(1.0);
+                }
+                _ => {}
+            }
+            assert_eq!(script.flight.phase(), phase, "{mode:?}");
+            script.take_over(mode);
+            script.run(0.1);
+            let goal = if mode == CopterMode::Land { Goal::Land } else { Goal::Prepare };
+            assert_eq!(
+                script.orders,
+                Orders { goal, setpoint: None, replies_to: None },
+                "{mode:?}"
+            );
+            let told = format!("switched to {mode:?}, not by this runtime");
+            let is_told = |notice: &FlightNotice| {
+                let is_hands_off = notice.text.contains("hands off") || mode == CopterMode::Land;
+                notice.text.contains(&told) && is_hands_off
+            };
+            assert!(script.notices.iter().any(is_told), "{phase:?} {mode:?}: {:?}", script.notices);
+            // Back in GUIDED by somebody's hand it is still theirs, however long.
+            if mode != CopterMode::Land {
+                script.link.mode = CopterMode::Guided as u32;
+                script.run(90.0);
+                assert_eq!(script.orders.goal, Goal::Prepare, "{phase:?} {mode:?}");
+                assert!(script.flight.outcome().is_none(), "it is not left while it is armed");
+                script.link.armed = false;
+                script.run(1.0);
+            }
+            script.run(10.0);
+            assert!(script.flight.outcome().is_some(), "{phase:?} {mode:?}");
+        }
+    }
+}
+
+#[test]
 fn sends_nothing_after_a_pilot_takes_over() {
     let mut script = Script::flying();
-    script.link.mode = CopterMode::Loiter as u32;
+    script.take_over(CopterMode::Loiter);
     script.run(5.0);
     assert_eq!(script.orders, Orders { goal: Goal::Prepare, setpoint: None, replies_to: None });
     assert_eq!(script.flight.phase(), FlightPhase::Landing);

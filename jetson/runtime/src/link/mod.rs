@@ -21,6 +21,7 @@ mod events;
 mod fence;
 mod messages;
 mod navigation;
+mod own_mode;
 mod params;
 mod partner;
 pub mod port;
@@ -55,6 +56,7 @@ pub use events::{LinkEvent, advice};
 pub use fence::{FenceEvent, FencePolygon};
 use navigation::Feed;
 pub use navigation::{Delay, VISION_HZ};
+use own_mode::OwnMode;
 use params::Params;
 pub use params::{Param, ParamEvent, same};
 pub use partner::{Intruder, IntruderFault, Wanted};
@@ -207,6 +209,7 @@ pub struct Link {
     goal: Goal,
     /// The goal is of before a restart of the autopilot: nothing is armed for it.
     goal_is_stale: bool,
+    own_mode: OwnMode,
     commands: Commands,
     chores: VecDeque<Command>,
     /// What we commanded, and when last: an acknowledgement of anything else is not for us.
@@ -271,6 +274,7 @@ impl Link {
             sent_packets: 0,
             goal: Goal::Prepare,
             goal_is_stale: false,
+            own_mode: OwnMode::default(),
             commands: Commands::default(),
             chores: VecDeque::new(),
             commanded: Vec::new(),
@@ -463,6 +467,12 @@ impl Link {
     /// Returns the autopilot's firmware, once it has reported it.
     pub fn firmware(&self) -> Option<Firmware> {
         self.firmware
+    }
+
+    /// Returns the mode that somebody else has chosen last, after ours was confirmed. Unless it is LAND, nothing is
+    /// commanded any more.
+    pub fn taken_mode(&self) -> Option<u32> {
+        self.own_mode.taken()
     }
 
     /// Whether the autopilot has accepted the take-off.

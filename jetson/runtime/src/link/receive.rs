@@ -151,6 +151,7 @@ impl Link {
             self.state.mode = mode;
             self.events.push_back(LinkEvent::Mode(mode));
         }
+        self.own_mode.handle_heartbeat(self.goal, mode, armed);
     }
 
     /// Drops what a restarted autopilot does not know any more.
