@@ -283,6 +283,42 @@ fn sends_the_sequence_that_a_real_arducopter_accepted() {
 }
 
 #[test]
+fn a_mode_that_somebody_else_chose_is_never_taken_back() {
+    // Of ArduCopter's: STABILIZE, ALT_HOLD, LOITER, RTL, LAND, BRAKE, and one that we have no name for.
+    for mode in [0, 2, 5, 6, 9, 17, 16] {
+        for phase in 0..4 {
+            let mut script = Script::ready();
+            script.link.set_goal(script.now, Goal::TakeOff(1.2));
+            script.run(2.0);
+            match phase {
+                1 => script.link.set_goal(script.now, Goal::Fly),
+                2 => script.link.set_goal(script.now, Goal::Land),
+                // LAND was ordered, and nobody has answered yet.
+                3 => {
+                    script.answer = |_| None;
+                    script.link.set_goal(script.now, Goal::Land);
+                }
+                _ => {}
+            }
+            if phase < 3 {
+                script.run(2.0);
+            }
+            script.answer = accept;
+            let before = script.commands().len();
+            // A heartbeat comes as soon as the mode changes.
+            script.mode = mode;
+            script.heartbeat();
+            script.run(20.0);
+            let after = &script.commands()[before..];
+            let is_own = mode == 9 && phase >= 2;
+            assert!(after.is_empty() || is_own, "{mode} {phase}: {after:?}");
+            assert_eq!(script.link.taken_mode(), (!is_own).then_some(mode), "{phase}");
+            assert_eq!(script.link.state().mode, mode, "{phase}");
+        }
+    }
+}
+
+#[test]
 fn reports_what_arming_waits_for() {
     let mut script = Script::new();
     let missing = |script: &Script| script.link.ready_to_arm(script.now).unwrap_err();
