@@ -1,6 +1,9 @@
 //! Whether somebody else commands this vehicle. Two companions that steer one vehicle fight: the
 //! second is refused, by its name where it has announced one.
 //!
+//! A ground station with our system id is no second companion, but hides that we are gone: the autopilot's failsafe
+//! counts its heartbeats as ours.
+//!
 //! Signs of another one: heartbeats of a companion computer that are not an echo of ours (a number in
 //! their unused `custom_mode` differs), and replies of the autopilot to requests that we did not send.
 
@@ -15,6 +18,8 @@ pub(super) const ANNOUNCES: &str = "companion ";
 const GONE_AFTER_S: f64 = 5.0;
 /// Signs needed: one may be an answer to a former run of ours.
 const SIGNS: u32 = 3;
+/// Heartbeats of a station that make one: a single one may be left over in a bridge.
+const BEATS: u32 = 2;
 /// Maximum number of others remembered.
 const MAX_OTHERS: usize = 8;
 /// MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4.
@@ -34,12 +39,14 @@ pub(super) struct Companions {
     /// Distinguishes our heartbeats from those of another that has our ids.
     own: u32,
     others: Vec<Other>,
+    /// A ground station with our system id: its component, its heartbeats so far, and when the last came.
+    station: Option<(u8, u32, HostTime)>,
 }
 
 impl Companions {
     /// Makes one; `own` differs from runtime to runtime.
     pub(super) fn new(own: u32) -> Self {
-        Self { own, others: Vec::new() }
+        Self { own, others: Vec::new(), station: None }
     }
 
     /// Returns what goes into our heartbeats' `custom_mode`.
@@ -54,7 +61,17 @@ impl Companions {
             && COMPANIONS.contains(&from.1);
         if companion && !echo {
             self.sign(now, from);
+        } else if from.0 == SYSTEM_ID && !echo {
+            let here = |&(_, _, at): &(u8, u32, HostTime)| now.seconds_since(at) < GONE_AFTER_S;
+            let beats = self.station.filter(here).map_or(0, |(_, beats, _)| beats);
+            self.station = Some((from.1, beats.saturating_add(1), now));
         }
+    }
+
+    /// Returns the component of a ground station that has our system id, if one is there.
+    pub(super) fn station(&self, now: HostTime) -> Option<u8> {
+        let (component, beats, at) = self.station?;
+        (beats >= BEATS && now.seconds_since(at) < GONE_AFTER_S).then_some(component)
     }
 
     /// Takes an answer of the autopilot that names `to` and that we did not ask for.
@@ -133,6 +150,31 @@ mod tests {
             Some("another companion (system 255, component 191)"),
         );
         check((1, 192), beat(0, computer), Some("another companion (system 1, component 192)"));
+    }
+
+    #[test]
+    fn a_station_with_our_system_id_is_known_as_long_as_it_is_there() {
+        let now = HostTime::from_ns(1_000_000_000);
+        let station = beat(0, MavType::MAV_TYPE_GCS);
+        let mut companions = Companions::new(77);
+        companions.heartbeat(now, (254, 190), &station);
+        companions.heartbeat(now, (254, 190), &station);
+        assert_eq!(companions.station(now), None, "another id");
+        companions.heartbeat(now, (255, 190), &station);
+        assert_eq!(companions.station(now), None);
+        companions.heartbeat(now.plus_seconds(1.0), (255, 190), &station);
+        assert_eq!(companions.station(now.plus_seconds(1.0)), Some(190));
+        assert_eq!(companions.other(now), None, "it does not fly");
+        let later = now.plus_seconds(1.0 + GONE_AFTER_S);
+        assert_eq!(companions.station(later), None);
+        companions.heartbeat(later, (255, 190), &station);
+        assert_eq!(companions.station(later), None, "it counts from the start");
+        // Our own, by whatever way it comes back.
+        let mut companions = Companions::new(77);
+        for _ in 0..3 {
+            companions.heartbeat(now, (255, 191), &beat(77, MavType::MAV_TYPE_ONBOARD_CONTROLLER));
+        }
+        assert_eq!(companions.station(now), None);
     }
 
     #[test]

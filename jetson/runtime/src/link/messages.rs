@@ -45,6 +45,13 @@ impl Link {
             let text = format!("{other} commands this vehicle too; stop one of the two");
             return Some(text.into());
         }
+        if let Some(component) = self.companions.station(now) {
+            let text = format!(
+                "a ground station (component {component}) has system id 255, as this runtime: give it another, else \
+                 the autopilot does not notice when the runtime is gone"
+            );
+            return Some(text.into());
+        }
         if let Some(missing) = self.navigation_missing() {
             return Some(missing);
         }
