@@ -241,7 +241,8 @@ impl Lab {
         fs::create_dir(&left).unwrap();
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o777);
         fs::set_permissions(&left, mode).unwrap();
-        fs::write(&config, format!("[plugin]\n{settings}\nwrite = [{left:?}]\n")).unwrap();
+        let writes = format!("write = ['{}']", left.display());
+        fs::write(&config, format!("[plugin]\n{settings}\n{writes}\n")).unwrap();
         let track = Track::default();
         let cuts = Arc::new(Cuts::default());
         let capture = self.capture(Arc::clone(&track), Arc::clone(&cuts));
