@@ -58,7 +58,7 @@ impl Link {
         let guided = self.state.mode == CopterMode::Guided as u32;
         let landing = self.state.mode == CopterMode::Land as u32;
         let chore = self.chores.front().copied();
-        if self.goal_is_stale || self.own_mode.is_hands_off() {
+        if self.goal_is_stale || self.own_mode.is_hands_off(self.goal) {
             return chore;
         }
         match self.goal {

@@ -43,9 +43,10 @@ impl OwnMode {
         self.taken
     }
 
-    /// Whether to command nothing any more. A landing that somebody else began goes on.
-    pub(super) fn is_hands_off(&self) -> bool {
-        self.taken.is_some_and(|mode| mode != CopterMode::Land as u32)
+    /// Whether nothing is to be commanded for `goal` any more. A landing that somebody else began is only landed.
+    pub(super) fn is_hands_off(&self, goal: Goal) -> bool {
+        let is_land = |mode: u32| mode == CopterMode::Land as u32;
+        self.taken.is_some_and(|mode| goal != Goal::Land || !is_land(mode))
     }
 }
 
@@ -86,18 +87,18 @@ mod tests {
     #[test]
     fn what_was_taken_is_not_ours_again_by_itself() {
         let own = after(&[(Goal::Fly, GUIDED, true), (Goal::Fly, LOITER, true)]);
-        assert!(own.is_hands_off());
+        assert!(own.is_hands_off(Goal::Fly) && own.is_hands_off(Goal::Land));
         let back = after(&[
             (Goal::Fly, GUIDED, true),
             (Goal::Fly, LOITER, true),
             (Goal::Prepare, GUIDED, true),
         ]);
-        assert!(back.is_hands_off());
+        assert!(back.is_hands_off(Goal::Fly));
         // A failsafe's landing goes on, until a pilot takes the vehicle out of it.
         let mut landing = after(&[(Goal::Fly, GUIDED, true), (Goal::Fly, LAND, true)]);
-        assert!(!landing.is_hands_off());
+        assert!(landing.is_hands_off(Goal::Fly) && !landing.is_hands_off(Goal::Land));
         landing.handle_heartbeat(Goal::Land, LAND, true);
         landing.handle_heartbeat(Goal::Land, LOITER, true);
-        assert!(landing.is_hands_off());
+        assert!(landing.is_hands_off(Goal::Land));
     }
 }

@@ -184,6 +184,8 @@ impl Link {
         if boot_ms.saturating_add(REBOOT_MS) < self.boot_ms {
             self.events.push_back(LinkEvent::Rebooted);
             self.forget();
+            // In which mode it starts is nobody's choice.
+            self.own_mode = super::OwnMode::default();
             self.params.read(self.dialect.watched());
         }
         self.boot_ms = boot_ms;

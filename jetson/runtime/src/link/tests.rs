@@ -303,6 +303,7 @@ fn a_mode_that_somebody_else_chose_is_never_taken_back() {
             if phase < 3 {
                 script.run(2.0);
             }
+            script.drain();
             script.answer = accept;
             let before = script.commands().len();
             // A heartbeat comes as soon as the mode changes.
