@@ -63,7 +63,7 @@ async function open(browser, url, options = {}) {
 
 const text = (page, id) => page.locator(`#${id}`).innerText();
 const until = (page, id, pattern) =>
-  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id).textContent), [id, pattern.source]);
+  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id)?.textContent ?? ""), [id, pattern.source]);
 
 async function shot(page, name) {
   if (shots) await page.screenshot({ path: path.join(shots, `${name}.png`) });

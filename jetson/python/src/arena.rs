@@ -120,7 +120,7 @@ impl ArenaInfo {
     #[new]
     #[pyo3(signature = (
         *, name = "test", geofence = None, no_fly = Vec::new(), floor_z_m = 0.0, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
-        goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, ground_truth = true,
+        goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, start_box = None, ground_truth = true,
         attitude_rate = false, setpoints = None, cameras = Vec::new()
     ))]
     #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
@@ -135,6 +135,7 @@ impl ArenaInfo {
         goal_m: Option<&Bound<'_, PyAny>>,
         goal_radius_m: f64,
         time_limit_s: f64,
+        start_box: Option<Volume>,
         ground_truth: bool,
         attitude_rate: bool,
         setpoints: Option<Vec<String>>,
@@ -172,6 +173,7 @@ impl ArenaInfo {
             goal_m: goal_m.map(|goal_m| vector(goal_m, "goal_m")).transpose()?,
             goal_radius_m,
             time_limit_s,
+            start_box: start_box.map(|volume| volume.0),
             ground_truth,
             pose_ages: PoseAges::default(),
             setpoints: kinds,
@@ -237,6 +239,12 @@ impl ArenaInfo {
     #[getter]
     fn time_limit_s(&self) -> f64 {
         self.0.time_limit_s
+    }
+
+    /// Where a flight begins; None if anywhere. [world]
+    #[getter]
+    fn start_box(&self) -> Option<Volume> {
+        self.0.start_box.map(Volume)
     }
 
     /// Whether the plugin gets the vehicle's pose and velocity.

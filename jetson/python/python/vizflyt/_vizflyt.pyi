@@ -35,6 +35,7 @@ class ArenaInfo:
         goal_m: _Vector | None = None,
         goal_radius_m: float = 1.0,
         time_limit_s: float = 0.0,
+        start_box: Volume | None = None,
         ground_truth: bool = True,
         attitude_rate: bool = False,
         setpoints: Sequence[str] | None = None,
@@ -79,6 +80,10 @@ class ArenaInfo:
     @property
     def time_limit_s(self) -> float:
         """From take-off; 0 is none. [s]"""
+
+    @property
+    def start_box(self) -> Volume | None:
+        """Where a flight begins; None if anywhere. [world]"""
 
     @property
     def ground_truth(self) -> bool:
