@@ -258,7 +258,10 @@ impl Cell {
             };
             set_attributes(tree, c"", libc::AT_EMPTY_PATH | libc::AT_RECURSIVE, attributes)?;
             shown.make_place()?;
-            move_mount(tree, &shown.path)?;
+            // A link within what is shown leads to what is shown by its own name too.
+            if !is_link(&shown.path) {
+                move_mount(tree, &shown.path)?;
+            }
         }
         for (path, is_folder) in &self.hidden {
             if *is_folder {
@@ -551,6 +554,12 @@ fn move_mount(tree: RawFd, path: &CStr) -> Result<(), Fault> {
         )
     };
     step("a folder to show", done as i32)
+}
+
+fn is_link(path: &CStr) -> bool {
+    let mut target = [0_u8; 8];
+    // SAFETY: a path that lives through the call, and room for as much as is asked for.
+    unsafe { libc::readlink(path.as_ptr(), target.as_mut_ptr().cast(), target.len()) >= 0 }
 }
 
 fn make_folder(path: &CStr) -> Result<(), Fault> {

@@ -141,7 +141,8 @@ fn limits(descriptors: usize) -> Limits {
     }
 }
 
-/// Accepts connections until the server stops. Those that are open then end by themselves.
+/// Accepts connections until the server stops. Those that are open end with the request that they are at: the next one
+/// belongs to whoever listens then.
 pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: Router, stop: Stop) {
     let door = Door::new(descriptors::raise_limit());
     let mut reserve = Reserve::default();
@@ -165,10 +166,10 @@ pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: R
                     debug!("page: no place for {from}");
                     continue;
                 };
-                let (tls, router) = (tls.clone(), router.clone());
+                let (tls, router, stop) = (tls.clone(), router.clone(), stop.clone());
                 tokio::spawn(async move {
                     tokio::select! {
-                        () = talk(stream, from, place, tls, router) => {}
+                        () = talk(stream, from, place, tls, (router, stop)) => {}
                         () = gives_way.notified() => debug!("page: {from} gave way"),
                     }
                 });
@@ -196,19 +197,24 @@ async fn talk(
     from: SocketAddr,
     place: ConnectionPlace,
     tls: Option<PageTls>,
-    router: Router,
+    served: (Router, Stop),
 ) {
     // Small answers leave at once.
     let _ = stream.set_nodelay(true);
-    let Some(tls) = tls else { return http(stream, from, place, false, router).await };
+    let Some(tls) = tls else { return http(stream, from, place, false, served).await };
     match tls.accept(stream).await {
-        Ok(stream) => http(stream, from, place, true, router).await,
+        Ok(stream) => http(stream, from, place, true, served).await,
         Err(error) => debug!("page: {from}: {error:#}"),
     }
 }
 
-async fn http<S>(stream: S, from: SocketAddr, place: ConnectionPlace, is_tls: bool, router: Router)
-where
+async fn http<S>(
+    stream: S,
+    from: SocketAddr,
+    place: ConnectionPlace,
+    is_tls: bool,
+    (router, stop): (Router, Stop),
+) where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
     let router = TowerToHyperService::new(router);
@@ -228,7 +234,15 @@ where
         .header_read_timeout(HEAD_WITHIN)
         .max_buf_size(MAX_HEAD)
         .max_headers(MAX_HEADERS);
-    let served = builder.serve_connection(TokioIo::new(stream), service).with_upgrades().await;
+    let connection = builder.serve_connection(TokioIo::new(stream), service).with_upgrades();
+    let mut connection = std::pin::pin!(connection);
+    let served = tokio::select! {
+        served = &mut connection => served,
+        () = stop.wait() => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
     if let Err(error) = served {
         debug!("page: {from}: {error}");
     }

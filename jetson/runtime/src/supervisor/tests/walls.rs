@@ -126,6 +126,31 @@ open('left', 'w')";
     }
 }
 
+/// An environment of Python's within the folder that the plugin is started in has `lib64 -> lib`.
+#[test]
+fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    fs::set_permissions(folder.path(), open).unwrap();
+    for name in ["bin", "lib"] {
+        fs::create_dir(folder.path().join(name)).unwrap();
+    }
+    let bin = folder.path().join("bin/tool");
+    fs::write(folder.path().join("lib/x"), "found\n").unwrap();
+    fs::write(&bin, "#!/bin/sh\ncat \"$(dirname \"$0\")/../lib64/x\"\n").unwrap();
+    fs::set_permissions(&bin, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    std::os::unix::fs::symlink("lib", folder.path().join("lib64")).unwrap();
+    let limits = PluginLimits {
+        folder: Some(folder.path().to_owned()),
+        write: vec![folder.path().to_owned()],
+        ..PluginLimits::default()
+    };
+    let confinement = Confinement::prepare(&limits, &[bin.clone().into()]);
+    assert!(!has_cells() || confinement.unsealed().is_none(), "{:?}", confinement.unsealed());
+    let (lines, sentence) = to_the_end_with(&limits, &[bin.to_str().unwrap()]);
+    assert!(lines.iter().any(|(_, line)| line == "found"), "{lines:?} {sentence}");
+}
+
 #[test]
 fn memory_of_all_that_it_starts_counts() {
     if !has_cells() {
