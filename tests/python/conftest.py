@@ -20,6 +20,12 @@ def program(request):
     return path
 
 
+@pytest.fixture(autouse=True)
+def readable(tmp_path):
+    """A plugin that root starts runs as another user, who reads it."""
+    tmp_path.chmod(0o755)
+
+
 def camera(name="front", width=64, height=48):
     return vizflyt.CameraInfo(name, vizflyt.Intrinsics.from_horizontal_fov(width, height, 1.5))
 

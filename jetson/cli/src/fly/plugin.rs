@@ -217,6 +217,13 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
         bail!("{} is not Python:\n{}", script.display(), mistake.trim_end());
     }
     let last = words.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
+    if let Some(user) = confinement.user_id().filter(|_| last.contains("PermissionError")) {
+        bail!(
+            "{last}: a plugin that root starts runs as another user (uid {user}), who must be able to read it; \
+             `chmod -R a+rX {}` lets everybody",
+            folder.display()
+        );
+    }
     let venv = folder.join(".venv");
     let package = match sources() {
         Ok(root) => root.join("jetson/python").display().to_string(),

@@ -20,7 +20,7 @@
 
 #![allow(unsafe_code, reason = "system calls between fork and exec, where little is allowed")]
 
-use std::ffi::{CStr, CString};
+use std::ffi::{CStr, CString, OsStr};
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};
 use std::os::unix::ffi::OsStrExt;
@@ -125,6 +125,13 @@ impl Cell {
             let is_same = later.path == earlier.path;
             earlier.is_writable |= is_same && later.is_writable;
             is_same
+        });
+        // Links within what is shown are there, and lead to what is shown by the name that the system gives it.
+        let paths: Vec<PathBuf> = shown.iter().map(Shown::path).collect();
+        shown.retain(|shown| {
+            let path = shown.path();
+            let is_within = paths.iter().any(|outer| path != *outer && path.starts_with(outer));
+            !is_within || path.canonicalize().is_ok_and(|canonical| canonical == path)
         });
         let hidden = places.hidden.iter().filter_map(|path| path.canonicalize().ok());
         let hidden = hidden.filter(|path| {
@@ -258,10 +265,7 @@ impl Cell {
             };
             set_attributes(tree, c"", libc::AT_EMPTY_PATH | libc::AT_RECURSIVE, attributes)?;
             shown.make_place()?;
-            // A link within what is shown leads to what is shown by its own name too.
-            if !is_link(&shown.path) {
-                move_mount(tree, &shown.path)?;
-            }
+            move_mount(tree, &shown.path)?;
         }
         for (path, is_folder) in &self.hidden {
             if *is_folder {
@@ -363,6 +367,10 @@ impl Shown {
             is_writable,
             way: way.into_iter().map(c_path).collect::<Result<_, _>>()?,
         })
+    }
+
+    fn path(&self) -> PathBuf {
+        PathBuf::from(OsStr::from_bytes(self.path.as_bytes()))
     }
 
     /// Makes the way to it, and what it is mounted on, where these were covered.
@@ -554,12 +562,6 @@ fn move_mount(tree: RawFd, path: &CStr) -> Result<(), Fault> {
         )
     };
     step("a folder to show", done as i32)
-}
-
-fn is_link(path: &CStr) -> bool {
-    let mut target = [0_u8; 8];
-    // SAFETY: a path that lives through the call, and room for as much as is asked for.
-    unsafe { libc::readlink(path.as_ptr(), target.as_mut_ptr().cast(), target.len()) >= 0 }
 }
 
 fn make_folder(path: &CStr) -> Result<(), Fault> {

@@ -140,6 +140,21 @@ fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
     fs::write(&bin, "#!/bin/sh\ncat \"$(dirname \"$0\")/../lib64/x\"\n").unwrap();
     fs::set_permissions(&bin, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     std::os::unix::fs::symlink("lib", folder.path().join("lib64")).unwrap();
+    // The environment may be another folder's, by a link.
+    let own = tempfile::tempdir().unwrap();
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+    fs::set_permissions(own.path(), open).unwrap();
+    std::os::unix::fs::symlink(folder.path(), own.path().join("venv")).unwrap();
+    let by_link = own.path().join("venv/bin/tool");
+    let limits = PluginLimits {
+        folder: Some(own.path().to_owned()),
+        write: vec![own.path().to_owned()],
+        ..PluginLimits::default()
+    };
+    let (lines, sentence) = to_the_end_with(&limits, &[by_link.to_str().unwrap()]);
+    assert!(lines.iter().any(|(_, line)| line == "found"), "{lines:?} {sentence}");
+    let confinement = Confinement::prepare(&limits, &[by_link.into()]);
+    assert!(!has_cells() || confinement.unsealed().is_none(), "{:?}", confinement.unsealed());
     let limits = PluginLimits {
         folder: Some(folder.path().to_owned()),
         write: vec![folder.path().to_owned()],
