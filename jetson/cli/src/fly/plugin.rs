@@ -191,11 +191,12 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
             folder.join("vizflyt.py").display()
         );
     }
-    let script = absolute(script)?;
-    let folder = script.parent().unwrap_or(Path::new("/"));
-    let confinement = Confinement::prepare(limits, &[python.into(), script.clone().into()]);
+    // As a person named it, it stands in messages.
+    let path = absolute(script)?;
+    let folder = path.parent().unwrap_or(Path::new("/"));
+    let confinement = Confinement::prepare(limits, &[python.into(), path.clone().into()]);
     let mut check = confinement.command(python);
-    check.args(["-c", CHECK]).args([&script, folder]);
+    check.args(["-c", CHECK]).args([&path, folder]);
     check.stdout(Stdio::null()).stderr(Stdio::piped());
     let output = match confinement.run(check, CHECK_WITHIN) {
         Ok(output) => output,

@@ -358,7 +358,10 @@ fn installation(program: &Path) -> Vec<PathBuf> {
     }
     let bin = program.parent().filter(|folder| folder.ends_with("bin"));
     let Some(prefix) = bin.and_then(Path::parent) else { return Vec::new() };
-    ["bin", "lib", "lib64", "pyvenv.cfg"].map(|name| prefix.join(name)).to_vec()
+    // An environment may be another folder's, by a link.
+    let prefixes = [Some(prefix.to_owned()), prefix.canonicalize().ok()].into_iter().flatten();
+    let parts = |prefix: PathBuf| ["bin", "lib", "lib64", "pyvenv.cfg"].map(|it| prefix.join(it));
+    prefixes.flat_map(parts).collect()
 }
 
 /// Chooses whom the plugin runs as, and whether it stays root by name.
