@@ -121,11 +121,11 @@ impl Plugin {
             }
             Kind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
             Kind::Script(script) => {
-                let script = absolute(script)?;
-                let python = python_of(&script);
-                check_python(&python, &script, limits)?;
+                let path = absolute(script)?;
+                let python = python_of(&path);
+                check_python(&python, script, limits)?;
                 // Unbuffered: a print is seen when it is made, not when 8 kB are full.
-                Ok(vec![python.into(), "-u".into(), script.into()])
+                Ok(vec![python.into(), "-u".into(), path.into()])
             }
         }
     }
