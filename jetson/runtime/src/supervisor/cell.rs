@@ -45,8 +45,8 @@ pub(super) struct Cell {
     shown: Vec<Shown>,
     /// What is not seen, wherever it lies; whether it is a folder.
     hidden: Vec<(CString, bool)>,
-    /// Where the plugin starts.
-    folder: CString,
+    /// Where the plugin starts, as a person's home that it is not shown: the way to it is there, empty.
+    folder: Shown,
     /// For `/proc/self/uid_map` and `gid_map`.
     uid_map: CString,
     gid_map: CString,
@@ -153,7 +153,10 @@ impl Cell {
             scratch: c_text(&format!("mode=755,size={scratch_mb}m"))?,
             shown,
             hidden,
-            folder: c_path(&places.folder)?,
+            folder: {
+                let under = covered.iter().find(|covered| places.folder.starts_with(covered));
+                Shown::new(&places.folder, under.map(PathBuf::as_path), false)?
+            },
             uid_map: c_text(&format!("{uid} {uid} 1"))?,
             gid_map: c_text(&format!("{gid} {gid} 1"))?,
         };
@@ -284,8 +287,9 @@ impl Cell {
         }
         let hardened = libc::MS_NOSUID | libc::MS_NODEV | libc::MS_NOEXEC;
         mount("/proc of its own", Some(c"proc"), c"/proc", Some(c"proc"), hardened, None)?;
+        self.folder.make_place()?;
         // SAFETY: a path that lives through the call. The former folder is that of the world outside.
-        step("its folder", unsafe { libc::chdir(self.folder.as_ptr()) })
+        step("its folder", unsafe { libc::chdir(self.folder.path.as_ptr()) })
     }
 
     /// Covers what is people's by shares of one scratch space, so that together they hold no more than it does.

@@ -126,6 +126,22 @@ open('left', 'w')";
     }
 }
 
+/// Whoever starts it from their home shows it no home, and it starts all the same.
+#[test]
+fn it_starts_where_nothing_is_shown() {
+    if !has_cells() {
+        return;
+    }
+    let folder = tempfile::tempdir_in("/var/tmp").unwrap();
+    let deep = folder.path().join("home/me");
+    fs::create_dir_all(&deep).unwrap();
+    fs::write(deep.join("private"), "private").unwrap();
+    let limits = PluginLimits { folder: Some(deep.clone()), ..PluginLimits::default() };
+    let (lines, sentence) = to_the_end_with(&limits, &["sh", "-c", "pwd; ls"]);
+    let lines: Vec<&str> = lines.iter().map(|(_, line)| line.as_str()).collect();
+    assert_eq!(lines, [deep.to_str().unwrap()], "{sentence}");
+}
+
 /// An environment of Python's within the folder that the plugin is started in has `lib64 -> lib`.
 #[test]
 fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
