@@ -242,7 +242,7 @@ impl Lab {
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o777);
         fs::set_permissions(&left, mode).unwrap();
         let writes = format!("write = ['{}']", left.display());
-        fs::write(&config, format!("[plugin]\n{settings}\n{writes}\n")).unwrap();
+        fs::write(&config, format!("[plugin]\n{writes}\n{settings}\n")).unwrap();
         let track = Track::default();
         let cuts = Arc::new(Cuts::default());
         let capture = self.capture(Arc::clone(&track), Arc::clone(&cuts));
