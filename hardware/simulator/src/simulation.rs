@@ -15,7 +15,7 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::{Airframe, AirframeState};
 pub use crate::autopilot::MAX_LINKS;
-use crate::autopilot::{Autopilot, Radio, UnknownParam};
+use crate::autopilot::{Autopilot, Radio, UnknownParam, airframe};
 use crate::battery::Battery;
 use crate::imu::Imu;
 use crate::mocap::{Mocap, MocapConfig, Sight};
@@ -27,7 +27,7 @@ use faults::{Due, Faults};
 /// Ticks a second: the rate of ArduCopter's main loop. [Hz]
 pub const TICK_HZ: u64 = 400;
 const TICK_NS: i64 = 1_000_000_000 / TICK_HZ.cast_signed();
-const TICK_S: f64 = 1.0 / TICK_HZ as f64;
+pub(crate) const TICK_S: f64 = 1.0 / TICK_HZ as f64;
 /// Physics steps a tick: 800 Hz.
 const STEPS: u32 = 2;
 
@@ -67,6 +67,13 @@ pub struct SimulationConfig {
     pub faults: Faults,
     /// MAVLink goes over this Wi-Fi; over a cable if absent.
     pub wifi: Option<WifiConfig>,
+}
+
+impl SimulationConfig {
+    /// Returns the default lab with a vehicle that moves as one set up by `hardware/airframe`.
+    pub fn airframe() -> Self {
+        Self { params: airframe(), ..Self::default() }
+    }
 }
 
 impl Default for SimulationConfig {

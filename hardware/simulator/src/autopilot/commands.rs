@@ -9,7 +9,9 @@ use super::dialect::{MavCmd, MavMessage, MavResult, MavSeverity};
 use super::failsafe::needs_position;
 use super::signing::Signing;
 use super::telemetry::autopilot_version;
-use super::{AUTOPILOT_COMPONENT, Autopilot, Guided, Param, Params, Return, TABLE, name_of};
+use super::{
+    AUTOPILOT_COMPONENT, Autopilot, Guided, Landing, Param, Params, Return, TABLE, name_of,
+};
 use crate::estimator::VisionMeasurement;
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -210,6 +212,7 @@ impl Autopilot {
             self.mode = mode;
             self.guided = Guided::Hold;
             self.returning = Return::Climb;
+            self.landing = Landing { began: self.now, pauses: false };
             self.flight.yaw = YawTarget::Keep;
             self.streams.heartbeat_now();
         }

@@ -12,6 +12,7 @@ use crate::control::Limits;
 use crate::control::attitude::Heading;
 use crate::control::mixer::{IDLE_SPEED, mix};
 use crate::control::position::{Horizontal, Vertical};
+use crate::control::shape::sqrt_rate;
 use crate::motor::THRUST_TO_WEIGHT;
 
 /// Less thrust than this share of the weight means that something else carries the vehicle.
@@ -25,6 +26,10 @@ const LANDED_MPS2: f64 = 1.5;
 const SHAKE_CUTOFF: f64 = 12.0; // [rad/s]
 /// A take-off is over this close to its height. [m]
 const REACHED_M: f64 = 0.05;
+/// A failsafe's LAND hovers until so long after LAND began (ArduCopter's `LAND_WITH_DELAY_MS`). [s]
+const LAND_PAUSE_S: f64 = 4.0;
+/// LAND sinks by so much of the height left over LAND_ALT_LOW_M (ArduCopter's `PSC_D_POS_P`). [1/s]
+const LAND_GAIN_PER_S: f64 = 1.0;
 /// A nose that follows travel does so above this share of WP_SPD.
 const LOOK_AHEAD_SHARE: f64 = 0.05;
 
@@ -140,7 +145,11 @@ impl Autopilot {
                 Demand::Motion(self.or_level(now, stay), stay_z)
             }
             CopterMode::Guided => self.guided_demand(now, dt_s),
-            CopterMode::Land => Demand::Motion(self.or_level(now, stay), self.descent()),
+            CopterMode::Land => {
+                self.landing.pauses &= now.seconds_since(self.landing.began) < LAND_PAUSE_S;
+                let down = if self.landing.pauses { stay_z } else { self.descent() };
+                Demand::Motion(self.or_level(now, stay), down)
+            }
             CopterMode::Rtl => self.return_demand(now),
         }
     }
@@ -157,8 +166,10 @@ impl Autopilot {
             0.0 => value(Param::WpSpeedDown),
             speed => speed,
         };
-        let slow = value(Param::LandSpeed);
-        Vertical::Descend(if height_m > value(Param::LandAltLow) { fast } else { slow })
+        let (slow, low_m) = (value(Param::LandSpeed), value(Param::LandAltLow));
+        // Slowed down on the way to LAND_ALT_LOW_M, not there.
+        let braked = sqrt_rate(height_m - low_m, LAND_GAIN_PER_S, value(Param::WpAccelerationZ));
+        Vertical::Descend(braked.clamp(slow, fast.max(slow)))
     }
 
     fn towards(&self, p: DVec3, v: DVec3) -> Demand {

@@ -44,7 +44,7 @@ use crate::control::position::PositionController;
 use crate::estimator::Estimator;
 use crate::imu::SensorSample;
 use dialect::{MavMessage, MavSeverity};
-pub use params::{Param, ParamSpec, Params, TABLE};
+pub use params::{Param, ParamSpec, Params, TABLE, airframe};
 use streams::Streams;
 
 /// Links that are served at once, as telemetry ports: each has its own stream of bytes.
@@ -71,6 +71,14 @@ enum Return {
     Land,
 }
 
+/// LAND of the moment.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Landing {
+    began: AutopilotTime,
+    /// A failsafe entered it, or came during it: it hovers first.
+    pauses: bool,
+}
+
 /// The receiver of a radio control.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Radio {
@@ -94,6 +102,7 @@ pub struct Autopilot {
     landed: bool,
     guided: Guided,
     returning: Return,
+    landing: Landing,
     /// Where the vehicle was armed. [m, world]
     home: Option<DVec3>,
     /// Latitude and longitude [1e-7 deg] and altitude [mm], as set.
@@ -134,6 +143,7 @@ impl Default for Autopilot {
             landed: true,
             guided: Guided::Hold,
             returning: Return::Climb,
+            landing: Landing::default(),
             home: None,
             origin: None,
             datum_reset: false,

@@ -1,4 +1,4 @@
-//! The parameters of ArduCopter that this autopilot honours, by the names of 4.8.
+//! The parameters of ArduCopter that this autopilot honours, by the names of 4.8, and those of `hardware/airframe`.
 //!
 //! Defaults are a lab's (`docs` of ArduCopter: external navigation, no GPS, no compass), not
 //! ArduCopter's own, wherever the comment states it.
@@ -80,16 +80,16 @@ params! {
     WpSpeedUp = "WP_SPD_UP", 0.5, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
     /// Sink rate towards position targets (lab). [m/s]
     WpSpeedDown = "WP_SPD_DN", 0.5, 0.1..5.0, MAV_PARAM_TYPE_REAL32;
-    /// Horizontal acceleration of all guided motion (lab). [m/s^2]
-    WpAcceleration = "WP_ACC", 8.0, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
-    /// Vertical acceleration of all guided motion (lab). [m/s^2]
-    WpAccelerationZ = "WP_ACC_Z", 4.0, 0.5..8.0, MAV_PARAM_TYPE_REAL32;
+    /// Horizontal acceleration of all guided motion. [m/s^2]
+    WpAcceleration = "WP_ACC", 2.5, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
+    /// Vertical acceleration of all guided motion. [m/s^2]
+    WpAccelerationZ = "WP_ACC_Z", 1.0, 0.5..8.0, MAV_PARAM_TYPE_REAL32;
     /// Nose when a setpoint ignores yaw: 0 keeps it, else it turns into the direction of travel.
     WpYawBehavior = "WP_YAW_BEHAVIOR", 2.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
-    /// Horizontal jerk (lab). [m/s^3]
-    JerkHorizontal = "PSC_JERK_NE", 80.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
-    /// Vertical jerk (lab). [m/s^3]
-    JerkVertical = "PSC_JERK_D", 50.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
+    /// Horizontal jerk; with ArduCopter's default a vehicle answers a velocity after some 0.7 s. [m/s^3]
+    JerkHorizontal = "PSC_JERK_NE", 5.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
+    /// Vertical jerk. [m/s^3]
+    JerkVertical = "PSC_JERK_D", 5.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
     /// Largest tilt (lab). [deg]
     AngleMax = "ATC_ANGLE_MAX", 45.0, 10.0..60.0, MAV_PARAM_TYPE_REAL32;
     /// Fastest turn of the nose to an angle (lab). [cdeg/s]
@@ -169,6 +169,19 @@ params! {
     MotHover = "MOT_THST_HOVER", 0.16, 0.05..0.8, MAV_PARAM_TYPE_REAL32;
 }
 
+/// Returns how a vehicle set up by `hardware/airframe` moves: what its file sets of this table's parameters for flying
+/// in a room. The rest of the file is about parts that a simulated lab does not have, or sets for itself.
+pub fn airframe() -> Vec<(String, f32)> {
+    const FILE: &str = include_str!("../../../airframe/whippet-copter-4.8.param");
+    const MOTION: [&str; 4] = ["WP_", "PSC_", "LAND_", "GUID_"];
+    FILE.lines()
+        .filter_map(|line| line.split_once(','))
+        .filter(|(name, _)| MOTION.iter().any(|group| name.starts_with(group)))
+        .filter(|(name, _)| Params::index_of(name).is_some())
+        .filter_map(|(name, value)| Some((name.to_owned(), value.trim().parse().ok()?)))
+        .collect()
+}
+
 /// The values of the moment.
 #[derive(Clone, Debug)]
 pub struct Params {
@@ -219,6 +232,16 @@ mod tests {
             assert!(spec.name.len() <= 16, "{}", spec.name);
             assert!((spec.least..=spec.most).contains(&spec.default), "{}", spec.name);
             assert_eq!(Params::index_of(spec.name), Some(i), "{} appears twice", spec.name);
+        }
+    }
+
+    #[test]
+    fn the_airframes_file_sets_how_the_lab_moves() {
+        let set = airframe();
+        for name in
+            ["PSC_JERK_NE", "PSC_JERK_D", "WP_ACC", "WP_ACC_Z", "GUID_TIMEOUT", "LAND_SPD_MS"]
+        {
+            assert!(set.iter().any(|(found, _)| found == name), "{name} is not among {set:?}");
         }
     }
 

@@ -8,7 +8,7 @@
 use glam::DVec3;
 
 use super::Limits;
-use super::shape::{ShapedVelocity, sqrt_rate, sqrt_rate_vector};
+use super::shape::ShapedVelocity;
 use crate::estimator::Estimate;
 
 /// Position feedback, horizontal and vertical. [1/s]
@@ -30,6 +30,9 @@ const THRUST_LAG_S: f64 = 0.05;
 const STAY_MPS: f64 = 0.02;
 /// The vehicle counts as stopped below this speed. [m/s]
 const STOPPED_MPS: f64 = 0.15;
+/// Fastest way back to a place, and to a height, that is held. [m/s]
+const RETURN_MPS: f64 = 1.0;
+const RETURN_Z_MPS: f64 = 0.5;
 /// How far the velocity demanded by an acceleration may run ahead of the vehicle. [m/s]
 const LEASH_MPS: f64 = 1.5;
 
@@ -163,8 +166,7 @@ impl PositionController {
         let flat = |v: DVec3| DVec3::new(v.x, v.y, 0.0);
         let (p, v) = (flat(estimate.p_world_m), flat(estimate.v_world_mps));
         let (a_limit, j_limit) = (limits.horizontal_mps2, limits.horizontal_mps3);
-        // Braking is planned softer than the limit, so that following it stays within.
-        let towards = |target: DVec3| sqrt_rate_vector(target - p, POSITION_GAIN, a_limit / 2.0);
+        let limits = (a_limit, j_limit);
         let axis = &mut self.horizontal;
         if !matches!(demand, Horizontal::Velocity(_)) {
             self.held = None;
@@ -175,8 +177,9 @@ impl PositionController {
                 return DVec3::ZERO;
             }
             Horizontal::Position { p: target, v: feed_forward, speed_mps } => {
-                let correction = towards(flat(target)).clamp_length_max(speed_mps);
-                axis.shaped.approach(flat(feed_forward) + correction, a_limit, j_limit, dt_s);
+                let within = |v: DVec3| v.clamp_length_max(speed_mps);
+                let (error, v_point) = (flat(target) - p, flat(feed_forward));
+                axis.shaped.approach_point(error, v_point, POSITION_GAIN, within, limits, dt_s);
             }
             Horizontal::Velocity(target) => {
                 let target = flat(target);
@@ -188,8 +191,13 @@ impl PositionController {
                 {
                     self.held = Some(p);
                 }
-                let target = self.held.map_or(target, |held| towards(held).clamp_length_max(1.0));
-                axis.shaped.approach(target, a_limit, j_limit, dt_s);
+                if let Some(held) = self.held {
+                    let within = |v: DVec3| v.clamp_length_max(RETURN_MPS);
+                    let (error, rest) = (held - p, DVec3::ZERO);
+                    axis.shaped.approach_point(error, rest, POSITION_GAIN, within, limits, dt_s);
+                } else {
+                    axis.shaped.approach(target, a_limit, j_limit, dt_s);
+                }
             }
             Horizontal::Acceleration(target) => {
                 axis.shaped.a += (flat(target).clamp_length_max(a_limit) - axis.shaped.a)
@@ -212,7 +220,7 @@ impl PositionController {
     ) -> DVec3 {
         let (z, v) = (estimate.p_world_m.z, estimate.v_world_mps.z);
         let (a_limit, j_limit) = (limits.vertical_mps2, limits.vertical_mps3);
-        let towards = |target: f64| sqrt_rate(target - z, POSITION_GAIN, a_limit / 2.0);
+        let limits = (a_limit, j_limit);
         let axis = &mut self.vertical;
         if !matches!(demand, Vertical::Velocity(_)) {
             self.held_z = None;
@@ -222,8 +230,9 @@ impl PositionController {
         }
         match demand {
             Vertical::Position { z: target, v: feed_forward, up_mps, down_mps } => {
-                let rate = feed_forward + towards(target).clamp(-down_mps, up_mps);
-                axis.shaped.approach(DVec3::Z * rate, a_limit, j_limit, dt_s);
+                let within = |v: DVec3| DVec3::Z * v.z.clamp(-down_mps, up_mps);
+                let (error, v_point) = (DVec3::Z * (target - z), DVec3::Z * feed_forward);
+                axis.shaped.approach_point(error, v_point, POSITION_GAIN, within, limits, dt_s);
             }
             Vertical::Velocity(target) => {
                 if target.abs() > STAY_MPS {
@@ -234,8 +243,13 @@ impl PositionController {
                 {
                     self.held_z = Some(z);
                 }
-                let rate = self.held_z.map_or(target, |held| towards(held).clamp(-0.5, 0.5));
-                axis.shaped.approach(DVec3::Z * rate, a_limit, j_limit, dt_s);
+                if let Some(held) = self.held_z {
+                    let within = |v: DVec3| v.clamp_length_max(RETURN_Z_MPS);
+                    let (error, rest) = (DVec3::Z * (held - z), DVec3::ZERO);
+                    axis.shaped.approach_point(error, rest, POSITION_GAIN, within, limits, dt_s);
+                } else {
+                    axis.shaped.approach(DVec3::Z * target, a_limit, j_limit, dt_s);
+                }
             }
             Vertical::Acceleration(target) => {
                 let wanted = target.clamp(-a_limit, a_limit);

@@ -1,10 +1,10 @@
 //! Turns a step of the velocity target into a velocity that a vehicle can follow: acceleration
-//! and jerk stay within limits, and the end is reached without overshoot.
+//! and jerk stay within limits, and the end is reached without overshoot. The law is ArduPilot's
+//! (`libraries/AP_Math/control.cpp`, `shape_vel_accel_xy` and `shape_pos_vel_accel_xy`): the last part
+//! of every change closes at the rate of jerk over acceleration, so that the jerk limit, not the motors,
+//! decides how late a vehicle answers.
 
 use glam::DVec3;
-
-/// How hard the end of a change is approached, as a first-order rate. [1/s]
-const APPROACH: f64 = 8.0;
 
 /// Returns the rate at which an error may be closed: proportional when small, and along the square
 /// root curve of constant deceleration `limit` when large (ArduPilot's `sqrt_controller`).
@@ -34,9 +34,34 @@ pub struct ShapedVelocity {
 impl ShapedVelocity {
     /// Moves on by `dt_s` towards `target` within an acceleration and a jerk limit.
     pub fn approach(&mut self, target: DVec3, a_limit: f64, j_limit: f64, dt_s: f64) {
-        // Half of the jerk is planned for the end, the rest is there to follow the plan.
-        let wanted =
-            sqrt_rate_vector(target - self.v, APPROACH, j_limit / 2.0).clamp_length_max(a_limit);
+        let wanted = sqrt_rate_vector(target - self.v, j_limit / a_limit, j_limit);
+        self.accelerate(wanted.clamp_length_max(a_limit), j_limit, dt_s);
+    }
+
+    /// Moves on by `dt_s` towards a point `error` away that itself moves by `v_point`; `gain` [1/s] closes small errors,
+    /// and `within` bounds the velocity towards it. As braking ends in time, the velocity is asked for that the way
+    /// will leave after the velocity's own lag.
+    pub fn approach_point(
+        &mut self,
+        error: DVec3,
+        v_point: DVec3,
+        gain: f64,
+        within: impl Fn(DVec3) -> DVec3,
+        (a_limit, j_limit): (f64, f64),
+        dt_s: f64,
+    ) {
+        let rate = j_limit / a_limit;
+        // Braking is planned softer than the limit, so that following it stays within.
+        let braking = a_limit / 2.0;
+        let towards = sqrt_rate_vector(error, gain, braking);
+        let linear = braking / (gain * gain);
+        let slope = if error.length() <= linear { gain } else { braking / towards.length() };
+        let foreseen = towards - (self.v - v_point) * (slope / rate);
+        let wanted = (v_point + within(foreseen) - self.v) * rate;
+        self.accelerate(wanted.clamp_length_max(a_limit), j_limit, dt_s);
+    }
+
+    fn accelerate(&mut self, wanted: DVec3, j_limit: f64, dt_s: f64) {
         self.a += (wanted - self.a).clamp_length_max(j_limit * dt_s);
         self.v += self.a * dt_s;
     }
@@ -52,12 +77,12 @@ mod tests {
         fn limits_hold_and_the_target_is_met_without_overshoot(
             target in prop::array::uniform3(-6.0..6.0f64),
             start in prop::array::uniform3(-6.0..6.0f64),
-            a_limit in 1.0..10.0f64, j_limit in 20.0..100.0f64,
+            a_limit in 1.0..10.0f64, j_limit in 3.0..100.0f64,
         ) {
             let (target, start, dt_s) = (DVec3::from(target), DVec3::from(start), 0.0025);
             let mut shaped = ShapedVelocity { v: start, a: DVec3::ZERO };
             let step = (target - start).length();
-            for _ in 0..6000 {
+            for _ in 0..12_000 {
                 let before = shaped;
                 shaped.approach(target, a_limit, j_limit, dt_s);
                 prop_assert!(shaped.a.length() <= a_limit + 1e-9);

@@ -222,6 +222,11 @@ impl Companion {
         companion
     }
 
+    /// When the next heartbeat is due. [s]
+    pub(crate) fn heartbeat_due_s(&self) -> f64 {
+        self.heartbeat_due_ns as f64 * 1e-9
+    }
+
     pub(crate) fn p(&self) -> DVec3 {
         self.lab.state().p_world_m
     }

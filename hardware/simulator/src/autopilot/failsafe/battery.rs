@@ -95,6 +95,6 @@ impl Autopilot {
             7 => Action::Brake,
             _ => Action::Nothing,
         };
-        self.act(now, action);
+        self.act_with_pause(now, action);
     }
 }

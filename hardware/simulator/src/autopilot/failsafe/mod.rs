@@ -86,6 +86,7 @@ impl Autopilot {
             let text = format!("EKF Failsafe: changed to {name} Mode");
             self.send_status_text(MavSeverity::MAV_SEVERITY_CRITICAL, &text);
             self.enter(mode);
+            self.landing.pauses = mode == CopterMode::Land;
         }
     }
 
@@ -167,7 +168,16 @@ impl Autopilot {
         if self.landed {
             self.disarm();
         } else {
-            self.act(now, action);
+            self.act_with_pause(now, action);
+        }
+    }
+
+    /// A landing by failsafe hovers first, for a pilot to take over; one under way that is to go on is held up by it
+    /// too.
+    fn act_with_pause(&mut self, now: AutopilotTime, action: Action) {
+        self.act(now, action);
+        if self.mode == CopterMode::Land && action != Action::Nothing {
+            self.landing.pauses = true;
         }
     }
 

@@ -1,6 +1,7 @@
 mod failsafes;
 mod fence;
 mod pitfalls;
+mod real;
 mod signed;
 
 use glam::DVec3;
@@ -234,7 +235,7 @@ fn rtl_comes_home_and_lands() {
 
 #[test]
 fn brake_stops_and_stabilize_without_a_pilot_falls() {
-    let mut c = Companion::hovering(SimulationConfig::default(), 1.5);
+    let mut c = Companion::hovering(SimulationConfig::airframe(), 1.5);
     c.fly(GuidedMotion::Velocity(DVec3::new(4.0, 0.0, 0.0)), YawTarget::Angle(0.0));
     c.wait(2.0);
     c.setpoint = None;

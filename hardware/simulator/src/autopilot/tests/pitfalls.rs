@@ -101,10 +101,10 @@ fn p3_masks() {
     // Position and acceleration, velocity ignored: hold, also out of full flight.
     assert!(!goes(&mut c, 0x838, north, NONE));
     c.raw(0x9C7, LOCAL, NONE, [1.0, 0.0, 0.0], NONE, 0.0);
-    c.wait(1.0);
+    c.wait(1.5);
     assert!(c.v().length() > 0.8);
     c.raw(0x838, LOCAL, north, NONE, NONE, 0.0);
-    c.wait(1.5);
+    c.wait(2.0);
     assert!(c.v().length() < 0.1, "{:?}", c.v());
 }
 
