@@ -10,6 +10,7 @@ use clap::Args;
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 
+use crate::autopilot::airframe;
 use crate::driver::Driver;
 use crate::link::serial::{DEFAULT_BAUD, baud_rate};
 use crate::link::{Endpoint, resolve};
@@ -70,6 +71,10 @@ pub struct SimArgs {
     /// Radius of the vehicle's body in metres, to measure the flight with.
     #[arg(long, value_name = "METRES", default_value_t = 0.12)]
     pub body_radius: f64,
+    /// The vehicle moves as one set up by `hardware/airframe`; without this as ArduCopter's defaults have it, which
+    /// answer velocities late.
+    #[arg(long)]
+    pub airframe: bool,
     /// Changes a parameter of the autopilot at boot; may be given several times.
     #[arg(long = "param", value_name = "NAME=VALUE", value_parser = parse_param)]
     pub params: Vec<(String, f32)>,
@@ -239,7 +244,10 @@ impl SimArgs {
                 loss: self.mocap_drop_percent / 100.0,
             },
             hand: self.hand,
-            params: self.params.clone(),
+            params: if self.airframe { airframe() } else { Vec::new() }
+                .into_iter()
+                .chain(self.params.iter().cloned())
+                .collect(),
             wind_world_mps: DVec3::from(self.wind),
             gust_mps: self.gusts,
             vibration_mps2: self.vibration,

@@ -12,7 +12,7 @@ use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::messages::{Event, EventKind, Limits, OutcomeKind, Setpoint, bounded};
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
-use vizflyt_runtime::guard::VehicleMotion;
+use vizflyt_runtime::guard::{Response, VehicleMotion};
 use vizflyt_runtime::link::{Goal, LinkEvent};
 use vizflyt_server::flights::events::Origin;
 use vizflyt_server::flights::vehicle::VehicleFlight;
@@ -108,6 +108,7 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
         taken: None,
         took_off: false,
         ready_to_arm: Ok(()),
+        response: Some(Response::smooth(0.2, 80.0)),
     };
     let (mut p_m, mut answer, mut poses) = (DVec3::new(1.0, 2.0, 0.0), Some(Setpoint::Hold), true);
     // Each is a nanosecond off the runtime's ticks, and apart from the others.

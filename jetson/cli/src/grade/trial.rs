@@ -308,7 +308,7 @@ impl<'a> Flight<'a> {
             spawn_yaw_rad: arena.spawn.yaw_deg.to_radians(),
             seed: trial.seed,
             body_radius_m: arena.body_radius_m,
-            ..SimulationConfig::default()
+            ..SimulationConfig::airframe()
         };
         let simulation = Simulation::new(config).context("the simulated autopilot")?;
         let settings = FlightSettings {

@@ -315,6 +315,7 @@ impl Show {
         };
         let mut sim: Vec<OsString> = vec![
             "sim".into(),
+            "--airframe".into(),
             "--json".into(),
             "--lifeline".into(),
             vehicle.into(),

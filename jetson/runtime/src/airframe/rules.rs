@@ -131,6 +131,8 @@ pub const RULES: &[Rule] = &[
             (value > 1.0).then_some("the vehicle coasts this long after the last velocity setpoint")
         },
     },
+    Rule { name: "PSC_JERK_NE", danger: late },
+    Rule { name: "PSC_JERK_D", danger: late },
     Rule {
         name: "VISO_TYPE",
         danger: |value| (value != 1.0).then_some("poses of the localization are not used"),
@@ -155,6 +157,13 @@ fn battery_action(value: f64) -> Option<&'static str> {
                    the ceiling; 1 lands",
         ),
     }
+}
+
+fn late(value: f64) -> Option<&'static str> {
+    (value < 10.0).then_some(
+        "the vehicle answers velocities so late that it does not stop before a net: flown at a part of the speed \
+         limit; 20 is right for a small one",
+    )
 }
 
 fn not_external(value: f64) -> Option<&'static str> {

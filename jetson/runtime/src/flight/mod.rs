@@ -34,7 +34,7 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::{Host, HostTime};
 
-use crate::guard::{Guard, GuardMode, VehicleMotion};
+use crate::guard::{Guard, GuardMode, Lagging, Response, VehicleMotion};
 use crate::link::{Goal, Link, LinkEvent};
 
 use sight::Sight;
@@ -117,6 +117,8 @@ pub struct LinkView {
     pub took_off: bool,
     /// What arming still waits for.
     pub ready_to_arm: Result<(), Cow<'static, str>>,
+    /// How the vehicle answers velocities, by its parameters.
+    pub response: Option<Response>,
 }
 
 impl LinkView {
@@ -130,6 +132,7 @@ impl LinkView {
             taken: link.taken_mode(),
             took_off: link.took_off(),
             ready_to_arm: link.ready_to_arm(now),
+            response: link.response(),
         }
     }
 }
@@ -196,6 +199,8 @@ pub struct Flight {
     fence_stopped_at: Option<HostTime>,
     /// When old images last did.
     slowed_at: Option<HostTime>,
+    /// What has been said of a vehicle that answers late.
+    lagging: Option<Lagging>,
     notices: VecDeque<FlightNotice>,
 }
 
@@ -232,6 +237,7 @@ impl Flight {
             restart_reason: None,
             fence_stopped_at: None,
             slowed_at: None,
+            lagging: None,
             notices: VecDeque::new(),
         }
     }

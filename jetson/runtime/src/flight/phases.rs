@@ -6,7 +6,7 @@ use vizflyt_protocol::messages::{EventKind, FlightPhase, bounded};
 use vizflyt_protocol::time::HostTime;
 
 use super::{Flight, LinkView, Orders};
-use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason, Slowed};
+use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason, Lagging, Slowed};
 
 /// Share of the take-off height that counts as reached: ArduCopter hands over at 90 cm of a metre
 /// as it eases into the height.
@@ -127,7 +127,8 @@ impl Flight {
         let Some(took_off_at) = self.took_off_at else { return };
         let risen_m = vehicle.p_world_m.z - self.start_z_m;
         if risen_m >= REACHED * arena.takeoff_height_m {
-            self.guard = Some(Guard::new(arena, vehicle, now, self.settings.slip_seed));
+            self.guard =
+                Some(Guard::new(arena, vehicle, link.response, now, self.settings.slip_seed));
             self.unanswered = None;
             self.enter(now, FlightPhase::Flying, "the plugin flies");
         } else if now.seconds_since(took_off_at) > CLIMB_WITHIN_S {
@@ -155,12 +156,17 @@ impl Flight {
         guard.see(self.sight.answered_at());
         let (output, mode) = guard.tick(now, vehicle);
         let (fence_stops, slowed) = (guard.fence_stops(), guard.slowed());
+        let lagging = guard.lagging();
         self.follow_guard(now, mode);
         if fence_stops {
             self.notice_fence(now);
         }
         if let Some(slowed) = slowed {
             self.notice_slowed(now, slowed);
+        }
+        if self.lagging != lagging {
+            self.lagging = lagging;
+            self.notice_lagging(lagging);
         }
         let setpoint = match output {
             GuardOutput::Guided(setpoint) => Some(setpoint),
@@ -219,6 +225,22 @@ impl Flight {
             );
             self.notice(EventKind::Note, text);
         }
+    }
+
+    /// Reports that the vehicle answers late, or no longer.
+    fn notice_lagging(&mut self, lagging: Option<Lagging>) {
+        let Some(Lagging { response, measured, share }) = lagging else {
+            let text = "the vehicle answers in time: flown at the full speed limit";
+            return self.notice(EventKind::Note, text.to_owned());
+        };
+        let knows = if measured { "answers" } else { "may answer, as nothing else is known," };
+        let text = format!(
+            "the vehicle {knows} {:.1} s late: flown at {:.0} % of the speed limit; ArduCopter answers sooner with \
+             PSC_JERK_NE and PSC_JERK_D (before 4.7: PSC_JERK_XY, PSC_JERK_Z) of 20, as `vizflyt doctor vehicle --apply` sets",
+            response.lag_s,
+            share * 1e2
+        );
+        self.notice(EventKind::Note, text);
     }
 
     /// Reports what is being waited for every [`REMIND_S`], and gives up at the time limit.

@@ -70,6 +70,7 @@ impl Script {
                 taken: None,
                 took_off: false,
                 ready_to_arm: Ok(()),
+                response: Some(Response::smooth(0.2, 80.0)),
             },
             p_m: DVec3::Z * 0.05,
             v_mps: DVec3::ZERO,

@@ -1,9 +1,11 @@
-//! The geofence with stopping distance: how fast the vehicle may approach each face, the ceiling
+//! The geofence with stopping distance, by how this vehicle answers: how fast it may approach each face, the ceiling
 //! that `max_altitude_m` is, the floor, and the boxes that it must stay out of.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{ArenaInfo, MAX_NO_FLY};
+
+use super::response::{Response, Stopping, largest};
 
 /// The keep-in volume, shrunk by the body and a margin, and what to keep out of.
 #[derive(Clone, Debug)]
@@ -15,16 +17,26 @@ pub(super) struct Fence {
     floor_m: f64,
     /// Greatest height of the body's centre, if there is one. [m, world]
     ceiling_m: Option<f64>,
-    /// Acceleration that the stopping distance counts on, per face. [m/s^2]
-    stopping_mps2: f64,
+    /// By which commands may change. [m/s^2]
+    max_mps2: f64,
 }
 
-/// Part of the acceleration limit counted on for stopping before one face. Three faces at once
+/// The vehicle's motion, and how it stops.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Momentum {
+    /// Velocity. [m/s, world]
+    pub v_mps: DVec3,
+    /// Acceleration, as far as it is known. [m/s^2, world]
+    pub a_mps2: DVec3,
+    /// How it answers a command.
+    pub response: Response,
+}
+
+/// Part of acceleration and jerk counted on for stopping before one face. Three faces at once
 /// (a corner) then need sqrt(3)/2 = 0.87 of the limit.
 const STOPPING_SHARE: f64 = 0.5;
-/// From a command to the vehicle's answer: link 20 ms, tick 20 ms, attitude and velocity loops
-/// about 0.2 s. The vehicle flies on at its speed for that long. [s]
-const REACTION_S: f64 = 0.3;
+/// And where it has to change more along the face than towards it, so much at least.
+const LEAST_SHARE: f64 = 0.1;
 /// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
 /// an autopilot's integrators carry the vehicle a decimetre too far. [m]
 const MARGIN_M: f64 = 0.2;
@@ -48,8 +60,13 @@ impl Fence {
             floor_m: arena.floor_z_m + arena.body_radius_m + FLOOR_MARGIN_M,
             body_radius_m: arena.body_radius_m,
             ceiling_m: arena.limits.max_altitude_m,
-            stopping_mps2: STOPPING_SHARE * max_acceleration_mps2,
+            max_mps2: max_acceleration_mps2,
         }
+    }
+
+    /// Whether its faces are flat and nothing in it is kept out of.
+    pub(super) fn is_flat(&self) -> bool {
+        matches!(self.volume, Volume::Cuboid { .. }) && self.keep_out.is_empty()
     }
 
     /// Returns how far the body's surface is outside; negative inside. [m]
@@ -66,22 +83,26 @@ impl Fence {
 
     /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling,
     /// the floor, or into a box. Motion along a face is left as it is. [m/s, world]
-    pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
-        let mut v = self.within(p_m, v_mps);
+    pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
+        let mut v = self.within(p_m, v_mps, vehicle);
         if self.keep_out.is_empty() {
             return v;
         }
         // What keeps one off a box may lead to another, or to the fence: some turns settle it.
         for _ in 0..SETTLING_TURNS {
+            let before = v;
             for volume in &self.keep_out {
-                let (towards, most) = self.towards(volume, p_m);
+                let (towards, most) = self.towards(volume, p_m, v, vehicle);
                 v += towards * (most - v.dot(towards)).min(0.0);
             }
-            v = self.within(p_m, v);
+            if v == before {
+                break;
+            }
+            v = self.within(p_m, v, vehicle);
         }
         // Where there is no way at all, less of it: the fence stays kept, and so do the boxes.
         let share = self.keep_out.iter().fold(1.0, |share: f64, volume| {
-            let (towards, most) = self.towards(volume, p_m);
+            let (towards, most) = self.towards(volume, p_m, v, vehicle);
             let speed_mps = v.dot(towards);
             if speed_mps > most.max(0.0) { share.min(most.max(0.0) / speed_mps) } else { share }
         });
@@ -90,84 +111,88 @@ impl Fence {
 
     /// Returns the direction to a box, and the greatest speed that way: boxes are convex, so a
     /// vehicle comes nearer by no more than it moves along the direction of the moment. [m/s]
-    fn towards(&self, volume: &Volume, p_m: DVec3) -> (DVec3, f64) {
+    fn towards(
+        &self,
+        volume: &Volume,
+        p_m: DVec3,
+        v_mps: DVec3,
+        vehicle: &Momentum,
+    ) -> (DVec3, f64) {
         let free_m = volume.signed_distance_m(p_m) - self.body_radius_m - MARGIN_M;
-        (-volume.outward_normal(p_m), self.approach_mps(free_m))
+        let towards = -volume.outward_normal(p_m);
+        (towards, self.approach_mps(free_m, towards, v_mps, vehicle))
     }
 
     /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling
     /// or the floor. [m/s, world]
-    fn within(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
+    fn within(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         match self.volume {
             // Each face on its own, so that the vehicle can slide along two into a corner.
             Volume::Cuboid { center_m, half_m, rotation } => {
                 let q = rotation.conjugate() * (p_m - center_m);
                 let free_m = half_m - DVec3::splat(self.body_radius_m + MARGIN_M);
                 let mut v = rotation.conjugate() * v_mps;
-                for axis in 0..3 {
-                    let most = self.approach_mps(free_m[axis] - q[axis]);
-                    let least = -self.approach_mps(free_m[axis] + q[axis]);
+                for (axis, face) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
+                    let out = rotation * face;
+                    let most = self.approach_mps(free_m[axis] - q[axis], out, v_mps, vehicle);
+                    let least = -self.approach_mps(free_m[axis] + q[axis], -out, v_mps, vehicle);
                     // A room narrower than its margins leaves no speed that suits both faces.
                     v[axis] = if least > most { 0.0 } else { v[axis].clamp(least, most) };
                 }
                 let v = rotation * v;
-                let below = self.between_floor_and_ceiling(p_m, v);
+                let below = self.between_floor_and_ceiling(p_m, v, vehicle);
                 // Less climb changes the way towards the walls only of a room that leans.
                 let leans = (rotation * DVec3::Z).z.abs() < 1.0 - 1e-9;
-                if leans && below != v { self.shorten(p_m, below) } else { below }
+                if leans && below != v { self.shorten(p_m, below, vehicle) } else { below }
             }
             // One face: the nearest. Then the whole stopping path, as faces may curve.
             volume => {
                 let outward = volume.outward_normal(p_m);
                 let free_m = -self.outside_m(p_m) - MARGIN_M;
-                let most = self.approach_mps(free_m);
+                let most = self.approach_mps(free_m, outward, v_mps, vehicle);
                 let v = v_mps + outward * (most - v_mps.dot(outward)).min(0.0);
-                self.shorten(p_m, self.between_floor_and_ceiling(p_m, v))
+                self.shorten(p_m, self.between_floor_and_ceiling(p_m, v, vehicle), vehicle)
             }
         }
     }
 
     /// Returns `v_mps` without a climb that would not end below the ceiling, or a descent that would
     /// not end over the floor. [m/s, world]
-    fn between_floor_and_ceiling(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
-        let most = self.ceiling_m.map(|ceiling_m| self.approach_mps(ceiling_m - MARGIN_M - p_m.z));
-        let least = -self.approach_mps(p_m.z - self.floor_m);
+    fn between_floor_and_ceiling(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
+        let approach = |free_m, out| self.approach_mps(free_m, out, v_mps, vehicle);
+        let most = self.ceiling_m.map(|ceiling_m| approach(ceiling_m - MARGIN_M - p_m.z, DVec3::Z));
+        let least = -approach(p_m.z - self.floor_m, DVec3::NEG_Z);
         v_mps.with_z(v_mps.z.max(least).min(most.unwrap_or(f64::INFINITY)))
     }
 
-    /// Returns the greatest speed towards a face that is `free_m` away from which the vehicle
-    /// stops before it: v t + v^2 / 2a = d. Negative (back) if the distance is. [m/s]
-    fn approach_mps(&self, free_m: f64) -> f64 {
+    /// Returns the greatest speed out to a face that is `free_m` away, of `v_mps` at most, from which the vehicle stops
+    /// before it. Negative (back) if the distance is. [m/s]
+    fn approach_mps(&self, free_m: f64, out: DVec3, v_mps: DVec3, vehicle: &Momentum) -> f64 {
         if !(free_m > 0.0) {
             return (BACK_PER_S * free_m).max(-BACK_MPS);
         }
-        let a = self.stopping_mps2;
-        let lag_mps = a * REACTION_S;
-        (lag_mps * lag_mps + 2.0 * a * free_m).sqrt() - lag_mps
+        let wanted_mps = v_mps.dot(out);
+        if !(wanted_mps > 0.0) {
+            return 0.0;
+        }
+        let (flown_mps, a_mps2) = (vehicle.v_mps.dot(out), vehicle.a_mps2.dot(out));
+        // What it has to change along the face leaves less for stopping before it.
+        let along_mps = wanted_mps.max(flown_mps);
+        let aside_mps = (v_mps - vehicle.v_mps).reject_from_normalized(out).length();
+        let share = along_mps / along_mps.hypot(aside_mps).max(f64::MIN_POSITIVE);
+        let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
+        let stopping = Stopping::new(vehicle.response, self.max_mps2, share);
+        stopping.most_mps(wanted_mps, free_m, flown_mps, a_mps2)
     }
 
-    /// Scales `v_mps` down until its stopping path ends inside; the volumes are convex, so the
-    /// path is then inside too. Nearer than the margin, the path must not come nearer still.
-    fn shorten(&self, p_m: DVec3, v_mps: DVec3) -> DVec3 {
-        let speed_mps = v_mps.length();
+    /// Scales `v_mps` down until its stopping path is inside. Nearer than the margin, the path must not come nearer still.
+    fn shorten(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let keep_m = (-KEPT_SHARE * self.outside_m(p_m)).clamp(0.0, MARGIN_M);
-        let stays = |scale: f64| {
-            let path_s = REACTION_S + scale * speed_mps / (2.0 * self.stopping_mps2);
-            self.outside_m(p_m + v_mps * scale * path_s) + keep_m <= 0.0
-        };
-        if stays(1.0) {
-            return v_mps;
-        }
-        let (mut good, mut bad) = (0.0, 1.0);
-        // 2^-20 of the speed is finer than any actuator.
-        for _ in 0..20 {
-            let middle = 0.5 * (good + bad);
-            if stays(middle) {
-                good = middle;
-            } else {
-                bad = middle;
-            }
-        }
-        v_mps * good
+        let stopping = Stopping::new(vehicle.response, self.max_mps2, STOPPING_SHARE);
+        let inside = |way_m: DVec3| self.outside_m(p_m + way_m) + keep_m <= 0.0;
+        v_mps
+            * largest(1.0, |scale| {
+                stopping.stays(v_mps * scale, vehicle.v_mps, vehicle.a_mps2, inside)
+            })
     }
 }

@@ -4,8 +4,8 @@ use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{ArenaInfo, Limits, Path, PoseAges, Setpoint};
 
-/// Where slew limit and fence disagree at a flat face, the command changes faster than the
-/// acceleration limit by at most this factor (measured over 10^5 random flights).
+/// Where slew limit and fence disagree at a flat face, the command changes faster than the acceleration limit by at most
+/// this factor.
 pub(super) const FENCE_EXCESS: f64 = 1.2;
 /// Standard gravity, ISO 80000-3. [m/s^2]
 pub(super) const GRAVITY_MPS2: f64 = 9.80665;

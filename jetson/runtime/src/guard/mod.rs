@@ -8,13 +8,15 @@
 //! 3. the plugin's setpoint becomes a velocity in world axes (positions by a braking profile,
 //!    accelerations by integration, attitude rates by the acceleration that the attitude means,
 //!    trajectories by a moving point); numbers that are not finite were refused at [`Guard::handle_setpoint`];
-//! 4. speed limit, which falls with the age of what the plugin sees, acceleration limit (which also bounds tilt), then the geofence, the ceiling, the
-//!    floor and the no-fly boxes: never faster towards a face than the vehicle can stop before it.
+//! 4. speed limit, which falls with the age of what the plugin sees and with the lag of the vehicle, acceleration limit
+//!    (which also bounds tilt), then the geofence, the ceiling, the floor and the no-fly boxes: never faster towards a face
+//!    than the vehicle can stop before it, by how it is seen to answer.
 //!
 //! Everything leaves as a velocity, so that one slew limit and one fence rule bound all motion.
 
 mod fence;
 mod limits;
+mod response;
 mod slip;
 #[cfg(test)]
 mod tests;
@@ -29,8 +31,11 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::HostTime;
 
-use fence::Fence;
+use fence::{Fence, Momentum};
+use limits::FENCE_EXCESS;
 pub use limits::check_arena;
+use response::Answers;
+pub use response::Response;
 use slip::Slip;
 use velocity::Resolved;
 
@@ -147,6 +152,11 @@ pub const SIGHT_HOLD_S: f64 = 0.7;
 /// And for this long: land. [s]
 pub const SIGHT_LAND_S: f64 = 2.0;
 
+/// Up to this lag a vehicle is flown at the full speed limit; beyond, the limit falls as the lag rises. [s]
+pub const LAG_USUAL_S: f64 = 0.5;
+
+/// A plugin's commands may change by so much for any vehicle. [m/s^2]
+const LEAST_FOLLOWED_MPS2: f64 = 1.0;
 /// A share of the speed limit that is reported when images bring it down to less.
 const SLOWED_NOTICE: f64 = 0.8;
 /// Maximum time over which a pose is extrapolated by its velocity. [s]
@@ -169,6 +179,17 @@ pub struct Slowed {
     pub share: f64,
 }
 
+/// The vehicle flies slower than the plugin may, because it answers late.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lagging {
+    /// How it answers.
+    pub response: Response,
+    /// Seen in this flight; else it is what the autopilot's parameters say, or nothing is known.
+    pub measured: bool,
+    /// What is left of the speed limit, 0 to 1.
+    pub share: f64,
+}
+
 /// The guard of one flight.
 #[derive(Clone, Debug)]
 pub struct Guard {
@@ -181,6 +202,8 @@ pub struct Guard {
     /// Since when that has been too old.
     blind_since: Option<HostTime>,
     slowed: Option<Slowed>,
+    /// How the vehicle answers.
+    answers: Answers,
     /// What keeps the limits of acceleration and of tilt.
     max_acceleration_mps2: f64,
     /// The last command; the slew limit counts from it. [m/s, world]
@@ -212,9 +235,15 @@ pub struct Guard {
 }
 
 impl Guard {
-    /// Makes the guard of a flight in `arena` that takes over the vehicle at `now`. Of `slip_seed` depends where places
-    /// slip that a plugin gives without knowing the pose.
-    pub fn new(arena: &ArenaInfo, vehicle: &VehicleMotion, now: HostTime, slip_seed: u64) -> Self {
+    /// Makes the guard of a flight in `arena` that takes over the vehicle at `now`, which answers as `response` says, by its
+    /// parameters, if they are known. Of `slip_seed` depends where places slip that a plugin gives without knowing the pose.
+    pub fn new(
+        arena: &ArenaInfo,
+        vehicle: &VehicleMotion,
+        response: Option<Response>,
+        now: HostTime,
+        slip_seed: u64,
+    ) -> Self {
         let max_acceleration_mps2 = limits::acceleration_within_tilt_mps2(&arena.limits);
         Self {
             fence: Fence::new(arena, max_acceleration_mps2),
@@ -223,6 +252,7 @@ impl Guard {
             seen_at: None,
             blind_since: None,
             slowed: None,
+            answers: Answers::new(response, vehicle.v_world_mps, max_acceleration_mps2),
             max_acceleration_mps2,
             v_command_mps: vehicle.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
             yaw: YawTarget::Angle(vehicle.yaw_rad()),
@@ -322,6 +352,13 @@ impl Guard {
         self.slowed
     }
 
+    /// Returns how the vehicle answers, if that lowers the speed limit.
+    pub fn lagging(&self) -> Option<Lagging> {
+        let (response, measured) = (self.answers.response(), self.answers.is_measured());
+        let share = share_of_lag(response);
+        (share < 1.0).then_some(Lagging { response, measured, share })
+    }
+
     /// Whether the fence limits the plugin's setpoint.
     pub fn fence_stops(&self) -> bool {
         self.fence_stops
@@ -334,7 +371,9 @@ impl Guard {
         self.slip.iter_mut().for_each(|slip| slip.advance(vehicle.p_world_m));
         let sight_age_s = self.seen_at.map_or(0.0, |at| now.seconds_since(at));
         let share = if sight_age_s > SIGHT_FRESH_S { SIGHT_FRESH_S / sight_age_s } else { 1.0 };
-        self.speed_limit_mps = self.max_speed_mps * share;
+        self.answers.watch(self.v_command_mps, vehicle.v_world_mps, dt_s);
+        let response = self.answers.response();
+        self.speed_limit_mps = self.max_speed_mps * share * share_of_lag(response);
         self.blind_since = (sight_age_s > SIGHT_HOLD_S).then(|| self.blind_since.unwrap_or(now));
         let mode = self.mode(now, vehicle);
         let v_target = match mode {
@@ -360,18 +399,46 @@ impl Guard {
             && v_target.length() > self.speed_limit_mps;
         self.slowed = is_slowed.then_some(Slowed { age_s: sight_age_s, share });
         let v_target = v_target.clamp_length_max(self.speed_limit_mps);
-        let change = (v_target - self.v_command_mps).clamp_length_max(slew_mps);
+        // A turn waits for a vehicle that cannot follow it: what it has to change along a face is missing for stopping
+        // before it. To slow down, all that is allowed is asked for.
+        let followed_mps2 = response.acceleration_mps2.max(LEAST_FOLLOWED_MPS2);
+        let slows = v_target.length() < self.v_command_mps.length();
+        let asked_mps = if slows { slew_mps } else { slew_mps.min(followed_mps2 * dt_s) };
+        let change = (v_target - self.v_command_mps).clamp_length_max(asked_mps);
         let v_slewed = self.v_command_mps + change;
         // Where the vehicle is now, not when the pose was measured.
         let age_s = now.seconds_since(vehicle.stamp).clamp(0.0, MAX_EXTRAPOLATION_S);
         let p_now = vehicle.p_world_m + vehicle.v_world_mps * age_s;
-        // The fence comes last: where it and the slew limit disagree, it wins.
-        let v_inside = self.fence.limit(p_now, v_slewed);
-        self.fence_stops =
-            mode == GuardMode::Following && (v_inside - v_slewed).length() > FENCE_NOTICE_MPS;
+        // The fence comes last: where it and the slew limit disagree, it wins, at flat faces within bounds.
+        let (v_mps, a_mps2) = (vehicle.v_world_mps, self.answers.a_mps2());
+        let momentum = Momentum { v_mps, a_mps2, response };
+        let v_inside = self.within_bounds(p_now, v_slewed, &momentum, slew_mps);
+        self.fence_stops = mode == GuardMode::Following
+            && v_inside != v_slewed
+            && (v_target - v_inside).length() > FENCE_NOTICE_MPS;
         self.v_command_mps = v_inside.clamp_length_max(self.max_speed_mps);
         let motion = GuidedMotion::Velocity(self.v_command_mps);
         (GuardOutput::Guided(GuidedSetpoint { motion, yaw: self.yaw }), mode)
+    }
+
+    /// Returns what the fence leaves of `v_slewed` [m/s, world]. At flat faces it takes back speed by [`FENCE_EXCESS`] of
+    /// the slew limit at most, and what it takes back goes before what the plugin wants.
+    fn within_bounds(
+        &self,
+        p_m: DVec3,
+        v_slewed: DVec3,
+        momentum: &Momentum,
+        slew_mps: f64,
+    ) -> DVec3 {
+        let v_inside = self.fence.limit(p_m, v_slewed, momentum);
+        let (change, most) = (v_inside - self.v_command_mps, FENCE_EXCESS * slew_mps);
+        if change.length() <= most || !self.fence.is_flat() {
+            return v_inside;
+        }
+        let v_braked = self.fence.limit(p_m, self.v_command_mps, momentum);
+        let braking = (v_braked - self.v_command_mps).clamp_length_max(most);
+        let rest = (change - braking).clamp_length_max((most - braking.length()).max(0.0));
+        self.v_command_mps + braking + rest
     }
 
     fn mode(&self, now: HostTime, vehicle: &VehicleMotion) -> GuardMode {
@@ -425,4 +492,9 @@ impl Guard {
             Some(_) => GuardMode::Following,
         }
     }
+}
+
+/// Returns what is left of the speed limit for a vehicle that answers so, 0 to 1.
+fn share_of_lag(response: Response) -> f64 {
+    (LAG_USUAL_S / response.lag_s).min(1.0)
 }

@@ -10,6 +10,8 @@ use super::velocity::MAX_YAW_RATE_RADPS;
 use super::*;
 
 const TICK_S: f64 = 0.02;
+/// A vehicle that answers as [`Vehicle`] does.
+const QUICK: Option<Response> = Some(Response::smooth(0.2, 80.0));
 
 fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> ArenaInfo {
     ArenaInfo {
@@ -24,8 +26,9 @@ fn room() -> Volume {
     Volume::aabb(DVec3::new(-5.0, -3.0, 0.0), DVec3::new(5.0, 3.0, 4.0))
 }
 
-/// A vehicle that follows velocity commands: delay, first-order lag, bounded acceleration.
+/// A vehicle that follows velocity commands: delay, first-order lag, bounded acceleration and jerk.
 struct Vehicle {
+    response: Response,
     p_m: DVec3,
     v_mps: DVec3,
     yaw_rad: f64,
@@ -37,20 +40,24 @@ struct Vehicle {
 
 /// Ticks from command to the vehicle's first answer.
 const DELAY_TICKS: usize = 2;
-/// Time constant of the velocity loop. [s]
-const LAG_S: f64 = 0.12;
+/// A small quadrotor whose autopilot shapes nothing.
+const UNSHAPED: Response = Response::smooth(0.12, f64::INFINITY);
 
 impl Vehicle {
     fn new(p_m: DVec3, max_acceleration_mps2: f64) -> Self {
         let delayed = [DVec3::ZERO; DELAY_TICKS].into();
         let (v_mps, a_mps2) = (DVec3::ZERO, DVec3::ZERO);
-        Self { p_m, v_mps, yaw_rad: 0.3, max_acceleration_mps2, a_mps2, delayed }
+        let response = UNSHAPED;
+        Self { response, p_m, v_mps, yaw_rad: 0.3, max_acceleration_mps2, a_mps2, delayed }
     }
 
     fn fly(&mut self, v_command_mps: DVec3) {
         self.delayed.push_back(v_command_mps);
         let v_command_mps = self.delayed.pop_front().unwrap();
-        let a = ((v_command_mps - self.v_mps) / LAG_S).clamp_length_max(self.max_acceleration_mps2);
+        let Response { lag_s, jerk_mps3, acceleration_mps2 } = self.response;
+        let most_mps2 = self.max_acceleration_mps2.min(acceleration_mps2);
+        let wanted = ((v_command_mps - self.v_mps) / lag_s).clamp_length_max(most_mps2);
+        let a = self.a_mps2 + (wanted - self.a_mps2).clamp_length_max(jerk_mps3 * TICK_S);
         self.p_m += self.v_mps * TICK_S + 0.5 * a * TICK_S * TICK_S;
         self.v_mps += a * TICK_S;
         self.a_mps2 = a;
@@ -185,7 +192,7 @@ proptest! {
         (arena.floor_z_m, arena.no_fly) = (floor_z_m, no_fly.iter().copied().collect());
         // It could do more than it may.
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
-        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), time(0), 7);
+        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), QUICK, time(0), 7);
         let mut v_before = DVec3::ZERO;
         let mut tick = 0;
         for (setpoint, ticks) in asked {
@@ -248,13 +255,156 @@ proptest! {
     }
 }
 
+/// Lags and jerks of vehicles.
+fn response() -> impl Strategy<Value = Response> {
+    // Most jerks near the small ones, which carry furthest.
+    (0.2..1.0f64, (3f64.ln()..80f64.ln()).prop_map(f64::exp))
+        .prop_map(|(lag_s, jerk_mps3)| Response::smooth(lag_s, jerk_mps3))
+}
+
+/// What the guard is told of a vehicle.
+#[derive(Clone, Copy, Debug)]
+enum Told {
+    /// What is true.
+    Truth,
+    /// Nothing.
+    Nothing,
+    /// That it answers as one set up by `hardware/airframe`.
+    Wrong,
+}
+
+fn told() -> impl Strategy<Value = Told> {
+    prop_oneof![Just(Told::Truth), Just(Told::Nothing), Just(Told::Wrong)]
+}
+
+impl Told {
+    fn response(self, truth: Response) -> Option<Response> {
+        match self {
+            Self::Truth => Some(truth),
+            Self::Nothing => None,
+            Self::Wrong => Some(Response::of_ardupilot(20.0, 5.0)),
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: cases() / 5, ..ProptestConfig::default() })]
+
+    /// At 3 m/s into each face, through a long room: the body never leaves the fence, however late the vehicle answers. If
+    /// the parameters lie, it is found out on the way.
+    #[test]
+    fn a_late_vehicle_stops_before_each_face(
+        truth in response(), told in told(), face in 0usize..6, aside in -1.0..1.0f64,
+    ) {
+        let room = Volume::aabb(DVec3::splat(-11.0), DVec3::splat(11.0));
+        let arena = ArenaInfo { floor_z_m: -11.0, ..arena(room, 3.0, 6.0) };
+        let out = [DVec3::X, DVec3::Y, DVec3::Z][face / 2] * [1.0, -1.0][face % 2];
+        let mut vehicle = Vehicle::new(-out * 10.0, 6.0);
+        vehicle.response = truth;
+        let start = vehicle.motion(time(0));
+        let mut guard = Guard::new(&arena, &start, told.response(truth), time(0), 7);
+        let (mut fastest_mps, mut nearest_m) = (0.0f64, f64::INFINITY);
+        for tick in 1..1500 {
+            let v_mps = out * 3.0 + out.any_orthonormal_vector() * aside;
+            guard.handle_setpoint(time(tick), velocity(v_mps)).unwrap();
+            let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+            prop_assert_eq!(mode, GuardMode::Following);
+            vehicle.fly(output_velocity(output));
+            fastest_mps = fastest_mps.max(vehicle.v_mps.length());
+            let inside_m = -room.signed_distance_m(vehicle.p_m) - arena.body_radius_m;
+            nearest_m = nearest_m.min(inside_m);
+            prop_assert!(inside_m >= 0.0, "{inside_m} m inside, {:?}", guard.answers.response());
+        }
+        // And it gets there.
+        let near_m = if matches!(told, Told::Truth) { 0.5 } else { 1.0 };
+        prop_assert!(nearest_m < near_m, "{nearest_m} m from it, at {fastest_mps} m/s at most");
+    }
+
+    /// Late vehicles anywhere, with random setpoints.
+    #[test]
+    fn late_vehicles_stay_inside_for_any_setpoints(
+        geofence in volume(),
+        truth in response(),
+        known in any::<bool>(),
+        no_fly in no_fly(),
+        asked in prop::collection::vec((setpoint(), 1usize..90), 1..10),
+    ) {
+        let mut arena = arena(geofence, 3.0, 6.0);
+        arena.no_fly = no_fly.iter().copied().collect();
+        let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 6.0);
+        vehicle.response = truth;
+        let told = known.then_some(truth);
+        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), told, time(0), 7);
+        let mut tick = 0;
+        for (setpoint, ticks) in asked {
+            for _ in 0..ticks {
+                tick += 1;
+                let _ = guard.handle_setpoint(time(tick), setpoint.clone());
+                let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+                let GuardOutput::Guided(_) = output else {
+                    let silent = matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(_)));
+                    prop_assert!(silent, "{mode:?}");
+                    return Ok(());
+                };
+                vehicle.fly(output_velocity(output));
+                let outside_m = geofence.signed_distance_m(vehicle.p_m) + arena.body_radius_m;
+                prop_assert!(outside_m <= 0.0, "{outside_m} m outside at {}", vehicle.p_m);
+                for volume in &no_fly {
+                    let free_m = volume.signed_distance_m(vehicle.p_m) - arena.body_radius_m;
+                    prop_assert!(free_m >= 0.0, "{free_m} m from {volume:?} at {}", vehicle.p_m);
+                }
+            }
+        }
+    }
+}
+
+/// What the parameters say is believed while the flight agrees; a vehicle that answers later is found out, and told.
+#[test]
+fn a_lag_is_measured_and_lowers_the_speed_limit() {
+    let fly = |truth: Response, told: Option<Response>| {
+        let arena = arena(Volume::aabb(DVec3::splat(-50.0), DVec3::splat(50.0)), 3.0, 6.0);
+        let mut vehicle = Vehicle::new(DVec3::ZERO, 6.0);
+        vehicle.response = truth;
+        let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), told, time(0), 7);
+        for tick in 1..300 {
+            let side = if tick / 60 % 2 == 0 { 2.0 } else { -1.0 };
+            guard.handle_setpoint(time(tick), velocity(DVec3::X * side)).unwrap();
+            let (output, _) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+            vehicle.fly(output_velocity(output));
+        }
+        guard
+    };
+    let airframe = Response::of_ardupilot(20.0, 5.0);
+    let late = Response::smooth(0.9, 5.0);
+    // As the parameters say: nothing is lowered.
+    let guard = fly(airframe, Some(airframe));
+    assert!(!guard.answers.is_measured() && guard.lagging().is_none());
+    // They lie.
+    let lagging = fly(late, Some(airframe)).lagging().expect("it answers late");
+    assert!(lagging.measured && (0.8..1.6).contains(&lagging.response.lag_s), "{lagging:?}");
+    assert!((0.3..0.65).contains(&lagging.share), "{lagging:?}");
+    // Nothing is known, and it is quick: the limit is lifted.
+    let guard = fly(airframe, None);
+    assert!(guard.answers.is_measured() && guard.lagging().is_none(), "{:?}", guard.lagging());
+    let lagging = fly(late, None).lagging().expect("it answers late");
+    assert!(lagging.response.lag_s >= 0.8, "{lagging:?}");
+    // Somebody holds it: that says nothing of how it answers.
+    let arena = arena(room(), 3.0, 4.0);
+    let mut held = Guard::new(&arena, &at_rest(0), QUICK, time(0), 7);
+    for tick in 1..500 {
+        held.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        held.tick(time(tick), &at_rest(tick));
+    }
+    assert!(held.lagging().is_none());
+}
+
 /// A vehicle at rest in the middle of the room.
 fn at_rest(tick: usize) -> VehicleMotion {
     Vehicle::new(DVec3::Z * 2.0, 4.0).motion(time(tick))
 }
 
 fn guard() -> Guard {
-    Guard::new(&arena(room(), 3.0, 4.0), &at_rest(0), time(0), 7)
+    Guard::new(&arena(room(), 3.0, 4.0), &at_rest(0), QUICK, time(0), 7)
 }
 
 fn velocity(v_mps: DVec3) -> Setpoint {
@@ -388,7 +538,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
     let mut arena = arena(room(), 3.0, 4.0);
     let pillar = Volume::aabb(DVec3::new(1.0, -0.5, 0.0), DVec3::new(1.5, 0.4, 4.0));
     arena.no_fly.push(pillar).unwrap();
-    let mut guard = Guard::new(&arena, &at_rest(0), time(0), 7);
+    let mut guard = Guard::new(&arena, &at_rest(0), QUICK, time(0), 7);
     let inside = VehicleMotion { p_world_m: DVec3::new(0.95, 0.0, 2.0), ..at_rest(1) };
     let (output, mode) = guard.tick(time(1), &inside);
     assert_eq!(output, GuardOutput::Land);
@@ -397,7 +547,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
         "{mode:?}"
     );
     // Straight at it: it stops before it. Past its edge: it goes round.
-    let mut guard = Guard::new(&arena, &at_rest(0), time(0), 7);
+    let mut guard = Guard::new(&arena, &at_rest(0), QUICK, time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let mut fly = |v_mps, ticks: std::ops::Range<usize>| {
         for tick in ticks {
@@ -417,7 +567,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
 fn a_plugin_does_not_fly_into_the_floor() {
     // The fence reaches below it, as every arena's does: vehicles land there.
     let deep = Volume::aabb(DVec3::new(-5.0, -3.0, -0.5), DVec3::new(5.0, 3.0, 4.0));
-    let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), time(0), 7);
+    let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), QUICK, time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     for tick in 1..200 {
         guard.handle_setpoint(time(tick), velocity(DVec3::new(0.2, 0.0, -3.0))).unwrap();
@@ -585,7 +735,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
     };
     let mut strict = arena(room(), 3.0, 4.0);
     strict.setpoints = SetpointKinds::USUAL;
-    let mut forbidden = Guard::new(&strict, &at_rest(0), time(0), 7);
+    let mut forbidden = Guard::new(&strict, &at_rest(0), QUICK, time(0), 7);
     let allowed = SetpointKinds::USUAL;
     let refused = InvalidSetpoint::NotAllowed { asked: SetpointKind::AttitudeRate, allowed };
     assert_eq!(forbidden.handle_setpoint(time(1), rates(0.0, 1.0)), Err(refused));
@@ -598,7 +748,8 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
             if tick <= 10 { (1.0, 1.0) } else { (0.0, 1.0 / 0.2_f64.cos()) };
         guard.handle_setpoint(time(tick), rates(pitch_radps, thrust)).unwrap();
         let before = v;
-        v = output_velocity(guard.tick(time(tick), &at_rest(tick)).0);
+        let flying = VehicleMotion { v_world_mps: v, ..at_rest(tick) };
+        v = output_velocity(guard.tick(time(tick), &flying).0);
         if tick == 40 {
             let a = (v - before) / TICK_S;
             let ahead = DQuat::from_rotation_z(0.3) * DVec3::X;
@@ -611,7 +762,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
 fn only_what_the_course_allows_is_flown() {
     let mut course = arena(room(), 3.0, 4.0);
     course.setpoints = [SetpointKind::Position].into_iter().collect();
-    let mut guard = Guard::new(&course, &at_rest(0), time(0), 7);
+    let mut guard = Guard::new(&course, &at_rest(0), QUICK, time(0), 7);
     let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
     assert_eq!(guard.handle_setpoint(time(1), position), Ok(()));
     let refused =
@@ -629,7 +780,7 @@ fn without_the_pose_places_count_from_the_vehicle_and_slip() {
     let mut course = arena(room(), 3.0, 4.0);
     (course.ground_truth, course.setpoints) = (false, SetpointKinds::BY_OWN_SENSES);
     let fly = |seed| {
-        let mut guard = Guard::new(&course, &at_rest(0), time(0), seed);
+        let mut guard = Guard::new(&course, &at_rest(0), QUICK, time(0), seed);
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
         let d_m = DVec3::X * 2.0;
         let ahead = Setpoint::Offset { d_m, axes: Axes::Heading, yaw: YawTarget::Keep };
@@ -648,7 +799,7 @@ fn without_the_pose_places_count_from_the_vehicle_and_slip() {
     assert!(missed.iter().all(|missed_m| (0.001..0.04).contains(missed_m)), "{missed:?}");
     assert_ne!(fly(1), fly(2));
 
-    let mut guard = Guard::new(&course, &at_rest(0), time(0), 7);
+    let mut guard = Guard::new(&course, &at_rest(0), QUICK, time(0), 7);
     let position = Setpoint::Position { p_world_m: DVec3::Z, yaw: YawTarget::Keep };
     let refused = guard.handle_setpoint(time(1), position).unwrap_err();
     assert!(matches!(refused, InvalidSetpoint::NotAllowed { .. }), "{refused}");

@@ -1,10 +1,14 @@
 //! What differs between autopilots: ArduCopter in GUIDED, PX4 in OFFBOARD. One trait, so that the
 //! link reads the same for both; modes are ArduCopter's numbers everywhere outside.
 
+use std::collections::BTreeMap;
 use std::fmt::Debug;
 
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavParamType};
+
+use super::params::Param;
+use crate::guard::Response;
 
 /// A message to be streamed: its id and how often. [us]
 pub(super) type Interval = (u32, f32);
@@ -38,6 +42,8 @@ pub(super) trait Dialect: Debug + Send + Sync {
     fn navigation_advice(&self) -> &'static str;
     /// Name of the parameter for external navigation's latency in milliseconds.
     fn delay_parameter(&self) -> &'static str;
+    /// Returns how the vehicle answers velocities, by its parameters; `None` if they are not there.
+    fn response(&self, known: &BTreeMap<String, Param>) -> Option<Response>;
     /// Parameters that flight safety depends on, read at every connection.
     fn watched(&self) -> &'static [&'static str];
     /// What it is asked to stream.
@@ -98,10 +104,23 @@ impl Dialect for ArduCopter {
         "VISO_DELAY_MS"
     }
 
+    /// Their names and units changed with 4.7.
+    fn response(&self, known: &BTreeMap<String, Param>) -> Option<Response> {
+        let value = |name: &str| known.get(name).map(|param| param.value);
+        let jerk_mps3 = value("PSC_JERK_NE").or_else(|| value("PSC_JERK_XY"))?;
+        let acceleration_mps2 =
+            value("WP_ACC").or_else(|| value("WPNAV_ACCEL").map(|cmss| cmss / 100.0))?;
+        Some(Response::of_ardupilot(jerk_mps3, acceleration_mps2))
+    }
+
     fn watched(&self) -> &'static [&'static str] {
         &[
             "VISO_TYPE",
             "VISO_DELAY_MS",
+            "PSC_JERK_NE",
+            "PSC_JERK_XY",
+            "WP_ACC",
+            "WPNAV_ACCEL",
             "EK3_SRC1_POSXY",
             "EK3_SRC1_YAW",
             "FS_GCS_ENABLE",
@@ -206,6 +225,11 @@ impl Dialect for Px4 {
 
     fn delay_parameter(&self) -> &'static str {
         "EKF2_EV_DELAY"
+    }
+
+    /// Its parameters do not say; the flight does.
+    fn response(&self, _: &BTreeMap<String, Param>) -> Option<Response> {
+        None
     }
 
     fn watched(&self) -> &'static [&'static str] {

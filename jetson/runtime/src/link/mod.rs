@@ -49,6 +49,8 @@ use vizflyt_protocol::messages::{PoseSample, VehicleState};
 use vizflyt_protocol::time::{Autopilot, Host, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
+use crate::guard::Response;
+
 use commands::{Command, Commands};
 use companions::Companions;
 use dialect::Dialect;
@@ -488,6 +490,11 @@ impl Link {
     /// Returns the parameters read so far, by name.
     pub fn params(&self) -> &BTreeMap<String, Param> {
         self.params.known()
+    }
+
+    /// Returns how the vehicle answers velocities, by the autopilot's parameters; `None` while they are not known.
+    pub fn response(&self) -> Option<Response> {
+        self.dialect.response(self.params.known())
     }
 
     /// Whether parameters are being read or written.
