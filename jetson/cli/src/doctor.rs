@@ -93,11 +93,12 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         print_line(line(difference));
     }
     let dangers = found.iter().filter(|f| f.danger.is_some()).count();
-    let wrong: Vec<_> = found.iter().filter(|f| f.has.is_some()).collect();
+    let absent = found.iter().filter(|f| f.has.is_none()).count();
+    let tuned = found.iter().filter(|f| f.is_tuned).count();
+    let wrong: Vec<_> = found.iter().filter(|f| f.has.is_some() && !f.is_tuned).collect();
     print_line(format!(
-        "{dangers} dangerous, {} other differences, {} parameters that it does not have",
+        "{dangers} dangerous, {} other differences, {absent} parameters that it does not have, {tuned} tuned",
         wrong.len() - dangers,
-        found.len() - wrong.len()
     ));
     if !args.apply {
         if !wrong.is_empty() || arena.is_some() {
@@ -187,8 +188,11 @@ fn status(wrong: usize) -> ExitCode {
 }
 
 fn line(difference: &Difference) -> String {
-    let Difference { name, has, right, danger } = difference;
+    let Difference { name, has, right, danger, is_tuned } = difference;
     match (has, danger) {
+        (Some(has), _) if *is_tuned => {
+            format!("tuned    {name} is {has}, and stays; tuning begins at {right}")
+        }
         (Some(has), Some(danger)) => {
             format!("DANGER   {name} is {has}, right is {right}: {danger}")
         }

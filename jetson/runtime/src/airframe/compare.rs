@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::autopilot_fence::FenceCylinder;
 use super::names::{ParamSpec, Version, param_spec};
 use super::rules::RULES;
+use super::tuning::is_tuned;
 use crate::link::same;
 
 /// A parameter that is not as it should be.
@@ -18,6 +19,8 @@ pub struct Difference {
     pub right: f64,
     /// What is dangerous about what it has.
     pub danger: Option<String>,
+    /// What it has was found for this vehicle, by AUTOTUNE, a flight or a person: it is right, and stays.
+    pub is_tuned: bool,
 }
 
 /// Returns the differences of what an autopilot `has` from what is `wanted`, the dangerous ones first.
@@ -35,12 +38,15 @@ pub fn compare(
             continue;
         }
         let spec = param_spec(version, name);
+        let is_tuned = spec
+            .zip(value)
+            .is_some_and(|(spec, value)| is_tuned(spec.name, spec.newest(version, value)));
         let (rank, danger) = match (spec, value) {
-            (Some(spec), Some(value)) => danger(version, spec, value, right),
+            (Some(spec), Some(value)) if !is_tuned => danger(version, spec, value, right),
             _ => (usize::MAX, None),
         };
         let name = name.clone();
-        found.push((rank, Difference { name, has: value, right, danger }));
+        found.push((rank, Difference { name, has: value, right, danger, is_tuned }));
     }
     found.sort_by_key(|(rank, _)| *rank);
     found.into_iter().map(|(_, difference)| difference).collect()
@@ -141,6 +147,25 @@ mod tests {
             assert_eq!(found[0].name, "FS_GCS_ENABLE");
             assert!(found[0].danger.as_ref().unwrap().contains("into the ceiling"));
             assert_eq!(found[6].danger, None, "a GPS alone is no danger: {found:?}");
+        }
+    }
+
+    /// ArduCopter's own gains are dangerous on this airframe; gains that somebody found are not touched.
+    #[test]
+    fn what_was_tuned_stays() {
+        for version in Version::ALL {
+            let check = |newest: f64| {
+                let mut has = wanted(version);
+                has.insert("ATC_RAT_RLL_P".to_owned(), newest);
+                let found = compare(version, &wanted(version), FenceCylinder::default(), |name| {
+                    has.get(name).copied()
+                });
+                found.into_iter().map(|f| (f.name, f.danger.is_some(), f.is_tuned)).collect()
+            };
+            let of = |is_danger, is_tuned| vec![("ATC_RAT_RLL_P".to_owned(), is_danger, is_tuned)];
+            assert_eq!(check(0.05), Vec::<(String, bool, bool)>::new());
+            assert_eq!(check(0.135), of(true, false));
+            assert_eq!(check(0.11), of(false, true));
         }
     }
 

@@ -11,8 +11,11 @@ mod autopilot_fence;
 mod compare;
 mod file;
 mod names;
+#[cfg(test)]
+mod pages;
 mod param_session;
 mod rules;
+mod tuning;
 
 pub use autopilot_fence::{AutopilotFence, FenceCylinder};
 pub use compare::{Difference, compare};
