@@ -189,7 +189,8 @@ fn status(wrong: usize) -> ExitCode {
 
 fn line(difference: &Difference) -> String {
     let Difference { name, has, right, danger, is_tuned } = difference;
-    match (has, danger) {
+    // As MAVLink carries it: 0.135, not 0.13500000536441803.
+    match (has.map(|has| has as f32), danger) {
         (Some(has), _) if *is_tuned => {
             format!("tuned    {name} is {has}, and stays; tuning begins at {right}")
         }

@@ -32,7 +32,8 @@ fn doctor(address: &str, more: &[&str]) -> (Output, String) {
 
 #[test]
 fn dangers_are_named_and_mended() {
-    let (_simulator, address) = simulator(&["FS_GCS_ENABLE=1", "RTL_ALT_M=15", "BATT_MONITOR=0"]);
+    let (_simulator, address) =
+        simulator(&["FS_GCS_ENABLE=1", "RTL_ALT_M=15", "BATT_MONITOR=0", "VISO_DELAY_MS=35"]);
     let (output, text) = doctor(&address, &[]);
     assert_eq!(output.status.code(), Some(1), "{text}");
     for expected in [
@@ -40,6 +41,7 @@ fn dangers_are_named_and_mended() {
         "into the ceiling",
         "DANGER   RTL_ALT_M is 15, right is 1",
         "DANGER   BATT_MONITOR is 0, right is 4: the battery is not watched",
+        "tuned    VISO_DELAY_MS is 35, and stays",
         "`--apply` writes the right values",
     ] {
         assert!(text.contains(expected), "no '{expected}' in:\n{text}");
@@ -56,6 +58,10 @@ fn dangers_are_named_and_mended() {
 
     let (output, text) = doctor(&address, &[]);
     assert!(output.status.success() && text.contains("0 dangerous, 0 other differences"), "{text}");
+    assert!(
+        text.contains("tuned    VISO_DELAY_MS is 35"),
+        "what was tuned is not written over:\n{text}"
+    );
 }
 
 #[test]

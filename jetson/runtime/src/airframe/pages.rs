@@ -367,7 +367,7 @@ fn ends_of(drawing: &str, id: &str) -> Option<[(f64, f64); 2]> {
 /// How far a text's baseline is below the middle of what it labels. [px]
 const BASELINE: f64 = 5.0;
 /// A wire ends this near to its pad, whose label stands beside it; rows are 38 apart. [px]
-const NEAR: (f64, f64) = (50.0, 6.0);
+const NEAR: (f64, f64) = (50.0, 10.0);
 
 /// Wires and resistors of the drawings that do not lead from the table's pin to its pad.
 fn wrong_drawings(table: &Table) -> Vec<String> {
