@@ -160,7 +160,10 @@ mod tests {
                 let found = compare(version, &wanted(version), FenceCylinder::default(), |name| {
                     has.get(name).copied()
                 });
-                found.into_iter().map(|f| (f.name, f.danger.is_some(), f.is_tuned)).collect()
+                found
+                    .into_iter()
+                    .map(|f| (f.name, f.danger.is_some(), f.is_tuned))
+                    .collect::<Vec<_>>()
             };
             let of = |is_danger, is_tuned| vec![("ATC_RAT_RLL_P".to_owned(), is_danger, is_tuned)];
             assert_eq!(check(0.05), Vec::<(String, bool, bool)>::new());
