@@ -254,6 +254,8 @@ fn wrong_sentences(table: &Table) -> Vec<String> {
     let mut found = Vec::new();
     for path in PAGES.iter().chain(DRAWINGS).map(|(path, ..)| path) {
         let about = table.port.iter().find(|port| path.contains(&port.device.to_lowercase()));
+        // A page speaks of one device, even where a line does not name it; a drawing shows the other's plug as well.
+        let is_page = PAGES.iter().any(|(page, _)| page == path);
         for (number, line) in text(path).lines().enumerate() {
             let at = format!("{path}:{}", number + 1);
             let lower = line.to_lowercase();
@@ -264,8 +266,7 @@ fn wrong_sentences(table: &Table) -> Vec<String> {
                     && table.port.iter().any(|other| {
                         other.name != port.name
                             && (speaks_of(other)
-                                || path.ends_with(".md")
-                                    && about.is_some_and(|about| about.name == other.name))
+                                || is_page && about.is_some_and(|about| about.name == other.name))
                     });
                 if words.contains(&port.name.as_str()) && is_anothers {
                     found.push(format!("{at}: {} is the {}'s", port.name, port.device));
@@ -368,6 +369,10 @@ fn ends_of(drawing: &str, id: &str) -> Option<[(f64, f64); 2]> {
 const BASELINE: f64 = 5.0;
 /// A wire ends this near to its pad, whose label stands beside it; rows are 38 apart. [px]
 const NEAR: (f64, f64) = (50.0, 10.0);
+/// The plug's numbers stand this far left of where its wires begin. [px]
+const NUMBER_LEFT: f64 = 98.0;
+/// A resistor's value stands this near to its middle. [px]
+const LABEL_NEAR: f64 = 70.0;
 
 /// Wires and resistors of the drawings that do not lead from the table's pin to its pad.
 fn wrong_drawings(table: &Table) -> Vec<String> {
@@ -397,8 +402,7 @@ fn wrong_drawings(table: &Table) -> Vec<String> {
                 found.push(format!("{path} has no wire-{pin}"));
                 continue;
             };
-            // The plug's numbers stand left of its contacts.
-            if !meets((x - 98.0, y), &pin.to_string()) {
+            if !meets((x - NUMBER_LEFT, y), &pin.to_string()) {
                 found.push(format!("{path}: wire-{pin} does not begin at pin {pin}"));
             }
             let end = ends_of(&drawing, &format!("wire-{pin}-end")).map_or(end, |[_, end]| end);
@@ -425,9 +429,8 @@ fn wrong_drawings(table: &Table) -> Vec<String> {
             if !on_row {
                 found.push(format!("{path}: {id} does not begin at {}", resistor.pad));
             }
-            let near = |label: &&Label| {
-                (label.x - (start.0 + end.0) / 2.0).hypot(label.y - (start.1 + end.1) / 2.0) < 70.0
-            };
+            let middle = (f64::midpoint(start.0, end.0), f64::midpoint(start.1, end.1));
+            let near = |label: &&Label| (label.x - middle.0).hypot(label.y - middle.1) < LABEL_NEAR;
             let ohm = resistor.ohm.replace('Ω', "&#937;");
             if !labels.iter().filter(near).any(|label| label.text == ohm) {
                 found.push(format!("{path}: {id} is not labelled {}", resistor.ohm));
