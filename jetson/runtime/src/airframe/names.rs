@@ -171,8 +171,6 @@ const TABLE: &[ParamSpec] = &[
     renamed("WP_SPD_DN", "WPNAV_SPEED_DN", 0.01, 0.1, 5.0),
     renamed("WP_ACC", "WPNAV_ACCEL", 0.01, 0.5, 10.0),
     renamed("WP_ACC_Z", "WPNAV_ACCEL_Z", 0.01, 0.5, 8.0),
-    renamed("PSC_JERK_NE", "PSC_JERK_XY", 1.0, 1.0, 20.0),
-    renamed("PSC_JERK_D", "PSC_JERK_Z", 1.0, 5.0, 50.0),
     whole("WP_YAW_BEHAVIOR", 0.0, 3.0),
     renamed("ATC_ANGLE_MAX", "ANGLE_MAX", 0.01, 10.0, 80.0),
     renamed("RTL_ALT_M", "RTL_ALT", 0.01, 0.3, 3000.0),

@@ -150,7 +150,8 @@ pub const RULES: &[Rule] = &[
 /// runtime's guard counts on (4.8.0-dev, software in the loop).
 fn brakes_late(value: f64) -> Option<&'static str> {
     (value < 20.0).then_some(
-        "the vehicle brakes later than the runtime's guard counts on: it may reach the net",
+        "the vehicle answers and brakes late: the runtime flies it at a part of the speed limit, so that it stops \
+         before the net",
     )
 }
 
