@@ -181,8 +181,6 @@ impl Link {
     }
 
     pub(super) fn every_second(&mut self, now: HostTime) {
-        // Heartbeats also give our address to a bridge or an autopilot that waits for one.
-        self.send_heartbeat(now);
         if let Some(signatures) = &mut self.signatures {
             while let Some((fault, count)) = signatures.poll_refused(now) {
                 self.events.push_back(LinkEvent::NotSigned { fault, count });
@@ -292,7 +290,7 @@ impl Link {
         self.send(now, &MavMessage::COMMAND_LONG(message));
     }
 
-    fn send_heartbeat(&mut self, now: HostTime) {
+    pub(super) fn send_heartbeat(&mut self, now: HostTime) {
         let heartbeat = HEARTBEAT_DATA {
             // Unused by companions: distinguishes two runtimes.
             custom_mode: self.companions.own(),

@@ -140,6 +140,8 @@ pub const COMPONENT_ID: u8 = 191;
 
 /// Heartbeats, origin and clock requests. [s]
 const SECOND_S: f64 = 1.0;
+/// Heartbeats go out this often: several may be lost before `FS_GCS_TIMEOUT`, whose least is 2, lands the vehicle. [s]
+const HEARTBEAT_S: f64 = 0.25;
 /// An autopilot silent for this long is lost: three heartbeats. [s]
 pub(crate) const LOST_AFTER_S: f64 = 3.0;
 /// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
@@ -252,6 +254,8 @@ pub struct Link {
     params: Params,
     rates: Rates,
     beat_at: HostTime,
+    /// When the next heartbeat is due.
+    heartbeat_at: HostTime,
     texts: VecDeque<(HostTime, String)>,
     text_parts: TextParts,
 }
@@ -307,6 +311,7 @@ impl Link {
             params: Params::default(),
             rates: Rates::default(),
             beat_at: now,
+            heartbeat_at: now,
             texts: VecDeque::new(),
             text_parts: TextParts::default(),
             settings,
@@ -335,6 +340,11 @@ impl Link {
 
     /// Does what is due at `now`.
     pub fn handle_timeout(&mut self, now: HostTime) {
+        if now >= self.heartbeat_at {
+            self.heartbeat_at = now.plus_seconds(HEARTBEAT_S);
+            // It also gives our address to a bridge or an autopilot that waits for one.
+            self.send_heartbeat(now);
+        }
         if now >= self.beat_at {
             self.beat_at = now.plus_seconds(SECOND_S);
             self.every_second(now);
@@ -437,7 +447,7 @@ impl Link {
     pub fn poll_timeout(&self) -> Option<HostTime> {
         let rising = self.rising.map(|rising| rising.due_at);
         let due = [self.commands.due_at(), self.params.due_at(), self.fence.due_at(), rising];
-        Some(due.into_iter().flatten().fold(self.beat_at, Ord::min))
+        Some(due.into_iter().flatten().fold(self.beat_at.min(self.heartbeat_at), Ord::min))
     }
 
     /// Returns the vehicle's state as the autopilot last reported it, in our frames.

@@ -190,8 +190,8 @@ fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
         "--param=FENCE_ALT_MAX=3.2",
         "--param=FENCE_MARGIN=0.3",
         "--param=FS_GCS_ENABLE=5",
-        "--param=FS_GCS_TIMEOUT=3",
-        "--param=FS_OPTIONS=8",
+        "--param=FS_GCS_TIMEOUT=2",
+        "--param=FS_OPTIONS=24",
         "--param=GUID_TIMEOUT=0.5",
     ];
     let vehicle = [fence, &vehicle].concat();
