@@ -115,7 +115,7 @@ params! {
     /// Lost estimate: 1 lands, 2 holds the height.
     FsEkfAction = "FS_EKF_ACTION", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
     /// Exceptions: 4 goes on in GUIDED without radio control, 8 goes on landing whatever is lost,
-    /// 16 (ArduCopter's default) concerns pilots.
+    /// 16 (ArduCopter's default) flies on by hand without a ground station.
     FsOptions = "FS_OPTIONS", 16.0, 0.0..63.0, MAV_PARAM_TYPE_INT32;
     /// Silence of the radio control that counts as lost. [s]
     RcFsTimeout = "RC_FS_TIMEOUT", 1.0, 0.5..10.0, MAV_PARAM_TYPE_REAL32;

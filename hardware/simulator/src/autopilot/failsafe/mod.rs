@@ -23,6 +23,7 @@ const TOPPLED_S: f64 = 2.0;
 /// Bits of FS_OPTIONS.
 const CONTINUE_GUIDED_WITHOUT_RADIO: u8 = 4;
 const CONTINUE_LANDING: u8 = 8;
+const CONTINUE_BY_HAND: u8 = 16;
 
 /// What a failsafe does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -106,6 +107,14 @@ impl Autopilot {
         }
         self.failsafe.gcs = true;
         if !self.armed {
+            return;
+        }
+        let by_hand =
+            matches!(self.mode, CopterMode::Stabilize | CopterMode::AltHold | CopterMode::Loiter);
+        let options = self.params.value(Param::FsOptions) as u8;
+        if by_hand && !self.landed && options & CONTINUE_BY_HAND != 0 {
+            let text = "GCS Failsafe - Continuing Pilot Control";
+            self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, text);
             return;
         }
         let action = match action {

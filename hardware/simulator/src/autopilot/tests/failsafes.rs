@@ -135,6 +135,19 @@ fn a_lost_radio_control_acts_after_its_timeout() {
     }
 }
 
+/// Who flies by hand flies on without a ground station, if FS_OPTIONS is set so.
+#[test]
+fn a_pilot_goes_on_if_configured() {
+    for (options, expected) in [(24.0, CopterMode::AltHold), (8.0, CopterMode::Land)] {
+        let params = [("FS_GCS_ENABLE", 5.0), ("FS_OPTIONS", options)];
+        let mut c = Companion::hovering(config(&params), 1.5);
+        c.heartbeats = false;
+        c.set_mode(CopterMode::AltHold);
+        c.until(7.0, "the failsafe", |c| c.texts_contain("GCS Failsafe"));
+        assert_eq!(c.mode(), expected, "{:?}", c.texts);
+    }
+}
+
 /// A landing goes on when more is lost, if FS_OPTIONS is set so; else the later failsafe acts.
 #[test]
 fn a_landing_continues_if_configured() {
