@@ -1,6 +1,7 @@
 //! What a real ArduCopter 4.8 did in software, flown through `serve` and `fly` with the airframe's parameter file, beside
-//! what this one does, within 15 %. One figure is not reached: blind for seconds, the real one's estimator drifted 2 to
-//! 3 times the speed's metres further than it braked, this one's drifts less; `docs/guides/failsafe.md` says so.
+//! what this one does, within 15 %. One figure is not reached: the way of a vehicle whose runtime died, blind for seconds,
+//! differed by half between two such flights of the real one; this one's is at its lower end, as `docs/guides/failsafe.md`
+//! says.
 
 use super::*;
 
@@ -38,9 +39,15 @@ impl Companion {
     fn comes_down(&mut self) -> Descent {
         let start = self.p();
         let land_s = self.until(12.0, "LAND", |c| c.mode() == CopterMode::Land);
-        let rest_s = self.until(20.0, "the floor", |c| c.p().z < 0.05);
-        let drift_m = (self.p() - start).truncate().length();
-        Descent { land_s, down_s: land_s + rest_s, drift_m }
+        let (mut ticks, mut drift_m) = (0, 0f64);
+        while self.p().z >= 0.05 {
+            assert!(ticks < 8000, "it does not come down");
+            self.tick();
+            ticks += 1;
+            drift_m = drift_m.max((self.p() - start).truncate().length());
+        }
+        let down_s = land_s + f64::from(ticks) * crate::simulation::TICK_S;
+        Descent { land_s, down_s, drift_m }
     }
 
     /// The runtime holds after 0.15 s, and orders LAND after 0.5 s.
@@ -80,7 +87,7 @@ fn a_dead_runtime_is_down_as_late_as_really() {
         println!("at {speed_mps} m/s: {found:?}, really drifted {drift_m} m");
         near("LAND", found.land_s, land_s);
         near("down", found.down_s, down_s);
-        assert!(found.drift_m < 1.15 * drift_m, "{found:?}");
+        assert!((0.45..1.15).contains(&(found.drift_m / drift_m)), "{found:?}");
     }
 }
 
@@ -140,6 +147,37 @@ fn a_velocity_is_answered_as_late_as_really() {
     };
     near("lag at the default jerk", lag_s(5.0), 0.73);
     near("lag at jerk 20", lag_s(20.0), 0.30);
+}
+
+/// Steps from rest and back to it, at both jerks: until two thirds are flown, and the way to standstill. (4.7, setpoints at
+/// 50 Hz.)
+#[test]
+fn steps_and_stops_are_as_really() {
+    for (jerk, speed_mps, until_s, stop_m) in [
+        (5.0, 0.5, 1.02, 0.56),
+        (5.0, 1.0, 1.11, 1.19),
+        (5.0, 2.0, 1.23, 2.53),
+        (5.0, 3.0, 1.31, 4.19),
+        (20.0, 0.5, 0.46, 0.24),
+        (20.0, 1.0, 0.52, 0.48),
+        (20.0, 2.0, 0.60, 1.17),
+        (20.0, 3.0, 0.69, 2.04),
+    ] {
+        let mut config = as_flown();
+        config.params.push(("PSC_JERK_NE".into(), jerk));
+        let mut c = Companion::hovering(config, 1.2);
+        c.fly(GuidedMotion::Velocity(DVec3::X * speed_mps), YawTarget::Angle(0.0));
+        c.set_once(GuidedMotion::Velocity(DVec3::X * speed_mps), YawTarget::Angle(0.0));
+        let found_s = c.until(5.0, "two thirds", |c| c.v().x > 0.632 * speed_mps);
+        c.wait(5.0);
+        let from = c.p();
+        c.fly(GuidedMotion::Velocity(DVec3::ZERO), YawTarget::Angle(0.0));
+        c.wait(6.0);
+        println!("jerk {jerk}, {speed_mps} m/s");
+        near("way", (c.p() - from).x, stop_m);
+        // A tenth of a second later with a small jerk, earlier with a great one.
+        assert!((found_s - until_s).abs() < (0.2 * until_s).max(0.1), "{found_s} {until_s}");
+    }
 }
 
 /// With the defaults of both, a velocity sent once stands after its three seconds and 0.7 more.
