@@ -15,7 +15,7 @@
 enum {
     VIZFLYT_UART_READABLE = 1, /* platform_uart_read would return bytes */
     VIZFLYT_UART_WRITABLE = 2, /* platform_uart_write would take bytes */
-    VIZFLYT_FRAMES_SENT = 4,   /* platform_frame_ready may have turned true */
+    VIZFLYT_FRAMES = 4,        /* platform_frame_waiting or platform_frame_ready may have turned true */
     VIZFLYT_LINK = 8,          /* platform_link_up may have changed */
 };
 
@@ -25,12 +25,6 @@ void vizflyt_start(void);
 /* Runs every task that can make progress. Returns for how long nothing will be due unless an event
  * comes first. [us]; UINT32_MAX: no timer is set. */
 uint32_t vizflyt_poll(uint32_t events);
-
-/* Takes one Ethernet frame that the radio received, without its checksum. Returns 0, or -1 when
- * there is no room and the frame is dropped: the packets' own numbers show what was lost. From the loop's context only; poll after. */
-int32_t vizflyt_frame_in(const uint8_t *frame, uint32_t len);
-/* For how many frames there is room: who can wait asks first, and loses none. */
-uint32_t vizflyt_frame_room(void);
 
 /* --- what the platform offers; none blocks */
 
@@ -55,11 +49,17 @@ uint32_t platform_uart_read(uint8_t *into, uint32_t len);
 uint32_t platform_uart_write(const uint8_t *bytes, uint32_t len);
 /* Whether all that was taken has left. */
 uint32_t platform_uart_is_idle(void);
+/* How often bytes came faster than they were read, so that some are lost. Counts up for ever. */
+uint32_t platform_uart_overruns(void);
 /* Sets the rate [baud] and whether RTS and CTS are used; what is under way is finished first. */
 void platform_uart_configure(uint32_t baud, uint32_t flow_control);
 
 /* The station's or access point's address. */
 void platform_mac(uint8_t into[6]);
+/* The received Ethernet frame that has waited longest, and its length without checksum; NULL if none
+ * waits. It stays where it is, and may be written to, until platform_frame_done lets it go. */
+uint8_t *platform_frame_waiting(uint32_t *len);
+void platform_frame_done(void);
 /* Whether a frame can be sent now. */
 uint32_t platform_frame_ready(void);
 /* Sends one Ethernet frame; it is copied. Only after platform_frame_ready returned true. */

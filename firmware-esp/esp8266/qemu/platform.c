@@ -3,6 +3,7 @@
  * are non-blocking); the loop waits where nothing is due. */
 
 #include "../include/vizflyt_platform.h"
+#include "constants.h"
 
 int simcall(int number, int a, int b, int c);
 uint32_t cycles(void);
@@ -15,8 +16,12 @@ enum { EAGAIN = 11 };
 /* The descriptors: an AF_UNIX socket of one Ethernet frame a packet, a raw pty, a file. */
 enum { CONSOLE = 2, FRAMES = 100, SERIAL = 101, FLASH = 102 };
 
-/* QEMU does its I/O page by page, and a packet must be one read: a page of its own. */
-static uint8_t page[4096] __attribute__((aligned(4096)));
+/* QEMU does its I/O page by page, and a packet must be one read: a page of its own. A received frame
+ * has another, because it waits while the first is used. Neither lies in the chip's memory. */
+#define EMULATORS_OWN __attribute__((aligned(4096), section(".emulator")))
+static uint8_t page[4096] EMULATORS_OWN;
+static uint8_t received[4096] EMULATORS_OWN;
+static uint32_t received_len;
 
 /* ccount runs at 40 MHz in QEMU's lx106 (its overlay's core frequency), by the emulator's clock: that
  * of the instructions with -icount. What is waited for outside is added. */
@@ -24,6 +29,7 @@ static uint8_t page[4096] __attribute__((aligned(4096)));
 static uint32_t waited_us;
 
 static volatile int woken;
+static int closed; /* the radio has been closed: the end */
 
 static void copy(uint8_t *to, const uint8_t *from, uint32_t len)
 {
@@ -113,6 +119,11 @@ uint32_t platform_uart_is_idle(void)
     return 1;
 }
 
+uint32_t platform_uart_overruns(void)
+{
+    return 0; /* a pty waits */
+}
+
 void platform_uart_configure(uint32_t baud, uint32_t flow_control)
 {
     /* A pty has neither. */
@@ -124,6 +135,24 @@ void platform_mac(uint8_t into[6])
 {
     static const uint8_t mac[6] = {0x02, 0x56, 0x46, 0x82, 0x66, 0x01}; /* locally administered */
     copy(into, mac, 6);
+}
+
+/* Reads a frame if none waits: as many wait in the socket as the radio would hold. */
+uint8_t *platform_frame_waiting(uint32_t *len)
+{
+    if (!received_len) {
+        int read = simcall(SYS_READ, FRAMES, (int)received, 1514);
+        if (read == 0)
+            closed = 1;
+        received_len = read > 0 ? read : 0;
+    }
+    *len = received_len;
+    return received_len ? received : 0;
+}
+
+void platform_frame_done(void)
+{
+    received_len = 0;
 }
 
 uint32_t platform_frame_ready(void)
@@ -217,41 +246,69 @@ int32_t platform_flash_erase(uint32_t sector)
     return 0;
 }
 
+void constant_fault(void)
+{
+    put_line("a load that the chip cannot do", 30);
+    stop(3);
+    __builtin_unreachable();
+}
+
 extern uint32_t _stack_bottom[], _stack_top[];
 
-static void report_stack(void)
+enum { PAINT = 0xA5A5A5A5 };
+/* The chip's stack has 5328 bytes, from 0x3FFFEB30 to the end of its RAM; an interrupt within an
+ * exception puts two frames of 256 onto it. */
+enum { STACK = 5328 - 2 * 256 };
+
+/* How deep the stack has gone since it was painted; paints it again. */
+static uint32_t stack_used(void)
 {
     uint32_t *deepest = _stack_bottom;
-    while (deepest < _stack_top && *deepest == 0xA5A5A5A5)
+    while (deepest < _stack_top && *deepest == PAINT)
         deepest++;
     uint32_t used = (uint32_t)_stack_top - (uint32_t)deepest;
-    char line[32] = "stack used: ";
-    uint32_t at = 12;
-    for (uint32_t scale = 10000; scale; scale /= 10)
-        line[at++] = '0' + used / scale % 10;
-    put_line(line, at);
+    for (uint32_t *here = __builtin_frame_address(0); deepest < here - 32; deepest++)
+        *deepest = PAINT;
+    if (used > STACK) {
+        put_line("deeper than the chip's stack", 28);
+        stop(4);
+    }
+    return used;
+}
+
+static void report(const char *what, uint32_t len, uint32_t value)
+{
+    char line[64];
+    copy((uint8_t *)line, (const uint8_t *)what, len);
+    for (uint32_t scale = 1000000000; scale; scale /= 10)
+        if (value >= scale || scale == 1)
+            line[len++] = '0' + value / scale % 10;
+    put_line(line, len);
+}
+
+static void report_all(void)
+{
+    report("stack used afterwards: ", 23, stack_used());
+    report("constants read by bytes or halves: ", 35, constant_loads.narrow);
+    report("constants read by words: ", 25, constant_loads.words);
 }
 
 int main(void)
 {
     vizflyt_start();
+    report("stack used to start: ", 21, stack_used());
     for (;;) {
-        int frames = 0, len = -1;
-        uint32_t zero[2] = {0, 0};
-        while (vizflyt_frame_room() && (len = simcall(SYS_READ, FRAMES, (int)page, 1600)) > 0) {
-            vizflyt_frame_in(page, len);
-            frames++;
-        }
-        if (len == 0) {
-            report_stack();
-            stop(0);
-        }
-        uint32_t events = VIZFLYT_UART_WRITABLE | VIZFLYT_FRAMES_SENT;
+        uint32_t len, zero[2] = {0, 0};
+        uint32_t events = VIZFLYT_UART_WRITABLE | VIZFLYT_FRAMES;
         if (simcall(SYS_SELECT_ONE, SERIAL, SELECT_READ, (int)zero) > 0)
             events |= VIZFLYT_UART_READABLE;
         woken = 0;
         uint32_t due_us = vizflyt_poll(events);
-        if (!woken && !frames && !(events & VIZFLYT_UART_READABLE)) {
+        if (!platform_frame_waiting(&len) && closed) {
+            report_all();
+            stop(0);
+        }
+        if (!woken && !len && !(events & VIZFLYT_UART_READABLE)) {
             /* The serial line cannot be waited for at the same time: look at it every 0.2 ms. */
             uint32_t wait[2] = {0, due_us < 200 ? due_us : 200};
             if (simcall(SYS_SELECT_ONE, FRAMES, SELECT_READ, (int)wait) == 0)

@@ -28,8 +28,9 @@ begin:
     callx0  a0
 4:  j       4b
 
-/* Exceptions end the emulator with a status of their own: 0x60 + the vector's number. Offsets are
- * the lx106's: debug 0x10, NMI 0x20, kernel 0x30, user 0x50, double 0x70. */
+/* Exceptions end the emulator with a status of their own: 0x60 + the vector's number; that of a load
+ * from the constants' addresses goes to constant_load (constants.c). Offsets are the lx106's: debug
+ * 0x10, NMI 0x20, kernel 0x30, user 0x50, double 0x70. */
     .macro  vector offset, status
     .org    \offset
     movi    a2, 1
@@ -40,9 +41,40 @@ begin:
     .section .vectors, "ax"
     vector  0x10, 0x61
     vector  0x20, 0x62
-    vector  0x30, 0x63
+    .org    0x30
+    wsr     a2, excsave1
+    j       load
     vector  0x50, 0x65
     vector  0x70, 0x67
+
+    /* Registers into an array, a0 first, and the shift's behind them; then constant_load. */
+    .align  4
+    .literal_position
+load:
+    movi    a2, constant_registers
+    s32i    a0, a2, 0
+    s32i    a1, a2, 4
+    rsr     a0, excsave1
+    s32i    a0, a2, 8
+    .irp    n, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15
+    s32i    a\n, a2, 4 * \n
+    .endr
+    rsr     a0, sar
+    s32i    a0, a2, 64
+    rsr     a3, epc1
+    rsr     a4, excvaddr
+    movi    a1, constant_stack_top
+    movi    a0, constant_load
+    callx0  a0              /* returns where to go on */
+    wsr     a2, epc1
+    movi    a2, constant_registers
+    l32i    a0, a2, 64
+    wsr     a0, sar
+    .irp    n, 0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15
+    l32i    a\n, a2, 4 * \n
+    .endr
+    l32i    a2, a2, 8
+    rfe
 
     .section .text.simcall, "ax"
     /* int simcall(int number, int a, int b, int c): the error number goes to simcall_error. */

@@ -3,8 +3,7 @@
 //! ```text
 //! C (QEMU's semihosting, or the vendor's SDK)        Rust, one object for both
 //! main loop ── vizflyt_poll ──────────────────────▶ executor: network, bridge, light
-//! radio ────── vizflyt_frame_in ──────────────────▶ radio ring ─▶ embassy-net ─▶ sockets
-//! ◀─────────── platform_frame_out ─────────────────           ◀─
+//! radio ◀───── platform_frame_waiting, _out ────────▶ embassy-net ─▶ sockets
 //! UART ◀────── platform_uart_read, _write ──────────▶ bridge
 //! ```
 //! The loop calls [`vizflyt_poll`] after every event and when a timer is due; nothing here blocks,
@@ -54,9 +53,10 @@ fn pender(_context: *mut ()) {
 #[unsafe(no_mangle)]
 pub extern "C" fn vizflyt_start() {
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
+    // What is large is there from the beginning where it can: made here it would pass over the stack.
     static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
         StaticCell::new();
-    static RADIO: StaticCell<radio::Radio> = StaticCell::new();
+    static RADIO: ConstStaticCell<radio::Radio> = ConstStaticCell::new(radio::Radio::new());
     static SHARED: ConstStaticCell<Shared> = ConstStaticCell::new(Shared::new(Bridge::empty()));
     static BUFFERS: ConstStaticCell<Buffers> = ConstStaticCell::new(Buffers::new());
     static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
@@ -71,7 +71,8 @@ pub extern "C" fn vizflyt_start() {
         word.copy_from_slice(&platform::random().to_le_bytes());
     }
     let seed = u64::from(platform::random()) << 32 | u64::from(platform::random());
-    let radio = RADIO.init(radio::Radio::new(address));
+    let radio = RADIO.take();
+    radio.begin(address);
     let (stack, runner) =
         embassy_net::new(radio, Config::default(), RESOURCES.init_with(StackResources::new), seed);
     let chip = Chip { address, random };
@@ -98,7 +99,7 @@ pub extern "C" fn vizflyt_poll(events: u32) -> u32 {
     if events & UART_WRITABLE != 0 {
         uart::writable();
     }
-    if events & (FRAMES_SENT | LINK) != 0 {
+    if events & (FRAMES | LINK) != 0 {
         radio::changed();
     }
     clock::wake_due();
@@ -111,27 +112,8 @@ pub extern "C" fn vizflyt_poll(events: u32) -> u32 {
 
 const UART_READABLE: u32 = 1;
 const UART_WRITABLE: u32 = 2;
-const FRAMES_SENT: u32 = 4;
+const FRAMES: u32 = 4;
 const LINK: u32 = 8;
-
-/// Takes a received frame; 0, or -1 if it was dropped.
-///
-/// # Safety
-/// `frame` points to `len` readable bytes.
-#[expect(unsafe_code, reason = "called from C")]
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn vizflyt_frame_in(frame: *const u8, len: u32) -> i32 {
-    // SAFETY: the caller's promise.
-    let frame = unsafe { core::slice::from_raw_parts(frame, len as usize) };
-    if radio::receive(frame) { 0 } else { -1 }
-}
-
-/// Returns for how many frames there is room.
-#[expect(unsafe_code, reason = "called from C")]
-#[unsafe(no_mangle)]
-pub extern "C" fn vizflyt_frame_room() -> u32 {
-    radio::room() as u32
-}
 
 #[embassy_executor::task]
 async fn network(mut runner: Runner<'static, &'static mut radio::Radio>) {

@@ -18,6 +18,8 @@ mod c {
         pub(super) safe fn platform_uart_is_idle() -> u32;
         pub(super) safe fn platform_uart_configure(baud: u32, flow_control: u32);
         pub(super) fn platform_mac(into: *mut u8);
+        pub(super) fn platform_frame_waiting(len: *mut u32) -> *mut u8;
+        pub(super) safe fn platform_frame_done();
         pub(super) safe fn platform_frame_ready() -> u32;
         pub(super) fn platform_frame_out(frame: *const u8, len: u32);
         pub(super) fn platform_wifi_station(ssid: *const u8, password: *const u8) -> i32;
@@ -88,6 +90,27 @@ pub(crate) fn mac() -> [u8; 6] {
     // SAFETY: the C side writes six bytes.
     unsafe { c::platform_mac(mac.as_mut_ptr()) };
     mac
+}
+
+/// Whether a received frame waits.
+pub(crate) fn is_frame_waiting() -> bool {
+    let mut len = 0;
+    // SAFETY: the C side writes one number.
+    !unsafe { c::platform_frame_waiting(&raw mut len) }.is_null()
+}
+
+/// Gives `f` the received frame that has waited longest, an empty one if none waits, and lets it go.
+pub(crate) fn with_frame<R>(f: impl FnOnce(&mut [u8]) -> R) -> R {
+    let mut len = 0;
+    // SAFETY: the C side writes one number.
+    let frame = unsafe { c::platform_frame_waiting(&raw mut len) };
+    if frame.is_null() {
+        return f(&mut []);
+    }
+    // SAFETY: `len` bytes from there are ours until `platform_frame_done`, which comes after `f`.
+    let result = f(unsafe { core::slice::from_raw_parts_mut(frame, len as usize) });
+    c::platform_frame_done();
+    result
 }
 
 /// Whether a frame can be sent.

@@ -1,14 +1,10 @@
-//! The radio as an Ethernet interface: frames in by `vizflyt_frame_in`, out by the platform.
-
-use core::cell::RefCell;
-use core::task::Context;
-
-use critical_section::Mutex;
-use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
-use embassy_sync::waitqueue::AtomicWaker;
+//! The radio as an Ethernet interface: received frames are read where the platform has them.
 
 use core::ffi::CStr;
+use core::task::Context;
 
+use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
+use embassy_sync::waitqueue::AtomicWaker;
 use embassy_time::{Duration, Instant, Timer};
 use vizflyt_bridge::wifi;
 
@@ -16,49 +12,9 @@ use crate::platform;
 
 /// An Ethernet frame without its checksum: 14 bytes of header, 1500 of payload.
 pub(crate) const FRAME: usize = 1514;
-/// Frames that wait for the network's task. The radio brings them in bursts of an A-MSDU at most
-/// while another task runs; batches of the bridge are one frame each.
-const WAITING: usize = 4;
-
-static RECEIVED: Mutex<RefCell<Ring>> = Mutex::new(RefCell::new(Ring::new()));
 static WAKER: AtomicWaker = AtomicWaker::new();
 
-struct Ring {
-    frames: [[u8; FRAME]; WAITING],
-    lens: [u16; WAITING],
-    first: usize,
-    count: usize,
-}
-
-impl Ring {
-    const fn new() -> Self {
-        Self { frames: [[0; FRAME]; WAITING], lens: [0; WAITING], first: 0, count: 0 }
-    }
-}
-
-/// Takes a received frame; returns whether there was room.
-pub(crate) fn receive(frame: &[u8]) -> bool {
-    let taken = critical_section::with(|section| {
-        let ring = &mut *RECEIVED.borrow_ref_mut(section);
-        if ring.count == WAITING || frame.len() > FRAME {
-            return false;
-        }
-        let at = (ring.first + ring.count) % WAITING;
-        ring.frames[at][..frame.len()].copy_from_slice(frame);
-        ring.lens[at] = frame.len() as u16;
-        ring.count += 1;
-        true
-    });
-    WAKER.wake();
-    taken
-}
-
-/// Returns for how many frames there is room.
-pub(crate) fn room() -> usize {
-    critical_section::with(|section| WAITING - RECEIVED.borrow_ref(section).count)
-}
-
-/// Looks again at the link, and whether frames can be sent.
+/// Looks again at the link, and whether frames have come or can be sent.
 pub(crate) fn changed() {
     WAKER.wake();
 }
@@ -70,8 +26,13 @@ pub(crate) struct Radio {
 }
 
 impl Radio {
-    pub(crate) const fn new(mac: [u8; 6]) -> Self {
-        Self { mac, frame: [0; FRAME] }
+    pub(crate) const fn new() -> Self {
+        Self { mac: [0; 6], frame: [0; FRAME] }
+    }
+
+    /// Takes the interface's address; before anything else.
+    pub(crate) fn begin(&mut self, mac: [u8; 6]) {
+        self.mac = mac;
     }
 }
 
@@ -81,7 +42,7 @@ impl Driver for Radio {
 
     fn receive(&mut self, cx: &mut Context<'_>) -> Option<(Received, Sending<'_>)> {
         WAKER.register(cx.waker());
-        if room() == WAITING || !platform::is_frame_ready() {
+        if !platform::is_frame_waiting() || !platform::is_frame_ready() {
             return None;
         }
         Some((Received, Sending(&mut self.frame)))
@@ -114,15 +75,7 @@ pub(crate) struct Received;
 
 impl RxToken for Received {
     fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, f: F) -> R {
-        // Why with interrupts off: nothing but the loop touches the ring, and the loop is here; the
-        // closure parses headers and copies one datagram, tens of microseconds.
-        critical_section::with(|section| {
-            let ring = &mut *RECEIVED.borrow_ref_mut(section);
-            let at = ring.first;
-            ring.first = (ring.first + 1) % WAITING;
-            ring.count -= 1;
-            f(&mut ring.frames[at][..usize::from(ring.lens[at])])
-        })
+        platform::with_frame(f)
     }
 }
 

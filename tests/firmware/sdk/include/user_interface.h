@@ -1,4 +1,3 @@
-#include <stdbool.h>
 #include "os_type.h"
 #include "lwip/ip_addr.h"
 enum { USER_TASK_PRIO_1 = 1, SYS_CPU_160MHZ = 160 };
@@ -10,10 +9,10 @@ enum sleep_type { NONE_SLEEP_T };
 typedef enum { AUTH_OPEN, AUTH_WEP, AUTH_WPA_PSK, AUTH_WPA2_PSK } AUTH_MODE;
 typedef struct { int type; uint32_t addr, size; } partition_item_t;
 typedef struct { uint32 event; } System_Event_t;
-struct station_config { uint8 ssid[32], password[64], bssid_set, bssid[6]; };
+struct station_config { uint8 ssid[32], password[64], channel, bssid_set, bssid[6]; };
 struct softap_config { uint8 ssid[32], password[64], ssid_len, channel; AUTH_MODE authmode; uint8 ssid_hidden, max_connection; uint16 beacon_interval; };
 bool system_partition_table_regist(const partition_item_t *table, uint32_t count, uint32_t map);
-bool system_os_task(void (*task)(os_event_t *), uint8 priority, os_event_t *queue, uint8 length);
+bool system_os_task(os_task_t task, uint8 priority, os_event_t *queue, uint8 length);
 bool system_os_post(uint8 priority, uint32_t signal, uint32_t parameter);
 uint32 system_get_time(void);
 uint32 system_get_free_heap_size(void);
@@ -37,3 +36,4 @@ bool wifi_set_sleep_type(enum sleep_type type);
 bool wifi_set_ip_info(uint8 interface, struct ip_info *info);
 sint8 wifi_station_get_rssi(void);
 void wifi_set_event_handler_cb(void (*handler)(System_Event_t *));
+void uart_div_modify(uint8 number, uint32 divisor);

@@ -3,6 +3,4 @@ struct netif {
     struct netif *next;
     err_t (*input)(struct pbuf *packet, struct netif *from);
     err_t (*linkoutput)(struct netif *to, struct pbuf *packet);
-    uint8_t hwaddr[6];
 };
-extern struct netif *netif_list;

@@ -8,5 +8,5 @@ struct pbuf { struct pbuf *next; void *payload; uint16_t tot_len, len; };
 struct pbuf *pbuf_alloc(pbuf_layer layer, uint16_t length, pbuf_type type);
 uint8_t pbuf_free(struct pbuf *packet);
 err_t pbuf_take(struct pbuf *packet, const void *from, uint16_t length);
-uint16_t pbuf_copy_partial(struct pbuf *packet, void *to, uint16_t length, uint16_t offset);
+struct pbuf *pbuf_coalesce(struct pbuf *packet, pbuf_layer layer);
 #endif

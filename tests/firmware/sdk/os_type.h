@@ -1,1 +1,0 @@
-#include "ets_sys.h"
