@@ -15,7 +15,7 @@
 enum {
     VIZFLYT_UART_READABLE = 1, /* platform_uart_read would return bytes */
     VIZFLYT_UART_WRITABLE = 2, /* platform_uart_write would take bytes */
-    VIZFLYT_FRAMES = 4,        /* platform_frame_waiting or platform_frame_ready may have turned true */
+    VIZFLYT_FRAMES = 4,        /* a frame has come, or one can be sent again */
     VIZFLYT_LINK = 8,          /* platform_link_up may have changed */
 };
 
@@ -60,10 +60,11 @@ void platform_mac(uint8_t into[6]);
  * waits. It stays where it is, and may be written to, until platform_frame_done lets it go. */
 uint8_t *platform_frame_waiting(uint32_t *len);
 void platform_frame_done(void);
-/* Whether a frame can be sent now. */
-uint32_t platform_frame_ready(void);
-/* Sends one Ethernet frame; it is copied. Only after platform_frame_ready returned true. */
-void platform_frame_out(const uint8_t *frame, uint32_t len);
+/* Room for one Ethernet frame to send, 1514 bytes; NULL if none can be sent now. Until it is sent or
+ * dropped there is no other. */
+uint8_t *platform_frame_begin(void);
+void platform_frame_send(uint32_t len);
+void platform_frame_drop(void);
 /* Joins a network, or stops trying and opens one. Texts end in a zero; an empty password: open. */
 int32_t platform_wifi_station(const char *ssid, const char *password);
 int32_t platform_wifi_access_point(const char *ssid, const char *password, uint32_t channel);

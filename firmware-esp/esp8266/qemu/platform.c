@@ -155,18 +155,24 @@ void platform_frame_done(void)
     received_len = 0;
 }
 
-uint32_t platform_frame_ready(void)
+/* Not the page of all other I/O: settings may be read between the beginning and the sending. */
+static uint8_t sending[4096] EMULATORS_OWN;
+
+uint8_t *platform_frame_begin(void)
 {
-    return 1;
+    return sending;
 }
 
-void platform_frame_out(const uint8_t *frame, uint32_t len)
+void platform_frame_send(uint32_t len)
 {
-    copy(page, frame, len);
     /* A full socket: wait, as the radio's own queue would. */
-    while (simcall(SYS_WRITE, FRAMES, (int)page, len) < 0)
+    while (simcall(SYS_WRITE, FRAMES, (int)sending, len) < 0)
         if (simcall_error != EAGAIN)
             stop(0);
+}
+
+void platform_frame_drop(void)
+{
 }
 
 int32_t platform_wifi_station(const char *ssid, const char *password)

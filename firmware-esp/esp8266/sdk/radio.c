@@ -51,23 +51,39 @@ void ICACHE_FLASH_ATTR platform_mac(uint8_t into[6])
     wifi_get_macaddr(role, into);
 }
 
-uint32_t ICACHE_FLASH_ATTR platform_frame_ready(void)
+static struct pbuf *sending;
+
+uint8_t *ICACHE_FLASH_ATTR platform_frame_begin(void)
 {
-    return link_up && system_get_free_heap_size() > HEAP_LEFT;
+    if (!link_up || system_get_free_heap_size() < HEAP_LEFT)
+        return NULL;
+    /* PBUF_LINK leaves room in front for what the radio puts there. */
+    sending = pbuf_alloc(PBUF_LINK, FRAME, PBUF_RAM);
+    return sending ? sending->payload : NULL;
 }
 
-void ICACHE_FLASH_ATTR platform_frame_out(const uint8_t *frame, uint32_t len)
+void ICACHE_FLASH_ATTR platform_frame_send(uint32_t len)
 {
     struct netif *ours = eagle_lwip_getif(role);
-    if (!ours)
-        return;
-    /* PBUF_LINK leaves room in front for what the radio puts there. */
-    struct pbuf *packet = pbuf_alloc(PBUF_LINK, len, PBUF_RAM);
-    if (!packet)
-        return; /* as a frame lost on the air; the bridge's sequence counters count it */
-    pbuf_take(packet, frame, len);
-    ours->linkoutput(ours, packet);
-    pbuf_free(packet);
+    sending->len = sending->tot_len = len;
+    if (len < FRAME / 2) {
+        /* It may wait in the radio's queue: a small one takes what it needs, if that is to be had. */
+        struct pbuf *fitting = pbuf_alloc(PBUF_LINK, len, PBUF_RAM);
+        if (fitting) {
+            os_memcpy(fitting->payload, sending->payload, len);
+            pbuf_free(sending);
+            sending = fitting;
+        }
+    }
+    if (ours)
+        ours->linkoutput(ours, sending);
+    platform_frame_drop(); /* the radio has taken its own hold of it */
+}
+
+void ICACHE_FLASH_ATTR platform_frame_drop(void)
+{
+    pbuf_free(sending);
+    sending = NULL;
 }
 
 /* The SDK's own stack wants an address before it counts an interface as up; nobody talks to it, as

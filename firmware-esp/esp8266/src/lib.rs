@@ -3,7 +3,7 @@
 //! ```text
 //! C (QEMU's semihosting, or the vendor's SDK)        Rust, one object for both
 //! main loop ── vizflyt_poll ──────────────────────▶ executor: network, bridge, light
-//! radio ◀───── platform_frame_waiting, _out ────────▶ embassy-net ─▶ sockets
+//! radio ◀───── platform_frame_waiting, _send ───────▶ embassy-net ─▶ sockets
 //! UART ◀────── platform_uart_read, _write ──────────▶ bridge
 //! ```
 //! The loop calls [`vizflyt_poll`] after every event and when a timer is due; nothing here blocks,
@@ -53,10 +53,9 @@ fn pender(_context: *mut ()) {
 #[unsafe(no_mangle)]
 pub extern "C" fn vizflyt_start() {
     static EXECUTOR: StaticCell<Executor> = StaticCell::new();
-    // What is large is there from the beginning where it can: made here it would pass over the stack.
     static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
         StaticCell::new();
-    static RADIO: ConstStaticCell<radio::Radio> = ConstStaticCell::new(radio::Radio::new());
+    static RADIO: StaticCell<radio::Radio> = StaticCell::new();
     static SHARED: ConstStaticCell<Shared> = ConstStaticCell::new(Shared::new(Bridge::empty()));
     static BUFFERS: ConstStaticCell<Buffers> = ConstStaticCell::new(Buffers::new());
     static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
@@ -71,8 +70,7 @@ pub extern "C" fn vizflyt_start() {
         word.copy_from_slice(&platform::random().to_le_bytes());
     }
     let seed = u64::from(platform::random()) << 32 | u64::from(platform::random());
-    let radio = RADIO.take();
-    radio.begin(address);
+    let radio = RADIO.init(radio::Radio::new(address));
     let (stack, runner) =
         embassy_net::new(radio, Config::default(), RESOURCES.init_with(StackResources::new), seed);
     let chip = Chip { address, random };

@@ -20,8 +20,9 @@ mod c {
         pub(super) fn platform_mac(into: *mut u8);
         pub(super) fn platform_frame_waiting(len: *mut u32) -> *mut u8;
         pub(super) safe fn platform_frame_done();
-        pub(super) safe fn platform_frame_ready() -> u32;
-        pub(super) fn platform_frame_out(frame: *const u8, len: u32);
+        pub(super) safe fn platform_frame_begin() -> *mut u8;
+        pub(super) safe fn platform_frame_send(len: u32);
+        pub(super) safe fn platform_frame_drop();
         pub(super) fn platform_wifi_station(ssid: *const u8, password: *const u8) -> i32;
         pub(super) fn platform_wifi_access_point(
             ssid: *const u8,
@@ -92,6 +93,9 @@ pub(crate) fn mac() -> [u8; 6] {
     mac
 }
 
+/// An Ethernet frame without its checksum: 14 bytes of header, 1500 of payload.
+pub(crate) const FRAME: usize = 1514;
+
 /// Whether a received frame waits.
 pub(crate) fn is_frame_waiting() -> bool {
     let mut len = 0;
@@ -113,15 +117,31 @@ pub(crate) fn with_frame<R>(f: impl FnOnce(&mut [u8]) -> R) -> R {
     result
 }
 
-/// Whether a frame can be sent.
-pub(crate) fn is_frame_ready() -> bool {
-    c::platform_frame_ready() != 0
+/// Room for a frame; dropped unsent it is given back.
+pub(crate) struct FrameToSend(*mut u8);
+
+/// Returns room for a frame of up to [`FRAME`] bytes, if one can be sent; for one at a time.
+pub(crate) fn frame_to_send() -> Option<FrameToSend> {
+    let room = c::platform_frame_begin();
+    (!room.is_null()).then_some(FrameToSend(room))
 }
 
-/// Sends a frame.
-pub(crate) fn frame_out(frame: &[u8]) {
-    // SAFETY: the C side copies the slice before it returns.
-    unsafe { c::platform_frame_out(frame.as_ptr(), frame.len() as u32) }
+impl FrameToSend {
+    /// Lets `f` write a frame of `len` bytes, and sends it.
+    pub(crate) fn send<R>(self, len: usize, f: impl FnOnce(&mut [u8]) -> R) -> R {
+        assert!(len <= FRAME);
+        // SAFETY: the C side has room for `FRAME` bytes there until the frame is sent or dropped.
+        let result = f(unsafe { core::slice::from_raw_parts_mut(self.0, len) });
+        c::platform_frame_send(len as u32);
+        core::mem::forget(self);
+        result
+    }
+}
+
+impl Drop for FrameToSend {
+    fn drop(&mut self) {
+        c::platform_frame_drop();
+    }
 }
 
 /// Joins a network.

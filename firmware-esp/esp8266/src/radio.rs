@@ -1,4 +1,4 @@
-//! The radio as an Ethernet interface: received frames are read where the platform has them.
+//! The radio as an Ethernet interface: frames are read and written where the platform has them.
 
 use core::ffi::CStr;
 use core::task::Context;
@@ -10,8 +10,6 @@ use vizflyt_bridge::wifi;
 
 use crate::platform;
 
-/// An Ethernet frame without its checksum: 14 bytes of header, 1500 of payload.
-pub(crate) const FRAME: usize = 1514;
 static WAKER: AtomicWaker = AtomicWaker::new();
 
 /// Looks again at the link, and whether frames have come or can be sent.
@@ -22,35 +20,29 @@ pub(crate) fn changed() {
 /// What the network stack drives.
 pub(crate) struct Radio {
     mac: [u8; 6],
-    frame: [u8; FRAME],
 }
 
 impl Radio {
-    pub(crate) const fn new() -> Self {
-        Self { mac: [0; 6], frame: [0; FRAME] }
-    }
-
-    /// Takes the interface's address; before anything else.
-    pub(crate) fn begin(&mut self, mac: [u8; 6]) {
-        self.mac = mac;
+    pub(crate) const fn new(mac: [u8; 6]) -> Self {
+        Self { mac }
     }
 }
 
 impl Driver for Radio {
     type RxToken<'a> = Received;
-    type TxToken<'a> = Sending<'a>;
+    type TxToken<'a> = Sending;
 
-    fn receive(&mut self, cx: &mut Context<'_>) -> Option<(Received, Sending<'_>)> {
+    fn receive(&mut self, cx: &mut Context<'_>) -> Option<(Received, Sending)> {
         WAKER.register(cx.waker());
-        if !platform::is_frame_waiting() || !platform::is_frame_ready() {
+        if !platform::is_frame_waiting() {
             return None;
         }
-        Some((Received, Sending(&mut self.frame)))
+        Some((Received, Sending(platform::frame_to_send()?)))
     }
 
-    fn transmit(&mut self, cx: &mut Context<'_>) -> Option<Sending<'_>> {
+    fn transmit(&mut self, cx: &mut Context<'_>) -> Option<Sending> {
         WAKER.register(cx.waker());
-        platform::is_frame_ready().then_some(Sending(&mut self.frame))
+        platform::frame_to_send().map(Sending)
     }
 
     fn link_state(&mut self, cx: &mut Context<'_>) -> LinkState {
@@ -60,7 +52,7 @@ impl Driver for Radio {
 
     fn capabilities(&self) -> Capabilities {
         let mut capabilities = Capabilities::default();
-        capabilities.max_transmission_unit = FRAME;
+        capabilities.max_transmission_unit = platform::FRAME;
         capabilities.max_burst_size = Some(1);
         capabilities
     }
@@ -80,13 +72,11 @@ impl RxToken for Received {
 }
 
 /// Room for one frame.
-pub(crate) struct Sending<'a>(&'a mut [u8; FRAME]);
+pub(crate) struct Sending(platform::FrameToSend);
 
-impl TxToken for Sending<'_> {
+impl TxToken for Sending {
     fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, len: usize, f: F) -> R {
-        let result = f(&mut self.0[..len]);
-        platform::frame_out(&self.0[..len]);
-        result
+        self.0.send(len, f)
     }
 }
 

@@ -7,6 +7,5 @@ typedef enum { PBUF_RAM, PBUF_ROM, PBUF_REF, PBUF_POOL } pbuf_type;
 struct pbuf { struct pbuf *next; void *payload; uint16_t tot_len, len; };
 struct pbuf *pbuf_alloc(pbuf_layer layer, uint16_t length, pbuf_type type);
 uint8_t pbuf_free(struct pbuf *packet);
-err_t pbuf_take(struct pbuf *packet, const void *from, uint16_t length);
 struct pbuf *pbuf_coalesce(struct pbuf *packet, pbuf_layer layer);
 #endif
