@@ -12,6 +12,7 @@ the bridge by its name.
 
 import argparse
 import collections
+import itertools
 import os
 import pty
 import random
@@ -31,7 +32,7 @@ FLASH_BYTES = 4 << 20
 OUR_MAC = bytes.fromhex("025646000002")
 BRIDGE_MAC = bytes.fromhex("025646826601")
 BRIDGE_PORT = 14550
-# Standing still for so long is a packet lost. The emulator is a few times slower than the chip and
+# A packet under way for so long is lost. The emulator is a few times slower than the chip and
 # shares the machine with other tests.
 PATIENCE_S = 20.0
 # Packets under way at once in each direction; UDP has no flow control of its own. So many fit into a
@@ -255,7 +256,8 @@ def exercise(options, network, line, emulator):
     rng = random.Random(options.seed)
     companion = Sender(rng, 255, 190, (1, 1))
     vehicle = Sender(rng, 1, 1, (255, 190))
-    sent = {"down": collections.Counter(), "up": collections.Counter()}
+    # When each packet under way was sent, the oldest first.
+    sent = {"down": {}, "up": {}}
     under_way = {"down": 0, "up": 0}
     left = {"down": options.packets, "up": options.packets}
     own = collections.Counter()
@@ -266,12 +268,19 @@ def exercise(options, network, line, emulator):
         if is_bridge(packet):
             own[packet[7] if packet[0] == 0xFD else packet[5]] += 1
             return
-        if sent[way][packet] == 0:
+        times = sent[way].get(packet)
+        if not times:
             raise SystemExit(f"{way}: nobody sent this, or it came twice: {packet.hex()}")
-        sent[way][packet] -= 1
+        times.pop(0)
+        if not times:
+            del sent[way][packet]
         under_way[way] -= 1
 
-    start = moved = spoke = time.monotonic()
+    def send(way, packet):
+        sent[way].setdefault(packet, []).append(time.monotonic())
+        under_way[way] += 1
+
+    start = spoke = time.monotonic()
     while any(left.values()) or any(under_way.values()):
         extra = time.monotonic() - spoke > SILENCE_S
         if extra or (left["down"] and under_way["down"] < WINDOW):
@@ -279,16 +288,14 @@ def exercise(options, network, line, emulator):
             batch = [companion.packet()
                      for _ in range(min(rng.randrange(1, 4), max(left["down"], 1)))]
             for packet in batch:
-                sent["down"][packet] += 1
-            under_way["down"] += len(batch)
+                send("down", packet)
             left["down"] = max(left["down"] - len(batch), 0)
             spoke = time.monotonic()
             network.send(14555, b"".join(batch))
         # The vehicle speaks once the bridge knows whom to send to.
         while greeted and left["up"] and under_way["up"] < WINDOW:
             packet = vehicle.packet()
-            sent["up"][packet] += 1
-            under_way["up"] += 1
+            send("up", packet)
             left["up"] -= 1
             to_line += packet
         ready, _, _ = select.select([network.wire, line], [], [], 0.0 if to_line else 0.2)
@@ -300,13 +307,11 @@ def exercise(options, network, line, emulator):
                     raise SystemExit(f"a datagram ends within a packet: {datagram[1].hex()}")
                 for packet in packets:
                     arrived("up", packet)
-                moved = time.monotonic()
         if line in ready:
             packets, from_line = split(from_line + os.read(line, 4096))
             for packet in packets:
                 arrived("down", packet)
             greeted = True
-            moved = time.monotonic()
         if to_line:
             try:
                 # The bridge reads 128 bytes at a time: hardly ever what ends with a packet.
@@ -315,8 +320,10 @@ def exercise(options, network, line, emulator):
                 pass
         if emulator.poll() is not None:
             raise SystemExit(f"the emulator ended with status {emulator.returncode}")
-        if time.monotonic() - moved > PATIENCE_S:
-            raise SystemExit(f"nothing came for {PATIENCE_S} s; still under way: {under_way}")
+        for way, packets in sent.items():
+            for packet, times in itertools.islice(packets.items(), 1):
+                if time.monotonic() - times[0] > PATIENCE_S:
+                    raise SystemExit(f"{way}: lost, one of {under_way[way]} under way: {packet.hex()}")
     print("of the bridge itself:", dict(own) or "nothing")
     return 2 * options.packets / (time.monotonic() - start)
 
