@@ -25,7 +25,7 @@ enum {
 };
 
 /* The SDK asks for them before anything else. */
-static const partition_item_t partitions[] = {
+static const partition_item_t partitions[] ICACHE_RODATA_ATTR = {
     {SYSTEM_PARTITION_CUSTOMER_BEGIN + 1, 0x00000, 0x10000},
     {SYSTEM_PARTITION_CUSTOMER_BEGIN + 2, 0x10000, 0x5C000},
     {SYSTEM_PARTITION_CUSTOMER_BEGIN + 3, SETTINGS, 0x2000},
@@ -147,10 +147,9 @@ void ICACHE_FLASH_ATTR platform_led(uint32_t on)
 
 /* --- the flash: the SDK wants whole words from aligned memory */
 
-static uint32_t words[FLASH_AT_ONCE / 4];
-
 int32_t ICACHE_FLASH_ATTR platform_flash_read(uint32_t address, uint8_t *into, uint32_t len)
 {
+    uint32_t words[FLASH_AT_ONCE / 4];
     while (len) {
         uint32_t part = len < sizeof words ? len : sizeof words;
         if (spi_flash_read(address, (uint32 *)words, part) != SPI_FLASH_RESULT_OK)
@@ -165,6 +164,7 @@ int32_t ICACHE_FLASH_ATTR platform_flash_read(uint32_t address, uint8_t *into, u
 
 int32_t ICACHE_FLASH_ATTR platform_flash_write(uint32_t address, const uint8_t *bytes, uint32_t len)
 {
+    uint32_t words[FLASH_AT_ONCE / 4];
     while (len) {
         uint32_t part = len < sizeof words ? len : sizeof words;
         os_memcpy(words, bytes, part);

@@ -35,7 +35,7 @@ enum {
     FRAMES_WAITING = 4,      /* [frames] received and not yet read; they lie in the SDK's own buffers */
     FRAME = 1514,            /* an Ethernet frame without its checksum */
     HEAP_LEFT = 8 * 1024,    /* frames being sent lie in the SDK's heap, as do its own needs: below this no more */
-    FLASH_AT_ONCE = 64 * 4,  /* what is read or written of the flash in one go */
+    FLASH_AT_ONCE = 64,      /* what is read or written of the flash in one go, over the stack */
 };
 
 /* Passes events of vizflyt_platform.h to the loop. From anywhere, interrupts included. */
