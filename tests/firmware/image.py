@@ -72,8 +72,10 @@ def esp8266(folder):
     """The program in its two parts, the SDK's own data; and whether the emulator's map is the chip's."""
     image = (folder / "bridge-esp8266.bin").read_bytes()
     update = (folder / "bridge-esp8266-update.bin").read_bytes()
+    loaded = (folder / "part-0x00000.bin").read_bytes()
     mapped = (folder / "part-0x10000.bin").read_bytes()
     assert image[:len(update)] == update, "the program differs from the update"
+    assert update[:MAPPED].rstrip(b"\xff") == loaded.rstrip(b"\xff"), "what is loaded is elsewhere"
     assert update[MAPPED:] == mapped, "what is read in place is elsewhere"
     assert len(update) <= SETTINGS and set(image[len(update):PHY_DATA]) == {0xFF}, \
         "something lies where the settings and the SDK's own go"
