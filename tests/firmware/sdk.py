@@ -38,7 +38,7 @@ def assembly():
     data = int(re.search(r"_sdk_bytes = (\d+);", MAP.read_text())[1])
     lines = [".section .entry.text, \"ax\"", ".align 4", ".literal_position",
              ".global call_user_start", "call_user_start:"]
-    for name in CALLED + ["sdk_data", "sdk_code", "sdk_flash"]:
+    for name in [*CALLED, "sdk_data", "sdk_code", "sdk_flash"]:
         lines += [f"movi a2, {name}", "callx0 a2"]
     lines += [".section .irom0.text, \"ax\"", ".align 4"]
     for name in functions():
