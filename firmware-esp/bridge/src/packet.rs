@@ -119,11 +119,18 @@ impl Cutter {
         }
     }
 
-    /// Gives up waiting for the rest of a packet: the line has been silent for longer than any
-    /// sender pauses. Packets hidden behind a false start come out now.
-    pub fn flush(&mut self, mut sink: impl FnMut(Raw<'_>)) {
-        cut(&self.buffer[..self.filled], true, &mut self.stats, &mut sink);
-        self.filled = 0;
+    /// The line is silent within what may be a packet. A whole packet behind a false start comes out
+    /// now; what may still be a packet's beginning stays, however long the rest takes: its checksum
+    /// decides, not the clock.
+    pub fn look_behind(&mut self, mut sink: impl FnMut(Raw<'_>)) {
+        while let Some(at) = hidden(&self.buffer[..self.filled]) {
+            self.stats.bad_checksum = self.stats.bad_checksum.wrapping_add(1);
+            self.stats.dropped_bytes = self.stats.dropped_bytes.wrapping_add(at as u32);
+            let rest = &self.buffer[at..self.filled];
+            let used = at + cut(rest, false, &mut self.stats, &mut sink);
+            self.buffer.copy_within(used..self.filled, 0);
+            self.filled -= used;
+        }
     }
 
     /// Whether it waits for the rest of a packet.
@@ -176,6 +183,20 @@ fn cut(bytes: &[u8], ended: bool, stats: &mut CutStats, sink: &mut impl FnMut(Ra
         }
     }
     bytes.len()
+}
+
+/// Returns where a whole packet of the dialect begins behind the unfinished one that `bytes` begin with.
+/// What follows it must be the next one's start, or nothing yet: then it is no part of a payload.
+fn hidden(bytes: &[u8]) -> Option<usize> {
+    (1..bytes.len()).find(|&at| match bytes[at] {
+        STX_V1 | STX_V2 => match candidate(&bytes[at..]) {
+            Candidate::Good { len, known: true } => {
+                bytes.get(at + len).is_none_or(|next| matches!(*next, STX_V1 | STX_V2))
+            }
+            _ => false,
+        },
+        _ => false,
+    })
 }
 
 enum Candidate {

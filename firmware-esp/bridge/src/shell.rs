@@ -8,7 +8,7 @@ use core::cell::RefCell;
 use core::net::SocketAddrV4;
 
 use embassy_futures::join::{join, join3, join5};
-use embassy_futures::select::select;
+use embassy_futures::select::{select, select3};
 use embassy_net::tcp::TcpSocket;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_net::{IpAddress, IpEndpoint, Stack};
@@ -315,7 +315,12 @@ async fn connection(
                     }
                 }
             };
-            select(read, write).await;
+            let stalled = async {
+                while shared.take(|bridge, _| bridge.is_open(slot)) {
+                    Timer::after(Duration::from_secs(1)).await;
+                }
+            };
+            select3(read, write, stalled).await;
         }
         shared.with(|bridge, _| bridge.close_stream(slot));
         socket.abort();

@@ -60,6 +60,8 @@ pub struct Stats {
     pub landings: u32,
     /// Configuration attempts refused: wrong key, no key, vehicle armed.
     pub refused: u32,
+    /// Connections ended because they took nothing for too long.
+    pub stalled: u32,
 }
 
 impl Side {
@@ -76,6 +78,7 @@ impl Stats {
         round_trip_us: 0,
         landings: 0,
         refused: 0,
+        stalled: 0,
     };
 
     /// Counts packets dropped for `reason`.
@@ -111,6 +114,7 @@ impl Stats {
             not_sent,
             self.round_trip_us,
             self.landings,
+            self.stalled,
         ]
     }
 
@@ -121,7 +125,7 @@ impl Stats {
 }
 
 /// Names of the counters, as `vizflyt bridge stats`, the page and the wire have them.
-pub const REPORT: [&str; 22] = [
+pub const REPORT: [&str; 23] = [
     "uptime_s",
     "uart_bytes_in",
     "uart_bytes_out",
@@ -144,6 +148,7 @@ pub const REPORT: [&str; 22] = [
     "drop_not_sent",
     "round_trip_us",
     "landings",
+    "stalled_clients",
 ];
 
 /// Counts what is missing in the sequence numbers of a few senders.

@@ -13,6 +13,10 @@ pub const CLIENTS: usize = 8;
 /// TCP connections at once, among them.
 pub const TCP_SLOTS: usize = 2;
 
+/// A connection that takes nothing for this long is ended: longer than Wi-Fi takes to come back, shorter
+/// than TCP takes to notice. [s]
+const STALLED_S: f64 = 5.0;
+
 /// Where a client is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Peer {
@@ -40,6 +44,8 @@ pub(crate) struct Client {
     pub pending: u32,
     /// When the oldest of them came.
     pub since: HostTime,
+    /// When it last took something, or had nothing to take.
+    pub taken_at: HostTime,
     /// One of them must not wait.
     pub hurry: bool,
     /// Packets sent.
@@ -60,6 +66,7 @@ impl Client {
             cursor,
             pending: 0,
             since: now,
+            taken_at: now,
             hurry: false,
             sent: 0,
             slow: 0,
@@ -85,6 +92,14 @@ impl Client {
         self.systems.iter().any(|&(system, component)| {
             system == target.0 && (target.1 == 0 || component == target.1)
         })
+    }
+
+    /// Whether it has taken nothing for too long of what waits for it. A datagram is gone once it is sent;
+    /// only a connection can refuse.
+    pub(crate) fn is_stalled(&self, now: HostTime) -> bool {
+        matches!(self.peer, Peer::Tcp(_))
+            && self.pending > 0
+            && now.seconds_since(self.taken_at) > STALLED_S
     }
 
     /// Whether it has been silent for too long.

@@ -9,7 +9,7 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::time::HostTime;
 
-use super::clients::bit;
+use super::clients::{Client, bit};
 use super::loss::{Flight, LossAction};
 use super::router::{PacketRouter, kind, millis};
 use crate::access::{self, Access};
@@ -39,19 +39,12 @@ pub(super) struct OutstandingRequests {
     syncs: heapless::Deque<(i64, HostTime), 4>,
     /// When a client last asked: then we need not.
     client_asked_at: Option<HostTime>,
-    /// The `ts1` of our own request.
-    ours: Option<i64>,
     pub(super) access: Access,
 }
 
 impl OutstandingRequests {
     pub(super) const fn new(random: [u8; 16]) -> Self {
-        Self {
-            syncs: heapless::Deque::new(),
-            client_asked_at: None,
-            ours: None,
-            access: Access::new(random),
-        }
+        Self { syncs: heapless::Deque::new(), client_asked_at: None, access: Access::new(random) }
     }
 
     fn note_sync(&mut self, now: HostTime, ts1: i64) {
@@ -93,14 +86,14 @@ impl PacketRouter {
 
     // ---- what passes by ----
 
-    /// Takes note of a packet from the autopilot; returns whether it is an answer to us alone.
-    pub(super) fn note_from_autopilot(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
+    /// Takes note of a packet from the autopilot.
+    pub(super) fn note_from_autopilot(&mut self, now: HostTime, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         match packet.id() {
             HEARTBEAT => {
                 let autopilot = field.byte(5);
                 if autopilot == MavAutopilot::MAV_AUTOPILOT_INVALID as u8 {
-                    return false;
+                    return;
                 }
                 self.autopilot = Some(packet.source());
                 self.autopilot_at = now;
@@ -110,7 +103,6 @@ impl PacketRouter {
                     px4: autopilot == MavAutopilot::MAV_AUTOPILOT_PX4 as u8,
                 };
                 self.heartbeat = heapless::Vec::from_slice(packet.bytes()).unwrap_or_default();
-                false
             }
             COMMAND_ACK => {
                 let ours = packet.target() == self.address();
@@ -118,7 +110,6 @@ impl PacketRouter {
                 if ours && land && field.byte(2) == MavResult::MAV_RESULT_ACCEPTED as u8 {
                     self.loss.note_acknowledged(now);
                 }
-                ours
             }
             TIMESYNC if field.i64(0) != 0 => {
                 let ts1 = field.i64(8);
@@ -127,9 +118,8 @@ impl PacketRouter {
                 {
                     self.stats.round_trip_us = (now.seconds_since(at) * 1e6) as u32;
                 }
-                self.outstanding.ours == Some(ts1)
             }
-            _ => false,
+            _ => {}
         }
     }
 
@@ -295,7 +285,6 @@ impl PacketRouter {
         if !asked_s.is_some_and(|asked_s| asked_s < SYNC_S) {
             let ts1 = now.as_ns().cast_signed().max(1);
             self.outstanding.note_sync(now, ts1);
-            self.outstanding.ours = Some(ts1);
             self.send_to_autopilot(
                 now,
                 &BridgeMessage::TIMESYNC(TIMESYNC_DATA { ts1, ..Default::default() }),
@@ -330,7 +319,15 @@ impl PacketRouter {
     }
 
     fn radio_status(&self) -> RADIO_STATUS_DATA {
-        let most = self.clients.iter().flatten().map(|client| client.pending).max().unwrap_or(0);
+        // The companion's, which the vehicle flies by; without one whoever is quickest: a client that
+        // does not take its packets must not slow the others down.
+        let companion = self.loss.companion();
+        let is_companion = |client: &&Client| companion.is_some_and(|source| client.holds(source));
+        let clients = || self.clients.iter().flatten();
+        let waiting = match clients().find(is_companion) {
+            Some(client) => client.pending,
+            None => clients().map(|client| client.pending).min().unwrap_or(0),
+        };
         // As SiK radios count: 1.9 steps per decibel above -127 dBm.
         let rssi = self
             .signal_dbm
@@ -340,8 +337,8 @@ impl PacketRouter {
             fixed: 0,
             rssi,
             remrssi: UNKNOWN,
-            // What the autopilot slows its streams by: the slowest client's room.
-            txbuf: 100 - (most * 100 / super::router::DOWN as u32).min(100) as u8,
+            // What the autopilot slows its streams by.
+            txbuf: 100 - (waiting * 100 / super::router::DOWN as u32).min(100) as u8,
             noise: UNKNOWN,
             remnoise: UNKNOWN,
         }
@@ -382,7 +379,7 @@ impl PacketRouter {
     fn send_to_clients(&mut self, now: HostTime, message: &BridgeMessage) {
         let mut packet = [0; MAX_PACKET];
         let len = write_message(&mut packet, self.address(), 0, message);
-        let everybody = self.listeners((0, 0), None);
+        let everybody = self.everybody();
         self.push_down(now, self.address(), kind(message.id()), everybody, true, &packet[..len]);
     }
 

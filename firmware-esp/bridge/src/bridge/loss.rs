@@ -78,6 +78,11 @@ impl LinkLoss {
     /// No companion yet; as the default, but `const`.
     pub(crate) const NONE: Self = Self { streamer: None, landing: None };
 
+    /// Returns who streams, if anybody does.
+    pub(crate) fn companion(&self) -> Option<(u8, u8)> {
+        self.streamer.filter(|streamer| streamer.counted >= STREAM).map(|streamer| streamer.source)
+    }
+
     /// Takes note of a packet from the network; `streams`: it is a setpoint or a pose.
     pub(crate) fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
         match &mut self.streamer {

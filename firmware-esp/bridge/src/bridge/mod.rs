@@ -39,16 +39,18 @@ pub struct Chip {
     pub random: [u8; 16],
 }
 
-/// Silence on the autopilot's port after which a batch goes out and an unfinished packet is given
-/// up waiting for. Autopilots write packets whole; a byte at 57600 baud takes 0.17 ms. [ns]
+/// Silence on the autopilot's port after which a batch goes out. Autopilots write packets whole; a
+/// byte at 57600 baud takes 0.17 ms. [ns]
 const IDLE_NS: i64 = 500_000;
-/// Silence after which a candidate's missing rest is not coming. [ns]
+/// Silence within a candidate after which it may be a false start, with whole packets behind. [ns]
 const STALL_NS: i64 = 50_000_000;
 
 /// The bridge. See the module.
 #[derive(Clone, Debug)]
 pub struct Bridge {
     uart: Cutter,
+    /// Behind the candidate that waits was looked already.
+    has_looked: bool,
     tcp: [Cutter; TCP_SLOTS],
     router: PacketRouter,
 }
@@ -66,6 +68,7 @@ impl Bridge {
     pub const fn empty() -> Self {
         Self {
             uart: Cutter::new(),
+            has_looked: false,
             tcp: [const { Cutter::new() }; TCP_SLOTS],
             router: PacketRouter::empty(),
         }
@@ -80,7 +83,8 @@ impl Bridge {
 
     /// Takes bytes from the autopilot's port, in any portions.
     pub fn handle_uart(&mut self, now: HostTime, bytes: &[u8]) {
-        let Self { uart, router, .. } = self;
+        let Self { uart, router, has_looked, .. } = self;
+        *has_looked &= bytes.is_empty();
         router.note_uart_bytes(now, bytes.len());
         uart.push(bytes, |packet| router.take_uart(now, packet));
         router.note_uart_cut(uart.stats(), uart.is_waiting());
@@ -109,6 +113,9 @@ impl Bridge {
 
     /// Takes bytes from a TCP connection.
     pub fn handle_stream(&mut self, now: HostTime, slot: u8, bytes: &[u8]) {
+        if !self.is_open(slot) {
+            return;
+        }
         let Self { tcp, router, .. } = self;
         let Some(cutter) = tcp.get_mut(usize::from(slot)) else { return };
         router.stats.net.bytes_in = router.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
@@ -116,6 +123,11 @@ impl Bridge {
         cutter.push(bytes, |packet| router.take_client(now, Peer::Tcp(slot), packet));
         router.note_stream_cut(before, cutter.stats());
         router.poll(now);
+    }
+
+    /// Whether a TCP connection is still served; one that takes nothing is not, and the shell ends it.
+    pub fn is_open(&self, slot: u8) -> bool {
+        self.router.place_of(Peer::Tcp(slot)).is_some()
     }
 
     /// The TCP connection of this slot has ended.
@@ -146,12 +158,13 @@ impl Bridge {
 
     /// Does what is due at `now`.
     pub fn handle_timeout(&mut self, now: HostTime) {
-        let Self { uart, router, .. } = self;
-        if uart.is_waiting() && now >= router.uart_at.plus_ns(STALL_NS) {
-            uart.flush(|packet| router.take_uart(now, packet));
+        if self.look_due().is_some_and(|due| due <= now) {
+            let Self { uart, router, has_looked, .. } = self;
+            *has_looked = true;
+            uart.look_behind(|packet| router.take_uart(now, packet));
             router.note_uart_cut(uart.stats(), false);
         }
-        router.poll(now);
+        self.router.poll(now);
     }
 
     // ---- what comes out ----
@@ -191,7 +204,13 @@ impl Bridge {
     /// Returns when [`Self::handle_timeout`] is due.
     pub fn poll_timeout(&self) -> HostTime {
         let due = self.router.due();
-        if self.uart.is_waiting() { due.min(self.router.uart_at.plus_ns(STALL_NS)) } else { due }
+        self.look_due().map_or(due, |look| due.min(look))
+    }
+
+    /// Returns when to look for packets behind the candidate that waits, if not done yet.
+    fn look_due(&self) -> Option<HostTime> {
+        let waits = self.uart.is_waiting() && !self.has_looked;
+        waits.then(|| self.router.uart_at.plus_ns(STALL_NS))
     }
 
     /// Returns the counters.

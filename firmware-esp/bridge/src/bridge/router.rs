@@ -151,16 +151,20 @@ impl PacketRouter {
     pub(super) fn take_uart(&mut self, now: HostTime, packet: Raw<'_>) {
         let lost = self.uart_sequences.note(packet.source(), packet.sequence());
         self.stats.uart.lost = self.stats.uart.lost.wrapping_add(lost);
-        if self.note_from_autopilot(now, packet) {
-            return;
-        }
-        let target = packet.target();
-        if self.is_ours(target) {
+        self.note_from_autopilot(now, packet);
+        if self.is_ours(packet.target()) {
             self.handle_own(now, None, packet);
-            return;
         }
-        let to = self.listeners(target, None);
-        self.push_down(now, packet.source(), kind(packet.id()), to, false, packet.bytes());
+        // To everybody, also what answers one of them or us: each counts the autopilot's numbers, and
+        // what is kept back is a loss to whoever does not get it.
+        self.push_down(
+            now,
+            packet.source(),
+            kind(packet.id()),
+            self.everybody(),
+            false,
+            packet.bytes(),
+        );
     }
 
     /// Puts a packet into the clients' ring.
@@ -187,6 +191,7 @@ impl PacketRouter {
             let Some(client) = client.as_mut().filter(|_| to & bit(index) != 0) else { continue };
             if client.pending == 0 {
                 client.since = now;
+                client.taken_at = now;
             }
             client.pending += bytes.len() as u32;
             client.hurry |= hurries_down(kind);
@@ -211,20 +216,10 @@ impl PacketRouter {
         self.down.pop();
     }
 
-    /// Returns the clients that a packet for `target` is for: those behind which the target
-    /// lives, or all if nobody knows it.
-    pub(super) fn listeners(&self, target: (u8, u8), except: Option<usize>) -> u8 {
-        let mut all = 0;
-        let mut holders = 0;
-        for (index, client) in self.clients.iter().enumerate() {
-            if let Some(client) = client.as_ref().filter(|_| Some(index) != except) {
-                all |= bit(index);
-                if target.0 != 0 && client.holds(target) {
-                    holders |= bit(index);
-                }
-            }
-        }
-        if holders == 0 { all } else { holders }
+    /// Returns every client's bit.
+    pub(super) fn everybody(&self) -> u8 {
+        let there = |(index, client): (usize, &Option<Client>)| client.as_ref().map(|_| bit(index));
+        self.clients.iter().enumerate().filter_map(there).fold(0, |all, one| all | one)
     }
 
     // ---- from the network ----
@@ -313,14 +308,19 @@ impl PacketRouter {
 
     /// Returns the place of a client, a new one if it is new and there is room.
     pub(super) fn open(&mut self, now: HostTime, peer: Peer) -> Option<usize> {
-        let known = |client: &Option<Client>| client.as_ref().is_some_and(|c| c.peer == peer);
-        if let Some(index) = self.clients.iter().position(known) {
+        if let Some(index) = self.place_of(peer) {
             return Some(index);
         }
         let free = self.clients.iter().position(Option::is_none);
         let index = free.or_else(|| self.replaceable(now))?;
         self.clients[index] = Some(Client::new(peer, false, now, self.down.head()));
         Some(index)
+    }
+
+    /// Returns the place of a client.
+    pub(super) fn place_of(&self, peer: Peer) -> Option<usize> {
+        let here = |client: &Option<Client>| client.as_ref().is_some_and(|c| c.peer == peer);
+        self.clients.iter().position(here)
     }
 
     /// Returns the place of the UDP client that is silent for longest, if that is long.
@@ -337,10 +337,8 @@ impl PacketRouter {
     }
 
     pub(super) fn close(&mut self, peer: Peer) {
-        for place in &mut self.clients {
-            if place.as_ref().is_some_and(|client| client.peer == peer) {
-                *place = None;
-            }
+        if let Some(index) = self.place_of(peer) {
+            self.clients[index] = None;
         }
     }
 
@@ -349,7 +347,11 @@ impl PacketRouter {
     /// Does what is due: silence of clients and autopilot, the seconds' messages, link loss.
     pub(super) fn poll(&mut self, now: HostTime) {
         for place in &mut self.clients {
-            if place.as_ref().is_some_and(|client| client.is_gone(now, &self.settings)) {
+            let Some(client) = place else { continue };
+            if client.is_stalled(now) {
+                self.stats.stalled = self.stats.stalled.wrapping_add(1);
+                *place = None;
+            } else if client.is_gone(now, &self.settings) {
                 *place = None;
             }
         }
@@ -453,10 +455,7 @@ impl PacketRouter {
     }
 
     pub(super) fn poll_tcp(&mut self, now: HostTime, slot: u8, out: &mut [u8]) -> usize {
-        let here = |client: &Option<Client>| {
-            client.as_ref().is_some_and(|client| client.peer == Peer::Tcp(slot))
-        };
-        self.clients.iter().position(here).map_or(0, |index| self.fill(now, index, out))
+        self.place_of(Peer::Tcp(slot)).map_or(0, |index| self.fill(now, index, out))
     }
 
     /// Writes what is due to a client into `out`, whole packets only; returns its length.
@@ -478,6 +477,7 @@ impl PacketRouter {
                     renumber(&mut out[used..used + len], client.sequence);
                 }
                 used += len;
+                client.taken_at = now;
                 client.pending -= len as u32;
                 client.sent = client.sent.wrapping_add(1);
                 self.stats.net.packets_out = self.stats.net.packets_out.wrapping_add(1);

@@ -304,6 +304,10 @@ impl Emulation {
         for (slot, place) in self.streams.iter_mut().enumerate() {
             let Some(connection) = place else { continue };
             let gone = loop {
+                if !self.bridge.is_open(slot as u8) {
+                    tracing::warn!("bridge: a tcp client that takes nothing is dropped");
+                    break true;
+                }
                 if connection.pending.is_empty() {
                     let mut batch = [0; 1472];
                     match self.bridge.poll_tcp(at, slot as u8, &mut batch) {
