@@ -155,20 +155,22 @@ impl Access {
     /// Whether a packet is signed by the key, MAVLink's way, and newer than the last that was
     /// (MAVLink guide, "Message Signing").
     pub(crate) fn signed_by(&mut self, key: Option<&Key>, packet: Raw<'_>) -> bool {
-        let Some(key) = key.filter(|_| packet.is_signed()) else { return false };
-        let bytes = packet.bytes();
-        let (signed, given) = bytes.split_at(bytes.len() - 6);
-        let right = Sha256::new().chain_update(key).chain_update(signed).finalize();
-        let mut stamp = [0; 8];
-        stamp[..6].copy_from_slice(&signed[signed.len() - 6..]);
-        let signed_at = u64::from_le_bytes(stamp);
-        // Why: six bytes are compared at once; how long that takes carries no information on a hash.
-        let fresh = right[..6] == *given && signed_at > self.signed_at;
+        let Some(key) = key else { return false };
+        let signed_at = packet.signed_at();
+        let fresh = signed_at > self.signed_at && is_signed_by(key, packet);
         if fresh {
             self.signed_at = signed_at;
         }
         fresh
     }
+}
+
+/// Whether a packet is signed by the key, MAVLink's way, whenever that was.
+pub(crate) fn is_signed_by(key: &Key, packet: Raw<'_>) -> bool {
+    let Some(signed) = packet.signed_bytes() else { return false };
+    let right = Sha256::new().chain_update(key).chain_update(signed).finalize();
+    // Why: six bytes are compared at once; how long that takes carries no information on a hash.
+    right[..6] == packet.bytes()[signed.len()..]
 }
 
 /// Returns the proof of a request by a key, for [`PROOF`] bytes behind it.

@@ -31,6 +31,20 @@ impl<'a> Raw<'a> {
         self.is_v2() && self.bytes[2] & SIGNED != 0
     }
 
+    /// Returns what a signature is made over: all bytes but the signature's own six.
+    pub(crate) fn signed_bytes(self) -> Option<&'a [u8]> {
+        self.is_signed().then(|| &self.bytes[..self.bytes.len() - 6])
+    }
+
+    /// Returns a signature's stamp; 0 without one. [10 us since 2015]
+    pub(crate) fn signed_at(self) -> u64 {
+        let mut stamp = [0; 8];
+        if let Some(signed) = self.signed_bytes() {
+            stamp[..6].copy_from_slice(&signed[signed.len() - 6..]);
+        }
+        u64::from_le_bytes(stamp)
+    }
+
     /// Returns the sender's packet counter.
     pub fn sequence(self) -> u8 {
         self.bytes[if self.is_v2() { 4 } else { 2 }]

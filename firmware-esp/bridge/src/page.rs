@@ -7,7 +7,7 @@ use core::fmt::{self, Write as _};
 use heapless::String;
 use vizflyt_protocol::time::HostTime;
 
-use crate::bridge::{Bridge, Peer};
+use crate::bridge::{Bridge, LandingStage, Peer};
 use crate::stats::REPORT;
 
 /// Bytes of a response at most.
@@ -76,6 +76,14 @@ fn page(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Resu
         Some((system, _)) if bridge.is_armed() => writeln!(out, "vehicle {system}, armed")?,
         Some((system, _)) => writeln!(out, "vehicle {system}, disarmed")?,
         None => writeln!(out, "no vehicle")?,
+    }
+    match bridge.landing() {
+        None => {}
+        Some(LandingStage::Asked) if bridge.is_unanswered(now) => {
+            writeln!(out, "the companion is silent; LAND is not acknowledged")?;
+        }
+        Some(LandingStage::Asked) => writeln!(out, "the companion is silent; asks for LAND")?,
+        Some(_) => writeln!(out, "the companion is silent; the vehicle lands")?,
     }
     if bridge.settings().key.is_none() {
         writeln!(out, "no key yet: vizflyt bridge configure --claim")?;

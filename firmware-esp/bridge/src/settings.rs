@@ -70,6 +70,8 @@ pub struct Settings {
     pub client: Option<SocketAddrV4>,
     /// The key; `None` until a bridge is claimed.
     pub key: Option<Key>,
+    /// The vehicle's key of MAVLink signing, for what we send to the autopilot.
+    pub vehicle_key: Option<Key>,
 }
 
 impl Default for Settings {
@@ -105,6 +107,7 @@ impl Settings {
             gateway: None,
             client: None,
             key: None,
+            vehicle_key: None,
         }
     }
 }
@@ -205,6 +208,7 @@ pub const TEXTS: &[(&str, bool)] = &[
     ("gateway", true),
     ("client", true),
     ("key", false),
+    ("vehicle.key", false),
 ];
 
 const fn number(
@@ -283,6 +287,10 @@ impl Settings {
                 self.key = maybe(value, key_from_hex)?;
                 Ok(())
             }
+            "vehicle.key" => {
+                self.vehicle_key = maybe(value, key_from_hex)?;
+                Ok(())
+            }
             _ => Err(Refused::Unknown),
         }
     }
@@ -294,8 +302,10 @@ impl Settings {
         for (name, value) in open {
             sink(name, value);
         }
-        if let Some(key) = self.key {
-            sink("key", &key_to_hex(&key));
+        for (name, key) in [("key", &self.key), ("vehicle.key", &self.vehicle_key)] {
+            if let Some(key) = key {
+                sink(name, &key_to_hex(key));
+            }
         }
         let readable = TEXTS.iter().filter(|(_, readable)| *readable).map(|(name, _)| *name);
         for name in readable.chain(NUMBERS.iter().map(|number| number.name)) {
@@ -339,6 +349,7 @@ impl Settings {
                 }
             }
             "key" => secret(&mut out, self.key.is_some()),
+            "vehicle.key" => secret(&mut out, self.vehicle_key.is_some()),
             _ => return None,
         }
         Some(out)

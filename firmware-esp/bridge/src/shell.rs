@@ -60,7 +60,7 @@ pub enum Light {
     NoClient = 3,
     /// Four blinks: no key yet; `vizflyt bridge configure` claims it.
     Unclaimed = 4,
-    /// Fast: the companion is silent and the bridge lands the vehicle.
+    /// Fast: the companion is silent and the bridge has asked for LAND.
     Landing = 10,
 }
 
@@ -461,7 +461,7 @@ const BEACON_PORT: u16 = 14550;
 
 /// Returns what the light shows.
 pub fn light(bridge: &Bridge, network: bool) -> Light {
-    if bridge.is_landing() {
+    if bridge.landing().is_some() {
         Light::Landing
     } else if !network {
         Light::NoNetwork

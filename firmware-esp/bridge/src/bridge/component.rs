@@ -95,6 +95,7 @@ impl PacketRouter {
                 if autopilot == MavAutopilot::MAV_AUTOPILOT_INVALID as u8 {
                     return;
                 }
+                self.signing.note_heartbeat(packet);
                 self.autopilot = Some(packet.source());
                 self.autopilot_at = now;
                 self.flight = Flight {
@@ -129,6 +130,9 @@ impl PacketRouter {
         if packet.id() == TIMESYNC && field.i64(0) == 0 {
             self.outstanding.note_sync(now, field.i64(8));
             self.outstanding.client_asked_at = Some(now);
+        }
+        if packet.id() == HEARTBEAT {
+            self.loss.note_heartbeat(packet.source(), field.bytes(0));
         }
     }
 
@@ -225,7 +229,7 @@ impl PacketRouter {
                 // The key stays: who resets the settings does not open the bridge to others.
                 let key = self.settings.key;
                 self.settings = Settings { key, ..Settings::default() };
-                self.fix_client(now);
+                self.apply_settings(now);
             }
             access::ShellRequest::Restart => {
                 let _ = self.events.push_back(Event::Restart);
@@ -255,7 +259,7 @@ impl PacketRouter {
 
     /// Once a second, and when the companion is silent.
     pub(super) fn poll_component(&mut self, now: HostTime) {
-        if let Some(act) = self.loss.poll(now, self.flight, self.settings.loss_ms) {
+        while let Some(act) = self.loss.poll(now, self.flight, self.settings.loss_ms) {
             self.act(now, act);
         }
         if now < self.second_at {
@@ -292,23 +296,44 @@ impl PacketRouter {
         }
     }
 
-    fn act(&mut self, now: HostTime, LossAction::Land { confirmation }: LossAction) {
+    fn act(&mut self, now: HostTime, act: LossAction) {
         let Some(target) = self.autopilot else { return };
-        if confirmation == 0 {
-            self.stats.landings = self.stats.landings.wrapping_add(1);
-            let text = "bridge: the companion is silent: landing";
-            self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
+        match act {
+            LossAction::Land { confirmation } => {
+                if confirmation == 0 {
+                    self.stats.landings = self.stats.landings.wrapping_add(1);
+                    let text = "bridge: the companion is silent: asks for LAND";
+                    self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
+                }
+                let land = COMMAND_LONG_DATA {
+                    command: MavCmd::MAV_CMD_NAV_LAND,
+                    target_system: target.0,
+                    target_component: target.1,
+                    confirmation,
+                    ..Default::default()
+                };
+                self.send_to_autopilot(now, &BridgeMessage::COMMAND_LONG(land));
+            }
+            LossAction::AnnounceLanding => {
+                let text = "bridge: landing";
+                self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
+            }
+            LossAction::ReportSilence => {
+                let unsigned = self.signing.is_required() && self.settings.vehicle_key.is_none();
+                let text = if unsigned {
+                    "bridge: LAND not acknowledged: vehicle.key missing"
+                } else {
+                    "bridge: LAND is not acknowledged"
+                };
+                self.send_status_text(now, MavSeverity::MAV_SEVERITY_EMERGENCY, text);
+            }
+            LossAction::Beat(system, beat) => {
+                let mut packet = [0; MAX_PACKET];
+                let source = (system, COMPONENT_ID);
+                let len = write_packet(&mut packet, source, 0, HEARTBEAT, &beat);
+                self.deliver(now, None, HEARTBEAT, &packet[..len]);
+            }
         }
-        self.send_to_autopilot(
-            now,
-            &BridgeMessage::COMMAND_LONG(COMMAND_LONG_DATA {
-                command: MavCmd::MAV_CMD_NAV_LAND,
-                target_system: target.0,
-                target_component: target.1,
-                confirmation,
-                ..Default::default()
-            }),
-        );
     }
 
     pub(super) fn note_saved(&mut self, now: HostTime, saved: bool) {

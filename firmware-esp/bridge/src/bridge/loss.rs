@@ -5,6 +5,15 @@
 //! (GUIDED, or PX4's OFFBOARD), silence of the companion for the set time means LAND: repeated
 //! until the autopilot has left that mode. A companion that comes back meanwhile changes nothing:
 //! a vehicle that changes its mind halfway is harder to foresee than one that lands.
+//!
+//! ```text
+//! silent ─▶ asked ── acknowledged ─▶ accepted ── heartbeat in LAND ─▶ descending ── disarmed, or a
+//!             └─ not for a second: reported ─┘                          │           pilot's mode ─▶ over
+//!                                                        the companion's heartbeat, in its place
+//! ```
+//! While it descends the companion's heartbeat goes on: ArduCopter's own failsafe, some seconds late,
+//! would begin the landing anew, with its pause. Not before: should LAND go unheard, that failsafe is
+//! what lands the vehicle.
 
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::time::HostTime;
@@ -27,10 +36,18 @@ impl Flight {
         let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
         self.armed && self.mode == mode
     }
+
+    /// Whether the vehicle lands by itself.
+    pub(crate) fn lands(self) -> bool {
+        let mode = if self.px4 { PX4_LAND } else { CopterMode::Land as u32 };
+        self.armed && self.mode == mode
+    }
 }
 
 /// PX4's main mode 6 in `custom_mode`.
 const PX4_OFFBOARD: u32 = 6 << 16;
+/// PX4's main mode 4, sub-mode 6.
+const PX4_LAND: u32 = 4 << 16 | 6 << 24;
 /// Packets that make a stream, within [`STREAM_S`].
 const STREAM: u8 = 10;
 const STREAM_S: f64 = 2.0;
@@ -41,6 +58,18 @@ const ENDED_S: f64 = 5.0;
 const REPEAT_S: f64 = 0.3;
 /// And this often from then on, until the mode has changed: heartbeats come once a second. [s]
 const REPEAT_ACKNOWLEDGED_S: f64 = 1.5;
+
+/// What nothing has acknowledged for this long is reported; a second's heartbeat may tell it too. [s]
+const UNANSWERED_S: f64 = 1.1;
+/// And this often from then on. [s]
+const REPORT_S: f64 = 5.0;
+/// The companion's heartbeat is sent in its place this often, as it did itself. [s]
+const BEAT_S: f64 = 1.0;
+/// And for no longer than this: a landing from the height of a hall takes a quarter of it. [s]
+const LONGEST_S: f64 = 120.0;
+
+/// Payload of a HEARTBEAT.
+pub(crate) type Beat = [u8; 9];
 
 /// The companion and its silence.
 #[derive(Clone, Copy, Debug, Default)]
@@ -55,13 +84,32 @@ struct Streamer {
     received_at: HostTime,
     counted: u8,
     counting_since: HostTime,
+    /// Its newest heartbeat.
+    beat: Option<Beat>,
+}
+
+/// How far a landing is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LandingStage {
+    /// The autopilot was asked, and has not answered.
+    Asked,
+    /// It has accepted.
+    Accepted,
+    /// Its heartbeat is in LAND.
+    Descending,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Landing {
-    repeat_at: HostTime,
+    stage: LandingStage,
+    asked_at: HostTime,
+    /// The next LAND; descending, the next heartbeat.
+    act_at: HostTime,
+    /// The next report that nothing has answered.
+    report_at: HostTime,
     confirmation: u8,
-    acknowledged: bool,
+    /// It was said that the vehicle lands.
+    is_announced: bool,
 }
 
 /// What is to be done.
@@ -72,6 +120,12 @@ pub(crate) enum LossAction {
         /// MAVLink's count of repetitions.
         confirmation: u8,
     },
+    /// Say that the autopilot lands.
+    AnnounceLanding,
+    /// Say that nothing has acknowledged LAND.
+    ReportSilence,
+    /// Send the companion's heartbeat, of its system.
+    Beat(u8, Beat),
 }
 
 impl LinkLoss {
@@ -101,63 +155,130 @@ impl LinkLoss {
                 if streamer.counted >= STREAM
                     && now.seconds_since(streamer.received_at) < STREAM_S => {}
             _ if streams => {
-                self.streamer =
-                    Some(Streamer { source, received_at: now, counted: 1, counting_since: now });
+                self.streamer = Some(Streamer {
+                    source,
+                    received_at: now,
+                    counted: 1,
+                    counting_since: now,
+                    beat: None,
+                });
             }
             _ => {}
         }
     }
 
-    /// Takes note of the autopilot's answer to LAND.
-    pub(crate) fn note_acknowledged(&mut self, now: HostTime) {
-        if let Some(landing) = &mut self.landing {
-            landing.acknowledged = true;
-            landing.repeat_at = now.plus_seconds(REPEAT_ACKNOWLEDGED_S);
+    /// Takes note of a heartbeat from the network.
+    pub(crate) fn note_heartbeat(&mut self, source: (u8, u8), beat: Beat) {
+        if let Some(streamer) = self.streamer.as_mut().filter(|known| known.source.0 == source.0) {
+            streamer.beat = Some(beat);
         }
     }
 
-    /// Whether it is landing the vehicle now.
-    pub(crate) fn is_landing(&self) -> bool {
-        self.landing.is_some()
+    /// Takes note of the autopilot's answer to LAND.
+    pub(crate) fn note_acknowledged(&mut self, now: HostTime) {
+        if let Some(landing) = &mut self.landing
+            && landing.stage == LandingStage::Asked
+        {
+            landing.stage = LandingStage::Accepted;
+            landing.act_at = now.plus_seconds(REPEAT_ACKNOWLEDGED_S);
+        }
+    }
+
+    /// Returns how far its landing of the vehicle is, if it lands it.
+    pub(crate) fn stage(&self) -> Option<LandingStage> {
+        self.landing.map(|landing| landing.stage)
+    }
+
+    /// Whether nothing has acknowledged LAND for too long.
+    pub(crate) fn is_unanswered(&self, now: HostTime) -> bool {
+        self.landing.is_some_and(|landing| {
+            landing.stage == LandingStage::Asked
+                && now.seconds_since(landing.asked_at) >= UNANSWERED_S
+        })
     }
 
     /// Returns when [`Self::poll`] has something to do, if `flight` stays.
     pub(crate) fn due(&self, flight: Flight, loss_ms: u16) -> Option<HostTime> {
         if let Some(landing) = self.landing {
-            return Some(landing.repeat_at);
+            return Some(match landing.stage {
+                LandingStage::Asked => landing.act_at.min(landing.report_at),
+                LandingStage::Accepted | LandingStage::Descending => landing.act_at,
+            });
         }
         let streamer = self.streamer.filter(|streamer| streamer.counted >= STREAM)?;
         (flight.follows() && loss_ms > 0)
             .then(|| streamer.received_at.plus_ns(i64::from(loss_ms) * 1_000_000))
     }
 
-    /// Returns what is to be done at `now`.
+    /// Returns what is to be done at `now`; called until nothing is.
     pub(crate) fn poll(
         &mut self,
         now: HostTime,
         flight: Flight,
         loss_ms: u16,
     ) -> Option<LossAction> {
-        if self.landing.is_some() && !flight.follows() {
-            self.landing = None;
-            // Its stream must be seen again before it is followed.
-            self.streamer = None;
-        }
-        // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
-        // later without one is not landed for its silence.
         let ended = |streamer: &Streamer| now.seconds_since(streamer.received_at) > ENDED_S;
-        if !flight.follows() && self.streamer.as_ref().is_some_and(ended) {
-            self.streamer = None;
+        match &mut self.landing {
+            Some(_) if !flight.follows() && !flight.lands() => {
+                self.landing = None;
+                // Its stream must be seen again before it is followed.
+                self.streamer = None;
+            }
+            Some(landing) => {
+                if flight.lands() && landing.stage != LandingStage::Descending {
+                    landing.stage = LandingStage::Descending;
+                    landing.act_at = now;
+                }
+                if landing.stage != LandingStage::Asked && !landing.is_announced {
+                    landing.is_announced = true;
+                    return Some(LossAction::AnnounceLanding);
+                }
+            }
+            // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
+            // later without one is not landed for its silence.
+            None if !flight.follows() && self.streamer.as_ref().is_some_and(ended) => {
+                self.streamer = None;
+            }
+            None => {}
         }
         if self.due(flight, loss_ms)? > now {
             return None;
         }
-        let confirmation = self.landing.map_or(0, |landing| landing.confirmation.saturating_add(1));
-        let acknowledged = self.landing.is_some_and(|landing| landing.acknowledged);
-        let repeat_s = if acknowledged { REPEAT_ACKNOWLEDGED_S } else { REPEAT_S };
-        let repeat_at = now.plus_seconds(repeat_s);
-        self.landing = Some(Landing { repeat_at, confirmation, acknowledged });
-        Some(LossAction::Land { confirmation })
+        let Some(landing) = &mut self.landing else {
+            self.landing = Some(Landing {
+                stage: LandingStage::Asked,
+                asked_at: now,
+                act_at: now.plus_seconds(REPEAT_S),
+                report_at: now.plus_seconds(UNANSWERED_S),
+                confirmation: 0,
+                is_announced: false,
+            });
+            return Some(LossAction::Land { confirmation: 0 });
+        };
+        match landing.stage {
+            LandingStage::Asked if landing.report_at <= now => {
+                landing.report_at = now.plus_seconds(REPORT_S);
+                Some(LossAction::ReportSilence)
+            }
+            LandingStage::Asked | LandingStage::Accepted => {
+                let accepted = landing.stage == LandingStage::Accepted;
+                let repeat_s = if accepted { REPEAT_ACKNOWLEDGED_S } else { REPEAT_S };
+                landing.act_at = now.plus_seconds(repeat_s);
+                landing.confirmation = landing.confirmation.saturating_add(1);
+                Some(LossAction::Land { confirmation: landing.confirmation })
+            }
+            LandingStage::Descending => {
+                landing.act_at = now.plus_seconds(BEAT_S);
+                let takes_too_long = now.seconds_since(landing.asked_at) > LONGEST_S;
+                // One that is back beats itself.
+                let silent = |streamer: &Streamer| {
+                    let silent_ms = now.seconds_since(streamer.received_at) * 1e3;
+                    silent_ms >= f64::from(loss_ms)
+                };
+                let streamer = self.streamer.filter(|known| !takes_too_long && silent(known))?;
+                Some(LossAction::Beat(streamer.source.0, streamer.beat?))
+            }
+        }
     }
 }
 
@@ -189,9 +310,10 @@ mod tests {
             if ms <= 1000 && ms % period_ms == 0 {
                 loss.note_packet(at(ms), RUNTIME, true);
             }
-            if let Some(LossAction::Land { confirmation }) = loss.poll(at(ms), flight(ms), loss_ms)
-            {
-                sent.push((ms, confirmation));
+            while let Some(act) = loss.poll(at(ms), flight(ms), loss_ms) {
+                if let LossAction::Land { confirmation } = act {
+                    sent.push((ms, confirmation));
+                }
             }
         }
         sent
@@ -246,11 +368,14 @@ mod tests {
         }
         assert_eq!(loss.poll(at(1500), GUIDED, 1000), Some(LossAction::Land { confirmation: 0 }));
         loss.note_acknowledged(at(1510));
+        assert_eq!(loss.poll(at(1510), GUIDED, 1000), Some(LossAction::AnnounceLanding));
         assert_eq!(loss.due(GUIDED, 1000), Some(at(3010)));
         // It comes back: the landing goes on.
         loss.note_packet(at(1600), RUNTIME, true);
         assert_eq!(loss.poll(at(3010), GUIDED, 1000), Some(LossAction::Land { confirmation: 1 }));
         assert_eq!(loss.poll(at(3100), Flight { mode: 9, ..GUIDED }, 1000), None);
-        assert!(!loss.is_landing());
+        assert_eq!(loss.stage(), Some(LandingStage::Descending));
+        assert_eq!(loss.poll(at(9000), Flight { armed: false, mode: 9, ..GUIDED }, 1000), None);
+        assert_eq!(loss.stage(), None);
     }
 }

@@ -16,6 +16,7 @@ mod requests;
 mod router;
 #[cfg(test)]
 mod tests;
+mod vehicle_signing;
 
 use core::net::SocketAddrV4;
 
@@ -24,6 +25,7 @@ use vizflyt_protocol::time::HostTime;
 
 pub use clients::{CLIENTS, Peer, TCP_SLOTS};
 pub use component::{COMPONENT_ID, Event};
+pub use loss::LandingStage;
 use router::PacketRouter;
 
 use crate::packet::{Cutter, each_in_datagram};
@@ -243,9 +245,19 @@ impl Bridge {
         self.router.flight.armed
     }
 
-    /// Whether it is landing the vehicle because the companion is silent.
+    /// Returns how far its landing of the vehicle is, because the companion is silent.
+    pub fn landing(&self) -> Option<LandingStage> {
+        self.router.loss.stage()
+    }
+
+    /// Whether the autopilot has said that it lands because the bridge asked.
     pub fn is_landing(&self) -> bool {
-        self.router.loss.is_landing()
+        self.landing().is_some_and(|stage| stage != LandingStage::Asked)
+    }
+
+    /// Whether nothing has acknowledged LAND for a second.
+    pub fn is_unanswered(&self, now: HostTime) -> bool {
+        self.router.loss.is_unanswered(now)
     }
 
     /// Returns each client: where, packets sent to it, packets it was too slow for.

@@ -63,7 +63,7 @@ impl PacketRouter {
                     Some((name, value)) => status_of(self.settings.set(name, value)),
                     None => Status::Malformed,
                 };
-                self.fix_client(now);
+                self.apply_settings(now);
                 (status, 0)
             }
             Op::Save => {

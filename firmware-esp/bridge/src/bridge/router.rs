@@ -9,6 +9,7 @@ use vizflyt_protocol::time::HostTime;
 use super::clients::{CLIENTS, Client, Peer, bit};
 use super::component::{Event, SECOND_S};
 use super::loss::{Flight, LinkLoss};
+use super::vehicle_signing::VehicleSigning;
 use super::{Chip, IDLE_NS};
 use crate::mavlink_writer::renumber;
 use crate::packet::{CutStats, Raw};
@@ -53,6 +54,7 @@ pub(super) struct PacketRouter {
     /// Its newest heartbeat, as it came: what the beacon repeats.
     pub(super) heartbeat: heapless::Vec<u8, 48>,
     pub(super) loss: LinkLoss,
+    pub(super) signing: VehicleSigning,
     pub(super) events: Deque<Event, 4>,
     pub(super) started_at: HostTime,
     pub(super) second_at: HostTime,
@@ -84,6 +86,7 @@ impl PacketRouter {
             flight: Flight::UNKNOWN,
             heartbeat: heapless::Vec::new(),
             loss: LinkLoss::NONE,
+            signing: VehicleSigning::new(),
             events: Deque::new(),
             started_at: HostTime::ZERO,
             second_at: HostTime::ZERO,
@@ -105,11 +108,13 @@ impl PacketRouter {
         self.autopilot_at = now;
         self.started_at = now;
         self.second_at = now.plus_seconds(SECOND_S);
-        self.fix_client(now);
+        self.apply_settings(now);
     }
 
-    /// Gives the client of the settings its place.
-    pub(super) fn fix_client(&mut self, now: HostTime) {
+    /// Does what settings ask that count at once: a place for the client of the settings, the
+    /// vehicle's key.
+    pub(super) fn apply_settings(&mut self, now: HostTime) {
+        self.signing.set_key(self.settings.vehicle_key.as_ref());
         for place in &mut self.clients {
             if place.as_ref().is_some_and(|client| client.fixed) {
                 *place = None;
@@ -152,6 +157,7 @@ impl PacketRouter {
         let lost = self.uart_sequences.note(packet.source(), packet.sequence());
         self.stats.uart.lost = self.stats.uart.lost.wrapping_add(lost);
         self.note_from_autopilot(now, packet);
+        self.signing.note(now, packet, self.settings.vehicle_key.as_ref());
         if self.is_ours(packet.target()) {
             self.handle_own(now, None, packet);
         }
@@ -249,6 +255,7 @@ impl PacketRouter {
             return;
         }
         self.loss.note_packet(now, packet.source(), streams(kind(packet.id())));
+        self.signing.note(now, packet, self.settings.vehicle_key.as_ref());
         self.note_to_autopilot(now, packet);
         let tag = Tag {
             kind: kind(packet.id()),
@@ -395,10 +402,11 @@ impl PacketRouter {
     pub(super) fn poll_uart(&mut self, now: HostTime, out: &mut [u8; MAX_PACKET]) -> usize {
         self.drop_stale(now);
         let len = take(&mut self.urgent, out).or_else(|| take(&mut self.normal, out));
-        let Some((tag, len)) = len else { return 0 };
+        let Some((tag, mut len)) = len else { return 0 };
         if tag.ours {
             self.uart_sequence = self.uart_sequence.wrapping_add(1);
             renumber(&mut out[..len], self.uart_sequence);
+            len = self.signing.sign(now, out, len);
         }
         self.stats.uart.bytes_out = self.stats.uart.bytes_out.wrapping_add(len as u32);
         self.stats.uart.packets_out = self.stats.uart.packets_out.wrapping_add(1);
@@ -468,15 +476,23 @@ impl PacketRouter {
         let mut used = 0;
         while let Some((tag, len, next)) = self.down.peek(client.cursor) {
             if tag.to & bit(index) != 0 {
-                if used + len > most {
+                let signature = if tag.ours { self.signing.added_bytes(now) } else { 0 };
+                if used + len + signature > most {
                     break;
                 }
                 self.down.copy(client.cursor, &mut out[used..used + len]);
+                let mut sent = len;
                 if tag.ours {
                     client.sequence = client.sequence.wrapping_add(1);
                     renumber(&mut out[used..used + len], client.sequence);
+                    if signature > 0 {
+                        let mut packet = [0; MAX_PACKET];
+                        packet[..len].copy_from_slice(&out[used..used + len]);
+                        sent = self.signing.sign(now, &mut packet, len);
+                        out[used..used + sent].copy_from_slice(&packet[..sent]);
+                    }
                 }
-                used += len;
+                used += sent;
                 client.taken_at = now;
                 client.pending -= len as u32;
                 client.sent = client.sent.wrapping_add(1);

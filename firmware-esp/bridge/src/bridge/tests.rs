@@ -370,6 +370,9 @@ fn the_companions_silence_lands_the_vehicle_and_is_reported() {
     assert!(reported);
     bridge.handle_uart(at(2700), &bytes(0, AUTOPILOT, &heartbeat(true, 9)));
     bridge.handle_timeout(at(2701));
+    assert!(bridge.is_landing(), "until it stands");
+    bridge.handle_uart(at(9000), &bytes(0, AUTOPILOT, &heartbeat(false, 9)));
+    bridge.handle_timeout(at(9001));
     assert!(!bridge.is_landing());
     assert_eq!(bridge.stats().landings, 1);
 }
@@ -414,6 +417,7 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
 }
 
 mod configuration;
+mod landing;
 mod stations;
 
 proptest! {
