@@ -14,7 +14,7 @@ use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_net::{IpAddress, IpEndpoint, Stack};
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
-use embassy_time::{Duration, Instant, Timer};
+use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_io_async::{Read, Write};
 use embedded_storage::nor_flash::NorFlash;
 use vizflyt_protocol::mavlink::MAX_PACKET;
@@ -22,6 +22,7 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::bridge::{Bridge, Event, TCP_SLOTS};
 use crate::page;
+use crate::stats::RestartCause;
 use crate::storage::Store;
 
 /// What only the chip can do.
@@ -34,6 +35,20 @@ pub trait Platform {
 
     /// Returns how well the radio receives its peer; `None` where it does not know. [dBm]
     fn signal_dbm(&mut self) -> Option<i8>;
+
+    /// Returns how often the serial port's own buffer has run over since the start.
+    fn overruns(&mut self) -> u32 {
+        0
+    }
+
+    /// Returns why the chip has started.
+    fn restart_cause(&mut self) -> RestartCause {
+        RestartCause::Unknown
+    }
+
+    /// Forwarding has come round once more: the watchdog, if there is one, has no reason to bite. Called
+    /// each second at least by the task that carries the bytes, and by none else.
+    fn feed(&mut self) {}
 
     /// Takes the next bytes of a new firmware, of which `first` are the beginning; returns true with
     /// the last: it is verified, and the next start is its own; `update` does both.
@@ -70,6 +85,7 @@ pub struct Shared {
     bridge: RefCell<Bridge>,
     uart: Wake,
     udp: Wake,
+    silent: Wake,
     tcp: [Wake; TCP_SLOTS],
     timer: Wake,
 }
@@ -83,6 +99,7 @@ impl Shared {
             bridge: RefCell::new(bridge),
             uart: Wake::new(),
             udp: Wake::new(),
+            silent: Wake::new(),
             tcp: [const { Wake::new() }; TCP_SLOTS],
             timer: Wake::new(),
         }
@@ -91,7 +108,8 @@ impl Shared {
     /// Gives the bridge something; wakes whoever may have something to do now.
     pub fn with<T>(&self, f: impl FnOnce(&mut Bridge, HostTime) -> T) -> T {
         let result = f(&mut self.bridge.borrow_mut(), now());
-        for wake in [&self.uart, &self.udp, &self.timer].into_iter().chain(&self.tcp) {
+        for wake in [&self.uart, &self.udp, &self.silent, &self.timer].into_iter().chain(&self.tcp)
+        {
             wake.signal(());
         }
         result
@@ -112,9 +130,23 @@ pub struct Buffers {
     udp_out: [u8; 1472],
     datagram_in: [u8; 1472],
     datagram_out: [u8; 1400],
+    silent: SilentBuffers,
     tcp: [TcpBuffers; TCP_SLOTS],
     page: PageBuffers,
 }
+
+/// Memory of the socket for those who do not speak: smaller datagrams, one at a time.
+#[derive(Debug)]
+struct SilentBuffers {
+    in_meta: [PacketMetadata; 1],
+    in_bytes: [u8; 1],
+    out_meta: [PacketMetadata; 1],
+    out_bytes: [u8; SILENT],
+    datagram: [u8; SILENT],
+}
+
+/// The longest packet fits. [bytes]
+const SILENT: usize = 300;
 
 #[derive(Debug)]
 struct PageBuffers {
@@ -146,6 +178,13 @@ impl Buffers {
             udp_out: [0; 1472],
             datagram_in: [0; 1472],
             datagram_out: [0; 1400],
+            silent: SilentBuffers {
+                in_meta: [PacketMetadata::EMPTY],
+                in_bytes: [0],
+                out_meta: [PacketMetadata::EMPTY],
+                out_bytes: [0; SILENT],
+                datagram: [0; SILENT],
+            },
             tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
                 TCP_SLOTS],
             page: PageBuffers { receive: [0; 536], transmit: [0; 536], request: [0; 256] },
@@ -153,9 +192,9 @@ impl Buffers {
     }
 }
 
-/// Sockets of a bridge, for a stack's `StackResources`: UDP, TCP, the page, and what the stack needs
-/// itself (DHCP).
-pub const SOCKETS: usize = 3 + TCP_SLOTS;
+/// Sockets of a bridge, for a stack's `StackResources`: UDP to those who speak and to the others, TCP,
+/// the page, and what the stack needs itself (DHCP).
+pub const SOCKETS: usize = 4 + TCP_SLOTS;
 
 /// What a bridge of ours may take of a chip's RAM: state and buffers. [bytes]
 pub const RAM_BUDGET: usize = 30 * 1024;
@@ -233,42 +272,83 @@ async fn serve<P: Platform>(
         udp_out,
         datagram_in,
         datagram_out,
+        silent,
         tcp,
         page,
     } = buffers;
+    let SilentBuffers { in_meta, in_bytes, out_meta, out_bytes, datagram } = silent;
     let mut socket = UdpSocket::new(stack, udp_in_meta, udp_in, udp_out_meta, udp_out);
-    // The port is not 0 and the socket is new: nothing else is refused.
-    let _ = socket.bind(udp_port);
-    let receive = async {
+    // What comes in goes to the first socket of the port.
+    let mut to_silent = UdpSocket::new(stack, in_meta, in_bytes, out_meta, out_bytes);
+    let to_speaking = async {
         loop {
-            let Ok((len, meta)) = socket.recv_from(datagram_in).await else { continue };
-            let IpAddress::Ipv4(address) = meta.endpoint.addr;
-            let from = SocketAddrV4::new(address, meta.endpoint.port);
-            shared.with(|bridge, now| bridge.handle_datagram(now, from, &datagram_in[..len]));
+            // The port is not 0 and the socket is closed: nothing else is refused.
+            let _ = socket.bind(udp_port);
+            let receive = receive_udp(shared, &socket, datagram_in);
+            let send = async {
+                loop {
+                    let next =
+                        shared.take(|bridge, now| bridge.poll_udp_speaking(now, datagram_out));
+                    let Some((to, len)) = next else {
+                        let due = shared.take(|bridge, now| bridge.speaking_due(now));
+                        wait(&shared.udp, due).await;
+                        continue;
+                    };
+                    let sent = socket.send_to(&datagram_out[..len], endpoint(to));
+                    match with_timeout(STUCK, sent).await {
+                        Ok(Ok(())) => {}
+                        Ok(Err(_)) => shared.take(|bridge, _| bridge.note_not_sent()),
+                        Err(_) => return,
+                    }
+                }
+            };
+            select(receive, send).await;
+            // Who is first in the queue has gone, and its address cannot be had any more: closing
+            // empties the queue.
+            shared.take(|bridge, _| bridge.note_not_sent());
+            socket.close();
         }
     };
-    let send = async {
+    let _ = to_silent.bind(udp_port);
+    let send_silent = async {
         loop {
-            let next = shared.take(|bridge, now| bridge.poll_udp(now, datagram_out));
+            let next = shared.take(|bridge, now| bridge.poll_udp_silent(now, datagram));
             let Some((to, len)) = next else {
-                wait(&shared.udp, shared.take(|bridge, _| bridge.udp_due())).await;
+                wait(&shared.silent, shared.take(|bridge, now| bridge.silent_due(now))).await;
                 continue;
             };
-            let to = IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port());
-            if socket.send_to(&datagram_out[..len], to).await.is_err() {
+            if to_silent.send_to(&datagram[..len], endpoint(to)).await.is_err() {
                 shared.take(|bridge, _| bridge.note_not_sent());
             }
         }
     };
     let [first, second] = tcp;
     join5(
-        receive,
-        send,
+        to_speaking,
+        send_silent,
         connection(shared, stack, tcp_port, 0, first),
         connection(shared, stack, tcp_port, 1, second),
         show_page(shared, stack, platform, page),
     )
     .await;
+}
+
+/// A network stack keeps what it cannot send, and everything behind it: a datagram for whoever has
+/// gone waits for an address for ever. One that is still there answers at once.
+const STUCK: Duration = Duration::from_secs(1);
+
+/// Hands datagrams to the bridge, for ever.
+async fn receive_udp(shared: &Shared, socket: &UdpSocket<'_>, bytes: &mut [u8]) {
+    loop {
+        let Ok((len, meta)) = socket.recv_from(bytes).await else { continue };
+        let IpAddress::Ipv4(address) = meta.endpoint.addr;
+        let from = SocketAddrV4::new(address, meta.endpoint.port);
+        shared.with(|bridge, now| bridge.handle_datagram(now, from, &bytes[..len]));
+    }
+}
+
+fn endpoint(to: SocketAddrV4) -> IpEndpoint {
+    IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port())
 }
 
 /// Serves one TCP client after another.
@@ -416,7 +496,11 @@ async fn mind<F: NorFlash, P: Platform>(
     let mut shown = None;
     let mut signal = platform.borrow_mut().signal_dbm();
     let mut asked_at = Instant::now();
+    let cause = platform.borrow_mut().restart_cause();
+    shared.take(|bridge, _| bridge.set_restart_cause(cause));
     loop {
+        platform.borrow_mut().feed();
+        let overruns = platform.borrow_mut().overruns();
         // Asking the radio is slow on some chips; this loop turns with every packet.
         if asked_at.elapsed() > Duration::from_secs(1) {
             signal = platform.borrow_mut().signal_dbm();
@@ -429,11 +513,13 @@ async fn mind<F: NorFlash, P: Platform>(
         let (event, light, due) = shared.take(|bridge, now| {
             bridge.set_network(broadcast);
             bridge.set_signal(signal);
+            bridge.set_overruns(overruns);
             bridge.handle_timeout(now);
             (bridge.poll_event(), light(bridge, broadcast.is_some()), bridge.poll_timeout())
         });
         shared.uart.signal(());
         shared.udp.signal(());
+        shared.silent.signal(());
         if shown != Some(light) {
             platform.borrow_mut().show(light);
             shown = Some(light);

@@ -62,6 +62,41 @@ pub struct Stats {
     pub refused: u32,
     /// Connections ended because they took nothing for too long.
     pub stalled: u32,
+    /// Times the port's own buffer ran over: bytes were lost before anybody saw them.
+    pub overruns: u32,
+    /// Why the chip last started.
+    pub restart_cause: RestartCause,
+}
+
+/// Why a chip started.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u8)]
+pub enum RestartCause {
+    /// It does not say.
+    #[default]
+    Unknown = 0,
+    /// Power came on.
+    Power = 1,
+    /// Somebody asked for it.
+    Asked = 2,
+    /// The program found itself wrong.
+    Panic = 3,
+    /// The program hung.
+    Watchdog = 4,
+    /// The voltage fell.
+    Brownout = 5,
+}
+
+impl RestartCause {
+    /// Returns what to tell of it, if it is worth telling: at most 50 characters.
+    pub fn message(self) -> Option<&'static str> {
+        match self {
+            Self::Unknown | Self::Power | Self::Asked => None,
+            Self::Panic => Some("bridge: has restarted after a panic"),
+            Self::Watchdog => Some("bridge: has restarted, its watchdog found it hung"),
+            Self::Brownout => Some("bridge: has restarted, its voltage fell"),
+        }
+    }
 }
 
 impl Side {
@@ -79,6 +114,8 @@ impl Stats {
         landings: 0,
         refused: 0,
         stalled: 0,
+        overruns: 0,
+        restart_cause: RestartCause::Unknown,
     };
 
     /// Counts packets dropped for `reason`.
@@ -115,6 +152,8 @@ impl Stats {
             self.round_trip_us,
             self.landings,
             self.stalled,
+            self.overruns,
+            self.restart_cause as u32,
         ]
     }
 
@@ -125,7 +164,7 @@ impl Stats {
 }
 
 /// Names of the counters, as `vizflyt bridge stats`, the page and the wire have them.
-pub const REPORT: [&str; 23] = [
+pub const REPORT: [&str; 25] = [
     "uptime_s",
     "uart_bytes_in",
     "uart_bytes_out",
@@ -149,6 +188,8 @@ pub const REPORT: [&str; 23] = [
     "round_trip_us",
     "landings",
     "stalled_clients",
+    "uart_overruns",
+    "restart_cause",
 ];
 
 /// Counts what is missing in the sequence numbers of a few senders.

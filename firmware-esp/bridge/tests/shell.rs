@@ -2,7 +2,7 @@
 //! a serial line in memory.
 
 use core::future::Future;
-use core::net::Ipv4Addr;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use ed25519_dalek::{Signer, SigningKey};
 use embassy_futures::join::{join, join3};
@@ -20,6 +20,7 @@ use sha2::{Digest, Sha256};
 use vizflyt_bridge::mavlink_writer::write_packet;
 use vizflyt_bridge::packet::{CutStats, Cutter, each_in_datagram};
 use vizflyt_bridge::shell::{Buffers, Light, Platform, SOCKETS, Shared, run};
+use vizflyt_bridge::stats::RestartCause;
 use vizflyt_bridge::storage::Store;
 use vizflyt_bridge::update::{Fault, Header, Slots, Target, Updater, Wanted};
 use vizflyt_bridge::{Bridge, Chip, Settings};
@@ -37,9 +38,22 @@ struct Bare {
     halves: Halves,
     updater: Option<Updater>,
     restarts: u32,
+    feeds: u32,
 }
 
 impl Platform for Bare {
+    fn overruns(&mut self) -> u32 {
+        7
+    }
+
+    fn restart_cause(&mut self) -> RestartCause {
+        RestartCause::Watchdog
+    }
+
+    fn feed(&mut self) {
+        self.feeds += 1;
+    }
+
     fn restart(&mut self) {
         self.restarts += 1;
     }
@@ -178,12 +192,14 @@ where
     let from_bridge = Box::leak(Box::new(Line::new()));
     let (bridge_in, autopilot_out) = to_bridge.split();
     let (autopilot_in, bridge_out) = from_bridge.split();
-    let settings = Settings { radio_status: false, ..Settings::default() };
+    // A client that is not there: nobody else waits for it.
+    let absent = Some(SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 77), 14550));
+    let settings = Settings { radio_status: false, client: absent, ..Settings::default() };
     let shared = Shared::new(Bridge::new(HostTime::ZERO, settings, Chip::default()));
     let mut buffers = Box::new(Buffers::new());
     let mut store = Store::new(Ram(vec![0xFF; 8192]), 0);
     let halves = Halves { spare: Ram(vec![0; 5 * 4096]), starts_spare: false };
-    let mut bare = Bare { lights: Vec::new(), halves, updater: None, restarts: 0 };
+    let mut bare = Bare { lights: Vec::new(), halves, updater: None, restarts: 0, feeds: 0 };
     {
         let bridge =
             run(&shared, stack_a, (bridge_in, bridge_out), &mut store, &mut bare, &mut buffers);
@@ -209,6 +225,7 @@ fn packet(from: (u8, u8), id: u32, number: u32) -> Vec<u8> {
 
 const ATTITUDE: u32 = 30;
 const VISION: u32 = 102;
+const STATUSTEXT: u32 = 253;
 const COUNT: u32 = 1000;
 
 #[test]
@@ -262,22 +279,28 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
     assert!(chip.lights.contains(&Light::NoAutopilot), "{:?}", chip.lights);
 }
 
+/// Asks for a page, as a browser does.
+async fn ask_page(stack: Stack<'static>, path: &str) -> String {
+    let (mut rx, mut tx) = ([0; 4096], [0; 1024]);
+    let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
+    // Refused while the page still serves the one before, as a browser would try again.
+    while socket.connect((BRIDGE, 80)).await.is_err() {
+        embassy_time::Timer::after(Duration::from_millis(1)).await;
+    }
+    let request = format!("GET {path} HTTP/1.1\r\nHost: bridge\r\n\r\n");
+    socket.write_all(request.as_bytes()).await.unwrap();
+    let (mut answer, mut bytes) = (Vec::new(), [0; 512]);
+    while let Ok(len @ 1..) = socket.read(&mut bytes).await {
+        answer.extend_from_slice(&bytes[..len]);
+    }
+    String::from_utf8(answer).unwrap()
+}
+
 #[test]
 fn a_browser_sees_the_page() {
     with_bridge(|stack, _uart_in, _uart_out| async move {
         for _ in 0..2 {
-            let (mut rx, mut tx) = ([0; 4096], [0; 1024]);
-            let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
-            // Refused while the page still serves the one before, as a browser would try again.
-            while socket.connect((BRIDGE, 80)).await.is_err() {
-                embassy_time::Timer::after(Duration::from_millis(1)).await;
-            }
-            socket.write_all(b"GET /stats.json HTTP/1.1\r\nHost: bridge\r\n\r\n").await.unwrap();
-            let (mut answer, mut bytes) = (Vec::new(), [0; 512]);
-            while let Ok(len @ 1..) = socket.read(&mut bytes).await {
-                answer.extend_from_slice(&bytes[..len]);
-            }
-            let answer = String::from_utf8(answer).unwrap();
+            let answer = ask_page(stack, "/stats.json").await;
             assert!(answer.starts_with("HTTP/1.0 200 OK") && answer.ends_with("}\n"), "{answer}");
         }
     });
@@ -399,4 +422,27 @@ fn an_armed_vehicle_keeps_its_firmware() {
         }
     });
     assert!(!chip.halves.starts_spare);
+}
+
+#[test]
+fn what_the_chip_counts_is_told_and_forwarding_feeds_the_watchdog() {
+    let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
+        let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 16]);
+        let (mut rx, mut tx) = ([0; 8192], [0; 8192]);
+        let mut socket = UdpSocket::new(stack, &mut rx_meta, &mut rx, &mut tx_meta, &mut tx);
+        socket.bind(14550).unwrap();
+        let (mut told, mut bytes) = (false, [0; 1500]);
+        while !told {
+            socket.send_to(&packet((255, 191), VISION, 0), (BRIDGE, 14550)).await.unwrap();
+            let (len, _) = socket.recv_from(&mut bytes).await.unwrap();
+            let mut cut = CutStats::default();
+            each_in_datagram(&bytes[..len], &mut cut, |found| {
+                let text = String::from_utf8_lossy(found.payload());
+                told |= found.id() == STATUSTEXT && text.contains("its watchdog found it hung");
+            });
+        }
+        let answer = ask_page(stack, "/stats.json").await;
+        assert!(answer.contains("\"uart_overruns\":7,\"restart_cause\":4"), "{answer}");
+    });
+    assert!(chip.feeds > 0);
 }

@@ -17,6 +17,9 @@ pub const TCP_SLOTS: usize = 2;
 /// than TCP takes to notice. [s]
 const STALLED_S: f64 = 5.0;
 
+/// Who has said nothing for this long may have gone: three heartbeats. [s]
+const SILENT_S: f64 = 3.0;
+
 /// Where a client is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Peer {
@@ -33,6 +36,7 @@ pub(crate) struct Client {
     /// Given by the settings: stays, however silent.
     pub fixed: bool,
     pub received_at: HostTime,
+    pub has_spoken: bool,
     /// Systems and components that spoke from here.
     pub systems: heapless::Vec<(u8, u8), 4>,
     pub sequences: Sequences<3>,
@@ -60,6 +64,7 @@ impl Client {
             peer,
             fixed,
             received_at: now,
+            has_spoken: false,
             systems: heapless::Vec::new(),
             sequences: Sequences::new(),
             sequence: 0,
@@ -76,6 +81,7 @@ impl Client {
     /// Takes note of a packet that came from it; returns how many were lost before it.
     pub(crate) fn note(&mut self, now: HostTime, packet: Raw<'_>) -> u32 {
         self.received_at = now;
+        self.has_spoken = true;
         let source = packet.source();
         if !self.systems.contains(&source) {
             if self.systems.is_full() {
@@ -102,12 +108,20 @@ impl Client {
             && now.seconds_since(self.taken_at) > STALLED_S
     }
 
+    /// Whether it is reached by datagrams.
+    pub(crate) fn is_udp(&self) -> bool {
+        matches!(self.peer, Peer::Udp(_))
+    }
+
+    /// Whether it has spoken lately, so that it is there.
+    pub(crate) fn speaks(&self, now: HostTime) -> bool {
+        self.has_spoken && now.seconds_since(self.received_at) < SILENT_S
+    }
+
     /// Whether it has been silent for too long.
     pub(crate) fn is_gone(&self, now: HostTime, settings: &Settings) -> bool {
         let silent_s = now.seconds_since(self.received_at);
-        matches!(self.peer, Peer::Udp(_))
-            && !self.fixed
-            && silent_s > f64::from(settings.client_timeout_s)
+        self.is_udp() && !self.fixed && silent_s > f64::from(settings.client_timeout_s)
     }
 }
 

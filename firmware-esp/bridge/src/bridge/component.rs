@@ -277,6 +277,9 @@ impl PacketRouter {
                 ..HEARTBEAT_DATA::default()
             }),
         );
+        if let Some(text) = self.untold.take_if(|_| self.clients.iter().any(Option::is_some)) {
+            self.send_status_text(now, MavSeverity::MAV_SEVERITY_ERROR, text);
+        }
         if self.autopilot.is_none() {
             return;
         }

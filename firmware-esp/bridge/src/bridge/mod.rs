@@ -23,6 +23,7 @@ use core::net::SocketAddrV4;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
+use clients::Client;
 pub use clients::{CLIENTS, Peer, TCP_SLOTS};
 pub use component::{COMPONENT_ID, Event};
 pub use loss::LandingStage;
@@ -30,7 +31,7 @@ use router::PacketRouter;
 
 use crate::packet::{Cutter, each_in_datagram};
 use crate::settings::Settings;
-use crate::stats::Stats;
+use crate::stats::{RestartCause, Stats};
 
 /// What a bridge knows of the chip it runs on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -142,6 +143,17 @@ impl Bridge {
         self.router.signal_dbm = dbm;
     }
 
+    /// Sets how often the port's own buffer has run over since the start; the chip counts.
+    pub fn set_overruns(&mut self, overruns: u32) {
+        self.router.stats.overruns = overruns;
+    }
+
+    /// Sets why the chip has started; what is worth telling is told to the first who listens.
+    pub fn set_restart_cause(&mut self, cause: RestartCause) {
+        self.router.stats.restart_cause = cause;
+        self.router.untold = cause.message();
+    }
+
     /// Reports whether the network is up, and the address to which heartbeats are broadcast until
     /// somebody answers.
     pub fn set_network(&mut self, broadcast: Option<SocketAddrV4>) {
@@ -179,7 +191,27 @@ impl Bridge {
     /// Writes the next datagram into `out` (300 bytes at least); returns its destination and its
     /// length.
     pub fn poll_udp(&mut self, now: HostTime, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
-        self.router.poll_udp(now, out)
+        self.router.poll_udp(now, out, |_| true).or_else(|| self.router.beacon(out))
+    }
+
+    /// As [`Self::poll_udp`], for those alone that have spoken lately: they are there, and a network
+    /// stack never waits for their address.
+    pub fn poll_udp_speaking(
+        &mut self,
+        now: HostTime,
+        out: &mut [u8],
+    ) -> Option<(SocketAddrV4, usize)> {
+        let speaks = |client: &Client| client.speaks(now);
+        self.router.poll_udp(now, out, speaks).or_else(|| self.router.beacon(out))
+    }
+
+    /// As [`Self::poll_udp`], for all others.
+    pub fn poll_udp_silent(
+        &mut self,
+        now: HostTime,
+        out: &mut [u8],
+    ) -> Option<(SocketAddrV4, usize)> {
+        self.router.poll_udp(now, out, |client| !client.speaks(now))
     }
 
     /// Writes what is due to a TCP client into `out` (300 bytes at least); returns its length, 0
@@ -195,12 +227,22 @@ impl Bridge {
 
     /// Returns when the next datagram is due; `None` while none waits.
     pub fn udp_due(&self) -> Option<HostTime> {
-        self.router.batches_due(|peer| matches!(peer, Peer::Udp(_)))
+        self.router.batches_due(Client::is_udp)
+    }
+
+    /// Returns when one is due to a client that has spoken lately.
+    pub fn speaking_due(&self, now: HostTime) -> Option<HostTime> {
+        self.router.batches_due(|client| client.is_udp() && client.speaks(now))
+    }
+
+    /// Returns when one is due to another.
+    pub fn silent_due(&self, now: HostTime) -> Option<HostTime> {
+        self.router.batches_due(|client| client.is_udp() && !client.speaks(now))
     }
 
     /// Returns when something is due to a TCP client; `None` while nothing waits.
     pub fn tcp_due(&self, slot: u8) -> Option<HostTime> {
-        self.router.batches_due(|peer| peer == Peer::Tcp(slot))
+        self.router.batches_due(|client| client.peer == Peer::Tcp(slot))
     }
 
     /// Returns when [`Self::handle_timeout`] is due.

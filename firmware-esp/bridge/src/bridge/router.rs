@@ -55,6 +55,8 @@ pub(super) struct PacketRouter {
     pub(super) heartbeat: heapless::Vec<u8, 48>,
     pub(super) loss: LinkLoss,
     pub(super) signing: VehicleSigning,
+    /// Why the chip has started, until somebody has heard it.
+    pub(super) untold: Option<&'static str>,
     pub(super) events: Deque<Event, 4>,
     pub(super) started_at: HostTime,
     pub(super) second_at: HostTime,
@@ -87,6 +89,7 @@ impl PacketRouter {
             heartbeat: heapless::Vec::new(),
             loss: LinkLoss::NONE,
             signing: VehicleSigning::new(),
+            untold: None,
             events: Deque::new(),
             started_at: HostTime::ZERO,
             second_at: HostTime::ZERO,
@@ -379,11 +382,11 @@ impl PacketRouter {
     }
 
     /// Returns when a datagram is due to the first client that `of` names; `None` while none waits.
-    pub(super) fn batches_due(&self, of: impl Fn(Peer) -> bool) -> Option<HostTime> {
+    pub(super) fn batches_due(&self, of: impl Fn(&Client) -> bool) -> Option<HostTime> {
         self.clients
             .iter()
             .flatten()
-            .filter(|client| client.pending > 0 && of(client.peer))
+            .filter(|client| client.pending > 0 && of(client))
             .map(|client| self.batch_due(client))
             .min()
     }
@@ -433,28 +436,31 @@ impl PacketRouter {
         }
     }
 
+    /// Writes the next datagram to a client that `of` names.
     pub(super) fn poll_udp(
         &mut self,
         now: HostTime,
         out: &mut [u8],
+        of: impl Fn(&Client) -> bool,
     ) -> Option<(SocketAddrV4, usize)> {
         for step in 0..CLIENTS {
             let index = (self.turn + step) % CLIENTS;
-            let Some(Client { peer: Peer::Udp(address), .. }) = self.clients[index] else {
+            let Some(client) = self.clients[index].as_ref().filter(|client| of(client)) else {
                 continue;
             };
+            let Peer::Udp(address) = client.peer else { continue };
             let len = self.fill(now, index, out);
             if len > 0 {
                 self.turn = index + 1;
                 return Some((address, len));
             }
         }
-        self.beacon(out)
+        None
     }
 
     /// Writes the autopilot's newest heartbeat for everybody on the network, once a second, while
     /// nobody listens.
-    fn beacon(&mut self, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
+    pub(super) fn beacon(&mut self, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
         let due = core::mem::take(&mut self.beacon_due);
         let to = self.broadcast.filter(|_| due && self.clients.iter().all(Option::is_none))?;
         let len = self.heartbeat.len();
