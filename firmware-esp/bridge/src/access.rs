@@ -9,7 +9,7 @@
 //! ```text
 //! request   op, counter (u32), body, [16 bytes of HMAC if it changes something]
 //! answer    op | 0x80, status, body
-//! HELLO     -> random (16), counter (u32), flags (1 claimed, 2 armed), version text
+//! HELLO     -> nonce (16), counter (u32), flags (1 claimed, 2 armed, 4 transparent), version text
 //! STATS     -> counters (u32 each), see `report`
 //! READ      name -> value
 //! SET       name = value      SAVE, RESET, RESTART: no body      CLAIM: 32 bytes of key
@@ -126,15 +126,15 @@ pub(crate) enum ShellRequest {
 /// What was proven so far in this start.
 #[derive(Clone, Debug)]
 pub(crate) struct Access {
-    pub(crate) random: [u8; 16],
+    pub(crate) nonce: [u8; 16],
     pub(crate) counter: u32,
     /// Newest time stamp of a signed packet. [10 us since 2015]
     signed_at: u64,
 }
 
 impl Access {
-    pub(crate) const fn new(random: [u8; 16]) -> Self {
-        Self { random, counter: 0, signed_at: 0 }
+    pub(crate) const fn new(nonce: [u8; 16]) -> Self {
+        Self { nonce, counter: 0, signed_at: 0 }
     }
 
     /// Whether a request (its proof at the end) proves the key; takes its counter.
@@ -144,7 +144,7 @@ impl Access {
         };
         let (signed, given) = request.split_at(at);
         let counter = u32::from_le_bytes([signed[1], signed[2], signed[3], signed[4]]);
-        let right = mac(key, &self.random, signed).verify_truncated_left(given).is_ok();
+        let right = mac(key, &self.nonce, signed).verify_truncated_left(given).is_ok();
         if right && counter > self.counter {
             self.counter = counter;
             return true;
@@ -173,19 +173,35 @@ pub(crate) fn is_signed_by(key: &Key, packet: Raw<'_>) -> bool {
     right[..6] == packet.bytes()[signed.len()..]
 }
 
-/// Returns the proof of a request by a key, for [`PROOF`] bytes behind it.
-pub fn proof(key: &Key, random: &[u8; 16], signed: &[u8]) -> [u8; PROOF] {
-    let whole = mac(key, random, signed).finalize().into_bytes();
+/// Returns what a bridge tells of its start's random bytes: proofs are over it, and the bytes themselves
+/// stay a secret.
+pub fn nonce(random: &[u8; 16]) -> [u8; 16] {
+    derived(b"vizflyt bridge nonce", random)
+}
+
+/// Returns random bytes for a key that people type.
+pub(crate) fn key_bytes(random: &[u8; 16]) -> [u8; 16] {
+    derived(b"vizflyt bridge typed key", random)
+}
+
+fn derived(purpose: &[u8], random: &[u8; 16]) -> [u8; 16] {
+    let whole = Sha256::new().chain_update(purpose).chain_update(random).finalize();
     core::array::from_fn(|at| whole[at])
 }
 
-fn mac(key: &Key, random: &[u8; 16], signed: &[u8]) -> Hmac<Sha256> {
+/// Returns the proof of a request by a key, for [`PROOF`] bytes behind it.
+pub fn proof(key: &Key, nonce: &[u8; 16], signed: &[u8]) -> [u8; PROOF] {
+    let whole = mac(key, nonce, signed).finalize().into_bytes();
+    core::array::from_fn(|at| whole[at])
+}
+
+fn mac(key: &Key, nonce: &[u8; 16], signed: &[u8]) -> Hmac<Sha256> {
     // HMAC fills a short key up with zeros to a block of the hash (RFC 2104, section 2).
     let mut block = [0; 64];
     block[..key.len()].copy_from_slice(key);
     let mut mac = <Hmac<Sha256> as Mac>::new(&block.into());
     mac.update(b"vizflyt bridge 1");
-    mac.update(random);
+    mac.update(nonce);
     mac.update(signed);
     mac
 }

@@ -2,11 +2,15 @@
 //! component as well; texts (networks, passwords, addresses) go through `vizflyt bridge configure`
 //! alone. Passwords and the key are written, never read back.
 
+mod numbers;
+
 use core::fmt::Write as _;
 use core::net::{Ipv4Addr, SocketAddrV4};
 use core::str::FromStr;
 
 use heapless::String;
+
+pub use numbers::{NUMBERS, Number};
 
 /// Which network a bridge is part of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -19,6 +23,32 @@ pub enum WifiRole {
 
 /// The key that opens the configuration.
 pub type Key = [u8; 32];
+
+/// Pins of an ESP32-C3's port, by their GPIO numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UartPins {
+    /// To the autopilot's RX.
+    pub tx: u8,
+    /// To its TX.
+    pub rx: u8,
+    /// To its CTS.
+    pub rts: u8,
+    /// To its RTS.
+    pub cts: u8,
+}
+
+impl UartPins {
+    /// As `hardware/bridge` has them.
+    pub const USUAL: Self = Self { tx: 4, rx: 5, rts: 6, cts: 7 };
+
+    /// Returns them, or the usual ones if two are the same: a bridge that cannot be reached by its
+    /// wires must still be reached by its network.
+    pub fn or_usual(self) -> Self {
+        let [a, b, c, d] = [self.tx, self.rx, self.rts, self.cts];
+        let distinct = a != b && a != c && a != d && b != c && b != d && c != d;
+        if distinct { self } else { Self::USUAL }
+    }
+}
 
 /// All settings of a bridge. Lives in flash; see `storage`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,8 +88,13 @@ pub struct Settings {
     pub password: String<64>,
     /// Name of the network we make; empty: `vizflyt-` and three bytes of the chip's address.
     pub ap_ssid: String<32>,
-    /// Its password, 8 characters at least; empty leaves it open, which the bridge announces.
+    /// Its password, 8 characters at least. Empty: the bridge makes one at its first start, and tells it
+    /// by wire alone; see [`Self::wifi_open`].
     pub ap_password: String<64>,
+    /// The network we make has no password: only where somebody asked for that.
+    pub wifi_open: bool,
+    /// Country whose rules the radio obeys, two letters; empty: what is allowed everywhere.
+    pub country: String<2>,
     /// Name that `NAME.local` finds us by.
     pub hostname: String<32>,
     /// Our address and its prefix length as a station; `None` asks by DHCP.
@@ -72,6 +107,12 @@ pub struct Settings {
     pub key: Option<Key>,
     /// The vehicle's key of MAVLink signing, for what we send to the autopilot.
     pub vehicle_key: Option<Key>,
+    /// What a browser's settings form asks for, 8 characters at least; empty: only `key` opens it.
+    pub page_key: String<64>,
+    /// Bytes pass as they come, unparsed: no priorities, no LAND, nothing of our own.
+    pub transparent: bool,
+    /// The port's pins, on an ESP32-C3.
+    pub pins: UartPins,
 }
 
 impl Default for Settings {
@@ -102,12 +143,17 @@ impl Settings {
             password: String::new(),
             ap_ssid: String::new(),
             ap_password: String::new(),
+            wifi_open: false,
+            country: String::new(),
             hostname: String::new(),
             address: None,
             gateway: None,
             client: None,
             key: None,
             vehicle_key: None,
+            page_key: String::new(),
+            transparent: false,
+            pins: UartPins::USUAL,
         }
     }
 }
@@ -123,80 +169,6 @@ pub enum Refused {
     OutOfRange,
 }
 
-/// A number that is a MAVLink parameter.
-#[derive(Clone, Copy, Debug)]
-pub struct Number {
-    /// Name, at most 16 characters.
-    pub name: &'static str,
-    /// Least value.
-    pub least: u32,
-    /// Greatest value.
-    pub most: u32,
-    /// Whether 0 is allowed besides: it turns the thing off.
-    pub zero: bool,
-    /// It counts only after a restart of the bridge.
-    pub at_restart: bool,
-    read: fn(&Settings) -> u32,
-    write: fn(&mut Settings, u32),
-}
-
-/// All numbers, in the order of their parameter index.
-pub const NUMBERS: &[Number] = &[
-    number("UART_BAUD", 57_600, 3_000_000, true, |s| s.baud, |s, v| s.baud = v),
-    number("UART_FLOW", 0, 1, true, |s| s.flow_control.into(), |s, v| s.flow_control = v != 0),
-    number("BATCH_US", 0, 20_000, false, |s| s.batch_us, |s, v| s.batch_us = v),
-    number(
-        "BATCH_BYTES",
-        300,
-        1400,
-        false,
-        |s| s.batch_bytes.into(),
-        |s, v| {
-            s.batch_bytes = v as u16;
-        },
-    ),
-    number(
-        "CLIENT_TIMEOUT_S",
-        2,
-        600,
-        false,
-        |s| s.client_timeout_s.into(),
-        |s, v| {
-            s.client_timeout_s = v as u16;
-        },
-    ),
-    number("UDP_PORT", 1, 65_535, true, |s| s.udp_port.into(), |s, v| s.udp_port = v as u16),
-    number("TCP_PORT", 0, 65_535, true, |s| s.tcp_port.into(), |s, v| s.tcp_port = v as u16),
-    number("PAGE_PORT", 0, 65_535, true, |s| s.page_port.into(), |s, v| s.page_port = v as u16),
-    Number {
-        zero: true,
-        ..number("LOSS_MS", 200, 10_000, false, |s| s.loss_ms.into(), |s, v| s.loss_ms = v as u16)
-    },
-    number("RADIO_STATUS", 0, 1, false, |s| s.radio_status.into(), |s, v| s.radio_status = v != 0),
-    number("BEACON", 0, 1, false, |s| s.beacon.into(), |s, v| s.beacon = v != 0),
-    number(
-        "WIFI_STATION",
-        0,
-        1,
-        true,
-        |s| u32::from(s.wifi_role == WifiRole::Station),
-        |s, v| {
-            s.wifi_role = if v == 0 { WifiRole::AccessPoint } else { WifiRole::Station };
-        },
-    ),
-    number("WIFI_CHANNEL", 1, 13, true, |s| s.wifi_channel.into(), |s, v| s.wifi_channel = v as u8),
-    number(
-        "WIFI_FALLBACK_S",
-        5,
-        600,
-        true,
-        |s| s.fallback_s.into(),
-        |s, v| {
-            s.fallback_s = v as u16;
-        },
-    ),
-];
-
 /// The texts' names, and whether they may be read back.
 pub const TEXTS: &[(&str, bool)] = &[
     ("wifi.ssid", true),
@@ -209,38 +181,9 @@ pub const TEXTS: &[(&str, bool)] = &[
     ("client", true),
     ("key", false),
     ("vehicle.key", false),
+    ("page.key", false),
+    ("wifi.country", true),
 ];
-
-const fn number(
-    name: &'static str,
-    least: u32,
-    most: u32,
-    at_restart: bool,
-    read: fn(&Settings) -> u32,
-    write: fn(&mut Settings, u32),
-) -> Number {
-    Number { name, least, most, zero: false, at_restart, read, write }
-}
-
-impl Number {
-    /// Returns its value.
-    pub fn value(&self, settings: &Settings) -> u32 {
-        (self.read)(settings)
-    }
-
-    /// Sets it.
-    ///
-    /// # Errors
-    /// [`Refused::OutOfRange`].
-    pub fn set(&self, settings: &mut Settings, value: u32) -> Result<(), Refused> {
-        if (self.least..=self.most).contains(&value) || (self.zero && value == 0) {
-            (self.write)(settings, value);
-            Ok(())
-        } else {
-            Err(Refused::OutOfRange)
-        }
-    }
-}
 
 impl Settings {
     /// Sets a number or text by its name; an empty text takes an address away.
@@ -291,15 +234,26 @@ impl Settings {
                 self.vehicle_key = maybe(value, key_from_hex)?;
                 Ok(())
             }
+            "page.key" => put_password(&mut self.page_key, value),
+            "wifi.country" => {
+                let letters = value.chars().all(|c| c.is_ascii_uppercase());
+                if !(value.is_empty() || (value.len() == 2 && letters)) {
+                    return Err(Refused::Malformed);
+                }
+                put(&mut self.country, value)
+            }
             _ => Err(Refused::Unknown),
         }
     }
 
     /// Calls `sink` with every setting's name and value, secrets too: for flash.
     pub(crate) fn each(&self, mut sink: impl FnMut(&str, &str)) {
-        let open: [(&str, &str); 2] =
-            [("wifi.password", &self.password), ("wifi.ap_password", &self.ap_password)];
-        for (name, value) in open {
+        let secrets: [(&str, &str); 3] = [
+            ("wifi.password", &self.password),
+            ("wifi.ap_password", &self.ap_password),
+            ("page.key", &self.page_key),
+        ];
+        for (name, value) in secrets {
             sink(name, value);
         }
         for (name, key) in [("key", &self.key), ("vehicle.key", &self.vehicle_key)] {
@@ -350,6 +304,8 @@ impl Settings {
             }
             "key" => secret(&mut out, self.key.is_some()),
             "vehicle.key" => secret(&mut out, self.vehicle_key.is_some()),
+            "page.key" => secret(&mut out, !self.page_key.is_empty()),
+            "wifi.country" => shown(&mut out, &self.country),
             _ => return None,
         }
         Some(out)
@@ -389,6 +345,19 @@ pub fn key_to_hex(key: &Key) -> String<64> {
         let _ = write!(hex, "{byte:02x}");
     }
     hex
+}
+
+/// Returns a key that people type, of 80 random bits: four groups of four letters and digits, none of
+/// which looks like another. It is a network's password, and opens the settings in a browser.
+pub fn typed_key(random: &[u8; 16]) -> String<19> {
+    const LETTERS: &[u8; 32] = b"abcdefghijkmnpqrstuvwxyz23456789";
+    let mut key = String::new();
+    for (place, byte) in random.iter().enumerate() {
+        let dash = if place > 0 && place % 4 == 0 { "-" } else { "" };
+        // 16 letters and 3 dashes: it fits.
+        let _ = write!(key, "{dash}{}", LETTERS[usize::from(byte % 32)] as char);
+    }
+    key
 }
 
 /// Returns a short text.
@@ -440,6 +409,9 @@ mod tests {
                 number.set(&mut settings, value).unwrap();
                 assert_eq!(number.value(&settings), value, "{}", number.name);
             }
+            for value in (0..32).filter(|value| number.except & (1 << value) != 0) {
+                assert_eq!(number.set(&mut settings, value), Err(Refused::OutOfRange));
+            }
             assert_eq!(number.set(&mut settings, number.most + 1), Err(Refused::OutOfRange));
             assert_eq!(number.set(&mut settings, 0).is_ok(), number.least == 0 || number.zero);
         }
@@ -469,9 +441,35 @@ mod tests {
         check("client", "somewhere", Err(Refused::Malformed));
         check("key", "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff", Ok("***"));
         check("key", "0011", Err(Refused::Malformed));
+        check("vehicle.key", "0011", Err(Refused::Malformed));
+        check("page.key", "abcd-efgh", Ok("***"));
+        check("page.key", "short", Err(Refused::Malformed));
+        check("wifi.country", "DE", Ok("DE"));
+        check("wifi.country", "de", Err(Refused::Malformed));
+        check("wifi.country", "DEU", Err(Refused::Malformed));
+        check("wifi.country", "", Ok(""));
+        check("UART_TX_PIN", "21", Ok("21"));
+        check("UART_TX_PIN", "18", Err(Refused::OutOfRange));
         check("UART_BAUD", "57600", Ok("57600"));
         check("UART_BAUD", "9600", Err(Refused::OutOfRange));
         check("LOSS_MS", "0", Ok("0"));
         check("NO_SUCH", "1", Err(Refused::Unknown));
+    }
+
+    #[test]
+    fn typed_keys_are_passwords_and_every_bit_counts() {
+        let key = typed_key(&[0, 1, 2, 3, 4, 5, 6, 7, 28, 29, 30, 31, 32, 33, 255, 254]);
+        assert_eq!(key, "abcd-efgh-6789-ab98");
+        let mut settings = Settings::default();
+        settings.set("wifi.ap_password", &key).unwrap();
+        settings.set("page.key", &key).unwrap();
+    }
+
+    #[test]
+    fn pins_are_four_different_ones() {
+        let usual = UartPins::USUAL;
+        assert_eq!(UartPins { tx: 21, rx: 20, ..usual }.or_usual().tx, 21);
+        assert_eq!(UartPins { tx: 5, ..usual }.or_usual(), usual);
+        assert_eq!(UartPins { rts: 7, ..usual }.or_usual(), usual);
     }
 }

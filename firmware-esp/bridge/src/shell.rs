@@ -10,7 +10,7 @@ use core::net::SocketAddrV4;
 use embassy_futures::join::{join, join3, join5};
 use embassy_futures::select::{select, select3};
 use embassy_net::tcp::TcpSocket;
-use embassy_net::udp::{PacketMetadata, UdpSocket};
+use embassy_net::udp::{PacketMetadata, UdpMetadata, UdpSocket};
 use embassy_net::{IpAddress, IpEndpoint, Stack};
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
@@ -128,20 +128,17 @@ pub struct Buffers {
     udp_in: [u8; 2048],
     udp_out_meta: [PacketMetadata; 4],
     udp_out: [u8; 1472],
-    datagram_in: [u8; 1472],
     datagram_out: [u8; 1400],
-    silent: SilentBuffers,
+    silent: SendOnly,
     tcp: [TcpBuffers; TCP_SLOTS],
     page: PageBuffers,
 }
 
-/// Memory of the socket for those who do not speak: smaller datagrams, one at a time.
+/// Memory of the socket to those who do not speak: smaller datagrams, one at a time.
 #[derive(Debug)]
-struct SilentBuffers {
-    in_meta: [PacketMetadata; 1],
-    in_bytes: [u8; 1],
-    out_meta: [PacketMetadata; 1],
-    out_bytes: [u8; SILENT],
+struct SendOnly {
+    meta: [PacketMetadata; 1],
+    bytes: [u8; SILENT],
     datagram: [u8; SILENT],
 }
 
@@ -176,13 +173,10 @@ impl Buffers {
             udp_in: [0; 2048],
             udp_out_meta: [PacketMetadata::EMPTY; 4],
             udp_out: [0; 1472],
-            datagram_in: [0; 1472],
             datagram_out: [0; 1400],
-            silent: SilentBuffers {
-                in_meta: [PacketMetadata::EMPTY],
-                in_bytes: [0],
-                out_meta: [PacketMetadata::EMPTY],
-                out_bytes: [0; SILENT],
+            silent: SendOnly {
+                meta: [PacketMetadata::EMPTY],
+                bytes: [0; SILENT],
                 datagram: [0; SILENT],
             },
             tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
@@ -192,9 +186,9 @@ impl Buffers {
     }
 }
 
-/// Sockets of a bridge, for a stack's `StackResources`: UDP to those who speak and to the others, TCP,
-/// the page, and what the stack needs itself (DHCP).
-pub const SOCKETS: usize = 4 + TCP_SLOTS;
+/// Sockets of a bridge, for a stack's `StackResources`: UDP in, out to those who speak and to the
+/// others; TCP; the page; and what the stack needs itself (DHCP).
+pub const SOCKETS: usize = 5 + TCP_SLOTS;
 
 /// What a bridge of ours may take of a chip's RAM: state and buffers. [bytes]
 pub const RAM_BUDGET: usize = 30 * 1024;
@@ -265,48 +259,39 @@ async fn serve<P: Platform>(
 ) {
     let (udp_port, tcp_port) =
         shared.take(|bridge, _| (bridge.settings().udp_port, bridge.settings().tcp_port));
-    let Buffers {
-        udp_in_meta,
-        udp_in,
-        udp_out_meta,
-        udp_out,
-        datagram_in,
-        datagram_out,
-        silent,
-        tcp,
-        page,
-    } = buffers;
-    let SilentBuffers { in_meta, in_bytes, out_meta, out_bytes, datagram } = silent;
-    let mut socket = UdpSocket::new(stack, udp_in_meta, udp_in, udp_out_meta, udp_out);
-    // What comes in goes to the first socket of the port.
-    let mut to_silent = UdpSocket::new(stack, in_meta, in_bytes, out_meta, out_bytes);
-    let to_speaking = async {
+    let Buffers { udp_in_meta, udp_in, udp_out_meta, udp_out, datagram_out, silent, tcp, page } =
+        buffers;
+    let SendOnly { meta, bytes, datagram } = silent;
+    // One socket for each way, of one port: what comes in goes to the one made first.
+    let (mut no_meta, mut none) = ([[PacketMetadata::EMPTY]; 3], [[0]; 3]);
+    let ([no_a, no_b, no_c], [none_a, none_b, none_c]) = (&mut no_meta, &mut none);
+    let mut incoming = UdpSocket::new(stack, udp_in_meta, udp_in, no_a, none_a);
+    let mut to_speaking = UdpSocket::new(stack, no_b, none_b, udp_out_meta, udp_out);
+    let mut to_silent = UdpSocket::new(stack, no_c, none_c, meta, bytes);
+    // The port is not 0 and the sockets are new: nothing else is refused.
+    let _ = incoming.bind(udp_port);
+    let receive = receive_udp(shared, &mut incoming);
+    let send_speaking = async {
         loop {
-            // The port is not 0 and the socket is closed: nothing else is refused.
-            let _ = socket.bind(udp_port);
-            let receive = receive_udp(shared, &socket, datagram_in);
-            let send = async {
-                loop {
-                    let next =
-                        shared.take(|bridge, now| bridge.poll_udp_speaking(now, datagram_out));
-                    let Some((to, len)) = next else {
-                        let due = shared.take(|bridge, now| bridge.speaking_due(now));
-                        wait(&shared.udp, due).await;
-                        continue;
-                    };
-                    let sent = socket.send_to(&datagram_out[..len], endpoint(to));
-                    match with_timeout(STUCK, sent).await {
-                        Ok(Ok(())) => {}
-                        Ok(Err(_)) => shared.take(|bridge, _| bridge.note_not_sent()),
-                        Err(_) => return,
-                    }
+            let _ = to_speaking.bind(udp_port);
+            loop {
+                let next = shared.take(|bridge, now| bridge.poll_udp_speaking(now, datagram_out));
+                let Some((to, len)) = next else {
+                    let due = shared.take(|bridge, now| bridge.speaking_due(now));
+                    wait(&shared.udp, due).await;
+                    continue;
+                };
+                let sent = to_speaking.send_to(&datagram_out[..len], endpoint(to));
+                match with_timeout(STUCK, sent).await {
+                    Ok(Ok(())) => {}
+                    Ok(Err(_)) => shared.take(|bridge, _| bridge.note_not_sent()),
+                    Err(_) => break,
                 }
-            };
-            select(receive, send).await;
+            }
             // Who is first in the queue has gone, and its address cannot be had any more: closing
             // empties the queue.
             shared.take(|bridge, _| bridge.note_not_sent());
-            socket.close();
+            to_speaking.close();
         }
     };
     let _ = to_silent.bind(udp_port);
@@ -324,8 +309,8 @@ async fn serve<P: Platform>(
     };
     let [first, second] = tcp;
     join5(
-        to_speaking,
-        send_silent,
+        receive,
+        join(send_speaking, send_silent),
         connection(shared, stack, tcp_port, 0, first),
         connection(shared, stack, tcp_port, 1, second),
         show_page(shared, stack, platform, page),
@@ -337,13 +322,15 @@ async fn serve<P: Platform>(
 /// gone waits for an address for ever. One that is still there answers at once.
 const STUCK: Duration = Duration::from_secs(1);
 
-/// Hands datagrams to the bridge, for ever.
-async fn receive_udp(shared: &Shared, socket: &UdpSocket<'_>, bytes: &mut [u8]) {
+/// Hands datagrams to the bridge, for ever, from where the stack has them.
+async fn receive_udp(shared: &Shared, socket: &mut UdpSocket<'_>) {
     loop {
-        let Ok((len, meta)) = socket.recv_from(bytes).await else { continue };
-        let IpAddress::Ipv4(address) = meta.endpoint.addr;
-        let from = SocketAddrV4::new(address, meta.endpoint.port);
-        shared.with(|bridge, now| bridge.handle_datagram(now, from, &bytes[..len]));
+        let take = |bytes: &[u8], meta: UdpMetadata| {
+            let IpAddress::Ipv4(address) = meta.endpoint.addr;
+            let from = SocketAddrV4::new(address, meta.endpoint.port);
+            shared.with(|bridge, now| bridge.handle_datagram(now, from, bytes));
+        };
+        socket.recv_from_with(take).await;
     }
 }
 
@@ -506,12 +493,14 @@ async fn mind<F: NorFlash, P: Platform>(
             signal = platform.borrow_mut().signal_dbm();
             asked_at = Instant::now();
         }
-        let broadcast = stack.config_v4().map(|config| {
-            let address = config.address.broadcast().unwrap_or(core::net::Ipv4Addr::BROADCAST);
+        let network = stack.config_v4().map(|config| config.address);
+        let broadcast = network.map(|network| {
+            let address = network.broadcast().unwrap_or(core::net::Ipv4Addr::BROADCAST);
             SocketAddrV4::new(address, BEACON_PORT)
         });
         let (event, light, due) = shared.take(|bridge, now| {
             bridge.set_network(broadcast);
+            bridge.set_address(network.map(|network| network.address()));
             bridge.set_signal(signal);
             bridge.set_overruns(overruns);
             bridge.handle_timeout(now);
@@ -551,7 +540,7 @@ pub fn light(bridge: &Bridge, network: bool) -> Light {
         Light::Landing
     } else if !network {
         Light::NoNetwork
-    } else if bridge.autopilot().is_none() {
+    } else if bridge.autopilot().is_none() && !bridge.is_transparent() {
         Light::NoAutopilot
     } else if bridge.clients().next().is_none() {
         Light::NoClient

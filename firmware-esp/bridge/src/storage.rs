@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use crate::settings::Settings;
 
 /// Bytes of a record at most; all settings at their longest take three quarters of it.
-const RECORD: usize = 1024;
+const RECORD: usize = 1280;
 /// Magic (4), sequence (4), length (2), zero (2), hash (8).
 const HEAD: usize = 20;
 const MAGIC: [u8; 4] = *b"VZB1";

@@ -7,7 +7,6 @@
 //! access point: own network, 192.168.4.1, which gives addresses to whoever joins
 //! ```
 
-use core::fmt::Write as _;
 use core::future::pending;
 use core::net::{Ipv4Addr, SocketAddrV4};
 
@@ -16,7 +15,6 @@ use embassy_futures::select::select;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_net::{ConfigV4, DhcpConfig, IpAddress, Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Instant, Timer, with_timeout};
-use heapless::String;
 
 use crate::settings::{Settings, WifiRole};
 use crate::shell::Shared;
@@ -119,14 +117,18 @@ pub async fn run<R: Radio>(
 /// Joins, falls back, comes back.
 async fn keep<R: Radio>(shared: &Shared, stack: Stack<'_>, radio: &mut R) {
     loop {
-        let settings = shared.with(|bridge, _| bridge.settings().clone());
+        let settings = shared.with(|bridge, now| {
+            bridge.ensure_password(now);
+            bridge.settings().clone()
+        });
         let joins = settings.wifi_role == WifiRole::Station && !settings.ssid.is_empty();
         if joins {
             be_station(stack, radio, &settings).await;
         }
-        let name = own_name(shared, &settings);
+        let name = shared.with(|bridge, _| bridge.network_name());
         stack.set_config_v4(ConfigV4::None);
-        if !radio.open(&name, &settings.ap_password, settings.wifi_channel).await {
+        let password = if settings.wifi_open { "" } else { settings.ap_password.as_str() };
+        if !radio.open(&name, password, settings.wifi_channel).await {
             Timer::after(Duration::from_secs(1)).await;
             continue;
         }
@@ -189,18 +191,6 @@ fn dhcp_config(settings: &Settings) -> DhcpConfig {
     let mut config = DhcpConfig::default();
     config.hostname = settings.hostname.as_str().try_into().ok();
     config
-}
-
-/// Returns the name of the network we make.
-fn own_name(shared: &Shared, settings: &Settings) -> String<32> {
-    if !settings.ap_ssid.is_empty() {
-        return settings.ap_ssid.clone();
-    }
-    let [.., a, b, c] = shared.with(|bridge, _| bridge.chip().address);
-    let mut name = String::new();
-    // 14 characters fit.
-    let _ = write!(name, "vizflyt-{a:02x}{b:02x}{c:02x}");
-    name
 }
 
 /// Gives addresses to those in our own network.

@@ -48,7 +48,7 @@ fuzz_target!(|steps: Vec<Step<'_>>| {
             Step::Request(request, with_key) => {
                 let mut request = request[..request.len().min(100)].to_vec();
                 if with_key {
-                    let proof = access::proof(&KEY, &[0; 16], &request);
+                    let proof = access::proof(&KEY, &access::nonce(&[0; 16]), &request);
                     request.extend_from_slice(&proof);
                     proven = true;
                 }

@@ -17,9 +17,6 @@ pub const TCP_SLOTS: usize = 2;
 /// than TCP takes to notice. [s]
 const STALLED_S: f64 = 5.0;
 
-/// Who has said nothing for this long may have gone: three heartbeats. [s]
-const SILENT_S: f64 = 3.0;
-
 /// Where a client is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Peer {
@@ -78,10 +75,15 @@ impl Client {
         }
     }
 
-    /// Takes note of a packet that came from it; returns how many were lost before it.
-    pub(crate) fn note(&mut self, now: HostTime, packet: Raw<'_>) -> u32 {
+    /// Takes note that it has spoken.
+    pub(crate) fn note_heard(&mut self, now: HostTime) {
         self.received_at = now;
         self.has_spoken = true;
+    }
+
+    /// Takes note of a packet that came from it; returns how many were lost before it.
+    pub(crate) fn note(&mut self, now: HostTime, packet: Raw<'_>) -> u32 {
+        self.note_heard(now);
         let source = packet.source();
         if !self.systems.contains(&source) {
             if self.systems.is_full() {
@@ -113,15 +115,18 @@ impl Client {
         matches!(self.peer, Peer::Udp(_))
     }
 
-    /// Whether it has spoken lately, so that it is there.
-    pub(crate) fn speaks(&self, now: HostTime) -> bool {
-        self.has_spoken && now.seconds_since(self.received_at) < SILENT_S
+    /// Whether it has spoken lately; only the settings' client stays when it has not.
+    pub(crate) fn speaks(&self, now: HostTime, settings: &Settings) -> bool {
+        self.has_spoken && !self.is_silent(now, settings)
     }
 
     /// Whether it has been silent for too long.
     pub(crate) fn is_gone(&self, now: HostTime, settings: &Settings) -> bool {
-        let silent_s = now.seconds_since(self.received_at);
-        self.is_udp() && !self.fixed && silent_s > f64::from(settings.client_timeout_s)
+        self.is_udp() && !self.fixed && self.is_silent(now, settings)
+    }
+
+    fn is_silent(&self, now: HostTime, settings: &Settings) -> bool {
+        now.seconds_since(self.received_at) > f64::from(settings.client_timeout_s)
     }
 }
 

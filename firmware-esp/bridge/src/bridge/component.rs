@@ -1,22 +1,24 @@
 //! The bridge as a MAVLink component of the vehicle: it shows itself, answers for its parameters,
 //! measures the round trip, reports the radio, and lands the vehicle when the companion is silent.
 
+use core::fmt::Write as _;
+
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::mavlink::dialect::{
-    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavModeFlag, MavParamType, MavResult,
-    MavSeverity, MavState, MavType, PARAM_VALUE_DATA, RADIO_STATUS_DATA, STATUSTEXT_DATA,
-    TIMESYNC_DATA,
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavModeFlag, MavResult, MavSeverity,
+    MavState, MavType, RADIO_STATUS_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
 };
 use vizflyt_protocol::time::HostTime;
 
 use super::clients::{Client, bit};
+use super::fields::Fields;
 use super::loss::{Flight, LossAction};
 use super::router::{PacketRouter, kind, millis};
 use crate::access::{self, Access};
 use crate::mavlink_writer::{BridgeMessage, write_message, write_packet};
 use crate::packet::Raw;
 use crate::ring::Tag;
-use crate::settings::{NUMBERS, Settings};
+use crate::settings::{Settings, typed_key};
 
 /// Our component: MAV_COMP_ID_UDP_BRIDGE.
 pub const COMPONENT_ID: u8 = 240;
@@ -43,8 +45,8 @@ pub(super) struct OutstandingRequests {
 }
 
 impl OutstandingRequests {
-    pub(super) const fn new(random: [u8; 16]) -> Self {
-        Self { syncs: heapless::Deque::new(), client_asked_at: None, access: Access::new(random) }
+    pub(super) const fn new(nonce: [u8; 16]) -> Self {
+        Self { syncs: heapless::Deque::new(), client_asked_at: None, access: Access::new(nonce) }
     }
 
     fn note_sync(&mut self, now: HostTime, ts1: i64) {
@@ -60,17 +62,21 @@ impl OutstandingRequests {
 const SYNC_S: f64 = 2.0;
 /// Heartbeats and reports. [s]
 pub(super) const SECOND_S: f64 = 1.0;
+/// Changes of parameters are kept together after this. [s]
+const SAVE_S: f64 = 1.0;
+/// The password that the bridge made is told this often. [s]
+const TELL_S: f64 = 10.0;
 /// No reading, in RADIO_STATUS.
 const UNKNOWN: u8 = 255;
 
 const HEARTBEAT: u32 = 0;
-const PARAM_REQUEST_READ: u32 = 20;
-const PARAM_REQUEST_LIST: u32 = 21;
-const PARAM_SET: u32 = 23;
+pub(super) const PARAM_REQUEST_READ: u32 = 20;
+pub(super) const PARAM_REQUEST_LIST: u32 = 21;
+pub(super) const PARAM_SET: u32 = 23;
 const COMMAND_LONG: u32 = 76;
 const COMMAND_ACK: u32 = 77;
 const TIMESYNC: u32 = 111;
-const TUNNEL: u32 = 385;
+pub(super) const TUNNEL: u32 = 385;
 
 impl PacketRouter {
     /// Returns our system and component.
@@ -140,33 +146,9 @@ impl PacketRouter {
 
     /// Answers a packet for us, from the client `from` or from the autopilot.
     pub(super) fn handle_own(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
-        let field = Fields(packet.payload());
         match packet.id() {
-            PARAM_REQUEST_LIST => {
-                for index in 0..NUMBERS.len() {
-                    self.send_param(now, from, index);
-                }
-            }
-            PARAM_REQUEST_READ => {
-                let index = match field.u16(0).cast_signed() {
-                    -1 => find(field.text(4)),
-                    index => usize::try_from(index).ok().filter(|&index| index < NUMBERS.len()),
-                };
-                if let Some(index) = index {
-                    self.send_param(now, from, index);
-                }
-            }
-            PARAM_SET => {
-                let Some(index) = find(field.text(6)) else { return };
-                let value = field.f32(0);
-                if self.may_change(now, packet)
-                    && (0.0..=1e7).contains(&value)
-                    && value % 1.0 == 0.0
-                {
-                    // A value out of range changes nothing, as the answer shows.
-                    let _ = NUMBERS[index].set(&mut self.settings, value as u32);
-                }
-                self.send_param(now, from, index);
+            PARAM_REQUEST_LIST | PARAM_REQUEST_READ | PARAM_SET => {
+                self.handle_parameter(now, from, packet);
             }
             COMMAND_LONG if self.is_ours(packet.target()) => {
                 self.handle_command(now, from, packet);
@@ -177,10 +159,10 @@ impl PacketRouter {
     }
 
     /// Whether a packet may change us: signed with the bridge's key, and the vehicle disarmed.
-    fn may_change(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
+    pub(super) fn may_change(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
         let reason = if self.flight.armed {
             "bridge: nothing is changed while armed"
-        } else if !self.outstanding.access.signed_by(self.settings.key.as_ref(), packet) {
+        } else if !self.is_signed_by_owner(packet) {
             "bridge: changes need its key: vizflyt bridge configure"
         } else {
             return true;
@@ -188,6 +170,14 @@ impl PacketRouter {
         self.stats.refused = self.stats.refused.wrapping_add(1);
         self.send_status_text(now, MavSeverity::MAV_SEVERITY_WARNING, reason);
         false
+    }
+
+    /// Whether a packet is signed with the bridge's key, or with the vehicle's: whoever has that commands
+    /// the vehicle itself.
+    fn is_signed_by_owner(&mut self, packet: Raw<'_>) -> bool {
+        let keys = [self.settings.key.as_ref(), self.settings.vehicle_key.as_ref()];
+        let access = &mut self.outstanding.access;
+        keys.into_iter().any(|key| access.signed_by(key, packet))
     }
 
     fn handle_command(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
@@ -208,6 +198,7 @@ impl PacketRouter {
             None => MavResult::MAV_RESULT_UNSUPPORTED,
             Some(request) if self.may_change(now, packet) => {
                 self.grant(now, request);
+                self.save_soon(now);
                 MavResult::MAV_RESULT_ACCEPTED
             }
             Some(_) => MavResult::MAV_RESULT_DENIED,
@@ -226,9 +217,18 @@ impl PacketRouter {
                 let _ = self.events.push_back(Event::Save);
             }
             access::ShellRequest::Reset => {
-                // The key stays: who resets the settings does not open the bridge to others.
-                let key = self.settings.key;
-                self.settings = Settings { key, ..Settings::default() };
+                // Keys and the own network's password stay: who resets the settings neither opens the
+                // bridge to others nor locks its owner out.
+                let Settings { ap_password, wifi_open, key, vehicle_key, page_key, .. } =
+                    self.settings.clone();
+                self.settings = Settings {
+                    ap_password,
+                    wifi_open,
+                    key,
+                    vehicle_key,
+                    page_key,
+                    ..Settings::default()
+                };
                 self.apply_settings(now);
             }
             access::ShellRequest::Restart => {
@@ -262,10 +262,18 @@ impl PacketRouter {
         while let Some(act) = self.loss.poll(now, self.flight, self.settings.loss_ms) {
             self.act(now, act);
         }
+        if self.save_at.is_some_and(|at| at <= now) {
+            self.save_at = None;
+            self.grant(now, access::ShellRequest::Save);
+        }
         if now < self.second_at {
             return;
         }
         self.second_at = now.plus_seconds(SECOND_S);
+        if self.transparent {
+            return;
+        }
+        self.tell_key(now);
         self.beacon_due = self.settings.beacon && self.autopilot.is_some();
         self.send_to_clients(
             now,
@@ -339,6 +347,42 @@ impl PacketRouter {
         }
     }
 
+    /// Keeps the settings in a moment: several changes come together.
+    pub(super) fn save_soon(&mut self, now: HostTime) {
+        self.save_at = Some(now.plus_seconds(SAVE_S));
+    }
+
+    /// Makes the own network's password where there is none and nobody asked for an open one.
+    pub(super) fn ensure_password(&mut self, now: HostTime) {
+        if self.settings.wifi_open || !self.settings.ap_password.is_empty() {
+            return;
+        }
+        let key = typed_key(&access::key_bytes(&self.chip.random));
+        let mut password = heapless::String::new();
+        // 19 characters fit into 64.
+        let _ = password.push_str(&key);
+        if self.settings.page_key.is_empty() {
+            self.settings.page_key = password.clone();
+        }
+        self.settings.ap_password = password;
+        self.grant(now, access::ShellRequest::Save);
+        self.tell_key_at = Some(now);
+    }
+
+    /// Tells the password that it made by itself, at the autopilot's wire and nowhere else, until
+    /// somebody has claimed the bridge.
+    fn tell_key(&mut self, now: HostTime) {
+        let due = self.tell_key_at.is_some_and(|at| at <= now) && self.settings.key.is_none();
+        if due && self.autopilot.is_some() {
+            self.tell_key_at = Some(now.plus_seconds(TELL_S));
+            let mut text = heapless::String::<50>::new();
+            // 27 characters and 19: it fits.
+            let _ = write!(text, "bridge: its network's key: {}", self.settings.ap_password);
+            let message = status_text(MavSeverity::MAV_SEVERITY_NOTICE, &text);
+            self.send_to_autopilot(now, &message);
+        }
+    }
+
     pub(super) fn note_saved(&mut self, now: HostTime, saved: bool) {
         if !saved {
             let text = "bridge: its flash did not take the settings";
@@ -374,27 +418,12 @@ impl PacketRouter {
 
     /// Says a sentence of at most 50 characters to everybody.
     fn send_status_text(&mut self, now: HostTime, severity: MavSeverity, text: &str) {
-        let message = BridgeMessage::STATUSTEXT(STATUSTEXT_DATA {
-            severity,
-            text: text.into(),
-            ..Default::default()
-        });
+        if self.transparent {
+            return;
+        }
+        let message = status_text(severity, text);
         self.send_to_clients(now, &message);
         self.send_to_autopilot(now, &message);
-    }
-
-    fn send_param(&mut self, now: HostTime, to: Option<usize>, index: usize) {
-        let number = &NUMBERS[index];
-        let message = BridgeMessage::PARAM_VALUE(PARAM_VALUE_DATA {
-            param_value: number.value(&self.settings) as f32,
-            param_count: NUMBERS.len() as u16,
-            param_index: index as u16,
-            param_id: number.name.into(),
-            param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
-        });
-        let mut packet = [0; MAX_PACKET];
-        let len = write_message(&mut packet, self.address(), 0, &message);
-        self.deliver(now, to, message.id(), &packet[..len]);
     }
 
     /// Sends a message to whoever asked.
@@ -419,7 +448,7 @@ impl PacketRouter {
 
     /// Puts a packet of ours into the queue of a client or of the autopilot; its number follows
     /// when it goes out.
-    fn deliver(&mut self, now: HostTime, to: Option<usize>, id: u32, packet: &[u8]) {
+    pub(super) fn deliver(&mut self, now: HostTime, to: Option<usize>, id: u32, packet: &[u8]) {
         let source = self.address();
         if let Some(index) = to {
             self.push_down(now, source, kind(id), bit(index), true, packet);
@@ -430,44 +459,7 @@ impl PacketRouter {
     }
 }
 
-/// Returns the place of a parameter by its name.
-fn find(name: &str) -> Option<usize> {
-    NUMBERS.iter().position(|number| number.name == name)
-}
-
-/// Reads a payload's fields; what MAVLink 2 left out is zero.
-struct Fields<'a>(&'a [u8]);
-
-impl<'a> Fields<'a> {
-    fn bytes<const N: usize>(&self, at: usize) -> [u8; N] {
-        core::array::from_fn(|i| self.byte(at + i))
-    }
-
-    fn byte(&self, at: usize) -> u8 {
-        self.0.get(at).copied().unwrap_or(0)
-    }
-
-    fn u16(&self, at: usize) -> u16 {
-        u16::from_le_bytes(self.bytes(at))
-    }
-
-    fn u32(&self, at: usize) -> u32 {
-        u32::from_le_bytes(self.bytes(at))
-    }
-
-    fn i64(&self, at: usize) -> i64 {
-        i64::from_le_bytes(self.bytes(at))
-    }
-
-    fn f32(&self, at: usize) -> f32 {
-        f32::from_le_bytes(self.bytes(at))
-    }
-
-    /// A name of at most 16 characters; empty if it is no text.
-    fn text(&self, at: usize) -> &'a str {
-        let field = self.0.get(at..).unwrap_or_default();
-        let field = &field[..field.len().min(16)];
-        let end = field.iter().position(|&byte| byte == 0).unwrap_or(field.len());
-        core::str::from_utf8(&field[..end]).unwrap_or_default()
-    }
+fn status_text(severity: MavSeverity, text: &str) -> BridgeMessage {
+    let data = STATUSTEXT_DATA { severity, text: text.into(), ..Default::default() };
+    BridgeMessage::STATUSTEXT(data)
 }

@@ -11,14 +11,16 @@
 
 mod clients;
 mod component;
+mod fields;
 mod loss;
+mod parameters;
 mod requests;
 mod router;
 #[cfg(test)]
 mod tests;
 mod vehicle_signing;
 
-use core::net::SocketAddrV4;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
@@ -29,7 +31,8 @@ pub use component::{COMPONENT_ID, Event};
 pub use loss::LandingStage;
 use router::PacketRouter;
 
-use crate::packet::{Cutter, each_in_datagram};
+use crate::access;
+use crate::packet::{CutStats, Cutter, each_in_datagram};
 use crate::settings::Settings;
 use crate::stats::{RestartCause, Stats};
 
@@ -89,6 +92,9 @@ impl Bridge {
         let Self { uart, router, has_looked, .. } = self;
         *has_looked &= bytes.is_empty();
         router.note_uart_bytes(now, bytes.len());
+        if router.transparent {
+            return router.take_raw_uart(now, bytes);
+        }
         uart.push(bytes, |packet| router.take_uart(now, packet));
         router.note_uart_cut(uart.stats(), uart.is_waiting());
         router.poll(now);
@@ -99,6 +105,9 @@ impl Bridge {
         let router = &mut self.router;
         let mut cut = router.stats.net.cut;
         router.stats.net.bytes_in = router.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        if router.transparent && !is_request(bytes) {
+            return router.take_raw_client(now, Peer::Udp(from), bytes);
+        }
         each_in_datagram(bytes, &mut cut, |packet| {
             router.take_client(now, Peer::Udp(from), packet);
         });
@@ -122,6 +131,9 @@ impl Bridge {
         let Self { tcp, router, .. } = self;
         let Some(cutter) = tcp.get_mut(usize::from(slot)) else { return };
         router.stats.net.bytes_in = router.stats.net.bytes_in.wrapping_add(bytes.len() as u32);
+        if router.transparent {
+            return router.take_raw_client(now, Peer::Tcp(slot), bytes);
+        }
         let before = cutter.stats();
         cutter.push(bytes, |packet| router.take_client(now, Peer::Tcp(slot), packet));
         router.note_stream_cut(before, cutter.stats());
@@ -160,6 +172,27 @@ impl Bridge {
         self.router.broadcast = broadcast;
     }
 
+    /// Sets our own address on the network.
+    pub fn set_address(&mut self, address: Option<Ipv4Addr>) {
+        self.router.own_address = address;
+    }
+
+    /// Makes the password of the network that we make, unless there is one or an open network is wanted;
+    /// before that network is made.
+    pub fn ensure_password(&mut self, now: HostTime) {
+        self.router.ensure_password(now);
+    }
+
+    /// Returns the name of the network that we make.
+    pub fn network_name(&self) -> heapless::String<32> {
+        self.router.network_name()
+    }
+
+    /// Whether bytes pass unparsed.
+    pub fn is_transparent(&self) -> bool {
+        self.router.transparent
+    }
+
     /// Network or port refused what was taken from [`Self::poll_udp`] or [`Self::poll_uart`].
     pub fn note_not_sent(&mut self) {
         self.router.stats.drop(crate::stats::Reason::NotSent, 1);
@@ -191,17 +224,17 @@ impl Bridge {
     /// Writes the next datagram into `out` (300 bytes at least); returns its destination and its
     /// length.
     pub fn poll_udp(&mut self, now: HostTime, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
-        self.router.poll_udp(now, out, |_| true).or_else(|| self.router.beacon(out))
+        self.router.poll_udp(now, out, |_, _| true).or_else(|| self.router.beacon(out))
     }
 
-    /// As [`Self::poll_udp`], for those alone that have spoken lately: they are there, and a network
-    /// stack never waits for their address.
+    /// As [`Self::poll_udp`], for those alone that have spoken lately: a network stack does not wait for
+    /// their address.
     pub fn poll_udp_speaking(
         &mut self,
         now: HostTime,
         out: &mut [u8],
     ) -> Option<(SocketAddrV4, usize)> {
-        let speaks = |client: &Client| client.speaks(now);
+        let speaks = |client: &Client, settings: &Settings| client.speaks(now, settings);
         self.router.poll_udp(now, out, speaks).or_else(|| self.router.beacon(out))
     }
 
@@ -211,7 +244,7 @@ impl Bridge {
         now: HostTime,
         out: &mut [u8],
     ) -> Option<(SocketAddrV4, usize)> {
-        self.router.poll_udp(now, out, |client| !client.speaks(now))
+        self.router.poll_udp(now, out, |client, settings| !client.speaks(now, settings))
     }
 
     /// Writes what is due to a TCP client into `out` (300 bytes at least); returns its length, 0
@@ -227,22 +260,22 @@ impl Bridge {
 
     /// Returns when the next datagram is due; `None` while none waits.
     pub fn udp_due(&self) -> Option<HostTime> {
-        self.router.batches_due(Client::is_udp)
+        self.router.batches_due(|client, _| client.is_udp())
     }
 
     /// Returns when one is due to a client that has spoken lately.
     pub fn speaking_due(&self, now: HostTime) -> Option<HostTime> {
-        self.router.batches_due(|client| client.is_udp() && client.speaks(now))
+        self.router.batches_due(|client, settings| client.is_udp() && client.speaks(now, settings))
     }
 
     /// Returns when one is due to another.
     pub fn silent_due(&self, now: HostTime) -> Option<HostTime> {
-        self.router.batches_due(|client| client.is_udp() && !client.speaks(now))
+        self.router.batches_due(|client, settings| client.is_udp() && !client.speaks(now, settings))
     }
 
     /// Returns when something is due to a TCP client; `None` while nothing waits.
     pub fn tcp_due(&self, slot: u8) -> Option<HostTime> {
-        self.router.batches_due(|client| client.peer == Peer::Tcp(slot))
+        self.router.batches_due(|client, _| client.peer == Peer::Tcp(slot))
     }
 
     /// Returns when [`Self::handle_timeout`] is due.
@@ -306,4 +339,16 @@ impl Bridge {
     pub fn clients(&self) -> impl Iterator<Item = (Peer, u32, u32)> {
         self.router.clients.iter().flatten().map(|client| (client.peer, client.sent, client.slow))
     }
+}
+
+/// Whether a datagram is a request for the configuration and nothing else: the way out for whoever has
+/// made the bridge transparent.
+fn is_request(datagram: &[u8]) -> bool {
+    let (mut cut, mut requests) = (CutStats::default(), 0);
+    each_in_datagram(datagram, &mut cut, |packet| {
+        let ours = packet.id() == component::TUNNEL && packet.target().1 == COMPONENT_ID;
+        let is_request = fields::Fields(packet.payload()).u16(0) == access::TUNNEL_TYPE;
+        requests += u32::from(ours && is_request);
+    });
+    (cut.packets, cut.dropped_bytes, requests) == (1, 0, 1)
 }

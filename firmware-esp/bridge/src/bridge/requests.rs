@@ -106,9 +106,11 @@ impl PacketRouter {
 
     fn hello(&self, out: &mut [u8]) -> usize {
         let access = &self.outstanding.access;
-        out[..16].copy_from_slice(&access.random);
+        out[..16].copy_from_slice(&access.nonce);
         out[16..20].copy_from_slice(&access.counter.to_le_bytes());
-        out[20] = u8::from(self.settings.key.is_some()) | u8::from(self.flight.armed) << 1;
+        out[20] = u8::from(self.settings.key.is_some())
+            | u8::from(self.flight.armed) << 1
+            | u8::from(self.transparent) << 2;
         let version = env!("CARGO_PKG_VERSION").as_bytes();
         out[21..21 + version.len()].copy_from_slice(version);
         21 + version.len()

@@ -1,6 +1,7 @@
 //! Where packets go: the state behind [`Bridge`](super::Bridge).
 
-use core::net::SocketAddrV4;
+use core::fmt::Write as _;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use heapless::Deque;
 use vizflyt_protocol::mavlink::MAX_PACKET;
@@ -9,8 +10,10 @@ use vizflyt_protocol::time::HostTime;
 use super::clients::{CLIENTS, Client, Peer, bit};
 use super::component::{Event, SECOND_S};
 use super::loss::{Flight, LinkLoss};
+use super::parameters::TypedTexts;
 use super::vehicle_signing::VehicleSigning;
 use super::{Chip, IDLE_NS};
+use crate::access;
 use crate::mavlink_writer::renumber;
 use crate::packet::{CutStats, Raw};
 use crate::ring::{Ring, Tag};
@@ -55,6 +58,14 @@ pub(super) struct PacketRouter {
     pub(super) heartbeat: heapless::Vec<u8, 48>,
     pub(super) loss: LinkLoss,
     pub(super) signing: VehicleSigning,
+    pub(super) typed: TypedTexts,
+    /// When changed settings are kept.
+    pub(super) save_at: Option<HostTime>,
+    /// When the password that we made is told next.
+    pub(super) tell_key_at: Option<HostTime>,
+    /// Bytes pass unparsed; as it was at the start.
+    pub(super) transparent: bool,
+    pub(super) own_address: Option<Ipv4Addr>,
     /// Why the chip has started, until somebody has heard it.
     pub(super) untold: Option<&'static str>,
     pub(super) events: Deque<Event, 4>,
@@ -89,6 +100,11 @@ impl PacketRouter {
             heartbeat: heapless::Vec::new(),
             loss: LinkLoss::NONE,
             signing: VehicleSigning::new(),
+            typed: TypedTexts::NONE,
+            save_at: None,
+            tell_key_at: None,
+            transparent: false,
+            own_address: None,
             untold: None,
             events: Deque::new(),
             started_at: HostTime::ZERO,
@@ -104,8 +120,9 @@ impl PacketRouter {
 
     /// Begins at `now`.
     pub(super) fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
-        self.outstanding = super::component::OutstandingRequests::new(chip.random);
+        self.outstanding = super::component::OutstandingRequests::new(access::nonce(&chip.random));
         self.chip = chip;
+        self.transparent = settings.transparent;
         self.settings = settings;
         self.uart_at = now;
         self.autopilot_at = now;
@@ -352,6 +369,42 @@ impl PacketRouter {
         }
     }
 
+    /// Returns the name of the network we make.
+    pub(super) fn network_name(&self) -> heapless::String<32> {
+        if !self.settings.ap_ssid.is_empty() {
+            return self.settings.ap_ssid.clone();
+        }
+        let [.., a, b, c] = self.chip.address;
+        let mut name = heapless::String::new();
+        // 14 characters fit.
+        let _ = write!(name, "vizflyt-{a:02x}{b:02x}{c:02x}");
+        name
+    }
+
+    // ---- unparsed ----
+
+    /// Takes bytes of the autopilot's port as they are.
+    pub(super) fn take_raw_uart(&mut self, now: HostTime, bytes: &[u8]) {
+        for part in bytes.chunks(MAX_PACKET) {
+            self.push_down(now, (0, 0), RAW, self.everybody(), false, part);
+        }
+    }
+
+    /// Takes bytes of a client as they are.
+    pub(super) fn take_raw_client(&mut self, now: HostTime, peer: Peer, bytes: &[u8]) {
+        let Some(index) = self.open(now, peer) else {
+            self.stats.drop(Reason::TooManyClients, 1);
+            return;
+        };
+        if let Some(client) = &mut self.clients[index] {
+            client.note_heard(now);
+        }
+        for part in bytes.chunks(MAX_PACKET) {
+            let tag = Tag { kind: RAW, source: (0, 0), to: 0, ours: false, stamp_ms: millis(now) };
+            self.push_up(tag, part);
+        }
+    }
+
     // ---- time ----
 
     /// Does what is due: silence of clients and autopilot, the seconds' messages, link loss.
@@ -374,7 +427,7 @@ impl PacketRouter {
 
     /// Returns when something other than sending is due next.
     pub(super) fn due(&self) -> HostTime {
-        let mut due = self.second_at;
+        let mut due = self.save_at.map_or(self.second_at, |at| at.min(self.second_at));
         if let Some(at) = self.loss.due(self.flight, self.settings.loss_ms) {
             due = due.min(at);
         }
@@ -382,11 +435,11 @@ impl PacketRouter {
     }
 
     /// Returns when a datagram is due to the first client that `of` names; `None` while none waits.
-    pub(super) fn batches_due(&self, of: impl Fn(&Client) -> bool) -> Option<HostTime> {
+    pub(super) fn batches_due(&self, of: impl Fn(&Client, &Settings) -> bool) -> Option<HostTime> {
         self.clients
             .iter()
             .flatten()
-            .filter(|client| client.pending > 0 && of(client))
+            .filter(|client| client.pending > 0 && of(client, &self.settings))
             .map(|client| self.batch_due(client))
             .min()
     }
@@ -441,11 +494,13 @@ impl PacketRouter {
         &mut self,
         now: HostTime,
         out: &mut [u8],
-        of: impl Fn(&Client) -> bool,
+        of: impl Fn(&Client, &Settings) -> bool,
     ) -> Option<(SocketAddrV4, usize)> {
         for step in 0..CLIENTS {
             let index = (self.turn + step) % CLIENTS;
-            let Some(client) = self.clients[index].as_ref().filter(|client| of(client)) else {
+            let Some(client) =
+                self.clients[index].as_ref().filter(|client| of(client, &self.settings))
+            else {
                 continue;
             };
             let Peer::Udp(address) = client.peer else { continue };
@@ -521,6 +576,9 @@ fn take<const N: usize>(ring: &mut Ring<N>, out: &mut [u8; MAX_PACKET]) -> Optio
     ring.pop();
     Some((tag, len))
 }
+
+/// Stands for a message's number where bytes are not parsed; no message that overtakes has it.
+const RAW: u16 = u16::MAX;
 
 /// Returns a message's number as the ring keeps it.
 pub(super) fn kind(id: u32) -> u16 {

@@ -13,6 +13,7 @@ use vizflyt_protocol::mavlink::dialect::{
 use vizflyt_protocol::mavlink::{MavHeader, Message, Packet, StreamDecoder, encode};
 
 use super::*;
+use crate::access;
 use crate::packet::Raw;
 use crate::stats::Reason;
 
@@ -417,6 +418,7 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
 }
 
 mod configuration;
+mod ground_station;
 mod landing;
 mod stations;
 

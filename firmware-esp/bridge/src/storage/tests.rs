@@ -103,13 +103,16 @@ fn the_longest_settings_fit() {
     for name in ["wifi.ssid", "wifi.ap_ssid", "hostname"] {
         longest.set(name, "n".repeat(32).as_str()).unwrap();
     }
-    for name in ["wifi.password", "wifi.ap_password"] {
+    for name in ["wifi.password", "wifi.ap_password", "page.key"] {
         longest.set(name, "p".repeat(63).as_str()).unwrap();
     }
     longest.set("address", "192.168.100.100/24").unwrap();
     longest.set("gateway", "192.168.100.100").unwrap();
     longest.set("client", "192.168.100.100:65535").unwrap();
-    longest.set("key", "ab".repeat(32).as_str()).unwrap();
+    for name in ["key", "vehicle.key"] {
+        longest.set(name, "ab".repeat(32).as_str()).unwrap();
+    }
+    longest.set("wifi.country", "DE").unwrap();
     for number in crate::settings::NUMBERS {
         number.set(&mut longest, number.most).unwrap();
     }

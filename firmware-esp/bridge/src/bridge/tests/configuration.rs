@@ -3,14 +3,14 @@
 use sha2::{Digest, Sha256};
 
 use super::*;
-use crate::access::{self, Op, PROOF, Status, TUNNEL_TYPE};
+use crate::access::{Op, PROOF, Status, TUNNEL_TYPE};
 use crate::settings::Key;
 use crate::stats::REPORT;
 
-const KEY: Key = [0x42; 32];
+pub(super) const KEY: Key = [0x42; 32];
 
 /// Asks the bridge; returns status and body of the answer.
-fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Status, Vec<u8>) {
+pub(super) fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Status, Vec<u8>) {
     let [low, high] = TUNNEL_TYPE.to_le_bytes();
     let mut payload = vec![low, high, 1, COMPONENT_ID, request.len() as u8];
     payload.extend_from_slice(request);
@@ -39,12 +39,12 @@ fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Status, Vec<u8>) {
     answer.expect("every request is answered")
 }
 
-fn request(op: Op, counter: u32, body: &[u8], key: Option<&Key>) -> Vec<u8> {
+pub(super) fn request(op: Op, counter: u32, body: &[u8], key: Option<&Key>) -> Vec<u8> {
     let mut request = vec![op as u8];
     request.extend_from_slice(&counter.to_le_bytes());
     request.extend_from_slice(body);
     if let Some(key) = key {
-        let proof: [u8; PROOF] = access::proof(key, &[7; 16], &request);
+        let proof: [u8; PROOF] = access::proof(key, &access::nonce(&[7; 16]), &request);
         request.extend_from_slice(&proof);
     }
     request
@@ -81,7 +81,7 @@ fn a_bridge_is_claimed_once_and_then_obeys_its_key_alone() {
 fn reading_is_open_and_tells_no_secret() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     let (status, hello) = ask(&mut bridge, 10, &request(Op::Hello, 0, b"", None));
-    assert_eq!((status, &hello[..16], hello[20]), (Status::Done, &[7; 16][..], 1));
+    assert_eq!((status, &hello[..16], hello[20]), (Status::Done, &access::nonce(&[7; 16])[..], 1));
     let (_, value) = ask(&mut bridge, 200, &request(Op::Read, 0, b"LOSS_MS", None));
     assert_eq!(value, b"1000");
     let (_, value) = ask(&mut bridge, 300, &request(Op::Read, 0, b"key", None));
@@ -105,7 +105,7 @@ fn nothing_changes_while_armed() {
 }
 
 /// Signs a packet as the MAVLink guide specifies.
-fn sign(packet: &[u8], key: &Key, stamp: u64) -> Vec<u8> {
+pub(super) fn sign(packet: &[u8], key: &Key, stamp: u64) -> Vec<u8> {
     let mut packet = packet.to_vec();
     let id = u32::from_le_bytes([packet[7], packet[8], packet[9], 0]);
     packet[2] = 1;
@@ -165,7 +165,8 @@ fn parameters_are_listed_and_set_by_who_signs_with_the_key() {
             _ => None,
         })
         .collect();
-    assert_eq!(names, (0..crate::settings::NUMBERS.len() as u16).collect::<Vec<_>>());
+    // Ours, and those by which a ground station knows a bridge.
+    assert_eq!(names, (0..crate::settings::NUMBERS.len() as u16 + 23).collect::<Vec<_>>());
     // The autopilot is asked as well: the request was for everybody.
     assert_eq!(foreign(uart(&mut bridge, at(5010))).len(), 1);
 }
