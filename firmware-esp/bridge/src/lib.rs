@@ -16,6 +16,7 @@ pub mod access;
 pub mod blink;
 pub mod bridge;
 pub mod dhcp;
+pub mod http;
 pub mod mavlink_writer;
 pub mod mdns;
 mod message_target;

@@ -1,46 +1,90 @@
-//! The status page: what a browser shows of a bridge, and the same as JSON. Reading only: settings
-//! change by `vizflyt bridge configure`, with the key; a firmware comes here too, and its signature
-//! speaks for it.
+//! The bridge in a browser: its state, its counters, the same as JSON, and its settings, which change for
+//! whoever types the key; see [`form`]. A firmware comes here too, and its signature speaks for it.
+
+pub mod form;
 
 use core::fmt::{self, Write as _};
 
+use form::Form;
 use heapless::String;
 use vizflyt_protocol::time::HostTime;
 
+use crate::access::Status;
 use crate::bridge::{Bridge, LandingStage, Peer};
+use crate::http::Request;
 use crate::stats::REPORT;
 
-/// Bytes of a response at most.
+/// Bytes of a part of a response at most.
 pub const RESPONSE: usize = 2048;
 
-/// Answers an HTTP request by its first line.
-pub fn respond(bridge: &Bridge, now: HostTime, request: &[u8]) -> String<RESPONSE> {
-    let mut out = String::new();
-    let written = match request {
-        request if request.starts_with(b"GET / ") => page(bridge, now, &mut out),
-        request if request.starts_with(b"GET /stats.json ") => json(bridge, now, &mut out),
-        _ => out.write_str(
-            "HTTP/1.0 404 Not Found\r\nConnection: close\r\n\r\nthere is / and /stats.json\n",
-        ),
-    };
-    if written.is_err() {
-        // More clients than fit: an error rather than half a page.
-        out.clear();
-        let _ = out
-            .write_str("HTTP/1.0 500 Internal Server Error\r\nConnection: close\r\n\r\ntoo long\n");
+/// How every page begins. Nothing from elsewhere is loaded, framed, or sent to.
+const HTML: &str = "HTTP/1.0 200 OK\r\nContent-Type: text/html; charset=utf-8\r\n\
+    Cache-Control: no-store\r\nConnection: close\r\nX-Frame-Options: DENY\r\n\
+    Content-Security-Policy: default-src 'none'; form-action 'self'\r\n\r\n<!doctype html>";
+/// How every other answer goes on behind its first line.
+const TEXT: &str = "\r\nContent-Type: text/plain; charset=utf-8\r\nConnection: close\r\n\r\n";
+
+/// Does what a request asks for, once; returns how that fared, if it asks for a change.
+pub fn act(bridge: &mut Bridge, now: HostTime, request: &Request) -> Option<Status> {
+    if request.is_too_long() || !request.is(b"POST /settings ") {
+        return None;
     }
-    out
+    let form = Form::parse(request.body()).filter(|_| !request.is_foreign());
+    Some(form.map_or(Status::Malformed, |form| bridge.change_by_form(now, &form)))
 }
 
-/// Whether the end of the request's head has come.
-pub fn is_whole(request: &[u8]) -> bool {
-    body(request).is_some()
+/// Returns a part of the answer to a request, of which `done` is what [`act`] returned; `None` behind the
+/// last part.
+pub fn respond(
+    bridge: &Bridge,
+    now: HostTime,
+    request: &Request,
+    done: Option<Status>,
+    part: usize,
+) -> Option<String<RESPONSE>> {
+    let mut out = String::new();
+    let written = match done {
+        None if request.is(b"GET /settings ") && !request.is_too_long() => {
+            form::write_part(bridge, part, &mut out)
+        }
+        _ if part > 0 => Ok(false),
+        Some(status) => answer_change(status, &mut out).map(|()| true),
+        None => answer(bridge, now, request, &mut out).map(|()| true),
+    };
+    match written {
+        Ok(true) => Some(out),
+        Ok(false) => None,
+        Err(fmt::Error) => {
+            // More clients than fit: an error rather than half a page.
+            out.clear();
+            let _ = write!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long\n");
+            Some(out)
+        }
+    }
 }
 
-/// Returns where a new firmware begins in a request that brings one: `POST /update`, the signed file
-/// as it is.
-pub fn firmware(request: &[u8]) -> Option<usize> {
-    body(request).filter(|_| request.starts_with(b"POST /update "))
+fn answer(
+    bridge: &Bridge,
+    now: HostTime,
+    request: &Request,
+    out: &mut String<RESPONSE>,
+) -> fmt::Result {
+    if request.is_too_long() {
+        write!(out, "HTTP/1.0 413 Content Too Large{TEXT}too long\n")
+    } else if request.is(b"GET / ") {
+        page(bridge, now, out)
+    } else if request.is(b"GET /stats.json ") {
+        json(counters(bridge, now), out)
+    } else if request.is(b"GET /status.json") {
+        json(station_counters(bridge).into_iter(), out)
+    } else {
+        write!(out, "HTTP/1.0 404 Not Found{TEXT}there is /, /settings and /stats.json\n")
+    }
+}
+
+fn answer_change(status: Status, out: &mut String<RESPONSE>) -> fmt::Result {
+    let line = form::status_line(status);
+    write!(out, "HTTP/1.0 {line}{TEXT}{}; go back to see the settings\n", status.message())
 }
 
 /// Answers a request that brought a firmware.
@@ -58,20 +102,34 @@ pub fn respond_firmware(taken: Result<(), &str>) -> String<RESPONSE> {
     out
 }
 
-fn body(request: &[u8]) -> Option<usize> {
-    request.windows(4).position(|end| end == b"\r\n\r\n").map(|at| at + 4)
-}
-
 fn counters(bridge: &Bridge, now: HostTime) -> impl Iterator<Item = (&'static str, u32)> {
     REPORT.iter().copied().zip(bridge.stats().report(bridge.uptime_s(now)))
 }
 
+/// What QGroundControl's page of a bridge asks for; `v` is the vehicle, `g` the ground.
+fn station_counters(bridge: &Bridge) -> [(&'static str, u32); 6] {
+    let stats = bridge.stats();
+    [
+        ("vpackets", stats.uart.cut.packets),
+        ("vsent", stats.uart.packets_out),
+        ("vlost", stats.uart.lost),
+        ("gpackets", stats.net.cut.packets),
+        ("gsent", stats.net.packets_out),
+        ("glost", stats.net.lost),
+    ]
+}
+
 fn page(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Result {
-    out.write_str("HTTP/1.0 200 OK\r\nContent-Type: text/html; charset=utf-8\r\n")?;
-    out.write_str("Cache-Control: no-store\r\nConnection: close\r\n\r\n")?;
-    out.write_str("<!doctype html><meta http-equiv=refresh content=2><title>bridge</title>")?;
+    out.write_str(HTML)?;
+    out.write_str("<meta http-equiv=refresh content=2><title>bridge</title>")?;
     // The name is letters, digits and hyphens: nothing to escape.
-    write!(out, "<h1>{}</h1><pre>", bridge.settings().hostname)?;
+    write!(out, "<h1>{}</h1><a href=/settings>settings</a><pre>", bridge.settings().hostname)?;
+    if bridge.is_transparent() {
+        writeln!(out, "transparent: bytes pass unparsed; no priorities, no LAND")?;
+    }
+    if let Some(cause) = bridge.stats().restart_cause.message() {
+        writeln!(out, "{cause}")?;
+    }
     match bridge.autopilot() {
         Some((system, _)) if bridge.is_armed() => writeln!(out, "vehicle {system}, armed")?,
         Some((system, _)) => writeln!(out, "vehicle {system}, disarmed")?,
@@ -101,11 +159,14 @@ fn page(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Resu
     out.write_str("</pre>")
 }
 
-fn json(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Result {
+fn json(
+    counters: impl Iterator<Item = (&'static str, u32)>,
+    out: &mut String<RESPONSE>,
+) -> fmt::Result {
     out.write_str(
         "HTTP/1.0 200 OK\r\nContent-Type: application/json\r\nConnection: close\r\n\r\n",
     )?;
-    for (place, (name, value)) in counters(bridge, now).enumerate() {
+    for (place, (name, value)) in counters.enumerate() {
         write!(out, "{}\"{name}\":{value}", if place == 0 { '{' } else { ',' })?;
     }
     out.write_str("}\n")
@@ -113,7 +174,11 @@ fn json(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Resu
 
 #[cfg(test)]
 mod tests {
+    extern crate std;
+
     use core::net::{Ipv4Addr, SocketAddrV4};
+
+    use std::borrow::ToOwned as _;
 
     use super::*;
     use crate::settings::Settings;
@@ -132,11 +197,21 @@ mod tests {
         bridge
     }
 
+    /// Answers a request, all parts of it.
+    fn answered(bridge: &mut Bridge, request: &str) -> std::string::String {
+        let mut whole = Request::new();
+        whole.push(request.as_bytes());
+        let now = HostTime::from_ns(5_000_000_000);
+        let done = act(bridge, now, &whole);
+        let parts = (0..).map_while(|part| respond(bridge, now, &whole, done, part));
+        parts.map(|part| part.as_str().to_owned()).collect()
+    }
+
     #[test]
     fn the_page_and_its_figures_fit_and_tell_no_secret() {
-        let bridge = crowded();
-        let check = |request: &str, expected: &[&str]| {
-            let answer = respond(&bridge, HostTime::from_ns(5_000_000_000), request.as_bytes());
+        let mut bridge = crowded();
+        let mut check = |request: &str, expected: &[&str]| {
+            let answer = answered(&mut bridge, request);
             for part in expected {
                 assert!(answer.contains(part), "{request}: {answer}");
             }
@@ -148,15 +223,69 @@ mod tests {
             "GET /stats.json HTTP/1.1\r\n\r\n",
             &["{\"uptime_s\":5,", "\"net_packets_in\":8,", "}\n"],
         );
+        let six = ["vpackets", "vsent", "vlost", "gpackets", "gsent", "glost"];
+        check("GET /status.json?r=1 HTTP/1.1\r\n\r\n", &six);
+        let settings = ["LOSS_MS           1000", "wifi.password     ***", "<form method=post"];
+        check("GET /settings HTTP/1.1\r\n\r\n", &settings);
         check("GET /setup HTTP/1.1\r\n\r\n", &["404"]);
         check("POST / HTTP/1.1\r\n\r\n", &["404"]);
-        check("\u{0}", &["404"]);
+        check("\u{0}\n\n", &["404"]);
+    }
+
+    fn post(body: &str, more: &str) -> std::string::String {
+        std::format!(
+            "POST /settings HTTP/1.1\r\n{more}Content-Length: {}\r\n\r\n{body}",
+            body.len()
+        )
     }
 
     #[test]
-    fn a_requests_end_is_found() {
-        assert!(is_whole(b"GET / HTTP/1.0\r\n\r\n"));
-        assert!(!is_whole(b"GET / HTTP/1.0\r\nHost: a\r\n"));
-        assert!(!is_whole(b""));
+    fn settings_change_for_who_has_the_key_and_for_nobody_else() {
+        let mut bridge = crowded();
+        let change = "name=LOSS_MS&value=800&key=";
+        let check = |bridge: &mut Bridge, request: &str, line: &str, loss_ms: u16| {
+            let answer = answered(bridge, request);
+            assert!(answer.starts_with(line), "{request}: {answer}");
+            assert_eq!(bridge.settings().loss_ms, loss_ms, "{request}");
+        };
+        // No key was ever given out: nobody has it, not even who sends none.
+        check(&mut bridge, &post(change, ""), "HTTP/1.0 403", 1000);
+        let mut settings = bridge.settings().clone();
+        settings.set("page.key", "abcd-efgh-2345-6789").unwrap();
+        let hex = "ab".repeat(32);
+        settings.set("key", &hex).unwrap();
+        let mut bridge = Bridge::new(HostTime::ZERO, settings, Chip::default());
+        let right = post(&std::format!("{change}abcd-efgh-2345-6789"), "");
+        let foreign =
+            post(&std::format!("{change}abcd-efgh-2345-6789"), "Sec-Fetch-Site: cross-site\r\n");
+        check(&mut bridge, &foreign, "HTTP/1.0 400", 1000);
+        check(&mut bridge, &post("name=LOSS_MS&value=800", ""), "HTTP/1.0 400", 1000);
+        check(&mut bridge, &right, "HTTP/1.0 200", 800);
+        assert_eq!(bridge.poll_event(), Some(crate::Event::Save));
+        check(
+            &mut bridge,
+            &post(&std::format!("name=LOSS_MS&value=700&key={hex}"), ""),
+            "HTTP/1.0 200",
+            700,
+        );
+        check(
+            &mut bridge,
+            &post(&std::format!("name=LOSS_MS&value=1&key={hex}"), ""),
+            "HTTP/1.0 400",
+            700,
+        );
+        check(
+            &mut bridge,
+            &post(&std::format!("{change}abcd-efgh-2345-678"), ""),
+            "HTTP/1.0 403",
+            700,
+        );
+        // Whoever guesses waits, and so does everybody else for a moment.
+        check(&mut bridge, &right, "HTTP/1.0 403", 700);
+        let mut armed = [0; 280];
+        let payload = [4, 0, 0, 0, 2, 3, 0x80 | 0x09, 4, 3];
+        let len = mavlink_writer::write_packet(&mut armed, (1, 1), 0, 0, &payload);
+        bridge.handle_uart(HostTime::from_ns(9_000_000_000), &armed[..len]);
+        check(&mut bridge, &right, "HTTP/1.0 409", 700);
     }
 }

@@ -369,6 +369,10 @@ pub(crate) fn text<const N: usize>(value: &str) -> String<N> {
 }
 
 fn put<const N: usize>(to: &mut String<N>, value: &str) -> Result<(), Refused> {
+    // In flash a setting is a line.
+    if value.chars().any(char::is_control) {
+        return Err(Refused::Malformed);
+    }
     *to = String::try_from(value).map_err(|_| Refused::Malformed)?;
     Ok(())
 }
@@ -427,6 +431,7 @@ mod tests {
         };
         check("wifi.ssid", "lab net", Ok("lab net"));
         check("wifi.ssid", "a name of more than thirty-two bytes", Err(Refused::Malformed));
+        check("wifi.ssid", "two\nkey=", Err(Refused::Malformed));
         check("wifi.password", "12345678", Ok("***"));
         check("wifi.ap_password", "short", Err(Refused::Malformed));
         check("wifi.ap_password", "", Ok(""));

@@ -21,6 +21,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 use crate::bridge::{Bridge, Event, TCP_SLOTS};
+use crate::http::{Progress, Request};
 use crate::page;
 use crate::stats::RestartCause;
 use crate::storage::Store;
@@ -149,7 +150,8 @@ const SILENT: usize = 300;
 struct PageBuffers {
     receive: [u8; 536],
     transmit: [u8; 536],
-    request: [u8; 256],
+    chunk: [u8; 128],
+    request: Request,
 }
 
 #[derive(Debug)]
@@ -181,7 +183,12 @@ impl Buffers {
             },
             tcp: [const { TcpBuffers { receive: [0; 536], transmit: [0; 1072], batch: [0; 536] } };
                 TCP_SLOTS],
-            page: PageBuffers { receive: [0; 536], transmit: [0; 536], request: [0; 256] },
+            page: PageBuffers {
+                receive: [0; 536],
+                transmit: [0; 536],
+                chunk: [0; 128],
+                request: Request::new(),
+            },
         }
     }
 }
@@ -407,7 +414,7 @@ async fn show_page<P: Platform>(
     if port == 0 {
         return;
     }
-    let PageBuffers { receive, transmit, request } = buffers;
+    let PageBuffers { receive, transmit, chunk, request } = buffers;
     loop {
         let mut socket = TcpSocket::new(stack, receive, transmit);
         // A browser that opens a connection for later must not keep others out.
@@ -416,25 +423,40 @@ async fn show_page<P: Platform>(
             Timer::after(Duration::from_millis(100)).await;
             continue;
         }
-        let mut len = 0;
-        while len < request.len() && !page::is_whole(&request[..len]) {
-            match socket.read(&mut request[len..]).await {
-                Ok(more @ 1..) => len += more,
+        request.restart();
+        let (mut len, mut progress) = (0, Progress::More);
+        while progress == Progress::More {
+            match socket.read(chunk).await {
+                Ok(more @ 1..) => {
+                    len = more;
+                    progress = request.push(&chunk[..len]);
+                }
                 _ => break,
             }
         }
         let mut restart = false;
-        if let Some(from) = page::firmware(&request[..len]) {
-            let taken = take_firmware(shared, platform, &mut socket, request, from, len).await;
-            restart = taken.is_ok();
-            let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
-            socket.close();
-            // Whoever still sends reads the answer only after that.
-            while let Ok(1..) = socket.read(request).await {}
-        } else if len > 0 {
-            let response = shared.take(|bridge, now| page::respond(bridge, now, &request[..len]));
-            // A browser that has gone wants no answer.
-            let _ = socket.write_all(response.as_bytes()).await;
+        match progress {
+            Progress::Firmware(from) => {
+                let taken = take_firmware(shared, platform, &mut socket, chunk, from, len).await;
+                restart = taken.is_ok();
+                let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
+                socket.close();
+                // Whoever still sends reads the answer only after that.
+                while let Ok(1..) = socket.read(chunk).await {}
+            }
+            Progress::Whole => {
+                let done = shared.with(|bridge, now| page::act(bridge, now, request));
+                for part in 0.. {
+                    let part =
+                        shared.take(|bridge, now| page::respond(bridge, now, request, done, part));
+                    let Some(part) = part else { break };
+                    // A browser that has gone wants no answer.
+                    if socket.write_all(part.as_bytes()).await.is_err() {
+                        break;
+                    }
+                }
+            }
+            Progress::More => {}
         }
         socket.close();
         let _ = socket.flush().await;
@@ -446,12 +468,12 @@ async fn show_page<P: Platform>(
     }
 }
 
-/// Takes a firmware whose first bytes are `request[from..to]`, the rest from the connection.
+/// Takes a firmware whose first bytes are `chunk[from..to]`, the rest from the connection.
 async fn take_firmware<P: Platform>(
     shared: &Shared,
     platform: &RefCell<&mut P>,
     socket: &mut TcpSocket<'_>,
-    request: &mut [u8],
+    chunk: &mut [u8],
     mut from: usize,
     mut to: usize,
 ) -> Result<(), &'static str> {
@@ -461,12 +483,12 @@ async fn take_firmware<P: Platform>(
         if shared.take(|bridge, _| bridge.is_armed()) {
             return Err("the vehicle is armed; land and disarm it first");
         }
-        if platform.borrow_mut().update(first, &request[from..to])? {
+        if platform.borrow_mut().update(first, &chunk[from..to])? {
             return Ok(());
         }
         first = false;
         from = 0;
-        to = match socket.read(request).await {
+        to = match socket.read(chunk).await {
             Ok(len @ 1..) => len,
             _ => return Err("the connection ended before the firmware did"),
         };

@@ -7,8 +7,10 @@ use embedded_storage::nor_flash::NorFlash;
 use esp_hal::gpio::Input;
 use esp_println::println;
 use vizflyt_bridge::shell::{Light, Platform};
+use vizflyt_bridge::stats::RestartCause;
 
 use crate::flash::{self, Flash};
+use crate::restart::Watchdog;
 use crate::update::Updates;
 use crate::{radio, serial};
 
@@ -30,6 +32,8 @@ pub(crate) fn light() -> Light {
 pub(crate) struct Front {
     /// `None` if it takes no firmware over the network.
     pub(crate) updates: Option<Updates>,
+    pub(crate) watchdog: Watchdog,
+    pub(crate) cause: RestartCause,
 }
 
 impl Platform for Front {
@@ -38,12 +42,24 @@ impl Platform for Front {
     }
 
     fn show(&mut self, light: Light) {
-        println!("{light:?}; serial overruns {}", serial::overruns());
+        println!("{light:?}");
         LIGHT.store(light as u8, Ordering::Relaxed);
     }
 
     fn signal_dbm(&mut self) -> Option<i8> {
         radio::signal_dbm()
+    }
+
+    fn overruns(&mut self) -> u32 {
+        serial::overruns()
+    }
+
+    fn restart_cause(&mut self) -> RestartCause {
+        self.cause
+    }
+
+    fn feed(&mut self) {
+        self.watchdog.feed();
     }
 
     fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {

@@ -3,12 +3,13 @@
 //! ```text
 //! GPIO4 ──▶ autopilot RX      GPIO5 ◀── autopilot TX       UART1, 921600 baud
 //! GPIO6 RTS ──▶ CTS           GPIO7 CTS ◀── RTS            only with UART_FLOW
+//!                             others by UART_TX_PIN and its like
 //! GPIO10 LED to ground, GPIO8 LED to 3.3 V (on most boards)
 //! GPIO9 the BOOT button: held for five seconds it forgets the settings
 //! USB: log, and flashing
 //! ```
 //! The autopilot's bytes are taken in an interrupt, the radio has the scheduler's threads, and the
-//! bridge is the tasks of the main thread.
+//! bridge is the tasks of the main thread. A panic restarts the chip, and so does forwarding that hangs.
 
 #![no_std]
 #![no_main]
@@ -17,7 +18,9 @@ extern crate alloc;
 
 mod flash;
 mod front;
+mod pins;
 mod radio;
+mod restart;
 mod serial;
 mod update;
 
@@ -28,7 +31,7 @@ use embassy_net::{Runner, Stack, StackResources};
 use embassy_time::{Duration, Timer};
 use esp_backtrace as _;
 use esp_hal::clock::CpuClock;
-use esp_hal::gpio::{Input, InputConfig, Level, Output, OutputConfig, Pull};
+use esp_hal::gpio::{Input, InputConfig, Level, Output, OutputConfig, Pin as _, Pull};
 use esp_hal::interrupt::Priority;
 use esp_hal::ram;
 use esp_hal::rng::Rng;
@@ -36,7 +39,7 @@ use esp_hal::timer::timg::TimerGroup;
 use esp_hal::uart::{Uart, UartTx};
 use esp_hal::{Blocking, efuse};
 use esp_println::println;
-use esp_radio::wifi::{ControllerConfig, WifiController};
+use esp_radio::wifi::{ControllerConfig, CountryInfo, WifiController};
 use esp_rtos::embassy::InterruptExecutor;
 use esp_storage::FlashStorage;
 use static_cell::{ConstStaticCell, StaticCell};
@@ -50,6 +53,8 @@ esp_bootloader_esp_idf::esp_app_desc!();
 /// chip's own loader used. [bytes]
 const RECLAIMED_BYTES: usize = 64 * 1024;
 const HEAP_BYTES: usize = 48 * 1024;
+/// What is allowed everywhere: channels 1 to 11.
+const ANYWHERE: &[u8; 2] = b"01";
 /// Time on the network after which a new firmware stays.
 const TRIAL: Duration = Duration::from_secs(30);
 
@@ -64,6 +69,8 @@ async fn main(spawner: Spawner) -> ! {
     static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
 
     let chip = esp_hal::init(esp_hal::Config::default().with_cpu_clock(CpuClock::max()));
+    let cause = restart::cause();
+    let watchdog = restart::Watchdog::start(TimerGroup::new(chip.TIMG1).wdt);
     let flash: &'static flash::Flash =
         FLASH.init_with(|| RefCell::new(FlashStorage::new(chip.FLASH)));
     let on_trial = update::start(flash);
@@ -75,13 +82,27 @@ async fn main(spawner: Spawner) -> ! {
     let mut store = Store::new(flash::settings(flash), 0);
     let settings = store.load().unwrap_or_default();
 
+    let pins = pins::Pins([
+        (0, Some(chip.GPIO0.degrade())),
+        (1, Some(chip.GPIO1.degrade())),
+        (2, Some(chip.GPIO2.degrade())),
+        (3, Some(chip.GPIO3.degrade())),
+        (4, Some(chip.GPIO4.degrade())),
+        (5, Some(chip.GPIO5.degrade())),
+        (6, Some(chip.GPIO6.degrade())),
+        (7, Some(chip.GPIO7.degrade())),
+        (20, Some(chip.GPIO20.degrade())),
+        (21, Some(chip.GPIO21.degrade())),
+    ])
+    .take(settings.pins)
+    .unwrap_or_else(|| panic!("the settings name a pin that no port may have"));
     let port = Uart::new(chip.UART1, serial::config(settings.baud, settings.flow_control))
         // The settings keep within what the port can do.
         .unwrap_or_else(|error| panic!("the serial port refuses {} baud: {error}", settings.baud))
-        .with_tx(chip.GPIO4)
-        .with_rx(chip.GPIO5);
+        .with_tx(pins.tx)
+        .with_rx(pins.rx);
     let port =
-        if settings.flow_control { port.with_rts(chip.GPIO6).with_cts(chip.GPIO7) } else { port };
+        if settings.flow_control { port.with_rts(pins.rts).with_cts(pins.cts) } else { port };
     let (receiver, sender) = port.split();
     let urgent = URGENT.init(InterruptExecutor::new(chip.FROM_CPU_INTR1));
     // Each task is spawned once: its one place is free.
@@ -90,7 +111,9 @@ async fn main(spawner: Spawner) -> ! {
     let rng = Rng::new();
     let mut random = [0; 16];
     let mut seed = [0; 8];
-    let controller = WifiController::new(chip.WIFI, ControllerConfig::default())
+    let country = *settings.country.as_bytes().first_chunk().unwrap_or(ANYWHERE);
+    let config = ControllerConfig::default().with_country_info(CountryInfo::from(country));
+    let controller = WifiController::new(chip.WIFI, config)
         .unwrap_or_else(|error| panic!("the radio does not start: {error:?}"));
     // Random indeed only with the radio on.
     rng.read(&mut random);
@@ -105,12 +128,12 @@ async fn main(spawner: Spawner) -> ! {
     let shared: &'static Shared = SHARED.take();
     let mut address = [0; 6];
     address.copy_from_slice(efuse::base_mac_address().as_bytes());
-    println!("vizflyt bridge {}, {} baud", env!("CARGO_PKG_VERSION"), settings.baud);
+    println!("vizflyt bridge {}, {} baud; {cause:?}", env!("CARGO_PKG_VERSION"), settings.baud);
     shared.with(|bridge, now| bridge.begin(now, settings, Chip { address, random }));
 
     spawner.spawn(network(runner).unwrap());
     spawner.spawn(join_networks(shared, stack, controller, WIFI.take()).unwrap());
-    let front = front::Front { updates: update::Updates::new(flash) };
+    let front = front::Front { updates: update::Updates::new(flash), watchdog, cause };
     spawner.spawn(forward(shared, stack, sender, store, front, BUFFERS.take()).unwrap());
     if on_trial {
         spawner.spawn(settle(stack, flash).unwrap());

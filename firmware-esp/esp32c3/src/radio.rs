@@ -189,7 +189,8 @@ impl wifi::Radio for Control {
             .with_channel(channel);
         let open = self.configure(&Config::AccessPoint(config));
         if open {
-            println!("own network {ssid:?}, channel {channel}");
+            // Whoever holds the board may know it; the air never hears it.
+            println!("own network {ssid:?}, channel {channel}, password {password:?}");
             set_role(Role::AccessPoint);
         }
         open

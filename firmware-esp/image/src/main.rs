@@ -1,10 +1,19 @@
 //! Makes what is flashed of the ESP32-C3's bridge: one file with bootloader, partition table and
 //! program for the first time, over USB, and the program alone for updates over the network.
 //!
-//! `vizflyt-bridge-image ELF PARTITIONS.csv FOLDER`
+//! `vizflyt-bridge-image [--open | --key KEY] ELF PARTITIONS.csv FOLDER`
+//! `vizflyt-bridge-image [--open | --key KEY] --settings FILE`
+//!
+//! The file for the first time holds settings: the key of the bridge's own network, new for every file,
+//! which also opens its settings in a browser. It is printed, and is nowhere else. `--settings` makes the
+//! settings alone, for a chip whose program another tool writes.
+
+mod settings;
 
 use std::path::Path;
 use std::{env, fs};
+
+use settings::Access;
 
 use anyhow::{Context as _, Result, bail};
 use espflash::flasher::{FlashData, FlashMode, FlashSettings, FlashSize};
@@ -14,10 +23,35 @@ use espflash::target::{Chip, XtalFrequency};
 /// What every board of the guide has; an image for 4 MB runs on larger flash too.
 const FLASH: FlashSize = FlashSize::_4Mb;
 
+/// Where the settings lie: `settings` in `partitions.csv`.
+const SETTINGS: usize = 0x9000;
+
 fn main() -> Result<()> {
-    let arguments: Vec<String> = env::args().skip(1).collect();
-    let [elf, partitions, folder] = &arguments[..] else {
-        bail!("usage: vizflyt-bridge-image ELF PARTITIONS.csv FOLDER");
+    let mut arguments: Vec<String> = env::args().skip(1).collect();
+    let access = match arguments.first().map(String::as_str) {
+        Some("--open") => {
+            arguments.remove(0);
+            Access::Open
+        }
+        Some("--key") if arguments.len() > 1 => {
+            arguments.remove(0);
+            Access::Given(arguments.remove(0))
+        }
+        _ => Access::Random,
+    };
+    let first = settings::first(&access)?;
+    let (elf, partitions, folder) = match &arguments[..] {
+        [flag, file] if flag == "--settings" => {
+            fs::write(file, &first.flash).with_context(|| format!("cannot write {file}"))?;
+            println!("{file}: {} bytes", first.flash.len());
+            print_key(first.key.as_deref());
+            return Ok(());
+        }
+        [elf, partitions, folder] => (elf, partitions, folder),
+        _ => bail!(
+            "usage: vizflyt-bridge-image [--open | --key KEY] ELF PARTITIONS.csv FOLDER
+       vizflyt-bridge-image [--open | --key KEY] --settings FILE"
+        ),
     };
     let bytes = fs::read(elf).with_context(|| format!("cannot read {elf}; build it first"))?;
     let folder = Path::new(folder);
@@ -43,6 +77,8 @@ fn main() -> Result<()> {
         whole.resize(start, 0xFF);
         whole.extend_from_slice(segment.data());
     }
+    // The loader leaves the settings' region out.
+    whole[SETTINGS..SETTINGS + first.flash.len()].copy_from_slice(&first.flash);
     let mut program = Vec::new();
     for segment in format()?.ota_segments() {
         program.extend_from_slice(segment.data());
@@ -53,5 +89,17 @@ fn main() -> Result<()> {
         fs::write(&path, content).with_context(|| format!("cannot write {}", path.display()))?;
         println!("{}: {} bytes", path.display(), content.len());
     }
+    print_key(first.key.as_deref());
     Ok(())
+}
+
+/// Prints what nobody can read from the bridge later.
+fn print_key(key: Option<&str>) {
+    match key {
+        Some(key) => {
+            println!("key of its network, and of its settings in a browser: {key}");
+            println!("write it down; another file has another key");
+        }
+        None => println!("its network is open: whoever is near is in it"),
+    }
 }

@@ -33,6 +33,7 @@ use router::PacketRouter;
 
 use crate::access;
 use crate::packet::{CutStats, Cutter, each_in_datagram};
+use crate::page::form::Form;
 use crate::settings::Settings;
 use crate::stats::{RestartCause, Stats};
 
@@ -196,6 +197,11 @@ impl Bridge {
     /// Network or port refused what was taken from [`Self::poll_udp`] or [`Self::poll_uart`].
     pub fn note_not_sent(&mut self) {
         self.router.stats.drop(crate::stats::Reason::NotSent, 1);
+    }
+
+    /// Changes a setting as a browser's form asks, if its key is right; returns how that fared.
+    pub fn change_by_form(&mut self, now: HostTime, form: &Form) -> access::Status {
+        self.router.change_by_form(now, form)
     }
 
     /// Reports the result of [`Event::Save`]; a failure is announced.

@@ -4,7 +4,8 @@ use vizflyt_protocol::time::HostTime;
 
 use super::router::PacketRouter;
 use crate::access::{HEAD, Op, PROOF, ShellRequest, Status};
-use crate::settings::Refused;
+use crate::page::form::Form;
+use crate::settings::{Refused, key_to_hex};
 
 impl PacketRouter {
     /// Answers a request; returns the answer's length.
@@ -104,6 +105,43 @@ impl PacketRouter {
         }
     }
 
+    /// Changes a setting as a browser's form asks.
+    pub(super) fn change_by_form(&mut self, now: HostTime, form: &Form) -> Status {
+        let refusal =
+            if self.flight.armed { Some(Status::Armed) } else { self.form_refusal(now, &form.key) };
+        if let Some(status) = refusal {
+            self.stats.refused = self.stats.refused.wrapping_add(1);
+            return status;
+        }
+        let status = status_of(self.settings.set(&form.name, &form.value));
+        if status == Status::Done {
+            self.apply_settings(now);
+            self.grant(now, ShellRequest::Save);
+            if form.restart {
+                self.grant(now, ShellRequest::Restart);
+            }
+        }
+        status
+    }
+
+    /// Returns why a typed key opens nothing, if so.
+    fn form_refusal(&mut self, now: HostTime, typed: &str) -> Option<Status> {
+        let own = self.settings.key.as_ref().map(key_to_hex);
+        let right = [Some(&self.settings.page_key), own.as_ref()]
+            .into_iter()
+            .flatten()
+            .filter(|key| !key.is_empty())
+            .any(|key| is_same(key, typed));
+        if now < self.form_opens_at {
+            return Some(Status::WrongKey);
+        }
+        if !right {
+            self.form_opens_at = now.plus_seconds(GUESS_S);
+            return Some(Status::WrongKey);
+        }
+        None
+    }
+
     fn hello(&self, out: &mut [u8]) -> usize {
         let access = &self.outstanding.access;
         out[..16].copy_from_slice(&access.nonce);
@@ -123,6 +161,16 @@ impl PacketRouter {
         }
         4 * counters.len()
     }
+}
+
+/// After a wrong key in the form nobody's is taken for this long: 80 bits are not guessed, and a short
+/// password of somebody's own is not either. [s]
+const GUESS_S: f64 = 2.0;
+
+/// Compares in a time that says nothing of where two keys differ.
+fn is_same(key: &str, typed: &str) -> bool {
+    let differ = key.bytes().zip(typed.bytes()).fold(0, |differ, (a, b)| differ | (a ^ b));
+    key.len() == typed.len() && differ == 0
 }
 
 fn status_of(result: Result<(), Refused>) -> Status {

@@ -63,6 +63,8 @@ pub(super) struct PacketRouter {
     pub(super) save_at: Option<HostTime>,
     /// When the password that we made is told next.
     pub(super) tell_key_at: Option<HostTime>,
+    /// Until then the browser's form takes no key.
+    pub(super) form_opens_at: HostTime,
     /// Bytes pass unparsed; as it was at the start.
     pub(super) transparent: bool,
     pub(super) own_address: Option<Ipv4Addr>,
@@ -103,6 +105,7 @@ impl PacketRouter {
             typed: TypedTexts::NONE,
             save_at: None,
             tell_key_at: None,
+            form_opens_at: HostTime::ZERO,
             transparent: false,
             own_address: None,
             untold: None,

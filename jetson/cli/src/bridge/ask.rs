@@ -29,6 +29,8 @@ pub(crate) struct BridgeClient {
     counter: u32,
     /// Whether it has a key.
     pub(crate) claimed: bool,
+    /// Whether bytes pass it unparsed.
+    pub(crate) transparent: bool,
     /// Its firmware's version.
     pub(crate) version: String,
 }
@@ -52,6 +54,7 @@ impl BridgeClient {
             random: [0; 16],
             counter: 0,
             claimed: false,
+            transparent: false,
             version: String::new(),
         };
         let (_, hello) = client.ask(Op::Hello, b"", None)?;
@@ -65,6 +68,7 @@ impl BridgeClient {
         client.random = *random;
         client.counter = u32::from_le_bytes(counter);
         client.claimed = flags & 1 != 0;
+        client.transparent = flags & 4 != 0;
         client.version = String::from_utf8_lossy(&hello[21..]).into_owned();
         Ok(client)
     }

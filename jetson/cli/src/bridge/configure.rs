@@ -22,6 +22,9 @@ use crate::terminal::print_line;
   vizflyt bridge configure                                          shows every setting
   vizflyt bridge configure WIFI_STATION=1 wifi.ssid=lab wifi.password=... --restart
   vizflyt bridge configure --bridge vizflyt.local LOSS_MS=800
+  vizflyt bridge configure vehicle.key=@/etc/vizflyt/mavlink.key    signs its LAND; a key may be a file
+  vizflyt bridge configure wifi.country=DE UART_TX_PIN=21 UART_RX_PIN=20 --restart
+  vizflyt bridge configure TRANSPARENT=1 --restart                  bytes of any kind, and no LAND
 
 A change is kept at once. Nothing changes while the vehicle is armed.")]
 pub(crate) struct ConfigureArgs {
@@ -79,7 +82,7 @@ pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
             tell_it(Op::Reset, "")?;
         }
         for setting in &args.changes {
-            tell_it(Op::Set, setting)?;
+            tell_it(Op::Set, &with_file(setting)?)?;
         }
         tell_it(Op::Save, "")?;
         if args.restart {
@@ -93,6 +96,14 @@ pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
         show(&mut client)?;
     }
     Ok(())
+}
+
+/// Puts a file's content in the place of a key's `@FILE`: keys are not for a shell's history.
+fn with_file(setting: &str) -> Result<String> {
+    let file = setting.split_once("=@").filter(|(name, _)| name.ends_with("key"));
+    let Some((name, path)) = file else { return Ok(setting.to_owned()) };
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {path}"))?;
+    Ok(format!("{name}={}", text.trim()))
 }
 
 fn claim(client: &mut BridgeClient, args: &ConfigureArgs) -> Result<()> {
@@ -139,6 +150,9 @@ fn change(client: &mut BridgeClient, op: Op, body: &str, key: &Key) -> Result<()
 fn show(client: &mut BridgeClient) -> Result<()> {
     let claimed = if client.claimed { "" } else { "; it has no key yet: --claim" };
     print_line(format!("bridge {}{claimed}", client.version));
+    if client.transparent {
+        print_line("transparent: bytes pass unparsed; no priorities, no LAND, armed or not");
+    }
     let names = NUMBERS.iter().map(|number| number.name);
     for name in names.chain(TEXTS.iter().map(|&(name, _)| name)) {
         // An older firmware may not know a name of ours.

@@ -33,7 +33,9 @@ use crate::terminal::{print_line, stop_flag};
   vizflyt bridge emulate --uart pty:/tmp/uart           then: vizflyt sim --serial /tmp/uart
   vizflyt bridge emulate --uart /dev/ttyUSB0            this computer carries a real autopilot's port
   vizflyt bridge emulate --client 127.0.0.1:14550       speaks first, to a runtime that waits there
-  vizflyt bridge emulate --page 127.0.0.1:8090          with the status page, as a browser shows it")]
+  vizflyt bridge emulate --page 127.0.0.1:8090 --set page.key=abcd-efgh
+                                                        with its page; the key changes settings there
+  vizflyt bridge emulate --set TRANSPARENT=1            bytes of any kind, unparsed: no LAND")]
 pub(crate) struct EmulateArgs {
     /// The autopilot's port: `pty` makes a pseudo-terminal, `pty:PATH` links to it by a name, PATH
     /// is a serial device.
@@ -119,6 +121,9 @@ pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
         }
         if let Some(page) = page {
             print_line(format!("              its page: http://{page}"));
+        }
+        if emulation.bridge.is_transparent() {
+            print_line("              transparent: bytes pass unparsed; no priorities, no LAND");
         }
     }
     while !stop.load(Ordering::Relaxed) {
@@ -213,7 +218,7 @@ impl Emulation {
         self.port.receive(now, |bytes| bridge.handle_uart(at, bytes))?;
         self.receive_udp(at);
         self.receive_tcp(at);
-        if self.page.as_mut().is_some_and(|page| page.turn(&self.bridge, at, now)) {
+        if self.page.as_mut().is_some_and(|page| page.turn(&mut self.bridge, at, now)) {
             self.restart(at)?;
         }
         if self.bridge.poll_timeout() <= at {

@@ -1,4 +1,4 @@
-//! The emulated bridge's status page, which takes firmware too: one browser after another, as on a
+//! The emulated bridge's page, which takes settings and firmware too: one browser after another, as on a
 //! chip, without ever waiting for it.
 
 use std::io::{ErrorKind, Read, Write};
@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use vizflyt_bridge::Bridge;
+use vizflyt_bridge::http::{Progress, Request};
 use vizflyt_bridge::page;
 use vizflyt_bridge::settings::Key;
 use vizflyt_bridge::update::{Fault, Slots, Target, Updater, Wanted};
@@ -26,7 +27,7 @@ pub(crate) struct Page {
 struct Visitor {
     stream: TcpStream,
     heard_at: Instant,
-    request: Vec<u8>,
+    request: Request,
     updater: Option<Updater>,
     answer: Option<Vec<u8>>,
     /// The answer is out; what still comes is read, so that it is not lost to a reset.
@@ -69,7 +70,7 @@ impl Page {
     }
 
     /// Serves whoever is there; returns true if the bridge shall restart, with a new firmware.
-    pub(crate) fn turn(&mut self, bridge: &Bridge, at: HostTime, now: Instant) -> bool {
+    pub(crate) fn turn(&mut self, bridge: &mut Bridge, at: HostTime, now: Instant) -> bool {
         if self.visitor.is_none()
             && let Ok((stream, _)) = self.listener.accept()
             && stream.set_nonblocking(true).is_ok()
@@ -96,7 +97,7 @@ impl Visitor {
         Self {
             stream,
             heard_at: now,
-            request: Vec::new(),
+            request: Request::new(),
             updater: None,
             answer: None,
             answered: false,
@@ -108,7 +109,7 @@ impl Visitor {
     fn turn(
         &mut self,
         halves: &mut Option<Halves>,
-        bridge: &Bridge,
+        bridge: &mut Bridge,
         at: HostTime,
         now: Instant,
     ) -> bool {
@@ -151,26 +152,23 @@ impl Visitor {
     fn take(
         &mut self,
         halves: &mut Option<Halves>,
-        bridge: &Bridge,
+        bridge: &mut Bridge,
         at: HostTime,
         bytes: &[u8],
     ) -> Option<Vec<u8>> {
         let mut bytes = bytes;
         if self.updater.is_none() {
-            self.request.extend_from_slice(bytes);
-            if !page::is_whole(&self.request) {
-                let too_long = self.request.len() > REQUEST;
-                return too_long.then(|| page::respond(bridge, at, b"").as_bytes().to_vec());
-            }
-            let Some(from) = page::firmware(&self.request) else {
-                return Some(page::respond(bridge, at, &self.request).as_bytes().to_vec());
+            let from = match self.request.push(bytes) {
+                Progress::More => return None,
+                Progress::Whole => return Some(answer(bridge, at, &self.request)),
+                Progress::Firmware(from) => from,
             };
             let Some(halves) = halves else {
                 return Some(refuse("this bridge takes no firmware: no --firmware-key was given"));
             };
             let wanted = Wanted { target: Target::Host, build: halves.build, key: halves.key };
             self.updater = Some(Updater::new(wanted));
-            bytes = &self.request[from..];
+            bytes = &bytes[from..];
         }
         let (Some(halves), Some(updater)) = (halves, &mut self.updater) else { return None };
         if bridge.is_armed() {
@@ -188,12 +186,17 @@ impl Visitor {
     }
 }
 
+/// Does what a request asks for; returns the answer.
+fn answer(bridge: &mut Bridge, at: HostTime, request: &Request) -> Vec<u8> {
+    let done = page::act(bridge, at, request);
+    let parts = (0..).map_while(|part| page::respond(bridge, at, request, done, part));
+    parts.flat_map(|part| part.as_bytes().to_vec()).collect()
+}
+
 fn refuse(why: &str) -> Vec<u8> {
     page::respond_firmware(Err(why)).as_bytes().to_vec()
 }
 
-/// Bytes of a request's head at most, as on a chip.
-const REQUEST: usize = 2048;
 /// A browser that is silent for so long must not keep others out.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Half of an ESP32-C3's flash of 4 MB, less what else is in it. [bytes]

@@ -144,7 +144,9 @@ fn what_nobody_acknowledges_is_called_that() {
     loss.run(6000);
     assert!(loss.says("bridge: LAND is not acknowledged"), "{:?}", loss.texts);
     assert!(!loss.says("bridge: landing") && !loss.bridge.is_landing());
-    let page = crate::page::respond(&loss.bridge, at(loss.now), b"GET / HTTP/1.0\r\n\r\n");
+    let mut request = crate::http::Request::new();
+    request.push(b"GET / HTTP/1.0\r\n\r\n");
+    let page = crate::page::respond(&loss.bridge, at(loss.now), &request, None, 0).unwrap();
     assert!(page.contains("LAND is not acknowledged"), "{page}");
 }
 
