@@ -1,7 +1,9 @@
-"""Runs every client against a simulator of its own, all at once; prints what they print, and how
-many checks passed.
+"""Runs every client against a simulator of its own, all at once, and then each through a bridge of its
+own; prints what they print, and how many checks passed.
 
-Usage: all.py COMMAND...   (what starts the simulator)
+Usage: all.py [--soak SECONDS] COMMAND...   (what starts the simulator)
+    The bridge is `vizflyt bridge emulate`; vizflyt lies beside COMMAND.
+    --soak    instead: so long through the bridge, whose memory must stay as it was
 """
 
 import json
@@ -10,6 +12,9 @@ import re
 import subprocess
 import sys
 import threading
+
+from bridge import Rig
+from square import Checks
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 # Nothing here takes half as long, however loaded the machine is. [s]
@@ -20,6 +25,13 @@ SQUARES = [
     ("square_mavproxy.py", "tcp:%s"),
     ("square_mavsdk.py", "tcpout://%s"),
 ]
+# The same through a bridge: over UDP, or TCP.
+BRIDGED = [
+    ("square_pymavlink.py", "udpout:%s", "udp"),
+    ("square_mavproxy.py", "tcp:%s", "tcp"),
+    ("square_mavsdk.py", "udpout://%s", "udp"),
+]
+BAUDS = [921600, 115200]
 
 
 def python(script, *args, **options):
@@ -69,6 +81,45 @@ def square(command, script, address, seed, results):
                 process.wait()
 
 
+def bridged(vizflyt, command, row, seed, results):
+    """Flies one client through a bridge, beside a listener that counts and one that never reads."""
+    script, address, way = row
+    rig = Rig(vizflyt, BAUDS[0], command, seed)
+    client = None
+    try:
+        client = python(script, address % getattr(rig, way), "--lossless")
+        watchdog = threading.Timer(LIMIT, client.kill)
+        watchdog.start()
+        lines = []
+        reader = threading.Thread(target=lambda: lines.extend(client.stdout))
+        reader.start()
+        while reader.is_alive():
+            rig.watcher.work()
+        watchdog.cancel()
+        print("".join("%s through a bridge\n" % line.rstrip() for line in lines), end="", flush=True)
+        check = Checks("%s through a bridge" % script, keeps_going=True)
+        rig.judge(check)
+        report, _ = rig.report()
+        check("the referee agrees", report["landed"] and report["path_m"] > 5.0, report)
+        passed = counted(lines) + check.passed
+        results.append((script, client.wait() == 0 and not check.failed, passed, check.failed))
+    finally:
+        if client:
+            client.kill()
+            client.wait()
+        rig.close()
+
+
+def transfers(vizflyt, command, baud, results):
+    """Moves parameters and a mission at one speed."""
+    client = python("bridge.py", vizflyt, str(baud), *command)
+    lines = []
+    for line in client.stdout:
+        print(line, end="", flush=True)
+        lines.append(line)
+    results.append(("bridge.py at %d" % baud, client.wait() == 0, counted(lines), False))
+
+
 def counted(lines):
     """Returns how many checks a client reports as passed."""
     found = re.search(r"(\d+) passed", lines[-1]) if lines else None
@@ -85,25 +136,47 @@ def behaviour(command, results):
     results.append(("behaviour.py", client.wait() == 0, counted(lines), False))
 
 
-def main():
-    command = sys.argv[1:]
-    if not command:
-        sys.exit(__doc__)
-    # What the simulators say beside, the clients hear anyway.
-    os.environ.setdefault("RUST_LOG", "warn")
-    results = []
-    threads = [threading.Thread(target=behaviour, args=(command, results))]
-    for seed, (script, address) in enumerate(SQUARES, 11):
-        threads.append(
-            threading.Thread(target=square, args=(command, script, address, seed, results))
-        )
+def together(threads):
+    """Runs threads side by side; returns how many there were."""
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
+    return len(threads)
+
+
+def main():
+    command = sys.argv[1:]
+    soak = command[:1] == ["--soak"]
+    if len(command) <= 2 * soak:
+        sys.exit(__doc__)
+    vizflyt = os.path.join(os.path.dirname(command[2 * soak]), "vizflyt")
+    if soak:
+        args = [*command[:2], vizflyt, str(BAUDS[0]), *command[2:]]
+        return subprocess.call([sys.executable, os.path.join(HERE, "bridge.py"), *args])
+    # What the simulators say beside, the clients hear anyway.
+    os.environ.setdefault("RUST_LOG", "warn")
+    results = []
+    started = together(
+        [threading.Thread(target=behaviour, args=(command, results))]
+        + [
+            threading.Thread(target=square, args=(command, script, address, seed, results))
+            for seed, (script, address) in enumerate(SQUARES, 11)
+        ]
+    )
+    started += together(
+        [
+            threading.Thread(target=bridged, args=(vizflyt, command, row, seed, results))
+            for seed, row in enumerate(BRIDGED, 31)
+        ]
+        + [
+            threading.Thread(target=transfers, args=(vizflyt, command, baud, results))
+            for baud in BAUDS
+        ]
+    )
     failed = [script for script, good, _, _ in results if not good]
     # A thread that ended by an exception has left no result.
-    missing = len(threads) - len(results)
+    missing = started - len(results)
     passed = sum(count for _, _, count, _ in results)
     print("%d checks passed; failed: %s" % (passed, ", ".join(failed) or "none"))
     return bool(failed or missing)

@@ -22,8 +22,9 @@ PATIENCE = 120.0
 class Checks:
     """Counts and prints checks."""
 
-    def __init__(self, client):
+    def __init__(self, client, keeps_going=False):
         self.client = client
+        self.keeps_going = keeps_going
         self.passed = self.failed = 0
 
     def __call__(self, name, good, detail=""):
@@ -31,7 +32,7 @@ class Checks:
         self.failed += not good
         more = "" if good or detail == "" else "  (%s)" % (detail,)
         print("%s  %s: %s%s" % ("ok  " if good else "FAIL", self.client, name, more), flush=True)
-        if not good:
+        if not good and not self.keeps_going:
             # What comes next would only fail for the same reason.
             self.end()
 

@@ -1,11 +1,14 @@
 """Flies a square with MAVProxy: its own prompt is typed at, as a person would, and the vehicle is
 watched over an output that MAVProxy forwards to.
 
-Usage: square_mavproxy.py CONNECTION      for example tcp:127.0.0.1:5760, udp:127.0.0.1:14550
+Usage: square_mavproxy.py CONNECTION [--lossless]
+    CONNECTION  for example tcp:127.0.0.1:5760, udp:127.0.0.1:14550
+    --lossless  a link that must lose nothing, as MAVProxy counts
 """
 
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -27,7 +30,7 @@ class Proxy:
         self.process = subprocess.Popen(
             [sys.executable, "-u", program, "--master", connection,
              "--out", "udpout:127.0.0.1:%d" % port, "--state-basedir", folder,
-             "--default-modules", "cmdlong,arm,mode,param,misc"],
+             "--default-modules", "cmdlong,arm,mode,param,misc,link"],
             cwd=folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -115,14 +118,28 @@ def fly(check, proxy):
     check("stands on the ground", abs(proxy.position()[2] - ground) < 0.3, proxy.position())
 
 
+def lost(proxy):
+    """Returns what MAVProxy's `link list` says of packets lost; None if it says nothing."""
+
+    def found():
+        lines = [re.search(r"(\d+) lost", line) for line in proxy.lines]
+        return [int(match.group(1)) for match in lines if match]
+
+    proxy.until(found, "link list", 20)
+    return found()[-1] if found() else None
+
+
 def main():
-    if len(sys.argv) != 2:
+    lossless = sys.argv[2:] == ["--lossless"]
+    if len(sys.argv) != 2 + lossless:
         sys.exit(__doc__)
     check = Checks("MAVProxy")
     with tempfile.TemporaryDirectory() as folder:
         proxy = Proxy(sys.argv[1], folder)
         try:
             fly(check, proxy)
+            if lossless:
+                check("lost no packet", lost(proxy) == 0, proxy.lines[-5:])
         finally:
             proxy.process.kill()
             proxy.process.wait()

@@ -1,6 +1,8 @@
 """Flies a square with pymavlink.
 
-Usage: square_pymavlink.py CONNECTION      for example tcp:127.0.0.1:5760, udpin:0.0.0.0:14550
+Usage: square_pymavlink.py CONNECTION [--lossless]
+    CONNECTION  for example tcp:127.0.0.1:5760, udpin:0.0.0.0:14550
+    --lossless  a link that must lose nothing, as pymavlink counts
 """
 
 import math
@@ -87,7 +89,8 @@ class Vehicle:
 
 
 def main():
-    if len(sys.argv) != 2:
+    lossless = sys.argv[2:] == ["--lossless"]
+    if len(sys.argv) != 2 + lossless:
         sys.exit(__doc__)
     check = Checks("pymavlink")
     vehicle = Vehicle(sys.argv[1])
@@ -118,6 +121,9 @@ def main():
     check("lands and disarms", vehicle.until(lambda: not vehicle.armed()), vehicle.texts[-5:])
     height = vehicle.position()[2] - ground
     check("stands on the ground", abs(height) < 0.3, height)
+    if lossless:
+        loss = vehicle.link.mav_loss
+        check("lost none of %d packets" % vehicle.link.mav_count, loss == 0, loss)
     check.end()
 
 

@@ -1,0 +1,293 @@
+"""A simulated vehicle behind the bridge's own program (`vizflyt bridge emulate`): a serial line of a real
+speed on one side, stations on the other, one of which never reads. Counts what a station counts.
+
+Usage: bridge.py [--soak SECONDS] VIZFLYT BAUD COMMAND...     COMMAND starts the simulator
+    Without --soak: loads all parameters, sends a mission and reads it back, while another client
+    stalls. With it: stays as long, and the bridge's memory must stay as it was.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+
+from lab import mavlink, mavutil
+from square import Checks, until
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+# Below this a vehicle slows its streams (ArduPilot's GCS_MAVLINK::handle_radio_status: 20 and 50; back at 90).
+ROOM = 90
+# Memory of a program that does the same all the time: pages of its heap come and go. [KiB]
+GROWTH_KIB = 512
+
+
+class Watcher:
+    """A ground station that only listens: pymavlink's own count of what it has lost."""
+
+    def __init__(self, address):
+        self.link = mavutil.mavlink_connection(
+            "udpout:%s" % address, source_system=250, source_component=190
+        )
+        self.beat = 0.0
+        self.rooms = []
+        self.newest = {}
+
+    def work(self):
+        if time.monotonic() - self.beat > 1:
+            self.beat = time.monotonic()
+            self.link.mav.heartbeat_send(
+                mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4
+            )
+        message = self.link.recv_match(blocking=True, timeout=0.02)
+        while message:
+            kind = message.get_type()
+            self.newest[kind] = message
+            if kind == "RADIO_STATUS":
+                self.rooms.append(message.txbuf)
+            message = self.link.recv_match(blocking=False)
+
+    def lost(self):
+        return self.link.mav_loss
+
+
+class Stalled:
+    """A TCP client that says hello and never reads."""
+
+    def __init__(self, address):
+        host, port = address.split(":")
+        self.socket = socket.socket()
+        # What the kernel would read for it is kept small.
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self.socket.connect((host, int(port)))
+        mav = mavlink.MAVLink(None, srcSystem=249, srcComponent=190)
+        hello = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+        self.socket.sendall(hello.pack(mav))
+
+    def is_dropped(self):
+        """Whether the bridge has ended the connection. Reads what lies there: call it last."""
+        self.socket.settimeout(5)
+        try:
+            while self.socket.recv(65536):
+                pass
+            return True
+        except ConnectionResetError:
+            return True
+        except TimeoutError:
+            return False
+
+
+class Rig:
+    """The bridge, the vehicle on its serial line, the pose that a net gives it, and a stalled client."""
+
+    def __init__(self, vizflyt, baud, command, seed):
+        self.folder = tempfile.TemporaryDirectory()
+        self.processes = []
+        uart = os.path.join(self.folder.name, "uart")
+        self.bridge, ready = self.start(
+            [vizflyt, "bridge", "emulate", "--json", "--lifeline", "--uart", "pty:" + uart,
+             "--listen", "127.0.0.1:0", "--tcp", "127.0.0.1:0", "--baud", str(baud)]
+        )
+        self.udp, self.tcp = ready["udp"], ready["tcp"]
+        feed = subprocess.Popen(
+            [sys.executable, os.path.join(HERE, "feed.py"), "0", "udpout:" + self.udp],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.processes.append(feed)
+        vicon = feed.stdout.readline().strip()
+        self.simulator, _ = self.start(
+            [*command, "--json", "--lifeline", "--serial", uart, "--baud", str(baud),
+             "--vicon", vicon, "--seed", str(seed)]
+        )
+        self.watcher = Watcher(self.udp)
+        self.stalled = Stalled(self.tcp)
+
+    def start(self, command):
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.processes.append(process)
+        return process, json.loads(process.stdout.readline())
+
+    def judge(self, check):
+        """What every station must be able to say in the end."""
+        watcher = self.watcher
+        until(lambda: len(watcher.rooms) > 3, 20, watcher.work)
+        check("a listener lost none of %d packets" % watcher.link.mav_count, watcher.lost() == 0,
+              watcher.lost())
+        rooms = watcher.rooms
+        check("nobody was throttled: room never below %d %%" % min(rooms), min(rooms) >= ROOM, rooms)
+        check("the client that never reads was dropped", self.stalled.is_dropped())
+
+    def report(self):
+        """Ends the simulator and the bridge; returns the report of each."""
+        reports = []
+        for process in (self.simulator, self.bridge):
+            process.stdin.close()
+            lines = [json.loads(line) for line in process.stdout]
+            reports.append(lines[-1]["report"])
+        return reports
+
+    def close(self):
+        for process in self.processes:
+            process.kill()
+            process.wait()
+        self.folder.cleanup()
+
+
+class Station:
+    """A pymavlink station that asks for things."""
+
+    def __init__(self, address):
+        self.link = mavutil.mavlink_connection("udpout:%s" % address, source_system=251)
+        self.params = {}
+        self.requests = []
+        self.acks = []
+        self.items = {}
+        self.beat = 0.0
+        self.ftp = False
+
+    def work(self):
+        if time.monotonic() - self.beat > 1:
+            self.beat = time.monotonic()
+            self.link.mav.heartbeat_send(
+                mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4
+            )
+        message = self.link.recv_match(blocking=True, timeout=0.02)
+        while message:
+            kind = message.get_type()
+            mine = getattr(message, "target_system", 251) == 251
+            if message.get_srcComponent() == 1 and mine:
+                if kind == "PARAM_VALUE":
+                    self.params[message.param_index] = message.param_count
+                elif kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+                    self.requests.append(message.seq)
+                elif kind == "MISSION_ACK":
+                    self.acks.append(message.type)
+                elif kind == "MISSION_COUNT":
+                    self.items["count"] = message.count
+                elif kind == "MISSION_ITEM_INT":
+                    self.items[message.seq] = (message.x, message.y)
+                elif kind == "FILE_TRANSFER_PROTOCOL":
+                    self.ftp = True
+            message = self.link.recv_match(blocking=False)
+
+    def until(self, done, seconds=30.0):
+        return until(done, seconds, self.work)
+
+    def load_params(self):
+        """The list as every station asks for it; what is missing is asked for again, by its place."""
+        start = time.monotonic()
+        self.link.mav.param_request_list_send(1, 1)
+        whole = lambda: self.params and len(self.params) == next(iter(self.params.values()))
+        self.until(whole, 60)
+        return bool(whole()), len(self.params), time.monotonic() - start
+
+    def asks_ftp(self):
+        """Whether anybody answers for files."""
+        name = b"@PARAM/param.pck"
+        payload = bytes([0, 0, 0, 4, len(name), 0, 0, 0, 0, 0, 0, 0]) + name
+        self.link.mav.file_transfer_protocol_send(0, 1, 1, payload.ljust(251, b"\0"))
+        return self.until(lambda: self.ftp, 3)
+
+    def send_mission(self, points, kind, command):
+        """Sends items one by one, as they are asked for; returns the answer."""
+        self.requests.clear()
+        self.acks.clear()
+        mav = self.link.mav
+        mav.mission_count_send(1, 1, len(points), kind)
+        end = time.monotonic() + 60
+        while not self.acks and time.monotonic() < end:
+            self.until(lambda: self.requests or self.acks, 2)
+            for seq in self.requests:
+                x, y = points[seq]
+                mav.mission_item_int_send(
+                    1, 1, seq, mavlink.MAV_FRAME_GLOBAL, command, 0, 1, len(points), 0, 0, 0, x, y, 0, kind
+                )
+            self.requests.clear()
+        return self.acks[0] if self.acks else None
+
+    def read_mission(self, kind):
+        """Asks for the items, one by one; returns where they are."""
+        self.items.clear()
+        mav = self.link.mav
+        mav.mission_request_list_send(1, 1, kind)
+        self.until(lambda: "count" in self.items)
+        count = self.items.get("count", 0)
+        for seq in range(count):
+            for _ in range(5):
+                mav.mission_request_int_send(1, 1, seq, kind)
+                if self.until(lambda: seq in self.items, 2):
+                    break
+        mav.mission_ack_send(1, 1, mavlink.MAV_MISSION_ACCEPTED, kind)
+        return [self.items.get(seq) for seq in range(count)]
+
+
+def transfers(check, rig):
+    """Parameters and a mission, as ground stations move them."""
+    station = Station(rig.udp)
+    alive = lambda: "HEARTBEAT" in rig.watcher.newest
+    check("connects", until(alive, 30, rig.watcher.work))
+    whole, count, seconds = station.load_params()
+    check("all %d parameters come, in %.1f s" % (count, seconds), whole and count >= 30, count)
+    if not station.asks_ftp():
+        print("--    %s: files are not served by this vehicle; ArduCopter's are" % check.client)
+    points = [(423000000 + 9000 * (i % 2), -718000000 + 300 * i) for i in range(20)]
+    points += [(423009000 + 9000 * (i % 2), -717990000 - 300 * i) for i in range(20)]
+    fence, corner = mavlink.MAV_MISSION_TYPE_FENCE, mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
+    sent = station.send_mission(points, fence, corner)
+    check("a mission of %d items is taken" % len(points), sent == mavlink.MAV_MISSION_ACCEPTED, sent)
+    read = station.read_mission(fence)
+    check("and comes back as it was", read == points, read[:3])
+    # Whoever is away for a while loses what passes meanwhile: only the listener's loss is judged.
+    check("the station that asked lost none", station.link.mav_loss == 0, station.link.mav_loss)
+
+
+def memory_kib(process):
+    with open("/proc/%d/status" % process.pid, encoding="ascii") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
+
+
+def soak(check, rig, seconds):
+    """Stays for a while; the bridge's memory must not grow behind its first minute."""
+    watcher = rig.watcher
+    start = time.monotonic()
+    until(lambda: False, min(60.0, seconds / 2), watcher.work)
+    before = memory_kib(rig.bridge)
+    until(lambda: False, seconds - (time.monotonic() - start), watcher.work)
+    after = memory_kib(rig.bridge)
+    took = time.monotonic() - start
+    check("soaked for %d s, %d packets; memory %d -> %d KiB" % (took, watcher.link.mav_count, before, after),
+          after - before <= GROWTH_KIB, after - before)
+
+
+def main():
+    args = sys.argv[1:]
+    seconds = 0.0
+    if args[:1] == ["--soak"] and len(args) > 1:
+        seconds = float(args[1])
+        args = args[2:]
+    if len(args) < 3:
+        sys.exit(__doc__)
+    vizflyt, baud, command = args[0], int(args[1]), args[2:]
+    check = Checks("bridge at %d" % baud)
+    rig = Rig(vizflyt, baud, command, 21)
+    try:
+        if seconds:
+            soak(check, rig, seconds)
+        else:
+            transfers(check, rig)
+        rig.judge(check)
+        _, bridge = rig.report()
+        lost = {name: bridge[name] for name in ("uart_lost", "uart_bad_checksum", "net_lost")}
+        check("the bridge itself lost none", not any(lost.values()), bridge)
+    finally:
+        rig.close()
+    check.end()
+
+
+if __name__ == "__main__":
+    main()
