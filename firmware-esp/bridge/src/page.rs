@@ -57,7 +57,7 @@ pub fn respond(
         Err(fmt::Error) => {
             // More clients than fit: an error rather than half a page.
             out.clear();
-            let _ = write!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long\n");
+            let _ = writeln!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long");
             Some(out)
         }
     }
@@ -70,7 +70,7 @@ fn answer(
     out: &mut String<RESPONSE>,
 ) -> fmt::Result {
     if request.is_too_long() {
-        write!(out, "HTTP/1.0 413 Content Too Large{TEXT}too long\n")
+        writeln!(out, "HTTP/1.0 413 Content Too Large{TEXT}too long")
     } else if request.is(b"GET / ") {
         page(bridge, now, out)
     } else if request.is(b"GET /stats.json ") {
@@ -78,13 +78,13 @@ fn answer(
     } else if request.is(b"GET /status.json") {
         json(station_counters(bridge).into_iter(), out)
     } else {
-        write!(out, "HTTP/1.0 404 Not Found{TEXT}there is /, /settings and /stats.json\n")
+        writeln!(out, "HTTP/1.0 404 Not Found{TEXT}there is /, /settings and /stats.json")
     }
 }
 
 fn answer_change(status: Status, out: &mut String<RESPONSE>) -> fmt::Result {
     let line = form::status_line(status);
-    write!(out, "HTTP/1.0 {line}{TEXT}{}; go back to see the settings\n", status.message())
+    writeln!(out, "HTTP/1.0 {line}{TEXT}{}; go back to see the settings", status.message())
 }
 
 /// Answers a request that brought a firmware.

@@ -4,25 +4,27 @@
 //!
 //! Everything runs in one task: futures side by side on one [`Shared`], no lock, no allocation.
 
+mod network;
+mod page;
+
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
 
-use embassy_futures::join::{join, join3, join5};
-use embassy_futures::select::{select, select3};
-use embassy_net::tcp::TcpSocket;
-use embassy_net::udp::{PacketMetadata, UdpMetadata, UdpSocket};
-use embassy_net::{IpAddress, IpEndpoint, Stack};
+use embassy_futures::join::{join, join3};
+use embassy_futures::select::select;
+use embassy_net::Stack;
+use embassy_net::udp::PacketMetadata;
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
 use embassy_sync::signal::Signal;
-use embassy_time::{Duration, Instant, Timer, with_timeout};
+use embassy_time::{Duration, Instant, Timer};
 use embedded_io_async::{Read, Write};
 use embedded_storage::nor_flash::NorFlash;
+use network::serve;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 use crate::bridge::{Bridge, Event, TCP_SLOTS};
-use crate::http::{Progress, Request};
-use crate::page;
+use crate::http::Request;
 use crate::stats::RestartCause;
 use crate::storage::Store;
 
@@ -255,244 +257,6 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
         }
     };
     join(receive, send).await;
-}
-
-/// Serves the network on one stack.
-async fn serve<P: Platform>(
-    shared: &Shared,
-    stack: Stack<'_>,
-    platform: &RefCell<&mut P>,
-    buffers: &mut Buffers,
-) {
-    let (udp_port, tcp_port) =
-        shared.take(|bridge, _| (bridge.settings().udp_port, bridge.settings().tcp_port));
-    let Buffers { udp_in_meta, udp_in, udp_out_meta, udp_out, datagram_out, silent, tcp, page } =
-        buffers;
-    let SendOnly { meta, bytes, datagram } = silent;
-    // One socket for each way, of one port: what comes in goes to the one made first.
-    let (mut no_meta, mut none) = ([[PacketMetadata::EMPTY]; 3], [[0]; 3]);
-    let ([no_a, no_b, no_c], [none_a, none_b, none_c]) = (&mut no_meta, &mut none);
-    let mut incoming = UdpSocket::new(stack, udp_in_meta, udp_in, no_a, none_a);
-    let mut to_speaking = UdpSocket::new(stack, no_b, none_b, udp_out_meta, udp_out);
-    let mut to_silent = UdpSocket::new(stack, no_c, none_c, meta, bytes);
-    // The port is not 0 and the sockets are new: nothing else is refused.
-    let _ = incoming.bind(udp_port);
-    let receive = receive_udp(shared, &mut incoming);
-    let send_speaking = async {
-        loop {
-            let _ = to_speaking.bind(udp_port);
-            loop {
-                let next = shared.take(|bridge, now| bridge.poll_udp_speaking(now, datagram_out));
-                let Some((to, len)) = next else {
-                    let due = shared.take(|bridge, now| bridge.speaking_due(now));
-                    wait(&shared.udp, due).await;
-                    continue;
-                };
-                let sent = to_speaking.send_to(&datagram_out[..len], endpoint(to));
-                match with_timeout(STUCK, sent).await {
-                    Ok(Ok(())) => {}
-                    Ok(Err(_)) => shared.take(|bridge, _| bridge.note_not_sent()),
-                    Err(_) => break,
-                }
-            }
-            // Who is first in the queue has gone, and its address cannot be had any more: closing
-            // empties the queue.
-            shared.take(|bridge, _| bridge.note_not_sent());
-            to_speaking.close();
-        }
-    };
-    let _ = to_silent.bind(udp_port);
-    let send_silent = async {
-        loop {
-            let next = shared.take(|bridge, now| bridge.poll_udp_silent(now, datagram));
-            let Some((to, len)) = next else {
-                wait(&shared.silent, shared.take(|bridge, now| bridge.silent_due(now))).await;
-                continue;
-            };
-            if to_silent.send_to(&datagram[..len], endpoint(to)).await.is_err() {
-                shared.take(|bridge, _| bridge.note_not_sent());
-            }
-        }
-    };
-    let [first, second] = tcp;
-    join5(
-        receive,
-        join(send_speaking, send_silent),
-        connection(shared, stack, tcp_port, 0, first),
-        connection(shared, stack, tcp_port, 1, second),
-        show_page(shared, stack, platform, page),
-    )
-    .await;
-}
-
-/// A network stack keeps what it cannot send, and everything behind it: a datagram for whoever has
-/// gone waits for an address for ever. One that is still there answers at once.
-const STUCK: Duration = Duration::from_secs(1);
-
-/// Hands datagrams to the bridge, for ever, from where the stack has them.
-async fn receive_udp(shared: &Shared, socket: &mut UdpSocket<'_>) {
-    loop {
-        let take = |bytes: &[u8], meta: UdpMetadata| {
-            let IpAddress::Ipv4(address) = meta.endpoint.addr;
-            let from = SocketAddrV4::new(address, meta.endpoint.port);
-            shared.with(|bridge, now| bridge.handle_datagram(now, from, bytes));
-        };
-        socket.recv_from_with(take).await;
-    }
-}
-
-fn endpoint(to: SocketAddrV4) -> IpEndpoint {
-    IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port())
-}
-
-/// Serves one TCP client after another.
-async fn connection(
-    shared: &Shared,
-    stack: Stack<'_>,
-    port: u16,
-    slot: u8,
-    buffers: &mut TcpBuffers,
-) {
-    if port == 0 {
-        return;
-    }
-    let TcpBuffers { receive, transmit, batch } = buffers;
-    let wake = &shared.tcp[usize::from(slot)];
-    loop {
-        let mut socket = TcpSocket::new(stack, receive, transmit);
-        if socket.accept(port).await.is_err() {
-            Timer::after(Duration::from_millis(100)).await;
-            continue;
-        }
-        // Packets must not wait for each other, and a client that is gone must make room.
-        socket.set_nagle_enabled(false);
-        socket.set_timeout(Some(Duration::from_secs(10)));
-        socket.set_keep_alive(Some(Duration::from_secs(3)));
-        shared.with(|bridge, now| bridge.open_stream(now, slot));
-        {
-            let (mut reader, mut writer) = socket.split();
-            let read = async {
-                let mut bytes = [0; 128];
-                while let Ok(len @ 1..) = reader.read(&mut bytes).await {
-                    shared.with(|bridge, now| bridge.handle_stream(now, slot, &bytes[..len]));
-                }
-            };
-            let write = async {
-                loop {
-                    match shared.take(|bridge, now| bridge.poll_tcp(now, slot, batch)) {
-                        0 => wait(wake, shared.take(|bridge, _| bridge.tcp_due(slot))).await,
-                        len => {
-                            if writer.write_all(&batch[..len]).await.is_err() {
-                                return;
-                            }
-                        }
-                    }
-                }
-            };
-            let stalled = async {
-                while shared.take(|bridge, _| bridge.is_open(slot)) {
-                    Timer::after(Duration::from_secs(1)).await;
-                }
-            };
-            select3(read, write, stalled).await;
-        }
-        shared.with(|bridge, _| bridge.close_stream(slot));
-        socket.abort();
-        // A connection that is reset already has nothing to flush.
-        let _ = socket.flush().await;
-    }
-}
-
-/// Serves the status page, to one browser after another, and takes firmware.
-async fn show_page<P: Platform>(
-    shared: &Shared,
-    stack: Stack<'_>,
-    platform: &RefCell<&mut P>,
-    buffers: &mut PageBuffers,
-) {
-    let port = shared.take(|bridge, _| bridge.settings().page_port);
-    if port == 0 {
-        return;
-    }
-    let PageBuffers { receive, transmit, chunk, request } = buffers;
-    loop {
-        let mut socket = TcpSocket::new(stack, receive, transmit);
-        // A browser that opens a connection for later must not keep others out.
-        socket.set_timeout(Some(Duration::from_secs(5)));
-        if socket.accept(port).await.is_err() {
-            Timer::after(Duration::from_millis(100)).await;
-            continue;
-        }
-        request.restart();
-        let (mut len, mut progress) = (0, Progress::More);
-        while progress == Progress::More {
-            match socket.read(chunk).await {
-                Ok(more @ 1..) => {
-                    len = more;
-                    progress = request.push(&chunk[..len]);
-                }
-                _ => break,
-            }
-        }
-        let mut restart = false;
-        match progress {
-            Progress::Firmware(from) => {
-                let taken = take_firmware(shared, platform, &mut socket, chunk, from, len).await;
-                restart = taken.is_ok();
-                let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
-                socket.close();
-                // Whoever still sends reads the answer only after that.
-                while let Ok(1..) = socket.read(chunk).await {}
-            }
-            Progress::Whole => {
-                let done = shared.with(|bridge, now| page::act(bridge, now, request));
-                for part in 0.. {
-                    let part =
-                        shared.take(|bridge, now| page::respond(bridge, now, request, done, part));
-                    let Some(part) = part else { break };
-                    // A browser that has gone wants no answer.
-                    if socket.write_all(part.as_bytes()).await.is_err() {
-                        break;
-                    }
-                }
-            }
-            Progress::More => {}
-        }
-        socket.close();
-        let _ = socket.flush().await;
-        socket.abort();
-        let _ = socket.flush().await;
-        if restart {
-            platform.borrow_mut().restart();
-        }
-    }
-}
-
-/// Takes a firmware whose first bytes are `chunk[from..to]`, the rest from the connection.
-async fn take_firmware<P: Platform>(
-    shared: &Shared,
-    platform: &RefCell<&mut P>,
-    socket: &mut TcpSocket<'_>,
-    chunk: &mut [u8],
-    mut from: usize,
-    mut to: usize,
-) -> Result<(), &'static str> {
-    let mut first = true;
-    loop {
-        // Asked again and again: it takes seconds, and flash stops everything else while it erases.
-        if shared.take(|bridge, _| bridge.is_armed()) {
-            return Err("the vehicle is armed; land and disarm it first");
-        }
-        if platform.borrow_mut().update(first, &chunk[from..to])? {
-            return Ok(());
-        }
-        first = false;
-        from = 0;
-        to = match socket.read(chunk).await {
-            Ok(len @ 1..) => len,
-            _ => return Err("the connection ended before the firmware did"),
-        };
-    }
 }
 
 /// Keeps the bridge's time, its settings and its light.

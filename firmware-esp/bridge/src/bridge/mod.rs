@@ -9,15 +9,18 @@
 //! loses its oldest, counted. Towards the autopilot setpoints, poses and commands overtake the rest.
 //! Every packet that does not go on is counted with its reason ([`Stats`]).
 
+mod announcements;
 mod clients;
 mod component;
 mod fields;
 mod loss;
+mod outgoing;
 mod parameters;
 mod requests;
 mod router;
 #[cfg(test)]
 mod tests;
+mod unparsed;
 mod vehicle_signing;
 
 use core::net::{Ipv4Addr, SocketAddrV4};

@@ -96,7 +96,7 @@ pub(super) fn write_part(
             out.write_str(super::HTML)?;
             out.write_str("<title>settings</title><h1>Settings</h1><a href=/>counters</a><pre>")?;
             for number in NUMBERS {
-                write!(out, "{:18}{}\n", number.name, number.value(settings))?;
+                writeln!(out, "{:18}{}", number.name, number.value(settings))?;
             }
         }
         1 => TEXTS.iter().try_for_each(|&(name, _)| show(name))?,

@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use nix::libc::linger;
 use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::socket::{setsockopt, sockopt};
 use nix::sys::time::TimeSpec;
 use serde_json::json;
 use vizflyt_bridge::bridge::TCP_SLOTS;
@@ -95,6 +97,9 @@ impl EmulateArgs {
 
 /// The loop wakes at least this often, to see that it shall end.
 const WAKE: Duration = Duration::from_millis(50);
+
+/// What a TCP client may leave unread at a chip, two segments. [bytes]
+const TCP_BUFFER: usize = 1072;
 
 /// Runs it until it is stopped.
 pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
@@ -283,6 +288,8 @@ impl Emulation {
         {
             // Small packets must not wait for each other; failing that they merely do.
             let _ = stream.set_nodelay(true);
+            // As little as a chip has: who does not read is known soon.
+            let _ = setsockopt(&stream, sockopt::SndBuf, &TCP_BUFFER);
             self.streams[slot] = Some(Connection { stream, pending: Vec::new() });
             self.bridge.open_stream(at, slot as u8);
         }
@@ -311,6 +318,9 @@ impl Emulation {
             let gone = loop {
                 if !self.bridge.is_open(slot as u8) {
                     tracing::warn!("bridge: a tcp client that takes nothing is dropped");
+                    // At once, as a chip aborts it: what it has not taken it will not take.
+                    let linger = linger { l_onoff: 1, l_linger: 0 };
+                    let _ = setsockopt(&connection.stream, sockopt::Linger, &linger);
                     break true;
                 }
                 if connection.pending.is_empty() {

@@ -1,0 +1,104 @@
+//! The bridge's page, and the firmware that comes to it.
+
+use core::cell::RefCell;
+
+use embassy_net::Stack;
+use embassy_net::tcp::TcpSocket;
+use embassy_time::{Duration, Timer};
+use embedded_io_async::Write;
+
+use super::{PageBuffers, Platform, Shared};
+use crate::http::Progress;
+use crate::page;
+
+/// Serves the status page, to one browser after another, and takes firmware.
+pub(super) async fn show_page<P: Platform>(
+    shared: &Shared,
+    stack: Stack<'_>,
+    platform: &RefCell<&mut P>,
+    buffers: &mut PageBuffers,
+) {
+    let port = shared.take(|bridge, _| bridge.settings().page_port);
+    if port == 0 {
+        return;
+    }
+    let PageBuffers { receive, transmit, chunk, request } = buffers;
+    loop {
+        let mut socket = TcpSocket::new(stack, receive, transmit);
+        // A browser that opens a connection for later must not keep others out.
+        socket.set_timeout(Some(Duration::from_secs(5)));
+        if socket.accept(port).await.is_err() {
+            Timer::after(Duration::from_millis(100)).await;
+            continue;
+        }
+        request.restart();
+        let (mut len, mut progress) = (0, Progress::More);
+        while progress == Progress::More {
+            match socket.read(chunk).await {
+                Ok(more @ 1..) => {
+                    len = more;
+                    progress = request.push(&chunk[..len]);
+                }
+                _ => break,
+            }
+        }
+        let mut restart = false;
+        match progress {
+            Progress::Firmware(from) => {
+                let taken = take_firmware(shared, platform, &mut socket, chunk, from, len).await;
+                restart = taken.is_ok();
+                let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
+                socket.close();
+                // Whoever still sends reads the answer only after that.
+                while let Ok(1..) = socket.read(chunk).await {}
+            }
+            Progress::Whole => {
+                let done = shared.with(|bridge, now| page::act(bridge, now, request));
+                for part in 0.. {
+                    let part =
+                        shared.take(|bridge, now| page::respond(bridge, now, request, done, part));
+                    let Some(part) = part else { break };
+                    // A browser that has gone wants no answer.
+                    if socket.write_all(part.as_bytes()).await.is_err() {
+                        break;
+                    }
+                }
+            }
+            Progress::More => {}
+        }
+        socket.close();
+        let _ = socket.flush().await;
+        socket.abort();
+        let _ = socket.flush().await;
+        if restart {
+            platform.borrow_mut().restart();
+        }
+    }
+}
+
+/// Takes a firmware whose first bytes are `chunk[from..to]`, the rest from the connection.
+async fn take_firmware<P: Platform>(
+    shared: &Shared,
+    platform: &RefCell<&mut P>,
+    socket: &mut TcpSocket<'_>,
+    chunk: &mut [u8],
+    mut from: usize,
+    mut to: usize,
+) -> Result<(), &'static str> {
+    let mut first = true;
+    loop {
+        // Asked again and again: it takes seconds, and flash stops everything else while it erases.
+        if shared.take(|bridge, _| bridge.is_armed()) {
+            return Err("the vehicle is armed; land and disarm it first");
+        }
+        if platform.borrow_mut().update(first, &chunk[from..to])? {
+            return Ok(());
+        }
+        first = false;
+        from = 0;
+        to = match socket.read(chunk).await {
+            Ok(len @ 1..) => len,
+            _ => return Err("the connection ended before the firmware did"),
+        };
+    }
+}
