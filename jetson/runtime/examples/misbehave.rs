@@ -5,7 +5,7 @@
 //!
 //! With `late-` it flies well for a moment before. Several, separated by commas, are done one after
 //! the other; what is left to do is kept in the file named by the second argument, so that a plugin
-//! that is started again goes on with the next.
+//! that is started again goes on with the next. `world:3:0` asks for 3 m/s east, fence or not.
 
 #![allow(unsafe_code, reason = "it misbehaves: a bad pointer, a fork")]
 
@@ -60,6 +60,9 @@ impl Autonomy for Misbehave {
         }
         if self.how.len() > 1 {
             self.next();
+        }
+        if let Some(v_mps) = how.strip_prefix("world:").map(velocity) {
+            return Some(Setpoint::velocity(v_mps, YawTarget::Keep));
         }
         match how.as_str() {
             "hover" => Some(Setpoint::Hold),
@@ -148,6 +151,13 @@ impl Misbehave {
             fs::write(kept, self.how.join(",")).expect("the file can be written");
         }
     }
+}
+
+/// Returns the horizontal velocity that `east:north` says. [m/s, world]
+fn velocity(text: &str) -> DVec3 {
+    let (east, north) = text.split_once(':').expect("two numbers");
+    let number = |text: &str| text.parse().expect("a number");
+    DVec3::new(number(east), number(north), 0.0)
 }
 
 /// Whether the vehicle is the plugin's now, if the event says so.
