@@ -1,0 +1,72 @@
+"""Flies every check against one autopilot; see `run`.
+
+Checks: pilot (whose word counts), net (the fence holds), failsafe (what is lost), station (a second system 255).
+"""
+
+import argparse
+import contextlib
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import failsafe
+import net
+import pilot
+import station
+from checks import say, skip, summary
+from lab import Lab
+from simulated import Simulated
+from sitl import Sitl
+
+CHECKS = {"pilot": pilot, "net": net, "failsafe": failsafe, "station": station}
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+def arguments():
+    parser = argparse.ArgumentParser(prog="tests/ardupilot/run", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a few flights of each check, in about a minute")
+    parser.add_argument("--only", default=",".join(CHECKS), metavar="CHECKS", help="some of %(default)s")
+    parser.add_argument("--vizflyt", default=ROOT / "target/release/vizflyt", type=pathlib.Path, metavar="PROGRAM")
+    parser.add_argument("--plugin", type=pathlib.Path, help="the built example `misbehave`, if it is not beside PROGRAM")
+    parser.add_argument("--keep", type=pathlib.Path, metavar="FOLDER", help="keeps logs and parameters there")
+    parser.add_argument("binary", type=pathlib.Path)
+    given = parser.parse_args()
+    given.plugin = given.plugin or given.vizflyt.parent / "examples/misbehave"
+    for file in (given.binary, given.vizflyt, given.plugin):
+        if not file.is_file():
+            parser.error(f"there is no {file}; `cargo build --release --workspace --bins --examples` builds ours")
+    for name in given.only.split(","):
+        if name not in CHECKS:
+            parser.error(f"there is no check '{name}'; there are {', '.join(CHECKS)}")
+    return given
+
+
+def counterpart(binary):
+    """What the binary is, by what it says of itself."""
+    help_text = subprocess.run([binary, "--help"], capture_output=True, text=True, timeout=30).stdout
+    if "--truth-to" in help_text:
+        return Simulated
+    return Sitl if "--slave" in help_text else None
+
+
+def main():
+    given = arguments()
+    kind = None if "px4" in given.binary.name else counterpart(given.binary)
+    if kind is None:
+        for name in given.only.split(","):
+            skip(name, f"{given.binary.name} is neither ArduCopter for SITL, nor our simulator; PX4 is not flown here: "
+                       "it has no way to say where the vehicle truly is, to less than a centimetre")
+        return summary()
+    with contextlib.ExitStack() as stack:
+        folder = given.keep or stack.enter_context(tempfile.TemporaryDirectory())
+        vehicle = kind(given.binary.resolve(), pathlib.Path(folder).resolve(), given.vizflyt.resolve())
+        lab = Lab(vehicle.folder, given.vizflyt.resolve(), given.plugin.resolve(), vehicle)
+        for name in given.only.split(","):
+            say(f"-- {name}")
+            CHECKS[name].run(lab, given.quick)
+    return summary()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""The motion capture: takes where the vehicle truly is, notes it, and hands it on as measured poses.
+
+The truth comes as the JSON packets that `vizflyt serve` reads poses from, at any rate; at most 100 a second are handed
+on, each with noise of half a millimetre.
+"""
+
+import bisect
+import json
+import math
+import random
+import socket
+import threading
+import time
+from typing import NamedTuple
+
+RATE_HZ = 100
+NOISE_M = 0.0005
+
+
+class Sight(NamedTuple):
+    at: float  # when it came, on our clock [s]
+    stamp_s: float  # when it was true, on the vehicle's clock [s]
+    p: tuple  # where the body was [m, world]
+
+
+class Poses(threading.Thread):
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.address = "127.0.0.1:%d" % self.socket.getsockname()[1]
+        self.server = None
+        self.cut = False
+        self.track = []
+        self.random = random.Random(1)
+        self.start()
+
+    def run(self):
+        while data := self.socket.recv(4096):
+            packet = json.loads(data)
+            stamp_s = packet["stamp_ns"] * 1e-9
+            if self.track and stamp_s - self.track[-1].stamp_s < 0.9 / RATE_HZ:
+                continue
+            self.track.append(Sight(time.monotonic(), stamp_s, tuple(packet["position_m"])))
+            if self.server and not self.cut:
+                noisy = [self.random.gauss(x, NOISE_M) for x in packet["position_m"]]
+                self.socket.sendto(json.dumps({**packet, "position_m": noisy}).encode(), self.server)
+
+    def close(self):
+        # An empty datagram ends the thread.
+        self.socket.sendto(b"", self.socket.getsockname())
+        self.join()
+        self.socket.close()
+
+    def now(self):
+        return self.track[-1]
+
+    def since(self, stamp_s):
+        return self.track[bisect.bisect_left(self.track, stamp_s, key=lambda sight: sight.stamp_s) :]
+
+    def stamp_s(self, at):
+        """The vehicle's time when it was `at` here."""
+        index = bisect.bisect_left(self.track, at, key=lambda sight: sight.at)
+        return self.track[min(index, len(self.track) - 1)].stamp_s
+
+    def speed_mps(self):
+        """Along the ground, over the last tenth of a second."""
+        if len(self.track) <= RATE_HZ // 10:
+            return 0.0
+        before, now = self.track[-1 - RATE_HZ // 10], self.track[-1]
+        return level_m(before.p, now.p) / max(now.stamp_s - before.stamp_s, 1e-3)
+
+
+def level_m(a, b):
+    return math.dist(a[:2], b[:2])

@@ -1,0 +1,56 @@
+"""Our own simulator in the autopilot's place: to try the checks themselves, and to see where it differs."""
+
+import json
+import subprocess
+
+from checks import wait
+from sitl import doctor
+from wire import Station
+
+
+class Simulated:
+    """The simulator, once per flight."""
+
+    is_real = False
+
+    def __init__(self, binary, folder, vizflyt):
+        self.binary, self.folder, self.vizflyt = binary, folder, vizflyt
+        self.parameters = []
+
+    def prepare(self, arena):
+        """The doctor sets it up, too; as it forgets with each end, every flight begins with what it had then."""
+        station = Station()
+        with RunningSimulator(self, [f"--mavlink=udpout:{station.address}", "--mavlink=tcpin:127.0.0.1:0"]) as running:
+            wait("the simulator's heartbeat", lambda: "HEARTBEAT" in station.newest, 30)
+            before = station.all_parameters()
+            doctor(self.vizflyt, f"tcpout:{running.ready['links'][1]}", arena, self.folder)
+            station.parameters.clear()
+            after = station.all_parameters()
+        station.close()
+        self.parameters = [f"--param={name}={value:g}" for name, value in after.items() if before.get(name) != value]
+
+    def start(self, poses, wire, station, spawn, yaw_deg):
+        links = [f"--mavlink=udpout:{wire.air}", f"--mavlink=udpout:{station.address}"]
+        place = "--spawn=%g,%g,%g,%g" % (*spawn, yaw_deg)
+        return RunningSimulator(self, [*links, f"--truth-to={poses.address}", place, "--radio", *self.parameters])
+
+
+class RunningSimulator:
+    def __init__(self, simulator, arguments):
+        with open(simulator.folder / "simulator.log", "w") as log:
+            self.process = subprocess.Popen(
+                [simulator.binary, "--json", "--lifeline", *arguments], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, stderr=log, text=True)
+        self.ready = json.loads(self.process.stdout.readline())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        self.process.kill()
+        self.process.wait()
+        self.process.stdin.close()
+        self.process.stdout.close()

@@ -1,0 +1,142 @@
+"""ArduCopter in SITL as the vehicle: set up by `vizflyt doctor vehicle --apply`, with its truth, its transmitter and
+its telemetry ports."""
+
+import contextlib
+import pathlib
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+from checks import Failed, say, wait
+from wire import Station
+
+HERE = pathlib.Path(__file__).parent
+
+# What no airframe file can hold: this one has other outputs, motors and a smaller battery, and was never calibrated.
+OVERRIDES = {
+    "SERVO1_FUNCTION": 33, "SERVO2_FUNCTION": 34, "SERVO3_FUNCTION": 35, "SERVO4_FUNCTION": 36,
+    "SERVO9_FUNCTION": 0, "SERVO10_FUNCTION": 0, "SERVO11_FUNCTION": 0, "SERVO12_FUNCTION": 0,
+    "SERVO_BLH_AUTO": 0, "MOT_PWM_TYPE": 0, "MOT_THST_EXPO": 0.65, "MOT_THST_HOVER": 0.39,
+    "MOT_SPIN_ARM": 0.1, "MOT_SPIN_MIN": 0.15, "INS_GYRO_FILTER": 20,
+    "SIM_BATT_VOLTAGE": 16.8,
+}
+CALIBRATED = {f"INS_ACC{n}{what}_{axis}": value
+              for n in ("", 2) for what, value in (("OFFS", 0.001), ("SCAL", 1.001)) for axis in "XYZ"}
+# The pilot's switch, by PWM, which the airframe file leaves free at three of its places.
+SWITCH = {"FLTMODE2": 5, "FLTMODE3": 17, "FLTMODE5": 6}
+PWM = {"STABILIZE": 1100, "LOITER": 1295, "BRAKE": 1425, "ALT_HOLD": 1555, "RTL": 1685, "LAND": 1900}
+
+PLACE = "42.3,-71.8,100"
+BOOT_S = 60
+
+
+def doctor(vizflyt, address, arena, folder):
+    """Sets an autopilot up as a person does, by the project's own airframe file, for this arena."""
+    command = [vizflyt, "doctor", "vehicle", "--mavlink", address, "--arena", arena, "--apply"]
+    done = subprocess.run(command, text=True, capture_output=True, timeout=120)
+    (folder / "doctor.log").write_text(done.stdout + done.stderr)
+    # Its status is 1 where something was dangerous: what it wrote counts after a restart.
+    if "DANGER" not in done.stdout:
+        raise Failed("the doctor found no danger in an autopilot as delivered: %s" % (done.stdout + done.stderr)[-500:])
+
+
+class Transmitter(threading.Thread):
+    """The pilot's: sticks in the middle, channel 5 as the switch stands, channel 6 lets the motors turn."""
+
+    def __init__(self, port):
+        super().__init__(daemon=True)
+        self.to = ("127.0.0.1", port)
+        self.switch = "STABILIZE"
+        self.running = True
+        self.start()
+
+    def run(self):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
+            while self.running:
+                channels = [1500, 1500, 1500, 1500, PWM[self.switch], 1000, 1000, 1000]
+                with contextlib.suppress(ConnectionError):
+                    radio.sendto(struct.pack("<16H", *channels, *[1000] * 8), self.to)
+                time.sleep(0.02)
+
+
+class Sitl:
+    """The program, once per flight, in a folder of its own."""
+
+    is_real = True
+
+    def __init__(self, binary, folder, vizflyt):
+        self.binary, self.folder, self.vizflyt = binary, folder, vizflyt
+        self.eeprom = folder / "eeprom.bin"
+
+    def prepare(self, arena):
+        """Sets the vehicle up as a person does, and restarts it: what it holds then begins every flight."""
+        (self.folder / "calibrated.param").write_text("".join(f"{n},{v}\n" for n, v in CALIBRATED.items()))
+        station = Station()
+        port = 5990
+        with Running(self, "prepare", station, f"tcp:{port - 5760}") as running:
+            wait("ArduCopter's heartbeat", lambda: "HEARTBEAT" in station.newest, BOOT_S)
+            doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", arena, self.folder)
+            for name, value in {**OVERRIDES, **SWITCH}.items():
+                if not station.set_parameter(name, value):
+                    say("note  this ArduCopter has no %s" % name)
+            time.sleep(1.5)
+            shutil.copy(running.folder / "eeprom.bin", self.eeprom)
+        station.close()
+
+    def start(self, poses, wire, station, spawn, yaw_deg):
+        return Running(self, "flight", station, f"udpclient:{wire.air}", poses, spawn, yaw_deg)
+
+
+class Running:
+    """SITL while it runs; closes with all that belongs to it."""
+
+    def __init__(self, sitl, name, station, jetson, poses=None, spawn=(0, 0, 0), yaw_deg=0):
+        self.folder = sitl.folder / name
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir()
+        if sitl.eeprom.exists():
+            shutil.copy(sitl.eeprom, self.folder)
+        self.log = open(self.folder / "log", "w")
+        self.slave = poses and subprocess.Popen(
+            [sys.executable, HERE / "slave.py", poses.address, "%g,%g,%g" % spawn], stdin=subprocess.PIPE)
+        radio = free_port()
+        self.transmitter = Transmitter(radio)
+        # TELEM2 is the Jetson's, TELEM1 a ground station's. SERIAL0 waits for a client unless it is given.
+        arguments = [
+            "--model", "x", "--speedup", "1", "--home", f"{PLACE},{90 - yaw_deg:g}",
+            "--defaults", sitl.folder / "calibrated.param", "--rc-in-port", str(radio),
+            "--serial0", "udpclient:127.0.0.1:%d" % free_port(),
+            "--serial1", f"udpclient:{station.address}", "--serial2", jetson,
+            *(["--slave", "1"] if poses else []),
+        ]
+        self.process = subprocess.Popen(
+            [sitl.binary, *arguments], cwd=self.folder, stdin=subprocess.DEVNULL, stdout=self.log,
+            stderr=subprocess.STDOUT, start_new_session=True)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def switch(self, mode):
+        self.transmitter.switch = mode
+
+    def close(self):
+        self.transmitter.running = False
+        self.process.kill()
+        self.process.wait()
+        if self.slave:
+            self.slave.stdin.close()
+            self.slave.wait()
+        self.log.close()
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
