@@ -6,6 +6,7 @@ Checks: pilot (whose word counts), net (the fence holds), failsafe (what is lost
 import argparse
 import contextlib
 import pathlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -28,7 +29,7 @@ def arguments():
     parser.add_argument("--quick", action="store_true", help="a few flights of each check, in about a minute")
     parser.add_argument("--only", default=",".join(CHECKS), metavar="CHECKS", help="some of %(default)s")
     parser.add_argument("--vizflyt", default=ROOT / "target/release/vizflyt", type=pathlib.Path, metavar="PROGRAM")
-    parser.add_argument("--plugin", type=pathlib.Path, help="the built example `misbehave`, if it is not beside PROGRAM")
+    parser.add_argument("--plugin", type=pathlib.Path, help="the example `misbehave`, if not beside PROGRAM")
     parser.add_argument("--keep", type=pathlib.Path, metavar="FOLDER", help="keeps logs and parameters there")
     parser.add_argument("binary", type=pathlib.Path)
     given = parser.parse_args()
@@ -51,6 +52,8 @@ def counterpart(binary):
 
 
 def main():
+    # Whoever ends this ends what it has started.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
     given = arguments()
     kind = None if "px4" in given.binary.name else counterpart(given.binary)
     if kind is None:

@@ -10,7 +10,7 @@ import subprocess
 import threading
 import time
 
-from checks import Failed, wait
+from checks import Failed, say, wait
 from poses import Poses
 from wire import Station, Wire
 
@@ -31,7 +31,9 @@ class Program:
         threading.Thread(target=self.read, daemon=True).start()
 
     def read(self):
+        lines = open(self.log.with_suffix(".jsonl"), "w", buffering=1)
         for line in self.process.stdout:
+            lines.write("%.3f %s" % (time.monotonic(), line))
             with contextlib.suppress(ValueError):
                 self.lines.append((time.monotonic(), json.loads(line)))
 
@@ -78,7 +80,8 @@ class Lab:
         values = {
             "width_px": 96, "height_px": 72,
             "position_m": [[*spawn], [0.5, 2.0, 3.2], None], "yaw_deg": yaw_deg, "radius_m": 0.01,
-            "min_m": [None, [spawn[0] - 0.5, spawn[1] - 0.5, -0.5]], "max_m": [None, [spawn[0] + 0.5, spawn[1] + 0.5, 1.0]],
+            "min_m": [None, [spawn[0] - 0.5, spawn[1] - 0.5, -0.5]],
+            "max_m": [None, [spawn[0] + 0.5, spawn[1] + 0.5, 1.0]],
         }
         text = self.plain
         for key, value in values.items():
@@ -122,6 +125,8 @@ class Flight:
         return self
 
     def __exit__(self, *_):
+        if note := self.poses.unsteady():
+            say(f"note  {note}")
         for part in (self.runtime, self.server, self.vehicle, self.station, self.wire, self.poses):
             part.close()
 

@@ -5,6 +5,7 @@ on, each with noise of half a millimetre.
 """
 
 import bisect
+import itertools
 import json
 import math
 import random
@@ -15,6 +16,8 @@ from typing import NamedTuple
 
 RATE_HZ = 100
 NOISE_M = 0.0005
+# A runtime holds after 150 ms without a pose.
+UNSTEADY_S = 0.1
 
 
 class Sight(NamedTuple):
@@ -62,6 +65,19 @@ class Poses(threading.Thread):
         """The vehicle's time when it was `at` here."""
         index = bisect.bisect_left(self.track, at, key=lambda sight: sight.at)
         return self.track[min(index, len(self.track) - 1)].stamp_s
+
+    def unsteady(self):
+        """How the vehicle's clock ran, if not evenly: then figures are a busy machine's."""
+        if len(self.track) < RATE_HZ:
+            return ""
+        # The first second belongs to the start.
+        track = self.track[RATE_HZ:]
+        gap_s = max((b.at - a.at for a, b in itertools.pairwise(track)), default=0.0)
+        ratio = (track[-1].stamp_s - track[0].stamp_s) / max(track[-1].at - track[0].at, 1e-3)
+        if gap_s < UNSTEADY_S and ratio > 0.95:
+            return ""
+        note = "a busy machine: the vehicle's clock stood still for %.0f ms, and ran at %.2f of ours"
+        return note % (gap_s * 1e3, ratio)
 
     def speed_mps(self):
         """Along the ground, over the last tenth of a second."""

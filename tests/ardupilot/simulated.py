@@ -49,6 +49,9 @@ class RunningSimulator:
     def __exit__(self, *_):
         self.close()
 
+    def lift(self):
+        """Nobody holds its sticks."""
+
     def close(self):
         self.process.kill()
         self.process.wait()

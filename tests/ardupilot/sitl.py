@@ -15,6 +15,7 @@ from checks import Failed, say, wait
 from wire import Station
 
 HERE = pathlib.Path(__file__).parent
+AIRFRAME = HERE.parents[1] / "hardware/airframe"
 
 # What no airframe file can hold: this one has other outputs, motors and a smaller battery, and was never calibrated.
 OVERRIDES = {
@@ -32,32 +33,43 @@ PWM = {"STABILIZE": 1100, "LOITER": 1295, "BRAKE": 1425, "ALT_HOLD": 1555, "RTL"
 
 PLACE = "42.3,-71.8,100"
 BOOT_S = 60
+# What SITL adds to the port of a TCP link.
+BASE_PORT = 5760
 
 
 def doctor(vizflyt, address, arena, folder):
     """Sets an autopilot up as a person does, by the project's own airframe file, for this arena."""
+    # The file for its version comes last; a build between two releases has names of both.
+    for file in [*sorted(AIRFRAME.glob("*.param")), None]:
+        ask(vizflyt, address, arena, folder, file)
+
+
+def ask(vizflyt, address, arena, folder, file):
     command = [vizflyt, "doctor", "vehicle", "--mavlink", address, "--arena", arena, "--apply"]
+    if file:
+        command += ["--airframe", file]
     done = subprocess.run(command, text=True, capture_output=True, timeout=120)
-    (folder / "doctor.log").write_text(done.stdout + done.stderr)
-    # Its status is 1 where something was dangerous: what it wrote counts after a restart.
-    if "DANGER" not in done.stdout:
-        raise Failed("the doctor found no danger in an autopilot as delivered: %s" % (done.stdout + done.stderr)[-500:])
+    with open(folder / "doctor.log", "a") as log:
+        log.write(done.stdout + done.stderr)
+    # Its status is 1 where something was dangerous, also if it mended that.
+    if done.returncode not in (0, 1) or "parameters" not in done.stdout:
+        raise Failed("the doctor gave up: %s" % (done.stdout + done.stderr)[-500:])
 
 
 class Transmitter(threading.Thread):
-    """The pilot's: sticks in the middle, channel 5 as the switch stands, channel 6 lets the motors turn."""
+    """The pilot's: throttle down until it is lifted, channel 5 as the switch stands, channel 6 lets the motors turn."""
 
     def __init__(self, port):
         super().__init__(daemon=True)
         self.to = ("127.0.0.1", port)
-        self.switch = "STABILIZE"
+        self.switch, self.throttle = "STABILIZE", 1000
         self.running = True
         self.start()
 
     def run(self):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
             while self.running:
-                channels = [1500, 1500, 1500, 1500, PWM[self.switch], 1000, 1000, 1000]
+                channels = [1500, 1500, self.throttle, 1500, PWM[self.switch], 1000, 1000, 1000]
                 with contextlib.suppress(ConnectionError):
                     radio.sendto(struct.pack("<16H", *channels, *[1000] * 8), self.to)
                 time.sleep(0.02)
@@ -75,15 +87,24 @@ class Sitl:
     def prepare(self, arena):
         """Sets the vehicle up as a person does, and restarts it: what it holds then begins every flight."""
         (self.folder / "calibrated.param").write_text("".join(f"{n},{v}\n" for n, v in CALIBRATED.items()))
-        station = Station()
-        port = 5990
-        with Running(self, "prepare", station, f"tcp:{port - 5760}") as running:
+        # A group of parameters is there once what switches it on has been, and the vehicle was restarted.
+        self.session(lambda port, _: doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", arena, self.folder))
+        self.session(lambda port, station: self.finish(f"tcpout:127.0.0.1:{port}", arena, station))
+
+    def finish(self, address, arena, station):
+        doctor(self.vizflyt, address, arena, self.folder)
+        for name, value in {**OVERRIDES, **SWITCH}.items():
+            if not station.set_parameter(name, value):
+                say("note  this ArduCopter has no %s" % name)
+
+    def session(self, work):
+        """Lets somebody work on it, and keeps its parameters."""
+        station, port = Station(), BASE_PORT + 230
+        with Running(self, "prepare", station, f"tcp:{port - BASE_PORT}") as running:
             wait("ArduCopter's heartbeat", lambda: "HEARTBEAT" in station.newest, BOOT_S)
-            doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", arena, self.folder)
-            for name, value in {**OVERRIDES, **SWITCH}.items():
-                if not station.set_parameter(name, value):
-                    say("note  this ArduCopter has no %s" % name)
-            time.sleep(1.5)
+            work(port, station)
+            # It writes them in the background.
+            time.sleep(2)
             shutil.copy(running.folder / "eeprom.bin", self.eeprom)
         station.close()
 
@@ -125,6 +146,9 @@ class Running:
 
     def switch(self, mode):
         self.transmitter.switch = mode
+
+    def lift(self):
+        self.transmitter.throttle = 1500
 
     def close(self):
         self.transmitter.running = False

@@ -22,7 +22,7 @@ ANSWER = struct.Struct("<HHI16H")
 MAGIC = 18458
 PERIOD_NS = 5_000_000
 # Answers under way ahead of it, so that SITL does not wait for this process to be scheduled.
-AHEAD = 3
+AHEAD = 100
 HALF = math.sqrt(0.5)
 
 

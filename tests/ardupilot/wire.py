@@ -171,8 +171,8 @@ class Station(threading.Thread):
     def command(self, number, *params):
         """Returns the result of its acknowledgement, or none."""
         self.acks.pop(number, None)
-        params = [*params, 0, 0, 0, 0, 0, 0, 0][:7]
-        self.ask(lambda: number in self.acks, self.mav.command_long_encode(1, 1, number, 0, *params))
+        all_seven = [*params, 0, 0, 0, 0, 0, 0, 0][:7]
+        self.ask(lambda: number in self.acks, self.mav.command_long_encode(1, 1, number, 0, *all_seven))
         return self.acks.get(number)
 
     def set_mode(self, number):
