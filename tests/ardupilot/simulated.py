@@ -23,7 +23,7 @@ class Simulated:
         with RunningSimulator(self, [f"--mavlink=udpout:{station.address}", "--mavlink=tcpin:127.0.0.1:0"]) as running:
             wait("the simulator's heartbeat", lambda: "HEARTBEAT" in station.newest, 30)
             before = station.all_parameters()
-            doctor(self.vizflyt, f"tcpout:{running.ready['links'][1]}", arena, self.folder)
+            doctor(self.vizflyt, f"tcpout:{running.ready['links'][1]}", self.folder, "--arena", arena)
             station.parameters.clear()
             after = station.all_parameters()
         station.close()

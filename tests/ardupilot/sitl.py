@@ -37,17 +37,9 @@ BOOT_S = 60
 BASE_PORT = 5760
 
 
-def doctor(vizflyt, address, arena, folder):
-    """Sets an autopilot up as a person does, by the project's own airframe file, for this arena."""
-    # The file for its version comes last; a build between two releases has names of both.
-    for file in [*sorted(AIRFRAME.glob("*.param")), None]:
-        ask(vizflyt, address, arena, folder, file)
-
-
-def ask(vizflyt, address, arena, folder, file):
-    command = [vizflyt, "doctor", "vehicle", "--mavlink", address, "--arena", arena, "--apply"]
-    if file:
-        command += ["--airframe", file]
+def doctor(vizflyt, address, folder, *more):
+    """Sets an autopilot up as a person does, by the project's own airframe file."""
+    command = [vizflyt, "doctor", "vehicle", "--mavlink", address, "--apply", *more]
     done = subprocess.run(command, text=True, capture_output=True, timeout=120)
     with open(folder / "doctor.log", "a") as log:
         log.write(done.stdout + done.stderr)
@@ -88,11 +80,14 @@ class Sitl:
         """Sets the vehicle up as a person does, and restarts it: what it holds then begins every flight."""
         (self.folder / "calibrated.param").write_text("".join(f"{n},{v}\n" for n, v in CALIBRATED.items()))
         # A group of parameters is there once what switches it on has been, and the vehicle was restarted.
-        self.session(lambda port, _: doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", arena, self.folder))
+        self.session(lambda port, _: doctor(self.vizflyt, f"tcpout:127.0.0.1:{port}", self.folder))
         self.session(lambda port, station: self.finish(f"tcpout:127.0.0.1:{port}", arena, station))
 
     def finish(self, address, arena, station):
-        doctor(self.vizflyt, address, arena, self.folder)
+        # A build between two releases has names of both. The file for its version comes last.
+        for file in sorted(AIRFRAME.glob("*.param")):
+            doctor(self.vizflyt, address, self.folder, "--airframe", file)
+        doctor(self.vizflyt, address, self.folder, "--arena", arena)
         for name, value in {**OVERRIDES, **SWITCH}.items():
             if not station.set_parameter(name, value):
                 say("note  this ArduCopter has no %s" % name)
