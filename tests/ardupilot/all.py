@@ -30,6 +30,7 @@ def arguments():
     parser.add_argument("--only", default=",".join(CHECKS), metavar="CHECKS", help="some of %(default)s")
     parser.add_argument("--vizflyt", default=ROOT / "target/release/vizflyt", type=pathlib.Path, metavar="PROGRAM")
     parser.add_argument("--plugin", type=pathlib.Path, help="the example `misbehave`, if not beside PROGRAM")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another parameter")
     parser.add_argument("--keep", type=pathlib.Path, metavar="FOLDER", help="keeps logs and parameters there")
     parser.add_argument("binary", type=pathlib.Path)
     given = parser.parse_args()
@@ -63,7 +64,7 @@ def main():
         return summary()
     with contextlib.ExitStack() as stack:
         folder = given.keep or stack.enter_context(tempfile.TemporaryDirectory())
-        vehicle = kind(given.binary.resolve(), pathlib.Path(folder).resolve(), given.vizflyt.resolve())
+        vehicle = kind(given.binary.resolve(), pathlib.Path(folder).resolve(), given.vizflyt.resolve(), given.set)
         lab = Lab(vehicle.folder, given.vizflyt.resolve(), given.plugin.resolve(), vehicle)
         for name in given.only.split(","):
             say(f"-- {name}")

@@ -13,8 +13,8 @@ class Simulated:
 
     is_real = False
 
-    def __init__(self, binary, folder, vizflyt):
-        self.binary, self.folder, self.vizflyt = binary, folder, vizflyt
+    def __init__(self, binary, folder, vizflyt, more):
+        self.binary, self.folder, self.vizflyt, self.more = binary, folder, vizflyt, more
         self.parameters = []
 
     def prepare(self, arena):
@@ -28,6 +28,7 @@ class Simulated:
             after = station.all_parameters()
         station.close()
         self.parameters = [f"--param={name}={value:g}" for name, value in after.items() if before.get(name) != value]
+        self.parameters += [f"--param={one}" for one in self.more]
 
     def start(self, poses, wire, station, spawn, yaw_deg):
         links = [f"--mavlink=udpout:{wire.air}", f"--mavlink=udpout:{station.address}"]

@@ -72,8 +72,9 @@ class Sitl:
 
     is_real = True
 
-    def __init__(self, binary, folder, vizflyt):
+    def __init__(self, binary, folder, vizflyt, more):
         self.binary, self.folder, self.vizflyt = binary, folder, vizflyt
+        self.more = {name: float(value) for name, value in (one.split("=") for one in more)}
         self.eeprom = folder / "eeprom.bin"
 
     def prepare(self, arena):
@@ -88,7 +89,7 @@ class Sitl:
         for file in sorted(AIRFRAME.glob("*.param")):
             doctor(self.vizflyt, address, self.folder, "--airframe", file)
         doctor(self.vizflyt, address, self.folder, "--arena", arena)
-        for name, value in {**OVERRIDES, **SWITCH}.items():
+        for name, value in {**OVERRIDES, **SWITCH, **self.more}.items():
             if not station.set_parameter(name, value):
                 say("note  this ArduCopter has no %s" % name)
 
