@@ -47,21 +47,21 @@ def arguments():
 def counterpart(binary):
     """What the binary is, by what it says of itself."""
     help_text = subprocess.run([binary, "--help"], capture_output=True, text=True, timeout=30).stdout
-    if "--truth-to" in help_text:
-        return Simulated
-    return Sitl if "--slave" in help_text else None
+    for kind, option in ((Simulated, "--truth-to"), (Sitl, "--slave")):
+        if option in help_text:
+            return kind
+    sys.exit(f"{binary} is neither ArduCopter for SITL nor our simulator: its help names no --slave and no --truth-to")
 
 
 def main():
     # Whoever ends this ends what it has started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
     given = arguments()
-    kind = None if "px4" in given.binary.name else counterpart(given.binary)
-    if kind is None:
+    if "px4" in given.binary.name:
         for name in given.only.split(","):
-            skip(name, f"{given.binary.name} is neither ArduCopter for SITL, nor our simulator; PX4 is not flown here: "
-                       "it has no way to say where the vehicle truly is, to less than a centimetre")
+            skip(name, f"{given.binary.name} is PX4, whose truth, parameters and transmitter this does not know yet")
         return summary()
+    kind = counterpart(given.binary)
     with contextlib.ExitStack() as stack:
         folder = given.keep or stack.enter_context(tempfile.TemporaryDirectory())
         vehicle = kind(given.binary.resolve(), pathlib.Path(folder).resolve(), given.vizflyt.resolve(), given.set)

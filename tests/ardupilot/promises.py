@@ -6,8 +6,9 @@ DRIFT_M = 0.5
 # And by so long a way at the speed that was flown. [s]
 DRIFT_S = 0.8
 
-# Losses that only the autopilot is left to answer: figures are compared with these rows of docs/guides/failsafe.md.
+# Losses that only the autopilot is left to answer: down as rows of docs/guides/failsafe.md say, or so much later. [s]
 AUTOPILOT_ALONE = {"MAVLink cut": "Wi-Fi dies"}
+AS_WRITTEN_S = 1.0
 
 # How far the body may be outside the fence. [m]
 OUTSIDE_M = 0.0
