@@ -185,6 +185,7 @@ fn outward(lab: &Lab) -> Flight {
 /// As [`outward`], with the autopilot's own fence of this kind.
 fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
     let vehicle = [
+        "--airframe",
         "--param=FENCE_ENABLE=1",
         "--param=FENCE_ACTION=2",
         "--param=FENCE_ALT_MAX=3.2",
@@ -192,7 +193,6 @@ fn outward_with(lab: &Lab, fence: &[&str]) -> Flight {
         "--param=FS_GCS_ENABLE=5",
         "--param=FS_GCS_TIMEOUT=2",
         "--param=FS_OPTIONS=24",
-        "--param=GUID_TIMEOUT=0.5",
     ];
     let vehicle = [fence, &vehicle].concat();
     let plan = Plan { how: "forward", vehicle: &vehicle, ..Plan::default() };
