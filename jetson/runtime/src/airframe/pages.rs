@@ -449,13 +449,14 @@ fn wrong_drawings(table: &Table) -> Vec<String> {
 
 /// Pins that the ESP32-C3's firmware drives otherwise.
 fn wrong_firmware(table: &Table) -> Vec<String> {
-    let source = text("firmware-esp/esp32c3/src/main.rs");
-    let pins = ["with_rx", "with_tx", "with_rts", "with_cts"];
+    let source = text("firmware-esp/bridge/src/settings.rs");
+    let usual = source.lines().find(|line| line.contains("const USUAL")).unwrap_or_default();
+    let pins = ["rx", "tx", "rts", "cts"];
     let mut found = Vec::new();
-    for (wire, call) in table.wire.iter().skip(1).zip(pins) {
-        let expected = format!("{call}(chip.{})", wire.esp32c3_chip);
-        if !source.contains(&expected) {
-            found.push(format!("the firmware has no {expected}"));
+    for (wire, pin) in table.wire.iter().skip(1).zip(pins) {
+        let expected = format!("{pin}: {}", wire.esp32c3_chip.trim_start_matches("GPIO"));
+        if !usual.split(['{', '}', ',']).any(|part| part.trim() == expected) {
+            found.push(format!("the bridge's usual pins have no {expected}"));
         }
     }
     found
