@@ -32,4 +32,8 @@ impl Platform for Front {
     fn signal_dbm(&mut self) -> Option<i8> {
         platform::rssi_dbm()
     }
+
+    fn overruns(&mut self) -> u32 {
+        platform::uart_overruns()
+    }
 }

@@ -16,6 +16,7 @@ mod c {
         pub(super) fn platform_uart_read(into: *mut u8, len: u32) -> u32;
         pub(super) fn platform_uart_write(bytes: *const u8, len: u32) -> u32;
         pub(super) safe fn platform_uart_is_idle() -> u32;
+        pub(super) safe fn platform_uart_overruns() -> u32;
         pub(super) safe fn platform_uart_configure(baud: u32, flow_control: u32);
         pub(super) fn platform_mac(into: *mut u8);
         pub(super) fn platform_frame_waiting(len: *mut u32) -> *mut u8;
@@ -78,6 +79,11 @@ pub(crate) fn uart_write(bytes: &[u8]) -> usize {
 /// Whether all bytes handed over have left.
 pub(crate) fn uart_is_idle() -> bool {
     c::platform_uart_is_idle() != 0
+}
+
+/// Returns how often received bytes were lost because nobody read them in time. Wraps.
+pub(crate) fn uart_overruns() -> u32 {
+    c::platform_uart_overruns()
 }
 
 /// Sets rate and flow control.
