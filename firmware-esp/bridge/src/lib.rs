@@ -15,6 +15,7 @@ pub mod access;
 #[cfg(feature = "net")]
 pub mod blink;
 pub mod bridge;
+mod capacity;
 pub mod dhcp;
 pub mod http;
 pub mod mavlink_writer;

@@ -184,7 +184,7 @@ impl PacketRouter {
             rssi,
             remrssi: UNKNOWN,
             // What the autopilot slows its streams by.
-            txbuf: 100 - (waiting * 100 / super::router::DOWN as u32).min(100) as u8,
+            txbuf: 100 - (waiting * 100 / crate::capacity::DOWN as u32).min(100) as u8,
             noise: UNKNOWN,
             remnoise: UNKNOWN,
         }

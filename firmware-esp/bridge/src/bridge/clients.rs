@@ -10,8 +10,6 @@ use crate::stats::Sequences;
 
 /// Clients at once.
 pub const CLIENTS: usize = 8;
-/// TCP connections at once, among them.
-pub const TCP_SLOTS: usize = 2;
 
 /// A connection that takes nothing for this long is ended: longer than Wi-Fi takes to come back, shorter
 /// than TCP takes to notice. [s]

@@ -28,8 +28,9 @@ use core::net::{Ipv4Addr, SocketAddrV4};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
+pub use crate::capacity::TCP_SLOTS;
 use clients::Client;
-pub use clients::{CLIENTS, Peer, TCP_SLOTS};
+pub use clients::{CLIENTS, Peer};
 pub use component::{COMPONENT_ID, Event};
 pub use loss::LandingStage;
 use router::PacketRouter;

@@ -15,17 +15,12 @@ use super::loss::{Flight, LinkLoss};
 use super::parameters::TypedTexts;
 use super::vehicle_signing::VehicleSigning;
 use crate::access;
+use crate::capacity::{DOWN, NORMAL, URGENT};
 use crate::packet::{CutStats, Raw};
 use crate::ring::{Ring, Tag};
 use crate::settings::Settings;
 use crate::stats::{Reason, Sequences, Stats};
 
-/// Bytes from the autopilot that clients have not taken yet: 89 ms at 921600 baud.
-pub(super) const DOWN: usize = 8192;
-/// Bytes of setpoints, poses and commands that wait for the autopilot's port.
-const URGENT: usize = 2048;
-/// Bytes of everything else that do.
-const NORMAL: usize = 4096;
 /// An autopilot silent for this long is gone: three heartbeats. [s]
 const LOST_AFTER_S: f64 = 3.5;
 /// A client silent for this long gives its place to a new one if there is no other. [s]

@@ -3,7 +3,7 @@
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
 
-use embassy_futures::join::{join, join5};
+use embassy_futures::join::{join, join_array, join4};
 use embassy_futures::select::select3;
 use embassy_net::tcp::TcpSocket;
 use embassy_net::udp::{PacketMetadata, UdpMetadata, UdpSocket};
@@ -71,15 +71,12 @@ pub(super) async fn serve<P: Platform>(
             }
         }
     };
-    let [first, second] = tcp;
-    join5(
-        receive,
-        join(send_speaking, send_silent),
-        connection(shared, stack, tcp_port, 0, first),
-        connection(shared, stack, tcp_port, 1, second),
-        show_page(shared, stack, platform, page),
-    )
-    .await;
+    let mut slots = 0..;
+    let connections = tcp
+        .each_mut()
+        .map(|buffers| connection(shared, stack, tcp_port, slots.next().unwrap_or(0), buffers));
+    let send = join(send_speaking, send_silent);
+    join4(receive, send, join_array(connections), show_page(shared, stack, platform, page)).await;
 }
 
 /// A network stack keeps what it cannot send, and everything behind it: a datagram for whoever has
