@@ -91,12 +91,10 @@ def bridged(vizflyt, command, row, seed, results):
         watchdog = threading.Timer(LIMIT, client.kill)
         watchdog.start()
         lines = []
-        reader = threading.Thread(target=lambda: lines.extend(client.stdout))
-        reader.start()
-        while reader.is_alive():
-            rig.watcher.work()
+        for line in client.stdout:
+            print("%s (through a bridge)" % line.rstrip(), flush=True)
+            lines.append(line)
         watchdog.cancel()
-        print("".join("%s through a bridge\n" % line.rstrip() for line in lines), end="", flush=True)
         check = Checks("%s through a bridge" % script, keeps_going=True)
         rig.judge(check)
         report, _ = rig.report()

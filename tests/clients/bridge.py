@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 
 from lab import mavlink, mavutil
@@ -28,7 +29,7 @@ GROWTH_KIB = 512
 
 
 class Watcher:
-    """A ground station that only listens: pymavlink's own count of what it has lost."""
+    """A ground station that only listens, all the while: pymavlink's own count of what it has lost."""
 
     def __init__(self, address):
         self.link = mavutil.mavlink_connection(
@@ -37,6 +38,13 @@ class Watcher:
         self.beat = 0.0
         self.rooms = []
         self.newest = {}
+        self.is_over = False
+        self.thread = threading.Thread(target=self.listen, daemon=True)
+        self.thread.start()
+
+    def listen(self):
+        while not self.is_over:
+            self.work()
 
     def work(self):
         if time.monotonic() - self.beat > 1:
@@ -54,6 +62,10 @@ class Watcher:
             if kind == "RADIO_STATUS":
                 self.rooms.append(message.txbuf)
             message = self.link.recv_match(blocking=False)
+
+    def close(self):
+        self.is_over = True
+        self.thread.join()
 
     def lost(self):
         return self.link.mav_loss
@@ -115,8 +127,8 @@ class Rig:
     def judge(self, check):
         """What every station must be able to say in the end."""
         watcher = self.watcher
-        until(lambda: len(watcher.rooms) > 3, 20, watcher.work)
-        dropped = until(self.stalled.is_dropped, 60, watcher.work)
+        until(lambda: len(watcher.rooms) > 3, 20)
+        dropped = until(self.stalled.is_dropped, 60)
         check("the client that never reads was dropped", dropped)
         check("a listener lost none of %d packets" % watcher.link.mav_count, watcher.lost() == 0,
               watcher.lost())
@@ -133,6 +145,7 @@ class Rig:
         return reports
 
     def close(self):
+        self.watcher.close()
         for process in self.processes:
             process.kill()
             process.wait()
@@ -231,7 +244,7 @@ def transfers(check, rig):
     """Parameters and a mission, as ground stations move them."""
     station = Station(rig.udp)
     alive = lambda: "HEARTBEAT" in rig.watcher.newest
-    check("connects", until(alive, 30, rig.watcher.work))
+    check("connects", until(alive, 30))
     whole, count, seconds = station.load_params()
     check("all %d parameters come, in %.1f s" % (count, seconds), whole and count >= 30, count)
     if not station.asks_ftp():
@@ -256,9 +269,9 @@ def soak(check, rig, seconds):
     """Stays for a while; the bridge's memory must not grow behind its first minute."""
     watcher = rig.watcher
     start = time.monotonic()
-    until(lambda: False, min(60.0, seconds / 2), watcher.work)
+    time.sleep(min(60.0, seconds / 2))
     before = memory_kib(rig.bridge)
-    until(lambda: False, seconds - (time.monotonic() - start), watcher.work)
+    time.sleep(seconds - (time.monotonic() - start))
     after = memory_kib(rig.bridge)
     took = time.monotonic() - start
     check("soaked for %d s, %d packets; memory %d -> %d KiB" % (took, watcher.link.mav_count, before, after),

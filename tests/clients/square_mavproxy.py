@@ -119,13 +119,13 @@ def fly(check, proxy):
 
 
 def lost(proxy):
-    """Returns what MAVProxy's `link list` says of packets lost; None if it says nothing."""
+    """Returns what MAVProxy's `link` says of packets lost; None if it says nothing."""
 
     def found():
         lines = [re.search(r"(\d+) lost", line) for line in proxy.lines]
         return [int(match.group(1)) for match in lines if match]
 
-    proxy.until(found, "link list", 20)
+    proxy.until(found, "link", 20)
     return found()[-1] if found() else None
 
 

@@ -1,13 +1,14 @@
 //! Starts that nobody asked for: after a panic, and when the watchdog finds that forwarding hangs. A
 //! bridge on a vehicle has nobody near it who could press a button.
 
-use core::sync::atomic::{AtomicU32, Ordering};
+use core::sync::atomic::Ordering;
 
 use esp_hal::peripherals::TIMG1;
 use esp_hal::ram;
 use esp_hal::rtc_cntl::SocResetReason;
 use esp_hal::time::Duration;
 use esp_hal::timer::timg::{MwdtStage, Wdt};
+use portable_atomic::AtomicU32;
 use vizflyt_bridge::stats::RestartCause;
 
 /// Forwarding comes round once a second at least. Erasing a half of the flash, sector by sector, is what
@@ -42,7 +43,8 @@ impl Watchdog {
 /// Returns why the chip has started; once, at the start.
 pub(crate) fn cause() -> RestartCause {
     use SocResetReason as Reason;
-    let panicked = PANICKED.swap(0, Ordering::Relaxed) == MARK;
+    let panicked = PANICKED.load(Ordering::Relaxed) == MARK;
+    PANICKED.store(0, Ordering::Relaxed);
     match esp_hal::system::reset_reason() {
         Some(Reason::CoreSw | Reason::Cpu0Sw) if panicked => RestartCause::Panic,
         Some(Reason::CoreSw | Reason::Cpu0Sw | Reason::CoreUsbUart | Reason::CoreUsbJtag) => {
