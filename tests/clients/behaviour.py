@@ -182,7 +182,7 @@ def fly_velocities(lab):
     check("with the nose south", abs(wrap(yaw - math.pi)) < 0.15, yaw)
     lab.setpoint = None
     start = lab.vicon.pose[:2]
-    lab.fly_for(4.5)
+    lab.fly_for(6)
     way = math.dist(start, lab.vicon.pose[:2])
     check("a setpoint dies after 3 s and the vehicle stops", lab.speed() < 0.15, lab.speed())
     check("having coasted on until then", 3.0 < way < 6.5, way)

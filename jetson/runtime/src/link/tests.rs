@@ -350,7 +350,8 @@ fn the_origin_is_sent_every_second_until_confirmed() {
     script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     script.run(3.0);
     assert_eq!(origins(&script), 4);
-    assert_eq!(script.count(|message| matches!(message, MavMessage::HEARTBEAT(_))), 7);
+    let beats = script.count(|message| matches!(message, MavMessage::HEARTBEAT(_)));
+    assert!((25..=27).contains(&beats), "four heartbeats a second: {beats}");
 }
 
 #[test]
