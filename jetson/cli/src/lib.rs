@@ -99,6 +99,12 @@ enum Command {
     /// Runs a built-in example plugin; started by `vizflyt fly`.
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
+    /// The last process of a flight to die; started by `vizflyt fly`.
+    #[command(hide = true, name = vizflyt_guardian::SUBCOMMAND)]
+    Guardian {
+        /// Where the autopilot is.
+        mavlink: String,
+    },
 }
 
 /// Reads the command line, runs what it says, and returns the exit status.
@@ -174,6 +180,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Stats(args) => stats::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
+        Command::Guardian { mavlink } => Ok(vizflyt_guardian::run(&mavlink)),
     }
 }
 

@@ -13,9 +13,9 @@ use vizflyt_protocol::messages::Limits;
 use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, Servers};
 
 use crate::config::{self, JetsonConfig, LogConfig, VehicleConfig};
-use crate::link::port::MavlinkAddress;
 use crate::link::{LinkSettings, SigningFile, VISION_HZ};
 use crate::log::{LogSettings, LoggedImages};
+use vizflyt_guardian::port::MavlinkAddress;
 
 /// Flies a plugin: images from the render server to it, its setpoints through the guard to the
 /// autopilot.

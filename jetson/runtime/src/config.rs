@@ -36,9 +36,9 @@ use vizflyt_toml::TomlErrors;
 use vizflyt_trust::Fingerprint;
 
 use crate::link::VISION_HZ;
-use crate::link::port::{self, Shape};
 use crate::log::{LoggedImages, Retention};
 use crate::supervisor::{PluginLimits, Restart};
+use vizflyt_guardian::port::{self, Shape};
 
 /// The whole of `jetson.toml`. Every section may be absent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -5,9 +5,9 @@ use std::hash::{BuildHasher, RandomState};
 use std::io::Read;
 use std::net::SocketAddr;
 use std::process;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -15,16 +15,18 @@ use anyhow::Context;
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{SignalKind, signal};
+use vizflyt_guardian::client::BUFFER;
+use vizflyt_guardian::{Feed, Guardian, Message};
 use vizflyt_protocol::flight_end::EndReason;
-use vizflyt_protocol::messages::{Purpose, bounded};
+use vizflyt_protocol::messages::{PoseSample, Purpose, bounded};
+use vizflyt_protocol::packet::feed::FeedKey;
+use vizflyt_protocol::time::HostTime;
 
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
 use crate::control::{Control, ControlInput, QUEUE, print_line};
 use crate::descriptors;
 use crate::flight::FlightSettings;
-use crate::link::Wanted;
-use crate::link::port::Port;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
 use crate::stream::{self, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
@@ -67,17 +69,17 @@ pub fn fly_command(
     let (fingerprint, identity) = args.server.known()?;
     let mavlink = args.mavlink_address();
     let link = args.link_settings()?;
-    let port = Arc::new(
-        Port::open(&mavlink, Wanted::of(&link))
-            .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?,
-    );
+    // Before any thread: a process that is to outlive this one.
+    let guardian = Guardian::start(&mavlink, &link.wanted())
+        .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?;
+    let guardian = Arc::new(guardian);
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
     let log = FlightLog::open(&args.log.settings(&args.jetson.log)?, live);
     log.flight(&args.plugin.clone().unwrap_or_default(), &args.plugin_arguments);
     let (sender, inputs) = sync_channel(QUEUE);
     let stop = Arc::new(AtomicBool::new(false));
-    receive_mavlink(Arc::clone(&port), sender.clone(), Arc::clone(&stop))?;
+    receive_mavlink(Arc::clone(&guardian), sender.clone(), Arc::clone(&stop))?;
     if args.lifeline {
         watch_stdin(sender.clone())?;
     }
@@ -97,9 +99,14 @@ pub fn fly_command(
         program: bounded(concat!("vizflyt-runtime ", env!("CARGO_PKG_VERSION"))),
     };
     let outbox = Arc::clone(&to_server);
-    let talk = stream::run(settings, shared.clone(), to_server, tell_stream(sender.clone()));
+    let talk = stream::run(
+        settings,
+        shared.clone(),
+        to_server,
+        tell_stream(sender.clone(), Arc::clone(&guardian)),
+    );
     let talk = tokio.spawn(talk);
-    print_ready(args.json, server, &port.local()?, &log);
+    print_ready(args.json, server, guardian.local(), &log);
 
     let control = Control {
         plugin_command,
@@ -112,7 +119,10 @@ pub fn fly_command(
             cameras: args.jetson.plugin.cameras.clone(),
         },
         waits_for_start: args.wait,
-        to_autopilot: Box::new(move |bytes| port.send(bytes)),
+        to_autopilot: Box::new({
+            let guardian = Arc::clone(&guardian);
+            move |bytes| guardian.send(bytes)
+        }),
         link,
         shared,
         to_server: Arc::clone(&outbox),
@@ -122,6 +132,7 @@ pub fn fly_command(
     };
     let flown = control.run(sender, &inputs);
     stop.store(true, Ordering::Relaxed);
+    guardian.leave();
 
     let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
     report.log = flown.log.path().map(|path| path.display().to_string());
@@ -149,27 +160,26 @@ fn listen(tokio: &Runtime, address: SocketAddr) -> anyhow::Result<Live> {
 }
 
 fn receive_mavlink(
-    port: Arc<Port>,
+    guardian: Arc<Guardian>,
     sender: SyncSender<ControlInput>,
     stop: Arc<AtomicBool>,
 ) -> std::io::Result<()> {
     let receive = move || {
-        // Larger than any datagram of MAVLink packets on an Ethernet.
-        let mut buffer = [0; 2048];
+        let mut buffer = BUFFER;
         while !stop.load(Ordering::Relaxed) {
-            if let Some(intruder) = port.poll_intruder() {
-                tracing::warn!("mavlink: {intruder}");
-                let _ = sender.try_send(ControlInput::Note(intruder.to_string()));
-            }
-            match port.receive(&mut buffer) {
-                Ok(Some(len)) => {
+            match guardian.receive(&mut buffer) {
+                Ok(Some(Message::Mavlink(bytes))) => {
                     // A full queue drops telemetry, as the network might.
-                    let _ = sender.try_send(ControlInput::Mavlink(buffer[..len].to_vec()));
+                    let _ = sender.try_send(ControlInput::Mavlink(bytes.to_vec()));
+                }
+                Ok(Some(Message::Note(text))) => {
+                    tracing::warn!("mavlink: {text}");
+                    let _ = sender.try_send(ControlInput::Note(text));
                 }
                 Ok(None) => {}
                 Err(error) => {
-                    tracing::warn!("mavlink socket: {error}");
-                    thread::sleep(std::time::Duration::from_millis(100));
+                    tracing::error!("{error}");
+                    let _ = sender.try_send(ControlInput::Note(error.to_string()));
                 }
             }
         }
@@ -220,15 +230,51 @@ fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<ControlInput>) -> s
     Ok(())
 }
 
-fn tell_stream(sender: SyncSender<ControlInput>) -> impl Fn(StreamEvent) -> bool + Send + Sync {
+fn tell_stream(
+    sender: SyncSender<ControlInput>,
+    guardian: Arc<Guardian>,
+) -> impl Fn(StreamEvent) -> bool + Send + Sync {
+    let feed = Mutex::new(FeedTeller::default());
     move |event| {
-        let is_pose = matches!(event, StreamEvent::Pose(..));
+        let is_pose = match &event {
+            StreamEvent::Feed(server, key) => {
+                feed.lock().unwrap_or_else(PoisonError::into_inner).source = Some((*server, *key));
+                return true;
+            }
+            StreamEvent::Pose(sample, stamp) => {
+                let mut feed = feed.lock().unwrap_or_else(PoisonError::into_inner);
+                if let Some(told) = feed.due(sample, *stamp) {
+                    guardian.feed(&told);
+                }
+                true
+            }
+            _ => false,
+        };
         // Poses are many and stale soon. An event that finds no room is sent again by the server.
         let taken = sender.try_send(ControlInput::Stream(event)).is_ok();
         if !taken && !is_pose {
             tracing::error!("the control loop is stalled");
         }
         taken
+    }
+}
+
+/// Tells the guardian once a second where poses come from, and how the server's clock stands to ours.
+#[derive(Default)]
+struct FeedTeller {
+    source: Option<(SocketAddr, FeedKey)>,
+    told_at: Option<HostTime>,
+}
+
+impl FeedTeller {
+    fn due(&mut self, sample: &PoseSample, stamp: HostTime) -> Option<Feed> {
+        let (server, key) = self.source?;
+        if self.told_at.is_some_and(|at| stamp.seconds_since(at) < 1.0) {
+            return None;
+        }
+        self.told_at = Some(stamp);
+        let server_ahead_ns = sample.stamp.as_ns().wrapping_sub(stamp.as_ns()).cast_signed();
+        Some(Feed { server, key, server_ahead_ns })
     }
 }
 

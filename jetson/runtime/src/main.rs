@@ -14,6 +14,12 @@ struct Program {
 }
 
 fn main() -> ExitCode {
+    let mut arguments = std::env::args().skip(1);
+    if arguments.next().as_deref() == Some(vizflyt_guardian::SUBCOMMAND)
+        && let Some(address) = arguments.next()
+    {
+        return vizflyt_guardian::run(&address);
+    }
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())

@@ -7,6 +7,7 @@
 //! - [`time`]: one stamp type per clock, and the filter that relates two clocks;
 //! - [`histogram`]: durations counted, the same way at both ends;
 //! - [`flight_end`]: how a flight ended, and why: reasons as data, and the one rule that decides;
+//! - [`failsafe`]: who is silent in flight, since when, and what follows; guardian and bridge run the same;
 //! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
@@ -16,6 +17,7 @@
 
 #![no_std]
 
+pub mod failsafe;
 pub mod flight_end;
 pub mod geometry;
 pub mod histogram;
@@ -28,4 +30,4 @@ pub mod time;
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first
 /// ([`packet::Preamble`]) and refuse a mismatch by name.
-pub const PROTOCOL_VERSION: u16 = 8;
+pub const PROTOCOL_VERSION: u16 = 9;

@@ -32,9 +32,17 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-arena",
         ],
     ),
+    ("vizflyt-guardian", &["vizflyt-protocol"]),
     (
         "vizflyt-runtime",
-        &["vizflyt-protocol", "vizflyt-rgbd", "vizflyt-toml", "vizflyt-trust", "vizflyt-sdk"],
+        &[
+            "vizflyt-protocol",
+            "vizflyt-rgbd",
+            "vizflyt-toml",
+            "vizflyt-trust",
+            "vizflyt-sdk",
+            "vizflyt-guardian",
+        ],
     ),
     (
         "vizflyt",
@@ -48,6 +56,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-scenes",
             "vizflyt-server",
             "vizflyt-runtime",
+            "vizflyt-guardian",
             "vizflyt-simulator",
             "vizflyt-bridge",
             "vizflyt-sdk",

@@ -3,16 +3,16 @@
 
 use core::fmt::Write as _;
 
+use vizflyt_protocol::failsafe::{FailsafeAction, land};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::mavlink::dialect::{
-    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavSeverity, MavState, MavType,
-    RADIO_STATUS_DATA, STATUSTEXT_DATA, TIMESYNC_DATA,
+    HEARTBEAT_DATA, MavAutopilot, MavSeverity, MavState, MavType, RADIO_STATUS_DATA,
+    STATUSTEXT_DATA, TIMESYNC_DATA,
 };
 use vizflyt_protocol::time::HostTime;
 
 use super::clients::{Client, bit};
 use super::component::{COMPONENT_ID, HEARTBEAT};
-use super::loss::LossAction;
 use super::router::{PacketRouter, kind, millis};
 use crate::access;
 use crate::mavlink_writer::{BridgeMessage, write_message, write_packet};
@@ -33,7 +33,7 @@ const UNKNOWN: u8 = 255;
 impl PacketRouter {
     /// Once a second, and when the companion is silent.
     pub(super) fn poll_component(&mut self, now: HostTime) {
-        while let Some(act) = self.loss.poll(now, self.flight, self.settings.loss_ms) {
+        while let Some(act) = self.failsafe.poll(now, self.flight, self.settings.loss_ms) {
             self.act(now, act);
         }
         if self.save_at.is_some_and(|at| at <= now) {
@@ -81,29 +81,23 @@ impl PacketRouter {
         }
     }
 
-    fn act(&mut self, now: HostTime, act: LossAction) {
+    fn act(&mut self, now: HostTime, act: FailsafeAction) {
         let Some(target) = self.autopilot else { return };
         match act {
-            LossAction::Land { confirmation } => {
+            FailsafeAction::Land { confirmation } => {
                 if confirmation == 0 {
                     self.stats.landings = self.stats.landings.wrapping_add(1);
                     let text = "bridge: the companion is silent: asks for LAND";
                     self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
                 }
-                let land = COMMAND_LONG_DATA {
-                    command: MavCmd::MAV_CMD_NAV_LAND,
-                    target_system: target.0,
-                    target_component: target.1,
-                    confirmation,
-                    ..Default::default()
-                };
-                self.send_to_autopilot(now, &BridgeMessage::COMMAND_LONG(land));
+                let land = BridgeMessage::COMMAND_LONG(land(target, confirmation));
+                self.send_to_autopilot(now, &land);
             }
-            LossAction::AnnounceLanding => {
+            FailsafeAction::AnnounceLanding => {
                 let text = "bridge: landing";
                 self.send_status_text(now, MavSeverity::MAV_SEVERITY_CRITICAL, text);
             }
-            LossAction::ReportSilence => {
+            FailsafeAction::ReportSilence => {
                 let unsigned = self.signing.is_required() && self.settings.vehicle_key.is_none();
                 let text = if unsigned {
                     "bridge: LAND not acknowledged: vehicle.key missing"
@@ -112,7 +106,7 @@ impl PacketRouter {
                 };
                 self.send_status_text(now, MavSeverity::MAV_SEVERITY_EMERGENCY, text);
             }
-            LossAction::Beat(system, beat) => {
+            FailsafeAction::Beat(system, beat) => {
                 let mut packet = [0; MAX_PACKET];
                 let source = (system, COMPONENT_ID);
                 let len = write_packet(&mut packet, source, 0, HEARTBEAT, &beat);
@@ -167,7 +161,7 @@ impl PacketRouter {
     fn radio_status(&self) -> RADIO_STATUS_DATA {
         // The companion's, which the vehicle flies by; without one whoever is quickest: a client that
         // does not take its packets must not slow the others down.
-        let companion = self.loss.companion();
+        let companion = self.failsafe.companion();
         let is_companion = |client: &&Client| companion.is_some_and(|source| client.holds(source));
         let clients = || self.clients.iter().flatten();
         let waiting = match clients().find(is_companion) {

@@ -1,13 +1,11 @@
 //! The bridge as a MAVLink component of the vehicle: what it learns from packets that pass, and what it
 //! does that somebody asks of it.
 
-use vizflyt_protocol::mavlink::dialect::{
-    MavAutopilot, MavCmd, MavModeFlag, MavResult, MavSeverity,
-};
+use vizflyt_protocol::failsafe::Flight;
+use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavCmd, MavResult, MavSeverity};
 use vizflyt_protocol::time::HostTime;
 
 use super::fields::Fields;
-use super::loss::Flight;
 use super::router::PacketRouter;
 use crate::access::{self, Access};
 use crate::packet::Raw;
@@ -86,18 +84,14 @@ impl PacketRouter {
                 self.signing.note_heartbeat(packet);
                 self.autopilot = Some(packet.source());
                 self.autopilot_at = now;
-                self.flight = Flight {
-                    armed: field.byte(6) & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0,
-                    mode: field.u32(0),
-                    px4: autopilot == MavAutopilot::MAV_AUTOPILOT_PX4 as u8,
-                };
+                self.flight = Flight::of(autopilot, field.byte(6), field.u32(0));
                 self.heartbeat = heapless::Vec::from_slice(packet.bytes()).unwrap_or_default();
             }
             COMMAND_ACK => {
                 let ours = packet.target() == self.address();
                 let land = u32::from(field.u16(0)) == MavCmd::MAV_CMD_NAV_LAND as u32;
                 if ours && land && field.byte(2) == MavResult::MAV_RESULT_ACCEPTED as u8 {
-                    self.loss.note_acknowledged(now);
+                    self.failsafe.note_acknowledged(now);
                 }
             }
             TIMESYNC if field.i64(0) != 0 => {
@@ -120,7 +114,7 @@ impl PacketRouter {
             self.outstanding.client_asked_at = Some(now);
         }
         if packet.id() == HEARTBEAT {
-            self.loss.note_heartbeat(packet.source(), field.bytes(0));
+            self.failsafe.note_heartbeat(packet.source(), field.bytes(0));
         }
     }
 

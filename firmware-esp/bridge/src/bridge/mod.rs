@@ -13,7 +13,6 @@ mod announcements;
 mod clients;
 mod component;
 mod fields;
-mod loss;
 mod outgoing;
 mod parameters;
 mod requests;
@@ -32,8 +31,8 @@ pub use crate::capacity::TCP_SLOTS;
 use clients::Client;
 pub use clients::{CLIENTS, Peer};
 pub use component::{COMPONENT_ID, Event};
-pub use loss::LandingStage;
 use router::PacketRouter;
+pub use vizflyt_protocol::failsafe::LandingStage;
 
 use crate::access;
 use crate::packet::{CutStats, Cutter, each_in_datagram};
@@ -332,7 +331,7 @@ impl Bridge {
 
     /// Returns how far its landing of the vehicle is, because the companion is silent.
     pub fn landing(&self) -> Option<LandingStage> {
-        self.router.loss.stage()
+        self.router.failsafe.stage()
     }
 
     /// Whether the autopilot has said that it lands because the bridge asked.
@@ -342,7 +341,7 @@ impl Bridge {
 
     /// Whether nothing has acknowledged LAND for a second.
     pub fn is_unanswered(&self, now: HostTime) -> bool {
-        self.router.loss.is_unanswered(now)
+        self.router.failsafe.is_unanswered(now)
     }
 
     /// Returns each client: where, packets sent to it, packets it was too slow for.

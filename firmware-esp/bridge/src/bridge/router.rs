@@ -4,6 +4,7 @@ use core::fmt::Write as _;
 use core::net::{Ipv4Addr, SocketAddrV4};
 
 use heapless::Deque;
+use vizflyt_protocol::failsafe::{Failsafe, Flight, is_stream};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
@@ -11,7 +12,6 @@ use super::Chip;
 use super::announcements::SECOND_S;
 use super::clients::{CLIENTS, Client, Peer, bit};
 use super::component::Event;
-use super::loss::{Flight, LinkLoss};
 use super::parameters::TypedTexts;
 use super::vehicle_signing::VehicleSigning;
 use crate::access;
@@ -48,7 +48,7 @@ pub(super) struct PacketRouter {
     pub(super) flight: Flight,
     /// Its newest heartbeat, as it came: what the beacon repeats.
     pub(super) heartbeat: heapless::Vec<u8, 48>,
-    pub(super) loss: LinkLoss,
+    pub(super) failsafe: Failsafe,
     pub(super) signing: VehicleSigning,
     pub(super) typed: TypedTexts,
     /// When changed settings are kept.
@@ -92,7 +92,7 @@ impl PacketRouter {
             autopilot_at: HostTime::ZERO,
             flight: Flight::UNKNOWN,
             heartbeat: heapless::Vec::new(),
-            loss: LinkLoss::NONE,
+            failsafe: Failsafe::NONE,
             signing: VehicleSigning::new(),
             typed: TypedTexts::NONE,
             save_at: None,
@@ -269,7 +269,7 @@ impl PacketRouter {
             self.push_down(now, packet.source(), kind(packet.id()), holders, false, packet.bytes());
             return;
         }
-        self.loss.note_packet(now, packet.source(), streams(kind(packet.id())));
+        self.failsafe.note_packet(now, packet.source(), is_stream(packet.id()));
         self.signing.note(now, packet, self.settings.vehicle_key.as_ref());
         self.note_to_autopilot(now, packet);
         let tag = Tag {
@@ -399,7 +399,7 @@ impl PacketRouter {
     /// Returns when something other than sending is due next.
     pub(super) fn due(&self) -> HostTime {
         let mut due = self.save_at.map_or(self.second_at, |at| at.min(self.second_at));
-        if let Some(at) = self.loss.due(self.flight, self.settings.loss_ms) {
+        if let Some(at) = self.failsafe.due(self.flight, self.settings.loss_ms) {
             due = due.min(at);
         }
         due
@@ -427,14 +427,9 @@ pub(super) fn millis(now: HostTime) -> u16 {
     (now.as_ns() / 1_000_000) as u16
 }
 
-/// Whether a message is one of a stream by which a vehicle flies: setpoints and external
-/// navigation. Of these the newest counts.
+/// Whether of this message the newest counts.
 pub(super) fn streams(kind: u16) -> bool {
-    // SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT,
-    // MANUAL_CONTROL, RC_CHANNELS_OVERRIDE; GLOBAL_VISION_POSITION_ESTIMATE,
-    // VISION_POSITION_ESTIMATE, VISION_SPEED_ESTIMATE, VICON_POSITION_ESTIMATE, ATT_POS_MOCAP,
-    // GPS_INPUT, ODOMETRY.
-    matches!(kind, 82 | 84 | 86 | 69 | 70 | 101..=104 | 138 | 232 | 331)
+    is_stream(kind.into())
 }
 
 /// Whether a message overtakes others on the way to the autopilot: streams, commands and what

@@ -8,11 +8,10 @@ use std::time::{Duration, Instant};
 use vizflyt_sdk::host_now;
 
 use super::names::Version;
-use crate::link::port::{MavlinkAddress, Port};
 use crate::link::{
     FenceEvent, FencePolygon, Firmware, Link, LinkEvent, LinkSettings, LinkSigning, ParamEvent,
-    Wanted,
 };
+use vizflyt_guardian::port::{MavlinkAddress, Port};
 
 /// Why a session failed.
 #[derive(Debug, thiserror::Error)]
@@ -81,7 +80,7 @@ impl ParamSession {
         address: &MavlinkAddress,
         settings: LinkSettings,
     ) -> Result<Self, ParamSessionError> {
-        let port = Port::open(address, Wanted::of(&settings))
+        let port = Port::open(address, settings.wanted())
             .map_err(|why| ParamSessionError::Open { address: address.clone(), why })?;
         let mut session = Self { port, link: Link::with(host_now(), settings) };
         let within_s = HEARTBEAT_WITHIN_S;

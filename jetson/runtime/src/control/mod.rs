@@ -300,6 +300,8 @@ impl ControlLoop {
                 self.companion.handle_event(now, event);
             }
             StreamEvent::Camera(index, camera) => self.handle_camera(index, &camera),
+            // The guardian's alone.
+            StreamEvent::Feed(..) => {}
         }
     }
 

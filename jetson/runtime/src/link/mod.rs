@@ -1,5 +1,5 @@
 //! The MAVLink link to an autopilot: a sans-IO state machine. Bytes, poses, setpoints and `now` in;
-//! datagrams and events out. [`port`] carries the bytes.
+//! datagrams and events out. The guardian carries the bytes.
 //!
 //! ```text
 //! poses 100 Hz ── vision() ──▶ VISION_POSITION_ESTIMATE 30-50 Hz   what the autopilot flies by
@@ -23,27 +23,21 @@ mod messages;
 mod navigation;
 mod own_mode;
 mod params;
-mod partner;
-pub mod port;
 mod rates;
 mod receive;
-mod serial;
 mod signing;
-mod tcp;
 #[cfg(test)]
 mod tests;
-mod udp;
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, VecDeque};
 
-use glam::DVec3;
 use vizflyt_protocol::mavlink::dialect::{
     EkfStatusFlags, MavCmd, MavMessage, MavSysStatusSensor, SETUP_SIGNING_DATA,
 };
 use vizflyt_protocol::mavlink::{
     GlobalPoint, GuidedSetpoint, MAX_PACKET, MavHeader, Packet, StreamDecoder, encode,
-    guided_to_mavlink, is_signed, vision_to_mavlink,
+    guided_to_mavlink, is_signed, vision_of_sample,
 };
 use vizflyt_protocol::messages::{PoseSample, VehicleState};
 use vizflyt_protocol::time::{Autopilot, Host, HostTime, OffsetFilter};
@@ -61,12 +55,13 @@ pub use navigation::{Delay, VISION_HZ};
 use own_mode::OwnMode;
 use params::Params;
 pub use params::{Param, ParamEvent, same};
-pub use partner::{Intruder, IntruderFault, Wanted};
 pub use rates::Rate;
 use rates::Rates;
 use receive::TextParts;
 use signing::Signatures;
-pub use signing::{LinkSigning, SigningFile, SigningFileError};
+pub use signing::{SigningFile, SigningFileError};
+pub use vizflyt_guardian::port::LinkSigning;
+use vizflyt_guardian::port::Wanted;
 
 /// The state that the link is to reach.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -98,6 +93,13 @@ pub struct LinkSettings {
 impl Default for LinkSettings {
     fn default() -> Self {
         Self { name: String::new(), system: None, vision_hz: *VISION_HZ.end(), signing: None }
+    }
+}
+
+impl LinkSettings {
+    /// Returns which autopilot is waited for.
+    pub fn wanted(&self) -> Wanted {
+        Wanted { system: self.system, signing: self.signing.clone() }
     }
 }
 
@@ -144,11 +146,6 @@ const SECOND_S: f64 = 1.0;
 const HEARTBEAT_S: f64 = 0.25;
 /// An autopilot silent for this long is lost: three heartbeats. [s]
 pub(crate) const LOST_AFTER_S: f64 = 3.0;
-/// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
-/// the autopilot's filter takes for independent. [m]
-const VISION_SIGMA_M: DVec3 = DVec3::splat(0.02);
-/// The same of attitudes: one degree. [rad]
-const VISION_SIGMA_RAD: DVec3 = DVec3::splat(0.02);
 /// Datagrams waiting at most; the driver empties the queue at once, so this is never reached.
 const OUTBOX: usize = 512;
 
@@ -374,12 +371,7 @@ impl Link {
     /// it passes on as many a second as are set, and none that is half a second old.
     pub fn vision(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         if self.autopilot.is_some() && sample.is_valid() && self.feed.take(now, stamp) {
-            // The autopilot relates this clock to its own by itself.
-            let usec = stamp.as_ns() / 1000;
-            let (pose, resets) = (&sample.world_from_body, sample.resets);
-            let p_sigma_m = sample.position_sigma_m.as_dvec3().max(VISION_SIGMA_M);
-            let r_sigma_rad = sample.rotation_sigma_rad.as_dvec3().max(VISION_SIGMA_RAD);
-            let message = vision_to_mavlink(pose, usec, resets, p_sigma_m, r_sigma_rad);
+            let message = vision_of_sample(sample, stamp);
             self.send(now, &MavMessage::VISION_POSITION_ESTIMATE(message));
         }
     }

@@ -16,16 +16,7 @@ use vizflyt_protocol::mavlink::{
 };
 use vizflyt_protocol::time::HostTime;
 
-/// Signing for one run of the link.
-#[derive(Clone, Debug)]
-pub struct LinkSigning {
-    /// The secret.
-    pub key: SigningKey,
-    /// The stamp of the moment at which the link is made.
-    pub start: SigningTime,
-    /// Accepts unsigned packets too: only where a key is handed over, as USB is not signed.
-    pub accepts_unsigned: bool,
-}
+use super::LinkSigning;
 
 /// Signs and verifies packets.
 #[derive(Clone, Debug)]

@@ -28,6 +28,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, Purpose, ReceivedEvents, Text,
 };
+use vizflyt_protocol::packet::feed::FeedKey;
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, random_instance_id};
@@ -59,6 +60,8 @@ pub struct StreamSettings {
 pub enum StreamEvent {
     /// The conversation began.
     Welcome(Box<ArenaInfo>),
+    /// Where the flight's guardian gets poses without us, and the key.
+    Feed(SocketAddr, FeedKey),
     /// Trying again will not help; why, in a sentence.
     Refused(String),
     /// The connection failed or ended; it is tried again.

@@ -1,6 +1,7 @@
 //! One connection: handshake, then messages both ways and images, until it fails.
 
 use std::convert::Infallible;
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use quinn::{Connection, ConnectionError, RecvStream, SendStream, VarInt};
@@ -8,6 +9,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 use vizflyt_protocol::messages::{
     ClockRequest, Datagram, Hello, ToRuntime, ToServer, Welcome, close,
 };
+use vizflyt_protocol::packet::feed::{FEED_LABEL, FeedKey};
 use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, decode_body, encode};
 use vizflyt_protocol::packet::{PeerRole, Preamble};
 use vizflyt_protocol::time::ServerTime;
@@ -81,7 +83,8 @@ async fn run_inner<T: Fn(StreamEvent) -> bool>(
     check_preamble(&mut receive).await?;
 
     receive::start(connection, with.shared);
-    let mut receiver = Receiver { with, past, handle, server: None, newest_pose: ServerTime::ZERO };
+    let newest_pose = ServerTime::ZERO;
+    let mut receiver = Receiver { with, past, connection, handle, server: None, newest_pose };
     let mut deframer = Box::new(Deframer::default());
     let mut chunk = vec![0; MAX_FRAMED];
     let mut ticks = interval(CLOCK_FAST);
@@ -143,6 +146,7 @@ async fn check_preamble(receive: &mut RecvStream) -> Result<(), SessionEnd> {
 struct Receiver<'a, T> {
     with: &'a SessionContext<'a>,
     past: &'a mut Past,
+    connection: &'a Connection,
     handle: &'a T,
     /// The server's `boot`, once it has welcomed us.
     server: Option<u64>,
@@ -152,7 +156,8 @@ struct Receiver<'a, T> {
 impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
     fn take(&mut self, message: Result<ToRuntime, FramingError>) -> Result<(), SessionEnd> {
         match message {
-            Ok(ToRuntime::Welcome(Welcome { boot, received_events, arena })) => {
+            Ok(ToRuntime::Welcome(Welcome { boot, received_events, arena, feed_port })) => {
+                self.offer_feed(feed_port)?;
                 (self.server, self.past.welcomed) = (Some(boot), true);
                 self.with.outbox.resume(received_events.of(self.past.boot));
                 self.hand(StreamEvent::Welcome(Box::new(arena)))?;
@@ -180,6 +185,16 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
             Err(error @ FramingError::TooLong(_)) => return Err(lost(error)),
         }
         Ok(())
+    }
+
+    /// Says where the flight's guardian gets poses by itself.
+    fn offer_feed(&self, port: u16) -> Result<(), SessionEnd> {
+        let mut key = FeedKey::default();
+        if port == 0 || self.connection.export_keying_material(&mut key, FEED_LABEL, b"").is_err() {
+            return Ok(());
+        }
+        let server = SocketAddr::new(self.connection.remote_address().ip(), port);
+        self.hand(StreamEvent::Feed(server, key))
     }
 
     /// Hands an event to the control loop; the server sends one that is not taken again on the next

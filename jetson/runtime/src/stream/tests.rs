@@ -59,7 +59,7 @@ impl Server {
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
         assert_eq!((hello.vehicle.as_str(), hello.purpose), ("vizflyt", Purpose::Fly));
         let received_events = ReceivedEvents { boot: hello.boot, seq: received(&hello) };
-        let welcome = Welcome { boot, received_events, arena: arena() };
+        let welcome = Welcome { boot, received_events, arena: arena(), feed_port: 0 };
         peer.send(&ToRuntime::Welcome(welcome)).await;
         (peer, hello)
     }

@@ -31,6 +31,6 @@ pub use signing::{SIGNATURE, Signer, SigningFault, SigningKey, SigningTime, Veri
 pub use state::{
     attitude_from_mavlink, attitude_to_mavlink, highres_imu_from_mavlink,
     local_position_from_mavlink, local_position_to_mavlink, raw_imu_from_mavlink,
-    vision_from_mavlink, vision_to_mavlink,
+    vision_from_mavlink, vision_of_sample, vision_to_mavlink,
 };
 pub use stream::{MAX_PACKET, Packet, StreamDecoder, StreamStats, encode};

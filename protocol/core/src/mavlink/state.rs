@@ -12,6 +12,8 @@ use super::frames::{
     world_rotation_from_ned,
 };
 use crate::geometry::{Body, Pose, World};
+use crate::messages::PoseSample;
+use crate::time::HostTime;
 
 /// Returns (roll, pitch, yaw), FRD in NED, of an attitude. [rad]
 fn euler_ned(world_from_body: DQuat) -> (f64, f64, f64) {
@@ -71,6 +73,22 @@ pub fn vision_to_mavlink(
         reset_counter,
     }
 }
+
+/// Makes the external navigation message of a localized pose that was true at `stamp`, which no autopilot
+/// takes for better than it is.
+pub fn vision_of_sample(sample: &PoseSample, stamp: HostTime) -> VISION_POSITION_ESTIMATE_DATA {
+    // The autopilot relates this clock to its own by itself.
+    let usec = stamp.as_ns() / 1000;
+    let p_sigma_m = sample.position_sigma_m.as_dvec3().max(VISION_SIGMA_M);
+    let r_sigma_rad = sample.rotation_sigma_rad.as_dvec3().max(VISION_SIGMA_RAD);
+    vision_to_mavlink(&sample.world_from_body, usec, sample.resets, p_sigma_m, r_sigma_rad)
+}
+
+/// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
+/// the autopilot's filter takes for independent. [m]
+const VISION_SIGMA_M: DVec3 = DVec3::splat(0.02);
+/// The same of attitudes: one degree. [rad]
+const VISION_SIGMA_RAD: DVec3 = DVec3::splat(0.02);
 
 /// Reads the external navigation message.
 pub fn vision_from_mavlink(message: &VISION_POSITION_ESTIMATE_DATA) -> Pose<World, Body> {

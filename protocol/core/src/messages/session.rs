@@ -43,6 +43,8 @@ pub struct Welcome {
     pub received_events: ReceivedEvents,
     /// What it must know of the arena.
     pub arena: ArenaInfo,
+    /// UDP port of the pose feed ([`crate::packet::feed`]) for the guardian of a flight; 0 is none.
+    pub feed_port: u16,
 }
 
 /// How many of the other side's events have been received.

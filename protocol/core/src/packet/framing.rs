@@ -133,7 +133,7 @@ mod tests {
 
     fn welcome() -> Welcome {
         let received_events = ReceivedEvents { boot: u64::MAX, seq: u64::MAX };
-        Welcome { boot: u64::MAX, received_events, arena: widest_arena() }
+        Welcome { boot: u64::MAX, received_events, arena: widest_arena(), feed_port: u16::MAX }
     }
 
     fn messages() -> Vec<ToRuntime> {

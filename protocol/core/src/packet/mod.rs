@@ -1,5 +1,6 @@
 //! Packets: fixed little-endian layouts read in place, and the framing of messages on a stream.
 
+pub mod feed;
 pub mod framing;
 mod image;
 mod observation;

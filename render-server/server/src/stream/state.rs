@@ -1,7 +1,7 @@
 //! What the encode thread, the sessions and the senders of images share.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::Duration;
 
 use vizflyt_arena::config::{CameraConfig, MAX_VEHICLES};
@@ -30,6 +30,8 @@ pub struct Streaming {
     pub adapt: Adaptation,
     /// Quantising and encoding one camera's image.
     pub encode_durations: StageDurations,
+    /// Where guardians subscribe to poses; 0 is nowhere.
+    pub feed_port: AtomicU16,
     /// Handing an image to the transport until the runtime has acknowledged all of it.
     pub send_durations: StageDurations,
 }
@@ -42,6 +44,7 @@ impl Streaming {
             vehicles: cameras.iter().map(|_| VehicleStream::default()).collect(),
             adapt,
             encode_durations: StageDurations::default(),
+            feed_port: AtomicU16::new(0),
             send_durations: StageDurations::default(),
         }
     }

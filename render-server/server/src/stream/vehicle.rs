@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use tokio::sync::watch;
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Timing};
+use vizflyt_protocol::packet::feed::FeedKey;
 use vizflyt_protocol::time::ServerTime;
 
 use super::connection::Connection;
@@ -29,6 +30,8 @@ pub struct VehicleStream {
     delivery: Mutex<DeliveryStats>,
     /// The runtime's session, its connection, and when that began.
     connection: Mutex<Option<(u64, quinn::Connection, ServerTime)>>,
+    /// Key of the newest flight's pose feed; kept when its connection has ended.
+    feed_key: Mutex<Option<FeedKey>>,
 }
 
 /// What became of a vehicle's images.
@@ -90,6 +93,16 @@ impl VehicleStream {
     pub fn connect(&self, id: u64, connection: &quinn::Connection) -> Connected<'_> {
         *lock(&self.connection) = Some((id, connection.clone(), clock::now()));
         Connected { stream: self, id }
+    }
+
+    /// Begins the pose feed of a flight.
+    pub fn open_feed(&self, key: FeedKey) {
+        *lock(&self.feed_key) = Some(key);
+    }
+
+    /// Returns the key of the newest flight's pose feed.
+    pub fn feed_key(&self) -> Option<FeedKey> {
+        *lock(&self.feed_key)
     }
 
     /// Returns the figures of the runtime's connection, if there is one.

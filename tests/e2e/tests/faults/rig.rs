@@ -361,7 +361,7 @@ impl Runtime {
                 }
                 StreamEvent::Down(why) => notes.downs.push(why),
                 StreamEvent::Refused(why) => panic!("refused: {why}"),
-                StreamEvent::Welcome(_) | StreamEvent::Camera(..) => {}
+                StreamEvent::Welcome(_) | StreamEvent::Camera(..) | StreamEvent::Feed(..) => {}
             }
             true
         };

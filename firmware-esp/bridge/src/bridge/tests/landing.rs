@@ -206,7 +206,7 @@ fn while_it_lands_the_companions_heartbeat_goes_on() {
     loss.mode = LAND_MODE;
     loss.run(8000);
     let beats = loss.beats(255);
-    assert!(beats.len() == 5 && beats.windows(2).all(|w| w[1] - w[0] == 1000), "{beats:?}");
+    assert!(beats.len() >= 9 && beats.windows(2).all(|w| w[1] - w[0] == 500), "{beats:?}");
     // It is the companion's own, but for who sends it.
     let (_, beat) =
         loss.sent.iter().find(|(ms, packet)| *ms == beats[0] && packet[5] == 255).unwrap();

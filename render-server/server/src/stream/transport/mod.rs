@@ -7,9 +7,11 @@
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
 //! ```
+//!        -> feed: sealed poses to the flight's guardian, over UDP, also when the connection has ended
 //! Settings and figures: docs/BENCHMARKS.md.
 
 mod control;
+mod feed;
 mod greeting;
 mod images;
 mod lan;
@@ -19,6 +21,7 @@ mod session;
 pub use lan::{Lan, LanConfig};
 
 use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -132,10 +135,26 @@ pub async fn serve(
     let mut sessions = tokio::task::JoinSet::new();
     let port = endpoint.local_addr().map_or(0, |address| address.port());
     let unknown_peers = Arc::new(UnknownPeers::default());
+    let feed = async {
+        let bound = match endpoint.local_addr() {
+            Ok(quic) => feed::bind(quic).await,
+            Err(error) => Err(error),
+        };
+        match bound.and_then(|socket| Ok((socket.local_addr()?.port(), socket))) {
+            Ok((port, socket)) => {
+                rooms.streaming.feed_port.store(port, Ordering::Relaxed);
+                feed::serve(&rooms, socket).await;
+            }
+            Err(error) => warn!("no pose feed for guardians: {error}"),
+        }
+        std::future::pending::<()>().await;
+    };
+    let mut feed = std::pin::pin!(feed);
     loop {
         let incoming = tokio::select! {
             incoming = endpoint.accept() => incoming,
             _ = sessions.join_next(), if !sessions.is_empty() => continue,
+            () = &mut feed => continue,
             () = rooms.stop.wait() => None,
         };
         let Some(incoming) = incoming else { break };

@@ -1,5 +1,7 @@
 //! The talk with one client, from its lease to its last byte.
 
+use std::sync::atomic::Ordering;
+
 use quinn::{Connection, SendStream};
 use tokio::sync::{mpsc, watch as cell};
 use tracing::{debug, info};
@@ -13,7 +15,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::control::{Ending, Incoming, Outbound, gone};
 use super::greeting::why;
 use super::images::ImageSenders;
-use super::{REPLACED, SLOW};
+use super::{REPLACED, SLOW, feed};
 use crate::clock;
 use crate::flights::control_lease::{ControlLease, WatchLease};
 use crate::flights::events::Origin;
@@ -47,6 +49,9 @@ impl Session<'_> {
             stream.begin_flight();
         }
         let _connected = stream.connect(lease.info.id, connection);
+        if let Some(key) = feed::key_of(connection) {
+            stream.open_feed(key);
+        }
         let ending = tokio::select! {
             ending = self.run(lease.info.id, Some(lease), lease.first_event, send, incoming) => ending,
             () = lease.evicted() => {
@@ -118,7 +123,8 @@ impl Session<'_> {
         let arena =
             ArenaInfo { cameras: sent.infos.iter().cloned().collect(), ..vehicle.arena.clone() };
         let boot = self.rooms.flights.instance_id;
-        let welcome = Welcome { boot, received_events, arena };
+        let feed_port = self.rooms.streaming.feed_port.load(Ordering::Relaxed);
+        let welcome = Welcome { boot, received_events, arena, feed_port };
         if let Err(ending) = out.write(&ToRuntime::Welcome(welcome)).await {
             return ending;
         }

@@ -1,4 +1,5 @@
-//! What a bridge does when the companion falls silent: it asks the autopilot to land, itself.
+//! What follows when a companion falls silent in flight: LAND, ordered in its place. The guardian on the
+//! companion's computer runs it, and the bridge on the vehicle; sans-IO, no allocation.
 //!
 //! Whoever streams setpoints or poses, ten within two seconds, is the companion; a ground station
 //! that sends one target now and then is not. While the vehicle is armed and follows a companion
@@ -15,13 +16,16 @@
 //! would begin the landing anew, with its pause. Not before: should LAND go unheard, that failsafe is
 //! what lands the vehicle.
 
-use vizflyt_protocol::mavlink::CopterMode;
-use vizflyt_protocol::time::HostTime;
+use crate::mavlink::CopterMode;
+use crate::mavlink::dialect::{COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavModeFlag};
+use crate::time::HostTime;
 
 /// Contents of the autopilot's heartbeat.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Flight {
+pub struct Flight {
+    /// Its motors may turn.
     pub armed: bool,
+    /// `custom_mode`.
     pub mode: u32,
     /// PX4, whose modes are numbered otherwise.
     pub px4: bool,
@@ -29,16 +33,25 @@ pub(crate) struct Flight {
 
 impl Flight {
     /// Before the first heartbeat; as the default, but `const`.
-    pub(crate) const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
+    pub const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
+
+    /// Returns what a heartbeat's fields say: `autopilot`, `base_mode`, `custom_mode`.
+    pub fn of(autopilot: u8, base_mode: u8, mode: u32) -> Self {
+        Self {
+            armed: base_mode & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0,
+            mode,
+            px4: autopilot == MavAutopilot::MAV_AUTOPILOT_PX4 as u8,
+        }
+    }
 
     /// Whether the vehicle obeys a companion.
-    pub(crate) fn follows(self) -> bool {
+    pub fn follows(self) -> bool {
         let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
         self.armed && self.mode == mode
     }
 
     /// Whether the vehicle lands by itself.
-    pub(crate) fn lands(self) -> bool {
+    pub fn lands(self) -> bool {
         let mode = if self.px4 { PX4_LAND } else { CopterMode::Land as u32 };
         self.armed && self.mode == mode
     }
@@ -63,17 +76,44 @@ const REPEAT_ACKNOWLEDGED_S: f64 = 1.5;
 const UNANSWERED_S: f64 = 1.1;
 /// And this often from then on. [s]
 const REPORT_S: f64 = 5.0;
-/// The companion's heartbeat is sent in its place this often, as it did itself. [s]
-const BEAT_S: f64 = 1.0;
+/// The companion's heartbeat is sent in its place this often: two may be lost before `FS_GCS_TIMEOUT`, whose
+/// least is 2 s. [s]
+const BEAT_S: f64 = 0.5;
 /// And for no longer than this: a landing from the height of a hall takes a quarter of it. [s]
 const LONGEST_S: f64 = 120.0;
 
+/// Whether a message is one of a stream by which a vehicle flies: setpoints and external
+/// navigation. Of these the newest counts.
+pub const fn is_stream(message_id: u32) -> bool {
+    // SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT,
+    // MANUAL_CONTROL, RC_CHANNELS_OVERRIDE.
+    matches!(message_id, 82 | 84 | 86 | 69 | 70) || is_navigation(message_id)
+}
+
+/// Whether a message tells the autopilot where it is.
+pub const fn is_navigation(message_id: u32) -> bool {
+    // GLOBAL_VISION_POSITION_ESTIMATE, VISION_POSITION_ESTIMATE, VISION_SPEED_ESTIMATE,
+    // VICON_POSITION_ESTIMATE, ATT_POS_MOCAP, GPS_INPUT, ODOMETRY.
+    matches!(message_id, 101..=104 | 138 | 232 | 331)
+}
+
+/// Returns the order to land, for `target` (system, component).
+pub fn land(target: (u8, u8), confirmation: u8) -> COMMAND_LONG_DATA {
+    COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_NAV_LAND,
+        target_system: target.0,
+        target_component: target.1,
+        confirmation,
+        ..COMMAND_LONG_DATA::default()
+    }
+}
+
 /// Payload of a HEARTBEAT.
-pub(crate) type Beat = [u8; 9];
+pub type Beat = [u8; 9];
 
 /// The companion and its silence.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct LinkLoss {
+pub struct Failsafe {
     streamer: Option<Streamer>,
     landing: Option<Landing>,
 }
@@ -112,9 +152,22 @@ struct Landing {
     is_announced: bool,
 }
 
+impl Landing {
+    fn begun(now: HostTime, stage: LandingStage) -> Self {
+        Self {
+            stage,
+            asked_at: now,
+            act_at: now.plus_seconds(REPEAT_S),
+            report_at: now.plus_seconds(UNANSWERED_S),
+            confirmation: 0,
+            is_announced: false,
+        }
+    }
+}
+
 /// What is to be done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum LossAction {
+pub enum FailsafeAction {
     /// Send LAND with this count of repetitions; zero means it begins: announce it.
     Land {
         /// MAVLink's count of repetitions.
@@ -128,17 +181,17 @@ pub(crate) enum LossAction {
     Beat(u8, Beat),
 }
 
-impl LinkLoss {
+impl Failsafe {
     /// No companion yet; as the default, but `const`.
-    pub(crate) const NONE: Self = Self { streamer: None, landing: None };
+    pub const NONE: Self = Self { streamer: None, landing: None };
 
     /// Returns who streams, if anybody does.
-    pub(crate) fn companion(&self) -> Option<(u8, u8)> {
+    pub fn companion(&self) -> Option<(u8, u8)> {
         self.streamer.filter(|streamer| streamer.counted >= STREAM).map(|streamer| streamer.source)
     }
 
     /// Takes note of a packet from the network; `streams`: it is a setpoint or a pose.
-    pub(crate) fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
+    pub fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
         match &mut self.streamer {
             Some(streamer) if streamer.source == source => {
                 streamer.received_at = now;
@@ -168,14 +221,14 @@ impl LinkLoss {
     }
 
     /// Takes note of a heartbeat from the network.
-    pub(crate) fn note_heartbeat(&mut self, source: (u8, u8), beat: Beat) {
+    pub fn note_heartbeat(&mut self, source: (u8, u8), beat: Beat) {
         if let Some(streamer) = self.streamer.as_mut().filter(|known| known.source.0 == source.0) {
             streamer.beat = Some(beat);
         }
     }
 
     /// Takes note of the autopilot's answer to LAND.
-    pub(crate) fn note_acknowledged(&mut self, now: HostTime) {
+    pub fn note_acknowledged(&mut self, now: HostTime) {
         if let Some(landing) = &mut self.landing
             && landing.stage == LandingStage::Asked
         {
@@ -185,12 +238,12 @@ impl LinkLoss {
     }
 
     /// Returns how far its landing of the vehicle is, if it lands it.
-    pub(crate) fn stage(&self) -> Option<LandingStage> {
+    pub fn stage(&self) -> Option<LandingStage> {
         self.landing.map(|landing| landing.stage)
     }
 
     /// Whether nothing has acknowledged LAND for too long.
-    pub(crate) fn is_unanswered(&self, now: HostTime) -> bool {
+    pub fn is_unanswered(&self, now: HostTime) -> bool {
         self.landing.is_some_and(|landing| {
             landing.stage == LandingStage::Asked
                 && now.seconds_since(landing.asked_at) >= UNANSWERED_S
@@ -198,7 +251,7 @@ impl LinkLoss {
     }
 
     /// Returns when [`Self::poll`] has something to do, if `flight` stays.
-    pub(crate) fn due(&self, flight: Flight, loss_ms: u16) -> Option<HostTime> {
+    pub fn due(&self, flight: Flight, loss_ms: u16) -> Option<HostTime> {
         if let Some(landing) = self.landing {
             return Some(match landing.stage {
                 LandingStage::Asked => landing.act_at.min(landing.report_at),
@@ -206,17 +259,12 @@ impl LinkLoss {
             });
         }
         let streamer = self.streamer.filter(|streamer| streamer.counted >= STREAM)?;
-        (flight.follows() && loss_ms > 0)
-            .then(|| streamer.received_at.plus_ns(i64::from(loss_ms) * 1_000_000))
+        let flies = flight.follows() || flight.lands();
+        (flies && loss_ms > 0).then(|| streamer.received_at.plus_ns(i64::from(loss_ms) * 1_000_000))
     }
 
     /// Returns what is to be done at `now`; called until nothing is.
-    pub(crate) fn poll(
-        &mut self,
-        now: HostTime,
-        flight: Flight,
-        loss_ms: u16,
-    ) -> Option<LossAction> {
+    pub fn poll(&mut self, now: HostTime, flight: Flight, loss_ms: u16) -> Option<FailsafeAction> {
         let ended = |streamer: &Streamer| now.seconds_since(streamer.received_at) > ENDED_S;
         match &mut self.landing {
             Some(_) if !flight.follows() && !flight.lands() => {
@@ -231,12 +279,15 @@ impl LinkLoss {
                 }
                 if landing.stage != LandingStage::Asked && !landing.is_announced {
                     landing.is_announced = true;
-                    return Some(LossAction::AnnounceLanding);
+                    return Some(FailsafeAction::AnnounceLanding);
                 }
             }
             // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
             // later without one is not landed for its silence.
-            None if !flight.follows() && self.streamer.as_ref().is_some_and(ended) => {
+            None if !flight.follows()
+                && !flight.lands()
+                && self.streamer.as_ref().is_some_and(ended) =>
+            {
                 self.streamer = None;
             }
             None => {}
@@ -244,28 +295,29 @@ impl LinkLoss {
         if self.due(flight, loss_ms)? > now {
             return None;
         }
-        let Some(landing) = &mut self.landing else {
-            self.landing = Some(Landing {
-                stage: LandingStage::Asked,
-                asked_at: now,
-                act_at: now.plus_seconds(REPEAT_S),
-                report_at: now.plus_seconds(UNANSWERED_S),
-                confirmation: 0,
-                is_announced: false,
-            });
-            return Some(LossAction::Land { confirmation: 0 });
+        let landing = match &mut self.landing {
+            Some(landing) => landing,
+            // The companion, or a pilot, has ordered it: only the heartbeat is missing.
+            none if flight.lands() => none.insert(Landing {
+                is_announced: true,
+                ..Landing::begun(now, LandingStage::Descending)
+            }),
+            none => {
+                *none = Some(Landing::begun(now, LandingStage::Asked));
+                return Some(FailsafeAction::Land { confirmation: 0 });
+            }
         };
         match landing.stage {
             LandingStage::Asked if landing.report_at <= now => {
                 landing.report_at = now.plus_seconds(REPORT_S);
-                Some(LossAction::ReportSilence)
+                Some(FailsafeAction::ReportSilence)
             }
             LandingStage::Asked | LandingStage::Accepted => {
                 let accepted = landing.stage == LandingStage::Accepted;
                 let repeat_s = if accepted { REPEAT_ACKNOWLEDGED_S } else { REPEAT_S };
                 landing.act_at = now.plus_seconds(repeat_s);
                 landing.confirmation = landing.confirmation.saturating_add(1);
-                Some(LossAction::Land { confirmation: landing.confirmation })
+                Some(FailsafeAction::Land { confirmation: landing.confirmation })
             }
             LandingStage::Descending => {
                 landing.act_at = now.plus_seconds(BEAT_S);
@@ -276,7 +328,7 @@ impl LinkLoss {
                     silent_ms >= f64::from(loss_ms)
                 };
                 let streamer = self.streamer.filter(|known| !takes_too_long && silent(known))?;
-                Some(LossAction::Beat(streamer.source.0, streamer.beat?))
+                Some(FailsafeAction::Beat(streamer.source.0, streamer.beat?))
             }
         }
     }
@@ -304,14 +356,14 @@ mod tests {
         period_ms: u64,
         until_ms: u64,
     ) -> Vec<(u64, u8)> {
-        let mut loss = LinkLoss::default();
+        let mut loss = Failsafe::default();
         let mut sent = Vec::new();
         for ms in 0..until_ms {
             if ms <= 1000 && ms % period_ms == 0 {
                 loss.note_packet(at(ms), RUNTIME, true);
             }
             while let Some(act) = loss.poll(at(ms), flight(ms), loss_ms) {
-                if let LossAction::Land { confirmation } = act {
+                if let FailsafeAction::Land { confirmation } = act {
                     sent.push((ms, confirmation));
                 }
             }
@@ -351,7 +403,7 @@ mod tests {
 
     #[test]
     fn only_packets_of_the_companion_count() {
-        let mut loss = LinkLoss::default();
+        let mut loss = Failsafe::default();
         for ms in (0..500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);
         }
@@ -362,17 +414,23 @@ mod tests {
 
     #[test]
     fn an_acknowledged_landing_is_repeated_slowly() {
-        let mut loss = LinkLoss::default();
+        let mut loss = Failsafe::default();
         for ms in (0..=500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);
         }
-        assert_eq!(loss.poll(at(1500), GUIDED, 1000), Some(LossAction::Land { confirmation: 0 }));
+        assert_eq!(
+            loss.poll(at(1500), GUIDED, 1000),
+            Some(FailsafeAction::Land { confirmation: 0 })
+        );
         loss.note_acknowledged(at(1510));
-        assert_eq!(loss.poll(at(1510), GUIDED, 1000), Some(LossAction::AnnounceLanding));
+        assert_eq!(loss.poll(at(1510), GUIDED, 1000), Some(FailsafeAction::AnnounceLanding));
         assert_eq!(loss.due(GUIDED, 1000), Some(at(3010)));
         // It comes back: the landing goes on.
         loss.note_packet(at(1600), RUNTIME, true);
-        assert_eq!(loss.poll(at(3010), GUIDED, 1000), Some(LossAction::Land { confirmation: 1 }));
+        assert_eq!(
+            loss.poll(at(3010), GUIDED, 1000),
+            Some(FailsafeAction::Land { confirmation: 1 })
+        );
         assert_eq!(loss.poll(at(3100), Flight { mode: 9, ..GUIDED }, 1000), None);
         assert_eq!(loss.stage(), Some(LandingStage::Descending));
         assert_eq!(loss.poll(at(9000), Flight { armed: false, mode: 9, ..GUIDED }, 1000), None);

@@ -9,11 +9,19 @@ use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
-use vizflyt_protocol::mavlink::dialect::MavMessage;
-use vizflyt_protocol::mavlink::{SigningFault, StreamDecoder, Verifier};
+use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavMessage};
+use vizflyt_protocol::mavlink::{SigningFault, SigningKey, SigningTime, StreamDecoder, Verifier};
 
-use super::signing::LinkSigning;
-use super::{LinkSettings, dialect};
+/// Signing for one run of the link.
+#[derive(Clone, Debug)]
+pub struct LinkSigning {
+    /// The secret.
+    pub key: SigningKey,
+    /// The stamp of the moment at which the link is made.
+    pub start: SigningTime,
+    /// Accepts unsigned packets too: only where a key is handed over, as USB is not signed.
+    pub accepts_unsigned: bool,
+}
 
 /// Which autopilot is waited for.
 #[derive(Clone, Debug, Default)]
@@ -22,13 +30,6 @@ pub struct Wanted {
     pub system: Option<u8>,
     /// Its heartbeats must be signed with this.
     pub signing: Option<LinkSigning>,
-}
-
-impl Wanted {
-    /// Returns what a link's settings say.
-    pub fn of(settings: &LinkSettings) -> Self {
-        Self { system: settings.system, signing: settings.signing.clone() }
-    }
 }
 
 /// Why a datagram is ignored.
@@ -202,7 +203,7 @@ impl Partner {
         };
         stream.decoder.push_whole(bytes, |bytes, packet| {
             let MavMessage::HEARTBEAT(heartbeat) = &packet.message else { return };
-            if found.is_ok() || dialect::of(heartbeat.autopilot).is_none() {
+            if found.is_ok() || !is_flown(heartbeat.autopilot) {
                 return;
             }
             // As the link itself numbers systems: ids beyond a byte are nobody's.
@@ -250,6 +251,11 @@ impl Partner {
     }
 }
 
+/// Whether it is an autopilot that we fly.
+pub(crate) fn is_flown(autopilot: MavAutopilot) -> bool {
+    matches!(autopilot, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA | MavAutopilot::MAV_AUTOPILOT_PX4)
+}
+
 /// A partner without a heartbeat for this long may be replaced by another sender of one.
 const PARTNER_KEPT: Duration = Duration::from_secs(3);
 /// Senders whose packets may come in parts.
@@ -264,18 +270,13 @@ const LONGEST_PAUSE: Duration = Duration::from_hours(1);
 pub(super) mod tests {
     use super::*;
     use proptest::prelude::*;
-    use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, RADIO_STATUS_DATA};
-    use vizflyt_protocol::mavlink::{
-        MAX_PACKET, MavHeader, Signer, SigningKey, SigningTime, encode,
-    };
+    use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, RADIO_STATUS_DATA};
+    use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, Signer, encode};
 
     const SECOND: Duration = Duration::from_secs(1);
 
     /// Returns a heartbeat of ArduPilot; signed, if there is a signer.
-    pub(in crate::link) fn heartbeat(
-        system: u8,
-        signer: Option<(&mut Signer, SigningTime)>,
-    ) -> Vec<u8> {
+    pub(crate) fn heartbeat(system: u8, signer: Option<(&mut Signer, SigningTime)>) -> Vec<u8> {
         let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
         let message = MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, ..Default::default() });
         packet(system, &message, signer)

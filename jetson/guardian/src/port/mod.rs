@@ -9,10 +9,17 @@ use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use super::partner::{Intruder, Partner, Wanted};
-use super::serial::SerialPort;
-use super::tcp::TcpPort;
-use super::udp::UdpPort;
+mod partner;
+mod serial;
+mod tcp;
+mod udp;
+
+use partner::Partner;
+pub(crate) use partner::is_flown;
+pub use partner::{Intruder, IntruderFault, LinkSigning, Wanted};
+use serial::SerialPort;
+use tcp::TcpPort;
+use udp::UdpPort;
 
 /// Where the autopilot is, as typed after `--mavlink`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,7 +45,7 @@ pub enum MavlinkAddress {
 
 /// The parts of an address, nothing looked up yet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Shape<'a> {
+pub enum Shape<'a> {
     /// Kind and `HOST:PORT`.
     Net(&'a str, &'a str),
     /// Path, baud and whether with flow control.
@@ -46,13 +53,13 @@ pub(crate) enum Shape<'a> {
 }
 
 /// What an address may look like.
-pub(crate) const SHAPES: &str = "write udpin:0.0.0.0:14550, udpout:HOST:PORT, tcpout:HOST:PORT, \
+pub const SHAPES: &str = "write udpin:0.0.0.0:14550, udpout:HOST:PORT, tcpout:HOST:PORT, \
                                  tcpin:ADDR:PORT or serial:/dev/ttyTHS1:921600";
 /// What ArduCopter's telemetry ports and Wi-Fi bridges are set to. [baud]
 const USUAL_BAUD: u32 = 921_600;
 
 /// Takes an address apart; `None` if it is none.
-pub(crate) fn shape(text: &str) -> Option<Shape<'_>> {
+pub fn shape(text: &str) -> Option<Shape<'_>> {
     let (kind, rest) = text.split_once(':')?;
     match kind {
         "udpin" | "udpout" | "tcpin" | "tcpout" => Some(Shape::Net(kind, rest)),
@@ -63,7 +70,7 @@ pub(crate) fn shape(text: &str) -> Option<Shape<'_>> {
                 Some((path, baud)) => (path, baud.parse().ok()?),
                 None => (rest, USUAL_BAUD),
             };
-            let good = path.starts_with('/') && super::serial::speed(baud).is_some();
+            let good = path.starts_with('/') && serial::speed(baud).is_some();
             good.then_some(Shape::Serial(path, baud, flow))
         }
         _ => None,
@@ -209,7 +216,7 @@ impl Port {
 
 #[cfg(test)]
 mod tests {
-    use super::super::partner::tests::heartbeat;
+    use super::partner::tests::heartbeat;
     use super::*;
 
     #[test]

@@ -1,0 +1,71 @@
+//! The guardian's own subscription to poses, over UDP: they go on when the runtime does not.
+
+use std::io;
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::packet::feed::{FeedMessage, MAX_FEED, open, seal};
+use vizflyt_protocol::time::{HostTime, ServerTime};
+
+use crate::channel::Feed;
+
+/// Subscriptions are renewed this often. [s]
+const RENEW_S: f64 = 0.5;
+/// Longest wait for a pose.
+const WAIT: Duration = Duration::from_millis(100);
+
+/// The subscription; `source` is set by the runtime, while it lives.
+pub(crate) struct Subscription {
+    socket: UdpSocket,
+    renew_at: HostTime,
+    newest: ServerTime,
+    current: Option<Feed>,
+}
+
+impl Subscription {
+    pub(crate) fn new(source: &Mutex<Option<Feed>>) -> io::Result<Option<Self>> {
+        let Some(feed) = *source.lock().unwrap_or_else(PoisonError::into_inner) else {
+            return Ok(None);
+        };
+        let any: SocketAddr = match feed.server {
+            SocketAddr::V4(_) => ([0, 0, 0, 0], 0).into(),
+            SocketAddr::V6(_) => ([0_u16; 8], 0).into(),
+        };
+        let socket = UdpSocket::bind(any)?;
+        socket.set_read_timeout(Some(WAIT))?;
+        Ok(Some(Self { socket, renew_at: HostTime::ZERO, newest: ServerTime::ZERO, current: None }))
+    }
+
+    /// Waits for a pose, 100 ms at most; returns it and when it was true, on this computer's clock.
+    pub(crate) fn receive(
+        &mut self,
+        clock: impl Fn() -> HostTime,
+        source: &Mutex<Option<Feed>>,
+    ) -> Option<(PoseSample, HostTime)> {
+        let feed = (*source.lock().unwrap_or_else(PoisonError::into_inner))?;
+        if self.current.is_none_or(|known| known.key != feed.key) {
+            // Another connection, perhaps to a server that was restarted: its clock begins anew.
+            (self.newest, self.renew_at) = (ServerTime::ZERO, HostTime::ZERO);
+        }
+        self.current = Some(feed);
+        let (now, mut buffer) = (clock(), [0; MAX_FEED]);
+        if now >= self.renew_at {
+            self.renew_at = now.plus_seconds(RENEW_S);
+            let subscribe = seal(&feed.key, &FeedMessage::Subscribe(now.as_ns()), &mut buffer);
+            let _ = self.socket.send_to(subscribe, feed.server);
+        }
+        let (len, from) = self.socket.recv_from(&mut buffer).ok()?;
+        if from != feed.server {
+            return None;
+        }
+        let Some(FeedMessage::Pose(sample)) = open(&feed.key, &buffer[..len]) else { return None };
+        if sample.stamp <= self.newest {
+            return None;
+        }
+        self.newest = sample.stamp;
+        let stamp_ns = sample.stamp.as_ns().cast_signed().saturating_sub(feed.server_ahead_ns);
+        Some((sample, HostTime::from_ns(stamp_ns.max(0).cast_unsigned())))
+    }
+}

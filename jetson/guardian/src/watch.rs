@@ -1,0 +1,264 @@
+//! The guardian's judgement, sans-IO: what the runtime and the autopilot send passes through it; from `now` follow
+//! LAND, the heartbeats of a landing, and poses in the runtime's place.
+//!
+//! It knows three things: whether the runtime speaks ([`Failsafe`]), what the autopilot's heartbeat says, and where
+//! the vehicle is. Once it has ordered LAND the runtime's orders no longer pass, should it wake up again; its poses
+//! and all else do. A pilot's mode ends the landing, as everywhere.
+
+use vizflyt_protocol::failsafe::{
+    Failsafe, FailsafeAction, Flight, is_navigation, is_stream, land,
+};
+use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage, MavResult};
+use vizflyt_protocol::mavlink::{
+    MAX_PACKET, MavHeader, MavlinkVersion, Message, Signer, SigningTime, StreamDecoder, Verifier,
+    encode, vision_of_sample,
+};
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::time::HostTime;
+
+use crate::port::{Wanted, is_flown};
+
+/// The runtime's silence that ends in LAND, while the vehicle follows it. [ms]
+pub const SILENCE_MS: u16 = 500;
+/// The component that we are: a second onboard computer, so that our packets are counted apart from the runtime's.
+pub const COMPONENT_ID: u8 = 192;
+/// The runtime's system, until it has sent something; the one whose heartbeats an autopilot counts.
+const SYSTEM_ID: u8 = 255;
+/// Our link id in signatures; the runtime's is 0.
+const SIGNING_LINK: u8 = 1;
+/// So long without a pose of the runtime's, and ours go out. [s]
+const NAVIGATION_S: f64 = 0.1;
+/// Poses older than this are not sent, as in the runtime. [s]
+const STALE_S: f64 = 0.5;
+/// At most so often. [s]
+const POSE_EVERY_S: f64 = 0.018;
+/// An autopilot that is not heard for this long, once the runtime is gone, is given up. [s]
+const GIVEN_UP_S: f64 = 10.0;
+/// What the guardian itself was not run for counts as this much silence of the runtime at most: where the whole
+/// computer stands still, the runtime gets its turn first. [s]
+const LONGEST_STEP_S: f64 = 0.05;
+
+/// Sentences for people.
+pub(crate) const LANDING: &str = "guardian: the runtime is silent: asks for LAND";
+const DESCENDING: &str = "guardian: the autopilot lands";
+const UNHEARD: &str = "guardian: LAND is not acknowledged";
+
+/// What goes out.
+pub trait Out {
+    /// A packet to the autopilot.
+    fn send(&mut self, packet: &[u8]);
+    /// A sentence for people.
+    fn say(&mut self, sentence: &'static str);
+}
+
+/// The state. See the module.
+pub struct Watch {
+    failsafe: Failsafe,
+    runtime_is_gone: bool,
+    /// The runtime's system, by its packets.
+    system: u8,
+    wanted: Wanted,
+    signer: Option<Signer>,
+    verifier: Option<Verifier>,
+    decoder: StreamDecoder,
+    autopilot: Option<(u8, u8)>,
+    autopilot_at: HostTime,
+    flight: Flight,
+    sequence: u8,
+    made_at: HostTime,
+    polled_at: HostTime,
+    /// Our own time: the clock's, without what we were not run for.
+    own: HostTime,
+    navigated_at: HostTime,
+}
+
+impl Watch {
+    /// Begins at `now`.
+    pub fn new(now: HostTime, wanted: Wanted) -> Self {
+        let signing = wanted.signing.as_ref();
+        let signer = signing.map(|signing| Signer::new(signing.key.clone(), SIGNING_LINK));
+        let checked = signing.filter(|signing| !signing.accepts_unsigned);
+        let verifier = checked.map(|signing| Verifier::new(signing.key.clone()));
+        Self {
+            failsafe: Failsafe::NONE,
+            runtime_is_gone: false,
+            system: SYSTEM_ID,
+            signer,
+            verifier,
+            wanted,
+            decoder: StreamDecoder::default(),
+            autopilot: None,
+            autopilot_at: now,
+            flight: Flight::UNKNOWN,
+            sequence: 0,
+            made_at: now,
+            polled_at: now,
+            own: now,
+            navigated_at: now,
+        }
+    }
+
+    /// Passes on a packet of the runtime's, which sends them one by one; an order not while we land the vehicle.
+    pub fn handle_runtime(&mut self, now: HostTime, packet: &[u8], out: &mut impl Out) {
+        let Some(head) = Head::of(packet) else { return };
+        self.step(now);
+        self.system = head.source.0;
+        self.failsafe.note_packet(self.own, head.source, is_stream(head.id));
+        if head.id == HEARTBEAT
+            && let Ok(beat) = head.payload.try_into()
+        {
+            self.failsafe.note_heartbeat(head.source, beat);
+        }
+        if is_navigation(head.id) {
+            self.navigated_at = now;
+        }
+        if self.failsafe.stage().is_none() || !is_order(head.id) {
+            out.send(packet);
+        }
+    }
+
+    /// Takes note of what comes from the autopilot.
+    pub fn handle_autopilot(&mut self, now: HostTime, bytes: &[u8]) {
+        self.step(now);
+        let Self { decoder, verifier, wanted, .. } = self;
+        let (mut beat, mut accepted) = (None, false);
+        let elapsed_us = (now.seconds_since(self.made_at).max(0.0) * 1e6) as u64;
+        decoder.push_whole(bytes, |bytes, packet| {
+            let system = packet.header.system_id as u8;
+            if wanted.system.is_some_and(|wanted| wanted != system) {
+                return;
+            }
+            match &packet.message {
+                MavMessage::HEARTBEAT(heartbeat) if is_flown(heartbeat.autopilot) => {
+                    if let (Some(verifier), Some(signing)) = (&mut *verifier, &wanted.signing)
+                        && verifier.check(signing.start.plus_us(elapsed_us), bytes).is_err()
+                    {
+                        return;
+                    }
+                    let flight = Flight::of(
+                        heartbeat.autopilot as u8,
+                        heartbeat.base_mode.bits(),
+                        heartbeat.custom_mode,
+                    );
+                    beat = Some(((system, packet.header.component_id), flight));
+                }
+                MavMessage::COMMAND_ACK(ack) => {
+                    accepted |= ack.command == MavCmd::MAV_CMD_NAV_LAND
+                        && ack.result == MavResult::MAV_RESULT_ACCEPTED;
+                }
+                _ => {}
+            }
+        });
+        if let Some((autopilot, flight)) = beat {
+            (self.autopilot, self.autopilot_at, self.flight) = (Some(autopilot), now, flight);
+        }
+        if accepted {
+            self.failsafe.note_acknowledged(self.own);
+        }
+    }
+
+    /// Takes note that the runtime has ended.
+    pub fn handle_end(&mut self) {
+        self.runtime_is_gone = true;
+    }
+
+    /// Takes a pose that was true at `stamp`; sends it on if the runtime no longer does.
+    pub fn handle_pose(
+        &mut self,
+        now: HostTime,
+        sample: &PoseSample,
+        stamp: HostTime,
+        out: &mut impl Out,
+    ) {
+        let runtime_sends = now.seconds_since(self.navigated_at) < NAVIGATION_S;
+        let is_fresh = now.seconds_since(stamp) < STALE_S;
+        if self.autopilot.is_some() && !runtime_sends && is_fresh && sample.is_valid() {
+            // The next one is due a period after this, not NAVIGATION_S after it.
+            self.navigated_at = now.plus_seconds(POSE_EVERY_S - NAVIGATION_S);
+            let message = vision_of_sample(sample, stamp);
+            self.transmit(now, &MavMessage::VISION_POSITION_ESTIMATE(message), out);
+        }
+    }
+
+    /// Does what is due; called at least every 20 ms.
+    pub fn handle_timeout(&mut self, now: HostTime, out: &mut impl Out) {
+        self.step(now);
+        let silence_ms = if self.runtime_is_gone { 1 } else { SILENCE_MS };
+        while let Some(action) = self.failsafe.poll(self.own, self.flight, silence_ms) {
+            match action {
+                FailsafeAction::Land { confirmation } => {
+                    if confirmation == 0 {
+                        out.say(LANDING);
+                    }
+                    let Some(target) = self.autopilot else { continue };
+                    let land = MavMessage::COMMAND_LONG(land(target, confirmation));
+                    self.transmit(now, &land, out);
+                }
+                FailsafeAction::AnnounceLanding => out.say(DESCENDING),
+                FailsafeAction::ReportSilence => out.say(UNHEARD),
+                FailsafeAction::Beat(_, beat) => {
+                    if let Ok(message) = MavMessage::parse(MavlinkVersion::V2, HEARTBEAT, &beat) {
+                        self.transmit(now, &message, out);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Whether nothing is left to do: the runtime has ended, and the vehicle stands, or is gone.
+    pub fn is_over(&self, now: HostTime) -> bool {
+        let is_heard = now.seconds_since(self.autopilot_at) < GIVEN_UP_S;
+        self.runtime_is_gone && !(self.flight.armed && is_heard)
+    }
+
+    /// Lets our own time pass.
+    fn step(&mut self, now: HostTime) {
+        let step_s = now.seconds_since(self.polled_at).clamp(0.0, LONGEST_STEP_S);
+        (self.polled_at, self.own) = (now, self.own.plus_seconds(step_s));
+    }
+
+    fn transmit(&mut self, now: HostTime, message: &MavMessage, out: &mut impl Out) {
+        let header = MavHeader {
+            system_id: self.system.into(),
+            component_id: COMPONENT_ID,
+            sequence: self.sequence,
+        };
+        self.sequence = self.sequence.wrapping_add(1);
+        let mut packet = [0; MAX_PACKET];
+        let mut len = encode(header, message, &mut packet).len();
+        if let (Some(signer), Some(signing)) = (&mut self.signer, &self.wanted.signing) {
+            let elapsed_us = (now.seconds_since(self.made_at).max(0.0) * 1e6) as u64;
+            let time: SigningTime = signing.start.plus_us(elapsed_us);
+            len = signer.sign(time, &mut packet, len);
+        }
+        out.send(&packet[..len]);
+    }
+}
+
+const HEARTBEAT: u32 = 0;
+
+/// Whether a message makes the autopilot do something: a setpoint, a mode, a command.
+const fn is_order(id: u32) -> bool {
+    // SET_MODE, COMMAND_INT, COMMAND_LONG.
+    (is_stream(id) && !is_navigation(id)) || matches!(id, 11 | 75 | 76)
+}
+
+/// What a MAVLink 2 packet's first bytes say.
+struct Head<'a> {
+    source: (u8, u8),
+    id: u32,
+    payload: &'a [u8],
+}
+
+impl<'a> Head<'a> {
+    fn of(packet: &'a [u8]) -> Option<Self> {
+        let &[0xFD, len, _, _, _, system, component, a, b, c, ref rest @ ..] = packet else {
+            return None;
+        };
+        let payload = rest.get(..usize::from(len))?;
+        Some(Self { source: (system, component), id: u32::from_le_bytes([a, b, c, 0]), payload })
+    }
+}
+
+#[cfg(test)]
+mod tests;

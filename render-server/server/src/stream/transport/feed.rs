@@ -1,0 +1,106 @@
+//! The pose feed: sealed datagrams to the guardian of each flight. It goes on when the runtime's connection has
+//! ended, for as long as its guardian asks for it.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use tokio::net::UdpSocket;
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::debug;
+use vizflyt_protocol::packet::feed::{FEED_LABEL, FeedKey, FeedMessage, MAX_FEED, open, seal};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::clock;
+use crate::stream::Rooms;
+
+/// Poses are looked for this often.
+const TICK: Duration = Duration::from_millis(5);
+/// At most 50 a second, with room for the jitter of a source. [s]
+const POSE_EVERY_S: f64 = 0.018;
+/// A subscription is good for so long. [s]
+const KEPT_S: f64 = 2.0;
+
+/// The guardian that subscribes to one vehicle.
+#[derive(Clone, Copy, Debug)]
+struct Subscriber {
+    address: SocketAddr,
+    /// Its newest number: what is not newer is a replay.
+    number: u64,
+    until: ServerTime,
+    /// The newest pose that it was sent.
+    sent: ServerTime,
+}
+
+/// Returns the key of a flight's feed, which both ends derive of the secrets of their connection.
+pub(super) fn key_of(connection: &quinn::Connection) -> Option<FeedKey> {
+    let mut key = FeedKey::default();
+    connection.export_keying_material(&mut key, FEED_LABEL, b"").ok()?;
+    Some(key)
+}
+
+/// Opens the socket: on the port after QUIC's, so that a firewall can name it, or on any.
+pub(super) async fn bind(quic: SocketAddr) -> std::io::Result<UdpSocket> {
+    let next = SocketAddr::new(quic.ip(), quic.port().wrapping_add(1));
+    match UdpSocket::bind(next).await {
+        Ok(socket) => Ok(socket),
+        Err(_) => UdpSocket::bind(SocketAddr::new(quic.ip(), 0)).await,
+    }
+}
+
+/// Sends poses until it is dropped.
+pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
+    let mut subscribers = vec![None::<Subscriber>; rooms.streaming.vehicles.len()];
+    let mut ticks = interval(TICK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let (mut received, mut buffer) = ([0; MAX_FEED], [0; MAX_FEED]);
+    loop {
+        tokio::select! {
+            datagram = socket.recv_from(&mut received) => {
+                // An error is of an earlier datagram of ours that found nobody.
+                let Ok((len, address)) = datagram else { continue };
+                subscribe(rooms, &mut subscribers, address, &received[..len]);
+                continue;
+            }
+            _ = ticks.tick(), if subscribers.iter().any(Option::is_some) => {}
+        }
+        let now = clock::now();
+        for (index, subscriber) in subscribers.iter_mut().enumerate() {
+            let stream = &rooms.streaming.vehicles[index];
+            let (Some(known), Some(key)) = (subscriber.as_mut(), stream.feed_key()) else {
+                continue;
+            };
+            if now >= known.until {
+                *subscriber = None;
+                continue;
+            }
+            let newest = *rooms.localization.vehicles[index].newest.borrow();
+            if let Some(pose) = newest
+                && pose.stamp.seconds_since(known.sent) >= POSE_EVERY_S
+            {
+                known.sent = pose.stamp;
+                let bytes = seal(&key, &FeedMessage::Pose(pose), &mut buffer);
+                let _ = socket.try_send_to(bytes, known.address);
+            }
+        }
+    }
+}
+
+/// Takes a datagram; one that no flight's key has sealed is nobody's.
+fn subscribe(
+    rooms: &Rooms,
+    subscribers: &mut [Option<Subscriber>],
+    address: SocketAddr,
+    datagram: &[u8],
+) {
+    for (stream, subscriber) in rooms.streaming.vehicles.iter().zip(subscribers) {
+        let Some(key) = stream.feed_key() else { continue };
+        let Some(FeedMessage::Subscribe(number)) = open(&key, datagram) else { continue };
+        if subscriber.is_some_and(|known| number <= known.number) {
+            return debug!("{address}: a subscription to poses is a replay");
+        }
+        let sent = subscriber.map_or(ServerTime::ZERO, |known| known.sent);
+        let until = clock::now().plus_seconds(KEPT_S);
+        *subscriber = Some(Subscriber { address, number, until, sent });
+        return;
+    }
+}
