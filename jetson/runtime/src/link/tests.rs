@@ -9,6 +9,7 @@ mod px4;
 mod refusals;
 mod signed;
 
+use glam::DVec3;
 use glam::{DQuat, Vec3};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::Pose;
