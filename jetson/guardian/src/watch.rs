@@ -1,25 +1,31 @@
 //! The guardian's judgement, sans-IO: what the runtime and the autopilot send passes through it; from `now` follow
-//! LAND, the heartbeats of a landing, and poses in the runtime's place.
+//! a stop, LAND, the heartbeats of a landing, and poses in the runtime's place.
 //!
 //! It knows three things: whether the runtime speaks ([`Failsafe`]), what the autopilot's heartbeat says, and where
 //! the vehicle is. Once it has ordered LAND the runtime's orders no longer pass, should it wake up again; its poses
 //! and all else do. A pilot's mode ends the landing, as everywhere.
 
+use glam::DVec3;
 use vizflyt_protocol::failsafe::{
     Failsafe, FailsafeAction, Flight, is_navigation, is_stream, land,
 };
 use vizflyt_protocol::mavlink::dialect::{MavCmd, MavMessage, MavResult};
 use vizflyt_protocol::mavlink::{
-    MAX_PACKET, MavHeader, MavlinkVersion, Message, Signer, SigningTime, StreamDecoder, Verifier,
-    encode, vision_of_sample,
+    GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, MavlinkVersion, Message, Signer,
+    SigningTime, StreamDecoder, Verifier, encode, guided_from_mavlink, guided_to_mavlink,
+    vision_of_sample,
 };
-use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::messages::{PoseSample, YawTarget};
 use vizflyt_protocol::time::HostTime;
 
 use crate::port::{Wanted, is_flown};
 
 /// The runtime's silence that ends in LAND, while the vehicle follows it. [ms]
 pub const SILENCE_MS: u16 = 500;
+/// Silence in the midst of setpoints, which come 50 times a second, that ends in a stop. [s]
+const STOP_S: f64 = 0.2;
+/// The stop is repeated this often. [s]
+const STOP_EVERY_S: f64 = 0.1;
 /// The component that we are: a second onboard computer, so that our packets are counted apart from the runtime's.
 pub const COMPONENT_ID: u8 = 192;
 /// The runtime's system, until it has sent something; the one whose heartbeats an autopilot counts.
@@ -70,6 +76,17 @@ pub struct Watch {
     /// Our own time: the clock's, without what we were not run for.
     own: HostTime,
     navigated_at: HostTime,
+    steering: Option<Steering>,
+}
+
+/// The runtime's newest setpoint.
+#[derive(Clone, Copy, Debug)]
+struct Steering {
+    /// In our own time.
+    at: HostTime,
+    yaw: YawTarget,
+    /// The next stop is due then, should no other setpoint come.
+    stop_at: HostTime,
 }
 
 impl Watch {
@@ -95,6 +112,7 @@ impl Watch {
             polled_at: now,
             own: now,
             navigated_at: now,
+            steering: None,
         }
     }
 
@@ -111,6 +129,10 @@ impl Watch {
         }
         if is_navigation(head.id) {
             self.navigated_at = now;
+        }
+        if let Some(yaw) = head.steers() {
+            let stop_at = self.own.plus_seconds(STOP_S);
+            self.steering = Some(Steering { at: self.own, yaw, stop_at });
         }
         if self.failsafe.stage().is_none() || !is_order(head.id) {
             out.send(packet);
@@ -184,6 +206,7 @@ impl Watch {
     pub fn handle_timeout(&mut self, now: HostTime, out: &mut impl Out) {
         self.step(now);
         let silence_ms = if self.runtime_is_gone { 1 } else { SILENCE_MS };
+        self.stop(now, out);
         while let Some(action) = self.failsafe.poll(self.own, self.flight, silence_ms) {
             match action {
                 FailsafeAction::Land { confirmation } => {
@@ -203,6 +226,21 @@ impl Watch {
                 }
             }
         }
+    }
+
+    /// Stops the vehicle where setpoints have ceased; the runtime's next one lets it fly on.
+    fn stop(&mut self, now: HostTime, out: &mut impl Out) {
+        let is_stopping = self.flight.follows() && self.failsafe.stage().is_none();
+        let (Some(target), Some(steering)) = (self.autopilot, &mut self.steering) else { return };
+        let silence_s = self.own.seconds_since(steering.at);
+        if !is_stopping || silence_s > 1e-3 * f64::from(SILENCE_MS) || self.own < steering.stop_at {
+            return;
+        }
+        steering.stop_at = self.own.plus_seconds(STOP_EVERY_S);
+        let stop =
+            GuidedSetpoint { motion: GuidedMotion::Velocity(DVec3::ZERO), yaw: steering.yaw };
+        let stop = guided_to_mavlink(&stop, target, (now.as_ns() / 1_000_000) as u32);
+        self.transmit(now, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(stop), out);
     }
 
     /// Whether nothing is left to do: the runtime has ended, and the vehicle stands, or is gone.
@@ -236,6 +274,7 @@ impl Watch {
 }
 
 const HEARTBEAT: u32 = 0;
+const SET_POSITION_TARGET_LOCAL_NED: u32 = 84;
 
 /// Whether a message makes the autopilot do something: a setpoint, a mode, a command.
 const fn is_order(id: u32) -> bool {
@@ -257,6 +296,22 @@ impl<'a> Head<'a> {
         };
         let payload = rest.get(..usize::from(len))?;
         Some(Self { source: (system, component), id: u32::from_le_bytes([a, b, c, 0]), payload })
+    }
+
+    /// Where the nose is to point, if this is a setpoint.
+    fn steers(&self) -> Option<YawTarget> {
+        if self.id != SET_POSITION_TARGET_LOCAL_NED {
+            return None;
+        }
+        match MavMessage::parse(MavlinkVersion::V2, self.id, self.payload) {
+            Ok(MavMessage::SET_POSITION_TARGET_LOCAL_NED(message)) => {
+                Some(match guided_from_mavlink(&message).ok()?.yaw {
+                    YawTarget::Rate(_) => YawTarget::Rate(0.0),
+                    yaw => yaw,
+                })
+            }
+            _ => None,
+        }
     }
 }
 

@@ -1,12 +1,10 @@
 use super::*;
 
-use glam::DVec3;
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::mavlink::SigningKey;
 use vizflyt_protocol::mavlink::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavModeFlag, MavType,
-    SET_POSITION_TARGET_LOCAL_NED_DATA,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -52,7 +50,9 @@ fn at(ms: u64) -> HostTime {
 }
 
 fn setpoint() -> MavMessage {
-    MavMessage::SET_POSITION_TARGET_LOCAL_NED(SET_POSITION_TARGET_LOCAL_NED_DATA::default())
+    let setpoint =
+        GuidedSetpoint { motion: GuidedMotion::Velocity(DVec3::X), yaw: YawTarget::Angle(0.5) };
+    MavMessage::SET_POSITION_TARGET_LOCAL_NED(guided_to_mavlink(&setpoint, (1, 1), 0))
 }
 
 fn pose(ms: u64) -> PoseSample {
@@ -89,7 +89,7 @@ impl Rig {
         encode(header, message, &mut [0; MAX_PACKET]).to_vec()
     }
 
-    fn from_runtime(&mut self, message: &MavMessage) {
+    fn runtime_sends(&mut self, message: &MavMessage) {
         let packet = self.packet((255, 191), message);
         self.watch.handle_runtime(at(self.ms), &packet, &mut self.sent);
     }
@@ -117,13 +117,13 @@ impl Rig {
                 self.watch.handle_autopilot(at(ms), &beat);
             }
             if ms < self.speaks_until && ms.is_multiple_of(20) {
-                self.from_runtime(&setpoint());
+                self.runtime_sends(&setpoint());
                 let vision = vision_of_sample(&pose(ms), at(ms));
-                self.from_runtime(&MavMessage::VISION_POSITION_ESTIMATE(vision));
+                self.runtime_sends(&MavMessage::VISION_POSITION_ESTIMATE(vision));
                 if ms.is_multiple_of(240) {
                     let mavtype = MavType::MAV_TYPE_ONBOARD_CONTROLLER;
                     let beat = HEARTBEAT_DATA { mavtype, mavlink_version: 3, ..Default::default() };
-                    self.from_runtime(&MavMessage::HEARTBEAT(beat));
+                    self.runtime_sends(&MavMessage::HEARTBEAT(beat));
                 }
             }
             if self.feed && ms.is_multiple_of(20) {
@@ -148,7 +148,7 @@ impl Rig {
 
 const COMMAND_LONG: u32 = 76;
 const VISION: u32 = 102;
-const SET_POSITION_TARGET: u32 = 84;
+const SET_POSITION_TARGET: u32 = SET_POSITION_TARGET_LOCAL_NED;
 
 #[test]
 fn silence_of_half_a_second_is_land_and_an_end_is_at_once() {
@@ -166,6 +166,30 @@ fn silence_of_half_a_second_is_land_and_an_end_is_at_once() {
     rig.run(2050);
     let lands = rig.ours(COMMAND_LONG, 0);
     assert!(lands[0] <= 2010, "{lands:?}");
+}
+
+#[test]
+fn setpoints_that_cease_are_a_stop_until_they_come_again() {
+    let mut rig = Rig::flying();
+    rig.speaks_until = 2001;
+    rig.run(2450);
+    let stops = rig.ours(SET_POSITION_TARGET, 0);
+    assert!((2190..=2220).contains(&stops[0]) && stops.len() == 3, "{stops:?}");
+    let (_, packet) =
+        rig.sent.packets.iter().find(|(ms, p)| *ms == stops[0] && p[7] == 84).unwrap();
+    let payload = Head::of(packet).unwrap().payload;
+    let Ok(MavMessage::SET_POSITION_TARGET_LOCAL_NED(stop)) =
+        MavMessage::parse(MavlinkVersion::V2, SET_POSITION_TARGET, payload)
+    else {
+        panic!()
+    };
+    let stop = guided_from_mavlink(&stop).unwrap();
+    assert_eq!(stop.motion, GuidedMotion::Velocity(DVec3::ZERO));
+    assert!(matches!(stop.yaw, YawTarget::Angle(yaw) if (yaw - 0.5).abs() < 1e-5), "{stop:?}");
+    rig.speaks_until = u64::MAX;
+    rig.run(4000);
+    assert_eq!(rig.ours(SET_POSITION_TARGET, 0), stops, "and it flies on");
+    assert_eq!(rig.ours(COMMAND_LONG, 0), []);
 }
 
 #[test]
@@ -222,7 +246,7 @@ fn a_runtime_that_wakes_up_orders_nothing_more() {
     rig.sent.packets.clear();
     rig.run(2900);
     let mode = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA::default());
-    rig.from_runtime(&mode);
+    rig.runtime_sends(&mode);
     let ids: Vec<_> =
         rig.sent.packets.iter().filter_map(|(_, bytes)| Some(Head::of(bytes)?.id)).collect();
     assert!(!ids.contains(&SET_POSITION_TARGET), "{ids:?}");
@@ -307,7 +331,7 @@ proptest! {
         rig.run(1500);
         rig.speaks_until = 0;
         for gap in gaps {
-            rig.from_runtime(&setpoint());
+            rig.runtime_sends(&setpoint());
             rig.watch.handle_autopilot(at(rig.ms), &noise);
             rig.watch.handle_runtime(at(rig.ms), &noise, &mut rig.sent);
             rig.run(rig.ms + gap);

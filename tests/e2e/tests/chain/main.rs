@@ -109,18 +109,26 @@ fn without_the_server_the_runtime_keeps_the_fence() {
 }
 
 #[test]
-fn without_the_runtime_the_autopilot_lands_it() {
+fn without_the_runtime_the_guardian_lands_it() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
     flight.kill_runtime();
-    ends_inside(&mut flight, "the runtime is killed", COAST_M);
+    ends_inside(&mut flight, "the runtime is killed", 0.0);
+}
+
+#[test]
+fn without_runtime_and_guardian_the_autopilot_lands_it() {
+    let lab = Lab::open(1);
+    let mut flight = outward(&lab);
+    flight.switch_off();
+    ends_inside(&mut flight, "the computer is off", COAST_M);
 }
 
 #[test]
 fn without_a_guard_the_autopilot_keeps_its_own_fence() {
     let lab = Lab::open(1);
     let mut flight = outward(&lab);
-    flight.kill_runtime();
+    flight.switch_off();
     fly_on(&flight);
     let reached_m = flight.now().p_m.x - START_X_M;
     println!(
@@ -165,7 +173,7 @@ fn with_neither_server_nor_guard_the_autopilot_lands_at_a_no_fly_box() {
     // Its circle and its ceiling would not notice; the runtime has uploaded the box.
     let mut flight = outward_with(&lab, &["--param=FENCE_TYPE=4"]);
     lab.kill_server();
-    flight.kill_runtime();
+    flight.switch_off();
     fly_on(&flight);
     let reached_m = flight.now().p_m.x;
     println!("a no-fly box from {NO_FLY_X_M} m: the autopilot's fence acts at {reached_m:.2} m");

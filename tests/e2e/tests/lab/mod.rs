@@ -19,6 +19,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use serde_json::Value;
 use vizflyt_e2e::vizflyt;
 use vizflyt_protocol::mavlink::StreamDecoder;
@@ -83,6 +85,8 @@ pub(crate) struct Flight {
     modes: Modes,
     /// When the runtime commanded to land.
     lands: Lands,
+    /// Poses that the guardian sent by itself.
+    guardian_poses: Arc<AtomicU32>,
     cuts: Arc<Cuts>,
     /// Sends to the vehicle what goes round the runtime.
     aside: Aside,
@@ -264,7 +268,8 @@ impl Lab {
         let mavlink = runtime.ready()["mavlink"].as_str().unwrap().to_owned();
 
         let (modes, lands) = (Modes::default(), Lands::default());
-        let seen = (Arc::clone(&modes), Arc::clone(&lands));
+        let guardian_poses = Arc::<AtomicU32>::default();
+        let seen = (Arc::clone(&modes), Arc::clone(&lands), Arc::clone(&guardian_poses));
         let (air, aside) = carry(mavlink, seen, Arc::clone(&cuts));
         let bridge = bridge.then(|| {
             let mut args = words("bridge emulate --json --lifeline --listen=127.0.0.1:0");
@@ -293,6 +298,7 @@ impl Lab {
             track,
             modes,
             lands,
+            guardian_poses,
             cuts,
             aside,
             report: at("report"),
@@ -362,9 +368,35 @@ impl Flight {
         &self.cuts
     }
 
-    /// Kills the runtime; its plugin goes with it.
+    /// Kills the runtime; its plugin goes with it, its guardian does not.
     pub(crate) fn kill_runtime(&mut self) {
         let _ = self.runtime.child.kill();
+    }
+
+    /// Stops the runtime, as one that hangs.
+    pub(crate) fn stop_runtime(&self) {
+        let _ = kill(Pid::from_raw(self.runtime.child.id().cast_signed()), Signal::SIGSTOP);
+    }
+
+    /// Kills the runtime and its guardian: the Jetson is off.
+    pub(crate) fn switch_off(&mut self) {
+        let runtime = self.runtime.child.id();
+        let children = format!("/proc/{runtime}/task/{runtime}/children");
+        let children = fs::read_to_string(children).expect("the runtime runs");
+        let is_guardian = |pid: &&str| {
+            let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+            line.split(|byte| *byte == 0).nth(1) == Some(b"guardian")
+        };
+        let guardian = children.split_whitespace().find(is_guardian).expect("it has a guardian");
+        let guardian = Pid::from_raw(guardian.parse().expect("a number"));
+        let _ = kill(guardian, Signal::SIGKILL);
+        let _ = self.runtime.child.kill();
+    }
+
+    /// Stops the bridge, as one that hangs.
+    pub(crate) fn stop_bridge(&self) {
+        let bridge = self.bridge.as_ref().expect("it flies through a bridge");
+        let _ = kill(Pid::from_raw(bridge.process.child.id().cast_signed()), Signal::SIGSTOP);
     }
 
     /// Kills the bridge, as a power cut does; a serial device goes with it.
@@ -408,6 +440,11 @@ impl Flight {
     /// Returns when the runtime first commanded to land, if it has.
     pub(crate) fn ordered_to_land(&self) -> Option<Instant> {
         lock(&self.lands).first().copied()
+    }
+
+    /// Returns how many poses the guardian has sent by itself.
+    pub(crate) fn guardian_poses(&self) -> u32 {
+        self.guardian_poses.load(Ordering::Relaxed)
     }
 
     /// Returns the newest pose.
@@ -488,7 +525,11 @@ impl Seen {
 
 /// Carries MAVLink between a vehicle, which sends to the address returned, and the runtime at
 /// `runtime`.
-fn carry(runtime: String, (modes, lands): (Modes, Lands), cuts: Arc<Cuts>) -> (SocketAddr, Aside) {
+fn carry(
+    runtime: String,
+    (modes, lands, guardian_poses): (Modes, Lands, Arc<AtomicU32>),
+    cuts: Arc<Cuts>,
+) -> (SocketAddr, Aside) {
     let to_vehicle = UdpSocket::bind("127.0.0.1:0").unwrap();
     let to_runtime = UdpSocket::bind("127.0.0.1:0").unwrap();
     let address = to_vehicle.local_addr().unwrap();
@@ -504,12 +545,18 @@ fn carry(runtime: String, (modes, lands): (Modes, Lands), cuts: Arc<Cuts>) -> (S
         loop {
             // A runtime that is gone reports itself as refused: go on.
             let Ok(len) = from_runtime.recv(&mut packet) else { continue };
-            decoder.push(&packet[..len], |packet| {
-                if let MavMessage::COMMAND_LONG(command) = packet.message
-                    && command.command == MavCmd::MAV_CMD_NAV_LAND
+            decoder.push(&packet[..len], |packet| match packet.message {
+                MavMessage::COMMAND_LONG(command)
+                    if command.command == MavCmd::MAV_CMD_NAV_LAND =>
                 {
                     lock(&lands).push(Instant::now());
                 }
+                MavMessage::VISION_POSITION_ESTIMATE(_)
+                    if packet.header.component_id == GUARDIAN =>
+                {
+                    guardian_poses.fetch_add(1, Ordering::Relaxed);
+                }
+                _ => {}
             });
             if let (true, Some(vehicle)) = (is_open(&open), *lock(&known)) {
                 let _ = up.send_to(&packet[..len], vehicle);
@@ -537,6 +584,8 @@ fn carry(runtime: String, (modes, lands): (Modes, Lands), cuts: Arc<Cuts>) -> (S
     (address, aside)
 }
 
+/// The guardian's component: its packets are not the runtime's.
+const GUARDIAN: u8 = 192;
 /// The simulated motion capture's rate. [Hz]
 const CAPTURE_HZ: f64 = 200.0;
 

@@ -1,7 +1,8 @@
-//! The chain of links between a pose and a motor, broken at each of its joints in flight. The vehicle
-//! is watched from outside, by the motion capture's own packets: whatever is lost, it is down inside the fence, within 5 s
-//! of the last good pose where somebody of ours is left to order LAND, within 9 s where only the autopilot is, whose
-//! failsafes hover for 4 s first; it has drifted by 1 m at most; what comes back in time costs a pause and no landing.
+//! The chain of links between a pose and a motor, broken at each of its joints in flight, at three speeds. The
+//! vehicle is watched from outside, by the motion capture's own packets: whatever is lost, it is down inside the
+//! fence, within 5 s of the last good pose where somebody of ours is left to order LAND, within 9 s where only the
+//! autopilot is, whose failsafes hover for 4 s first. How far it drifts meanwhile depends on whether it still knows
+//! where it is. What comes back in time costs a pause and no landing.
 //!
 //! Prints the table of `docs/guides/failsafe.md`; with `VIZFLYT_LINKLOSS=write` writes it there.
 //! Durations are the simulator's, so that a busy machine does not make the vehicle look slow.
@@ -14,17 +15,25 @@ use std::sync::Mutex;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use glam::Vec3;
 use lab::{Flight, Lab, Plan, Sight};
 use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
+use vizflyt_splat::{format, ply};
 
 /// What is lost.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Loss {
     /// The runtime is killed.
     Runtime,
+    /// The runtime is stopped, as one that hangs.
+    Stopped,
+    /// The runtime and its guardian are killed.
+    Jetson,
     /// MAVLink stops both ways: Wi-Fi. [s]
     Mavlink(f64),
+    /// The bridge is stopped, as one that hangs.
+    BridgeHangs,
     /// The bridge is killed, and started again after so long. [s]
     Bridge(f64),
     /// The motion capture sees nothing. [s]
@@ -33,10 +42,23 @@ enum Loss {
     Server,
     /// The autopilot reboots.
     Autopilot,
+    /// Runtime, guardian, poses and MAVLink.
+    All,
 }
 
 /// For ever, as far as a flight goes. [s]
 const FOR_EVER: f64 = 1e6;
+
+/// Who is left to bring it down.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Left {
+    /// Runtime, guardian or bridge orders LAND.
+    Ours,
+    /// The autopilot has to find out.
+    Autopilot,
+    /// It flies on.
+    FliesOn,
+}
 
 /// A row of the table.
 #[derive(Debug)]
@@ -48,111 +70,169 @@ struct Case {
     does: &'static str,
     /// Whether its MAVLink goes through a bridge.
     bridge: bool,
-    /// Whether the vehicle comes down; else it flies on.
-    lands: bool,
+    left: Left,
 }
 
-impl Case {
-    fn down_within_s(&self) -> f64 {
-        if self.does.starts_with("autopilot") { DOWN_BY_AUTOPILOT_WITHIN_S } else { DOWN_WITHIN_S }
-    }
-}
-
-const CASES: [Case; 13] = [
+/// Flown at each of [`SPEEDS`].
+const AT_ALL_SPEEDS: [Case; 11] = [
     Case {
         loss: Loss::Runtime,
         name: "the runtime is killed",
-        does: "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT",
+        does: "guardian: LAND at once",
         bridge: false,
-        lands: true,
+        left: Left::Ours,
     },
     Case {
-        loss: Loss::Mavlink(FOR_EVER),
-        name: "Wi-Fi dies",
-        does: "autopilot: as above; runtime: LAND, unheard",
+        loss: Loss::Stopped,
+        name: "the runtime is stopped",
+        does: "guardian: LAND after 0.5 s",
         bridge: false,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Mavlink(1.0),
-        name: "Wi-Fi is away for 1 s",
-        does: "autopilot: stops by GUID_TIMEOUT, flies on",
-        bridge: false,
-        lands: false,
-    },
-    Case {
-        loss: Loss::Poses(0.2),
-        name: "the pose stalls for 200 ms",
-        does: "runtime: holds after 0.15 s, flies on",
-        bridge: false,
-        lands: false,
-    },
-    Case {
-        loss: Loss::Poses(1.0),
-        name: "the pose stalls for 1 s",
-        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
-        bridge: false,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Poses(5.0),
-        name: "the pose stalls for 5 s",
-        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
-        bridge: false,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Poses(FOR_EVER),
-        name: "the pose is gone",
-        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
-        bridge: false,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Autopilot,
-        name: "the autopilot reboots in flight",
-        does: "nobody can: motors stop, it falls",
-        bridge: false,
-        lands: true,
+        left: Left::Ours,
     },
     Case {
         loss: Loss::Runtime,
         name: "the runtime is killed, behind a bridge",
-        does: "bridge: LAND after 1 s",
+        does: "guardian: LAND at once",
         bridge: true,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Mavlink(FOR_EVER),
-        name: "Wi-Fi dies, behind a bridge",
-        does: "bridge: LAND after 1 s; runtime: LAND, unheard",
-        bridge: true,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Bridge(FOR_EVER),
-        name: "the bridge dies",
-        does: "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT",
-        bridge: true,
-        lands: true,
-    },
-    Case {
-        loss: Loss::Bridge(1.0),
-        name: "the bridge loses power for 1 s",
-        does: "autopilot: stops by GUID_TIMEOUT, flies on",
-        bridge: true,
-        lands: false,
+        left: Left::Ours,
     },
     Case {
         loss: Loss::Server,
         name: "the server is killed",
         does: "runtime: holds after 0.15 s, LAND after 0.5 s",
         bridge: false,
-        lands: true,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Poses(FOR_EVER),
+        name: "the pose is gone",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies, behind a bridge",
+        does: "bridge: LAND after 1 s",
+        bridge: true,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Jetson,
+        name: "the Jetson is off, behind a bridge",
+        does: "bridge: LAND after 1 s",
+        bridge: true,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Jetson,
+        name: "the Jetson is off",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        left: Left::Autopilot,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        left: Left::Autopilot,
+    },
+    Case {
+        loss: Loss::BridgeHangs,
+        name: "the bridge hangs",
+        does: BY_AUTOPILOT,
+        bridge: true,
+        left: Left::Autopilot,
+    },
+    Case {
+        loss: Loss::All,
+        name: "all at once",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        left: Left::Autopilot,
     },
 ];
 
-/// Vehicles that fly at a time; the server is the last row's, alone.
+const BY_AUTOPILOT: &str = "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT";
+
+/// Flown at the least of [`SPEEDS`].
+const AT_ONE_SPEED: [Case; 6] = [
+    Case {
+        loss: Loss::Autopilot,
+        name: "the autopilot reboots in flight",
+        does: "nobody can: motors stop, it falls",
+        bridge: false,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Mavlink(1.0),
+        name: "Wi-Fi is away for 1 s",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: false,
+        left: Left::FliesOn,
+    },
+    Case {
+        loss: Loss::Bridge(1.0),
+        name: "the bridge loses power for 1 s",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: true,
+        left: Left::FliesOn,
+    },
+    Case {
+        loss: Loss::Poses(0.2),
+        name: "the pose stalls for 200 ms",
+        does: "runtime: holds after 0.15 s, flies on",
+        bridge: false,
+        left: Left::FliesOn,
+    },
+    Case {
+        loss: Loss::Poses(1.0),
+        name: "the pose stalls for 1 s",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        left: Left::Ours,
+    },
+    Case {
+        loss: Loss::Bridge(FOR_EVER),
+        name: "the bridge loses power",
+        does: BY_AUTOPILOT,
+        bridge: true,
+        left: Left::Autopilot,
+    },
+];
+
+/// [m/s], and what asks the plugin for it.
+const SPEEDS: [(f64, &str); 3] = [(0.35, "world:0.35:0"), (1.0, "world:1:0"), (2.5, "world:2.5:0")];
+
+/// One flight: a row at a speed.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    case: &'static Case,
+    speed_mps: f64,
+    /// What is asked of the plugin.
+    how: &'static str,
+}
+
+impl Run {
+    /// From 1.2 m. [s]
+    fn down_within_s(self) -> f64 {
+        if self.case.left == Left::Autopilot { 9.0 } else { 5.0 }
+    }
+
+    /// From where it was at the last good pose. [m]
+    fn drift_within_m(self) -> f64 {
+        match (self.case.left, self.case.loss) {
+            // Blind for eight seconds.
+            (Left::Autopilot, _) => 2.0 + 0.8 * self.speed_mps,
+            // The bridge waits for a second.
+            (_, Loss::Jetson | Loss::Mavlink(_)) => 0.5 + self.speed_mps,
+            _ => 0.5 + 0.8 * self.speed_mps,
+        }
+    }
+}
+
+/// Vehicles that fly at a time; where the server is lost, each has its own.
 const TOGETHER: usize = 4;
 /// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
 /// for an autopilot that does not receive it.
@@ -186,21 +266,17 @@ const PARAMETERS: [&str; 26] = [
 ];
 /// Down means this near the floor. [m]
 const DOWN_M: f64 = 0.05;
-/// The promise: where somebody of ours orders LAND, and where the autopilot has to find out. [s], [m]
-const DOWN_WITHIN_S: f64 = 5.0;
-const DOWN_BY_AUTOPILOT_WITHIN_S: f64 = 9.0;
-const MAX_DRIFT_M: f64 = 1.0;
 /// How long a vehicle that shall fly on is watched after the loss is over. [s]
 const WATCH_S: f64 = 3.0;
-/// The room's fence, which the lab draws in. [m, world]
-const FENCE_X_M: (f64, f64) = (0.0, 2.6);
+/// The room's fence. [m, world]
+const FENCE_X_M: (f64, f64) = (0.0, 11.0);
 /// A limit on waiting; nothing takes half as long.
 const PATIENCE: Duration = Duration::from_mins(2);
 
-/// A row as measured.
+/// A flight as measured.
 #[derive(Debug)]
 struct Row {
-    case: &'static Case,
+    run: Run,
     /// From the loss until it stood, or came straight down. [s]
     stands_s: Option<f64>,
     /// From the loss until LAND was entered. [s]
@@ -214,14 +290,28 @@ struct Row {
 
 #[test]
 fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
+    let at_all = AT_ALL_SPEEDS
+        .iter()
+        .flat_map(|case| SPEEDS.iter().map(move |&(speed_mps, how)| Run { case, speed_mps, how }));
+    let (speed_mps, how) = SPEEDS[0];
+    let at_one = AT_ONE_SPEED.iter().map(|case| Run { case, speed_mps, how });
+    let runs: Vec<_> = at_all.chain(at_one).collect();
+    let (server, others): (Vec<Run>, Vec<Run>) =
+        runs.iter().partition(|run| run.case.loss == Loss::Server);
     let mut rows = Vec::new();
-    let (last, others) = CASES.split_last().expect("there are rows");
     for batch in others.chunks(TOGETHER) {
-        let mut lab = Lab::open(TOGETHER);
-        rows.extend(fly(&mut lab, batch));
+        let lab = Mutex::new(open(batch.len()));
+        rows.extend(fly(batch.iter().enumerate().map(|(index, run)| (&lab, index, *run))));
     }
-    let mut lab = Lab::open(1);
-    rows.extend(fly(&mut lab, std::slice::from_ref(last)));
+    let labs: Vec<_> = server.iter().map(|_| Mutex::new(open(1))).collect();
+    rows.extend(fly(labs.iter().zip(server).map(|(lab, run)| (lab, 0, run))));
+    // In the order in which they stand above.
+    let place = |row: &Row| {
+        runs.iter().position(|run| {
+            run.case.name == row.run.case.name && run.speed_mps == row.run.speed_mps
+        })
+    };
+    rows.sort_by_key(place);
     let found = table::write(&rows);
     println!("{found}");
     let complaints: Vec<_> = rows.iter().filter_map(Row::complaint).collect();
@@ -232,23 +322,46 @@ fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
     table::compare(&rows);
 }
 
-/// Flies some cases at once, each with a thread that strikes it.
-fn fly(lab: &mut Lab, cases: &'static [Case]) -> Vec<Row> {
+/// Opens a lab whose room is free from end to end: nothing is hit, no goal is reached.
+fn open(vehicles: usize) -> Lab {
+    Lab::open_in(vehicles, |folder| {
+        let path = folder.join("scene.ply");
+        let mut scene = format::read(&path).expect("the generated scene reads").splats;
+        let is_in_the_way = |p_m: &Vec3| {
+            (0.2..10.9).contains(&p_m.x) && p_m.y.abs() < 1.9 && (0.1..3.0).contains(&p_m.z)
+        };
+        for (mean_m, opacity) in scene.means_m.iter().zip(&mut scene.opacities) {
+            if is_in_the_way(mean_m) {
+                *opacity = 0.0;
+            }
+        }
+        ply::write(&path, &scene).expect("the scene is written");
+        let arena = folder.join("arena.toml");
+        let text = std::fs::read_to_string(&arena).expect("the arena reads");
+        let text = text.replace("radius_m = 0.6", "radius_m = 0.01");
+        std::fs::write(&arena, text).expect("the arena is written");
+    })
+}
+
+/// Flies some at once, each with a thread that strikes it: lab, vehicle's index, run.
+fn fly<'a>(runs: impl Iterator<Item = (&'a Mutex<Lab>, usize, Run)>) -> Vec<Row> {
     let vehicle = vehicle();
     let vehicle: Vec<&str> = vehicle.iter().map(String::as_str).collect();
-    let start = |(index, case): (usize, &Case)| {
-        let plan =
-            Plan { how: "forward", vehicle: &vehicle, bridge: case.bridge, ..Plan::default() };
-        lab.fly(index, plan)
-    };
-    let flights: Vec<_> = cases.iter().enumerate().map(start).collect();
-    let lab = Mutex::new(lab);
+    let flights: Vec<_> = runs
+        .map(|(lab, index, run)| {
+            let plan = Plan {
+                how: run.how,
+                vehicle: &vehicle,
+                bridge: run.case.bridge,
+                ..Plan::default()
+            };
+            (lab, run, lab.lock().expect("nobody panics with it").fly(index, plan))
+        })
+        .collect();
     std::thread::scope(|scope| {
-        let lab = &lab;
-        let flights: Vec<_> = cases
-            .iter()
-            .zip(flights)
-            .map(|(case, flight)| scope.spawn(move || fly_one(lab, case, flight)))
+        let flights: Vec<_> = flights
+            .into_iter()
+            .map(|(lab, run, flight)| scope.spawn(move || fly_one(lab, run, flight)))
             .collect();
         flights.into_iter().map(|flight| flight.join().expect("a flight's thread")).collect()
     })
@@ -268,14 +381,24 @@ fn vehicle() -> Vec<String> {
     values.into_iter().chain(["--radio".to_owned()]).collect()
 }
 
-/// Strikes a vehicle half a metre into its flight, at 0.5 m/s.
-fn fly_one(lab: &Mutex<&mut Lab>, case: &'static Case, mut flight: Flight) -> Row {
+/// Strikes a vehicle that flies at its speed.
+fn fly_one(lab: &Mutex<Lab>, run: Run, mut flight: Flight) -> Row {
     flight.until("\"phase\":\"flying\"");
     let start = flight.now().p_m;
-    wait(case.name, || (flight.now().p_m - start).truncate().length() > 0.4);
+    let way_m = run.speed_mps.mul_add(1.2, 0.2);
+    wait(run.case.name, || (flight.now().p_m - start).truncate().length() > way_m);
     let last_good = flight.now();
-    strike(lab, &mut flight, case.loss);
-    judge(case, flight, last_good)
+    strike(lab, &mut flight, run.case.loss);
+    let row = judge(run, &flight, last_good);
+    // The runtime's own end is its own test's matter; a killed one has none.
+    let poses = flight.guardian_poses();
+    match run.case.loss {
+        Loss::Runtime | Loss::Stopped => {
+            assert!(poses > 40, "{}: {poses} poses by the guardian's own feed", run.case.name);
+        }
+        _ => {}
+    }
+    row
 }
 
 fn wait(what: &str, done: impl Fn() -> bool) {
@@ -287,10 +410,18 @@ fn wait(what: &str, done: impl Fn() -> bool) {
 }
 
 /// Lets the loss happen, and end if it does, on the simulator's clock.
-fn strike(lab: &Mutex<&mut Lab>, flight: &mut Flight, loss: Loss) {
+fn strike(lab: &Mutex<Lab>, flight: &mut Flight, loss: Loss) {
     let since_s = flight.now().stamp_s;
     match loss {
         Loss::Runtime => flight.kill_runtime(),
+        Loss::Stopped => flight.stop_runtime(),
+        Loss::Jetson => flight.switch_off(),
+        Loss::BridgeHangs => flight.stop_bridge(),
+        Loss::All => {
+            flight.switch_off();
+            flight.cuts().poses.store(true, Ordering::Relaxed);
+            flight.cuts().mavlink.store(true, Ordering::Relaxed);
+        }
         Loss::Server => lab.lock().expect("nobody panics with it").kill_server(),
         Loss::Mavlink(seconds) => {
             flight.cuts().mavlink.store(true, Ordering::Relaxed);
@@ -326,7 +457,9 @@ fn strike(lab: &Mutex<&mut Lab>, flight: &mut Flight, loss: Loss) {
 }
 
 /// Watches the rest of a flight.
-fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
+fn judge(run: Run, flight: &Flight, last_good: Sight) -> Row {
+    let case = run.case;
+    let lands = case.left != Left::FliesOn;
     let over_s = match case.loss {
         Loss::Mavlink(seconds) | Loss::Bridge(seconds) | Loss::Poses(seconds)
             if seconds < FOR_EVER =>
@@ -340,16 +473,12 @@ fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
     // One that lands is watched until it is down, or ought to be; one that flies on for a while.
     wait(case.name, || {
         let now = flight.now();
-        if case.lands {
-            is_down(&now) || since_s(&now) > 2.0 * DOWN_BY_AUTOPILOT_WITHIN_S
-        } else {
-            since_s(&now) > over_s + WATCH_S
-        }
+        if lands { is_down(&now) || since_s(&now) > 20.0 } else { since_s(&now) > over_s + WATCH_S }
     });
     let (track, modes) = flight.so_far();
     let lost: Vec<_> = track.iter().filter(|sight| sight.stamp_s >= last_good.stamp_s).collect();
     let down = lost.iter().find(|sight| is_down(sight));
-    let until_s = match (case.lands, down) {
+    let until_s = match (lands, down) {
         (true, Some(down)) => since_s(down),
         (true, None) => f64::INFINITY,
         (false, _) => over_s,
@@ -365,15 +494,13 @@ fn judge(case: &'static Case, flight: Flight, last_good: Sight) -> Row {
     let land = CopterMode::Land as u32;
     let landed = modes.iter().find(|&&(at, mode)| mode == land && at >= last_good.at);
     let row = Row {
-        case,
+        run,
         // One that flies on stands later too, at the end of its way.
-        stands_s: stands_s(&lost, &last_good).filter(|&s| case.lands || s <= over_s),
+        stands_s: stands_s(&lost, &last_good).filter(|&s| lands || s <= over_s),
         lands_s: landed.map(|&(at, _)| at_s(at)),
         down_s: down.map(|sight| since_s(sight)),
         drift_m,
     };
-    // The runtime's own end is its own test's matter; a killed one has none.
-    drop(flight);
     let outside = track.iter().find(|sight| !(FENCE_X_M.0..FENCE_X_M.1).contains(&sight.p_m.x));
     let way: Vec<_> = lost.iter().step_by(40).map(|sight| (since_s(sight), sight.p_m)).collect();
     assert!(outside.is_none(), "{}: left the fence: {outside:?}; {way:?}, {row:?}", case.name);
@@ -395,17 +522,24 @@ fn stands_s(lost: &[&Sight], last_good: &Sight) -> Option<f64> {
 impl Row {
     /// Returns what breaks the promise.
     fn complaint(&self) -> Option<String> {
-        let name = self.case.name;
-        if !(self.drift_m <= MAX_DRIFT_M) {
-            return Some(format!("{name}: drifted by {:.2} m", self.drift_m));
+        let Run { case, speed_mps, .. } = self.run;
+        let (name, within_m) = (case.name, self.run.drift_within_m());
+        if !(self.drift_m <= within_m) {
+            let drift_m = self.drift_m;
+            return Some(format!(
+                "{name}, {speed_mps} m/s: drifted by {drift_m:.2} of {within_m:.2} m"
+            ));
         }
-        match (self.case.lands, self.down_s) {
-            (true, None) => Some(format!("{name}: it did not come down")),
-            (true, Some(down_s)) if !(down_s <= self.case.down_within_s()) => {
-                Some(format!("{name}: down after {down_s:.2} s"))
+        match (case.left, self.down_s) {
+            (Left::FliesOn, Some(_)) => Some(format!("{name}: it landed")),
+            (Left::FliesOn, None) if self.lands_s.is_some() => {
+                Some(format!("{name}: it began to land"))
             }
-            (false, Some(_)) => Some(format!("{name}: it landed")),
-            (false, None) if self.lands_s.is_some() => Some(format!("{name}: it began to land")),
+            (Left::FliesOn, None) => None,
+            (_, None) => Some(format!("{name}, {speed_mps} m/s: it did not come down")),
+            (_, Some(down_s)) if !(down_s <= self.run.down_within_s()) => {
+                Some(format!("{name}, {speed_mps} m/s: down after {down_s:.2} s"))
+            }
             _ => None,
         }
     }

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::PathBuf;
 
-use super::Row;
+use super::{Left, Row, Run};
 
 const BEGIN: &str = "<!-- linkloss: begin -->\n";
 const END: &str = "<!-- linkloss: end -->";
@@ -12,18 +12,18 @@ const END: &str = "<!-- linkloss: end -->";
 /// Returns the rows as Markdown.
 pub(crate) fn write(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| what is lost | who notices, and does what | stands after | LAND after | down after | drift |\n\
-         |---|---|---|---|---|---|\n",
+        "| what is lost | who notices, and does what | at | stands after | LAND after | down after | drift |\n\
+         |---|---|---|---|---|---|---|\n",
     );
     for row in rows {
         let seconds =
             |value: Option<f64>| value.map_or("-".to_owned(), |seconds| format!("{seconds:.1} s"));
-        let lands = if row.case.lands { seconds(row.lands_s) } else { "flies on".to_owned() };
+        let flies_on = row.run.case.left == Left::FliesOn;
+        let lands = if flies_on { "flies on".to_owned() } else { seconds(row.lands_s) };
         writeln!(
             text,
-            "| {} | {} | {} | {lands} | {} | {:.2} m |",
-            row.case.name,
-            row.case.does,
+            "{} {} | {lands} | {} | {:.2} m |",
+            begins(row),
             seconds(row.stands_s),
             seconds(row.down_s),
             row.drift_m
@@ -31,6 +31,12 @@ pub(crate) fn write(rows: &[Row]) -> String {
         .expect("a string takes all");
     }
     text
+}
+
+/// Returns the row's first cells: what it is, not what was measured.
+fn begins(row: &Row) -> String {
+    let Run { case, speed_mps, .. } = row.run;
+    format!("| {} | {} | {speed_mps} m/s |", case.name, case.does)
 }
 
 fn guide() -> PathBuf {
@@ -58,7 +64,7 @@ pub(crate) fn compare(rows: &[Row]) {
     let lines: Vec<_> = table.lines().skip(2).collect();
     assert_eq!(lines.len(), rows.len(), "the guide has other rows; {WRITE}");
     for (line, row) in lines.iter().zip(rows) {
-        let begins = format!("| {} | {} |", row.case.name, row.case.does);
+        let begins = begins(row);
         assert!(line.starts_with(&begins), "the guide has {line:?}, not {begins:?}; {WRITE}");
     }
 }
