@@ -3,6 +3,7 @@
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::process::CommandExt;
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -53,18 +54,18 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Starts one, a process of this same program, on the port at `address`.
+    /// Starts one, a process of `program`, which has the subcommand, on the port at `address`.
     ///
     /// # Errors
     /// The system's refusal of a process or of the port.
-    pub fn start(address: &MavlinkAddress, wanted: &Wanted) -> io::Result<Self> {
+    pub fn start(program: &Path, address: &MavlinkAddress, wanted: &Wanted) -> io::Result<Self> {
         let flag = SockFlag::SOCK_CLOEXEC;
         let (ours, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, flag)?;
         for end in [&ours, &theirs] {
             setsockopt(end, SndBuf, &QUEUE)?;
         }
         setsockopt(&ours, ReceiveTimeout, &TimeVal::milliseconds(WAIT_MS))?;
-        let child = Command::new(std::env::current_exe()?)
+        let child = Command::new(program)
             .args([SUBCOMMAND, &address.to_string()])
             .stdin(Stdio::from(theirs))
             .stdout(Stdio::null())
@@ -82,6 +83,11 @@ impl Guardian {
         &self.local
     }
 
+    /// Returns the number of its process.
+    pub fn pid(&self) -> u32 {
+        self.child.lock().unwrap_or_else(PoisonError::into_inner).id()
+    }
+
     /// Sends a packet to the autopilot; loss is the protocol's concern.
     pub fn send(&self, packet: &[u8]) {
         let _ = put(self.socket.as_fd(), Kind::Mavlink, packet);
@@ -96,11 +102,16 @@ impl Guardian {
     /// free. Where the vehicle still lands, it goes on without us.
     pub fn leave(&self) {
         let _ = shutdown(self.socket.as_raw_fd(), Shutdown::Both);
-        let mut child = self.child.lock().unwrap_or_else(PoisonError::into_inner);
         let deadline = Instant::now() + LEAVES_WITHIN;
-        while matches!(child.try_wait(), Ok(None)) && Instant::now() < deadline {
+        while !self.has_left() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
         }
+    }
+
+    /// Whether its process has ended.
+    pub fn has_left(&self) -> bool {
+        let mut child = self.child.lock().unwrap_or_else(PoisonError::into_inner);
+        !matches!(child.try_wait(), Ok(None))
     }
 
     /// Waits for what comes, 100 ms at most.

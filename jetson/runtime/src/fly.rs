@@ -70,7 +70,8 @@ pub fn fly_command(
     let mavlink = args.mavlink_address();
     let link = args.link_settings()?;
     // Before any thread: a process that is to outlive this one.
-    let guardian = Guardian::start(&mavlink, &link.wanted())
+    let program = std::env::current_exe().context("cannot find this program's path")?;
+    let guardian = Guardian::start(&program, &mavlink, &link.wanted())
         .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?;
     let guardian = Arc::new(guardian);
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;

@@ -1,0 +1,153 @@
+//! The guardian as a process, between a runtime and an autopilot that are played by the test: what ends a runtime
+//! does not end it, it lands what is in the air, and it leaves when nothing is left to do. What it adds to the way
+//! of a packet is printed: `cargo test --release -p vizflyt-e2e --test guardian -- --nocapture`.
+
+use std::net::UdpSocket;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use vizflyt_e2e::vizflyt;
+use vizflyt_guardian::client::BUFFER;
+use vizflyt_guardian::port::Wanted;
+use vizflyt_guardian::{Guardian, Message};
+use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag};
+use vizflyt_protocol::mavlink::{
+    GuidedMotion, GuidedSetpoint, MAX_PACKET, MavHeader, StreamDecoder, encode, guided_to_mavlink,
+};
+use vizflyt_protocol::messages::YawTarget;
+
+const GUIDED: u32 = 4;
+const LAND: u32 = 9;
+/// Anything here ends within this, however loaded the machine is.
+const PATIENCE: Duration = Duration::from_mins(1);
+
+fn packet(source: (u8, u8), message: &MavMessage) -> Vec<u8> {
+    let header = MavHeader { system_id: source.0.into(), component_id: source.1, sequence: 0 };
+    encode(header, message, &mut [0; MAX_PACKET]).to_vec()
+}
+
+fn heartbeat(mode: u32, armed: bool) -> Vec<u8> {
+    let mut base_mode = MavModeFlag::empty();
+    base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, armed);
+    let beat = HEARTBEAT_DATA {
+        custom_mode: mode,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode,
+        ..HEARTBEAT_DATA::default()
+    };
+    packet((1, 1), &MavMessage::HEARTBEAT(beat))
+}
+
+fn setpoint() -> Vec<u8> {
+    let motion = GuidedMotion::Velocity(glam::DVec3::X);
+    let setpoint = GuidedSetpoint { motion, yaw: YawTarget::Angle(0.0) };
+    let message = guided_to_mavlink(&setpoint, (1, 1), 0);
+    packet((255, 191), &MavMessage::SET_POSITION_TARGET_LOCAL_NED(message))
+}
+
+/// A guardian, and the autopilot's end of its port.
+fn start() -> (Guardian, UdpSocket) {
+    let address = "udpin:127.0.0.1:0".parse().unwrap();
+    let guardian = Guardian::start(&vizflyt(), &address, &Wanted::default()).unwrap();
+    let autopilot = UdpSocket::bind("127.0.0.1:0").unwrap();
+    autopilot.connect(guardian.local()).unwrap();
+    autopilot.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
+    autopilot.send(&heartbeat(GUIDED, true)).unwrap();
+    let (mut buffer, deadline) = (BUFFER, Instant::now() + PATIENCE);
+    while !matches!(guardian.receive(&mut buffer), Ok(Some(Message::Mavlink(_)))) {
+        assert!(Instant::now() < deadline, "the autopilot's heartbeat did not come");
+    }
+    (guardian, autopilot)
+}
+
+/// Waits until message `id` reaches the autopilot.
+fn until(autopilot: &UdpSocket, id: u32) {
+    let (mut decoder, mut buffer) = (StreamDecoder::default(), [0; 2048]);
+    let deadline = Instant::now() + PATIENCE;
+    let mut found = false;
+    while !found {
+        assert!(Instant::now() < deadline, "message {id} did not come");
+        let Ok(len) = autopilot.recv(&mut buffer) else { continue };
+        decoder.push(&buffer[..len], |packet| {
+            found |= vizflyt_protocol::mavlink::Message::message_id(&packet.message) == id;
+        });
+    }
+}
+
+#[test]
+fn it_outlives_what_ends_a_runtime_and_leaves_when_the_vehicle_stands() {
+    let (guardian, autopilot) = start();
+    let pid = Pid::from_raw(guardian.pid().cast_signed());
+    for _ in 0..20 {
+        guardian.send(&setpoint());
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
+        kill(pid, signal).unwrap();
+        guardian.send(&setpoint());
+    }
+    until(&autopilot, 84);
+    // The runtime ends in flight: LAND at once, and it stays.
+    guardian.leave();
+    until(&autopilot, 76);
+    autopilot.send(&heartbeat(LAND, true)).unwrap();
+    assert!(kill(pid, None).is_ok(), "it waits for the vehicle to stand");
+    autopilot.send(&heartbeat(LAND, false)).unwrap();
+    let deadline = Instant::now() + PATIENCE;
+    while !guardian.has_left() {
+        assert!(Instant::now() < deadline, "it does not leave");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+#[test]
+fn a_port_that_is_taken_is_told_and_no_process_is_left() {
+    let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let address = format!("udpin:{}", taken.local_addr().unwrap()).parse().unwrap();
+    let error = Guardian::start(&vizflyt(), &address, &Wanted::default()).unwrap_err().to_string();
+    assert!(error.contains("in use"), "{error}");
+}
+
+/// Prints, and judges nothing by time.
+#[test]
+fn its_part_of_a_packets_way_is_measured() {
+    const PACKETS: usize = 2000;
+    let (guardian, autopilot) = start();
+    let direct = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let other = UdpSocket::bind("127.0.0.1:0").unwrap();
+    direct.connect(other.local_addr().unwrap()).unwrap();
+    other.set_read_timeout(Some(PATIENCE)).unwrap();
+    autopilot.set_read_timeout(Some(PATIENCE)).unwrap();
+    let bytes = setpoint();
+    let mut buffer = [0; 2048];
+    let (mut through, mut without) = (Vec::new(), Vec::new());
+    for _ in 0..PACKETS {
+        std::thread::sleep(Duration::from_millis(1));
+        let sent = Instant::now();
+        guardian.send(&bytes);
+        autopilot.recv(&mut buffer).unwrap();
+        through.push(sent.elapsed().as_secs_f64() * 1e3);
+        let sent = Instant::now();
+        direct.send(&bytes).unwrap();
+        other.recv(&mut buffer).unwrap();
+        without.push(sent.elapsed().as_secs_f64() * 1e3);
+    }
+    let mut back = Vec::new();
+    let mut message = BUFFER;
+    for _ in 0..PACKETS {
+        std::thread::sleep(Duration::from_millis(1));
+        let sent = Instant::now();
+        autopilot.send(&bytes).unwrap();
+        while !matches!(guardian.receive(&mut message), Ok(Some(Message::Mavlink(_)))) {}
+        back.push(sent.elapsed().as_secs_f64() * 1e3);
+    }
+    for (name, times) in
+        [("through the guardian", &mut through), ("back", &mut back), ("without", &mut without)]
+    {
+        times.sort_by(f64::total_cmp);
+        let (p50, p99) = (times[PACKETS / 2], times[PACKETS * 99 / 100]);
+        println!("{name}: p50 {p50:.3} ms, p99 {p99:.3} ms");
+    }
+    autopilot.send(&heartbeat(GUIDED, false)).unwrap();
+}
