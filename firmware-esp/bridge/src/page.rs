@@ -16,6 +16,8 @@ use crate::stats::REPORT;
 
 /// Bytes of a part of a response at most.
 pub const RESPONSE: usize = 2048;
+/// A part of a response.
+pub type Response = String<RESPONSE>;
 
 /// How every page begins. Nothing from elsewhere is loaded, framed, or sent to.
 const HTML: &str = "HTTP/1.0 200 OK\r\nContent-Type: text/html; charset=utf-8\r\n\
@@ -25,6 +27,7 @@ const HTML: &str = "HTTP/1.0 200 OK\r\nContent-Type: text/html; charset=utf-8\r\
 const TEXT: &str = "\r\nContent-Type: text/plain; charset=utf-8\r\nConnection: close\r\n\r\n";
 
 /// Does what a request asks for, once; returns how that fared, if it asks for a change.
+#[inline(never)] // Why: as `respond`.
 pub fn act(bridge: &mut Bridge, now: HostTime, request: &Request) -> Option<Status> {
     if request.is_too_long() || !request.is(b"POST /settings ") {
         return None;
@@ -33,42 +36,35 @@ pub fn act(bridge: &mut Bridge, now: HostTime, request: &Request) -> Option<Stat
     Some(form.map_or(Status::Malformed, |form| bridge.change_by_form(now, &form)))
 }
 
-/// Returns a part of the answer to a request, of which `done` is what [`act`] returned; `None` behind the
-/// last part.
+/// Writes a part of the answer to a request into `out`, of which `done` is what [`act`] returned; returns
+/// false behind the last part.
+#[inline(never)] // Why: inlined, its frame would be its caller's for ever, and a chip's stack is small.
 pub fn respond(
     bridge: &Bridge,
     now: HostTime,
     request: &Request,
     done: Option<Status>,
     part: usize,
-) -> Option<String<RESPONSE>> {
-    let mut out = String::new();
+    out: &mut Response,
+) -> bool {
+    out.clear();
     let written = match done {
         None if request.is(b"GET /settings ") && !request.is_too_long() => {
-            form::write_part(bridge, part, &mut out)
+            form::write_part(bridge, part, out)
         }
         _ if part > 0 => Ok(false),
-        Some(status) => answer_change(status, &mut out).map(|()| true),
-        None => answer(bridge, now, request, &mut out).map(|()| true),
+        Some(status) => answer_change(status, out).map(|()| true),
+        None => answer(bridge, now, request, out).map(|()| true),
     };
-    match written {
-        Ok(true) => Some(out),
-        Ok(false) => None,
-        Err(fmt::Error) => {
-            // More clients than fit: an error rather than half a page.
-            out.clear();
-            let _ = writeln!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long");
-            Some(out)
-        }
-    }
+    written.unwrap_or_else(|fmt::Error| {
+        // More clients than fit: an error rather than half a page.
+        out.clear();
+        let _ = writeln!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long");
+        true
+    })
 }
 
-fn answer(
-    bridge: &Bridge,
-    now: HostTime,
-    request: &Request,
-    out: &mut String<RESPONSE>,
-) -> fmt::Result {
+fn answer(bridge: &Bridge, now: HostTime, request: &Request, out: &mut Response) -> fmt::Result {
     if request.is_too_long() {
         writeln!(out, "HTTP/1.0 413 Content Too Large{TEXT}too long")
     } else if request.is(b"GET / ") {
@@ -82,14 +78,14 @@ fn answer(
     }
 }
 
-fn answer_change(status: Status, out: &mut String<RESPONSE>) -> fmt::Result {
+fn answer_change(status: Status, out: &mut Response) -> fmt::Result {
     let line = form::status_line(status);
     writeln!(out, "HTTP/1.0 {line}{TEXT}{}; go back to see the settings", status.message())
 }
 
-/// Answers a request that brought a firmware.
-pub fn respond_firmware(taken: Result<(), &str>) -> String<RESPONSE> {
-    let mut out = String::new();
+/// Writes the answer to a request that brought a firmware into `out`.
+pub fn respond_firmware(taken: Result<(), &str>, out: &mut Response) {
+    out.clear();
     // Fits: the longest reason is a sentence.
     let _ = match taken {
         Ok(()) => out.write_str(
@@ -99,7 +95,6 @@ pub fn respond_firmware(taken: Result<(), &str>) -> String<RESPONSE> {
             write!(out, "HTTP/1.0 409 Conflict\r\nConnection: close\r\n\r\n{why}\n")
         }
     };
-    out
 }
 
 fn counters(bridge: &Bridge, now: HostTime) -> impl Iterator<Item = (&'static str, u32)> {
@@ -119,7 +114,7 @@ fn station_counters(bridge: &Bridge) -> [(&'static str, u32); 6] {
     ]
 }
 
-fn page(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Result {
+fn page(bridge: &Bridge, now: HostTime, out: &mut Response) -> fmt::Result {
     out.write_str(HTML)?;
     out.write_str("<meta http-equiv=refresh content=2><title>bridge</title>")?;
     // The name is letters, digits and hyphens: nothing to escape.
@@ -159,10 +154,7 @@ fn page(bridge: &Bridge, now: HostTime, out: &mut String<RESPONSE>) -> fmt::Resu
     out.write_str("</pre>")
 }
 
-fn json(
-    counters: impl Iterator<Item = (&'static str, u32)>,
-    out: &mut String<RESPONSE>,
-) -> fmt::Result {
+fn json(counters: impl Iterator<Item = (&'static str, u32)>, out: &mut Response) -> fmt::Result {
     out.write_str(
         "HTTP/1.0 200 OK\r\nContent-Type: application/json\r\nConnection: close\r\n\r\n",
     )?;
@@ -203,8 +195,12 @@ mod tests {
         whole.push(request.as_bytes());
         let now = HostTime::from_ns(5_000_000_000);
         let done = act(bridge, now, &whole);
-        let parts = (0..).map_while(|part| respond(bridge, now, &whole, done, part));
-        parts.map(|part| part.as_str().to_owned()).collect()
+        let mut out = Response::new();
+        (0..)
+            .map_while(|part| {
+                respond(bridge, now, &whole, done, part, &mut out).then(|| out.as_str().to_owned())
+            })
+            .collect()
     }
 
     #[test]

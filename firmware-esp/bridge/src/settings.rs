@@ -122,6 +122,12 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// Back to the defaults.
+    #[inline(never)] // Why: the copy is on the stack while this runs, and no longer.
+    pub(crate) fn restore(&mut self) {
+        *self = Self::default();
+    }
+
     /// The defaults without a name; `const`, for a chip's static memory.
     pub(crate) const fn unnamed() -> Self {
         Self {

@@ -25,6 +25,7 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::bridge::{Bridge, Event, TCP_SLOTS};
 use crate::http::Request;
+use crate::page::Response;
 use crate::stats::RestartCause;
 use crate::storage::Store;
 
@@ -154,6 +155,7 @@ struct PageBuffers {
     transmit: [u8; 536],
     chunk: [u8; 128],
     request: Request,
+    answer: Response,
 }
 
 #[derive(Debug)]
@@ -190,6 +192,7 @@ impl Buffers {
                 transmit: [0; 536],
                 chunk: [0; 128],
                 request: Request::new(),
+                answer: Response::new(),
             },
         }
     }
@@ -199,11 +202,12 @@ impl Buffers {
 /// others; TCP; the page; and what the stack needs itself (DHCP).
 pub const SOCKETS: usize = 5 + TCP_SLOTS;
 
-/// What a bridge of ours may take of a chip's RAM: state and buffers. [bytes]
-pub const RAM_BUDGET: usize = 30 * 1024;
+/// What a bridge of ours may take of a chip's RAM: state and buffers. The ESP8266 has the smaller set of
+/// `capacity`. [bytes]
+pub const RAM_BUDGET: usize = 1024 * if cfg!(feature = "small") { 22 } else { 32 };
 const _: () = assert!(
     core::mem::size_of::<Shared>() + core::mem::size_of::<Buffers>() <= RAM_BUDGET,
-    "the bridge outgrows the ESP8266: shrink a ring or a buffer"
+    "the bridge outgrows its chip: shrink a ring or a buffer"
 );
 
 /// Runs the bridge for ever: serial port, network, flash and light.
@@ -301,8 +305,7 @@ async fn mind<F: NorFlash, P: Platform>(
         }
         match event {
             Some(Event::Save) => {
-                let settings = shared.take(|bridge, _| bridge.settings().clone());
-                let saved = store.save(&settings).is_ok();
+                let saved = shared.take(|bridge, _| store.save(bridge.settings()).is_ok());
                 shared.with(|bridge, now| bridge.note_saved(now, saved));
             }
             Some(Event::Restart) => {

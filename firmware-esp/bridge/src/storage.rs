@@ -41,24 +41,31 @@ impl<F: NorFlash> Store<F> {
 
     /// Returns the newest settings; `None` if none were ever saved.
     pub fn load(&mut self) -> Option<Settings> {
+        let mut settings = Settings::default();
+        self.load_into(&mut settings).map(|()| settings)
+    }
+
+    /// As [`Self::load`], over defaults that the caller has: a chip's stack has no room for a copy.
+    #[inline(never)] // Why: the record is on a chip's stack while this runs, and no longer.
+    pub fn load_into(&mut self, settings: &mut Settings) -> Option<()> {
         let mut record = [0; RECORD];
         let (slot, _) = self.newest(&mut record)?;
         self.read(slot, &mut record)?;
         let (_, body) = valid(&record)?;
-        let mut settings = Settings::default();
         for line in body.lines() {
             if let Some((name, value)) = line.split_once('=') {
                 // A name of another firmware, or a value outside today's range.
                 let _ = settings.set(name, value);
             }
         }
-        Some(settings)
+        Some(())
     }
 
     /// Writes settings over the older record.
     ///
     /// # Errors
     /// See [`StoreError`]; the settings before are still there.
+    #[inline(never)] // Why: as `load_into`.
     pub fn save(&mut self, settings: &Settings) -> Result<(), StoreError> {
         let mut record = [0; RECORD];
         let (slot, sequence) = match self.newest(&mut record) {

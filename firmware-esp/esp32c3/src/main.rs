@@ -129,7 +129,8 @@ async fn main(spawner: Spawner) -> ! {
     let mut address = [0; 6];
     address.copy_from_slice(efuse::base_mac_address().as_bytes());
     println!("vizflyt bridge {}, {} baud; {cause:?}", env!("CARGO_PKG_VERSION"), settings.baud);
-    shared.with(|bridge, now| bridge.begin(now, settings, Chip { address, random }));
+    shared
+        .with(|bridge, now| bridge.begin(now, Chip { address, random }, |place| *place = settings));
 
     spawner.spawn(network(runner).unwrap());
     spawner.spawn(join_networks(shared, stack, controller, WIFI.take()).unwrap());

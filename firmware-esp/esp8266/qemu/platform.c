@@ -266,6 +266,22 @@ enum { PAINT = 0xA5A5A5A5 };
  * exception puts two frames of 256 onto it. */
 enum { STACK = 5328 - 2 * 256 };
 
+/* Writes a number at the end of a text; returns the new length. */
+static uint32_t put_number(char *line, uint32_t len, uint32_t value)
+{
+    for (uint32_t scale = 1000000000; scale; scale /= 10)
+        if (value >= scale || scale == 1)
+            line[len++] = '0' + value / scale % 10;
+    return len;
+}
+
+static void report(const char *what, uint32_t len, uint32_t value)
+{
+    char line[64];
+    copy((uint8_t *)line, (const uint8_t *)what, len);
+    put_line(line, put_number(line, len, value));
+}
+
 /* How deep the stack has gone since it was painted; paints it again. */
 static uint32_t stack_used(void)
 {
@@ -276,20 +292,15 @@ static uint32_t stack_used(void)
     for (uint32_t *here = __builtin_frame_address(0); deepest < here - 32; deepest++)
         *deepest = PAINT;
     if (used > STACK) {
-        put_line("deeper than the chip's stack", 28);
+        char line[64] = "deeper than the chip's stack: ";
+        uint32_t len = put_number(line, 30, used);
+        copy((uint8_t *)line + len, (const uint8_t *)" of ", 4);
+        len = put_number(line, len + 4, STACK);
+        copy((uint8_t *)line + len, (const uint8_t *)" bytes", 6);
+        put_line(line, len + 6);
         stop(4);
     }
     return used;
-}
-
-static void report(const char *what, uint32_t len, uint32_t value)
-{
-    char line[64];
-    copy((uint8_t *)line, (const uint8_t *)what, len);
-    for (uint32_t scale = 1000000000; scale; scale /= 10)
-        if (value >= scale || scale == 1)
-            line[len++] = '0' + value / scale % 10;
-    put_line(line, len);
 }
 
 static void report_all(void)

@@ -27,7 +27,7 @@ use embassy_net::{Config, Runner, Stack, StackResources};
 use static_cell::{ConstStaticCell, StaticCell};
 use vizflyt_bridge::shell::{self, Buffers, Shared};
 use vizflyt_bridge::storage::Store;
-use vizflyt_bridge::{Bridge, Chip, blink, wifi};
+use vizflyt_bridge::{Bridge, Chip, Settings, blink, wifi};
 
 /// Where the settings lie in the flash; see the SDK's map in `sdk/platform.c`.
 const SETTINGS: flash::Region = flash::Region { start: 0x3F_0000, len: 2 * flash::SECTOR };
@@ -52,30 +52,44 @@ fn pender(_context: *mut ()) {
 #[expect(unsafe_code, reason = "called from C")]
 #[unsafe(no_mangle)]
 pub extern "C" fn vizflyt_start() {
-    static EXECUTOR: StaticCell<Executor> = StaticCell::new();
+    let (stack, runner) = start_network();
+    start_tasks(stack, runner);
+}
+
+type Network = Runner<'static, &'static mut radio::Radio>;
+
+/// Makes the network stack: the deepest place of the chip's stack, so nothing else lies there meanwhile.
+#[inline(never)]
+fn start_network() -> (Stack<'static>, Network) {
     static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
         StaticCell::new();
     static RADIO: StaticCell<radio::Radio> = StaticCell::new();
+    let seed = u64::from(platform::random()) << 32 | u64::from(platform::random());
+    let radio = RADIO.init(radio::Radio::new(platform::mac()));
+    embassy_net::new(radio, Config::default(), RESOURCES.init_with(StackResources::new), seed)
+}
+
+/// Builds the bridge and spawns all tasks.
+#[inline(never)]
+fn start_tasks(stack: Stack<'static>, runner: Network) {
+    static EXECUTOR: StaticCell<Executor> = StaticCell::new();
     static SHARED: ConstStaticCell<Shared> = ConstStaticCell::new(Shared::new(Bridge::empty()));
     static BUFFERS: ConstStaticCell<Buffers> = ConstStaticCell::new(Buffers::new());
     static WIFI: ConstStaticCell<wifi::Buffers> = ConstStaticCell::new(wifi::Buffers::new());
 
-    let mut store = Store::new(SETTINGS, 0);
-    let settings = store.load().unwrap_or_default();
-    platform::uart_configure(settings.baud, settings.flow_control);
-
-    let address = platform::mac();
     let mut random = [0; 16];
     for word in random.chunks_exact_mut(4) {
         word.copy_from_slice(&platform::random().to_le_bytes());
     }
-    let seed = u64::from(platform::random()) << 32 | u64::from(platform::random());
-    let radio = RADIO.init(radio::Radio::new(address));
-    let (stack, runner) =
-        embassy_net::new(radio, Config::default(), RESOURCES.init_with(StackResources::new), seed);
-    let chip = Chip { address, random };
+    let chip = Chip { address: platform::mac(), random };
     let shared = SHARED.take();
-    shared.with(|bridge, now| bridge.begin(now, settings, chip));
+    let mut store = Store::new(SETTINGS, 0);
+    let load = |settings: &mut Settings| {
+        // Where none were saved, the defaults.
+        let _ = store.load_into(settings);
+        platform::uart_configure(settings.baud, settings.flow_control);
+    };
+    shared.with(|bridge, now| bridge.begin(now, chip, load));
 
     let executor: &'static Executor = EXECUTOR.init(Executor::new(core::ptr::null_mut()));
     critical_section::with(|section| RUNNING.borrow(section).set(Some(Loop(executor))));
@@ -114,7 +128,7 @@ const FRAMES: u32 = 4;
 const LINK: u32 = 8;
 
 #[embassy_executor::task]
-async fn network(mut runner: Runner<'static, &'static mut radio::Radio>) {
+async fn network(mut runner: Network) {
     runner.run().await;
 }
 

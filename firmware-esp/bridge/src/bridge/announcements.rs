@@ -59,7 +59,8 @@ impl PacketRouter {
                 ..HEARTBEAT_DATA::default()
             }),
         );
-        if let Some(text) = self.untold.take_if(|_| self.clients.iter().any(Option::is_some)) {
+        let listens = |client: &Client| client.speaks(now, &self.settings);
+        if let Some(text) = self.untold.take_if(|_| self.clients.iter().flatten().any(listens)) {
             self.send_status_text(now, MavSeverity::MAV_SEVERITY_ERROR, text);
         }
         if self.autopilot.is_none() {

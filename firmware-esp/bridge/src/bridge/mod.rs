@@ -69,7 +69,7 @@ impl Bridge {
     /// Makes a bridge at `now`.
     pub fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
         let mut bridge = Self::empty();
-        bridge.begin(now, settings, chip);
+        bridge.begin(now, chip, |place| *place = settings);
         bridge
     }
 
@@ -84,9 +84,12 @@ impl Bridge {
         }
     }
 
-    /// Begins at `now`; once, before anything else.
-    pub fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
-        self.router.begin(now, settings, chip);
+    /// Begins at `now`; once, before anything else. `load` changes the default settings where they lie:
+    /// a chip's stack has no room for copies.
+    pub fn begin(&mut self, now: HostTime, chip: Chip, load: impl FnOnce(&mut Settings)) {
+        self.router.settings.restore();
+        load(&mut self.router.settings);
+        self.router.begin(now, chip);
     }
 
     // ---- what goes in ----

@@ -113,12 +113,11 @@ impl PacketRouter {
         }
     }
 
-    /// Begins at `now`.
-    pub(super) fn begin(&mut self, now: HostTime, settings: Settings, chip: Chip) {
+    /// Begins at `now` with the settings that are there.
+    pub(super) fn begin(&mut self, now: HostTime, chip: Chip) {
         self.outstanding = super::component::OutstandingRequests::new(access::nonce(&chip.random));
         self.chip = chip;
-        self.transparent = settings.transparent;
-        self.settings = settings;
+        self.transparent = self.settings.transparent;
         self.uart_at = now;
         self.autopilot_at = now;
         self.started_at = now;

@@ -22,7 +22,7 @@ pub(super) async fn show_page<P: Platform>(
     if port == 0 {
         return;
     }
-    let PageBuffers { receive, transmit, chunk, request } = buffers;
+    let PageBuffers { receive, transmit, chunk, request, answer } = buffers;
     loop {
         let mut socket = TcpSocket::new(stack, receive, transmit);
         // A browser that opens a connection for later must not keep others out.
@@ -47,21 +47,23 @@ pub(super) async fn show_page<P: Platform>(
             Progress::Firmware(from) => {
                 let taken = take_firmware(shared, platform, &mut socket, chunk, from, len).await;
                 restart = taken.is_ok();
-                let _ = socket.write_all(page::respond_firmware(taken).as_bytes()).await;
+                page::respond_firmware(taken, answer);
+                let _ = socket.write_all(answer.as_bytes()).await;
                 socket.close();
                 // Whoever still sends reads the answer only after that.
                 while let Ok(1..) = socket.read(chunk).await {}
             }
             Progress::Whole => {
                 let done = shared.with(|bridge, now| page::act(bridge, now, request));
-                for part in 0.. {
-                    let part =
-                        shared.take(|bridge, now| page::respond(bridge, now, request, done, part));
-                    let Some(part) = part else { break };
+                let mut part = 0;
+                while shared
+                    .take(|bridge, now| page::respond(bridge, now, request, done, part, answer))
+                {
                     // A browser that has gone wants no answer.
-                    if socket.write_all(part.as_bytes()).await.is_err() {
+                    if socket.write_all(answer.as_bytes()).await.is_err() {
                         break;
                     }
+                    part += 1;
                 }
             }
             Progress::More => {}

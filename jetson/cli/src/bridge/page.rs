@@ -179,7 +179,7 @@ impl Visitor {
             Ok(true) => {
                 halves.build = updater.build().unwrap_or(halves.build);
                 self.restart = true;
-                Some(page::respond_firmware(Ok(())).as_bytes().to_vec())
+                Some(answer_firmware(Ok(())))
             }
             Err(fault) => Some(refuse(Fault::message(fault))),
         }
@@ -189,12 +189,23 @@ impl Visitor {
 /// Does what a request asks for; returns the answer.
 fn answer(bridge: &mut Bridge, at: HostTime, request: &Request) -> Vec<u8> {
     let done = page::act(bridge, at, request);
-    let parts = (0..).map_while(|part| page::respond(bridge, at, request, done, part));
-    parts.flat_map(|part| part.as_bytes().to_vec()).collect()
+    let (mut part, mut whole) = (page::Response::new(), Vec::new());
+    let mut place = 0;
+    while page::respond(bridge, at, request, done, place, &mut part) {
+        whole.extend_from_slice(part.as_bytes());
+        place += 1;
+    }
+    whole
+}
+
+fn answer_firmware(taken: Result<(), &str>) -> Vec<u8> {
+    let mut answer = page::Response::new();
+    page::respond_firmware(taken, &mut answer);
+    answer.as_bytes().to_vec()
 }
 
 fn refuse(why: &str) -> Vec<u8> {
-    page::respond_firmware(Err(why)).as_bytes().to_vec()
+    answer_firmware(Err(why))
 }
 
 /// A browser that is silent for so long must not keep others out.

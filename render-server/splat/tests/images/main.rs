@@ -3,6 +3,7 @@
 mod agreement;
 mod compare;
 mod corners;
+mod cuts;
 mod fisheye;
 mod npz;
 mod objects;

@@ -146,7 +146,8 @@ fn what_nobody_acknowledges_is_called_that() {
     assert!(!loss.says("bridge: landing") && !loss.bridge.is_landing());
     let mut request = crate::http::Request::new();
     request.push(b"GET / HTTP/1.0\r\n\r\n");
-    let page = crate::page::respond(&loss.bridge, at(loss.now), &request, None, 0).unwrap();
+    let mut page = crate::page::Response::new();
+    assert!(crate::page::respond(&loss.bridge, at(loss.now), &request, None, 0, &mut page));
     assert!(page.contains("LAND is not acknowledged"), "{page}");
 }
 

@@ -163,3 +163,23 @@ proptest! {
         prop_assert_eq!(arrived, (0..10).collect::<Vec<u8>>());
     }
 }
+
+#[test]
+fn why_the_chip_has_started_waits_for_somebody_who_hears_it() {
+    // The settings name one; it is not there.
+    let mut bridge = bridge(Settings { client: Some(address(9)), ..Settings::default() });
+    bridge.set_restart_cause(crate::stats::RestartCause::Watchdog);
+    let told = |bridge: &mut Bridge, now: HostTime| {
+        bridge.handle_timeout(now);
+        let all = datagrams(bridge, now);
+        let texts = all.iter().flat_map(|(_, bytes)| decode(bytes));
+        texts.filter(|packet| matches!(packet.message, MavMessage::STATUSTEXT(_))).count()
+    };
+    for second in 1..4 {
+        assert_eq!(told(&mut bridge, at(1000 * second)), 0);
+    }
+    bridge.handle_datagram(at(3500), address(2), &bytes(0, RUNTIME, &heartbeat(false, 0)));
+    // To the one who spoke, and to the other.
+    assert_eq!(told(&mut bridge, at(4100)), 2);
+    assert_eq!(told(&mut bridge, at(5200)), 0);
+}
