@@ -78,6 +78,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-arena",
             "vizflyt-server",
             "vizflyt-runtime",
+            "vizflyt-guardian",
             "vizflyt-simulator",
             "vizflyt-bridge",
             "vizflyt-tags",
