@@ -44,6 +44,9 @@ use watch::{Out, Watch};
 /// Longest wait for the runtime: how late LAND may be. [ms]
 const TICK_MS: i64 = 10;
 
+/// What to do about a port that is in use.
+const TAKEN: &str = ": by another runtime, a ground station, or the guardian of an earlier flight, which leaves when its vehicle stands";
+
 /// What the threads share.
 struct Shared {
     port: Port,
@@ -82,7 +85,8 @@ fn try_run(address: &str) -> io::Result<()> {
     let port = match opened {
         Ok(port) => port,
         Err(error) => {
-            put(runtime.as_fd(), Kind::Refused, error.to_string().as_bytes())?;
+            let advice = if error.kind() == io::ErrorKind::AddrInUse { TAKEN } else { "" };
+            put(runtime.as_fd(), Kind::Refused, format!("{error}{advice}").as_bytes())?;
             return Ok(());
         }
     };

@@ -38,6 +38,8 @@ const NAVIGATION_S: f64 = 0.1;
 const STALE_S: f64 = 0.5;
 /// At most so often. [s]
 const POSE_EVERY_S: f64 = 0.018;
+/// An autopilot that is not heard for this long gives its place to another. [s]
+const LOST_AFTER_S: f64 = 3.0;
 /// An autopilot that is not heard for this long, once the runtime is gone, is given up. [s]
 const GIVEN_UP_S: f64 = 10.0;
 /// What the guardian itself was not run for counts as this much silence of the runtime at most: where the whole
@@ -171,8 +173,12 @@ impl Watch {
                 _ => {}
             }
         });
-        if let Some((autopilot, flight)) = beat {
-            (self.autopilot, self.autopilot_at, self.flight) = (Some(autopilot), now, flight);
+        if let Some((from, flight)) = beat {
+            // The first one keeps its place while it speaks, as in the runtime.
+            let is_kept = now.seconds_since(self.autopilot_at) < LOST_AFTER_S;
+            if self.autopilot.is_none_or(|known| known == from || !is_kept) {
+                (self.autopilot, self.autopilot_at, self.flight) = (Some(from), now, flight);
+            }
         }
         if accepted {
             self.failsafe.note_acknowledged(self.own);

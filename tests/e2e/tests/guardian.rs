@@ -106,7 +106,7 @@ fn a_port_that_is_taken_is_told_and_no_process_is_left() {
     let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
     let address = format!("udpin:{}", taken.local_addr().unwrap()).parse().unwrap();
     let error = Guardian::start(&vizflyt(), &address, &Wanted::default()).unwrap_err().to_string();
-    assert!(error.contains("in use"), "{error}");
+    assert!(error.contains("in use") && error.contains("guardian of an earlier flight"), "{error}");
 }
 
 /// Prints, and judges nothing by time.

@@ -309,7 +309,10 @@ mod tests {
         use std::io::{Read, Write};
         let pty = nix::pty::openpty(None, None).unwrap();
         let path = nix::unistd::ttyname(&pty.slave).unwrap();
-        let here = open(&format!("serial:{}:3000000", path.display()));
+        let address = format!("serial:{}:3000000", path.display());
+        let here = open(&address);
+        let second = Port::open(&address.parse().unwrap(), Wanted::default());
+        assert_eq!(second.unwrap_err().kind(), io::ErrorKind::AddrInUse, "one program has it");
         let mut far = std::fs::File::from(pty.master);
         // Raw: no byte is changed, none is echoed.
         let sent: Vec<u8> = (0..=255).collect();

@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use nix::fcntl::{Flock, FlockArg};
 use nix::libc::{O_NOCTTY, O_NONBLOCK};
 use nix::poll::{PollFd, PollFlags, poll};
 use nix::sys::termios::{
@@ -28,7 +29,8 @@ pub(super) struct SerialPort {
     path: PathBuf,
     baud: BaudRate,
     flow: bool,
-    file: Mutex<Option<Arc<File>>>,
+    /// Locked: what two programs read, each has half of.
+    file: Mutex<Option<Arc<Flock<File>>>>,
     backlog: Mutex<Vec<u8>>,
 }
 
@@ -70,11 +72,11 @@ impl SerialPort {
         &self.path
     }
 
-    fn current(&self) -> Option<Arc<File>> {
+    fn current(&self) -> Option<Arc<Flock<File>>> {
         self.file.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    fn set(&self, file: Option<Arc<File>>) {
+    fn set(&self, file: Option<Arc<Flock<File>>>) {
         *self.file.lock().unwrap_or_else(PoisonError::into_inner) = file;
     }
 
@@ -94,7 +96,7 @@ impl SerialPort {
         if !matches!(poll(&mut fds, WAIT_MS), Ok(ready) if ready > 0) {
             return None;
         }
-        match (&*file).read(buffer) {
+        match (&**file).read(buffer) {
             Ok(len) if len > 0 => return Some(len),
             Err(error)
                 if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
@@ -111,7 +113,7 @@ impl SerialPort {
             backlog.extend_from_slice(bytes);
         }
         while !backlog.is_empty() {
-            match (&*file).write(&backlog) {
+            match (&**file).write(&backlog) {
                 Ok(len) if len > 0 => {
                     backlog.drain(..len);
                 }
@@ -122,15 +124,17 @@ impl SerialPort {
     }
 }
 
-fn open(path: &Path, baud: BaudRate, flow: bool) -> io::Result<File> {
+fn open(path: &Path, baud: BaudRate, flow: bool) -> io::Result<Flock<File>> {
     let file =
         OpenOptions::new().read(true).write(true).custom_flags(O_NOCTTY | O_NONBLOCK).open(path)?;
-    let mut settings = tcgetattr(&file)?;
+    let file = Flock::lock(file, FlockArg::LockExclusiveNonblock)
+        .map_err(|(_, _)| io::Error::from(ErrorKind::AddrInUse))?;
+    let mut settings = tcgetattr(&*file)?;
     cfmakeraw(&mut settings);
     settings.control_flags |= ControlFlags::CLOCAL | ControlFlags::CREAD;
     settings.control_flags.set(ControlFlags::CRTSCTS, flow);
     cfsetspeed(&mut settings, baud)?;
-    tcsetattr(&file, SetArg::TCSANOW, &settings)?;
-    tcflush(&file, FlushArg::TCIOFLUSH)?;
+    tcsetattr(&*file, SetArg::TCSANOW, &settings)?;
+    tcflush(&*file, FlushArg::TCIOFLUSH)?;
     Ok(file)
 }

@@ -238,6 +238,19 @@ fn a_pilot_and_a_vehicle_on_the_ground_are_left_alone() {
 }
 
 #[test]
+fn another_autopilot_on_the_link_is_not_ours() {
+    let mut rig = Rig::flying();
+    // System 7 says that it stands on the ground.
+    let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+    let beat = HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() };
+    let other = rig.packet((7, 1), &MavMessage::HEARTBEAT(beat));
+    rig.watch.handle_autopilot(at(rig.ms), &other);
+    rig.speaks_until = 2000;
+    rig.run(2600);
+    assert!(!rig.ours(COMMAND_LONG, 0).is_empty());
+}
+
+#[test]
 fn a_runtime_that_wakes_up_orders_nothing_more() {
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;
