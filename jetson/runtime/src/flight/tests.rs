@@ -114,6 +114,7 @@ impl Script {
                     p_world_m: self.p_m,
                     v_world_mps: self.v_mps + self.hand_mps,
                     rotation: DQuat::IDENTITY,
+                    sigma_m: 0.0,
                 };
                 self.flight.handle(self.now, FlightInput::Pose(vehicle));
             }

@@ -39,7 +39,7 @@ const STOPPING_SHARE: f64 = 0.5;
 const LEAST_SHARE: f64 = 0.1;
 /// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
 /// an autopilot's integrators carry the vehicle a decimetre too far. [m]
-const MARGIN_M: f64 = 0.2;
+pub(super) const MARGIN_M: f64 = 0.2;
 /// Kept free under the body while a plugin flies; landing is the autopilot's. Less than the
 /// fence's: low flight is part of courses, and a touch there is a bump. [m]
 const FLOOR_MARGIN_M: f64 = 0.05;

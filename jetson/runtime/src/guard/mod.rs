@@ -31,7 +31,7 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::HostTime;
 
-use fence::{Fence, Momentum};
+use fence::{Fence, MARGIN_M, Momentum};
 use limits::FENCE_EXCESS;
 pub use limits::check_arena;
 use response::Answers;
@@ -50,6 +50,8 @@ pub struct VehicleMotion {
     pub v_world_mps: DVec3,
     /// Attitude: body to world.
     pub rotation: DQuat,
+    /// How far the position may be off, one standard deviation along the worst axis; 0 is not known. [m]
+    pub sigma_m: f64,
 }
 
 impl VehicleMotion {
@@ -60,6 +62,7 @@ impl VehicleMotion {
             p_world_m: sample.world_from_body.translation_m,
             v_world_mps: sample.twist.linear_mps,
             rotation: sample.world_from_body.rotation,
+            sigma_m: f64::from(sample.position_sigma_m.max_element()),
         }
     }
 
@@ -95,6 +98,8 @@ pub enum HoldReason {
     NoSetpoint,
     /// The newest pose is older than [`PoseAges::hold_after_s`].
     PoseStale,
+    /// The pose may be off by more than the guard keeps from the fence: [`UNSURE_SIGMAS`].
+    PoseUnsure,
     /// What the plugin has answered last is older than [`SIGHT_HOLD_S`].
     ImagesOld,
     /// The plugin is being started again.
@@ -114,6 +119,8 @@ pub enum LandReason {
     NoPlugin,
     /// The newest pose is so old. [s]
     PoseLost(f64),
+    /// The pose has been too unsure for as long as it may be away; its standard deviation. [m]
+    PoseUnsure(f64),
     /// What the plugin has answered last has been too old for [`SIGHT_LAND_S`]; now it is so old. [s]
     ImagesOld(f64),
     /// The body is outside the fence by so much. [m]
@@ -135,6 +142,8 @@ pub enum GuardMode {
     Landing(LandReason),
 }
 
+/// So many standard deviations of the pose must fit into what the guard keeps from the fence: hold; for `land_after_s`: land.
+pub const UNSURE_SIGMAS: f64 = 3.0;
 /// No setpoint for this long: hold. A plugin at 10 Hz may miss four images. [s]
 pub const SETPOINT_HOLD_S: f64 = 0.5;
 /// No setpoint for this long: land. [s]
@@ -201,6 +210,8 @@ pub struct Guard {
     seen_at: Option<HostTime>,
     /// Since when that has been too old.
     blind_since: Option<HostTime>,
+    /// When the pose became too unsure.
+    unsure_since: Option<HostTime>,
     slowed: Option<Slowed>,
     /// How the vehicle answers.
     answers: Answers,
@@ -251,6 +262,7 @@ impl Guard {
             speed_limit_mps: arena.limits.max_speed_mps,
             seen_at: None,
             blind_since: None,
+            unsure_since: None,
             slowed: None,
             answers: Answers::new(response, vehicle.v_world_mps, max_acceleration_mps2),
             max_acceleration_mps2,
@@ -374,6 +386,8 @@ impl Guard {
         self.answers.watch(self.v_command_mps, vehicle.v_world_mps, dt_s);
         let response = self.answers.response();
         self.speed_limit_mps = self.max_speed_mps * share * share_of_lag(response);
+        let is_unsure = UNSURE_SIGMAS * vehicle.sigma_m > MARGIN_M;
+        self.unsure_since = is_unsure.then(|| self.unsure_since.unwrap_or(now));
         self.blind_since = (sight_age_s > SIGHT_HOLD_S).then(|| self.blind_since.unwrap_or(now));
         let mode = self.mode(now, vehicle);
         let v_target = match mode {
@@ -449,6 +463,11 @@ impl Guard {
         if pose_age_s > self.pose_ages.land_after_s {
             return GuardMode::Landing(LandReason::PoseLost(pose_age_s));
         }
+        if let Some(since) = self.unsure_since
+            && now.seconds_since(since) > self.pose_ages.land_after_s
+        {
+            return GuardMode::Landing(LandReason::PoseUnsure(vehicle.sigma_m));
+        }
         let outside_m = self.fence.outside_m(vehicle.p_world_m);
         if outside_m > 0.0 {
             return GuardMode::Landing(LandReason::OutsideFence(outside_m));
@@ -476,6 +495,9 @@ impl Guard {
         }
         if pose_age_s > self.pose_ages.hold_after_s {
             return GuardMode::Holding(HoldReason::PoseStale);
+        }
+        if self.unsure_since.is_some() {
+            return GuardMode::Holding(HoldReason::PoseUnsure);
         }
         if silent_s > SETPOINT_HOLD_S {
             return GuardMode::Holding(HoldReason::NoSetpoint);

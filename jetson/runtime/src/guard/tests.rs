@@ -70,7 +70,13 @@ impl Vehicle {
 
     fn motion(&self, stamp: HostTime) -> VehicleMotion {
         let rotation = DQuat::from_rotation_z(self.yaw_rad);
-        VehicleMotion { stamp, p_world_m: self.p_m, v_world_mps: self.v_mps, rotation }
+        VehicleMotion {
+            stamp,
+            p_world_m: self.p_m,
+            v_world_mps: self.v_mps,
+            rotation,
+            sigma_m: 0.0,
+        }
     }
 }
 
@@ -503,6 +509,28 @@ fn old_images_slow_then_hold_then_land() {
         // At tick 35 it is 0.7 s, to the last bit.
         assert!(tick == 35 || holds == (36..=60).contains(&tick), "{tick} {mode:?}");
     }
+}
+
+#[test]
+fn an_unsure_pose_holds_then_lands() {
+    // 3 x 0.06 m fits into the 0.2 m before the fence, 3 x 0.07 m does not.
+    let unsure = |tick, sigma_m| VehicleMotion { sigma_m, ..at_rest(tick) };
+    let mut guard = guard();
+    for tick in 1..=60 {
+        guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        let sigma_m = if (11..=30).contains(&tick) { 0.07 } else { 0.06 };
+        let (_, mode) = guard.tick(time(tick), &unsure(tick, sigma_m));
+        let holds = mode == GuardMode::Holding(HoldReason::PoseUnsure);
+        assert!(holds == (11..=30).contains(&tick), "{tick} {mode:?}");
+    }
+    // A step of the clock more than the half a second that a pose may be away.
+    let lands = (61..200).find(|&tick| {
+        guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+        guard.tick(time(tick), &unsure(tick, 0.5)).0 == GuardOutput::Land
+    });
+    let land_after_s = arena(room(), 3.0, 4.0).pose_ages.land_after_s;
+    let took_s = time(lands.unwrap()).seconds_since(time(61));
+    assert!((land_after_s..land_after_s + 0.05).contains(&took_s), "{took_s}");
 }
 
 #[test]

@@ -95,6 +95,12 @@ pub enum EndReason {
         /// Age of what it answered last. [s]
         age_s: f64,
     },
+    /// The pose may have been off by more than the guard keeps from the fence, for longer than the arena's
+    /// `land_after_s`.
+    PoseUnsure {
+        /// Its standard deviation along the worst axis. [m]
+        sigma_m: f64,
+    },
 }
 
 /// A contact of the vehicle's body.
