@@ -40,8 +40,9 @@ const STALE_S: f64 = 0.5;
 const POSE_EVERY_S: f64 = 0.018;
 /// An autopilot that is not heard for this long gives its place to another. [s]
 const LOST_AFTER_S: f64 = 3.0;
-/// An autopilot that is not heard for this long, once the runtime is gone, is given up. [s]
-const GIVEN_UP_S: f64 = 10.0;
+/// An autopilot that sends nothing at all for this long, once the runtime is gone, is given up: its own failsafes
+/// have begun by then. [s]
+const GIVEN_UP_S: f64 = 5.0;
 /// What the guardian itself was not run for counts as this much silence of the runtime at most: where the whole
 /// computer stands still, the runtime gets its turn first. [s]
 const LONGEST_STEP_S: f64 = 0.05;
@@ -71,6 +72,8 @@ pub struct Watch {
     decoder: StreamDecoder,
     autopilot: Option<(u8, u8)>,
     autopilot_at: HostTime,
+    /// Any packet of it.
+    heard_at: HostTime,
     flight: Flight,
     sequence: u8,
     made_at: HostTime,
@@ -108,6 +111,7 @@ impl Watch {
             decoder: StreamDecoder::default(),
             autopilot: None,
             autopilot_at: now,
+            heard_at: now,
             flight: Flight::UNKNOWN,
             sequence: 0,
             made_at: now,
@@ -144,14 +148,15 @@ impl Watch {
     /// Takes note of what comes from the autopilot.
     pub fn handle_autopilot(&mut self, now: HostTime, bytes: &[u8]) {
         self.step(now);
-        let Self { decoder, verifier, wanted, .. } = self;
-        let (mut beat, mut accepted) = (None, false);
+        let Self { decoder, verifier, wanted, autopilot, .. } = self;
+        let (mut beat, mut accepted, mut is_heard) = (None, false, false);
         let elapsed_us = (now.seconds_since(self.made_at).max(0.0) * 1e6) as u64;
         decoder.push_whole(bytes, |bytes, packet| {
             let system = packet.header.system_id as u8;
             if wanted.system.is_some_and(|wanted| wanted != system) {
                 return;
             }
+            is_heard |= *autopilot == Some((system, packet.header.component_id));
             match &packet.message {
                 MavMessage::HEARTBEAT(heartbeat) if is_flown(heartbeat.autopilot) => {
                     if let (Some(verifier), Some(signing)) = (&mut *verifier, &wanted.signing)
@@ -179,6 +184,9 @@ impl Watch {
             if self.autopilot.is_none_or(|known| known == from || !is_kept) {
                 (self.autopilot, self.autopilot_at, self.flight) = (Some(from), now, flight);
             }
+        }
+        if is_heard {
+            self.heard_at = now;
         }
         if accepted {
             self.failsafe.note_acknowledged(self.own);
@@ -251,7 +259,7 @@ impl Watch {
 
     /// Whether nothing is left to do: the runtime has ended, and the vehicle stands, or is gone.
     pub fn is_over(&self, now: HostTime) -> bool {
-        let is_heard = now.seconds_since(self.autopilot_at) < GIVEN_UP_S;
+        let is_heard = now.seconds_since(self.heard_at) < GIVEN_UP_S;
         self.runtime_is_gone && !(self.flight.armed && is_heard)
     }
 
