@@ -19,6 +19,8 @@ pub(super) struct VehicleNames {
     driver: Driver,
     source: u8,
     alignment: Alignment,
+    /// What the source is late by, always. [s]
+    latency_s: f64,
     objects: Vec<Object>,
     bad_packets: u64,
     /// What the newest packet yielded.
@@ -66,6 +68,7 @@ impl VehicleNames {
             driver: config.driver,
             source,
             alignment: config.alignment(),
+            latency_s: config.latency_ms * 1e-3,
             objects: vehicles.iter().take(MAX_VEHICLES).map(object).collect(),
             bad_packets: 0,
             measured: Vec::with_capacity(MAX_VEHICLES),
@@ -181,7 +184,7 @@ impl VehicleNames {
             }
         });
         self.objects[vehicle].counters.poses += 1;
-        let source = self.source;
+        let (source, stamp) = (self.source, stamp.plus_seconds(-self.latency_s));
         self.measured.push(Measurement { vehicle, source, stamp, arrival, world_from_body, sigma });
     }
 
