@@ -369,22 +369,31 @@ impl Referee {
     }
 
     fn report_change(&mut self, now: ServerTime) {
-        match self.filter.poll_change() {
-            Some(PoseChange::Lost(age_s, why)) => {
-                let why = why.map_or_else(String::new, |why| format!(": {why}"));
-                let text = format!("no pose for {:.0} ms{why}", age_s * 1e3);
-                self.report(now, EventKind::PoseLost { age_s }, &text);
+        while let Some(change) = self.filter.poll_change() {
+            match change {
+                PoseChange::Lost(age_s, why) => {
+                    let why = why.map_or_else(String::new, |why| format!(": {why}"));
+                    let text = format!("no pose for {:.0} ms{why}", age_s * 1e3);
+                    self.report(now, EventKind::PoseLost { age_s }, &text);
+                }
+                PoseChange::Regained => {
+                    self.report(now, EventKind::PoseRegained, "poses are back");
+                }
+                PoseChange::Jumped(distance_m, angle_rad) => {
+                    let text = format!(
+                        "the pose jumped by {distance_m:.2} m and {:.0} degrees and stayed there; it \
+                         is accepted, as a reset: was the origin moved, or are markers swapped?",
+                        angle_rad.to_degrees()
+                    );
+                    self.report(now, EventKind::Note, &text);
+                }
+                PoseChange::ImuLeftOut => {
+                    let text = "the autopilot's IMU contradicts the poses and is left out: is the \
+                                object's frame turned against the autopilot, or does the vehicle \
+                                shake?";
+                    self.report(now, EventKind::Note, text);
+                }
             }
-            Some(PoseChange::Regained) => {
-                self.report(now, EventKind::PoseRegained, "poses are back");
-            }
-            Some(PoseChange::ImuLeftOut) => {
-                let text = "the autopilot's IMU contradicts the poses and is left out: is the \
-                            object's frame turned against the autopilot, or does the vehicle \
-                            shake?";
-                self.report(now, EventKind::Note, text);
-            }
-            None => {}
         }
     }
 

@@ -10,7 +10,7 @@ use super::estimate::{Estimate, Manoeuvre};
 use super::history::{History, Input, Record};
 use super::motion::Motion;
 use super::quality::{Fading, PoseQuality, Rejects};
-use super::source::{ClaimKind, Source};
+use super::source::{ClaimKind, Source, Surprise};
 use super::{ImuReading, MAX_SOURCES, Measured, PoseConfig, PoseSigma, Rejected};
 
 /// What changed about the sources of poses.
@@ -20,6 +20,8 @@ pub enum PoseChange {
     Lost(f64, Option<Rejected>),
     /// Poses are back.
     Regained,
+    /// The pose jumped so far [m], turned at once so far [rad], and stayed there: a reset.
+    Jumped(f64, f64),
     /// The IMU contradicts the poses and is left out from now on.
     ImuLeftOut,
 }
@@ -36,6 +38,8 @@ pub struct PoseFilter {
     resets: u8,
     lost: bool,
     change: Option<PoseChange>,
+    /// A reset that nobody has been told of.
+    jumped: Option<PoseChange>,
     imu: Imu,
     /// Intervals of accepted poses, and their innovations. [standard deviations]
     accepted: Fading,
@@ -59,7 +63,11 @@ enum GateResult {
     /// A motion that the model did not foresee.
     Manoeuvre(Manoeuvre),
     /// The pose changed for another reason than motion.
-    Reset,
+    Reset {
+        distance_m: f64,
+        angle_rad: f64,
+    },
+
     Rejected(Rejected),
 }
 
@@ -81,6 +89,7 @@ impl PoseFilter {
             resets: 0,
             lost: false,
             change: None,
+            jumped: None,
             imu: Imu::default(),
             accepted: Fading::default(),
         }
@@ -125,8 +134,21 @@ impl PoseFilter {
         let sigma = self.sigma(measured);
         let long_ago =
             self.newest.is_none_or(|newest| stamp.seconds_since(newest.stamp) > BEGIN_ANEW_AFTER_S);
-        if long_ago && self.sources[index].pending(measured).is_none() {
-            self.begin(stamp, &pose, &sigma);
+        let still = Surprise {
+            stamp,
+            pose,
+            is_turned: false,
+            // Nothing is expected.
+            off_m: DVec3::INFINITY,
+            off_rad: DVec3::INFINITY,
+            v_world_mps: DVec3::ZERO,
+            omega_body_radps: DVec3::ZERO,
+            noise_m: 0.0,
+            noise_rad: 0.0,
+        };
+        if long_ago && self.sources[index].pending(&still).is_none() {
+            let noise = self.sources[index].noise_factor();
+            self.begin(stamp, &pose, &sigma.times(noise));
             return Ok(0.0);
         }
         if !self.history.reaches(stamp) {
@@ -135,9 +157,14 @@ impl PoseFilter {
         let imu = &mut self.imu;
         let prior = self.history.at(stamp, |estimate, record| imu.fuse(estimate, record));
         let Some(prior) = prior else { return Err(Rejected::Stale) };
+        let begins = self.sources[index].add(stamp, &pose, &sigma);
         let noise = self.sources[index].noise_factor();
-        let result = self.judge(index, measured, &sigma, &prior);
+        let result = self.judge(index, measured, &sigma, &prior, begins);
         let taken = match result {
+            GateResult::Fits { sigmas } if begins => {
+                self.begin(stamp, &pose, &sigma.times(noise));
+                return Ok(sigmas);
+            }
             GateResult::Fits { sigmas } => {
                 self.put(stamp, &pose, self.variances(&sigma, &prior, noise), None);
                 Ok(sigmas)
@@ -146,9 +173,10 @@ impl PoseFilter {
                 self.put(stamp, &pose, self.variances(&sigma, &prior, noise), Some(manoeuvre));
                 Ok(self.config.gate_sigmas)
             }
-            GateResult::Reset => {
+            GateResult::Reset { distance_m, angle_rad } => {
+                self.jumped = Some(PoseChange::Jumped(distance_m, angle_rad));
                 self.resets = self.resets.wrapping_add(1);
-                self.begin(stamp, &pose, &sigma);
+                self.begin(stamp, &pose, &sigma.times(noise));
                 return Ok(self.config.gate_sigmas);
             }
             GateResult::Rejected(reason) => Err(reason),
@@ -183,6 +211,7 @@ impl PoseFilter {
         measured: &Measured,
         sigma: &PoseSigma,
         prior: &Estimate,
+        begins: bool,
     ) -> GateResult {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         if let Err(frozen) = self.sources[index].check_frozen(measured, self.imu.turned) {
@@ -194,54 +223,97 @@ impl PoseFilter {
         let attitude = prior.attitude_innovation(pose.rotation, variance_rad2);
         let sigmas = place.sigmas.max(attitude.sigmas);
         let gate = self.config.gate_sigmas;
-        // The longer nothing is accepted, the more would fit; what did not at first must prove true.
-        let pending = self.sources[index].pending(measured).map(|claim| claim.kind);
-        let denied = matches!(pending, Some(ClaimKind::Jump(_) | ClaimKind::Flip));
-        if !denied && place.residual.length() < LEARNS_WITHIN_M {
-            self.sources[index].learn(sigmas);
-        }
-        if sigmas <= gate && !denied {
-            return GateResult::Fits { sigmas };
-        }
-        let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
+        let surprise = Surprise {
+            stamp,
+            pose,
+            is_turned: attitude.sigmas > place.sigmas,
+            off_m: place.residual,
+            off_rad: attitude.residual,
+            v_world_mps: prior.v_world_mps,
+            omega_body_radps: prior.omega_body_radps,
+            noise_m: sigma.position_m.max_element() * noise.sqrt(),
+            noise_rad: sigma.rotation_rad.max_element() * noise.sqrt(),
+        };
+        // The longer nothing is accepted, the more would fit: what several poses have claimed goes on being a claim
+        // as long as it is nearer than what was expected.
+        let denied = self.sources[index]
+            .pending(&surprise)
+            .is_some_and(|claim| claim.count >= 2 && claim.explains(&surprise));
+        self.sources[index].add_innovation(sigmas);
         let trusted = self.sources.iter().enumerate().find(|(other, source)| {
             let age_s = source.accepted_at.map(|at| stamp.seconds_since(at).abs());
             *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
         });
+        let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
+        let newest = self.newest.map_or(stamp, |newest| newest.stamp);
+        let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
+        let far = distance_m > DOUBT_M.max(DOUBT_SIGMAS * surprise.noise_m)
+            || angle_rad > DOUBT_RAD.max(DOUBT_SIGMAS * surprise.noise_rad);
+        // A doubt must not cost the pose.
+        let interval_s = 1.0 / self.sources[index].rate_hz(stamp).max(1.0);
+        let matters = far
+            && dt_s <= (DOUBT_UNTIL * self.config.hold_after_s).max(DOUBT_INTERVALS * interval_s);
+        let sure = match trusted {
+            None if matters && self.sources[index].is_known() => {
+                self.sources[index].sure_within(gate)
+            }
+            _ => gate,
+        };
+        if sigmas <= sure && !denied {
+            return GateResult::Fits { sigmas };
+        }
         if let Some((other, _)) = trusted {
             let other = other as u8;
             return GateResult::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
         }
-        let newest = self.newest.map_or(stamp, |newest| newest.stamp);
-        let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
         let speed_mps = distance_m / dt_s;
         // A gyroscope would have measured a turn.
         let measured_turn = self.imu_is_fresh(stamp) && angle_rad > MEASURABLE_RAD;
-        let kind = if place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS {
-            ClaimKind::Jump(speed_mps)
-        } else if attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS) {
+        let flips = attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS);
+        let leaps = place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS;
+        let kind = if sigmas <= gate {
+            ClaimKind::Doubtful
+        } else if leaps {
+            ClaimKind::Leap
+        } else if flips {
             ClaimKind::Flip
         } else {
-            ClaimKind::Manoeuvre(dt_s)
+            ClaimKind::Shift
         };
-        let claim = self.sources[index].claim(measured, kind);
-        match claim.kind {
-            ClaimKind::Jump(_)
-                if claim.count >= JUMP_CONFIRMED && claim.lasted_s() >= JUMP_LASTS_S =>
-            {
-                GateResult::Reset
-            }
-            ClaimKind::Flip if claim.lasted_s() >= self.config.flip_believed_after_s => {
-                GateResult::Reset
-            }
-            ClaimKind::Manoeuvre(dt_s) if claim.count >= MANOEUVRE_CONFIRMED => {
+        // Before it is known how the source scatters, nothing is expected of it.
+        if kind <= ClaimKind::Shift && (begins || !self.sources[index].is_known()) {
+            return GateResult::Fits { sigmas: sigmas.min(gate) };
+        }
+        let (claim, moves) = self.sources[index].claim(&surprise, kind);
+        // Two poses are enough where they follow each other so closely that outliers could hardly look like a motion.
+        let close = claim.lasted_s() <= CLOSE_S / 2.0;
+        let enough = if close || sigmas <= gate { 2 } else { CONFIRMED };
+        if moves && claim.count >= enough {
+            return if sigmas <= gate {
+                GateResult::Fits { sigmas }
+            } else {
                 GateResult::Manoeuvre(Manoeuvre { distance_m, angle_rad, dt_s })
+            };
+        }
+        let lasted_s = claim.lasted_s();
+        let stays = claim.count >= JUMP_CONFIRMED && lasted_s >= JUMP_LASTS_S
+            || claim.count >= CONFIRMED && lasted_s >= JUMP_LASTS_LONG_S;
+        match claim.kind {
+            ClaimKind::Doubtful if claim.count >= CONFIRMED => GateResult::Fits { sigmas },
+            ClaimKind::Shift | ClaimKind::Leap if stays => {
+                GateResult::Reset { distance_m, angle_rad }
             }
-            ClaimKind::Jump(speed_mps) => {
-                GateResult::Rejected(Rejected::Jump { distance_m, speed_mps })
+            ClaimKind::Flip if lasted_s >= self.config.flip_believed_after_s => {
+                GateResult::Reset { distance_m, angle_rad }
             }
             ClaimKind::Flip => GateResult::Rejected(Rejected::Flip(angle_rad)),
-            ClaimKind::Manoeuvre(_) => GateResult::Rejected(Rejected::Outlier(sigmas)),
+            ClaimKind::Shift if claim.count >= 2 && !moves => {
+                GateResult::Rejected(Rejected::Jump { distance_m, speed_mps })
+            }
+            ClaimKind::Leap => GateResult::Rejected(Rejected::Jump { distance_m, speed_mps }),
+            ClaimKind::Shift | ClaimKind::Doubtful => {
+                GateResult::Rejected(Rejected::Outlier(sigmas))
+            }
         }
     }
 
@@ -330,12 +402,12 @@ impl PoseFilter {
 
     /// Notices silence. Call at [`Self::poll_timeout`].
     pub fn handle_timeout(&mut self, now: ServerTime) {
-        if let Some(newest) = self.newest {
+        if let (Some(newest), Some(due)) = (self.newest, self.poll_timeout())
+            && now >= due
+        {
+            self.lost = true;
             let age_s = now.seconds_since(newest.stamp);
-            if age_s >= self.config.hold_after_s && !self.lost {
-                self.lost = true;
-                self.change = Some(PoseChange::Lost(age_s, self.rejected));
-            }
+            self.change = Some(PoseChange::Lost(age_s, self.rejected));
         }
     }
 
@@ -344,12 +416,24 @@ impl PoseFilter {
     pub fn poll_timeout(&self) -> Option<ServerTime> {
         let newest = self.newest.filter(|_| !self.lost)?;
         // A nanosecond later: the sum is rounded.
-        Some(newest.stamp.plus_seconds(self.config.hold_after_s).plus_ns(1))
+        Some(newest.stamp.plus_seconds(self.patience_s(newest.stamp)).plus_ns(1))
     }
 
-    /// Returns a change of the source once.
+    /// Returns for how long a missing pose is no lost one: as configured, but at least until a slow source has left out
+    /// one and is late with the next. [s]
+    fn patience_s(&self, now: ServerTime) -> f64 {
+        let rate_hz = self.sources.iter().map(|source| source.rate_hz(now)).fold(0.0, f64::max);
+        let PoseConfig { hold_after_s, land_after_s, .. } = self.config;
+        if rate_hz > 0.0 {
+            (MISSED_POSES / rate_hz).clamp(hold_after_s, land_after_s)
+        } else {
+            hold_after_s
+        }
+    }
+
+    /// Returns a change of the source once. Call until there is none.
     pub fn poll_change(&mut self) -> Option<PoseChange> {
-        self.change.take()
+        self.change.take().or_else(|| self.jumped.take())
     }
 
     /// Returns the newest accepted pose.
@@ -435,29 +519,41 @@ impl Imu {
     }
 }
 
+/// Intervals that pass while one pose is left out and the next is late.
+const MISSED_POSES: f64 = 2.5;
 /// Positions beyond this are no room's. [m]
 const FURTHEST_M: f64 = 1e4;
 /// After such a pause nothing of the former motion holds. [s]
 const BEGIN_ANEW_AFTER_S: f64 = 1.0;
 /// A source that was accepted so lately is accepted against another. [s]
 const TRUSTED_FOR_S: f64 = 0.15;
-/// What is further off is no noise of a localization that flies. [m]
-const LEARNS_WITHIN_M: f64 = 0.3;
 /// Measurements closer together carry no information on speed. [s]
 const MIN_DT_S: f64 = 1e-4;
 /// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
 /// [m/s]
-const MAX_MANOEUVRE_MPS: f64 = 15.0;
+pub(super) const MAX_MANOEUVRE_MPS: f64 = 15.0;
 /// Racing drones turn by 2000 degrees a second. [rad/s]
-const MAX_TURN_RADPS: f64 = 35.0;
+pub(super) const MAX_TURN_RADPS: f64 = 35.0;
 /// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
 const MEASURABLE_RAD: f64 = 0.2;
-/// A jump that stays put for so many measurements, over so long, is the truth (a moved origin, a
-/// regained object). [s]
-const JUMP_CONFIRMED: u32 = 10;
-const JUMP_LASTS_S: f64 = 0.02;
-/// One measurement off is an outlier, a second one like it is a motion.
-const MANOEUVRE_CONFIRMED: u32 = 2;
+/// A jump that stays for so many measurements, over so long, is the truth (a moved origin, a regained object); fewer are
+/// enough over longer. [s]
+const JUMP_CONFIRMED: u32 = 5;
+const JUMP_LASTS_S: f64 = 0.015;
+const JUMP_LASTS_LONG_S: f64 = 0.095;
+/// One or two measurements off are outliers, a third one that goes on is a motion.
+const CONFIRMED: u32 = 3;
+/// What is closer to the expected is accepted without doubt: less than half of what an outlier must be to do harm, and
+/// what a start at 4 m/s^2 is off at 10 Hz. [m], [rad]
+const DOUBT_M: f64 = 0.02;
+const DOUBT_RAD: f64 = 0.1;
+/// Share of `hold_after_s` for which doubtful measurements are left out, and intervals of a slow source.
+const DOUBT_UNTIL: f64 = 0.7;
+const DOUBT_INTERVALS: f64 = 2.2;
+/// And so is what the source's noise explains. [standard deviations]
+const DOUBT_SIGMAS: f64 = 5.0;
+/// Over two intervals; in so short a time a motion is so short that two outliers seldom look like one. [s]
+const CLOSE_S: f64 = 0.03;
 /// Noise of a flight controller's gyroscope with the motors running. [rad/s]
 const GYRO_SIGMA_RADPS: f64 = 0.03;
 /// Noise of its accelerometer with the motors running: mostly vibration. [m/s^2]

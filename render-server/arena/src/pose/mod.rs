@@ -43,6 +43,14 @@ pub struct PoseSigma {
     pub rotation_rad: DVec3,
 }
 
+impl PoseSigma {
+    /// Returns the same with its variances multiplied.
+    fn times(&self, factor: f64) -> Self {
+        let root = factor.sqrt();
+        Self { position_m: self.position_m * root, rotation_rad: self.rotation_rad * root }
+    }
+}
+
 /// A pose as its source gave it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measured {
@@ -83,13 +91,13 @@ pub enum Rejected {
     /// The stamps went back by so much while poses kept coming. [s]
     #[error("the stamps of the poses went back by {0:.2} s: the source's clock was set")]
     ClockJump(f64),
-    /// Beyond the gate by itself; a second one like it would be accepted. [standard deviations]
+    /// Off by itself; others that go on from it would be accepted. [standard deviations]
     #[error("the pose is {0:.0} standard deviations from the expected: an outlier")]
     Outlier(f64),
-    /// Further from the expected than any vehicle flies.
+    /// Further from the expected than any vehicle flies, or for the second time at one place off it.
     #[error(
-        "the pose jumped by {distance_m:.2} m, as fast as {speed_mps:.0} m/s: another object, or \
-         swapped markers?"
+        "the pose jumped by {distance_m:.2} m: an outlier, another object, swapped markers, or a \
+         moved origin?"
     )]
     Jump {
         /// From where it was expected. [m]

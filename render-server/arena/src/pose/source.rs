@@ -1,33 +1,61 @@
 //! What is remembered of one source of poses, to distinguish a bad measurement from a bad prediction.
 
-use glam::DQuat;
+use std::collections::VecDeque;
+
+use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::ServerTime;
 
 use super::estimate::{Estimate, shortest};
+use super::filter::{MAX_MANOEUVRE_MPS, MAX_TURN_RADPS};
 use super::quality::{Fading, Rejects, SourceQuality};
-use super::{Measured, Rejected};
+use super::{Measured, PoseSigma, Rejected};
 
 /// Poses that do not fit what is known, but each other.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Claim {
     pub kind: ClaimKind,
+    /// The first of them, and how far it was from what was expected. [m, world], [rad, body]
     since: ServerTime,
+    first_off_m: DVec3,
+    first_off_rad: DVec3,
+    /// Whether the attitude is what does not fit.
+    is_turned: bool,
     newest: ServerTime,
     pose: Pose<World, Body>,
     /// How many.
     pub count: u32,
 }
 
-/// What the vehicle would have to have done.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// What is wrong with them; the worst of them counts.
+#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub(super) enum ClaimKind {
-    /// A turn or a stop that the motion model does not foresee, over this time. [s]
-    Manoeuvre(f64),
-    /// Flown faster than vehicles fly. [m/s]
-    Jump(f64),
+    /// Within the gate, but so far off that an outlier is as likely as a manoeuvre.
+    Doubtful,
+    /// Beyond the gate, as far as a manoeuvre may lead.
+    Shift,
+    /// Further than vehicles fly in the time.
+    Leap,
     /// Turned faster than vehicles turn.
     Flip,
+}
+
+/// A pose that does not fit, beside what was expected in its place.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Surprise {
+    pub stamp: ServerTime,
+    pub pose: Pose<World, Body>,
+    /// How far it is from what was expected. [m, world], [rad, body]
+    pub off_m: DVec3,
+    pub off_rad: DVec3,
+    /// Whether the attitude is what does not fit, more than the place.
+    pub is_turned: bool,
+    /// How what was expected moves. [m/s, world], [rad/s, body]
+    pub v_world_mps: DVec3,
+    pub omega_body_radps: DVec3,
+    /// One standard deviation of the measurement. [m], [rad]
+    pub noise_m: f64,
+    pub noise_rad: f64,
 }
 
 /// The last accepted pose, as long as it comes again and again.
@@ -55,18 +83,91 @@ pub(super) struct Source {
     noise: Noise,
 }
 
-/// How its measurements scatter against their stated sigmas.
-#[derive(Clone, Copy, Debug)]
+/// How its measurements scatter, by their medians: a few outliers, however great, teach nothing.
+#[derive(Clone, Debug, Default)]
 struct Noise {
-    /// Mean square of innovations in standard deviations, an axis: 1 where all is as stated.
-    square: f64,
-    /// What variances are multiplied by.
-    factor: f64,
+    /// The last two measurements.
+    last: Option<(ServerTime, Pose<World, Body>)>,
+    step: Option<Step>,
+    /// Squares of how far each measurement is beside the line through the two before it, 1 in the median where noise is
+    /// as stated and nobody manoeuvres; of places and of attitudes.
+    places: Window,
+    attitudes: Window,
+    /// Innovations of the filter. [standard deviations]
+    innovations: Window,
 }
 
-impl Default for Noise {
-    fn default() -> Self {
-        Self { square: 1.0, factor: 1.0 }
+/// From one measurement to the next.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    dt_s: f64,
+    moved_m: DVec3,
+    turned_rad: DVec3,
+}
+
+/// The last values, and their median.
+#[derive(Clone, Debug, Default)]
+struct Window(VecDeque<f64>);
+
+impl Window {
+    fn push(&mut self, value: f64) {
+        if self.0.len() == WINDOW {
+            self.0.pop_front();
+        }
+        self.0.push_back(value);
+    }
+
+    /// Returns 0 where there is no value.
+    fn median(&self) -> f64 {
+        let mut values = [0.0; WINDOW];
+        let count = self.0.len().min(WINDOW);
+        for (to, from) in values.iter_mut().zip(&self.0) {
+            *to = *from;
+        }
+        match count {
+            0 => 0.0,
+            _ => *values[..count].select_nth_unstable_by(count / 2, f64::total_cmp).1,
+        }
+    }
+}
+
+impl Noise {
+    fn add(&mut self, stamp: ServerTime, pose: &Pose<World, Body>, sigma: &PoseSigma) {
+        let Some((at, from)) = self.last.replace((stamp, *pose)) else { return };
+        let step = Step {
+            dt_s: stamp.seconds_since(at),
+            moved_m: pose.translation_m - from.translation_m,
+            turned_rad: shortest(from.rotation.conjugate() * pose.rotation).to_scaled_axis(),
+        };
+        // Only steps of one length show what is beside the line.
+        let former = self.step.replace(step);
+        let Some(former) = former.filter(|former| {
+            (0.5..2.0).contains(&(step.dt_s / former.dt_s)) && step.dt_s < CLAIM_LASTS_S
+        }) else {
+            return;
+        };
+        let share = step.dt_s / former.dt_s;
+        // Variances of one measurement, of `share` and one more of the middle one, and of `share` of the first.
+        let weight = MEDIAN_SQUARE * (1.0 + (1.0 + share).powi(2) + share * share);
+        let add = |window: &mut Window, beside: DVec3, usual: f64, sigma: f64| {
+            let by_motion = usual * step.dt_s * step.dt_s;
+            let square = (beside.length_squared() - by_motion * by_motion).max(0.0);
+            window.push(square / (weight * sigma * sigma));
+        };
+        let beside_m = step.moved_m - former.moved_m * share;
+        let beside_rad = step.turned_rad - former.turned_rad * share;
+        add(&mut self.places, beside_m, USUAL_MPS2, sigma.position_m.max_element());
+        add(&mut self.attitudes, beside_rad, USUAL_RADPS2, sigma.rotation_rad.max_element());
+    }
+
+    fn is_known(&self) -> bool {
+        self.places.0.len() >= TRIAL
+    }
+
+    /// Returns what variances are to be multiplied by: 1 as long as measurements scatter as their sigmas state.
+    fn factor(&self) -> f64 {
+        let square = self.places.median().max(self.attitudes.median());
+        if square > NOISY_SQUARE { square.min(MAX_FACTOR) } else { 1.0 }
     }
 }
 
@@ -102,7 +203,7 @@ impl Source {
         let flown_m = if still.speed_mps > MOVING_MPS { still.speed_mps * since_s } else { 0.0 };
         let turned_rad =
             if still.turn_radps > TURNING_RADPS { still.turn_radps * since_s } else { 0.0 };
-        let by_gyro_rad = shortest(still.turned.conjugate() * turned).to_scaled_axis().length();
+        let by_gyro_rad = angle_rad(still.turned.conjugate() * turned);
         let frozen = flown_m > FROZEN_M
             || turned_rad > FROZEN_RAD
             || by_gyro_rad > FROZEN_RAD + GYRO_DRIFT_RADPS * since_s;
@@ -110,20 +211,41 @@ impl Source {
     }
 
     /// Returns the claim that earlier poses made, if this one makes it too.
-    pub(super) fn pending(&self, measured: &Measured) -> Option<Claim> {
-        self.claim.filter(|claim| claim.fits(measured.stamp, &measured.world_from_body))
+    pub(super) fn pending(&self, surprise: &Surprise) -> Option<Claim> {
+        self.claim.filter(|claim| claim.is_made_by(surprise))
     }
 
-    /// Takes note of a pose that does not fit; returns its claim, of `kind` if it is the first to
-    /// make it.
-    pub(super) fn claim(&mut self, measured: &Measured, kind: ClaimKind) -> Claim {
-        let Measured { stamp, world_from_body: pose, .. } = *measured;
-        let claim = match self.pending(measured) {
-            Some(claim) => Claim { newest: stamp, pose, count: claim.count + 1, ..claim },
-            None => Claim { kind, since: stamp, newest: stamp, pose, count: 1 },
+    /// Takes note of a pose that does not fit; returns its claim, and whether that is a manoeuvre: poses that
+    /// leave the expected path together, each further than the one before.
+    pub(super) fn claim(&mut self, surprise: &Surprise, kind: ClaimKind) -> (Claim, bool) {
+        let Surprise { stamp, pose, off_m, off_rad, .. } = *surprise;
+        // What was only doubted says nothing of what is beyond the gate.
+        let former = self
+            .claim
+            .filter(|former| former.kind > ClaimKind::Doubtful || kind == ClaimKind::Doubtful);
+        let accepted_at = self.accepted_at.unwrap_or(stamp);
+        let moves = former.filter(|former| former.leads_to(surprise, accepted_at));
+        let claim = match moves.or(former.filter(|former| former.is_made_by(surprise))) {
+            Some(former) => Claim {
+                kind: if kind > former.kind { kind } else { former.kind },
+                newest: stamp,
+                pose,
+                count: former.count + 1,
+                ..former
+            },
+            None => Claim {
+                kind,
+                since: stamp,
+                first_off_m: off_m,
+                first_off_rad: off_rad,
+                is_turned: surprise.is_turned,
+                newest: stamp,
+                pose,
+                count: 1,
+            },
         };
         self.claim = Some(claim);
-        claim
+        (claim, moves.is_some() && claim.kind <= ClaimKind::Shift)
     }
 
     /// Takes note of an accepted pose, after which the vehicle moves as in `estimate`.
@@ -143,22 +265,47 @@ impl Source {
         }
     }
 
+    /// Takes note of a measurement, accepted or not; returns whether it shows for the first time that the source is
+    /// noisier than it states, so that what is known by now rests on too much trust.
+    pub(super) fn add(
+        &mut self,
+        stamp: ServerTime,
+        pose: &Pose<World, Body>,
+        sigma: &PoseSigma,
+    ) -> bool {
+        let was_known = self.noise.is_known();
+        self.noise.add(stamp, pose, sigma);
+        !was_known && self.noise.is_known() && self.noise.factor() > 1.0
+    }
+
+    /// Takes note of how far a measurement is from what was expected. [standard deviations]
+    pub(super) fn add_innovation(&mut self, sigmas: f64) {
+        self.noise.innovations.push(sigmas);
+    }
+
     /// Returns what this source's variances are to be multiplied by: 1 as long as its measurements
     /// scatter as their sigmas state.
     pub(super) fn noise_factor(&self) -> f64 {
-        self.noise.factor
+        if self.noise.is_known() { self.noise.factor() } else { 1.0 }
     }
 
-    /// Learns from a measurement that is no jump: it was off by so many standard deviations of
-    /// three axes.
-    pub(super) fn learn(&mut self, sigmas: f64) {
-        let Noise { square, factor } = &mut self.noise;
-        *square += ((sigmas * sigmas / 3.0).min(MAX_SQUARE) - *square) * LEARNS;
-        if *square > NOISY_SQUARE {
-            *factor = (*factor * (1.0 + LEARNS)).min(MAX_FACTOR);
-        } else if *square < CALM_SQUARE {
-            *factor = (*factor * (1.0 - LEARNS)).max(1.0);
-        }
+    /// Whether enough has come to know how its measurements scatter.
+    pub(super) fn is_known(&self) -> bool {
+        self.noise.is_known()
+    }
+
+    /// Returns how many standard deviations are no surprise by what came lately, at most a share of the gate: a source whose
+    /// poses are always close to what is expected is doubted sooner.
+    pub(super) fn sure_within(&self, gate: f64) -> f64 {
+        let usual = self.noise.innovations.median() * SURPRISING;
+        let sure = usual.clamp(LEAST_SURPRISE, gate * MOST_SURE);
+        // Outliers come in pairs, and after one more would fit.
+        if self.claim.is_some() { sure * AFTER_OUTLIER } else { sure }
+    }
+
+    /// Returns how often measurements come, accepted or not. [Hz]
+    pub(super) fn rate_hz(&self, now: ServerTime) -> f64 {
+        self.latency.rate_hz(now)
     }
 
     pub(super) fn reject(&mut self, reason: &Rejected) {
@@ -182,15 +329,61 @@ impl Source {
 }
 
 impl Claim {
-    /// Whether a vehicle at the claimed position could be there now.
-    fn fits(&self, stamp: ServerTime, pose: &Pose<World, Body>) -> bool {
+    /// Whether an object at the claimed place, at rest or moving as the vehicle does, would be there now.
+    fn is_made_by(&self, surprise: &Surprise) -> bool {
+        let Surprise { stamp, v_world_mps, omega_body_radps, .. } = *surprise;
         let dt_s = stamp.seconds_since(self.newest);
-        let moved_m = (pose.translation_m - self.pose.translation_m).length();
-        let turned_rad =
-            shortest(self.pose.rotation.conjugate() * pose.rotation).to_scaled_axis().length();
+        let moved_m = surprise.pose.translation_m - self.pose.translation_m;
+        let turned = self.pose.rotation.conjugate() * surprise.pose.rotation;
+        let turning = DQuat::from_scaled_axis(-omega_body_radps * dt_s);
+        let mut fits_m = FITS_M + FITS_MPS * dt_s + FITS_SIGMAS * surprise.noise_m;
+        let mut fits_rad = FITS_RAD + FITS_RADPS * dt_s + FITS_SIGMAS * surprise.noise_rad;
+        // What agrees is closer to each other than to the expected.
+        if self.is_turned {
+            fits_rad = fits_rad.min(CLOSER * surprise.off_rad.length());
+        } else {
+            fits_m = fits_m.min(CLOSER * surprise.off_m.length());
+        }
         (0.0..=CLAIM_LASTS_S).contains(&dt_s)
-            && moved_m <= FITS_M + FITS_MPS * dt_s
-            && turned_rad <= FITS_RAD + FITS_RADPS * dt_s
+            && moved_m.length().min((moved_m - v_world_mps * dt_s).length()) <= fits_m
+            && angle_rad(turned).min(angle_rad(turned * turning)) <= fits_rad
+    }
+
+    /// Whether the way from its first pose to this one, flown backwards, leads to the expected path between the last
+    /// accepted pose and the first that was not: a bump or a hard stop does, an outlier does not.
+    fn leads_to(&self, surprise: &Surprise, accepted_at: ServerTime) -> bool {
+        let dt_s = surprise.stamp.seconds_since(self.since);
+        let before_s = self.since.seconds_since(accepted_at).max(0.0);
+        // What was flown in a pause of the source nobody knows.
+        let unseen_m = if before_s > PAUSE_S { UNSEEN_MPS * before_s } else { 0.0 };
+        let leads = |first: DVec3, now: DVec3, noise: f64, most: f64| {
+            let way = now - first;
+            let along = first.dot(way) / way.length_squared().max(f64::MIN_POSITIVE);
+            let miss = first - way * along.clamp(0.0, before_s / dt_s);
+            way.length() <= most * dt_s && miss.length() <= ASTRAY * first.length() + noise
+        };
+        let Surprise { off_m, off_rad, noise_m, noise_rad, .. } = *surprise;
+        // From within the noise every way leads back.
+        let is_beyond_noise = if self.is_turned {
+            self.first_off_rad.length() > FITS_SIGMAS * noise_rad
+        } else {
+            self.first_off_m.length() > FITS_SIGMAS * noise_m
+        };
+        dt_s > 0.0
+            && is_beyond_noise
+            && surprise.stamp.seconds_since(self.newest) <= CLAIM_LASTS_S
+            && leads(self.first_off_m, off_m, FITS_SIGMAS * noise_m + unseen_m, MAX_MANOEUVRE_MPS)
+            && leads(self.first_off_rad, off_rad, FITS_SIGMAS * noise_rad, MAX_TURN_RADPS)
+    }
+
+    /// Whether it explains the pose better than what was expected.
+    pub(super) fn explains(&self, surprise: &Surprise) -> bool {
+        let Surprise { pose, off_m, off_rad, .. } = surprise;
+        if self.is_turned {
+            angle_rad(self.pose.rotation.conjugate() * pose.rotation) < off_rad.length()
+        } else {
+            (pose.translation_m - self.pose.translation_m).length() < off_m.length()
+        }
     }
 
     /// How long it has been made. [s]
@@ -199,15 +392,30 @@ impl Claim {
     }
 }
 
-/// Share of what one measurement teaches: 50 of them.
-const LEARNS: f64 = 0.02;
-/// One measurement does not count for more. [sigma^2]
-const MAX_SQUARE: f64 = 36.0;
-/// Beyond this a source scatters by more than it states; a motion model that fits badly for a while
-/// does not reach it.
-const NOISY_SQUARE: f64 = 2.5;
-/// Below this its weight may rise again.
-const CALM_SQUARE: f64 = 1.2;
+/// Returns the angle of a rotation. [rad]
+fn angle_rad(rotation: DQuat) -> f64 {
+    shortest(rotation).to_scaled_axis().length()
+}
+
+/// Measurements that are remembered: a second at 30 Hz.
+const WINDOW: usize = 32;
+/// So many are enough to judge by: 0.3 s at 30 Hz.
+const TRIAL: usize = 8;
+/// The median of what is distributed as chi square with three degrees of freedom.
+const MEDIAN_SQUARE: f64 = 2.37;
+/// What a hovering vehicle does anyway. [m/s^2], [rad/s^2]
+const USUAL_MPS2: f64 = 1.0;
+const USUAL_RADPS2: f64 = 2.0;
+/// So many times the usual innovation is a surprise.
+const SURPRISING: f64 = 4.0;
+/// And less than this is none: what the filter itself expects of every other pose. [standard deviations]
+const LEAST_SURPRISE: f64 = 1.5;
+/// After a measurement that did not fit, less is one.
+const AFTER_OUTLIER: f64 = 0.5;
+/// But this share of the gate is one.
+const MOST_SURE: f64 = 0.5;
+/// Beyond this a source scatters by more than it states, and not by chance. [sigma^2]
+const NOISY_SQUARE: f64 = 1.8;
 /// Ten times the sigma: what is worse still is no localization.
 const MAX_FACTOR: f64 = 100.0;
 /// A measurement may seem to come before it was made by what two clocks disagree at most. [s]
@@ -230,9 +438,18 @@ const FROZEN_RAD: f64 = 0.06;
 const GYRO_DRIFT_RADPS: f64 = 0.03;
 /// Poses of one claim follow each other within this; slower sources do not fly. [s]
 const CLAIM_LASTS_S: f64 = 0.25;
-/// Noise within a claim. [m], [rad]
-const FITS_M: f64 = 0.05;
-const FITS_RAD: f64 = 0.2;
-/// Motion within a claim: faster than anyone flies in a room. [m/s], [rad/s]
-const FITS_MPS: f64 = 30.0;
-const FITS_RADPS: f64 = 35.0;
+/// Within a claim: twice the pose of what is tracked by chance, in standard deviations of the measurement.
+const FITS_SIGMAS: f64 = 4.0;
+/// What a false place wobbles by. [m], [rad]
+const FITS_M: f64 = 0.02;
+const FITS_RAD: f64 = 0.1;
+/// What is tracked by mistake moves against the vehicle: another one, or a wand in a hand. [m/s], [rad/s]
+const FITS_MPS: f64 = 3.0;
+const FITS_RADPS: f64 = 4.0;
+/// Of how far the newest is off.
+const CLOSER: f64 = 0.5;
+/// How far beside the expected path a manoeuvre may seem to begin, of its first deviation: 11 degrees.
+const ASTRAY: f64 = 0.2;
+/// Eight missing frames at 100 Hz, a vehicle may have stopped or turned in. [s], [m/s]
+const PAUSE_S: f64 = 0.08;
+const UNSEEN_MPS: f64 = 3.0;

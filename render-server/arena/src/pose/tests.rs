@@ -2,6 +2,9 @@ use glam::DQuat;
 use proptest::prelude::*;
 
 use super::*;
+use vizflyt_protocol::messages::PoseSample;
+
+mod outliers;
 
 fn at(seconds: f64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000).plus_seconds(seconds)
@@ -109,7 +112,7 @@ fn jump_is_rejected_until_it_lasts() {
         }
     }
     let (count, sample) = accepted.expect("a lasting jump is accepted");
-    assert_eq!(count, 10);
+    assert_eq!(count, 5);
     assert_eq!((sample.resets, sample.twist.linear_mps), (1, DVec3::ZERO));
 }
 

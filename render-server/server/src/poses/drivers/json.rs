@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::sender_clock::SenderClock;
 use super::source::{Measurement, SourceCounters, TagsSeen};
 use super::udp::{PoseStream, Silence};
-use super::vehicle_names::VehicleNames;
+use super::vehicle_names::{FrameOrder, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
 /// A packet, as it is written.
@@ -181,8 +181,8 @@ impl JsonStream {
                 let stamp = clock.map_in_order(stamp_ns, now);
                 if let Some(jump_s) = clock.take_jump_s() {
                     self.names.warn(format!(
-                        "json: the clock that stamps '{}' has jumped by {jump_s:.3} s; use a \
-                         monotonic one (in Python time.monotonic_ns())",
+                        "json: the clock that stamps '{}' has jumped by {jump_s:.3} s; if its sender was \
+                         not restarted, use a monotonic one (in Python time.monotonic_ns())",
                         packet.object
                     ));
                 }
@@ -221,8 +221,12 @@ impl PoseStream for JsonStream {
             self.names.others(std::iter::once(&*packet.object), advice);
             return &[];
         };
-        if packet.seq.is_some_and(|seq| !self.names.is_next(vehicle, seq as u32, now)) {
-            return &[];
+        let order = packet.seq.map(|seq| self.names.is_next(vehicle, seq as u32, now));
+        match order {
+            Some(FrameOrder::Old) => return &[],
+            // Its clock may have begun anew, too.
+            Some(FrameOrder::Restarted) => self.clocks[vehicle] = SenderClock::default(),
+            Some(FrameOrder::Next) | None => {}
         }
         let stamp = self.stamp(vehicle, &packet, now);
         let sigma = packet

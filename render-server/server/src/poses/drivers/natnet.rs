@@ -24,7 +24,7 @@ use vizflyt_protocol::time::ServerTime;
 use super::sender_clock::SenderClock;
 use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
-use super::vehicle_names::VehicleNames;
+use super::vehicle_names::{FrameOrder, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
 /// Who Motive is, and how it streams.
@@ -174,7 +174,7 @@ impl NatnetStream {
     ) {
         let number = frame.frame_number.cast_unsigned();
         if self.names.measured().iter().any(|measured| measured.vehicle == vehicle)
-            || !self.names.is_next(vehicle, number, now)
+            || self.names.is_next(vehicle, number, now) == FrameOrder::Old
         {
             return;
         }

@@ -13,13 +13,15 @@ pub struct SenderClock {
     buckets: [Option<(u64, i64)>; BUCKETS],
     /// Since when everything has come late.
     late_since: Option<ServerTime>,
+    /// The newest packet that came too late for any network, when, and how many such have come evenly since.
+    fallen: Option<(u64, ServerTime, u32)>,
     last: Option<ServerTime>,
     jump_s: Option<f64>,
 }
 
 impl Default for SenderClock {
     fn default() -> Self {
-        Self { buckets: [None; BUCKETS], late_since: None, last: None, jump_s: None }
+        Self { buckets: [None; BUCKETS], late_since: None, fallen: None, last: None, jump_s: None }
     }
 }
 
@@ -38,11 +40,12 @@ impl SenderClock {
                 if late_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
             let slipped =
                 self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S);
-            if slipped || late_s < -SLIP_S {
+            let restarted = self.has_restarted(sent_ns, arrival, late_s);
+            if slipped || restarted || late_s < -SLIP_S {
                 // Its clock moved by as much as its packets seem to come early.
                 self.jump_s = Some(-late_s);
                 self.buckets = [None; BUCKETS];
-                self.late_since = None;
+                (self.late_since, self.fallen) = (None, None);
             }
         }
         let bucket = &mut self.buckets[(second % BUCKETS as u64) as usize];
@@ -67,6 +70,25 @@ impl SenderClock {
         self.jump_s.take()
     }
 
+    /// Whether packets come evenly by a clock that fell back: its computer or program was restarted. A burst after a
+    /// pause comes all at once instead, and packets that were overtaken alone.
+    fn has_restarted(&mut self, sent_ns: u64, arrival: ServerTime, late_s: f64) -> bool {
+        if late_s < FALLEN_S {
+            self.fallen = None;
+            return false;
+        }
+        let count = match self.fallen {
+            Some((last_ns, at, count)) if sent_ns > last_ns => {
+                let (sent_s, came_s) =
+                    ((sent_ns - last_ns) as f64 * 1e-9, arrival.seconds_since(at));
+                if came_s > 0.5 * sent_s && came_s < 2.0 * sent_s { count + 1 } else { 1 }
+            }
+            _ => 1,
+        };
+        self.fallen = Some((sent_ns, arrival, count));
+        count >= EVEN_PACKETS
+    }
+
     fn least_ns(&self, second: u64) -> Option<i64> {
         let recent = |&&(at, _): &&(u64, i64)| second.wrapping_sub(at) < BUCKETS as u64;
         self.buckets.iter().flatten().filter(recent).map(|&(_, least_ns)| least_ns).min()
@@ -78,6 +100,9 @@ const BUCKETS: usize = 10;
 /// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
 const SLIP_S: f64 = 0.02;
 const SLIP_LASTS_S: f64 = 0.3;
+/// A clock that fell back by this, and ran on evenly for so many packets, began anew. [s]
+const FALLEN_S: f64 = 0.5;
+const EVEN_PACKETS: u32 = 3;
 
 #[cfg(test)]
 mod tests {
@@ -140,6 +165,40 @@ mod tests {
             let last = clock.map(shown(200, jump_s), truth(200));
             assert!(last.seconds_since(truth(200)).abs() < 1e-3);
         }
+    }
+
+    #[test]
+    fn a_clock_that_begins_anew_is_followed_within_three_packets() {
+        for hz in [10u64, 30, 100, 200] {
+            let mut clock = SenderClock::default();
+            let at = |index: u64| ServerTime::from_ns(100_000_000_000 + index * 1_000_000_000 / hz);
+            for index in 0..100 {
+                clock.map(at(index).as_ns() - APART_NS, at(index));
+            }
+            let mut jumps = Vec::new();
+            for index in 0..3 {
+                let now = at(100 + index);
+                let mapped = clock.map(index * 1_000_000_000 / hz, now);
+                jumps.extend(clock.take_jump_s());
+                assert!(index < 2 || now.seconds_since(mapped) < 1e-3, "{hz} Hz: {mapped:?}");
+            }
+            assert_eq!(jumps.len(), 1, "{hz} Hz");
+        }
+    }
+
+    /// Old packets between new ones, as a network or a recording brings them, move no clock.
+    #[test]
+    fn old_packets_between_new_ones_move_nothing() {
+        let mut clock = SenderClock::default();
+        for index in 0..400 {
+            let mapped = clock.map(truth(index).as_ns() - APART_NS, truth(index));
+            assert!(mapped.seconds_since(truth(index)).abs() < 1e-6);
+            if index > 100 {
+                let late = truth(index).plus_ns(1_000_000);
+                clock.map(truth(index - 100).as_ns() - APART_NS, late);
+            }
+        }
+        assert_eq!(clock.take_jump_s(), None);
     }
 
     #[test]

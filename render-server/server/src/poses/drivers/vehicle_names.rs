@@ -19,6 +19,8 @@ pub(super) struct VehicleNames {
     driver: Driver,
     source: u8,
     alignment: Alignment,
+    /// What the source is late by, always. [s]
+    latency_s: f64,
     objects: Vec<Object>,
     bad_packets: u64,
     /// What the newest packet yielded.
@@ -36,7 +38,12 @@ struct Object {
     name: String,
     clock: FrameClock,
     last_frame: Option<u32>,
-    /// Since when that frame has been repeated.
+    /// When that came, and how far apart frames come. [s]
+    last_at: ServerTime,
+    interval_s: f64,
+    /// The newest of frames that fell back and rise since, and how many.
+    fallen: Option<(u32, u32)>,
+    /// Since when the last frame has been repeated.
     stuck_since: Option<ServerTime>,
     warned_of_stuck: bool,
     counters: SourceCounters,
@@ -50,6 +57,9 @@ impl VehicleNames {
             name: config.object_of(vehicle).to_owned(),
             clock: FrameClock::default(),
             last_frame: None,
+            last_at: ServerTime::ZERO,
+            interval_s: 0.0,
+            fallen: None,
             stuck_since: None,
             warned_of_stuck: false,
             counters: SourceCounters::default(),
@@ -58,6 +68,7 @@ impl VehicleNames {
             driver: config.driver,
             source,
             alignment: config.alignment(),
+            latency_s: config.latency_ms * 1e-3,
             objects: vehicles.iter().take(MAX_VEHICLES).map(object).collect(),
             bad_packets: 0,
             measured: Vec::with_capacity(MAX_VEHICLES),
@@ -88,27 +99,38 @@ impl VehicleNames {
         &self.measured
     }
 
-    /// Takes the number of a vehicle's next frame; returns whether it is newer than the last, and
-    /// counts.
-    pub(super) fn is_next(&mut self, vehicle: usize, frame: u32, now: ServerTime) -> bool {
+    /// Takes the number of a vehicle's next frame; returns whether it is newer than the last, or of a sender that was
+    /// restarted, and counts.
+    pub(super) fn is_next(&mut self, vehicle: usize, frame: u32, now: ServerTime) -> FrameOrder {
         let object = &mut self.objects[vehicle];
+        let mut order = FrameOrder::Next;
         if let Some(last) = object.last_frame {
             let ahead = frame.wrapping_sub(last).cast_signed();
-            // A counter that falls back by more than any reordering is a source restarted.
-            if ahead <= 0 && ahead > -RESTART_FRAMES {
+            if ahead == 0 {
                 object.counters.stale_packets += 1;
-                if ahead == 0 {
-                    self.notice_stuck(vehicle, frame, now);
-                }
-                return false;
+                self.notice_stuck(vehicle, frame, now);
+                return FrameOrder::Old;
             }
-            if (2..RESTART_FRAMES).contains(&ahead) {
+            if ahead < 0 && !object.is_restart(frame, now) {
+                object.counters.stale_packets += 1;
+                return FrameOrder::Old;
+            }
+            if (2..MAX_LOST_FRAMES).contains(&ahead) {
                 object.counters.lost_frames += (ahead - 1) as u64;
             }
+            if ahead < 0 {
+                order = FrameOrder::Restarted;
+                let (driver, name) = (self.driver, &object.name);
+                let text = format!(
+                    "{driver}: the sender of '{name}' was restarted: its frames begin again, at {frame} \
+                     after {last}"
+                );
+                self.warn(text);
+            }
         }
-        object.last_frame = Some(frame);
-        (object.stuck_since, object.warned_of_stuck) = (None, false);
-        true
+        let object = &mut self.objects[vehicle];
+        object.accept_frame(frame, now);
+        order
     }
 
     /// The very same frame again and again: the source is paused, or shows a still.
@@ -162,7 +184,7 @@ impl VehicleNames {
             }
         });
         self.objects[vehicle].counters.poses += 1;
-        let source = self.source;
+        let (source, stamp) = (self.source, stamp.plus_seconds(-self.latency_s));
         self.measured.push(Measurement { vehicle, source, stamp, arrival, world_from_body, sigma });
     }
 
@@ -222,6 +244,45 @@ impl VehicleNames {
     }
 }
 
+impl Object {
+    /// Whether a frame that fell back is of a sender that was restarted: after a silence, or where frames rise again
+    /// while those of before have stopped. A frame that was overtaken is alone, and a recording that is replayed beside
+    /// its living source finds no gap.
+    fn is_restart(&mut self, frame: u32, now: ServerTime) -> bool {
+        let silent_s = now.seconds_since(self.last_at);
+        let count = match self.fallen {
+            Some((newest, count)) if frame.wrapping_sub(newest).cast_signed() > 0 => count + 1,
+            _ => 1,
+        };
+        self.fallen = Some((frame, count));
+        silent_s > SILENT_S
+            || count >= RISING_FRAMES
+                && self.interval_s > 0.0
+                && silent_s > SILENT_INTERVALS * self.interval_s
+    }
+
+    fn accept_frame(&mut self, frame: u32, now: ServerTime) {
+        if self.last_frame.is_some() {
+            let interval_s = now.seconds_since(self.last_at).min(SILENT_S);
+            let share = if self.interval_s > 0.0 { INTERVAL_SHARE } else { 1.0 };
+            self.interval_s += (interval_s - self.interval_s) * share;
+        }
+        (self.last_frame, self.last_at, self.fallen) = (Some(frame), now, None);
+        (self.stuck_since, self.warned_of_stuck) = (None, false);
+    }
+}
+
+/// Where a frame stands among those of its object.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum FrameOrder {
+    /// Newer than the last.
+    Next,
+    /// The first of a sender that was restarted.
+    Restarted,
+    /// Not to be used.
+    Old,
+}
+
 /// Returns the standard deviations along other axes of what has these along its own, uncorrelated.
 fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
     let squared = sigma * sigma;
@@ -232,8 +293,15 @@ fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
     DVec3::new(row(0), row(1), row(2))
 }
 
-/// Ten seconds at 200 Hz: beyond any reordering on a LAN.
-const RESTART_FRAMES: i32 = 2000;
+/// More missing frames than this are no loss but another count: ten seconds at 200 Hz.
+const MAX_LOST_FRAMES: i32 = 2000;
+/// So many frames that rise after a fall are a restarted sender's, if those of before have stopped for so many intervals
+/// or for so long. [s]
+const RISING_FRAMES: u32 = 3;
+const SILENT_INTERVALS: f64 = 2.5;
+const SILENT_S: f64 = 0.5;
+/// Of a new interval in their mean.
+const INTERVAL_SHARE: f64 = 0.1;
 /// Names in a warning.
 pub(super) const MAX_NAMES: usize = 8;
 /// Maximum number of warnings that wait.
@@ -242,3 +310,6 @@ const MAX_WARNINGS: usize = 16;
 const FAR_M: f64 = 100.0;
 /// A repeated frame for so long is no hiccup. [s]
 const STUCK_S: f64 = 1.0;
+
+#[cfg(test)]
+mod tests;

@@ -23,7 +23,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::source::{Measurement, SourceCounters};
 use super::udp::{PoseStream, Silence};
-use super::vehicle_names::{MAX_NAMES, VehicleNames};
+use super::vehicle_names::{FrameOrder, MAX_NAMES, VehicleNames};
 use crate::poses::settings::{Euler, LocalizationConfig};
 
 /// One object of a packet.
@@ -158,7 +158,7 @@ impl PoseStream for ViconStream {
         }
         for (vehicle, object) in found.into_iter().enumerate() {
             let Some(object) = object else { continue };
-            if !self.names.is_next(vehicle, frame, now) {
+            if self.names.is_next(vehicle, frame, now) == FrameOrder::Old {
                 continue;
             }
             let Some(angles_rad) = object.angles_rad else {

@@ -55,6 +55,10 @@ pub struct LocalizationConfig {
     /// Where the tracked point is on the vehicle. [m, body]
     #[serde(default, skip_serializing_if = "is_default")]
     pub pivot_m: DVec3,
+    /// How much earlier than stamped, or than its arrival where it has no stamp, a pose was true: the source's own
+    /// constant delay, 0 to 500. [ms]
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub latency_ms: f64,
     /// Names of the vehicles' objects in the stream, where they differ from the vehicles' names.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub objects: BTreeMap<String, String>,
@@ -416,6 +420,7 @@ impl LocalizationConfig {
             nose: Nose::default(),
             offset: Offset::default(),
             pivot_m: DVec3::ZERO,
+            latency_ms: 0.0,
             objects: BTreeMap::new(),
             interface: None,
         }
@@ -507,6 +512,7 @@ impl LocalizationConfig {
         }
         check_position(&format!("{key}.offset.position_m"), self.offset.position_m)?;
         check_position(&format!("{key}.pivot_m"), self.pivot_m)?;
+        check_number(&format!("{key}.latency_ms"), self.latency_ms, "ms", 0.0..=500.0)?;
         check_number(
             &format!("{key}.offset.yaw_deg"),
             self.offset.yaw_deg,

@@ -39,6 +39,16 @@ fn the_packet_of_the_guide_is_read() {
 }
 
 #[test]
+fn a_constant_delay_is_taken_off_the_stamp() {
+    let found = only(&mut stream("latency_ms=100"), at(250), &packet("")).unwrap();
+    assert_eq!((found.stamp, found.arrival), (at(150), at(250)));
+    for wrong in ["-1", "501", "nan"] {
+        let error = LocalizationConfig::parse(&format!("json,latency_ms={wrong}")).unwrap_err();
+        assert!(error.contains("latency_ms"), "{error}");
+    }
+}
+
+#[test]
 fn sigmas_turn_with_the_axes() {
     let text = packet(r#","position_sigma_m":[1,2,3],"rotation_sigma_rad":[0.1,0.2,0.3]"#);
     let found = only(&mut stream("up=y,units=mm,nose=y"), at(0), &text).unwrap();

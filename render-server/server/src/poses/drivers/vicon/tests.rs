@@ -144,8 +144,11 @@ fn another_objects_name_stands_in_the_warning_once() {
 #[test]
 fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
     let mut stream = stream(&["v"]);
+    let mut ms = 0;
     let mut feed = |frame: u32, values: [f64; 6]| {
-        !stream.handle_packet(at(0), &packet(frame, &[("v", values)])).is_empty()
+        // Tracker is away for a second while it is restarted.
+        ms += if frame == 1 { 1000 } else { 5 };
+        !stream.handle_packet(at(ms), &packet(frame, &[("v", values)])).is_empty()
     };
     assert!(feed(100_000, [1.0; 6]));
     assert!(!feed(100_000, [1.0; 6])); // twice
@@ -165,6 +168,10 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
             occluded: 1,
             ..SourceCounters::default()
         }
+    );
+    assert_eq!(
+        stream.next_warning().unwrap(),
+        "vicon: the sender of 'v' was restarted: its frames begin again, at 1 after 100004"
     );
     assert!(stream.next_warning().unwrap().starts_with("vicon: item 0 needs"));
 }
