@@ -16,7 +16,7 @@
 //! views take some seconds.
 
 mod lens;
-mod matrix;
+pub(crate) mod matrix;
 mod normal;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};

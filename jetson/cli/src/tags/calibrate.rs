@@ -90,6 +90,8 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
         intrinsics: k,
         mounting: Mounting::Unknown,
         calibration: Some(quality),
+        survey: None,
+        latency_ms: 0.0,
     };
     camera.write(&args.output)?;
     let [fx, fy, cx, cy] = found.sigma_px;

@@ -159,9 +159,14 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
             second.seconds = printed_at.elapsed().as_secs_f64();
             printed_at = Instant::now();
             if args.json {
-                print_line(json!({ "status": second.to_json() }));
+                let mut status = second.to_json();
+                status["findings"] = findings(&locator, &names).into();
+                print_line(json!({ "status": status }));
             } else {
                 print_line(second.to_line());
+                for finding in findings(&locator, &names) {
+                    print_line(format!("  {finding}"));
+                }
             }
             figures.add(&std::mem::take(&mut second));
         }
@@ -169,11 +174,21 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     second.seconds = printed_at.elapsed().as_secs_f64();
     figures.add(&second);
     if args.json {
-        print_line(json!({ "report": figures.to_json() }));
+        let mut report = figures.to_json();
+        report["findings"] = findings(&locator, &names).into();
+        print_line(json!({ "report": report }));
     } else {
         print_line(format!("in all: {}", figures.to_line()));
+        for finding in findings(&locator, &names) {
+            print_line(format!("  {finding}"));
+        }
     }
     Ok(())
+}
+
+/// Returns what is wrong with the lab, in words.
+fn findings(locator: &Locator, names: &[&str]) -> Vec<String> {
+    locator.findings().iter().map(|finding| finding.words(names)).collect()
 }
 
 /// Cuts shots, which are in the order of their stamps, where their stamps are apart or a camera comes

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
-use vizflyt_tags::camera::{Mounting, TagCamera};
+use vizflyt_tags::camera::{Mounting, Survey, TagCamera};
 use vizflyt_tags::capture::{self, ImageSource};
 use vizflyt_tags::detect::{Detector, DetectorSettings};
 use vizflyt_tags::family::TagFamily;
@@ -191,7 +191,16 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
     }
     let placed = survey::cameras(&seen, &mat, cube.as_ref())?;
     for ((path, _, camera), placed) in files.iter().zip(placed) {
-        let file = TagCamera { mounting: Mounting::World(placed.world_from_cam), ..camera.clone() };
+        let survey = Survey {
+            sigma_m: placed.sigma_m,
+            rms_px: placed.rms_px,
+            corners: placed.corners as u32,
+        };
+        let file = TagCamera {
+            mounting: Mounting::World(placed.world_from_cam),
+            survey: Some(survey),
+            ..camera.clone()
+        };
         file.write(path)?;
         let p = placed.world_from_cam.translation_m;
         print_line(format_args!(
