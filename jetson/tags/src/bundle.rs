@@ -252,7 +252,8 @@ impl Bundle {
         Places { lens, place, shared, views }
     }
 
-    fn cost(&self) -> f64 {
+    /// Returns what all corners cost: Cauchy's loss. [px^2]
+    pub(crate) fn cost(&self) -> f64 {
         self.seen.iter().map(|seen| self.loss(self.residual(seen))).sum()
     }
 

@@ -10,7 +10,7 @@ mod cameras;
 mod mat;
 mod picker;
 
-pub use cameras::{CameraImages, PlacedCamera, cameras};
+pub use cameras::{CameraImages, CubeScale, PlacedCamera, SurveyedCameras, cameras};
 pub use mat::{Surveyed, TagResidual, mat};
 pub use picker::Picker;
 
