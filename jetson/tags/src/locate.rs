@@ -146,6 +146,8 @@ pub struct CameraResult {
     pub stamp: HostTime,
     /// Where it was looked; the whole image if nothing.
     pub region: Option<Region>,
+    /// Whether no tag should be in its image, by where the vehicle should be.
+    pub out_of_view: bool,
     /// Tags of the layouts.
     pub seen: Vec<TagObservation>,
     /// Tags of no layout, or of one that this camera cannot use.
@@ -405,7 +407,9 @@ impl Locator {
             .into_iter()
             .map(|detection| TagObservation { detection, expected_px: None })
             .collect();
-        CameraResult { camera: view.camera, stamp: view.stamp, region, seen, strangers }
+        let out_of_view = expected == Expected::OutOfView;
+        let StampedImage { camera, stamp, .. } = *view;
+        CameraResult { camera, stamp, region, out_of_view, seen, strangers }
     }
 
     /// Whether a camera other than this view's saw the vehicle in its newest image, not long ago.
