@@ -157,6 +157,11 @@ class Camera:
         spots = self.random.normal(0, 1, (lens.height // 24 + 1, lens.width // 24 + 1)).astype(np.float32)
         self.wall = WALL + 14 * cv2.resize(spots, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC)
 
+    def leave(self, tags: list[Tag], pose: Pose) -> None:
+        """Leaves tags where they do not move against the camera: they are part of the wall from now on."""
+        for tag in tags:
+            self._paint(self.wall, tag, pose, 0.0)
+
     def image(self, groups: list[tuple[list[Tag], Pose]], t_s: float) -> np.ndarray:
         """What is seen at an instant, the middle row's."""
         canvas = self.wall.copy()

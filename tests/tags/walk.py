@@ -6,9 +6,12 @@ Usage: walk.py VIZFLYT [ROW ...]      rows by their names; without any, all
 
 import json
 import pathlib
+import signal
 import subprocess
 import sys
 import tempfile
+import time
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -157,6 +160,15 @@ class Lab:
             off_mm = 1e3 * np.linalg.norm(self.camera_pose(name)[1] - true_m)
             print(f"  {name} is {off_mm:.1f} mm off", flush=True)
             assert off_mm < 10, name
+        assert "of its layout's size" in out, out
+        # A cube printed at 97 %, as far as its layout knows.
+        scale_layout(self.home / "cube.toml", 1 / 0.97, self.home / "large.toml")
+        kept = {name: (self.home / f"{name}.toml").read_text() for name in EYES}
+        shrunk = self.survey_cameras("large").splitlines()[-1]
+        print(f"  {shrunk}")
+        assert "cube: it has 97." in shrunk and "--bar-mm 97." in shrunk, shrunk
+        for name, text in kept.items():
+            (self.home / f"{name}.toml").write_text(text)
 
     def survey_cameras(self, cube: str) -> str:
         places = [f"{name}.toml={name}-places" for name in EYES]
@@ -168,6 +180,7 @@ class Lab:
         cube = self.layout("cube")
         for index, (eye, pose) in enumerate(EYES.items()):
             camera = Camera(self.lens, fixed(*pose), sensor, 20 + index)
+            camera.leave(self.layout("mat"), fixed(np.eye(3), np.zeros(3)))
             images = [camera.image([(cube, truth)], t_s) for t_s in self.stamps_s(eye)]
             write_images(self.home / name / eye, images, self.stamps_s(eye))
         return truth
@@ -176,11 +189,24 @@ class Lab:
     def stamps_s(eye: str) -> list[float]:
         return [BEGIN_S + (index + PHASE[eye]) / RATE_HZ for index in range(int(SECONDS * RATE_HZ))]
 
-    def locate(self, flight: str, cube: str = "cube", layouts: tuple[str, ...] = ()) -> list[dict]:
-        """Runs `tags locate` on a flight; returns its lines."""
-        files = json.dumps([f"{name}.toml" for name in (cube, *layouts)])
+    def write_config(self, *layouts: str) -> None:
+        files = json.dumps([f"{name}.toml" for name in layouts])
         cameras = json.dumps([f"{name}.toml" for name in EYES])
         (self.home / "lab.toml").write_text(f"cameras = {cameras}\nlayouts = {files}\n")
+
+    def bump(self, name: str) -> None:
+        """Writes into a camera's file that it is elsewhere than it is: by 2.4 cm and 0.7 degrees."""
+        file = self.home / f"{name}.toml"
+        rotation, position = self.camera_pose(name)
+        turned_by = turned(*(np.array([x]) for x in np.radians([0.5, 0.4, -0.3])))[0]
+        place = (position + np.array([0.015, -0.016, 0.01])).tolist()
+        head = file.read_text().split("[world_from_cam]")[0]
+        pose = f"position_m = {place}\nrotation_xyzw = {quaternion_of(rotation @ turned_by)}"
+        file.write_text(f"{head}[world_from_cam]\n{pose}\n")
+
+    def locate(self, flight: str, cube: str = "cube", layouts: tuple[str, ...] = ()) -> list[dict]:
+        """Runs `tags locate` on a flight; returns its lines."""
+        self.write_config(cube, *layouts)
         sources = [f"--source={name}={flight}/{name}" for name in EYES]
         out = self.tags("locate", "lab.toml", "--poses", "--json", *sources)
         return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
@@ -209,6 +235,7 @@ def figures(lines: list[dict], truth: Pose) -> dict[str, float]:
         "p99_mm": 1e3 * float(np.quantile(distance, 0.99)),
         "rms_deg": float(np.degrees(np.sqrt(np.mean((turn**2).sum(1))))),
         "sigma_mm": 1e3 * float(np.median(np.linalg.norm(sigma, axis=1))),
+        # Their mean over the axes: NEES / 3.
         "nees": float(np.mean((off / sigma) ** 2)),
         "turn_nees": float(np.mean((turn / turn_sigma) ** 2)),
         "px": float(np.median([pose["quality"]["rms_px"] for pose in poses])),
@@ -224,37 +251,119 @@ def main() -> None:
         lab.print_and_calibrate()
         lab.survey()
         rows(lab, wanted)
+        cameras_come_and_go(lab)
+
+
+@dataclass
+class Row:
+    """What is wrong with a lab, and how well its flight must be located all the same."""
+
+    flight: str = "slow"
+    # By how much the right camera's stamps are late, and what its file says of it.
+    late_s: float = 0.0
+    latency_ms: float = 0.0
+    cube: str = "cube"
+    layouts: tuple[str, ...] = ()
+    bumped: str = ""
+    rms_mm: float = 4.0
+    rms_deg: float = 0.8
+    # What is said to be wrong; each the beginning and the end of a finding.
+    findings: tuple[tuple[str, str], ...] = ()
+
+
+LATE = ("right stamps images", "latency_ms in its file")
+SCALE = ("the tags have 97.", "--bar-mm")
+ROLLING = ("reads its rows over", "(corrected)")
+SURVEY = "survey again"
+ROWS = {
+    "normal": Row(),
+    "10 ms apart": Row(late_s=0.010, findings=(LATE,)),
+    "30 ms apart": Row(late_s=0.030, rms_mm=10, findings=(LATE,)),
+    "100 ms, known": Row(late_s=0.100, latency_ms=100),
+    "tags at 97 %": Row(cube="large", rms_mm=20, findings=(SCALE,)),
+    "rolling shutter": Row(flight="rolling", findings=(ROLLING, ROLLING)),
+    "left bumped": Row(bumped="left", rms_mm=25, findings=(("left camera moved by", SURVEY),)),
+    "left bumped, the mat is there": Row(
+        bumped="left", layouts=("room",), rms_mm=25, findings=(("left camera moved by 2.", SURVEY),)
+    ),
+    "right bumped, the mat is there": Row(
+        bumped="right", layouts=("room",), rms_mm=25, findings=(("right camera moved by 2.", SURVEY),)
+    ),
+}
 
 
 def rows(lab: Lab, wanted: list[str]) -> None:
-    slow = lab.fly("slow", 1.0, Sensor())
-    rolling = lab.fly("rolling", 2.0, Sensor(readout_s=0.02))
-    scale_layout(lab.home / "cube.toml", 1 / 0.97, lab.home / "large.toml")
+    flights = {"slow": lab.fly("slow", 1.0, Sensor()), "rolling": lab.fly("rolling", 2.0, Sensor(readout_s=0.02))}
+    files = {name: (lab.home / f"{name}.toml").read_text() for name in EYES}
+    for name, row in ROWS.items():
+        if wanted and name not in wanted:
+            continue
+        write_stamps(lab.home / row.flight / "right", [stamp + row.late_s for stamp in lab.stamps_s("right")])
+        if row.latency_ms:
+            head, size = files["right"].split("width_px", 1)
+            (lab.home / "right.toml").write_text(f"{head}latency_ms = {row.latency_ms}\nwidth_px{size}")
+        if row.bumped:
+            lab.bump(row.bumped)
+        lines = lab.locate(row.flight, row.cube, row.layouts)
+        for eye, text in files.items():
+            (lab.home / f"{eye}.toml").write_text(text)
+        write_stamps(lab.home / row.flight / "right", lab.stamps_s("right"))
+        values = figures(lines, flights[row.flight])
+        (report,) = (line["report"] for line in lines if "report" in line)
+        words = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
+        print(f"{name}: {words}", report["findings"], flush=True)
+        check(row, values, report)
 
-    def show(name: str, truth: Pose, lines: list[dict]) -> None:
-        values = figures(lines, truth)
-        print(f"{name}:", "  ".join(f"{key} {value:.4g}" for key, value in values.items()), flush=True)
 
-    def apart(name: str, by_s: float) -> None:
-        write_stamps(lab.home / "slow" / "right", [stamp + by_s for stamp in lab.stamps_s("right")])
-        show(name, slow, lab.locate("slow"))
-        write_stamps(lab.home / "slow" / "right", lab.stamps_s("right"))
+def check(row: Row, values: dict[str, float], report: dict) -> None:
+    assert values["rms_mm"] < row.rms_mm, "poses are off"
+    assert values["rms_deg"] < row.rms_deg, "attitudes are off"
+    # Squared errors in units of the sigma that is sent: 1 is exact.
+    assert 0.3 < values["nees"] < 2.5, "sigma is not honest"
+    assert 0.2 < values["turn_nees"] < 2.5, "sigma of the attitude is not honest"
+    assert values["poses"] >= 0.98 * values["sets"], report
+    found = report["findings"]
+    assert len(found) == len(row.findings), found
+    for text, (begin, end) in zip(found, row.findings):
+        assert begin in text and end in text, (text, begin)
 
-    show("normal", slow, lab.locate("slow"))
-    apart("10 ms apart", 0.010)
-    apart("30 ms apart", 0.030)
-    show("97 %", slow, lab.locate("slow", cube="large"))
-    show("rolling", rolling, lab.locate("rolling"))
-    kept = (lab.home / "left.toml").read_text()
-    rotation, position = lab.camera_pose("left")
-    bump = rotation @ turned(*(np.array([x]) for x in np.radians([0.5, 0.4, -0.3])))[0]
-    place = position + np.array([0.015, -0.016, 0.01])
-    head = kept.split("[world_from_cam]")[0]
-    (lab.home / "left.toml").write_text(
-        f"{head}[world_from_cam]\nposition_m = {place.tolist()}\nrotation_xyzw = {quaternion_of(bump)}\n"
-    )
-    show("bumped", slow, lab.locate("slow"))
-    (lab.home / "left.toml").write_text(kept)
+
+def cameras_come_and_go(lab: Lab) -> None:
+    """A camera that hangs, repeats, goes dark and is unplugged is named, and is taken back; the other goes on."""
+    begin_ns = time.monotonic_ns() + 2 * 10**9
+    faults = ["hang:1:1.7", "repeat:2.2:2.7", "dark:3.2:3.7", "end:4.2:4.3"]
+    feed = f"{sys.executable} {pathlib.Path(__file__).with_name('feed.py')}"
+    sources = [
+        f"--source={name}=| exec {feed} slow/{name} {begin_ns} {' '.join(faults if name == 'right' else [])}"
+        for name in EYES
+    ]
+    lab.write_config("cube")
+    command = [lab.vizflyt, "tags", "locate", "lab.toml", "--poses", "--json", *sources]
+    with subprocess.Popen(command, cwd=lab.home, stdout=subprocess.PIPE, text=True) as located:
+        events, alone, both, after = [], 0, 0, 0
+        for line in located.stdout:
+            said = json.loads(line)
+            if "fault" in said:
+                events.append((said["camera"], said["fault"]))
+                print("  ", said, flush=True)
+            if "vizflyt_pose" in said:
+                alone += said["quality"]["cameras"] == 1
+                both += said["quality"]["cameras"] == 2
+                after += "ended with" in str(events) and events[-1] == ("right", None)
+            # The left one ends with its recording.
+            if events and events[-1] == ("left", "its images ended"):
+                located.send_signal(signal.SIGINT)
+                break
+    right = [fault for camera, fault in events if camera == "right"]
+    # Until the flight begins both are silent.
+    while right and right[0] is not None:
+        right.pop(0)
+    right.pop(0)
+    for part in ("no image", "repeats an image", "sees nothing", "ended with"):
+        told = [index for index, fault in enumerate(right) if fault and part in fault]
+        assert told and None in right[told[0] :], (part, events)
+    assert alone > 0 and both > 0 and after > 0, (alone, both, after)
+    print(f"cameras come and go: {both} poses by two cameras, {alone} by one", flush=True)
 
 
 if __name__ == "__main__":
