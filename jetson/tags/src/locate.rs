@@ -643,9 +643,9 @@ const ROOM_UNCERTAINTY_M: f64 = 0.1;
 /// Images of a camera that are kept: others' that come late lie between two of them.
 const MAX_KEPT: usize = 4;
 /// What the vehicle's estimated velocity may be off. [m/s]
-const SPEED_UNCERTAINTY_MPS: f64 = 0.015;
+const SPEED_UNCERTAINTY_MPS: f64 = 0.02;
 /// And its acceleration. [m/s^2]
-const ACCELERATION_UNCERTAINTY_MPS2: f64 = 1.5;
+const ACCELERATION_UNCERTAINTY_MPS2: f64 = 2.0;
 /// Cosine to a tag's normal below which it cannot be read: 81 degrees.
 const GRAZING: f64 = 0.15;
 
