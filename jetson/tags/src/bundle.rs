@@ -16,7 +16,7 @@
 //! views take some seconds.
 
 mod lens;
-mod matrix;
+pub(crate) mod matrix;
 mod normal;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -252,7 +252,8 @@ impl Bundle {
         Places { lens, place, shared, views }
     }
 
-    fn cost(&self) -> f64 {
+    /// Returns what all corners cost: Cauchy's loss. [px^2]
+    pub(crate) fn cost(&self) -> f64 {
         self.seen.iter().map(|seen| self.loss(self.residual(seen))).sum()
     }
 

@@ -50,6 +50,8 @@ pub enum ViewOutcome {
     TooFewTags,
     /// The checkerboard is not in it as a whole.
     NoBoard,
+    /// Another checkerboard is, of so many inner corners each way.
+    AnotherBoard(u32, u32),
     /// The board was nearly there before.
     KnownView,
     /// The board moves: its corners are smeared.
@@ -60,10 +62,16 @@ pub enum ViewOutcome {
 
 impl fmt::Display for ViewOutcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Self::AnotherBoard(few, many) = self {
+            return write!(
+                f,
+                "this checkerboard has {few} by {many} inner corners: correct columns and rows in the board's file"
+            );
+        }
         f.write_str(match self {
             Self::Kept => "kept",
             Self::TooFewTags => "show at least four tags of the board",
-            Self::NoBoard => "show the whole checkerboard",
+            Self::NoBoard | Self::AnotherBoard(..) => "show the whole checkerboard",
             Self::KnownView => "the board was there before; move or tilt it",
             Self::Moving => "hold the board still",
             Self::Enough => "enough views",

@@ -42,6 +42,22 @@ pub struct TagCamera {
     pub mounting: Mounting,
     /// How well the lens is known; absent if it was not calibrated here.
     pub calibration: Option<Calibration>,
+    /// How well its place is known; absent if it was not surveyed here.
+    pub survey: Option<Survey>,
+    /// How much later than the exposure its images are stamped: a delay that is known and does not change. [ms]
+    pub latency_ms: f64,
+}
+
+/// How well a camera's place is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Survey {
+    /// One standard deviation of its position. [m]
+    pub sigma_m: f64,
+    /// Root mean square distance of corners from where the answer puts them. [px]
+    pub rms_px: f64,
+    /// Corners it rests on.
+    pub corners: u32,
 }
 
 /// Where a camera is.
@@ -76,6 +92,8 @@ struct CameraFile {
     source: Option<String>,
     width_px: u32,
     height_px: u32,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    latency_ms: f64,
     fx_px: f64,
     fy_px: f64,
     cx_px: f64,
@@ -84,6 +102,8 @@ struct CameraFile {
     distortion: Option<LensConfig>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     calibration: Option<Calibration>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    survey: Option<Survey>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     world_from_cam: Option<PoseConfig>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -128,6 +148,8 @@ impl TagCamera {
             },
             mounting,
             calibration: file.calibration,
+            survey: file.survey,
+            latency_ms: file.latency_ms,
         };
         camera.validate()?;
         Ok(camera)
@@ -163,6 +185,8 @@ impl TagCamera {
             cy_px: k.cy_px,
             distortion: LensConfig::new(k.distortion),
             calibration: self.calibration,
+            survey: self.survey,
+            latency_ms: self.latency_ms,
             world_from_cam,
             body_from_cam,
         })?)
@@ -192,6 +216,11 @@ impl TagCamera {
             let size = format!("{}x{}, {}, {}", k.width_px, k.height_px, k.fx_px, k.fy_px);
             invalid("width_px x height_px, fx_px, fy_px", size, error.to_string())
         })?;
+        check_number("latency_ms", self.latency_ms, "ms", 0.0..=500.0)?;
+        if let Some(survey) = &self.survey {
+            check_number("survey.sigma_m", survey.sigma_m, "m", 0.0..=10.0)?;
+            check_number("survey.rms_px", survey.rms_px, "px", 0.0..=100.0)?;
+        }
         if let Some(calibration) = &self.calibration {
             check_number("calibration.rms_px", calibration.rms_px, "px", 0.0..=100.0)?;
             let held_out_px = calibration.held_out_rms_px;
@@ -199,6 +228,12 @@ impl TagCamera {
         }
         Ok(())
     }
+}
+
+/// A camera without a delay has no such key.
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
 }
 
 /// As a camera's name in `arena.toml`.
@@ -233,6 +268,8 @@ mod tests {
         check_refused(&LEFT.replace("left", " "), &["name = \" \"", "1 to 32 bytes"]);
         check_refused(&LEFT.replace("fy_px", "fz_px"), &["fz_px"]);
         check_refused(&format!("{LEFT}source = \"\""), &["source", "folder"]);
+        check_refused(&format!("{LEFT}latency_ms = 501.0"), &["latency_ms", "0 to 500 ms"]);
+        check_refused(&format!("{LEFT}latency_ms = -1.0"), &["latency_ms = -1", "0 to 500 ms"]);
         let lens = format!("{LEFT}distortion = {{ model = \"brown-conrady\", k1 = inf }}");
         check_refused(&lens, &["distortion coefficient"]);
     }
@@ -261,6 +298,8 @@ mod tests {
                     _ => Mounting::Body(Pose::new(DVec3::from(p), q)),
                 },
                 calibration: fisheye.then_some(Calibration { rms_px: 0.2, held_out_rms_px: 0.3, images: 20 }),
+                survey: fisheye.then_some(Survey { sigma_m: 0.002, rms_px: 0.2, corners: 400 }),
+                latency_ms: if fisheye { 12.5 } else { 0.0 },
             };
             prop_assert_eq!(TagCamera::parse(&camera.to_toml().unwrap()).unwrap(), camera);
         }

@@ -16,6 +16,7 @@ mod folder;
 mod pipe;
 #[cfg(target_os = "linux")]
 mod v4l2;
+mod watch;
 mod y4m;
 
 use std::path::Path;
@@ -25,6 +26,7 @@ pub use folder::{Folder, parse_stamps};
 pub use pipe::Pipe;
 #[cfg(target_os = "linux")]
 pub use v4l2::Camera;
+pub use watch::CameraWatch;
 pub use y4m::Y4m;
 
 use crate::image::Gray;
@@ -107,7 +109,7 @@ pub fn open(source: &str) -> Result<Box<dyn ImageSource>, CaptureError> {
 }
 
 /// Returns the time of this computer's monotonic clock. [ns]
-fn now_ns() -> u64 {
+pub fn now_ns() -> u64 {
     // Only a clock that does not exist fails, and this one does.
     nix::time::clock_gettime(nix::time::ClockId::CLOCK_MONOTONIC)
         .map_or(0, |now| now.tv_sec() as u64 * 1_000_000_000 + now.tv_nsec() as u64)

@@ -109,6 +109,13 @@ impl Checkerboard {
         let half_px = (0.3 * spacing_px).clamp(2.0, MAX_HALF_PX) as i32;
         grid.into_iter().map(|corner| corners::refine(image, corner, half_px)).collect()
     }
+
+    /// Returns the inner corners, the fewer first, of a whole checkerboard in an image that has other numbers of them
+    /// than this one.
+    pub fn find_another(&self, image: &Gray) -> Option<(u32, u32)> {
+        let own = (self.columns.min(self.rows), self.columns.max(self.rows));
+        grid::count(image, &corners::candidates(image)).filter(|counted| *counted != own)
+    }
 }
 
 /// Fewer corners make no grid that can be distinguished from clutter.

@@ -6,20 +6,23 @@
 //!
 //! - [`config`]: the file that names cameras and layouts;
 //! - [`region`]: where tags should be in an image, by where the vehicle should be;
-//! - [`track`]: how the vehicle moves, and both answers where corners leave two open.
+//! - [`track`]: how the vehicle moves, and both answers where corners leave two open;
+//! - [`monitor`]: what is wrong with clocks, cameras' places and tags' sizes, and what that leaves open of the pose.
 //!
 //! Cameras that were not exposed together are carried to one instant by the vehicle's motion: webcams
 //! run free, and at 2 m/s half an image's interval is 3 cm.
 
 mod config;
+mod monitor;
 mod region;
 mod track;
 
 pub use config::{LocateConfig, LocateSetup, SIMULATED, SensorConfig};
+pub use monitor::Finding;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DAffine3, DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
@@ -29,7 +32,8 @@ use crate::detection::Detection;
 use crate::family::TagFamily;
 use crate::image::Gray;
 use crate::layout::{CORNERS, LayoutFrame, Tag, TagLayout};
-use crate::solve::{self, Geometry, Sighting};
+use crate::solve::{self, Geometry, Motion, Sighting, Solved};
+use monitor::{Linear, Monitor};
 use region::Expected;
 use track::Track;
 
@@ -60,9 +64,9 @@ impl Default for LocateSettings {
             corner_sigma_px: 0.12,
             most_rms_px: 3.0,
             most_tilt_rad: 1.1,
-            floor_m: 0.002,
+            floor_m: 0.0002,
             floor_rad: 0.002,
-            most_lag_s: 0.035,
+            most_lag_s: 0.075,
         }
     }
 }
@@ -142,6 +146,8 @@ pub struct CameraResult {
     pub stamp: HostTime,
     /// Where it was looked; the whole image if nothing.
     pub region: Option<Region>,
+    /// Whether no tag should be in its image, by where the vehicle should be.
+    pub out_of_view: bool,
     /// Tags of the layouts.
     pub seen: Vec<TagObservation>,
     /// Tags of no layout, or of one that this camera cannot use.
@@ -172,15 +178,20 @@ pub struct Locator {
     tags: HashMap<(TagFamily, u32), (LayoutFrame, Tag)>,
     detector: Detector,
     track: Track,
+    monitor: Monitor,
+    /// Middle of the tags that cameras look at: what they grow about. [m, body or world]
+    middle_m: DVec3,
     settings: LocateSettings,
 }
 
 struct CameraState {
     camera: TagCamera,
-    /// What it saw last.
-    kept: Option<(HostTime, Vec<Detection>)>,
+    /// What it saw in its last images, the newest last, by the stamps that came with them.
+    kept: VecDeque<(HostTime, Vec<Detection>)>,
     /// Images since it last saw a tag.
     misses: u32,
+    /// When it was last looked whether tags of the room are where they were.
+    room_seen: Option<HostTime>,
 }
 
 impl Locator {
@@ -225,11 +236,39 @@ impl Locator {
         families.sort_unstable();
         families.dedup();
         let detector = Detector::new(&families, settings.detector.clone());
-        let stations = cameras
+        let stations: Vec<CameraState> = cameras
             .into_iter()
-            .map(|camera| CameraState { camera, kept: None, misses: 0 })
+            .map(|camera| CameraState { camera, kept: VecDeque::new(), misses: 0, room_seen: None })
             .collect();
-        Ok(Self { stations, tags, detector, track: Track::default(), settings })
+        let frame = if on_vehicle { LayoutFrame::Body } else { LayoutFrame::World };
+        let looked_at =
+            tags.values().filter(|(of, _)| *of == frame).map(|(_, tag): &(_, Tag)| tag.position_m);
+        let middle_m = looked_at.clone().sum::<DVec3>() / looked_at.count() as f64;
+        let place_sigma_m = |station: &CameraState| {
+            let survey = station.camera.survey.as_ref();
+            survey.map_or(UNSURVEYED_M, |survey| {
+                SURVEY_SIGMAS * survey.sigma_m.max(LEAST_SURVEY_M) / 3f64.sqrt()
+            })
+        };
+        let monitor = Monitor::new(&stations.iter().map(place_sigma_m).collect::<Vec<_>>());
+        let track = Track::default();
+        Ok(Self { stations, tags, detector, track, monitor, middle_m, settings })
+    }
+
+    /// Returns what is found to be wrong with the lab.
+    pub fn findings(&self) -> Vec<Finding> {
+        let places: Vec<DAffine3> = self
+            .stations
+            .iter()
+            .map(|station| match station.camera.mounting {
+                Mounting::World(Pose { rotation, translation_m, .. })
+                | Mounting::Body(Pose { rotation, translation_m, .. }) => {
+                    DAffine3::from_rotation_translation(rotation, translation_m)
+                }
+                Mounting::Unknown => DAffine3::IDENTITY,
+            })
+            .collect();
+        self.monitor.findings(&places)
     }
 
     /// Returns the cameras, in the order of their indices.
@@ -242,16 +281,18 @@ impl Locator {
     /// # Panics
     /// If there is no view, a camera has no such index, or an image is not of the camera's size.
     pub fn handle_images(&mut self, views: &[StampedImage]) -> LocateOutcome {
-        let stamp = views.iter().map(|view| view.stamp).max().expect("there is a view");
+        let exposed = views.iter().map(|view| self.exposed(view.camera, view.stamp));
+        let stamp = exposed.max().expect("there is a view");
         let mut expected =
             self.track.predict(stamp).map(|pose| (pose, self.track.uncertainty_m(stamp)));
         let mut looks = Vec::with_capacity(views.len());
         for view in views {
+            self.look_at_room(view);
             looks.push(self.look(view, expected.as_ref()));
             if expected.is_none() && looks.iter().any(|look: &CameraResult| !look.seen.is_empty()) {
                 // Found by one camera, it is looked for in the right place by the others.
-                let sightings = self.sightings(stamp);
-                let motion = self.track.motion().unwrap_or_default();
+                let (sightings, _) = self.sightings(stamp);
+                let motion = self.track.motion(stamp).unwrap_or_default();
                 if let Some(solved) = solve::solve(&sightings, &motion, None)
                     && solved.other.is_none()
                     && solved.best.rms_px <= self.settings.most_rms_px
@@ -269,6 +310,53 @@ impl Locator {
         LocateOutcome { located, looks }
     }
 
+    /// Looks now and then whether tags of the room are still where a camera in the room had them.
+    fn look_at_room(&mut self, view: &StampedImage) {
+        let wrong = self.monitor.correction(view.camera);
+        let station = &mut self.stations[view.camera];
+        let Mounting::World(world_from_cam) = station.camera.mounting else { return };
+        let due = station.room_seen.is_none_or(|at| view.stamp.seconds_since(at) > ROOM_S);
+        if !due || !self.tags.values().any(|(frame, _)| *frame == LayoutFrame::World) {
+            return;
+        }
+        station.room_seen = Some(view.stamp);
+        let room = self.tags.values().filter(|(frame, _)| *frame == LayoutFrame::World);
+        let room = room.map(|(_, tag)| tag);
+        let Expected::Within(region) =
+            region::expect(&station.camera, room, &Pose::IDENTITY, ROOM_UNCERTAINTY_M)
+        else {
+            return;
+        };
+        let found = self.detector.look(view.image, &region, &station.camera.intrinsics);
+        // A vehicle that stays where it is, and is the camera's stand.
+        let at = wrong.apply(&world_from_cam);
+        let body_from_cam = Pose::new(at.translation_m, at.rotation);
+        let sightings: Vec<Sighting> = found
+            .iter()
+            .filter_map(|seen| {
+                let (frame, tag) = self.tags.get(&(seen.family, seen.id))?;
+                (*frame == LayoutFrame::World).then(|| Sighting {
+                    camera: &station.camera.intrinsics,
+                    sight: Geometry::InsideOut {
+                        body_from_cam,
+                        world_from_tag: tag.frame_from_tag(),
+                    },
+                    size_m: tag.size_m,
+                    corners_px: seen.corners_px,
+                    sigma_px: self.settings.corner_sigma_px,
+                    lag_s: 0.0,
+                    readout_s: 0.0,
+                })
+            })
+            .collect();
+        let cameras = vec![view.camera; sightings.len()];
+        let motion = Motion::default();
+        let pose = Pose::IDENTITY;
+        if let Some(set) = Linear::at(&sightings, &cameras, &motion, &pose, self.middle_m) {
+            self.monitor.anchor(view.camera, &set);
+        }
+    }
+
     fn look(
         &mut self,
         view: &StampedImage,
@@ -280,7 +368,9 @@ impl Locator {
         let size = (view.image.width_px(), view.image.height_px());
         assert_eq!(size, (k.width_px, k.height_px), "images have the size of their intrinsics");
         let expected = expected.map_or(Expected::Unknown, |(pose, uncertainty_m)| {
-            region::expect(&station.camera, self.tags.values(), pose, *uncertainty_m)
+            let tags =
+                self.tags.values().filter(|(frame, _)| sees(&station.camera.mounting, *frame));
+            region::expect(&station.camera, tags.map(|(_, tag)| tag), pose, *uncertainty_m)
         });
         // Where it is not found, the whole image is searched, but seldom: something is in the way. Not while
         // another camera sees the vehicle: then the place is right, and a search of this image (140 ms at
@@ -307,44 +397,62 @@ impl Locator {
         let (known, strangers): (Vec<Detection>, Vec<Detection>) =
             found.into_iter().partition(usable);
         station.misses = if known.is_empty() { station.misses.wrapping_add(1) } else { 0 };
-        if station.kept.as_ref().is_none_or(|(kept, _)| *kept <= view.stamp) {
-            station.kept = Some((view.stamp, known.clone()));
+        if station.kept.back().is_none_or(|(kept, _)| *kept <= view.stamp) {
+            station.kept.push_back((view.stamp, known.clone()));
+            if station.kept.len() > MAX_KEPT {
+                station.kept.pop_front();
+            }
         }
         let seen = known
             .into_iter()
             .map(|detection| TagObservation { detection, expected_px: None })
             .collect();
-        CameraResult { camera: view.camera, stamp: view.stamp, region, seen, strangers }
+        let out_of_view = expected == Expected::OutOfView;
+        let StampedImage { camera, stamp, .. } = *view;
+        CameraResult { camera, stamp, region, out_of_view, seen, strangers }
     }
 
     /// Whether a camera other than this view's saw the vehicle in its newest image, not long ago.
     fn is_seen_elsewhere(&self, view: &StampedImage) -> bool {
         self.stations.iter().enumerate().any(|(index, station)| {
-            let newest = station.kept.as_ref().filter(|_| index != view.camera);
+            let newest = station.kept.back().filter(|_| index != view.camera);
             newest.is_some_and(|(at, tags)| {
                 !tags.is_empty() && view.stamp.seconds_since(*at).abs() < SEEN_LATELY_S
             })
         })
     }
 
-    /// Returns what all cameras saw around an instant.
-    fn sightings(&self, stamp: HostTime) -> Vec<Sighting<'_>> {
-        let mut all = Vec::new();
-        for station in &self.stations {
-            let Some((at, tags)) = &station.kept else { continue };
-            let lag_s = stamp.seconds_since(*at);
-            if lag_s.abs() > self.most_lag_s() {
-                continue;
-            }
-            for tag in tags {
+    /// Returns when an image was exposed that bears a stamp.
+    fn exposed(&self, camera: usize, stamp: HostTime) -> HostTime {
+        stamp.plus_seconds(-self.monitor.correction(camera).late_s)
+    }
+
+    /// Returns what all cameras saw around an instant, and which camera each.
+    fn sightings(&self, stamp: HostTime) -> (Vec<Sighting<'_>>, Vec<usize>) {
+        let (mut all, mut cameras) = (Vec::new(), Vec::new());
+        let scale = self.monitor.scale();
+        for (index, station) in self.stations.iter().enumerate() {
+            let wrong = self.monitor.correction(index);
+            let lag_s = |at: HostTime| stamp.seconds_since(self.exposed(index, at));
+            // The newest image up to the instant, and the first one after it: motion in between cancels out.
+            let before = station.kept.iter().rfind(|(at, _)| lag_s(*at) >= 0.0);
+            let after = station.kept.iter().find(|(at, _)| lag_s(*at) < 0.0);
+            let near = before.into_iter().chain(after).map(|(at, tags)| (lag_s(*at), tags));
+            let near = near.filter(|(lag_s, _)| lag_s.abs() <= self.most_lag_s(stamp));
+            let seen =
+                near.flat_map(|(lag_s, tags)| tags.iter().map(move |tag| (lag_s, tags, tag)));
+            for (lag_s, tags, tag) in seen {
                 let Some((_, placed)) = self.tags.get(&(tag.family, tag.id)) else { continue };
+                let position_m = self.middle_m + scale * (placed.position_m - self.middle_m);
+                let size_m = scale * placed.size_m;
+                let placed = Tag { size_m, position_m, ..*placed };
                 let sight = match station.camera.mounting {
                     Mounting::World(world_from_cam) => Geometry::OutsideIn {
-                        world_from_cam,
+                        world_from_cam: wrong.apply(&world_from_cam),
                         body_from_tag: placed.frame_from_tag(),
                     },
                     Mounting::Body(body_from_cam) => Geometry::InsideOut {
-                        body_from_cam,
+                        body_from_cam: wrong.apply(&body_from_cam),
                         world_from_tag: placed.frame_from_tag(),
                     },
                     Mounting::Unknown => continue,
@@ -354,7 +462,9 @@ impl Locator {
                 let edge_px = tag.corners_px[0].distance(tag.corners_px[2]) / 2f64.sqrt();
                 let px_per_m = edge_px / placed.size_m;
                 let corners = (4 * tags.len()) as f64;
-                let carried_px = lag_s.abs() * SPEED_UNCERTAINTY_MPS * px_per_m * corners.sqrt();
+                let carried_m = lag_s.abs() * SPEED_UNCERTAINTY_MPS
+                    + 0.5 * lag_s * lag_s * ACCELERATION_UNCERTAINTY_MPS2;
+                let carried_px = carried_m * px_per_m * corners.sqrt();
                 let sigma_px = self.settings.corner_sigma_px.hypot(carried_px);
                 all.push(Sighting {
                     camera: &station.camera.intrinsics,
@@ -363,63 +473,88 @@ impl Locator {
                     corners_px: tag.corners_px,
                     sigma_px,
                     lag_s,
+                    readout_s: wrong.readout_s,
                 });
+                cameras.push(index);
             }
         }
-        all
+        (all, cameras)
     }
 
     /// Returns how far apart in time images are used together. [s]
-    fn most_lag_s(&self) -> f64 {
+    fn most_lag_s(&self, stamp: HostTime) -> f64 {
         // What moves in an unknown way is where it was for one exposure only.
-        if self.track.motion().is_some() { self.settings.most_lag_s } else { TOGETHER_S }
+        if self.track.motion(stamp).is_some() { self.settings.most_lag_s } else { TOGETHER_S }
     }
 
     fn locate(&mut self, stamp: HostTime, looks: &[CameraResult]) -> Result<Located, Unlocated> {
         if looks.iter().all(|look| look.seen.is_empty()) {
             return Err(Unlocated::NoTag);
         }
-        if self.track.newest().is_some_and(|newest| stamp <= newest) {
-            return Err(Unlocated::Old);
-        }
-        let mut sightings = self.sightings(stamp);
+        let is_old = self.track.newest().is_some_and(|newest| stamp <= newest);
+        let (mut sightings, mut cameras) = self.sightings(stamp);
         let expected = self.track.predict(stamp);
-        let motion = self.track.motion().unwrap_or_default();
+        let motion = self.track.motion(stamp).unwrap_or_default();
+        let middle_m = self.middle_m;
+        let linear = |sightings: &[Sighting], cameras: &[usize], solved: &Solved| {
+            Linear::at(sightings, cameras, &motion, &solved.best.world_from_body, middle_m)
+        };
         let most_off = sightings.len() / 3;
         let mut off = 0;
+        let mut solved = solve::solve(&sightings, &motion, expected.as_ref());
+        // Corners that fit no pose tell why.
+        let learnt = solved.as_ref().filter(|solved| solved.other.is_none());
+        let learnt = learnt.and_then(|solved| linear(&sightings, &cameras, solved));
         let solved = loop {
-            let solved =
-                solve::solve(&sightings, &motion, expected.as_ref()).ok_or(Unlocated::NoPose)?;
-            if solved.best.rms_px <= self.settings.most_rms_px {
-                break solved;
+            let Some(found) = &solved else { break Err(Unlocated::NoPose) };
+            if found.best.rms_px <= self.settings.most_rms_px {
+                break Ok(*found);
             }
             // A few tags that do not fit the others are misread, or have moved: without them.
-            let pose = &solved.best.world_from_body;
+            let pose = &found.best.world_from_body;
             let worst = sightings
                 .iter()
                 .map(|sighting| solve::residual_px(sighting, &motion, pose))
                 .enumerate()
                 .max_by(|a, b| a.1.total_cmp(&b.1));
             match worst {
-                Some((index, _)) if off < most_off => drop(sightings.swap_remove(index)),
-                _ => return Err(Unlocated::Residuals(solved.best.rms_px)),
+                Some((index, _)) if off < most_off => {
+                    sightings.swap_remove(index);
+                    cameras.swap_remove(index);
+                }
+                _ => break Err(Unlocated::Residuals(found.best.rms_px)),
             }
             off += 1;
+            solved = solve::solve(&sightings, &motion, expected.as_ref());
         };
         let tags = sightings.len();
-        let cameras = self
-            .stations
-            .iter()
-            .filter(|station| {
-                station.kept.as_ref().is_some_and(|(at, tags)| {
-                    !tags.is_empty() && stamp.seconds_since(*at).abs() <= self.most_lag_s()
-                })
-            })
-            .count();
-        let fit = self
+        let spread = solved
+            .as_ref()
+            .ok()
+            .and_then(|solved| linear(&sightings, &cameras, solved))
+            .map_or([[0.0; 6]; 6], |set| self.monitor.spread(&set));
+        cameras.sort_unstable();
+        cameras.dedup();
+        if let Some(set) = learnt {
+            self.monitor.learn(stamp, &set, &motion);
+            self.monitor.judge(stamp);
+        }
+        if is_old {
+            // Of a camera whose images come late: between two of another's they tell the motion well.
+            if let Ok(Solved { best, other: None }) = solved {
+                self.track.insert(stamp, &best);
+            }
+            return Err(Unlocated::Old);
+        }
+        let mut fit = self
             .track
-            .update(stamp, &solved, self.settings.most_tilt_rad)
+            .update(stamp, &solved?, self.settings.most_tilt_rad)
             .ok_or(Unlocated::Ambiguous)?;
+        for (row, spread) in fit.covariance.iter_mut().zip(spread) {
+            for (value, spread) in row.iter_mut().zip(spread) {
+                *value += spread;
+            }
+        }
         let (sigma_m, sigma_rad) = fit.sigmas();
         let floored = |sigma: DVec3, floor: f64| {
             DVec3::new(sigma.x.hypot(floor), sigma.y.hypot(floor), sigma.z.hypot(floor))
@@ -431,7 +566,7 @@ impl Locator {
             rotation_sigma_rad: floored(sigma_rad, self.settings.floor_rad),
             covariance: fit.covariance,
             tags,
-            cameras,
+            cameras: cameras.len(),
             rms_px: fit.rms_px,
         })
     }
@@ -439,8 +574,9 @@ impl Locator {
     /// Fills in where the pose puts the corners.
     fn expect(&self, look: &mut CameraResult, located: &Located) {
         let camera = &self.stations[look.camera].camera;
-        let lag_s = located.stamp.seconds_since(look.stamp);
-        let pose = self.track.motion().unwrap_or_default().carry(&located.world_from_body, -lag_s);
+        let lag_s = located.stamp.seconds_since(self.exposed(look.camera, look.stamp));
+        let motion = self.track.motion(located.stamp).unwrap_or_default();
+        let pose = motion.carry(&located.world_from_body, -lag_s);
         for seen in &mut look.seen {
             let key = (seen.detection.family, seen.detection.id);
             let Some((_, tag)) = self.tags.get(&key) else { continue };
@@ -494,8 +630,22 @@ fn project_tag(
 const SEEN_LATELY_S: f64 = 0.2;
 /// Exposures closer than this are one. [s]
 const TOGETHER_S: f64 = 0.001;
+/// How far a camera may be off whose file has no survey, along an axis. [m]
+const UNSURVEYED_M: f64 = 0.001;
+/// Errors that all its corners share are not in a survey's sigma: so many of it.
+const SURVEY_SIGMAS: f64 = 1.0;
+/// Nor do stands hold better than this. [m]
+const LEAST_SURVEY_M: f64 = 0.0002;
+/// How often tags of the room are looked at. [s]
+const ROOM_S: f64 = 0.3;
+/// They are looked for so far from where they were. [m]
+const ROOM_UNCERTAINTY_M: f64 = 0.1;
+/// Images of a camera that are kept: others' that come late lie between two of them.
+const MAX_KEPT: usize = 4;
 /// What the vehicle's estimated velocity may be off. [m/s]
-const SPEED_UNCERTAINTY_MPS: f64 = 0.1;
+const SPEED_UNCERTAINTY_MPS: f64 = 0.02;
+/// And its acceleration. [m/s^2]
+const ACCELERATION_UNCERTAINTY_MPS2: f64 = 2.0;
 /// Cosine to a tag's normal below which it cannot be read: 81 degrees.
 const GRAZING: f64 = 0.15;
 

@@ -278,6 +278,8 @@ pub fn webcams(count: usize) -> Vec<TagCamera> {
             },
             mounting: Mounting::World(looking(from, at)),
             calibration: None,
+            survey: None,
+            latency_ms: 0.0,
         }
     });
     made.collect()
@@ -295,6 +297,8 @@ pub fn belly_camera() -> TagCamera {
         intrinsics: Intrinsics { distortion, ..k },
         mounting: Mounting::Body(Pose::new(DVec3::new(0.02, 0.0, -0.04), DQuat::from_mat3(&axes))),
         calibration: None,
+        survey: None,
+        latency_ms: 0.0,
     }
 }
 

@@ -10,7 +10,7 @@ mod cameras;
 mod mat;
 mod picker;
 
-pub use cameras::{CameraImages, PlacedCamera, cameras};
+pub use cameras::{CameraImages, CubeScale, PlacedCamera, SurveyedCameras, cameras};
 pub use mat::{Surveyed, TagResidual, mat};
 pub use picker::Picker;
 
@@ -86,6 +86,7 @@ fn camera_pose(
             corners_px,
             sigma_px: SIGMA_PX,
             lag_s: 0.0,
+            readout_s: 0.0,
         })
         .collect();
     let solved = solve(&sightings, &Motion::default(), None)?;
@@ -108,6 +109,7 @@ fn cube_pose(seen: &[OnCube<'_>]) -> Option<Solved> {
             corners_px,
             sigma_px: SIGMA_PX,
             lag_s: 0.0,
+            readout_s: 0.0,
         })
         .collect();
     solve(&sightings, &Motion::default(), None)

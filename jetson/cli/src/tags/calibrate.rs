@@ -62,7 +62,8 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
         if let Some(calibrator) = session.progress() {
             let line = guide(calibrator, verdict, is_live);
             if line != printed {
-                if is_live || verdict == ViewOutcome::Kept {
+                let tells = matches!(verdict, ViewOutcome::Kept | ViewOutcome::AnotherBoard(..));
+                if is_live || tells {
                     print_line(&line);
                 }
                 printed = line;
@@ -90,6 +91,8 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
         intrinsics: k,
         mounting: Mounting::Unknown,
         calibration: Some(quality),
+        survey: None,
+        latency_ms: 0.0,
     };
     camera.write(&args.output)?;
     let [fx, fy, cx, cy] = found.sigma_px;
@@ -109,6 +112,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
 fn guide(calibrator: &Calibrator, verdict: ViewOutcome, is_live: bool) -> String {
     let wanted = calibrator.wanted();
     let next = match (verdict, wanted.first()) {
+        (ViewOutcome::AnotherBoard(..), _) => verdict.to_string(),
         (ViewOutcome::Moving | ViewOutcome::TooFewTags | ViewOutcome::NoBoard, _) if is_live => {
             verdict.to_string()
         }

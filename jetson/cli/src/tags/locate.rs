@@ -20,7 +20,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, StampedImage, Unlocated};
 
-use self::sources::{CameraImage, Sources};
+use self::sources::{CameraEvent, CameraImage, Sources};
 use self::view::LiveView;
 use crate::terminal::{print_line, stop_flag};
 
@@ -128,6 +128,15 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let mut printed_at = Instant::now();
     while !stop.load(Ordering::Relaxed) {
         let Some(shots) = sources.next(WAIT)? else { break };
+        while let Some(CameraEvent { camera, fault }) = sources.poll_event() {
+            let name = names[camera];
+            if args.json {
+                print_line(json!({ "camera": name, "fault": fault }));
+            } else {
+                let fault = fault.as_deref().unwrap_or("is back");
+                print_line(format!("{name}: {fault}"));
+            }
+        }
         for set in together(&shots) {
             let views: Vec<StampedImage> = set
                 .iter()
@@ -159,9 +168,14 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
             second.seconds = printed_at.elapsed().as_secs_f64();
             printed_at = Instant::now();
             if args.json {
-                print_line(json!({ "status": second.to_json() }));
+                let mut status = second.to_json();
+                status["findings"] = findings(&locator, &names).into();
+                print_line(json!({ "status": status }));
             } else {
                 print_line(second.to_line());
+                for finding in findings(&locator, &names) {
+                    print_line(format!("  {finding}"));
+                }
             }
             figures.add(&std::mem::take(&mut second));
         }
@@ -169,11 +183,21 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     second.seconds = printed_at.elapsed().as_secs_f64();
     figures.add(&second);
     if args.json {
-        print_line(json!({ "report": figures.to_json() }));
+        let mut report = figures.to_json();
+        report["findings"] = findings(&locator, &names).into();
+        print_line(json!({ "report": report }));
     } else {
         print_line(format!("in all: {}", figures.to_line()));
+        for finding in findings(&locator, &names) {
+            print_line(format!("  {finding}"));
+        }
     }
     Ok(())
+}
+
+/// Returns what is wrong with the lab, in words.
+fn findings(locator: &Locator, names: &[&str]) -> Vec<String> {
+    locator.findings().iter().map(|finding| finding.words(names)).collect()
 }
 
 /// Cuts shots, which are in the order of their stamps, where their stamps are apart or a camera comes
@@ -261,6 +285,10 @@ struct Figures {
     images: usize,
     sets: usize,
     located: usize,
+    /// Sets in which no camera can see the vehicle, by where it should be.
+    out_of_view: usize,
+    /// Sets older than a pose before them.
+    late: usize,
     no_tag: usize,
     residuals: usize,
     ambiguous: usize,
@@ -274,8 +302,16 @@ struct Figures {
 
 impl Figures {
     fn note(&mut self, outcome: &LocateOutcome, image_ms: f64, off_m: Option<f64>) {
-        self.sets += 1;
         self.images += outcome.looks.len();
+        if outcome.looks.iter().all(|look| look.out_of_view) {
+            self.out_of_view += 1;
+            return;
+        }
+        if matches!(outcome.located, Err(Unlocated::Old)) {
+            self.late += 1;
+            return;
+        }
+        self.sets += 1;
         self.image_ms.push(image_ms);
         match &outcome.located {
             Ok(located) => {
@@ -288,7 +324,9 @@ impl Figures {
             Err(Unlocated::NoTag) => self.no_tag += 1,
             Err(Unlocated::Residuals(_)) => self.residuals += 1,
             Err(Unlocated::Ambiguous) => self.ambiguous += 1,
-            Err(Unlocated::NoPose | Unlocated::Old) => self.other += 1,
+            Err(Unlocated::NoPose) => self.other += 1,
+            // Counted above.
+            Err(Unlocated::Old) => {}
         }
     }
 
@@ -297,6 +335,8 @@ impl Figures {
         self.images += other.images;
         self.sets += other.sets;
         self.located += other.located;
+        self.out_of_view += other.out_of_view;
+        self.late += other.late;
         self.no_tag += other.no_tag;
         self.residuals += other.residuals;
         self.ambiguous += other.ambiguous;
@@ -324,6 +364,8 @@ impl Figures {
             "images": self.images,
             "sets": self.sets,
             "located": self.located,
+            "out_of_view": self.out_of_view,
+            "late": self.late,
             "no_tag": self.no_tag,
             "residuals": self.residuals,
             "ambiguous": self.ambiguous,

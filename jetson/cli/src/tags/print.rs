@@ -64,6 +64,11 @@ enum PrintCommand {
         /// Edge of a tag's black square. [mm]
         #[arg(long, value_name = "MM", default_value_t = 70.0)]
         tag_mm: f64,
+        /// Length, width and height of a hall [m]: tags as large as webcams in its upper corners need to be surveyed by, on
+        /// the paper that takes.
+        #[arg(long, value_name = "LxWxH", value_parser = hall,
+            conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper"])]
+        for_hall: Option<DVec3>,
         /// Where the grid's middle lies in the room: east, north, up. [m]
         #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
@@ -139,7 +144,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
             let paper = paper.into();
             let cube = Cube { family, first_id, faces, face_mm, tag_mm, middle_m, paper, bar_mm };
             let printed = cube.print()?;
-            finish("cube", common, &printed)?;
+            finish("cube", common, paper, &printed)?;
             for (tag, (name, ..)) in printed.layout.tags.iter().zip(CUBE_FACES) {
                 print_line(format_args!("  {name:<6} {} {}", tag.family, tag.id));
             }
@@ -148,12 +153,45 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
                 face_mm * bar_mm / BAR_MM
             ));
         }
-        PrintCommand::Mat { ref common, first_id, columns, rows, pitch_mm, tag_mm, middle_m } => {
+        PrintCommand::Mat {
+            ref common,
+            first_id,
+            columns,
+            rows,
+            pitch_mm,
+            tag_mm,
+            for_hall,
+            middle_m,
+        } => {
             let &Common { family, paper, bar_mm, .. } = common;
             let paper = paper.into();
-            let mat =
-                Mat { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm };
-            finish("mat", common, &mat.print()?)?;
+            let mat = match for_hall {
+                Some(hall_m) => {
+                    let (mat, px) = Mat::for_hall(hall_m, family, first_id, middle_m, bar_mm)?;
+                    let (tag_mm, paper) = (mat.tag_mm, mat.paper);
+                    print_line(format_args!(
+                        "tags of {tag_mm:.0} mm on {paper}: a webcam of 900 px in a corner sees them with {px:.0} px"
+                    ));
+                    if px < READ_FROM_PX {
+                        print_line(format_args!(
+                            "That is too few: lay the mat nearer to the cameras, one after the other, or take narrower lenses."
+                        ));
+                    }
+                    mat
+                }
+                None => Mat {
+                    family,
+                    first_id,
+                    columns,
+                    rows,
+                    pitch_mm,
+                    tag_mm,
+                    middle_m,
+                    paper,
+                    bar_mm,
+                },
+            };
+            finish("mat", common, mat.paper, &mat.print()?)?;
             print_line(format_args!(
                 "Join the sheets edge to edge, columns to the east, rows to the north; then survey it: \
                  glued paper is off by millimetres."
@@ -162,7 +200,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
         PrintCommand::Board { ref common, first_id, tag_mm } => {
             let &Common { family, paper, bar_mm, .. } = common;
             let board = Mat::board(family, first_id, tag_mm, paper.into(), bar_mm)?;
-            finish("board", common, &board.print()?)?;
+            finish("board", common, board.paper, &board.print()?)?;
             print_line(format_args!(
                 "Glue it on something flat and stiff: a lens is only as straight as the board."
             ));
@@ -200,17 +238,13 @@ fn beside(pdf: &Path) -> Result<PathBuf> {
     Ok(layout)
 }
 
-fn finish(title: &str, common: &Common, printed: &Printed) -> Result<()> {
+fn finish(title: &str, common: &Common, paper: Paper, printed: &Printed) -> Result<()> {
     let path = &common.output;
     let layout = beside(path)?;
     write(path, &pdf(&format!("VizFlyt {title}"), &printed.sheets))?;
     write(&layout, printed.layout.to_toml()?.as_bytes())?;
     let (sheets, tags) = (printed.sheets.len(), printed.layout.tags.len());
-    print_line(format_args!(
-        "{}: {sheets} sheets of {}, {tags} tags",
-        path.display(),
-        Paper::from(common.paper)
-    ));
+    print_line(format_args!("{}: {sheets} sheets of {paper}, {tags} tags", path.display()));
     print_line(format_args!("{}: where they are", layout.display()));
     Ok(())
 }
@@ -218,6 +252,15 @@ fn finish(title: &str, common: &Common, printed: &Printed) -> Result<()> {
 fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }
+
+/// Reads the size of a hall: `11x4.5x3.65`. [m]
+fn hall(text: &str) -> Result<DVec3, String> {
+    three(&text.replace('x', ","))
+        .map_err(|_| "give LENGTHxWIDTHxHEIGHT in metres: 11x4.5x3.65".into())
+}
+
+/// Smaller tags are not read reliably. [px]
+const READ_FROM_PX: f64 = 20.0;
 
 /// Reads three numbers with commas between them.
 fn three(text: &str) -> Result<DVec3, String> {

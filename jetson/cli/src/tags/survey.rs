@@ -5,12 +5,12 @@ use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
-use vizflyt_tags::camera::{Mounting, TagCamera};
+use vizflyt_tags::camera::{Mounting, Survey, TagCamera};
 use vizflyt_tags::capture::{self, ImageSource};
 use vizflyt_tags::detect::{Detector, DetectorSettings};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{LayoutFrame, TagLayout};
-use vizflyt_tags::survey::{self, CameraImages, Picker};
+use vizflyt_tags::survey::{self, CameraImages, CubeScale, Picker};
 
 use crate::terminal::print_line;
 
@@ -189,9 +189,18 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
             break;
         }
     }
-    let placed = survey::cameras(&seen, &mat, cube.as_ref())?;
-    for ((path, _, camera), placed) in files.iter().zip(placed) {
-        let file = TagCamera { mounting: Mounting::World(placed.world_from_cam), ..camera.clone() };
+    let surveyed = survey::cameras(&seen, &mat, cube.as_ref())?;
+    for ((path, _, camera), placed) in files.iter().zip(surveyed.cameras) {
+        let survey = Survey {
+            sigma_m: placed.sigma_m,
+            rms_px: placed.rms_px,
+            corners: placed.corners as u32,
+        };
+        let file = TagCamera {
+            mounting: Mounting::World(placed.world_from_cam),
+            survey: Some(survey),
+            ..camera.clone()
+        };
         file.write(path)?;
         let p = placed.world_from_cam.translation_m;
         print_line(format_args!(
@@ -206,7 +215,27 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
             path.display()
         ));
     }
+    if let Some(scale) = surveyed.cube {
+        print_line(cube_size(scale));
+    }
     Ok(())
+}
+
+/// Returns what is known of the cube's size, and what to do.
+fn cube_size(CubeScale { scale, sigma }: CubeScale) -> String {
+    let (percent, give_or_take) = (1e2 * scale, 1e2 * sigma);
+    if !(sigma < UNKNOWN_SCALE) {
+        "cube: its size cannot be known from these images, as no two cameras see the mat: measure its tags with a \
+         ruler, or lay the mat where two cameras see it"
+            .into()
+    } else if (scale - 1.0).abs() > (4.0 * sigma).max(WRONG_SCALE) {
+        format!(
+            "cube: it has {percent:.1} +- {give_or_take:.1} % of its layout's size; cameras are placed by that. Print it \
+             again at 100 %, or its layout with --bar-mm {percent:.1}"
+        )
+    } else {
+        format!("cube: {percent:.2} +- {give_or_take:.2} % of its layout's size")
+    }
 }
 
 /// Returns the next image; of a live camera the newest, past those that its driver has kept.
@@ -264,6 +293,10 @@ fn check_size(camera: &TagCamera, image: &vizflyt_tags::image::Gray, source: &st
     Ok(())
 }
 
+/// Of a size that is known worse nothing is said.
+const UNKNOWN_SCALE: f64 = 0.02;
+/// A cube that is off by less is as printers and scissors are.
+const WRONG_SCALE: f64 = 0.004;
 /// Images that a driver has buffered before the newest.
 const STALE: usize = 4;
 /// Images of a mat that does not move: noise averages out.

@@ -2,36 +2,46 @@
 
 /// A symmetric matrix; its lower triangle, row by row.
 #[derive(Clone, Debug)]
-pub(super) struct Symmetric {
+pub(crate) struct Symmetric {
     size: usize,
     lower: Vec<f64>,
 }
 
 impl Symmetric {
-    pub(super) fn zero(size: usize) -> Self {
+    pub(crate) fn zero(size: usize) -> Self {
         Self { size, lower: vec![0.0; size * (size + 1) / 2] }
     }
 
     /// Returns an element of the lower triangle.
-    pub(super) fn at(&self, row: usize, column: usize) -> f64 {
+    pub(crate) fn at(&self, row: usize, column: usize) -> f64 {
         self.lower[row * (row + 1) / 2 + column]
     }
 
     /// Adds to an element of the lower triangle.
-    pub(super) fn add(&mut self, row: usize, column: usize, value: f64) {
+    pub(crate) fn add(&mut self, row: usize, column: usize, value: f64) {
         self.lower[row * (row + 1) / 2 + column] += value;
     }
 
     /// Makes the diagonal larger by this share (Marquardt 1963).
-    pub(super) fn damp(&mut self, share: f64) {
+    pub(crate) fn damp(&mut self, share: f64) {
         for i in 0..self.size {
             self.lower[i * (i + 1) / 2 + i] *= 1.0 + share;
         }
     }
 
-    pub(super) fn scaled(mut self, by: f64) -> Self {
-        self.lower.iter_mut().for_each(|x| *x *= by);
+    pub(crate) fn scaled(mut self, by: f64) -> Self {
+        self.scale(by);
         self
+    }
+
+    /// Multiplies it.
+    pub(crate) fn scale(&mut self, by: f64) {
+        self.lower.iter_mut().for_each(|x| *x *= by);
+    }
+
+    /// Adds another one.
+    pub(crate) fn add_all(&mut self, other: &Self) {
+        self.lower.iter_mut().zip(&other.lower).for_each(|(x, y)| *x += y);
     }
 
     /// Replaces it by its Cholesky factor; `false` if it is not positive definite.
@@ -60,7 +70,7 @@ impl Symmetric {
     }
 
     /// Solves for one right side, and is of no use afterwards; `None` if it is not positive definite.
-    pub(super) fn solve(&mut self, right: &[f64]) -> Option<Vec<f64>> {
+    pub(crate) fn solve(&mut self, right: &[f64]) -> Option<Vec<f64>> {
         self.factor().then(|| self.back(right.to_vec()))
     }
 
@@ -82,7 +92,7 @@ impl Symmetric {
     }
 
     /// Replaces it by its inverse; `false` if it is not positive definite.
-    pub(super) fn invert(&mut self) -> bool {
+    pub(crate) fn invert(&mut self) -> bool {
         if !self.factor() {
             return false;
         }

@@ -17,6 +17,8 @@ pub struct Session {
     detector: Option<Detector>,
     calibrator: Option<Calibrator>,
     kept: Vec<Gray>,
+    /// Inner corners of a checkerboard that is not the one of the file.
+    another: Option<(u32, u32)>,
 }
 
 impl Session {
@@ -33,7 +35,7 @@ impl Session {
             }
             Board::Checkerboard(_) => None,
         };
-        Self { board, model, detector, calibrator: None, kept: Vec::new() }
+        Self { board, model, detector, calibrator: None, kept: Vec::new(), another: None }
     }
 
     /// Takes an image; with `is_stream`, as [`Calibrator::add`].
@@ -59,7 +61,15 @@ impl Session {
         let rough = Intrinsics::from_horizontal_fov(size[0], size[1], 1.2);
         let verdict = match (&self.board, &mut self.detector) {
             (Board::Checkerboard(board), _) => {
-                calibrator.add_checkerboard(board.find(&image).as_deref(), is_stream)
+                let verdict = calibrator.add_checkerboard(board.find(&image).as_deref(), is_stream);
+                match verdict {
+                    ViewOutcome::NoBoard => {
+                        let another = board.find_another(&image);
+                        self.another = self.another.or(another);
+                        another.map_or(verdict, |(few, many)| ViewOutcome::AnotherBoard(few, many))
+                    }
+                    _ => verdict,
+                }
             }
             (Board::Tags(_), Some(detector)) => {
                 calibrator.add(&detector.search(&image, &rough, false), is_stream)
@@ -88,7 +98,13 @@ impl Session {
                 add: vec!["show the board to the camera".into()],
             });
         };
-        let first = calibrator.finish(self.model)?;
+        let first = calibrator.finish(self.model).map_err(|refused| match self.another {
+            Some((few, many)) if calibrator.views() == 0 => {
+                let why = ViewOutcome::AnotherBoard(few, many).to_string();
+                Refused { why, add: Vec::new() }
+            }
+            _ => refused,
+        })?;
         // A checkerboard's corners are measured without a lens.
         let Some(detector) = &mut self.detector else { return Ok(first) };
         let mut again = Calibrator::new(self.board.clone(), calibrator.size_px)?;

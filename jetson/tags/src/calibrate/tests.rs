@@ -218,6 +218,30 @@ fn a_board_that_is_no_plane_is_refused() {
 }
 
 #[test]
+fn wrong_counts_of_a_checkerboard_are_named() {
+    use crate::checkerboard::Checkerboard;
+    use crate::checkerboard::tests::{BOARD, PAINTER, pose};
+
+    let mut random = Random::new(8);
+    let mut session =
+        Session::new(Checkerboard { columns: 6, rows: 7, ..BOARD }, LensModel::BrownConrady);
+    let verdicts: Vec<ViewOutcome> = (0..12)
+        .map(|i| {
+            let at = pose(i, 0.75, DVec2::new(40.0, 30.0), &mut random);
+            session.take(PAINTER.paint(&BOARD, &at, 2.0, i.into()), false).unwrap()
+        })
+        .collect();
+    assert!(verdicts.contains(&ViewOutcome::AnotherBoard(6, 9)), "{verdicts:?}");
+    let others = verdicts.iter().filter(|verdict| !matches!(verdict, ViewOutcome::NoBoard));
+    assert!(
+        others.clone().all(|verdict| *verdict == ViewOutcome::AnotherBoard(6, 9)),
+        "{verdicts:?}"
+    );
+    let refused = session.finish().unwrap_err().to_string();
+    assert!(refused.contains("6 by 9 inner corners"), "{refused}");
+}
+
+#[test]
 fn a_lens_is_found_from_images_of_a_checkerboard() {
     use crate::checkerboard::tests::{BOARD, PAINTER, pose, webcam};
 

@@ -20,6 +20,27 @@ pub(super) fn grow(image: &Gray, corners: &[DVec2], board: &Checkerboard) -> Opt
     })
 }
 
+/// Returns columns and rows of the whole grid that hangs together, whatever board it is; the fewer first.
+pub(super) fn count(image: &Gray, corners: &[DVec2]) -> Option<(u32, u32)> {
+    corners.iter().take(MAX_SEEDS).enumerate().find_map(|(seed, _)| {
+        let cells = grow_from(image, corners, seed)?;
+        let least = cells.keys().copied().reduce(IVec2::min)?;
+        let size = cells.keys().copied().reduce(IVec2::max)? - least + 1;
+        let is_whole = size.x * size.y == cells.len() as i32 && size.min_element() >= 3;
+        // One that the image cuts off may go on outside of it.
+        let step_px = |cell: &IVec2| {
+            let next = cells.get(&(*cell + IVec2::X))?;
+            Some(corners[*next].distance(corners[cells[cell]]))
+        };
+        let margin = DVec2::splat(2.0 * cells.keys().filter_map(step_px).fold(0.0, f64::max));
+        let size_px = DVec2::new(image.width_px().into(), image.height_px().into());
+        let inside =
+            |corner: DVec2| corner.cmpgt(margin).all() && corner.cmplt(size_px - margin).all();
+        let is_whole = is_whole && cells.values().all(|&corner| inside(corners[corner]));
+        is_whole.then(|| (size.min_element() as u32, size.max_element() as u32))
+    })
+}
+
 /// Returns the least distance between neighbours of one row. [px]
 pub(super) fn least_spacing_px(grid: &[DVec2], columns: usize) -> f64 {
     let rows = grid.chunks(columns).flat_map(|row| row.windows(2));

@@ -3,10 +3,10 @@
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
-use super::{project_tag, sees};
+use super::project_tag;
 use crate::camera::{Mounting, TagCamera};
 use crate::detect::Region;
-use crate::layout::{LayoutFrame, Tag};
+use crate::layout::Tag;
 
 /// What is expected of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,10 +19,10 @@ pub(super) enum Expected {
     Within(Region),
 }
 
-/// Returns where tags should be if the vehicle is at a pose, give or take `uncertainty_m`.
+/// Returns where tags that move against a camera should be if the vehicle is at a pose, give or take `uncertainty_m`.
 pub(super) fn expect<'a>(
     camera: &TagCamera,
-    tags: impl Iterator<Item = &'a (LayoutFrame, Tag)>,
+    tags: impl Iterator<Item = &'a Tag>,
     world_from_body: &Pose<World, Body>,
     uncertainty_m: f64,
 ) -> Expected {
@@ -30,10 +30,7 @@ pub(super) fn expect<'a>(
     let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
     let (mut edge_px, mut margin_px) = (0.0f64, 0.0f64);
-    for (frame, tag) in tags {
-        if !sees(&camera.mounting, *frame) {
-            continue;
-        }
+    for tag in tags {
         let Some(corners) = project_tag(camera, tag, world_from_body, WITH_RIM) else { continue };
         let inside = |corner: &DVec2| corner.cmpge(DVec2::ZERO).all() && corner.cmple(size).all();
         if !corners.iter().any(inside) {

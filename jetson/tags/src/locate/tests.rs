@@ -156,3 +156,73 @@ fn a_camera_at_whose_border_it_is_does_not_hold_up_the_one_that_sees_it() {
     }
     assert!(found > 20 && hidden > 12, "{found} found by one, {hidden} hidden from the other");
 }
+
+/// Flies a circle before two webcams that are exposed in turn, the second's stamps late by `late_s`; returns what is
+/// found, and how far the last second's poses are from the truth: root mean square in metres, and in sigmas.
+fn fly_before(
+    files: Vec<TagCamera>,
+    room: Option<&TagLayout>,
+    late_s: f64,
+) -> (Vec<String>, f64, f64) {
+    let pose_at = |t_s: f64| {
+        let (s, c) = (1.3 * t_s).sin_cos();
+        Pose::new(DVec3::new(5.5 + c, 0.8 * s, 1.4 + 0.2 * s), DQuat::from_rotation_z(0.6 * t_s))
+    };
+    let layouts: Vec<TagLayout> = std::iter::once(cube()).chain(room.cloned()).collect();
+    let mut all = Vec::new();
+    for (index, camera) in webcams(2).into_iter().enumerate() {
+        let sensor = Sensor { phase: 0.5 * index as f64, ..Sensor::default() };
+        let mut simulated = SimulatedCamera::new(camera, sensor);
+        let mut truth = Truth::default();
+        for ms in 0..3000 {
+            truth.push(at(ms), pose_at(ms as f64 * 1e-3));
+            if let Some((stamp, image)) = simulated.expose(&truth, &layouts, false) {
+                all.push((stamp.plus_seconds(late_s * index as f64), index, image));
+            }
+        }
+    }
+    all.sort_by_key(|(stamp, index, _)| (*stamp, *index));
+    let mut locator = locator(files, &layouts);
+    let (mut off_m2, mut sigmas, mut count) = (0.0f64, 0.0, 0.0);
+    for (stamp, camera, image) in &all {
+        let image = StampedImage { camera: *camera, stamp: *stamp, image };
+        let Ok(found) = locator.handle_images(&[image]).located else { continue };
+        let t_s = found.stamp.seconds_since(at(0));
+        if t_s > 2.0 {
+            let off = found.world_from_body.translation_m - pose_at(t_s).translation_m;
+            off_m2 += off.length_squared();
+            sigmas += (off / found.position_sigma_m).length_squared() / 3.0;
+            count += 1.0;
+        }
+    }
+    let findings =
+        locator.findings().iter().map(|finding| finding.words(&["west", "east"])).collect();
+    (findings, (off_m2 / count).sqrt(), sigmas / count)
+}
+
+#[test]
+fn what_is_wrong_with_the_lab_is_found_named_and_corrected() {
+    let moved = |index: usize| {
+        let mut files = webcams(2);
+        if let Mounting::World(pose) = &mut files[index].mounting {
+            pose.translation_m += DVec3::new(0.012, -0.018, 0.01);
+            pose.rotation *= DQuat::from_scaled_axis(DVec3::new(0.006, 0.009, -0.004));
+        }
+        files
+    };
+    let check = |files: Vec<TagCamera>, room, late_s, expected: &[&str]| {
+        let (found, off_m, sigmas) = fly_before(files, room, late_s);
+        println!("{found:?}, {off_m} m, {sigmas}");
+        assert_eq!(found.len(), expected.len(), "{found:?}");
+        for (found, part) in found.iter().zip(expected) {
+            assert!(found.contains(part), "{found} lacks {part}");
+        }
+        assert!(off_m < 0.01, "{off_m} m");
+        assert!(sigmas < 2.5, "{sigmas}");
+    };
+    check(webcams(2), None, 0.0, &[]);
+    check(webcams(2), None, 0.03, &["east stamps images"]);
+    let floor = mat(DVec2::new(4.5, -1.0), DVec2::new(6.5, 1.0));
+    check(moved(0), Some(&floor), 0.0, &["west camera moved by 2."]);
+    check(moved(1), Some(&floor), 0.0, &["east camera moved by 2."]);
+}

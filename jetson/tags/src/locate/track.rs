@@ -22,8 +22,8 @@ pub(super) struct Track {
 
 #[derive(Clone, Debug)]
 struct Hypothesis {
-    /// Newest last.
-    past: VecDeque<(HostTime, Pose<World, Body>)>,
+    /// Newest last, each with how much it counts.
+    past: VecDeque<(HostTime, Pose<World, Body>, f64)>,
     penalty: f64,
 }
 
@@ -47,9 +47,17 @@ impl Track {
             + 0.5 * ACCELERATION_UNCERTAINTY_MPS2 * dt_s * dt_s
     }
 
-    /// Returns how it moves; `None` before there are enough poses.
-    pub(super) fn motion(&self) -> Option<Motion> {
-        self.hypotheses.first()?.motion()
+    /// Takes a pose of the past, which tells how it moves since.
+    pub(super) fn insert(&mut self, stamp: HostTime, fit: &PoseFit) {
+        if let [only] = &mut self.hypotheses[..] {
+            only.push(stamp, fit);
+        }
+    }
+
+    /// Returns how it moves; `None` before there are enough poses, and some time after the last.
+    pub(super) fn motion(&self, stamp: HostTime) -> Option<Motion> {
+        let age_s = stamp.seconds_since(self.newest()?);
+        (age_s <= MOTION_LASTS_S).then(|| self.hypotheses.first()?.motion())?
     }
 
     /// Takes a solution; returns the accepted fit, or `None` while two are possible.
@@ -80,7 +88,7 @@ impl Track {
                 None => (own, VecDeque::new()),
             };
             let mut hypothesis = Hypothesis { past, penalty };
-            hypothesis.push(stamp, pose);
+            hypothesis.push(stamp, &fit);
             next.push((hypothesis, fit));
         }
         next.sort_by(|a, b| a.0.penalty.total_cmp(&b.0.penalty));
@@ -101,12 +109,15 @@ impl Track {
 
 impl Hypothesis {
     fn newest(&self) -> Option<(HostTime, Pose<World, Body>)> {
-        self.past.back().copied()
+        self.past.back().map(|(stamp, pose, _)| (*stamp, *pose))
     }
 
-    fn push(&mut self, stamp: HostTime, pose: Pose<World, Body>) {
-        self.past.push_back((stamp, pose));
-        while self.past.front().is_some_and(|(old, _)| stamp.seconds_since(*old) > MOTION_SPAN_S)
+    fn push(&mut self, stamp: HostTime, fit: &PoseFit) {
+        let weight = (fit.sigmas().0.length_squared() + MIN_SIGMA_M * MIN_SIGMA_M).recip();
+        let at = self.past.partition_point(|(other, ..)| *other < stamp);
+        self.past.insert(at, (stamp, fit.world_from_body, weight));
+        let Some((stamp, _)) = self.newest() else { return };
+        while self.past.front().is_some_and(|(old, ..)| stamp.seconds_since(*old) > MOTION_SPAN_S)
             || self.past.len() > MAX_KEPT
         {
             self.past.pop_front();
@@ -119,26 +130,59 @@ impl Hypothesis {
         (dt_s.abs() <= FORGET_AFTER_S).then(|| self.motion().unwrap_or_default().carry(&pose, dt_s))
     }
 
-    /// Returns straight lines through the latest poses, by least squares.
+    /// Returns parabolas through the latest poses, by least squares; straight lines through a few. At the newest
+    /// pose: the velocity of a straight line is that of the middle of its span.
     fn motion(&self) -> Option<Motion> {
-        let (newest, pose) = self.newest()?;
-        if self.past.len() < 3 {
+        let (_, pose) = self.newest()?;
+        let (v_world_mps, a_world_mps2) =
+            self.slope(MOTION_SPAN_S, |past| past.translation_m - pose.translation_m)?;
+        let (omega_body_radps, _) =
+            self.slope(TURN_SPAN_S, |past| turn(pose.rotation, past.rotation))?;
+        Some(Motion { v_world_mps, omega_body_radps, a_world_mps2 })
+    }
+
+    /// Returns first and second derivative by time of a quantity at the newest pose, by those of the last `span_s`.
+    fn slope(
+        &self,
+        span_s: f64,
+        value: impl Fn(&Pose<World, Body>) -> DVec3,
+    ) -> Option<(DVec3, DVec3)> {
+        let (newest, _) = self.newest()?;
+        let age_s = |stamp: &HostTime| newest.seconds_since(*stamp);
+        let recent = || self.past.iter().filter(|(stamp, ..)| age_s(stamp) <= span_s);
+        let count = recent().count();
+        let (oldest, ..) = recent().next()?;
+        let span_s = age_s(oldest);
+        if count < 3 || !(span_s > 1e-3) {
             return None;
         }
-        let n = self.past.len() as f64;
-        let times = self.past.iter().map(|(stamp, _)| stamp.seconds_since(newest));
-        let mean_s = times.clone().sum::<f64>() / n;
-        let spread: f64 = times.map(|t| (t - mean_s).powi(2)).sum();
-        if !(spread > 1e-9) {
-            return None;
+        // Time in spans, 0 is the newest: sums of powers of it, and of what changes times them.
+        let (mut powers, mut sums) = ([0.0; 5], [DVec3::ZERO; 3]);
+        for (stamp, past, weight) in recent() {
+            let (t, value) = (-age_s(stamp) / span_s, value(past));
+            let mut power = *weight;
+            for i in 0..5 {
+                powers[i] += power;
+                if i < 3 {
+                    sums[i] += value * power;
+                }
+                power *= t;
+            }
         }
-        let (mut v, mut omega) = (DVec3::ZERO, DVec3::ZERO);
-        for (stamp, past) in &self.past {
-            let weight = (stamp.seconds_since(newest) - mean_s) / spread;
-            v += weight * (past.translation_m - pose.translation_m);
-            omega += weight * turn(pose.rotation, past.rotation);
-        }
-        Some(Motion { v_world_mps: v, omega_body_radps: omega })
+        let [n, t, t2, t3, t4] = powers;
+        // Rows of the inverse that yield slope and curvature.
+        let (slope, bend) = if count >= CURVED_FROM {
+            let det = n * (t2 * t4 - t3 * t3) - t * (t * t4 - t3 * t2) + t2 * (t * t3 - t2 * t2);
+            (
+                [(t3 * t2 - t * t4) / det, (n * t4 - t2 * t2) / det, (t * t2 - n * t3) / det],
+                [(t * t3 - t2 * t2) / det, (t * t2 - n * t3) / det, (n * t2 - t * t) / det],
+            )
+        } else {
+            let det = n * t2 - t * t;
+            ([-t / det, n / det, 0.0], [0.0; 3])
+        };
+        let by = |row: [f64; 3]| row[0] * sums[0] + row[1] * sums[1] + row[2] * sums[2];
+        Some((by(slope) / span_s, 2.0 * by(bend) / (span_s * span_s)))
     }
 
     /// Returns what a pose costs as the next of this one's.
@@ -160,8 +204,16 @@ fn turn(from: DQuat, to: DQuat) -> DVec3 {
     (if q.w < 0.0 { -q } else { q }).to_scaled_axis()
 }
 
-/// Poses of this span make the motion: at 30 Hz five of them. [s]
-const MOTION_SPAN_S: f64 = 0.14;
+/// Poses of this span make the motion: of two cameras at 30 Hz ten. [s]
+const MOTION_SPAN_S: f64 = 0.16;
+/// Turns change faster than velocities. [s]
+const TURN_SPAN_S: f64 = 0.12;
+/// After this long a motion is another one. [s]
+const MOTION_LASTS_S: f64 = 0.15;
+/// A parabola takes so many poses.
+const CURVED_FROM: usize = 6;
+/// Better than this poses do not count more. [m]
+const MIN_SIGMA_M: f64 = 0.001;
 /// And no more than this many.
 const MAX_KEPT: usize = 32;
 /// After this long a vehicle can be anywhere. [s]

@@ -60,6 +60,41 @@ impl Mat {
         Ok(Self { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm })
     }
 
+    /// Returns the mat by which webcams in the upper corners of a hall are surveyed, laid in its middle: two by four
+    /// tags, as large as these see them well, and no larger than A3 has room for; and how many pixels the tags fill.
+    ///
+    /// # Errors
+    /// [`PrintError::Invalid`] for a hall that is none.
+    pub fn for_hall(
+        hall_m: DVec3,
+        family: TagFamily,
+        first_id: u32,
+        middle_m: DVec3,
+        bar_mm: f64,
+    ) -> Result<(Self, f64), PrintError> {
+        if !(hall_m.cmpge(DVec3::ONE).all() && hall_m.cmple(DVec3::splat(100.0)).all()) {
+            let (name, value) = ("for_hall", hall_m.max_element());
+            let advice = "give length, width and height in metres, 1 to 100 each: 11x4.5x3.65";
+            return Err(PrintError::Invalid { name, value, advice });
+        }
+        let away_m = (hall_m * DVec3::new(0.5, 0.5, 1.0)).length();
+        let wanted_mm = 1e3 * WELL_SEEN_PX * away_m / WEBCAM_FOCAL_PX;
+        // In steps of a centimetre.
+        let tag_mm = ((wanted_mm / 10.0).ceil() * 10.0).clamp(70.0, A3_TAG_MM);
+        let mat = Self {
+            family,
+            first_id,
+            columns: 2,
+            rows: 4,
+            pitch_mm: HALL_PITCH * tag_mm,
+            tag_mm,
+            middle_m,
+            paper: if tag_mm > A4_TAG_MM { Paper::A3 } else { Paper::A4 },
+            bar_mm,
+        };
+        Ok((mat, 1e-3 * tag_mm / away_m * WEBCAM_FOCAL_PX))
+    }
+
     /// Returns its sheets, row by row from the lower left, and its layout.
     ///
     /// # Errors
@@ -163,3 +198,13 @@ impl Mat {
         TagLayout { frame: LayoutFrame::World, tags }
     }
 }
+
+/// A tag that lies on the floor is seen aslant, and is read from 20 px on. [px]
+const WELL_SEEN_PX: f64 = 25.0;
+/// Of a webcam of 70 degrees at 1280 x 720. [px]
+const WEBCAM_FOCAL_PX: f64 = 900.0;
+/// From tag to tag in tags: white rims, and room for scissors.
+const HALL_PITCH: f64 = 1.375;
+/// The largest tags of which one fits on a sheet at this pitch. [mm]
+const A3_TAG_MM: f64 = 200.0;
+const A4_TAG_MM: f64 = 130.0;

@@ -157,6 +157,23 @@ fn invalid_sheets_are_refused_by_name() {
 }
 
 #[test]
+fn a_mat_is_sized_by_the_hall() {
+    let check = |hall_m: [f64; 3], tag_mm: f64, paper: Paper| {
+        let middle_m = DVec3::ZERO;
+        let (mat, px) =
+            Mat::for_hall(hall_m.into(), TagFamily::Tag36h11, 100, middle_m, BAR_MM).unwrap();
+        assert_eq!((mat.tag_mm, mat.paper), (tag_mm, paper), "{hall_m:?}");
+        assert!(px >= 25.0 || tag_mm == 200.0, "{px}");
+        assert_eq!(mat.print().unwrap().layout.tags.len(), 8);
+    };
+    check([11.0, 4.5, 3.65], 200.0, Paper::A3);
+    check([5.0, 4.0, 2.5], 120.0, Paper::A4);
+    check([30.0, 20.0, 8.0], 200.0, Paper::A3);
+    let none = DVec3::new(f64::NAN, 4.0, 3.0);
+    assert!(Mat::for_hall(none, TagFamily::Tag36h11, 100, DVec3::ZERO, BAR_MM).is_err());
+}
+
+#[test]
 fn a_pdf_has_a_page_for_each_sheet_of_its_size() {
     let printed = mat().print().unwrap();
     let bytes = pdf("mat", &printed.sheets);

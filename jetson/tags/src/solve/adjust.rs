@@ -35,8 +35,8 @@ impl PoseFit {
 pub(super) fn cost(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, Body>) -> f64 {
     let mut total = 0.0;
     for sighting in sightings {
-        let at = motion.carry(pose, -sighting.lag_s);
         for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+            let at = motion.carry(pose, -sighting.lag_at_s(measured.y));
             let p_cam = in_cam(sighting, &at, (*corner * sighting.size_m).extend(0.0)).0;
             let Some(seen) = project(sighting.camera, p_cam) else { return f64::INFINITY };
             total += loss((seen.0 - measured).length_squared() / sighting.sigma_px.powi(2)).0;
@@ -47,9 +47,9 @@ pub(super) fn cost(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, B
 
 /// See [`super::residual_px`].
 pub(super) fn residual_px(sighting: &Sighting, motion: &Motion, pose: &Pose<World, Body>) -> f64 {
-    let at = motion.carry(pose, -sighting.lag_s);
     let mut sum = 0.0;
     for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+        let at = motion.carry(pose, -sighting.lag_at_s(measured.y));
         let p_cam = in_cam(sighting, &at, (*corner * sighting.size_m).extend(0.0)).0;
         let Some(seen) = project(sighting.camera, p_cam) else { return f64::INFINITY };
         sum += (seen.0 - measured).length_squared();
@@ -97,7 +97,7 @@ pub(super) fn adjust(
             }
         }
     }
-    let mut covariance = normal.inverse()?;
+    let mut covariance = invert6(&normal.matrix)?;
     // Corners that scatter more than they should show that sigma was too small; never that it was
     // too large: few corners agree by chance.
     let freedom = (2 * normal.corners).saturating_sub(6).max(1);
@@ -117,6 +117,93 @@ pub(super) fn adjust(
     (pose.is_valid() && fit.cost.is_finite()).then_some(fit)
 }
 
+/// A corner's residual and how it changes with everything that may be wrong.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CornerRow {
+    /// Where the pose puts the corner less where it was seen. [px]
+    pub(crate) off_px: DVec2,
+    /// By the pose's position (world axes) and turns (body axes), for x and for y. [px/m, px/rad]
+    pub(crate) by_pose: [[f64; 6]; 2],
+    /// By the time between exposure and pose. [px/s]
+    pub(crate) by_lag: DVec2,
+    /// By the camera's position (outer axes) and turns (its own axes). [px/m, px/rad]
+    pub(crate) by_camera: [[f64; 6]; 2],
+    /// By the tags' scale about `middle_m`. [px]
+    pub(crate) by_scale: DVec2,
+    /// The row: -0.5 is the image's first, 0.5 its last.
+    pub(crate) row_share: f64,
+}
+
+/// Returns the four corners of a tag at a pose; `None` behind the camera. Tags grow about `middle_m` of their
+/// layout's frame.
+pub(crate) fn corner_rows(
+    sighting: &Sighting,
+    motion: &Motion,
+    pose: &Pose<World, Body>,
+    middle_m: DVec3,
+) -> Option<[CornerRow; 4]> {
+    let zero = DVec2::ZERO;
+    let row = CornerRow {
+        off_px: zero,
+        by_pose: [[0.0; 6]; 2],
+        by_lag: zero,
+        by_camera: [[0.0; 6]; 2],
+        by_scale: zero,
+        row_share: 0.0,
+    };
+    let mut rows = [row; 4];
+    for ((row, corner), measured) in rows.iter_mut().zip(CORNERS).zip(sighting.corners_px) {
+        let lag_s = sighting.lag_at_s(measured.y);
+        let at = motion.carry(pose, -lag_s);
+        let p_tag = (corner * sighting.size_m).extend(0.0);
+        let (p_cam, by_position, by_turn) = in_cam(sighting, &at, p_tag);
+        let (seen, by_point) = project(sighting.camera, p_cam)?;
+        row.off_px = seen - measured;
+        row.row_share = sighting.row_share(measured.y);
+        let v_mps = motion.v_world_mps - motion.a_world_mps2 * lag_s;
+        let by_lag = -(by_position * v_mps + by_turn * motion.omega_body_radps);
+        // Where the camera goes everything else goes the other way.
+        let (outer, grown) = match sighting.sight {
+            Geometry::OutsideIn { world_from_cam, body_from_tag } => {
+                let p_body = body_from_tag.transform_point(p_tag);
+                let by_body = by_position * DMat3::from_quat(at.rotation);
+                (world_from_cam.rotation, by_body * (p_body - middle_m))
+            }
+            Geometry::InsideOut { body_from_cam, world_from_tag } => {
+                let p_world = world_from_tag.transform_point(p_tag);
+                (body_from_cam.rotation, by_position * (middle_m - p_world))
+            }
+        };
+        let by_place = -DMat3::from_quat(outer).transpose();
+        let by_tilt = cross(p_cam);
+        for (axis, by_point) in by_point.iter().enumerate() {
+            row.by_lag[axis] = by_point.dot(by_lag);
+            row.by_scale[axis] = by_point.dot(grown);
+            row.by_pose[axis] = six(*by_point, by_position, by_turn);
+            row.by_camera[axis] = six(*by_point, by_place, by_tilt);
+        }
+    }
+    Some(rows)
+}
+
+fn six(by_point: DVec3, by_position: DMat3, by_turn: DMat3) -> [f64; 6] {
+    let position = by_position.transpose() * by_point;
+    let turn = by_turn.transpose() * by_point;
+    [position.x, position.y, position.z, turn.x, turn.y, turn.z]
+}
+
+/// Returns the inverse of a symmetric positive matrix, of which the lower triangle is read.
+pub(crate) fn invert6(matrix: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
+    let l = cholesky(matrix)?;
+    let mut inverse = [[0.0; 6]; 6];
+    for i in 0..6 {
+        let mut unit = [0.0; 6];
+        unit[i] = 1.0;
+        inverse[i] = solve_with(&l, &unit);
+    }
+    inverse.iter().flatten().all(|value| value.is_finite()).then_some(inverse)
+}
+
 /// The normal equations at a pose.
 struct Normal {
     /// Lower triangle of `J^T W J`.
@@ -124,7 +211,7 @@ struct Normal {
     /// `J^T W r`.
     gradient: [f64; 6],
     cost: f64,
-    /// Weighted, in units of sigma.
+    /// In units of sigma; a misread corner counts as [`MISREAD_SIGMAS`].
     square_sum: f64,
     square_sum_px2: f64,
     corners: usize,
@@ -141,10 +228,10 @@ impl Normal {
             corners: 0,
         };
         for sighting in sightings {
-            let at = motion.carry(pose, -sighting.lag_s);
             // A turn of the pose that is asked for turns the earlier one about the same vehicle axes, up to
             // what the vehicle turns in the lag: a degree, which costs a round, not exactness.
             for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
+                let at = motion.carry(pose, -sighting.lag_at_s(measured.y));
                 let p_tag = (*corner * sighting.size_m).extend(0.0);
                 let (p_cam, by_position, by_turn) = in_cam(sighting, &at, p_tag);
                 let (seen, by_point) = project(sighting.camera, p_cam)?;
@@ -152,13 +239,11 @@ impl Normal {
                 let scaled = off_px / sighting.sigma_px;
                 let (loss, weight) = loss(scaled.length_squared());
                 n.cost += loss;
-                n.square_sum += weight * scaled.length_squared();
+                n.square_sum += scaled.length_squared().min(MISREAD_SIGMAS * MISREAD_SIGMAS);
                 n.square_sum_px2 += off_px.length_squared();
                 n.corners += 1;
                 for (row, residual) in by_point.iter().zip([scaled.x, scaled.y]) {
-                    let position = by_position.transpose() * *row / sighting.sigma_px;
-                    let turn = by_turn.transpose() * *row / sighting.sigma_px;
-                    let j = [position.x, position.y, position.z, turn.x, turn.y, turn.z];
+                    let j = six(*row / sighting.sigma_px, by_position, by_turn);
                     for a in 0..6 {
                         n.gradient[a] += weight * j[a] * residual;
                         for b in 0..=a {
@@ -178,17 +263,6 @@ impl Normal {
         }
         let l = cholesky(&damped)?;
         Some(solve_with(&l, &self.gradient.map(|g| -g)))
-    }
-
-    fn inverse(&self) -> Option<[[f64; 6]; 6]> {
-        let l = cholesky(&self.matrix)?;
-        let mut inverse = [[0.0; 6]; 6];
-        for i in 0..6 {
-            let mut unit = [0.0; 6];
-            unit[i] = 1.0;
-            inverse[i] = solve_with(&l, &unit);
-        }
-        inverse.iter().flatten().all(|value| value.is_finite()).then_some(inverse)
     }
 }
 
@@ -289,6 +363,8 @@ fn solve_with(l: &[[f64; 6]; 6], right: &[f64; 6]) -> [f64; 6] {
 
 /// Corners off by more than this many sigma lose their pull.
 const ROBUST_SIGMAS: f64 = 4.0;
+/// What is further off than this many sigma does not tell how far others may be off.
+const MISREAD_SIGMAS: f64 = 25.0;
 /// Nothing is in focus closer than this. [m]
 const NEAREST_M: f64 = 0.02;
 /// It converges in five to ten.

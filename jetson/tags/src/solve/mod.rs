@@ -20,6 +20,7 @@ mod opencv;
 mod plane;
 
 pub use adjust::PoseFit;
+pub(crate) use adjust::{CornerRow, corner_rows, invert6};
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
@@ -58,8 +59,26 @@ pub struct Sighting<'a> {
     pub corners_px: [DVec2; 4],
     /// How far a corner may be off, one standard deviation along x or y. [px]
     pub sigma_px: f64,
-    /// How much later the pose is asked for than the image was exposed. [s]
+    /// How much later the pose is asked for than the image's middle row was exposed. [s]
     pub lag_s: f64,
+    /// From the exposure of the image's first row to that of its last. [s]
+    pub readout_s: f64,
+}
+
+impl Sighting<'_> {
+    /// Returns how much later the pose is asked for than a row of the image was exposed. [s]
+    pub(crate) fn lag_at_s(&self, row_px: f64) -> f64 {
+        self.lag_s - self.readout_s * self.row_share(row_px)
+    }
+
+    /// Returns where a row is in the image: -0.5 is the first, 0.5 the last.
+    pub(crate) fn row_share(&self, row_px: f64) -> f64 {
+        row_px / f64::from(self.camera.height_px) - 0.5
+    }
+
+    fn middle_lag_s(&self) -> f64 {
+        self.lag_at_s(0.5 * (self.corners_px[0].y + self.corners_px[2].y))
+    }
 }
 
 /// How the vehicle moves, to relate images that were not exposed together.
@@ -69,13 +88,17 @@ pub struct Motion {
     pub v_world_mps: DVec3,
     /// Angular velocity. [rad/s, body]
     pub omega_body_radps: DVec3,
+    /// Acceleration. [m/s^2, world]
+    pub a_world_mps2: DVec3,
 }
 
 impl Motion {
     /// Returns where a vehicle is `dt_s` later; earlier where that is negative.
     pub fn carry(&self, world_from_body: &Pose<World, Body>, dt_s: f64) -> Pose<World, Body> {
         Pose::new(
-            world_from_body.translation_m + self.v_world_mps * dt_s,
+            world_from_body.translation_m
+                + self.v_world_mps * dt_s
+                + self.a_world_mps2 * (0.5 * dt_s * dt_s),
             (world_from_body.rotation * DQuat::from_scaled_axis(self.omega_body_radps * dt_s))
                 .normalize(),
         )
@@ -109,7 +132,8 @@ pub fn solve(
     };
     for sighting in sightings {
         for cam_from_tag in square(sighting) {
-            add(motion.carry(&world_from_body(&sighting.sight, &cam_from_tag), sighting.lag_s));
+            add(motion
+                .carry(&world_from_body(&sighting.sight, &cam_from_tag), sighting.middle_lag_s()));
         }
     }
     #[cfg(feature = "opencv")]

@@ -208,7 +208,7 @@ mod tests {
                 }
                 let Some(corners_px) = corners(&cam_from_tag, &[0.0; 8]) else { continue };
                 let sight = Geometry::OutsideIn { world_from_cam, body_from_tag };
-                sightings.push(Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.01 });
+                sightings.push(Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.01, readout_s: 0.0 });
             }
             prop_assume!(sightings.len() >= 2);
             let found = joint(&sightings);

@@ -42,7 +42,15 @@ fn seen<'a>(
         let p = cam_from_tag.transform_point((c * SIZE_M).extend(0.0));
         *corner = camera.project(p)? + noise_px();
     }
-    Some(Sighting { camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.0 })
+    Some(Sighting {
+        camera,
+        sight,
+        size_m: SIZE_M,
+        corners_px,
+        sigma_px: 0.2,
+        lag_s: 0.0,
+        readout_s: 0.0,
+    })
 }
 
 fn error(a: &Pose<World, Body>, b: &Pose<World, Body>) -> (f64, f64) {
@@ -126,7 +134,7 @@ proptest! {
         let [a, b, c, d, e, f, g, h] = corners;
         let corners_px = [DVec2::new(a, b), DVec2::new(c, d), DVec2::new(e, f), DVec2::new(g, h)];
         let sight = Geometry::OutsideIn { world_from_cam: Pose::IDENTITY, body_from_tag: Pose::IDENTITY };
-        let sighting = Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.0 };
+        let sighting = Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.0, readout_s: 0.0 };
         if let Some(solved) = solve(&[sighting], &Motion::default(), None) {
             prop_assert!(solved.best.world_from_body.is_valid());
             prop_assert!(solved.best.covariance.iter().flatten().all(|v| v.is_finite()));
@@ -229,6 +237,7 @@ fn images_of_other_instants_are_carried_along() {
         looking(DVec3::new(5.2, -2.0, 3.3), DVec3::new(0.0, 0.0, 1.2)),
     ];
     let motion = Motion {
+        a_world_mps2: DVec3::ZERO,
         v_world_mps: DVec3::new(2.0, -1.0, 0.3),
         omega_body_radps: DVec3::new(0.1, 0.2, 1.0),
     };

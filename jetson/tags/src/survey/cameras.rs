@@ -1,10 +1,10 @@
 //! Fixed cameras, from images of a surveyed mat or of a cube that is carried about.
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use super::{LOSS_PX, MAX_OUTLIERS, SurveyError, camera_pose, cube_pose};
-use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid};
+use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid, Solution};
 use crate::detection::Detection;
 use crate::layout::{CORNERS, TagLayout};
 
@@ -34,7 +34,25 @@ pub struct PlacedCamera {
     pub corners: usize,
 }
 
-/// Returns where cameras are. The mat gives the `world` frame; cameras that do not see it are placed by
+/// How large the cube is in units of its layout.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CubeScale {
+    /// Its size.
+    pub scale: f64,
+    /// One standard deviation; large where only one camera sees the mat, as the others are then placed by the cube.
+    pub sigma: f64,
+}
+
+/// Where fixed cameras are.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SurveyedCameras {
+    /// In the order of the images.
+    pub cameras: Vec<PlacedCamera>,
+    /// The cube's size, if there is one: solved along where it can be known.
+    pub cube: Option<CubeScale>,
+}
+
+/// Returns where cameras are, and how large the cube is. The mat gives the `world` frame; cameras that do not see it are placed by
 /// the cube, at moments when cameras already placed see it, too.
 ///
 /// # Errors
@@ -43,7 +61,7 @@ pub fn cameras(
     cameras: &[CameraImages],
     mat: &TagLayout,
     cube: Option<&TagLayout>,
-) -> Result<Vec<PlacedCamera>, SurveyError> {
+) -> Result<SurveyedCameras, SurveyError> {
     let mut placed: Vec<Option<Pose<World, Cam>>> =
         cameras.iter().map(|camera| by_mat(camera, mat)).collect();
     let moments = cameras.iter().map(|camera| camera.images.len()).max().unwrap_or(0);
@@ -163,8 +181,10 @@ fn adjust(
     mat: &TagLayout,
     cube: Option<&TagLayout>,
     bodies: &[Option<Pose<World, Body>>],
-) -> Result<Vec<PlacedCamera>, SurveyError> {
+) -> Result<SurveyedCameras, SurveyError> {
     let mut bundle = Bundle { loss_px: LOSS_PX, ..Bundle::default() };
+    // Which of what is seen is on the cube.
+    let mut cube_corners = Vec::new();
     let world = bundle.pose(Rigid::IDENTITY, Parameter::Fixed);
     let numbers: Vec<usize> =
         start.iter().map(|pose| bundle.pose(pose.inverse(), Parameter::Shared)).collect();
@@ -180,6 +200,9 @@ fn adjust(
                 };
                 let on_mat = mat.find(d.family, d.id).map(|tag| (tag, world));
                 let Some((tag, right)) = on_mat.or_else(on_cube) else { continue };
+                if right != world {
+                    cube_corners.extend(bundle.seen.len()..bundle.seen.len() + 4);
+                }
                 for (point_m, pixel) in tag.corners_m().into_iter().zip(d.corners_px) {
                     bundle.seen.push(CornerObservation { lens, left, right, point_m, pixel });
                 }
@@ -187,7 +210,16 @@ fn adjust(
         }
     }
     let advice = "show each camera more tags of the mat, or the cube in more places";
-    let solution = bundle.solve().ok_or(SurveyError::Undetermined { advice })?;
+    let mut solution = bundle.solve().ok_or(SurveyError::Undetermined { advice })?;
+    let scale = cube
+        .filter(|_| !cube_corners.is_empty())
+        .and_then(|cube| scale_of(&bundle, &solution, &cube_corners, middle_m(cube)));
+    if let (Some(cube), Some(CubeScale { scale, sigma })) = (cube, scale)
+        && sigma < KNOWN_SCALE
+    {
+        resize(&mut bundle, &cube_corners, middle_m(cube), scale);
+        solution = bundle.solve().ok_or(SurveyError::Undetermined { advice })?;
+    }
     let mut placed = Vec::new();
     for (lens, number) in numbers.into_iter().enumerate() {
         let residuals: Vec<f64> = bundle
@@ -216,5 +248,64 @@ fn adjust(
         let world_from_cam = cam_from_world.inverse();
         placed.push(PlacedCamera { world_from_cam, rms_px, sigma_m, corners });
     }
-    Ok(placed)
+    Ok(SurveyedCameras { cameras: placed, cube: scale })
 }
+
+/// Returns the size of the cube that explains the corners best: where the parabola through their cost, each time with
+/// all poses solved again, is least; its curvature tells how sure that is.
+fn scale_of(
+    bundle: &Bundle,
+    solution: &Solution,
+    cube_corners: &[usize],
+    middle_m: DVec3,
+) -> Option<CubeScale> {
+    let cost = |scale: f64| {
+        let mut bundle = bundle.clone();
+        resize(&mut bundle, cube_corners, middle_m, scale);
+        bundle.solve()?;
+        Some(bundle.cost())
+    };
+    // The robust cost is no parabola but near its least.
+    let mut found = CubeScale { scale: 1.0, sigma: f64::INFINITY };
+    let mut least = cost(1.0)?;
+    for percent in (-MOST_PERCENT..=MOST_PERCENT).filter(|percent| *percent != 0) {
+        let scale = 1.0 + f64::from(percent) / 100.0;
+        match cost(scale) {
+            Some(cost) if cost < least => (found.scale, least) = (scale, cost),
+            _ => {}
+        }
+    }
+    for step in [0.005, 0.002] {
+        let at = found.scale;
+        let [below, here, above] = [cost(at - step)?, cost(at)?, cost(at + step)?];
+        let bend = (above + below - 2.0 * here) / (step * step);
+        if !(bend > 0.0) {
+            return Some(CubeScale { scale: 1.0, sigma: f64::INFINITY });
+        }
+        let slope = (above - below) / (2.0 * step);
+        let scale = at - (slope / bend).clamp(-0.01, 0.01);
+        // Half the squares of both axes, in units of the corners' variance along one.
+        let variance_px2 = 0.5 * solution.rms_px.max(LEAST_RMS_PX).powi(2);
+        found = CubeScale { scale, sigma: (2.0 * variance_px2 / bend).sqrt() };
+    }
+    Some(found)
+}
+
+/// Makes the cube as large, about the middle of its tags.
+fn resize(bundle: &mut Bundle, cube_corners: &[usize], middle_m: DVec3, scale: f64) {
+    for &index in cube_corners {
+        let point_m = &mut bundle.seen[index].point_m;
+        *point_m = middle_m + scale * (*point_m - middle_m);
+    }
+}
+
+fn middle_m(cube: &TagLayout) -> DVec3 {
+    cube.tags.iter().map(|tag| tag.position_m).sum::<DVec3>() / cube.tags.len() as f64
+}
+
+/// A cube's size is used if it is known as well as this.
+const KNOWN_SCALE: f64 = 0.003;
+/// A print that is off by more is another layout's. [%]
+const MOST_PERCENT: i32 = 5;
+/// No corners are better than this. [px]
+const LEAST_RMS_PX: f64 = 0.05;

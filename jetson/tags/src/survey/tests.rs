@@ -252,13 +252,32 @@ fn cameras_are_placed_by_the_mat_and_those_that_miss_it_by_the_cube() {
     };
     let all = [see(0, true, &mut random), see(1, true, &mut random), see(2, false, &mut random)];
     let found = cameras(&all, &mat_layout, Some(&cube())).unwrap();
-    for (found, truth) in found.iter().zip(&truth) {
+    let scale = found.cube.expect("there is a cube");
+    assert!((scale.scale - 1.0).abs() < 4.0 * scale.sigma && scale.sigma < 0.002, "{scale:?}");
+    for (found, truth) in found.cameras.iter().zip(&truth) {
         let off_m = found.world_from_cam.translation_m.distance(truth.translation_m);
         let off_rad = found.world_from_cam.rotation.angle_between(truth.rotation);
         assert!(off_m < 0.005 && off_rad < 0.002, "{off_m} m, {off_rad} rad off: {found:?}");
         assert!(off_m < 5.0 * found.sigma_m && found.sigma_m < 0.01, "{off_m}: {found:?}");
         assert!(found.rms_px < 0.4, "{found:?}");
     }
+    // Printed at 97 %: two cameras that see the mat know.
+    let mut shrunk = cube();
+    for tag in &mut shrunk.tags {
+        tag.size_m /= 0.97;
+        tag.position_m /= 0.97;
+    }
+    let found = cameras(&all, &mat_layout, Some(&shrunk)).unwrap();
+    let scale = found.cube.expect("there is a cube");
+    assert!((scale.scale - 0.97).abs() < 4.0 * scale.sigma && scale.sigma < 0.002, "{scale:?}");
+    for (found, truth) in found.cameras.iter().zip(&truth) {
+        let off_m = found.world_from_cam.translation_m.distance(truth.translation_m);
+        assert!(off_m < 0.005, "{off_m} m off: {found:?}");
+    }
+    // One that sees the mat alone does not: the others' places grow with the cube.
+    let alone = [see(0, true, &mut random), see(1, false, &mut random)];
+    let scale = cameras(&alone, &mat_layout, Some(&shrunk)).unwrap().cube.expect("there is a cube");
+    assert!(scale.sigma > 0.02, "{scale:?}");
     // Without the cube nothing ties the third camera to the room.
     let error = cameras(&all, &mat_layout, None).unwrap_err().to_string();
     assert!(error.contains("\"camera 2\"") && error.contains("cube"), "{error}");

@@ -1,4 +1,6 @@
 //! Where images come from: one thread a camera, newest wins; recorded images one after the other.
+//!
+//! A camera that fails does not end the others: its thread opens it again until it is back.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +13,7 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_server::poses::drivers::json::PosePacket;
 use vizflyt_tags::camera::TagCamera;
-use vizflyt_tags::capture::{self, Exposure, ImageSource};
+use vizflyt_tags::capture::{self, CameraWatch, CaptureError, Exposure, ImageSource, now_ns};
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::locate::{LocateSetup, SIMULATED};
 use vizflyt_tags::simulated::{SimulatedCamera, Truth};
@@ -32,13 +34,24 @@ pub(super) struct Sources {
     truth: Option<(SocketAddr, Arc<SharedTruth>)>,
     /// Recordings, whose images all count; none if the cameras are live.
     recorded: Vec<Recording>,
+    /// What was last told to be wrong with each camera.
+    told: Vec<Option<String>>,
+}
+
+/// A change of what is wrong with a camera.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct CameraEvent {
+    /// Its index.
+    pub(super) camera: usize,
+    /// What is wrong; `None` if it is well again.
+    pub(super) fault: Option<String>,
 }
 
 /// A folder, a video: a camera of the past.
 struct Recording {
-    name: String,
-    size: (u32, u32),
+    camera: TagCamera,
     source: Box<dyn ImageSource>,
+    watch: CameraWatch,
     /// Its next image; `None` at its end.
     head: Option<Exposure>,
 }
@@ -48,8 +61,8 @@ struct Recording {
 struct Mailbox {
     shots: Mutex<Vec<CameraImage>>,
     arrived: Condvar,
-    /// Why a camera gives no more images.
-    failed: Mutex<Option<String>>,
+    /// Of each live camera; none if they are simulated.
+    watches: Mutex<Vec<CameraWatch>>,
 }
 
 /// What the simulated cameras render from.
@@ -66,8 +79,12 @@ impl Sources {
         truth_at: SocketAddr,
         stop: &Arc<AtomicBool>,
     ) -> Result<Self> {
-        let mut sources =
-            Self { mailbox: Arc::new(Mailbox::default()), truth: None, recorded: Vec::new() };
+        let mut sources = Self {
+            mailbox: Arc::new(Mailbox::default()),
+            truth: None,
+            recorded: Vec::new(),
+            told: vec![None; setup.cameras.len()],
+        };
         let is_simulated = |camera: &&TagCamera| camera.source.as_deref() == Some(SIMULATED);
         let simulated = setup.cameras.iter().filter(is_simulated).count();
         if simulated == setup.cameras.len() {
@@ -94,9 +111,9 @@ impl Sources {
         let live = opened.iter().filter(|(_, source)| source.is_live()).count();
         if live == 0 {
             for (camera, mut source) in opened {
-                let size = (camera.intrinsics.width_px, camera.intrinsics.height_px);
-                let head = source.next()?;
-                sources.recorded.push(Recording { name: camera.name.clone(), size, source, head });
+                let head = next_exposed(camera, source.as_mut())?;
+                let watch = CameraWatch::new(head.as_ref().map_or(0, |head| head.stamp_ns));
+                sources.recorded.push(Recording { camera: camera.clone(), source, watch, head });
             }
             return Ok(sources);
         }
@@ -106,15 +123,11 @@ impl Sources {
                 opened.len()
             );
         }
+        *lock(&sources.mailbox.watches) = vec![CameraWatch::new(now_ns()); opened.len()];
         for (index, (camera, source)) in opened.into_iter().enumerate() {
             let (mailbox, stop) = (Arc::clone(&sources.mailbox), Arc::clone(stop));
-            let (name, size) =
-                (camera.name.clone(), (camera.intrinsics.width_px, camera.intrinsics.height_px));
-            std::thread::spawn(move || {
-                if let Err(error) = read(index, &name, size, source, &mailbox, &stop) {
-                    *lock(&mailbox.failed) = Some(format!("{error:#}"));
-                }
-            });
+            let camera = camera.clone();
+            std::thread::spawn(move || read(index, &camera, source, &mailbox, &stop));
         }
         Ok(sources)
     }
@@ -171,11 +184,35 @@ impl Sources {
             .unwrap_or_else(PoisonError::into_inner);
         let mut taken = std::mem::take(&mut *shots);
         drop(shots);
-        if let Some(why) = lock(&self.mailbox.failed).take() {
-            bail!("tags: {why}");
+        // Without a thread that reads there will be none.
+        if taken.is_empty() && Arc::strong_count(&self.mailbox) == 1 {
+            return Ok(None);
         }
         taken.sort_by_key(|shot| shot.stamp);
         Ok(Some(taken))
+    }
+
+    /// Returns what has changed with cameras: named once, and again when they are well.
+    pub(super) fn poll_event(&mut self) -> Option<CameraEvent> {
+        let faults: Vec<Option<String>> = if self.recorded.is_empty() {
+            let now_ns = now_ns();
+            lock(&self.mailbox.watches).iter().map(|watch| watch.fault(now_ns)).collect()
+        } else {
+            // A recording is as late as it is.
+            let fault = |recording: &Recording| recording.watch.fault(0);
+            self.recorded.iter().map(fault).collect()
+        };
+        for (camera, (fault, told)) in faults.into_iter().zip(&mut self.told).enumerate() {
+            // For how long there was none is told once.
+            let words = |fault: &Option<String>| {
+                fault.as_ref().map(|text| text.split(" for ").next().unwrap_or("").to_owned())
+            };
+            if words(&fault) != words(told) {
+                told.clone_from(&fault);
+                return Some(CameraEvent { camera, fault });
+            }
+        }
+        None
     }
 
     /// Returns the earliest images of the recordings, those of one instant together.
@@ -188,9 +225,11 @@ impl Sources {
             if recording.head.as_ref().is_some_and(due)
                 && let Some(Exposure { stamp_ns, image }) = recording.head.take()
             {
-                check_size(&recording.name, recording.size, &image)?;
-                shots.push(CameraImage { camera, stamp: HostTime::from_ns(stamp_ns), image });
-                recording.head = recording.source.next()?;
+                check_size(&recording.camera, &image).map_err(anyhow::Error::msg)?;
+                if recording.watch.handle_image(stamp_ns, &image) {
+                    shots.push(CameraImage { camera, stamp: HostTime::from_ns(stamp_ns), image });
+                }
+                recording.head = next_exposed(&recording.camera, recording.source.as_mut())?;
             }
         }
         shots.sort_by_key(|shot| shot.stamp);
@@ -207,35 +246,68 @@ impl Mailbox {
     }
 }
 
-/// Reads one live camera until it is stopped.
+/// Reads one live camera until it is stopped; opens it again when it ended.
 fn read(
     index: usize,
-    name: &str,
-    size: (u32, u32),
-    mut source: Box<dyn ImageSource>,
+    camera: &TagCamera,
+    source: Box<dyn ImageSource>,
     mailbox: &Mailbox,
     stop: &AtomicBool,
-) -> Result<()> {
+) {
+    let mut source = Some(source);
     while !stop.load(Ordering::Relaxed) {
-        let next = source.next().with_context(|| format!("camera {name:?}"))?;
-        let Some(Exposure { stamp_ns, image }) = next else {
-            bail!("camera {name:?} gives no more images");
+        let next = match &mut source {
+            Some(source) => {
+                next_exposed(camera, source.as_mut()).map_err(|error| error.to_string())
+            }
+            None => Err(String::new()),
         };
-        check_size(name, size, &image)?;
-        mailbox.put(CameraImage { camera: index, stamp: HostTime::from_ns(stamp_ns), image });
+        let ended = match next {
+            Ok(Some(Exposure { stamp_ns, image })) => match check_size(camera, &image) {
+                Ok(()) => {
+                    let is_fit = lock(&mailbox.watches)[index].handle_image(now_ns(), &image);
+                    if is_fit {
+                        let stamp = HostTime::from_ns(stamp_ns);
+                        mailbox.put(CameraImage { camera: index, stamp, image });
+                    }
+                    continue;
+                }
+                Err(why) => why,
+            },
+            Ok(None) => "its images ended".into(),
+            Err(why) => why,
+        };
+        if source.take().is_some() {
+            lock(&mailbox.watches)[index].handle_end(ended);
+        }
+        // Standard input does not come again.
+        let Some(name) = camera.source.as_deref().filter(|name| *name != "-") else { return };
+        std::thread::sleep(OPEN_AGAIN);
+        source = capture::open(name).ok();
     }
-    Ok(())
+}
+
+/// Returns a source's next image, its stamp less the delay that its camera is known to have.
+fn next_exposed(
+    camera: &TagCamera,
+    source: &mut dyn ImageSource,
+) -> Result<Option<Exposure>, CaptureError> {
+    let late_ns = (1e6 * camera.latency_ms) as u64;
+    let next = source.next()?;
+    Ok(next.map(|next| Exposure { stamp_ns: next.stamp_ns.saturating_sub(late_ns), ..next }))
 }
 
 /// Images of another size than the lens was calibrated in would be located wrongly.
-fn check_size(name: &str, (width, height): (u32, u32), image: &Gray) -> Result<()> {
+fn check_size(camera: &TagCamera, image: &Gray) -> Result<(), String> {
+    let (width, height) = (camera.intrinsics.width_px, camera.intrinsics.height_px);
     if (image.width_px(), image.height_px()) != (width, height) {
-        bail!(
-            "camera {name:?} gives images of {}x{}, its file is for {width}x{height}; set the camera to \
+        return Err(format!(
+            "camera {:?} gives images of {}x{}, its file is for {width}x{height}; set the camera to \
              that size, or calibrate it in this one",
+            camera.name,
             image.width_px(),
             image.height_px()
-        );
+        ));
     }
     Ok(())
 }
@@ -309,5 +381,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 /// Recorded images closer than this were exposed together.
 const TOGETHER_NS: u64 = 2_000_000;
+/// How often a camera that ended is tried again.
+const OPEN_AGAIN: Duration = Duration::from_millis(500);
 /// How often threads look whether they should end.
 const LOOK_AT_STOP: Duration = Duration::from_millis(100);
