@@ -14,7 +14,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-
 from lab import (
     Camera,
     Lens,

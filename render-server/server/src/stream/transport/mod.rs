@@ -6,8 +6,8 @@
 //!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
-//! ```
 //!        -> feed: sealed poses to the flight's guardian, over UDP, also when the connection has ended
+//! ```
 //! Settings and figures: docs/BENCHMARKS.md.
 
 mod control;
