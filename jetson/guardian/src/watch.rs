@@ -48,7 +48,8 @@ const GIVEN_UP_S: f64 = 5.0;
 const LONGEST_STEP_S: f64 = 0.05;
 
 /// Sentences for people.
-pub(crate) const LANDING: &str = "guardian: the runtime is silent: asks for LAND";
+const SILENT: &str = "guardian: the runtime is silent: asks for LAND";
+const ENDED: &str = "guardian: the runtime has ended in flight: asks for LAND";
 const DESCENDING: &str = "guardian: the autopilot lands";
 const UNHEARD: &str = "guardian: LAND is not acknowledged";
 
@@ -225,7 +226,7 @@ impl Watch {
             match action {
                 FailsafeAction::Land { confirmation } => {
                     if confirmation == 0 {
-                        out.say(LANDING);
+                        out.say(if self.runtime_is_gone { ENDED } else { SILENT });
                     }
                     let Some(target) = self.autopilot else { continue };
                     let land = MavMessage::COMMAND_LONG(land(target, confirmation));

@@ -158,14 +158,14 @@ fn silence_of_half_a_second_is_land_and_an_end_is_at_once() {
     rig.run(3000);
     let lands = rig.ours(COMMAND_LONG, 0);
     assert!((2500..=2520).contains(&lands[0]), "{lands:?}");
-    assert!(lands.len() > 1 && rig.sent.said == [LANDING], "repeated until the mode has changed");
+    assert!(lands.len() > 1 && rig.sent.said == [SILENT], "repeated until the mode has changed");
 
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;
     rig.watch.handle_end();
     rig.run(2050);
     let lands = rig.ours(COMMAND_LONG, 0);
-    assert!(lands[0] <= 2010, "{lands:?}");
+    assert!(lands[0] <= 2010 && rig.sent.said == [ENDED], "{lands:?}");
 }
 
 #[test]

@@ -8,7 +8,6 @@ use vizflyt_protocol::time::HostTime;
 use super::Flight;
 use crate::guard::{
     GuardMode, HoldReason, LandReason, RESTART_WITHIN_S, SETPOINT_HOLD_S, SIGHT_HOLD_S,
-    UNSURE_SIGMAS,
 };
 
 impl Flight {
@@ -93,8 +92,8 @@ impl Flight {
                             format!("the pose is older than {} s", self.pose_ages().hold_after_s)
                         }
                         HoldReason::PoseUnsure => {
-                            let sigma_m = self.vehicle.map_or(0.0, |vehicle| vehicle.sigma_m);
-                            format!("the pose may be off by {:.2} m", UNSURE_SIGMAS * sigma_m)
+                            let off_m = self.vehicle.map_or(0.0, |vehicle| vehicle.off_m());
+                            format!("the pose may be off by {off_m:.2} m")
                         }
                         HoldReason::ImagesOld => {
                             format!("what the plugin sees is older than {SIGHT_HOLD_S} s")
@@ -130,7 +129,7 @@ impl Flight {
             }
             LandReason::NoSetpoint(_) => self.why_silent(now),
             LandReason::PoseLost(age_s) => EndReason::PoseLost { age_s },
-            LandReason::PoseUnsure(sigma_m) => EndReason::PoseUnsure { sigma_m },
+            LandReason::PoseUnsure(off_m) => EndReason::PoseUnsure { off_m },
             LandReason::ImagesOld(age_s) => EndReason::ImagesOld { age_s },
             LandReason::OutsideFence(outside_m) => breach(outside_m, Boundary::Geofence),
             LandReason::InNoFly(inside_m) => breach(inside_m, Boundary::NoFly(Name::new())),

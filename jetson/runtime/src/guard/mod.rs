@@ -71,6 +71,11 @@ impl VehicleMotion {
         yaw_of(self.rotation)
     }
 
+    /// Returns how far the position may be off: [`UNSURE_SIGMAS`] along the worst axis. [m]
+    pub fn off_m(&self) -> f64 {
+        UNSURE_SIGMAS * self.sigma_m
+    }
+
     /// Whether every number is finite and the rotation is one.
     pub fn is_valid(&self) -> bool {
         self.p_world_m.is_finite()
@@ -119,7 +124,7 @@ pub enum LandReason {
     NoPlugin,
     /// The newest pose is so old. [s]
     PoseLost(f64),
-    /// The pose has been too unsure for as long as it may be away; its standard deviation. [m]
+    /// The pose has been too unsure for as long as it may be away; how far it may be off. [m]
     PoseUnsure(f64),
     /// What the plugin has answered last has been too old for [`SIGHT_LAND_S`]; now it is so old. [s]
     ImagesOld(f64),
@@ -386,7 +391,7 @@ impl Guard {
         self.answers.watch(self.v_command_mps, vehicle.v_world_mps, dt_s);
         let response = self.answers.response();
         self.speed_limit_mps = self.max_speed_mps * share * share_of_lag(response);
-        let is_unsure = UNSURE_SIGMAS * vehicle.sigma_m > MARGIN_M;
+        let is_unsure = vehicle.off_m() > MARGIN_M;
         self.unsure_since = is_unsure.then(|| self.unsure_since.unwrap_or(now));
         self.blind_since = (sight_age_s > SIGHT_HOLD_S).then(|| self.blind_since.unwrap_or(now));
         let mode = self.mode(now, vehicle);
@@ -466,7 +471,7 @@ impl Guard {
         if let Some(since) = self.unsure_since
             && now.seconds_since(since) > self.pose_ages.land_after_s
         {
-            return GuardMode::Landing(LandReason::PoseUnsure(vehicle.sigma_m));
+            return GuardMode::Landing(LandReason::PoseUnsure(vehicle.off_m()));
         }
         let outside_m = self.fence.outside_m(vehicle.p_world_m);
         if outside_m > 0.0 {

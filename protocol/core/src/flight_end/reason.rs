@@ -98,8 +98,8 @@ pub enum EndReason {
     /// The pose may have been off by more than the guard keeps from the fence, for longer than the arena's
     /// `land_after_s`.
     PoseUnsure {
-        /// Its standard deviation along the worst axis. [m]
-        sigma_m: f64,
+        /// How far it may have been off: three standard deviations along the worst axis. [m]
+        off_m: f64,
     },
 }
 

@@ -68,9 +68,7 @@ impl fmt::Display for EndReason {
             }
             Self::NeverTookOff => f.write_str("the vehicle never took off"),
             Self::RecordEnds => f.write_str("not over when its record ends"),
-            Self::PoseUnsure { sigma_m } => {
-                write!(f, "the pose could be off by {:.2} m", 3.0 * sigma_m)
-            }
+            Self::PoseUnsure { off_m } => write!(f, "the pose could be off by {off_m:.2} m"),
             Self::ImagesOld { age_s } => write!(f, "what the plugin saw was {age_s:.1} s old"),
         }
     }

@@ -60,7 +60,7 @@ fn each() -> Vec<EndReason> {
         NeverTookOff,
         RecordEnds,
         ImagesOld { age_s: 2.9 },
-        PoseUnsure { sigma_m: 0.09 },
+        PoseUnsure { off_m: 0.27 },
     ]
 }
 
