@@ -12,6 +12,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::clock;
 use crate::stream::Rooms;
+use crate::stream::vehicle::VehicleStream;
 
 /// Poses are looked for this often.
 const TICK: Duration = Duration::from_millis(5);
@@ -58,7 +59,8 @@ pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
             datagram = socket.recv_from(&mut received) => {
                 // An error is of an earlier datagram of ours that found nobody.
                 let Ok((len, address)) = datagram else { continue };
-                subscribe(rooms, &mut subscribers, address, &received[..len]);
+                let keys = rooms.streaming.vehicles.iter().map(VehicleStream::feed_key);
+                subscribe(clock::now(), keys, &mut subscribers, address, &received[..len]);
                 continue;
             }
             _ = ticks.tick(), if subscribers.iter().any(Option::is_some) => {}
@@ -87,20 +89,46 @@ pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
 
 /// Takes a datagram; one that no flight's key has sealed is nobody's.
 fn subscribe(
-    rooms: &Rooms,
+    now: ServerTime,
+    keys: impl Iterator<Item = Option<FeedKey>>,
     subscribers: &mut [Option<Subscriber>],
     address: SocketAddr,
     datagram: &[u8],
 ) {
-    for (stream, subscriber) in rooms.streaming.vehicles.iter().zip(subscribers) {
-        let Some(key) = stream.feed_key() else { continue };
+    for (key, subscriber) in keys.zip(subscribers) {
+        let Some(key) = key else { continue };
         let Some(FeedMessage::Subscribe(number)) = open(&key, datagram) else { continue };
         if subscriber.is_some_and(|known| number <= known.number) {
             return debug!("{address}: a subscription to poses is a replay");
         }
         let sent = subscriber.map_or(ServerTime::ZERO, |known| known.sent);
-        let until = clock::now().plus_seconds(KEPT_S);
+        let until = now.plus_seconds(KEPT_S);
         *subscriber = Some(Subscriber { address, number, until, sent });
         return;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_flight_s_guardian_subscribes_and_a_replay_moves_nothing() {
+        let (ours, theirs) = (SocketAddr::from(([10, 0, 0, 2], 1)), ([10, 0, 0, 9], 1).into());
+        let keys = [None, Some([1; 32]), Some([2; 32])];
+        let mut subscribers = [None; 3];
+        let (now, mut buffer) = (ServerTime::from_ns(1_000_000_000), [0; MAX_FEED]);
+        let mut take = |address, key: FeedKey, number| {
+            let datagram = seal(&key, &FeedMessage::Subscribe(number), &mut buffer);
+            subscribe(now, keys.into_iter(), &mut subscribers, address, datagram);
+            subscribers.map(|known| known.map(|known| (known.address, known.number)))
+        };
+        assert_eq!(take(theirs, [9; 32], 5), [None; 3], "nobody's key");
+        assert_eq!(take(ours, [2; 32], 5), [None, None, Some((ours, 5))]);
+        assert_eq!(take(theirs, [2; 32], 5), [None, None, Some((ours, 5))], "recorded, sent again");
+        assert_eq!(take(theirs, [2; 32], 4), [None, None, Some((ours, 5))], "an older one");
+        // Its own next one, from a new port.
+        let moved = SocketAddr::from(([10, 0, 0, 2], 7));
+        assert_eq!(take(moved, [2; 32], 6), [None, None, Some((moved, 6))]);
     }
 }
