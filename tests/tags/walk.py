@@ -90,18 +90,7 @@ class Lab:
         self.tags("print", "cube", "-o", "cube.pdf", "--paper", "a3", "--face-mm", "250", "--tag-mm", "200")
         mat = ["--tag-mm", "200", "--pitch-mm", "275", "--columns", "2", "--rows", "4"]
         self.tags("print", "mat", "-o", "mat.pdf", "--paper", "a3", *mat)
-        board = self.layout("board")
-        random = np.random.default_rng(1)
-        still = fixed(np.eye(3), np.zeros(3))
-        camera = Camera(self.lens, still, Sensor(exposure_s=0), 2)
-        images = []
-        for index in range(36):
-            depth = 0.34 + 0.1 * random.random()
-            side = np.array([(index % 3 - 1) * 0.44, (index // 3 % 3 - 1) * 0.27, 1.0])
-            facing = np.diag([1.0, -1.0, -1.0])
-            tilt = turned(*(np.array([x]) for x in random.uniform(-0.5, 0.5, 3)))[0]
-            images.append(camera.image([(board, fixed(tilt @ facing, depth * side))], 0.0))
-        write_images(self.home / "board", images, [index / 10 for index in range(len(images))])
+        self.wave_board("board", self.lens, 0.34, (0.44, 0.27))
         for name in EYES:
             out = self.tags("calibrate", "board", "--board", "board.toml", "-o", f"{name}.toml")
         print("calibrate:", *out.splitlines()[-3:-1], sep="\n  ", flush=True)
@@ -110,6 +99,20 @@ class Lab:
         # The file's pixels begin at the outer corner of the first.
         middle = self.number(self.home / "left.toml", "cx_px")
         assert abs(middle - 0.5 - self.lens.matrix[0, 2]) < 1.5, middle
+
+    def wave_board(self, folder: str, lens: Lens, depth_m: float, reach: tuple[float, float]) -> None:
+        """Renders the board all over an image, tilted to all sides: its middle reaches these slopes."""
+        board = self.layout("board")
+        random = np.random.default_rng(1)
+        camera = Camera(lens, fixed(np.eye(3), np.zeros(3)), Sensor(exposure_s=0), 2)
+        images = []
+        for index in range(36):
+            depth = depth_m + 0.1 * random.random()
+            side = np.array([(index % 3 - 1) * reach[0], (index // 3 % 3 - 1) * reach[1], 1.0])
+            facing = np.diag([1.0, -1.0, -1.0])
+            tilt = turned(*(np.array([x]) for x in random.uniform(-0.5, 0.5, 3)))[0]
+            images.append(camera.image([(board, fixed(tilt @ facing, depth * side))], 0.0))
+        write_images(self.home / folder, images, [index / 10 for index in range(len(images))])
 
     @staticmethod
     def number(file: pathlib.Path, key: str) -> float:
@@ -250,6 +253,8 @@ def main() -> None:
         lab.print_and_calibrate()
         lab.survey()
         rows(lab, wanted)
+        if not wanted or INSIDE_OUT in wanted:
+            inside_out(lab)
         cameras_come_and_go(lab)
 
 
@@ -325,6 +330,97 @@ def check(row: Row, values: dict[str, float], report: dict) -> None:
     assert len(found) == len(row.findings), found
     for text, (begin, end) in zip(found, row.findings):
         assert begin in text and end in text, (text, begin)
+
+
+INSIDE_OUT = "under the vehicle"
+# The camera looks straight down, the image's top towards the nose; its lens is 80 mm above the soles.
+BODY_FROM_CAM = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+LENS_M = np.array([0.02, 0.0, 0.08])
+
+
+def up_and_down(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A flight from a pad and back onto it: stands, climbs to 1.2 m, flies a circle, lands; turning all the while."""
+
+    def smooth(begin_s: float, end_s: float) -> np.ndarray:
+        share = np.clip((t_s - BEGIN_S - begin_s) / (end_s - begin_s), 0, 1)
+        return share**2 * (3 - 2 * share)
+
+    height = 1.2 * (smooth(0.4, 1.9) - smooth(5.0, 7.0))
+    angle = 2 * np.pi * smooth(1.5, 5.2)
+    position = np.stack([0.7 * np.sin(angle), 0.5 * (1 - np.cos(angle)), height], axis=-1)
+    yaw = 0.8 * smooth(0.4, 5.0)
+    return turned(yaw, 0.08 * np.sin(angle), -0.08 * np.sin(angle)), position
+
+
+def carried(body: Pose, rotation: np.ndarray, place_m: np.ndarray) -> Pose:
+    """What sits on a vehicle."""
+
+    def pose(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r, p = body(t_s)
+        return r @ rotation, p + r @ place_m
+
+    return pose
+
+
+def inside_out(lab: Lab) -> None:
+    """The camera is under the vehicle, over a mat that a person has laid by a tape: printed, calibrated, surveyed,
+    located, from the floor up and down to it."""
+    focal = 270.0
+    lens = Lens(
+        width=640,
+        height=480,
+        matrix=np.array([[focal, 0.0, 321.4], [0.0, focal - 0.4, 238.2], [0.0, 0.0, 1.0]]),
+        distortion=np.array([-0.11, 0.025, 0.0006, -0.0005, 0.0]),
+    )
+    lab.tags("print", "mat", "-o", "floor.pdf", "--fly-over", "3x2.5", "--pad", "0,0", "--middle-m", "0,0,0")
+    lab.wave_board("wide-board", lens, 0.16, (0.8, 0.55))
+    lab.tags("calibrate", "wide-board", "--board", "board.toml", "-o", "belly.toml")
+    print("calibrate:", lab.number(lab.home / "belly.toml", "fx_px"), "px", flush=True)
+
+    random = np.random.default_rng(11)
+    laid = lab.layout("floor")
+    for tag in laid:
+        # Large sheets lie where a tape says; small ones are printed together.
+        if tag.size_m > 0.1:
+            tag.position_m = tag.position_m + np.array([*random.normal(0, 0.004, 2), 0])
+            tag.rotation = turned(*(np.array([x]) for x in (random.normal(0, 0.01), 0.0, 0.0)))[0]
+    still = fixed(np.eye(3), np.zeros(3))
+    # A walk over all of it, and low over the pad.
+    places = [np.array([x, y, 0.9]) for x in np.linspace(-1.1, 1.1, 6) for y in np.linspace(-0.8, 0.8, 4)]
+    places += [np.array([x, y, 0.35]) for x in (-0.15, 0.0, 0.15) for y in (-0.1, 0.1)]
+    images = []
+    for index, over in enumerate(places):
+        aim = np.array([*(0.8 * over[:2] + random.uniform(-0.1, 0.1, 2)), 0])
+        pose = looking(over, aim, random.uniform(-1, 1))
+        images.append(Camera(lens, fixed(*pose), Sensor(exposure_s=0), index).image([(laid, still)], 0.0))
+    write_images(lab.home / "floor-walk", images, [index / 10 for index in range(len(images))])
+    survey = ["--camera", "belly.toml", "--layout", "floor.toml", "-o", "floor-room.toml"]
+    out = lab.tags("survey", "mat", "floor-walk", *survey)
+    print("survey mat:", out.splitlines()[-2], sep="\n  ", flush=True)
+
+    # Mounted by a ruler and the mat's level: 1.5 mm and 1.5 mrad off along and about each axis.
+    tilt = turned(*(np.array([x]) for x in (-0.0015, 0.0015, 0.0015)))[0]
+    place_m = LENS_M + np.array([0.0015, -0.0015, -0.0015])
+    camera = Camera(lens, carried(up_and_down, BODY_FROM_CAM @ tilt, place_m), Sensor(), 40)
+    stamps = [BEGIN_S + index / RATE_HZ for index in range(int(7.5 * RATE_HZ))]
+    write_images(lab.home / "belly", [camera.image([(laid, still)], t_s) for t_s in stamps], stamps)
+    file = lab.home / "belly.toml"
+    mount = f"position_m = {LENS_M.tolist()}\nrotation_xyzw = {quaternion_of(BODY_FROM_CAM)}\n"
+    file.write_text(f"{file.read_text()}\n[body_from_cam]\n{mount}")
+    (lab.home / "belly-lab.toml").write_text('cameras = ["belly.toml"]\nlayouts = ["floor-room.toml"]\n')
+    out = lab.tags("locate", "belly-lab.toml", "--poses", "--json", "--source=belly=belly")
+    lines = [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+    low = [line for line in lines if "vizflyt_pose" not in line or line["position_m"][2] < 0.4]
+    (report,) = (line["report"] for line in lines if "report" in line)
+    for what, part in (("all", lines), ("low", low)):
+        values = figures(part, up_and_down)
+        words = "  ".join(f"{key} {value:.4g}" for key, value in values.items())
+        print(f"{INSIDE_OUT}, {what}: {words}", report["findings"], flush=True)
+        assert values["rms_mm"] < 6 and values["p99_mm"] < 26, "poses are off"
+        assert values["rms_deg"] < 0.5, "attitudes are off"
+        assert 0.5 < values["nees"] < 2, "sigma is not honest"
+    assert report["located"] >= 0.99 * report["sets"], report
+    assert not report["findings"], report
 
 
 def cameras_come_and_go(lab: Lab) -> None:

@@ -53,9 +53,10 @@ pub struct SimArgs {
     #[arg(long, value_name = "FORMAT:HOST:PORT")]
     pub mocap: Vec<FeedTarget>,
     /// Where the true pose is sent at every tick, with its instant on CLOCK_MONOTONIC, as the JSON that
-    /// `vizflyt serve` reads poses from: what `vizflyt tags locate` draws its simulated cameras' images by.
+    /// `vizflyt serve` reads poses from: what `vizflyt tags locate` draws its simulated cameras' images by. May be given several
+    /// times.
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
-    pub truth_to: Option<SocketAddr>,
+    pub truth_to: Vec<SocketAddr>,
     /// Name of the vehicle in the motion capture.
     #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
     pub object: String,
@@ -132,8 +133,8 @@ pub struct SimArgs {
     /// Share of the motion capture's datagrams that are lost, in percent.
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0)]
     pub mocap_drop_percent: f64,
-    /// Instead of flying, somebody lifts the vehicle, pushes it forward, turns it left and raises its nose,
-    /// over and over: what `vizflyt doctor localization` asks for.
+    /// Instead of flying, somebody lifts the vehicle, pushes it forward, turns it left, raises its nose and its
+    /// left side, over and over; its IMU feels that: what `vizflyt doctor localization` asks for.
     #[arg(long)]
     pub hand: bool,
     /// Prints JSON lines on stdout: one when ready, one report at the end.
@@ -297,7 +298,8 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let simulation = Simulation::new(args.config()?)?;
     let endpoints = args.endpoints();
-    let truth = args.truth_to.map(|target| TruthFeed::open(target, &args.object)).transpose();
+    let truth: std::io::Result<Vec<TruthFeed>> =
+        args.truth_to.iter().map(|target| TruthFeed::open(*target, &args.object)).collect();
     let vicon = args.vicon.map(|address| FeedTarget { format: Format::Vicon, address });
     let mocap: Vec<_> = vicon.into_iter().chain(args.mocap.iter().copied()).collect();
     let driver = Driver::open(simulation, &endpoints, &mocap, args.realtime_factor)?

@@ -28,7 +28,7 @@ pub struct Driver {
     simulation: Simulation,
     links: Vec<Link>,
     mocap: Vec<Feed>,
-    truth: Option<TruthFeed>,
+    truth: Vec<TruthFeed>,
     /// Simulated seconds per second.
     factor: f64,
 }
@@ -63,13 +63,13 @@ impl Driver {
             .map(|target| Feed::open(*target))
             .collect::<std::io::Result<_>>()
             .context("simulator: cannot open a socket for the mocap")?;
-        Ok(Self { simulation, links, mocap, truth: None, factor })
+        Ok(Self { simulation, links, mocap, truth: Vec::new(), factor })
     }
 
     /// Also sends the true pose at every tick, for cameras that are simulated elsewhere.
     #[must_use]
-    pub fn telling_truth(mut self, feed: Option<TruthFeed>) -> Self {
-        self.truth = feed;
+    pub fn telling_truth(mut self, feeds: Vec<TruthFeed>) -> Self {
+        self.truth = feeds;
         self
     }
 
@@ -109,7 +109,7 @@ impl Driver {
             for left in (0..ticks).rev() {
                 self.simulation.tick();
                 self.send_mavlink();
-                if let Some(truth) = &mut self.truth {
+                for truth in &mut self.truth {
                     truth.send(pacer.at(left), &self.simulation.true_pose());
                 }
             }

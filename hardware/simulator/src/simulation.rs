@@ -207,6 +207,10 @@ impl Simulation {
         AutopilotTime::from_ns(self.now.as_ns().saturating_sub(self.booted_at.as_ns()))
     }
 
+    fn since_start_s(&self) -> f64 {
+        self.now.seconds_since(AutopilotTime::ZERO)
+    }
+
     /// Sets the steady wind. [m/s, world]
     pub fn set_wind(&mut self, wind_world_mps: DVec3) {
         self.wind.set_steady(wind_world_mps);
@@ -304,13 +308,13 @@ impl Simulation {
         self.battery.tick(state.rotor_speed, TICK_S);
 
         let steps = f64::from(STEPS);
-        let mut sample = self.imu.sample(
-            felt_body / steps,
-            omega_body / steps,
-            state.p_world_m.z,
-            state.rotor_speed,
-            TICK_S,
-        );
+        let (felt_body, omega_body) = match &self.hand {
+            // In a hand it feels the hand, and stands on no floor.
+            Some(world_from_start) => hand::felt(world_from_start, self.since_start_s(), TICK_S),
+            None => (felt_body / steps, omega_body / steps),
+        };
+        let mut sample =
+            self.imu.sample(felt_body, omega_body, state.p_world_m.z, state.rotor_speed, TICK_S);
         sample.battery_v = self.battery.voltage_v();
         sample.battery_a = self.battery.current_a();
         if !self.is_booting() {
@@ -332,9 +336,7 @@ impl Simulation {
             }
         }
         let seen = match self.hand {
-            Some(world_from_start) => {
-                hand::carried(&world_from_start, self.now.seconds_since(AutopilotTime::ZERO))
-            }
+            Some(world_from_start) => hand::carried(&world_from_start, self.since_start_s()),
             None => state.pose(),
         };
         self.mocap.handle_truth(self.now, &seen);

@@ -21,6 +21,7 @@ use crate::terminal::print_line;
   vizflyt demo --through-bridge                 MAVLink goes through the vehicle's Wi-Fi bridge, emulated
   vizflyt demo --localization natnet            the motion capture is an OptiTrack
   vizflyt demo --localization tags              no motion capture: two simulated webcams see AprilTags
+  vizflyt demo --localization mat               nor webcams in the room: one under the vehicle sees tags on the floor
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
     #[command(flatten)]

@@ -39,9 +39,11 @@ enum CheckCommand {
     /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
     /// turns it left; then which setting is wrong.
     ///
-    /// Ends with status 1 if one is.
+    /// With --mavlink, the delay of the poses is measured by the autopilot's gyroscope, too. Ends with status 1 if a
+    /// setting is wrong.
     #[command(after_help = "Examples:
   vizflyt doctor localization arena.toml
+  vizflyt doctor localization arena.toml --mavlink udpin:0.0.0.0:14550     with the delay, for latency_ms
   vizflyt doctor localization --pose natnet:239.255.42.99:1511,up=y
   vizflyt doctor localization --pose vicon --watch        only prints the pose, until Ctrl-C")]
     Localization(localization::LocalizationArgs),

@@ -161,8 +161,14 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
         if poses {
             let rotation = DQuat::IDENTITY;
             let (stamp, v_world_mps) = (at(now), DVec3::ZERO);
-            let motion =
-                VehicleMotion { stamp, p_world_m: p_m, v_world_mps, rotation, sigma_m: 0.0 };
+            let motion = VehicleMotion {
+                stamp,
+                p_world_m: p_m,
+                v_world_mps,
+                rotation,
+                sigma_m: 0.0,
+                allowance_s: 0.0,
+            };
             flight.handle(at(now), FlightInput::Pose(motion));
         }
         let mut views = Views::default();

@@ -45,6 +45,21 @@ impl AutopilotArgs {
     }
 
     fn open_session_with(&self, change: impl Fn(&mut LinkSettings)) -> Result<ParamSession> {
+        let (address, mut settings) = self.link()?;
+        change(&mut settings);
+        Ok(ParamSession::open(&address, settings)?)
+    }
+
+    /// Returns the autopilot at an address, with what this computer's settings say of it otherwise.
+    pub(crate) fn at(mavlink: MavlinkAddress, config: Option<PathBuf>) -> Self {
+        Self { mavlink: Some(mavlink), config }
+    }
+
+    /// Returns where it is, and how to talk to it.
+    ///
+    /// # Errors
+    /// Settings that cannot be read.
+    pub(crate) fn link(&self) -> Result<(MavlinkAddress, LinkSettings)> {
         let file = self.config.clone().or_else(config::find);
         let vehicle = match file {
             Some(file) => JetsonConfig::read(&file)?.vehicle,
@@ -56,9 +71,7 @@ impl AutopilotArgs {
             (None, None) => MavlinkAddress::usual(),
         };
         let name = vehicle.name.as_deref().unwrap_or("vizflyt");
-        let mut settings = link_settings(&vehicle, name)?;
-        change(&mut settings);
-        Ok(ParamSession::open(&address, settings)?)
+        Ok((address, link_settings(&vehicle, name)?))
     }
 }
 

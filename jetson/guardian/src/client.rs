@@ -101,6 +101,7 @@ impl Guardian {
     /// Tells it that the flight is over, and waits a second for it to leave: the next flight finds the port
     /// free. Where the vehicle still lands, it goes on without us.
     pub fn leave(&self) {
+        self.has_ended.store(true, Ordering::Relaxed);
         let _ = shutdown(self.socket.as_raw_fd(), Shutdown::Both);
         let deadline = Instant::now() + LEAVES_WITHIN;
         while !self.has_left() && Instant::now() < deadline {
@@ -129,8 +130,9 @@ impl Guardian {
                 Ok(Some(Message::Note(String::from_utf8_lossy(text).into_owned())))
             }
             Received::Message(..) | Received::Nothing => Ok(None),
+            // We have left it, or it us.
+            Received::Ended if self.has_ended.swap(true, Ordering::Relaxed) => Ok(None),
             Received::Ended => {
-                self.has_ended.store(true, Ordering::Relaxed);
                 Err(io::Error::other("the guardian has ended: nothing reaches the autopilot"))
             }
         }

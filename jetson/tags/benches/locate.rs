@@ -5,7 +5,7 @@
 #[path = "../tests/flights/mod.rs"]
 mod flights;
 
-use flights::{Figures, Path, fly, lemniscate, pose_on, spiral, square};
+use flights::{Figures, Path, fly, fly_over_mat, lemniscate, pads, pose_on, spiral, square};
 use glam::{DVec2, DVec3};
 use nix::time::{ClockId, clock_gettime};
 use vizflyt_protocol::time::HostTime;
@@ -13,7 +13,7 @@ use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::detect::{Detector, DetectorSettings, Region};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::locate::{LocateSettings, Locator, StampedImage};
-use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth, belly_camera, cube, mat, webcams};
+use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth, cube, over_mat, webcams};
 
 fn main() {
     // cargo passes `--bench` on.
@@ -65,19 +65,12 @@ fn accuracy(seconds: f64) {
             });
         row(&format!("{distance_m} m"), &figures);
     }
-    head("webcam under the vehicle, height over a mat of 0.16 m tags, 1 m/s");
-    let floor = mat(DVec2::new(2.5, -1.8), DVec2::new(8.5, 1.8));
-    for height_m in [0.5, 1.0, 1.5, 2.0] {
+    head("webcam under the vehicle, height over the mat, 1 m/s");
+    for height_m in [0.5, 0.7, 1.0, 1.5, 2.0, 2.5] {
         let over =
             move |s_m: f64| lemniscate(s_m) * DVec3::new(1.0, 0.8, 0.0) + DVec3::Z * height_m;
-        let figures = fly(
-            vec![belly_camera()],
-            std::slice::from_ref(&floor),
-            Sensor::default(),
-            false,
-            seconds,
-            |t_s| pose_on(over, 1.0, t_s),
-        );
+        let figures =
+            fly_over_mat(pads(), 7, SimulatedCamera::new, seconds, |t_s| pose_on(over, 1.0, t_s));
         row(&format!("{height_m} m"), &figures);
     }
 }
@@ -109,8 +102,8 @@ fn speed() {
         ("tracking the cube, detect and solve", webcams(1).remove(0), cube()),
         (
             "tracking a mat, 1 m below",
-            belly_camera(),
-            mat(DVec2::new(2.5, -1.8), DVec2::new(8.5, 1.8)),
+            over_mat::camera(),
+            over_mat::floor(pads()).print().expect("there are tags enough").layout,
         ),
     ] {
         let is_mat = layout.tags.len() > 5;

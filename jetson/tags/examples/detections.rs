@@ -14,14 +14,14 @@ use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::detect::{Detector, DetectorSettings};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{CORNERS, TagLayout};
-use vizflyt_tags::simulated::{Sensor, belly_camera, cube, mat, webcams};
+use vizflyt_tags::simulated::{Sensor, cube, over_mat, webcams};
 use vizflyt_tags::synth::{Placed, Renderer, SyntheticExposure};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::env::args_os().nth(1).ok_or("give a folder to write to")?;
     let folder = Path::new(&folder);
     std::fs::create_dir_all(folder)?;
-    let (cube, floor) = (cube(), mat(DVec2::new(4.0, -1.0), DVec2::new(7.0, 1.0)));
+    let (cube, floor) = (cube(), over_mat::floor(Vec::new()).print()?.layout);
     let west = webcams(1).remove(0);
     let (mut found, mut truth) = (String::new(), String::new());
     for index in 0..IMAGES {
@@ -31,7 +31,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let above = index >= IMAGES / 2;
         let (camera, layout, p_m) = if above {
             let z_m = 0.6 + 0.06 * (n - f64::from(IMAGES / 2));
-            (belly_camera(), &floor, DVec3::new(5.5, 0.3 * n.sin(), z_m))
+            (over_mat::camera(), &floor, DVec3::new(5.5, 0.3 * n.sin(), z_m))
         } else {
             (west.clone(), &cube, DVec3::new(1.5 + 0.28 * n, 0.5 * n.sin(), 1.4))
         };

@@ -5,7 +5,9 @@
 //! and what was seen where, for the live view. Called once per set of images, 30 to 120 times a second.
 //!
 //! - [`config`]: the file that names cameras and layouts;
+//! - [`outcome`]: what comes of a set of images;
 //! - [`region`]: where tags should be in an image, by where the vehicle should be;
+//! - [`room`]: whether tags of the room are where a camera in the room had them;
 //! - [`track`]: how the vehicle moves, and both answers where corners leave two open;
 //! - [`monitor`]: what is wrong with clocks, cameras' places and tags' sizes, and what that leaves open of the pose.
 //!
@@ -14,27 +16,30 @@
 
 mod config;
 mod monitor;
+mod outcome;
 mod region;
+mod room;
 mod track;
 
-pub use config::{LocateConfig, LocateSetup, SIMULATED, SensorConfig};
+pub use config::{LocateConfig, LocateSetup, SIMULATED, SensorConfig, SimulatedTruth};
 pub use monitor::Finding;
+pub use outcome::{CameraResult, LocateOutcome, Located, TagObservation, Unlocated};
 
 use std::collections::{HashMap, VecDeque};
 
-use glam::{DAffine3, DMat3, DVec2, DVec3};
+use glam::{DAffine3, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
 use crate::camera::{Mounting, TagCamera};
-use crate::detect::{Detector, DetectorSettings, Region};
+use crate::detect::{Detector, DetectorSettings};
 use crate::detection::Detection;
 use crate::family::TagFamily;
 use crate::image::Gray;
-use crate::layout::{CORNERS, LayoutFrame, Tag, TagLayout};
-use crate::solve::{self, Geometry, Motion, Sighting, Solved};
+use crate::layout::{LayoutFrame, Tag, TagLayout};
+use crate::solve::{self, Geometry, Sighting, Solved};
 use monitor::{Linear, Monitor};
-use region::Expected;
+use region::{Expected, project_tag, sees};
 use track::Track;
 
 /// What locating needs to know beside tags and cameras; the defaults serve.
@@ -99,77 +104,6 @@ pub struct StampedImage<'a> {
     pub stamp: HostTime,
     /// What it saw, in the size of the camera's intrinsics.
     pub image: &'a Gray,
-}
-
-/// The vehicle's pose.
-#[derive(Clone, Copy, Debug)]
-pub struct Located {
-    /// When it was there.
-    pub stamp: HostTime,
-    /// Where.
-    pub world_from_body: Pose<World, Body>,
-    /// Standard deviation of the position. [m, world]
-    pub position_sigma_m: DVec3,
-    /// Standard deviation of the attitude, about the vehicle's axes. [rad, body]
-    pub rotation_sigma_rad: DVec3,
-    /// Covariance of both, position first, without the floors. [m, world; rad, body]
-    pub covariance: [[f64; 6]; 6],
-    /// How many tags it rests on; one in two cameras counts twice.
-    pub tags: usize,
-    /// In how many cameras.
-    pub cameras: usize,
-    /// Root mean square distance of corners from where the pose puts them. [px]
-    pub rms_px: f64,
-}
-
-/// Why there is no pose.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Unlocated {
-    /// No tag of a layout is in the images.
-    NoTag,
-    /// Tags do not lead to any pose.
-    NoPose,
-    /// Corners lie too far from where the best pose puts them, root mean square. [px]
-    Residuals(f64),
-    /// One tag, and two poses that explain it: more images will decide.
-    Ambiguous,
-    /// The images are older than those before.
-    Old,
-}
-
-/// What one camera saw.
-#[derive(Clone, Debug)]
-pub struct CameraResult {
-    /// Index of the camera.
-    pub camera: usize,
-    /// When.
-    pub stamp: HostTime,
-    /// Where it was looked; the whole image if nothing.
-    pub region: Option<Region>,
-    /// Whether no tag should be in its image, by where the vehicle should be.
-    pub out_of_view: bool,
-    /// Tags of the layouts.
-    pub seen: Vec<TagObservation>,
-    /// Tags of no layout, or of one that this camera cannot use.
-    pub strangers: Vec<Detection>,
-}
-
-/// A tag of a layout in an image.
-#[derive(Clone, Copy, Debug)]
-pub struct TagObservation {
-    /// The tag.
-    pub detection: Detection,
-    /// Where the pose puts its corners; absent without one. [px]
-    pub expected_px: Option<[DVec2; 4]>,
-}
-
-/// What came of a set of images.
-#[derive(Clone, Debug)]
-pub struct LocateOutcome {
-    /// The pose, or why there is none.
-    pub located: Result<Located, Unlocated>,
-    /// What each camera saw.
-    pub looks: Vec<CameraResult>,
 }
 
 /// Locates one vehicle.
@@ -244,13 +178,20 @@ impl Locator {
         let looked_at =
             tags.values().filter(|(of, _)| *of == frame).map(|(_, tag): &(_, Tag)| tag.position_m);
         let middle_m = looked_at.clone().sum::<DVec3>() / looked_at.count() as f64;
-        let place_sigma_m = |station: &CameraState| {
-            let survey = station.camera.survey.as_ref();
-            survey.map_or(UNSURVEYED_M, |survey| {
-                SURVEY_SIGMAS * survey.sigma_m.max(LEAST_SURVEY_M) / 3f64.sqrt()
-            })
-        };
-        let monitor = Monitor::new(&stations.iter().map(place_sigma_m).collect::<Vec<_>>());
+        let place_sigma =
+            |station: &CameraState| match (&station.camera.survey, station.camera.mounting) {
+                (None, Mounting::Body(_)) => (CARRIED_M, CARRIED_RAD),
+                (survey, _) => {
+                    let sigma_m = survey.as_ref().map_or(UNSURVEYED_M, |survey| {
+                        SURVEY_SIGMAS * survey.sigma_m.max(LEAST_SURVEY_M) / 3f64.sqrt()
+                    });
+                    (sigma_m, sigma_m / ARM_M)
+                }
+            };
+        // Tags of the room alone are the room's only measure: nothing is larger or smaller than they say.
+        let is_measure = !(fixed && on_vehicle);
+        let places = stations.iter().map(place_sigma).collect::<Vec<_>>();
+        let monitor = Monitor::new(&places, is_measure);
         let track = Track::default();
         Ok(Self { stations, tags, detector, track, monitor, middle_m, settings })
     }
@@ -308,53 +249,6 @@ impl Locator {
             }
         }
         LocateOutcome { located, looks }
-    }
-
-    /// Looks now and then whether tags of the room are still where a camera in the room had them.
-    fn look_at_room(&mut self, view: &StampedImage) {
-        let wrong = self.monitor.correction(view.camera);
-        let station = &mut self.stations[view.camera];
-        let Mounting::World(world_from_cam) = station.camera.mounting else { return };
-        let due = station.room_seen.is_none_or(|at| view.stamp.seconds_since(at) > ROOM_S);
-        if !due || !self.tags.values().any(|(frame, _)| *frame == LayoutFrame::World) {
-            return;
-        }
-        station.room_seen = Some(view.stamp);
-        let room = self.tags.values().filter(|(frame, _)| *frame == LayoutFrame::World);
-        let room = room.map(|(_, tag)| tag);
-        let Expected::Within(region) =
-            region::expect(&station.camera, room, &Pose::IDENTITY, ROOM_UNCERTAINTY_M)
-        else {
-            return;
-        };
-        let found = self.detector.look(view.image, &region, &station.camera.intrinsics);
-        // A vehicle that stays where it is, and is the camera's stand.
-        let at = wrong.apply(&world_from_cam);
-        let body_from_cam = Pose::new(at.translation_m, at.rotation);
-        let sightings: Vec<Sighting> = found
-            .iter()
-            .filter_map(|seen| {
-                let (frame, tag) = self.tags.get(&(seen.family, seen.id))?;
-                (*frame == LayoutFrame::World).then(|| Sighting {
-                    camera: &station.camera.intrinsics,
-                    sight: Geometry::InsideOut {
-                        body_from_cam,
-                        world_from_tag: tag.frame_from_tag(),
-                    },
-                    size_m: tag.size_m,
-                    corners_px: seen.corners_px,
-                    sigma_px: self.settings.corner_sigma_px,
-                    lag_s: 0.0,
-                    readout_s: 0.0,
-                })
-            })
-            .collect();
-        let cameras = vec![view.camera; sightings.len()];
-        let motion = Motion::default();
-        let pose = Pose::IDENTITY;
-        if let Some(set) = Linear::at(&sightings, &cameras, &motion, &pose, self.middle_m) {
-            self.monitor.anchor(view.camera, &set);
-        }
     }
 
     fn look(
@@ -585,69 +479,29 @@ impl Locator {
     }
 }
 
-/// Returns whether a camera can use tags of a layout in this frame.
-fn sees(mounting: &Mounting, frame: LayoutFrame) -> bool {
-    matches!(
-        (mounting, frame),
-        (Mounting::World(_), LayoutFrame::Body) | (Mounting::Body(_), LayoutFrame::World)
-    )
-}
-
-/// Returns the corners of a tag, grown about its middle by `scale`, in a camera; `None` unless all are
-/// ahead of it and its printed face is seen at more than a grazing angle.
-fn project_tag(
-    camera: &TagCamera,
-    tag: &Tag,
-    world_from_body: &Pose<World, Body>,
-    scale: f64,
-) -> Option<[DVec2; 4]> {
-    let (rotation, at) = match camera.mounting {
-        Mounting::World(world_from_cam) => {
-            let cam_from_body = world_from_cam.inverse() * *world_from_body;
-            (cam_from_body.rotation, cam_from_body.translation_m)
-        }
-        Mounting::Body(body_from_cam) => {
-            let cam_from_world = (*world_from_body * body_from_cam).inverse();
-            (cam_from_world.rotation, cam_from_world.translation_m)
-        }
-        Mounting::Unknown => return None,
-    };
-    let turn = DMat3::from_quat(rotation);
-    let middle = turn * tag.position_m + at;
-    let normal = turn * tag.normal();
-    if !(normal.dot(middle) < -GRAZING * middle.length()) {
-        return None;
-    }
-    let mut corners = [DVec2::ZERO; 4];
-    for (corner, c) in corners.iter_mut().zip(CORNERS) {
-        let p = tag.position_m + tag.rotation_xyzw * (c * tag.size_m * scale).extend(0.0);
-        *corner = camera.intrinsics.project(turn * p + at)?;
-    }
-    Some(corners)
-}
-
 /// Three images of a slow webcam: what one of them saw then is still a reason to trust the track. [s]
 const SEEN_LATELY_S: f64 = 0.2;
 /// Exposures closer than this are one. [s]
 const TOGETHER_S: f64 = 0.001;
 /// How far a camera may be off whose file has no survey, along an axis. [m]
 const UNSURVEYED_M: f64 = 0.001;
+/// And one under a vehicle: 1.5 mm where a ruler has placed it, and more, for it is off in the same way all along, and who
+/// filters these poses takes that for noise, which averages out. [m]
+const CARRIED_M: f64 = 0.0019;
+/// Likewise, of 1.5 mrad where the mat's own level has turned it. [rad]
+const CARRIED_RAD: f64 = 0.0019;
+/// What turns a camera in the room turns it about something so far away. [m]
+const ARM_M: f64 = 3.0;
 /// Errors that all its corners share are not in a survey's sigma: so many of it.
 const SURVEY_SIGMAS: f64 = 1.0;
 /// Nor do stands hold better than this. [m]
 const LEAST_SURVEY_M: f64 = 0.0002;
-/// How often tags of the room are looked at. [s]
-const ROOM_S: f64 = 0.3;
-/// They are looked for so far from where they were. [m]
-const ROOM_UNCERTAINTY_M: f64 = 0.1;
 /// Images of a camera that are kept: others' that come late lie between two of them.
 const MAX_KEPT: usize = 4;
 /// What the vehicle's estimated velocity may be off. [m/s]
 const SPEED_UNCERTAINTY_MPS: f64 = 0.02;
 /// And its acceleration. [m/s^2]
 const ACCELERATION_UNCERTAINTY_MPS2: f64 = 2.0;
-/// Cosine to a tag's normal below which it cannot be read: 81 degrees.
-const GRAZING: f64 = 0.15;
 
 #[cfg(test)]
 mod tests;

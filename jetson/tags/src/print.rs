@@ -1,7 +1,7 @@
 //! Tags on paper: cubes with fold marks, mats over several sheets, as a PDF and a layout; and checkerboards.
 //!
 //! ```text
-//! Cube or Mat -> sheets of shapes in millimetres -> PDF
+//! Cube, Mat or Floor -> sheets of shapes in millimetres -> PDF
 //!             -> TagLayout, as if everything were glued without a fault; a survey measures the rest
 //! ```
 //!
@@ -12,15 +12,19 @@
 
 mod checkerboard;
 mod cube;
+mod floor;
 mod mat;
 mod pdf;
 mod sheet;
 
 pub use checkerboard::checkerboard;
 pub use cube::{CUBE_FACES, Cube};
+pub use floor::{Floor, Pad};
 pub use mat::Mat;
 pub use pdf::pdf;
 pub use sheet::{Paper, Shape, Sheet};
+
+use glam::DVec3;
 
 use crate::family::TagFamily;
 use crate::layout::TagLayout;
@@ -125,6 +129,15 @@ fn scale(bar_mm: f64) -> Result<f64, PrintError> {
         return Err(PrintError::Invalid { name: "bar_mm", value: bar_mm, advice });
     }
     Ok(bar_mm / BAR_MM)
+}
+
+/// Checks that a mat lies in a room. [m, world]
+fn check_middle(middle_m: DVec3) -> Result<(), PrintError> {
+    if !(middle_m.is_finite() && middle_m.abs().max_element() <= 900.0) {
+        let (name, value) = ("middle_m", middle_m.length());
+        return Err(PrintError::Invalid { name, value, advice: "give metres within the room" });
+    }
+    Ok(())
 }
 
 fn check_positive(name: &'static str, value_mm: f64) -> Result<(), PrintError> {

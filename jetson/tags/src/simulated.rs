@@ -3,7 +3,10 @@
 //!
 //! [`Truth`] keeps the vehicle's true poses of the last second, as they arrive; [`SimulatedCamera`] renders an
 //! image once the truth reaches past the end of its exposure. Cameras run free, each with its own phase,
-//! as webcams do.
+//! as webcams do. The lab's two setups are here: webcams in the room and a [`cube`] on the vehicle, and [`over_mat`] a
+//! webcam under the vehicle.
+
+pub mod over_mat;
 
 use std::collections::VecDeque;
 
@@ -70,6 +73,10 @@ pub struct Sensor {
     pub exposure_s: f64,
     /// Standard deviation of the optics' blur. [px]
     pub blur_px: f64,
+    /// The distance at which the lens is focused. [m]
+    pub focus_m: f64,
+    /// How wide its opening is: what is elsewhere than in focus is blurred by it; 0 is a pinhole. [m]
+    pub aperture_m: f64,
     /// Standard deviation of the sensor's noise. [grey levels of 255]
     pub noise: f64,
     /// How bright things appear.
@@ -83,6 +90,8 @@ impl Default for Sensor {
             phase: 0.0,
             exposure_s: 0.004,
             blur_px: 0.6,
+            focus_m: 1.0,
+            aperture_m: 0.0,
             noise: 4.0,
             light: Light { gradient: DVec2::new(0.4, -0.3), vignette: 0.3, ..Light::default() },
         }
@@ -195,7 +204,7 @@ impl SimulatedCamera {
         let image = self.renderer.render(&SyntheticExposure {
             background: background.as_ref(),
             light: self.sensor.light,
-            blur_px: self.sensor.blur_px,
+            blur_px: self.sensor.blur_px.hypot(self.defocus_px(&placed, &middle)),
             noise: self.sensor.noise,
             seed: stamp.as_ns(),
             ..SyntheticExposure {
@@ -204,6 +213,26 @@ impl SimulatedCamera {
             }
         });
         Some((stamp, image))
+    }
+
+    /// Returns the blur of a lens that is focused elsewhere, one standard deviation, at the tag that is nearest. [px]
+    fn defocus_px(&self, placed: &[Placed], world_from_cam: &Pose<World, Cam>) -> f64 {
+        let Sensor { focus_m, aperture_m, .. } = self.sensor;
+        let k = &self.camera.intrinsics;
+        let (cam_from_world, size) =
+            (world_from_cam.inverse(), DVec2::new(k.width_px.into(), k.height_px.into()));
+        let p_cam = placed.iter().flat_map(Placed::middles_m);
+        let p_cam = p_cam.map(|p_m| cam_from_world.transform_point(p_m));
+        let is_seen = |p_m: &DVec3| {
+            k.project(*p_m).is_some_and(|px| px.cmpge(DVec2::ZERO).all() && px.cmple(size).all())
+        };
+        let nearest_m = p_cam.filter(is_seen).map(|p_m| p_m.z).fold(f64::INFINITY, f64::min);
+        if !nearest_m.is_finite() {
+            return 0.0;
+        }
+        // A disc has a deviation of a quarter of its diameter along an axis.
+        let disc = aperture_m * (nearest_m.recip() - focus_m.recip()).abs();
+        0.25 * k.fx_px * disc
     }
 }
 
@@ -227,23 +256,6 @@ pub fn cube() -> TagLayout {
         Tag { family: TagFamily::Tag36h11, id, size_m: CUBE_TAG_M, position_m, rotation_xyzw }
     });
     TagLayout { frame: LayoutFrame::Body, tags: tags.collect() }
-}
-
-/// Returns a mat on the floor: tags of 0.16 m every 0.3 m between two corners, upper edges to the north, ids
-/// from 100 on.
-pub fn mat(least_m: DVec2, most_m: DVec2) -> TagLayout {
-    let count = ((most_m - least_m) / MAT_SPACING_M).floor().max(DVec2::ZERO);
-    let (columns, rows) = (count.x as u32 + 1, count.y as u32 + 1);
-    let tags = (0..rows * columns).map(|i| Tag {
-        family: TagFamily::Tag36h11,
-        id: MAT_FIRST_ID + i,
-        size_m: MAT_TAG_M,
-        position_m: (least_m
-            + DVec2::new(f64::from(i % columns), f64::from(i / columns)) * MAT_SPACING_M)
-            .extend(0.0),
-        rotation_xyzw: DQuat::IDENTITY,
-    });
-    TagLayout { frame: LayoutFrame::World, tags: tags.collect() }
 }
 
 /// Returns one to four webcams of the simulated lab, the netted hall of 11 x 4.5 x 3.65 m (x from 0 to 11,
@@ -285,23 +297,6 @@ pub fn webcams(count: usize) -> Vec<TagCamera> {
     made.collect()
 }
 
-/// Returns the webcam under the vehicle: it looks straight down, the image's top towards the nose.
-pub fn belly_camera() -> TagCamera {
-    let k = Intrinsics::from_horizontal_fov(1280, 720, 70f64.to_radians());
-    let distortion =
-        Distortion::BrownConrady { k1: -0.12, k2: 0.03, p1: 0.0008, p2: -0.0005, k3: 0.0 };
-    let axes = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_X, DVec3::NEG_Z);
-    TagCamera {
-        name: "belly".into(),
-        source: None,
-        intrinsics: Intrinsics { distortion, ..k },
-        mounting: Mounting::Body(Pose::new(DVec3::new(0.02, 0.0, -0.04), DQuat::from_mat3(&axes))),
-        calibration: None,
-        survey: None,
-        latency_ms: 0.0,
-    }
-}
-
 /// Returns a camera at a point that looks at another, its right side level.
 fn looking(from_m: DVec3, at_m: DVec3) -> Pose<World, Cam> {
     let z = (at_m - from_m).normalize();
@@ -317,12 +312,6 @@ const CUBE_M: f64 = 0.25;
 const CUBE_TAG_M: f64 = 0.2;
 /// Its middle above the vehicle's. [m]
 const CUBE_HEIGHT_M: f64 = 0.165;
-/// Edge of the mat's black squares, one on a sheet of A4. [m]
-const MAT_TAG_M: f64 = 0.16;
-/// Between the middles of tags on the mat. [m]
-const MAT_SPACING_M: f64 = 0.3;
-/// The cube has the ids below.
-const MAT_FIRST_ID: u32 = 100;
 
 #[cfg(test)]
 mod tests {
@@ -380,7 +369,6 @@ mod tests {
     #[test]
     fn the_lab_s_tags_are_upright_and_its_layouts_valid() {
         cube().validate().unwrap();
-        mat(DVec2::ZERO, DVec2::new(3.0, 2.0)).validate().unwrap();
         for tag in &cube().tags[..4] {
             assert!((tag.rotation_xyzw * DVec3::Y - DVec3::Z).length() < 1e-12);
             // Outwards.

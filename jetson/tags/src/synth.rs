@@ -10,9 +10,8 @@
 //! instant of the exposure; its ray meets the tag's plane by a homography. So blur of optics and of
 //! motion cost nothing beside antialiasing. Everything is determined by the shot and its seed.
 //!
-//! Budget: 14 ns a sample on one core of a busy machine, 16 samples a pixel that shows a tag: light and
-//! noise of 1280 x 720 take 6 ms, a cube's three faces of 60 x 60 px 2 ms, a tag that fills the image
-//! 200 ms.
+//! Budget: 16 samples a pixel that shows an edge between cells, one where all is one colour, fewer where that is so
+//! over many pixels (`docs/BENCHMARKS.md`, "drawing").
 
 mod pattern;
 mod rays;
@@ -20,7 +19,7 @@ mod rays;
 use std::collections::HashMap;
 use std::sync::Mutex;
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat2, DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Frame, Intrinsics, Pose, World};
 
 use crate::family::{Cells, TagFamily};
@@ -69,6 +68,11 @@ impl<'a> Placed<'a> {
     /// Places it anywhere: for calibration boards that are waved before a camera.
     pub fn anywhere(layout: &'a TagLayout, world_from_layout: Pose<World, Layout>) -> Self {
         Self { layout, world_from_layout: [world_from_layout; 2] }
+    }
+
+    /// Returns where its tags' middles are when the shutter opens. [m, world]
+    pub(crate) fn middles_m(&self) -> impl Iterator<Item = DVec3> {
+        self.layout.tags.iter().map(|tag| self.world_from_layout[0].transform_point(tag.position_m))
     }
 }
 
@@ -180,7 +184,7 @@ impl Renderer {
     }
 
     /// Returns the tags that face the camera, those behind others first.
-    fn farthest_first(shot: &SyntheticExposure<'_>) -> Vec<(Vec<DMat3>, Tag)> {
+    fn farthest_first(shot: &SyntheticExposure<'_>) -> Vec<([DMat3; 2], Tag)> {
         let mut quads = Vec::new();
         for placed in shot.placed {
             for tag in &placed.layout.tags {
@@ -198,14 +202,13 @@ impl Renderer {
                     middle.transform_point((*c * 2.0 * tag.size_m).extend(0.0)).z > NEAR_M
                 });
                 if faces && ahead {
-                    let tag_from_slope = (0..SAMPLES)
-                        .map(|i| homography(cam_from_tag(pattern::instant(i, SAMPLES)), tag.size_m))
-                        .collect();
+                    let tag_from_slope =
+                        [0.0, 1.0].map(|t| homography(cam_from_tag(t), tag.size_m));
                     quads.push((middle.translation_m.length(), tag_from_slope, *tag));
                 }
             }
         }
-        quads.sort_by(|a: &(f64, Vec<DMat3>, Tag), b| b.0.total_cmp(&a.0));
+        quads.sort_by(|a: &(f64, [DMat3; 2], Tag), b| b.0.total_cmp(&a.0));
         quads.into_iter().map(|(_, quad, tag)| (quad, tag)).collect()
     }
 
@@ -213,7 +216,7 @@ impl Renderer {
         &self,
         albedo: &mut [f32],
         pattern: &Pattern,
-        tag_from_slope: &[DMat3],
+        tag_from_slope: &[DMat3; 2],
         tag: &Tag,
     ) {
         let mut kept = self.cells.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -231,18 +234,42 @@ impl Renderer {
         };
         let (border, half) = (f64::from(cells.border()), f64::from(cells.across()) / 2.0);
         let across = cells.across() as i32;
-        for y in top..bottom {
-            for x in left..right {
-                let Some((slope, per_px)) = self.rays.at(x, y) else { continue };
+        let spots = |x: u32, y: u32| -> Option<[Spot; 2]> {
+            let (slope, per_px) = self.rays.at(x, y)?;
+            let [begin, end] = tag_from_slope.each_ref();
+            Some([Spot::at(begin, slope, per_px)?, Spot::at(end, slope, per_px)?])
+        };
+        // Most of a large tag is one colour over many pixels, and most pixels of it are one colour.
+        let plain = |spots: &[Spot; 2], around_px: f64| {
+            let [begin, end] =
+                spots.each_ref().map(|spot| spot.reach(pattern.reach_px + around_px));
+            colour(cells, begin.0.min(end.0), begin.1.max(end.1), paper).map(f32::from)
+        };
+        let width = self.intrinsics.width_px;
+        for (x, y) in (top..bottom)
+            .step_by(BLOCK_PX as usize)
+            .flat_map(|y| (left..right).step_by(BLOCK_PX as usize).map(move |x| (x, y)))
+        {
+            let (x_end, y_end) = ((x + BLOCK_PX).min(right), (y + BLOCK_PX).min(bottom));
+            let middle = spots(x + (x_end - x) / 2, y + (y_end - y) / 2);
+            let block = middle.and_then(|spots| plain(&spots, f64::from(BLOCK_PX) / 2.0));
+            for (x, y) in (y..y_end).flat_map(|y| (x..x_end).map(move |x| (x, y))) {
+                let pixel = &mut albedo[(y * width + x) as usize];
+                if let Some(shade) = block {
+                    *pixel = shade;
+                    continue;
+                }
+                // Behind the camera, and so not on the paper.
+                let Some(spots) = spots(x, y) else { continue };
+                if let Some(shade) = plain(&spots, 0.0) {
+                    *pixel = shade;
+                    continue;
+                }
+                let [begin, end] = spots;
+                let moved = end.at - begin.at;
                 let (mut sum, mut covered) = (0u32, 0u32);
-                for (offset, tag_from_slope) in pattern.offsets_px.iter().zip(tag_from_slope) {
-                    let slope = slope + per_px * *offset;
-                    let p = *tag_from_slope * slope.extend(1.0);
-                    // Behind the camera, and so not on the paper.
-                    if !(p.z > 0.0) {
-                        continue;
-                    }
-                    let at = p.truncate() / p.z;
+                for (offset, instant) in pattern.offsets_px.iter().zip(&pattern.instants) {
+                    let at = begin.at + moved * *instant + begin.by_px * *offset;
                     if !(at.x.abs() < paper && at.y.abs() < paper) {
                         continue;
                     }
@@ -254,7 +281,6 @@ impl Renderer {
                     sum += u32::from(!inside || cells.is_white(column as u32, row as u32));
                 }
                 if covered > 0 {
-                    let pixel = &mut albedo[(y * self.intrinsics.width_px + x) as usize];
                     let rest = SAMPLES as f32 - covered as f32;
                     *pixel = (sum as f32 + rest * *pixel) / SAMPLES as f32;
                 }
@@ -263,12 +289,15 @@ impl Renderer {
     }
 
     /// Returns the pixels that a paper can reach: left, top, right, bottom; the last two past it.
-    fn bounds(&self, tag_from_slope: &[DMat3], paper: f64, pattern: &Pattern) -> Option<[u32; 4]> {
+    fn bounds(
+        &self,
+        tag_from_slope: &[DMat3; 2],
+        paper: f64,
+        pattern: &Pattern,
+    ) -> Option<[u32; 4]> {
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        let instants = [0, tag_from_slope.len() / 2, tag_from_slope.len() - 1];
-        let (first, last) = (pattern::earliest(SAMPLES), pattern::latest(SAMPLES));
-        for i in instants.into_iter().chain([first, last]) {
-            let slope_from_tag = tag_from_slope[i].inverse();
+        for tag_from_slope in tag_from_slope {
+            let slope_from_tag = tag_from_slope.inverse();
             for step in 0..=OUTLINE {
                 let along = paper * (2.0 * f64::from(step) / f64::from(OUTLINE) - 1.0);
                 for at in [
@@ -339,6 +368,61 @@ fn homography(cam_from_tag: Pose<Cam, Square>, size_m: f64) -> DMat3 {
     cam_from_plane.inverse()
 }
 
+/// Where a pixel's ray meets a tag's plane at an instant, to first order in pixels: of a footprint of some pixels the rest
+/// is less than a hundredth of one.
+#[derive(Clone, Copy)]
+struct Spot {
+    /// Of the pixel's middle. [edges of the black square]
+    at: DVec2,
+    /// How it changes with a step of one pixel right or down.
+    by_px: DMat2,
+}
+
+impl Spot {
+    /// Returns `None` behind the camera.
+    fn at(tag_from_slope: &DMat3, slope: DVec2, per_px: DMat2) -> Option<Self> {
+        let p = *tag_from_slope * slope.extend(1.0);
+        if !(p.z > 0.0) {
+            return None;
+        }
+        let at = p.truncate() / p.z;
+        let by_slope = |column: DVec3| (column.truncate() - at * column.z) / p.z;
+        let axes = [tag_from_slope.x_axis, tag_from_slope.y_axis].map(by_slope);
+        Some(Self { at, by_px: DMat2::from_cols(axes[0], axes[1]) * per_px })
+    }
+
+    /// Returns between which places all is that lies so many pixels around it.
+    fn reach(&self, around_px: f64) -> (DVec2, DVec2) {
+        let reach = (self.by_px.x_axis.abs() + self.by_px.y_axis.abs()) * around_px;
+        (self.at - reach, self.at + reach)
+    }
+}
+
+/// Returns the colour of all cells between two places of a tag, in edges of its black square: whether it is white. `None` if
+/// there are two colours, or if the paper, of half the edge `paper`, ends there.
+fn colour(cells: &Cells, low: DVec2, high: DVec2, paper: f64) -> Option<bool> {
+    if low.abs().max(high.abs()).max_element() > paper {
+        return None;
+    }
+    let (border, half) = (f64::from(cells.border()), f64::from(cells.across()) / 2.0);
+    let columns = [low.x, high.x].map(|x| (x * border + half).floor() as i32);
+    let rows = [high.y, low.y].map(|y| (half - y * border).floor() as i32);
+    // Where a pixel sees many cells, they have two colours.
+    if columns[1] - columns[0] > 1 || rows[1] - rows[0] > 1 {
+        return None;
+    }
+    let across = 0..cells.across() as i32;
+    let is_white = |column: i32, row: i32| {
+        !(across.contains(&column) && across.contains(&row))
+            || cells.is_white(column as u32, row as u32)
+    };
+    let first = is_white(columns[0], rows[0]);
+    let is_one = is_white(columns[1], rows[0]) == first
+        && is_white(columns[0], rows[1]) == first
+        && is_white(columns[1], rows[1]) == first;
+    is_one.then_some(first)
+}
+
 /// Returns a grey wall with shades and boxes, in which nothing is a tag.
 fn clutter(intrinsics: &Intrinsics) -> Vec<f32> {
     let (width, height) = (intrinsics.width_px, intrinsics.height_px);
@@ -367,6 +451,8 @@ fn clutter(intrinsics: &Intrinsics) -> Vec<f32> {
 
 /// Samples a pixel: edges along the image's axes are then placed within 1/32 px.
 const SAMPLES: usize = 16;
+/// Pixels along the edge of a block whose colour is looked at at once. [px]
+const BLOCK_PX: u32 = 4;
 /// Points along each edge of a paper whose images bound it; a lens bends edges.
 const OUTLINE: u32 = 8;
 /// White paper beyond what must be printed. [cells]

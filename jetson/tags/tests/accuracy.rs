@@ -5,9 +5,12 @@
 mod flights;
 mod hall;
 
-use flights::{Figures, Path, fly, lemniscate, locate, pose_on, spiral, square};
-use glam::{DVec2, DVec3};
-use vizflyt_tags::simulated::{Sensor, belly_camera, cube, mat, webcams};
+use flights::{
+    Figures, Path, fly, fly_over_mat, lemniscate, locate, pads, pose_on, spiral, square,
+};
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_tags::simulated::{Sensor, SimulatedCamera, cube, webcams};
 
 fn print_figures(name: &str, figures: &Figures) {
     println!(
@@ -57,25 +60,44 @@ fn the_hall_behind_the_tags_changes_nothing() {
     assert!(figures.rms_deg() <= 1.0);
     assert!(figures.availability_percent() >= 99.0);
 
-    let mat = mat(DVec2::new(2.5, -1.8), DVec2::new(8.5, 1.8));
-    let over = |s_m: f64| lemniscate(s_m) * DVec3::new(1.0, 1.0, 0.0) + DVec3::Z;
     let figures =
-        locate(hall::seen_by(vec![belly_camera()]), &[mat], 1.5, |t_s| pose_on(over, 1.0, t_s));
+        fly_over_mat(Vec::new(), 7, hall::before(), 1.5, |t_s| pose_on(at_a_metre, 1.0, t_s));
     print_figures("over the mat in the hall", &figures);
     assert!(figures.rms_mm() <= 8.0, "{} mm", figures.rms_mm());
     assert!(figures.rms_deg() <= 1.0);
     assert!(figures.availability_percent() >= 99.0);
 }
 
+/// The lemniscate, 1 m above the floor.
+fn at_a_metre(s_m: f64) -> DVec3 {
+    lemniscate(s_m) * DVec3::new(1.0, 1.0, 0.0) + DVec3::Z
+}
+
+/// Standing on one pad, then up, along the hall and down onto another: the vehicle is seen at every height, and sigma
+/// says how well. [m, world] by [s]
+fn from_pad_to_pad(t_s: f64) -> Pose<World, Body> {
+    // From 0 to 1 within a time, without a jerk.
+    let smooth = |from_s: f64, to_s: f64| {
+        let t = ((t_s - from_s) / (to_s - from_s)).clamp(0.0, 1.0);
+        t * t * (3.0 - 2.0 * t)
+    };
+    let (up, across, down) = (smooth(0.5, 2.0), smooth(2.0, 6.0), smooth(6.0, 8.0));
+    let aside_m = 0.4 * (across * std::f64::consts::TAU).sin();
+    let at = DVec3::new(0.9 + 8.75 * across, aside_m, 1.2 * (up - down));
+    Pose::new(at, DQuat::from_rotation_z(0.5 * across))
+}
+
 #[test]
 fn a_webcam_under_the_vehicle_locates_it_over_a_mat() {
-    let mat = mat(DVec2::new(2.5, -1.8), DVec2::new(8.5, 1.8));
-    let over = |s_m: f64| lemniscate(s_m) * DVec3::new(1.0, 1.0, 0.0) + DVec3::Z;
-    let figures = fly(vec![belly_camera()], &[mat], Sensor::default(), false, 4.0, |t_s| {
-        pose_on(over, 1.0, t_s)
-    });
-    print_figures("over the mat", &figures);
-    assert!(figures.rms_mm() <= 8.0, "{} mm", figures.rms_mm());
-    assert!(figures.rms_deg() <= 1.0);
-    assert!(figures.availability_percent() >= 99.0);
+    for seed in [1, 2, 3] {
+        let figures = fly_over_mat(pads(), seed, SimulatedCamera::new, 8.5, from_pad_to_pad);
+        print_figures(&format!("from pad to pad, seed {seed}"), &figures);
+        assert!(figures.rms_mm() <= 6.0 && figures.p99_mm() <= 15.0, "seed {seed}");
+        assert!(figures.rms_deg() <= 1.0, "seed {seed}");
+        assert!(figures.availability_percent() >= 99.0, "seed {seed}: {:?}", figures.unlocated);
+        let honest = figures.position_consistency();
+        println!("squared errors of the position {honest:.2} of the predicted");
+        // Cautious by itself: what is off all along does not average out in the filter behind (tests/e2e/tests/mat.rs).
+        assert!((0.3..2.0).contains(&honest), "seed {seed}: {honest}");
+    }
 }

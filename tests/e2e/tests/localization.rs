@@ -33,7 +33,16 @@ fn doctor(format: &str, settings: &str, within: &str) -> (bool, String) {
     (code == Some(0), doctor.seen.join("\n"))
 }
 
-fn check(format: &str, settings: &str, expected: &[&str]) {
+/// Carries a vehicle for each case, all at once: a hand and its doctor mostly wait.
+fn check(cases: &[(&str, &str, &[&str])]) {
+    std::thread::scope(|scope| {
+        for (format, settings, expected) in cases {
+            scope.spawn(|| check_one(format, settings, expected));
+        }
+    });
+}
+
+fn check_one(format: &str, settings: &str, expected: &[&str]) {
     let (is_content, text) = doctor(format, settings, "100");
     for line in expected {
         assert!(text.contains(line), "{format}{settings}: no '{line}' in:\n{text}");
@@ -44,16 +53,47 @@ fn check(format: &str, settings: &str, expected: &[&str]) {
 
 #[test]
 fn motive_s_up_axis_is_found() {
-    check("natnet", "", &["lifted, it went along +y, not up", "set      up = \"y\""]);
-    check("natnet", ",up=y", &["up is +z", "right    axes"]);
+    check(&[
+        ("natnet", "", &["lifted, it went along +y, not up", "set      up = \"y\""]),
+        ("natnet", ",up=y", &["up is +z", "right    axes"]),
+    ]);
 }
 
 #[test]
 fn wrong_units_orders_and_mirrors_are_found() {
-    check("json", ",units=mm", &["it went 0.50 mm", "set      units = \"m\""]);
-    check("json", ",axes=x-yz", &["it turned right by", "set      axes = \"xyz\""]);
-    check("vicon", ",euler=zyx", &["with its nose raised", "set      euler = \"xyz\""]);
-    check("mavlink", ",nose=y", &["pushed the way its nose points", "set      nose = \"x\""]);
+    check(&[
+        ("json", ",units=mm", &["it went 0.50 mm", "set      units = \"m\""]),
+        ("json", ",axes=x-yz", &["it turned right by", "set      axes = \"xyz\""]),
+        ("vicon", ",euler=zyx", &["with its nose raised", "set      euler = \"xyz\""]),
+        ("mavlink", ",nose=y", &["pushed the way its nose points", "set      nose = \"x\""]),
+    ]);
+}
+
+/// The autopilot's gyroscope feels the hand, and the motion capture shows it later.
+#[test]
+fn the_delay_of_the_poses_is_measured() {
+    for (delay_ms, set) in [(80, ""), (40, ",latency_ms=40")] {
+        let (address, mavlink) = (free(), free());
+        let mut doctor = Command::new(vizflyt());
+        doctor.args(["doctor", "localization", "--within=100"]);
+        doctor.arg(format!("--mavlink=udpin:{mavlink}"));
+        doctor.args(["--pose", &format!("json:{address}{set}")]);
+        let mut doctor = Demo::spawn(&mut doctor);
+        doctor.wait_for("gyroscope", CHECKED);
+        let mut simulator = Command::new(vizflyt());
+        simulator.args(["sim", "--json", "--hand", "--spawn=1,2,0,20"]);
+        simulator.arg(format!("--mavlink=udpout:{mavlink}"));
+        simulator.args(["--mocap", &format!("json:{address}")]);
+        simulator.arg(format!("--mocap-delay-ms={delay_ms}"));
+        let _simulator = Demo::spawn(&mut simulator);
+        let code = doctor.wait(CHECKED);
+        let text = doctor.seen.join("\n");
+        let found = text.split_once("show a turn ").and_then(|(_, rest)| rest.split_once(" ms"));
+        let found_ms: f64 = found.expect(&text).0.parse().expect(&text);
+        assert!((found_ms - f64::from(delay_ms)).abs() <= 10.0, "{text}");
+        assert_eq!(text.contains("set      latency_ms = "), set.is_empty(), "{text}");
+        assert_eq!(code == Some(0), !set.is_empty(), "{text}");
+    }
 }
 
 /// A whole flight whose poses come as Motive streams them; and its log as a source of poses.

@@ -1,7 +1,9 @@
 //! `vizflyt doctor localization`: the pose in plain words, and the check by hand.
 
 mod check;
+mod delay;
 mod description;
+mod gyro;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -9,12 +11,17 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
 use clap::Args;
+use vizflyt_guardian::port::MavlinkAddress;
+use vizflyt_server::poses::drivers::{Measurement, PoseSource};
 use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 use vizflyt_server::poses::{drivers, settings};
 
-use self::check::{Check, Diagnosis, Step};
+use self::check::{Change, Check, Diagnosis, Step};
+use self::delay::{Delay, DelayMeter, NoDelay};
 use self::description::describe_pose;
+use self::gyro::Gyro;
 use crate::terminal::print_line;
+use crate::vehicle::AutopilotArgs;
 
 /// What is looked at.
 #[derive(Args, Debug)]
@@ -27,6 +34,14 @@ pub(crate) struct LocalizationArgs {
     /// The vehicle
     #[arg(long, value_name = "NAME", default_value = "vizflyt")]
     vehicle: String,
+    /// The vehicle's autopilot: by its gyroscope the source's delay is measured, `latency_ms`. As for
+    /// `vizflyt doctor vehicle`
+    #[arg(long, value_name = "ADDRESS", conflicts_with = "watch")]
+    mavlink: Option<MavlinkAddress>,
+    /// The settings of the autopilot's link
+    /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
+    #[arg(long, value_name = "FILE", requires = "mavlink")]
+    config: Option<PathBuf>,
     /// Only prints the pose, until Ctrl-C
     #[arg(long)]
     watch: bool,
@@ -41,17 +56,14 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
     let mut opened = drivers::open(std::slice::from_ref(&config))?;
     let address = opened.first_mut().map(|source| source.address()).unwrap_or_default();
     print_line(format!("listens  {} {address}", config.driver));
+    let mut gyro = args.gyro()?;
     let mut source = drivers::track(opened, &[args.vehicle.as_str()])?;
     let mut check = Check::new(config.clone());
     let (start, mut printed_at) = (Instant::now(), None::<Instant>);
     let mut step = None;
     while args.watch || start.elapsed().as_secs_f64() < args.within {
         let now_s = start.elapsed().as_secs_f64();
-        let measured = source.receive(Duration::from_millis(100)).last().copied();
-        while let Some(warning) = source.next_warning() {
-            print_line(format!("note     {warning}"));
-        }
-        let Some(measured) = measured else { continue };
+        let Some(measured) = receive(&mut *source, gyro.as_mut()) else { continue };
         let pose = measured.world_from_body;
         if printed_at.is_none_or(|at| at.elapsed() >= PRINT_PERIOD) {
             printed_at = Some(Instant::now());
@@ -69,7 +81,10 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
         }
         print_line(format!("seen     {}", check.seen()));
         if check.step() == Step::Done {
-            return Ok(report(&config, &check.diagnosis()));
+            let diagnosis = check.diagnosis();
+            let delay =
+                gyro.map(|mut gyro| measure_delay(&config, &diagnosis, &mut *source, &mut gyro));
+            return Ok(report(&config, diagnosis, delay.as_ref()));
         }
         step = Some(check.step());
         print_line(format!("do       {}", check.step().ask()));
@@ -88,32 +103,196 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
     bail!("the check was not done within {:.0} s; --within gives more time", args.within)
 }
 
-fn report(config: &LocalizationConfig, diagnosis: &Diagnosis) -> ExitCode {
+/// Waits for a pose, a tenth of a second at most; tells what is odd, and gives the delay's meter its share.
+fn receive(source: &mut dyn PoseSource, gyro: Option<&mut Vehicle>) -> Option<Measurement> {
+    let measured = source.receive(Duration::from_millis(100)).last().copied();
+    while let Some(warning) = source.next_warning() {
+        print_line(format!("note     {warning}"));
+    }
+    if let Some(vehicle) = gyro {
+        let heard = vehicle.gyro.take();
+        if heard.is_connected && !std::mem::replace(&mut vehicle.was_connected, true) {
+            print_line("vehicle  its autopilot's heartbeats come");
+        }
+        vehicle.clock_off_ms = heard.clock_off_ms;
+        if heard.began_anew {
+            vehicle.meter = DelayMeter::default();
+        }
+        for (at_s, rate_radps) in heard.readings {
+            vehicle.meter.add_gyro(at_s, rate_radps);
+        }
+        if let Some(measured) = &measured {
+            let at_s = measured.stamp.as_ns() as f64 * 1e-9;
+            vehicle.meter.add_pose(at_s, measured.world_from_body.rotation);
+        }
+    }
+    measured
+}
+
+/// The vehicle's gyroscope, and what is made of it.
+struct Vehicle {
+    gyro: Gyro,
+    meter: DelayMeter,
+    was_connected: bool,
+    /// How far the gyroscope's times may be off. [ms]
+    clock_off_ms: Option<f64>,
+}
+
+/// Returns the delay by which poses come beyond what is set; where the motions were too gentle, after some
+/// quicker ones.
+fn measure_delay(
+    config: &LocalizationConfig,
+    diagnosis: &Diagnosis,
+    source: &mut dyn PoseSource,
+    vehicle: &mut Vehicle,
+) -> Result<(Delay, Option<f64>), String> {
+    if diagnosis.change.iter().any(|(key, _)| *key == "euler") {
+        return Err(
+            "its angles must be read rightly first: set `euler`, and do it again".to_owned()
+        );
+    }
+    let mut found = vehicle.meter.delay();
+    if found == Err(NoDelay::Gentle) {
+        print_line(format!(
+            "do       turn it left and right by a quarter turn, quickly, for {:.0} seconds",
+            SHAKE.as_secs_f64()
+        ));
+        let end = Instant::now() + SHAKE;
+        while Instant::now() < end {
+            receive(source, Some(vehicle));
+        }
+        found = vehicle.meter.delay();
+    }
+    match found {
+        Ok(delay) => Ok((delay, vehicle.clock_off_ms)),
+        Err(NoDelay::Gentle) => {
+            Err("it was turned too gently for the noise of its poses; do it again, quicker"
+                .to_owned())
+        }
+        Err(NoDelay::Unlike) => Err(format!(
+            "poses and gyroscope turned otherwise: is it '{}' whose autopilot that is, and is the delay \
+             less than half a second?",
+            config.objects.values().next().map_or("the vehicle", String::as_str)
+        )),
+        Err(NoDelay::Silent) if !vehicle.was_connected => {
+            Err("no heartbeat of an autopilot came; check power, link and address".to_owned())
+        }
+        Err(NoDelay::Silent) => {
+            Err("the autopilot's gyroscope was not heard throughout; look at its link".to_owned())
+        }
+    }
+}
+
+/// A delay beyond what is set, and how far the gyroscope's times may be off [ms]; or why there is none.
+type Measured = Result<(Delay, Option<f64>), String>;
+
+fn report(
+    config: &LocalizationConfig,
+    mut diagnosis: Diagnosis,
+    delay: Option<&Measured>,
+) -> ExitCode {
+    let is_laid_right = diagnosis.faults.is_empty();
+    let explained = !diagnosis.change.is_empty();
+    if let Some(Ok((delay, clock_off_ms))) = delay {
+        judge_delay(config, delay, *clock_off_ms, &mut diagnosis);
+    }
     for line in &diagnosis.faults {
         print_line(format!("WRONG    {line}"));
     }
-    for (key, value) in &diagnosis.change {
-        print_line(format!(
-            "set      {key} = \"{value}\" in [[localization]], or --pose {}:{},...,{key}={value}",
-            config.driver,
-            config.address()
-        ));
+    print_change("set  ", config, &diagnosis.change);
+    for other in &diagnosis.others {
+        print_change("or   ", config, other);
     }
-    if diagnosis.faults.is_empty() {
+    if !diagnosis.others.is_empty() {
+        print_line(
+            "each of these explains all that was seen: set one, and do it again with the vehicle looking \
+             another way",
+        );
+    }
+    match delay {
+        None => print_line(
+            "note     the delay of the poses was not measured: power the vehicle, and add --mavlink \
+             udpin:0.0.0.0:14550, or where its autopilot is",
+        ),
+        Some(Err(why)) => print_line(format!("note     the delay was not measured: {why}")),
+        Some(Ok(_)) => {}
+    }
+    if is_laid_right {
         print_line("right    axes, units and turns are as they must be");
-        return ExitCode::SUCCESS;
-    }
-    if diagnosis.change.is_empty() {
+    } else if !explained {
         print_line(
             "no setting explains all of it: do it again, one motion at a time, straight up, straight \
              towards the nose, a quarter turn to the left; then look whether the object's axes were laid \
              along the vehicle's when it was made",
         );
     }
-    ExitCode::FAILURE
+    if diagnosis.faults.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// Prints what to set: one line for each key, and all of them for the command line.
+fn print_change(word: &str, config: &LocalizationConfig, change: &Change) {
+    if change.is_empty() {
+        return;
+    }
+    for (key, value) in change {
+        let quote = if value.parse::<f64>().is_ok() { "" } else { "\"" };
+        print_line(format!("{word}    {key} = {quote}{value}{quote} in [[localization]]"));
+    }
+    let pairs: Vec<_> = change.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    print_line(format!(
+        "         or --pose {}:{},...,{}",
+        config.driver,
+        config.address(),
+        pairs.join(",")
+    ));
+}
+
+/// Says what the delay is, and adds what to set.
+fn judge_delay(
+    config: &LocalizationConfig,
+    delay: &Delay,
+    clock_off_ms: Option<f64>,
+    diagnosis: &mut Diagnosis,
+) {
+    let uncertain_ms = delay.uncertain_ms + clock_off_ms.unwrap_or(0.0);
+    let link = match clock_off_ms {
+        Some(_) => "",
+        None => ", and more by what the autopilot's link takes, which answers no TIMESYNC",
+    };
+    let total_ms = config.latency_ms + delay.ms;
+    print_line(format!(
+        "delay    poses show a turn {total_ms:.0} ms after the gyroscope (+-{uncertain_ms:.0} ms{link}); \
+         latency_ms is {}",
+        config.latency_ms
+    ));
+    if delay.ms.abs() <= DELAY_MATTERS_MS.max(uncertain_ms) {
+        return;
+    }
+    let set_ms = total_ms.round().max(0.0);
+    if set_ms == config.latency_ms {
+        return;
+    }
+    diagnosis.faults.push(format!(
+        "poses are {:.0} ms {} than their stamps say",
+        delay.ms.abs(),
+        if delay.ms > 0.0 { "older" } else { "younger" }
+    ));
+    if set_ms <= MAX_LATENCY_MS {
+        diagnosis.change.push(("latency_ms", set_ms.to_string()));
+    }
 }
 
 impl LocalizationArgs {
+    /// Opens the way to the vehicle's gyroscope, if one was named.
+    fn gyro(&self) -> Result<Option<Vehicle>> {
+        let Some(mavlink) = &self.mavlink else { return Ok(None) };
+        let (address, settings) = AutopilotArgs::at(mavlink.clone(), self.config.clone()).link()?;
+        let gyro = Gyro::open(&address, settings)?;
+        print_line(format!("listens  {address} for the autopilot's gyroscope"));
+        let meter = DelayMeter::default();
+        Ok(Some(Vehicle { gyro, meter, was_connected: false, clock_off_ms: None }))
+    }
+
     /// Returns the source: that of the command line, else the arena's first, else Vicon.
     fn source(&self) -> Result<LocalizationConfig> {
         if let Some(config) = &self.pose {
@@ -131,5 +310,11 @@ impl LocalizationArgs {
     }
 }
 
+/// So long is it shaken.
+const SHAKE: Duration = Duration::from_secs(6);
+/// A smaller error of `latency_ms` is lost in the rest: 5 mm at 1 m/s. [ms]
+const DELAY_MATTERS_MS: f64 = 5.0;
+/// The greatest `latency_ms`. [ms]
+const MAX_LATENCY_MS: f64 = 500.0;
 /// Period of the printed poses: often enough to follow, slow enough to read.
 const PRINT_PERIOD: Duration = Duration::from_secs(1);

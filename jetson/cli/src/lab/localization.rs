@@ -6,6 +6,7 @@ use std::net::UdpSocket;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
 use glam::DVec3;
+use vizflyt_tags::print::Pad;
 
 /// Where the server's poses come from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -19,19 +20,30 @@ pub(crate) enum Localization {
     Json,
     /// AprilTags on the vehicle, in the images of two simulated webcams.
     Tags,
+    /// A mat of AprilTags on the floor, in the images of one simulated webcam under the vehicle.
+    Mat,
 }
 
 impl Localization {
-    /// Refuses a fence that reaches beyond where the vehicle can be seen. [m, world]
+    /// Whether AprilTags are all there is.
+    pub(crate) fn is_by_tags(self) -> bool {
+        matches!(self, Self::Tags | Self::Mat)
+    }
+
+    /// Refuses a fence that reaches beyond where the vehicle can be seen, or sees. [m, world]
     pub(crate) fn check(self, fence_m: (DVec3, DVec3)) -> Result<()> {
         let (least_m, most_m) = fence_m;
         let seen =
             least_m.cmpge(HALL_M.0 - SLACK_M).all() && most_m.cmple(HALL_M.1 + SLACK_M).all();
-        if self == Self::Tags && !seen {
+        let why = match self {
+            Self::Tags => "--localization tags: the two webcams see a hall of 11 x 4.5 m",
+            Self::Mat => "--localization mat: the mat covers a hall of 11 x 4.5 m",
+            _ => return Ok(()),
+        };
+        if !seen {
             let size_m = most_m - least_m;
             bail!(
-                "--localization tags: the two webcams see a hall of 11 x 4.5 m, and this scene is flown \
-                 in {:.0} x {:.0} m; take --scene room or race",
+                "{why}, and this scene is flown in {:.0} x {:.0} m; take --scene room or race",
                 size_m.x,
                 size_m.y
             );
@@ -44,7 +56,7 @@ impl Localization {
         match self {
             Self::Vicon => "--pose=vicon:127.0.0.1:0".into(),
             Self::Natnet => format!("--pose=natnet:{},up=y", unused()).into(),
-            Self::Json | Self::Tags => "--pose=json:127.0.0.1:0".into(),
+            Self::Json | Self::Tags | Self::Mat => "--pose=json:127.0.0.1:0".into(),
         }
     }
 
@@ -53,21 +65,28 @@ impl Localization {
         match self {
             Self::Vicon => format!("--vicon={poses}"),
             Self::Natnet => format!("--mocap=natnet:{poses}"),
-            Self::Json | Self::Tags => format!("--mocap=json:{poses}"),
+            Self::Json | Self::Tags | Self::Mat => format!("--mocap=json:{poses}"),
         }
     }
 
     /// Returns the command that sees tags and sends poses to the server at `poses`; it reports where it waits
-    /// for the true poses that its cameras' images are rendered from.
-    pub(crate) fn of_tags(poses: &str) -> Vec<OsString> {
+    /// for the true poses that its cameras' images are rendered from. A mat has pads where the vehicle takes off and lands, and
+    /// its survey errors of this seed.
+    pub(crate) fn of_tags(self, poses: &str, pads: &[Pad], seed: u64) -> Vec<OsString> {
         let words = ["tags", "locate", "--json", "--lifeline", "--simulated"];
         let mut args: Vec<OsString> = words.map(OsString::from).to_vec();
         args.extend([format!("--to={poses}").into(), "--http=127.0.0.1:0".into()]);
+        if self == Self::Mat {
+            args.extend(["--inside-out".into(), format!("--seed={seed}").into()]);
+            args.extend(pads.iter().map(|Pad { middle_m, size_m }| {
+                format!("--pad={},{},{},{}", middle_m.x, middle_m.y, size_m.x, size_m.y).into()
+            }));
+        }
         args
     }
 }
 
-/// What the webcams of `vizflyt_tags::simulated` see. [m, world]
+/// What the webcams of `vizflyt_tags::simulated` see, and its mat covers. [m, world]
 const HALL_M: (DVec3, DVec3) = (DVec3::new(0.0, -2.25, 0.0), DVec3::new(11.0, 2.25, 3.65));
 /// Nobody flies to the very net.
 const SLACK_M: DVec3 = DVec3::splat(0.5);
@@ -84,12 +103,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tags_are_for_rooms_that_the_webcams_see() {
+    fn tags_are_for_rooms_that_are_seen() {
         let (room, forest) = (DVec3::new(11.0, 2.25, 3.5), DVec3::new(40.0, 5.0, 4.0));
         let least_m = DVec3::new(0.0, -2.25, 0.0);
         assert!(Localization::Tags.check((least_m, room)).is_ok());
+        assert!(Localization::Mat.check((least_m, room)).is_ok());
         assert!(Localization::Vicon.check((least_m, forest)).is_ok());
-        let error = Localization::Tags.check((least_m, forest)).unwrap_err().to_string();
-        assert!(error.contains("flown in 40 x 7 m; take --scene room"), "{error}");
+        for (by, what) in [(Localization::Tags, "webcams see"), (Localization::Mat, "mat covers")] {
+            let error = by.check((least_m, forest)).unwrap_err().to_string();
+            assert!(error.contains("flown in 40 x 7 m; take --scene room"), "{error}");
+            assert!(error.contains(what), "{error}");
+        }
     }
 }

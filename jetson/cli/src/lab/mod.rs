@@ -23,7 +23,7 @@ mod prepare;
 mod report;
 
 use std::ffi::OsString;
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener};
 use std::os::unix::process::ExitStatusExt;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
@@ -55,7 +55,7 @@ pub(crate) use self::report::Report;
 pub(crate) struct LabArgs {
     #[arg(long, help = format!(
         "{}; or the path of a scene folder, an arena.toml or a scene file [default: forest; room with \
-         --localization tags]", SceneKind::names()
+         --localization tags or mat]", SceneKind::names()
     ))]
     pub scene: Option<String>,
     #[arg(long, value_name = "NAME", value_parser = project_name, help = format!(
@@ -79,13 +79,16 @@ pub(crate) struct LabArgs {
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
-    /// Localization: a motion capture that streams in one of these formats, or AprilTags
-    /// on it that two simulated webcams see.
+    /// Localization: a motion capture that streams in one of these formats, AprilTags on the vehicle that two
+    /// simulated webcams see, or a mat of them on the floor that a simulated webcam under the vehicle sees.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub localization: Localization,
     /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
     #[arg(long)]
     pub through_bridge: bool,
+    /// Also sends the vehicle's true pose here, as `vizflyt sim --truth-to` does: to measure localization by.
+    #[arg(long, value_name = "ADDR:PORT")]
+    pub truth_to: Option<SocketAddr>,
     /// Port of the page; a free one without it.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
@@ -97,8 +100,8 @@ impl LabArgs {
         if let Some(project) = &self.project {
             return project;
         }
-        // A forest is larger than what two webcams see.
-        let default = if self.localization == Localization::Tags { "room" } else { "forest" };
+        // A forest is larger than what two webcams see, and than a mat.
+        let default = if self.localization.is_by_tags() { "room" } else { "forest" };
         self.scene.as_deref().unwrap_or(default)
     }
 
@@ -300,8 +303,8 @@ impl Show {
         };
         let poses = server["pose"][0]["address"].as_str();
         let poses = poses.with_context(|| format!("the ready line {server} has no pose"))?;
-        let seen = if lab.localization == Localization::Tags {
-            let mut tags = Localization::of_tags(poses);
+        let seen = if lab.localization.is_by_tags() {
+            let mut tags = lab.localization.of_tags(poses, &stage.pads, lab.seed());
             tags.push(self.log_level.clone());
             let Some(tags) = self.start(Role::Tags, &tags)? else {
                 return Ok(LabEnd::Interrupted);
@@ -324,6 +327,7 @@ impl Show {
             format!("--seed={}", lab.seed()).into(),
             self.log_level.clone(),
         ];
+        sim.extend(lab.truth_to.map(|to| OsString::from(format!("--truth-to={to}"))));
         if let Some(truth) = &stage.truth {
             sim.push("--truth".into());
             sim.push(truth.clone().into());

@@ -10,6 +10,7 @@ use tempfile::TempDir;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_scenes::SceneKind;
 use vizflyt_server::scene::Up;
+use vizflyt_tags::print::Pad;
 
 use super::LabArgs;
 
@@ -25,6 +26,8 @@ pub(crate) struct Stage {
     pub spawn: String,
     /// Corners of the fence. [m, world]
     pub fence_m: (DVec3, DVec3),
+    /// Where it takes off, and where the flight ends.
+    pub pads: Vec<Pad>,
     /// Holds generated files until the flight ends.
     folder: Option<TempDir>,
 }
@@ -70,6 +73,7 @@ impl Stage {
             map: None,
             spawn: spawn(&arena),
             fence_m: fence_m(&arena),
+            pads: pads(&arena),
             folder: None,
         })
     }
@@ -86,12 +90,23 @@ impl Stage {
             ArenaConfig::parse(&text).with_context(|| format!("in {}", arena.display()))?;
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
         let map = Some(arena.with_file_name("map.json")).filter(|path| path.exists());
-        Ok(Self { arena, truth, map, spawn: spawn(&config), fence_m: fence_m(&config), folder })
+        let (spawn, fence_m, pads) = (spawn(&config), fence_m(&config), pads(&config));
+        Ok(Self { arena, truth, map, spawn, fence_m, pads, folder })
     }
 }
 
 fn fence_m(arena: &ArenaConfig) -> (DVec3, DVec3) {
     (arena.geofence.min_m, arena.geofence.max_m)
+}
+
+/// Returns where a mat needs pads: at the spawn, and as long as the goal is wide, for a vehicle brakes in it.
+fn pads(arena: &ArenaConfig) -> Vec<Pad> {
+    let start = Pad { middle_m: arena.spawn.position_m.truncate(), size_m: Pad::SIZE_M };
+    let end = arena.goal.as_ref().map(|goal| Pad {
+        middle_m: goal.position_m.truncate(),
+        size_m: Pad::SIZE_M.with_x(2.0 * goal.radius_m),
+    });
+    std::iter::once(start).chain(end).collect()
 }
 
 /// Returns where the vehicle stands, as `vizflyt sim --spawn` reads it.

@@ -19,6 +19,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
 use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, StampedImage, Unlocated};
+use vizflyt_tags::print::Pad;
 
 use self::sources::{CameraEvent, CameraImage, Sources};
 use self::view::LiveView;
@@ -41,6 +42,16 @@ pub(crate) struct LocateArgs {
     /// How many simulated webcams, 1 to 4.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=4), requires = "simulated")]
     webcams: u8,
+    /// The simulated webcam is under the vehicle, and sees a mat of tags on the hall's floor.
+    #[arg(long, requires = "simulated", conflicts_with = "webcams")]
+    inside_out: bool,
+    /// Where that mat has small tags, for a vehicle that stands there: east, north, and how far it reaches [default: 0.5,0.35].
+    /// May be given several times. [m, world]
+    #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = super::print::pad, allow_hyphen_values = true, requires = "inside_out")]
+    pads: Vec<Pad>,
+    /// Seed of what survey and mount have left wrong in that lab.
+    #[arg(long, default_value_t = 7, requires = "inside_out")]
+    seed: u64,
     /// Name of the vehicle; that of the file without it.
     #[arg(long)]
     object: Option<String>,
@@ -86,6 +97,9 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let mut setup = match &args.config {
         Some(path) => LocateSetup::read(path)?,
+        None if args.inside_out => {
+            LocateSetup::simulated_over_mat(args.pads.clone(), args.seed, "vizflyt")?
+        }
         None => LocateSetup::simulated(args.webcams.into(), "vizflyt"),
     };
     if let Some(object) = &args.object {
@@ -102,7 +116,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let mut locator = Locator::new(setup.cameras.clone(), &setup.layouts, setup.settings.clone())?;
     let live = args.http.map(|address| LiveView::serve(address, &setup.cameras)).transpose()?;
     let view_port = live.as_ref().map(|live| live.address().port());
-    let sender = PoseSender::open(&args.to, &setup.object, view_port)?;
+    let mut sender = PoseSender::open(&args.to, &setup.object, view_port)?;
     let mut sources = Sources::open(&setup, args.truth, &stop)?;
     let page = live.as_ref().map(|live| format!("http://{}", live.address()));
     let names: Vec<&str> = setup.cameras.iter().map(|camera| camera.name.as_str()).collect();
@@ -126,6 +140,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let mut figures = Figures::default();
     let mut second = Figures::default();
     let mut printed_at = Instant::now();
+    let mut faults: Vec<Option<String>> = vec![None; names.len()];
     while !stop.load(Ordering::Relaxed) {
         let Some(shots) = sources.next(WAIT)? else { break };
         while let Some(CameraEvent { camera, fault }) = sources.poll_event() {
@@ -133,9 +148,11 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
             if args.json {
                 print_line(json!({ "camera": name, "fault": fault }));
             } else {
-                let fault = fault.as_deref().unwrap_or("is back");
-                print_line(format!("{name}: {fault}"));
+                print_line(format!("{name}: {}", fault.as_deref().unwrap_or("is back")));
             }
+            faults[camera] = fault.map(|fault| format!("{name}: {fault}"));
+            sender.notes =
+                faults.iter().flatten().cloned().chain(findings(&locator, &names)).collect();
         }
         for set in together(&shots) {
             let views: Vec<StampedImage> = set
@@ -167,16 +184,18 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
         if printed_at.elapsed() >= Duration::from_secs(1) {
             second.seconds = printed_at.elapsed().as_secs_f64();
             printed_at = Instant::now();
+            let found = findings(&locator, &names);
             if args.json {
                 let mut status = second.to_json();
-                status["findings"] = findings(&locator, &names).into();
+                status["findings"] = found.clone().into();
                 print_line(json!({ "status": status }));
             } else {
                 print_line(second.to_line());
-                for finding in findings(&locator, &names) {
+                for finding in &found {
                     print_line(format!("  {finding}"));
                 }
             }
+            sender.notes = faults.iter().flatten().cloned().chain(found).collect();
             figures.add(&std::mem::take(&mut second));
         }
     }
@@ -229,6 +248,8 @@ struct PoseSender {
     object: String,
     /// Where the live view is, for the server's page.
     view_port: Option<u16>,
+    /// What people who look at the server's page should know.
+    notes: Vec<String>,
     seq: std::cell::Cell<u64>,
 }
 
@@ -238,7 +259,8 @@ impl PoseSender {
         let socket = UdpSocket::bind(any).context("tags: cannot open a socket for poses")?;
         // A full buffer drops a pose; the next is better anyway.
         socket.set_nonblocking(true).context("tags: the socket for poses")?;
-        Ok(Self { socket, to: to.to_vec(), object: object.into(), view_port, seq: 0.into() })
+        let (to, object, notes) = (to.to_vec(), object.into(), Vec::new());
+        Ok(Self { socket, to, object, view_port, notes, seq: 0.into() })
     }
 
     /// Sends a pose, and returns it as this computer's clock has it.
@@ -249,6 +271,9 @@ impl PoseSender {
             let clock = if is_live && to.ip().is_loopback() { "server" } else { "sender" };
             let mut packet = packet(&self.object, self.seq.get(), clock, located, image_ms);
             packet["quality"]["view_port"] = self.view_port.into();
+            if !self.notes.is_empty() {
+                packet["notes"] = self.notes.clone().into();
+            }
             // Lost like any datagram if nobody listens.
             let _ = self.socket.send_to(packet.to_string().as_bytes(), to);
         }

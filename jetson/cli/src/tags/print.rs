@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand, ValueEnum};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use vizflyt_tags::family::TagFamily;
-use vizflyt_tags::print::{BAR_MM, CUBE_FACES, Cube, Mat, Paper, Printed, checkerboard, pdf};
+use vizflyt_tags::print::{
+    BAR_MM, CUBE_FACES, Cube, Floor, Mat, Pad, Paper, Printed, checkerboard, pdf,
+};
 
 use super::family;
 use crate::terminal::print_line;
@@ -67,8 +69,17 @@ enum PrintCommand {
         /// Length, width and height of a hall [m]: tags as large as webcams in its upper corners need to be surveyed by, on
         /// the paper that takes.
         #[arg(long, value_name = "LxWxH", value_parser = hall,
-            conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper"])]
+            conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper", "fly_over"])]
         for_hall: Option<DVec3>,
+        /// Length (east) and width (north) of where the vehicle flies with a webcam under it [m]: large tags half a metre apart,
+        /// one on a sheet of A3.
+        #[arg(long, value_name = "LxW", value_parser = area,
+            conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper"])]
+        fly_over: Option<DVec2>,
+        /// Where it takes off or lands there: small tags for a camera 80 mm above the floor and more; east, north, and how far
+        /// the pad reaches [default: 0.5,0.35]. May be given several times. [m, room]
+        #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = pad, allow_hyphen_values = true, requires = "fly_over")]
+        pads: Vec<Pad>,
         /// Where the grid's middle lies in the room: east, north, up. [m]
         #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
@@ -161,9 +172,18 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
             pitch_mm,
             tag_mm,
             for_hall,
+            fly_over,
+            ref pads,
             middle_m,
         } => {
             let &Common { family, paper, bar_mm, .. } = common;
+            if let Some(size_m) = fly_over {
+                let pads = pads.clone();
+                return print_floor(
+                    common,
+                    &Floor { family, first_id, size_m, middle_m, pads, bar_mm },
+                );
+            }
             let paper = paper.into();
             let mat = match for_hall {
                 Some(hall_m) => {
@@ -229,6 +249,24 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
     Ok(())
 }
 
+/// Prints a mat to fly over, and says what lies where.
+fn print_floor(common: &Common, floor: &Floor) -> Result<()> {
+    finish("mat", common, Paper::A3, &floor.print()?)?;
+    for Mat { first_id, columns, rows, middle_m, .. } in floor.pads() {
+        print_line(format_args!(
+            "  pad at {:.2}, {:.2}: tags {first_id} to {}",
+            middle_m.x,
+            middle_m.y,
+            first_id + columns * rows - 1
+        ));
+    }
+    print_line(format_args!(
+        "Lay each large tag's middle where its sheet says, and join a pad's sheets edge to edge; then survey it all: \
+         a tape is off by millimetres."
+    ));
+    Ok(())
+}
+
 /// Returns the file beside the PDF that describes its content.
 fn beside(pdf: &Path) -> Result<PathBuf> {
     let layout = pdf.with_extension("toml");
@@ -259,15 +297,39 @@ fn hall(text: &str) -> Result<DVec3, String> {
         .map_err(|_| "give LENGTHxWIDTHxHEIGHT in metres: 11x4.5x3.65".into())
 }
 
+/// Reads an area: `11x4.5`. [m]
+fn area(text: &str) -> Result<DVec2, String> {
+    let numbers = numbers(&text.replace('x', ","));
+    match numbers.as_deref() {
+        Ok([length, width]) => Ok(DVec2::new(*length, *width)),
+        _ => Err("give LENGTHxWIDTH in metres: 11x4.5".into()),
+    }
+}
+
+/// Reads a pad: `0.9,0` or `10,0,1.2,0.35`. [m]
+pub(super) fn pad(text: &str) -> Result<Pad, String> {
+    match numbers(text)?[..] {
+        [x, y] => Ok(Pad { middle_m: DVec2::new(x, y), size_m: Pad::SIZE_M }),
+        [x, y, length, width] if length > 0.0 && width > 0.0 => {
+            Ok(Pad { middle_m: DVec2::new(x, y), size_m: DVec2::new(length, width) })
+        }
+        _ => Err("give X,Y or X,Y,LENGTH,WIDTH in metres".into()),
+    }
+}
+
 /// Smaller tags are not read reliably. [px]
 const READ_FROM_PX: f64 = 20.0;
 
 /// Reads three numbers with commas between them.
 fn three(text: &str) -> Result<DVec3, String> {
-    let numbers: Vec<f64> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
-        .collect::<Result<_, _>>()?;
-    let [x, y, z] = numbers[..] else { return Err("give three numbers: X,Y,Z".into()) };
+    let [x, y, z] = numbers(text)?[..] else { return Err("give three numbers: X,Y,Z".into()) };
     Ok(DVec3::new(x, y, z))
+}
+
+/// Reads finite numbers with commas between them.
+fn numbers(text: &str) -> Result<Vec<f64>, String> {
+    let number = |part: &str| part.trim().parse().ok().filter(|number: &f64| number.is_finite());
+    text.split(',')
+        .map(|part| number(part).ok_or_else(|| format!("{part:?} is no number")))
+        .collect()
 }

@@ -89,7 +89,9 @@ impl Flight {
                         HoldReason::NoSetpoint => self.why_silent(now).to_string(),
                         HoldReason::Restarting => "the plugin is being started again".to_owned(),
                         HoldReason::PoseStale => {
-                            format!("the pose is older than {} s", self.pose_ages().hold_after_s)
+                            let allowed_s = self.vehicle.map_or(0.0, |vehicle| vehicle.allowance_s);
+                            let hold_after_s = self.pose_ages().hold_after_s + allowed_s;
+                            format!("the pose is older than {hold_after_s:.2} s")
                         }
                         HoldReason::PoseUnsure => {
                             let off_m = self.vehicle.map_or(0.0, |vehicle| vehicle.off_m());

@@ -62,11 +62,11 @@ impl Flight {
         if self.lands_former_flight(now, link) {
             return;
         }
-        let pose_age_s = self.vehicle.map(|vehicle| now.seconds_since(vehicle.stamp));
+        let overdue_s = self.vehicle.map(|vehicle| vehicle.overdue_s(now));
         let hold_after_s = self.pose_ages().hold_after_s;
         let missing = if link.armed {
             Some(Missing::Disarmed)
-        } else if pose_age_s.is_none_or(|age_s| age_s > hold_after_s) {
+        } else if overdue_s.is_none_or(|overdue_s| overdue_s > hold_after_s) {
             Some(Missing::Pose)
         } else if let Some(why) = self.why_not_at_start() {
             Some(Missing::Start(bounded(&why)))
@@ -120,9 +120,8 @@ impl Flight {
         if link.took_off && self.took_off_at.is_none() {
             self.took_off_at = Some(now);
         }
-        let pose_age_s = now.seconds_since(vehicle.stamp);
-        if pose_age_s > arena.pose_ages.land_after_s {
-            return self.end_for(now, EndReason::PoseLost { age_s: pose_age_s });
+        if vehicle.overdue_s(now) > arena.pose_ages.land_after_s {
+            return self.end_for(now, EndReason::PoseLost { age_s: vehicle.age_s(now) });
         }
         let Some(took_off_at) = self.took_off_at else { return };
         let risen_m = vehicle.p_world_m.z - self.start_z_m;

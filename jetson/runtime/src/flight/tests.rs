@@ -115,6 +115,7 @@ impl Script {
                     v_world_mps: self.v_mps + self.hand_mps,
                     rotation: DQuat::IDENTITY,
                     sigma_m: 0.0,
+                    allowance_s: 0.0,
                 };
                 self.flight.handle(self.now, FlightInput::Pose(vehicle));
             }

@@ -178,7 +178,9 @@ impl Fence {
         let (flown_mps, a_mps2) = (vehicle.v_mps.dot(out), vehicle.a_mps2.dot(out));
         // What it has to change along the face leaves less for stopping before it.
         let along_mps = wanted_mps.max(flown_mps);
-        let aside_mps = (v_mps - vehicle.v_mps).reject_from_normalized(out).length();
+        let aside_mps = |v_mps: DVec3| (v_mps - vehicle.v_mps).reject_from_normalized(out).length();
+        // The next command may be to stop altogether.
+        let aside_mps = aside_mps(v_mps).max(aside_mps(DVec3::ZERO));
         let share = along_mps / along_mps.hypot(aside_mps).max(f64::MIN_POSITIVE);
         let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
         let stopping = Stopping::new(vehicle.response, self.max_mps2, share);

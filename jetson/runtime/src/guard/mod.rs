@@ -52,6 +52,8 @@ pub struct VehicleMotion {
     pub rotation: DQuat,
     /// How far the position may be off, one standard deviation along the worst axis; 0 is not known. [m]
     pub sigma_m: f64,
+    /// How much older it may grow than [`PoseAges`] say. [s]
+    pub allowance_s: f64,
 }
 
 impl VehicleMotion {
@@ -63,7 +65,18 @@ impl VehicleMotion {
             v_world_mps: sample.twist.linear_mps,
             rotation: sample.world_from_body.rotation,
             sigma_m: f64::from(sample.position_sigma_m.max_element()),
+            allowance_s: f64::from(sample.allowance_s),
         }
+    }
+
+    /// Returns the age of the pose. [s]
+    pub fn age_s(&self, now: HostTime) -> f64 {
+        now.seconds_since(self.stamp)
+    }
+
+    /// Returns what [`PoseAges`] bound: its age beyond what its source always delays and leaves out. [s]
+    pub fn overdue_s(&self, now: HostTime) -> f64 {
+        self.age_s(now) - self.allowance_s
     }
 
     /// Returns the heading from world x, counter-clockwise. [rad]
@@ -101,7 +114,7 @@ pub enum HoldReason {
     Requested,
     /// No setpoint has come for [`SETPOINT_HOLD_S`].
     NoSetpoint,
-    /// The newest pose is older than [`PoseAges::hold_after_s`].
+    /// The newest pose is overdue by more than [`PoseAges::hold_after_s`].
     PoseStale,
     /// The pose may be off by more than the guard keeps from the fence: [`UNSURE_SIGMAS`].
     PoseUnsure,
@@ -426,7 +439,7 @@ impl Guard {
         let change = (v_target - self.v_command_mps).clamp_length_max(asked_mps);
         let v_slewed = self.v_command_mps + change;
         // Where the vehicle is now, not when the pose was measured.
-        let age_s = now.seconds_since(vehicle.stamp).clamp(0.0, MAX_EXTRAPOLATION_S);
+        let age_s = vehicle.age_s(now).clamp(0.0, MAX_EXTRAPOLATION_S);
         let p_now = vehicle.p_world_m + vehicle.v_world_mps * age_s;
         // The fence comes last: where it and the slew limit disagree, it wins, at flat faces within bounds.
         let (v_mps, a_mps2) = (vehicle.v_world_mps, self.answers.a_mps2());
@@ -464,9 +477,9 @@ impl Guard {
         if let Some(reason) = self.landing {
             return GuardMode::Landing(reason);
         }
-        let pose_age_s = now.seconds_since(vehicle.stamp);
-        if pose_age_s > self.pose_ages.land_after_s {
-            return GuardMode::Landing(LandReason::PoseLost(pose_age_s));
+        let overdue_s = vehicle.overdue_s(now);
+        if overdue_s > self.pose_ages.land_after_s {
+            return GuardMode::Landing(LandReason::PoseLost(vehicle.age_s(now)));
         }
         if let Some(since) = self.unsure_since
             && now.seconds_since(since) > self.pose_ages.land_after_s
@@ -488,7 +501,7 @@ impl Guard {
             return GuardMode::Holding(HoldReason::Ending);
         }
         if let Some(until) = self.restarting_until {
-            return match pose_age_s > self.pose_ages.hold_after_s {
+            return match overdue_s > self.pose_ages.hold_after_s {
                 _ if now >= until => GuardMode::Landing(LandReason::NoPlugin),
                 true => GuardMode::Holding(HoldReason::PoseStale),
                 false => GuardMode::Holding(HoldReason::Restarting),
@@ -498,7 +511,7 @@ impl Guard {
         if silent_s > SETPOINT_LAND_S {
             return GuardMode::Landing(LandReason::NoSetpoint(silent_s));
         }
-        if pose_age_s > self.pose_ages.hold_after_s {
+        if overdue_s > self.pose_ages.hold_after_s {
             return GuardMode::Holding(HoldReason::PoseStale);
         }
         if self.unsure_since.is_some() {

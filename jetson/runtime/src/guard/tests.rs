@@ -76,6 +76,7 @@ impl Vehicle {
             v_world_mps: self.v_mps,
             rotation,
             sigma_m: 0.0,
+            allowance_s: 0.0,
         }
     }
 }
@@ -293,6 +294,26 @@ impl Told {
     }
 }
 
+/// A localization that is late by some ticks.
+struct Late(std::collections::VecDeque<VehicleMotion>);
+
+impl Late {
+    fn new(ticks: usize, vehicle: &Vehicle) -> Self {
+        Self((1..ticks).map(|_| vehicle.motion(time(0))).collect())
+    }
+
+    /// Returns the newest pose at a tick; the vehicle is where it was at the end of the one before.
+    fn motion(&mut self, tick: usize, vehicle: &Vehicle) -> VehicleMotion {
+        self.0.push_back(vehicle.motion(time(tick - 1)));
+        self.0.pop_front().unwrap()
+    }
+}
+
+/// Ticks from a measurement to its pose: up to 0.2 s.
+fn delay() -> impl Strategy<Value = usize> {
+    1usize..=10
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: cases() / 5, ..ProptestConfig::default() })]
 
@@ -300,20 +321,21 @@ proptest! {
     /// the parameters lie, it is found out on the way.
     #[test]
     fn a_late_vehicle_stops_before_each_face(
-        truth in response(), told in told(), face in 0usize..6, aside in -1.0..1.0f64,
+        truth in response(), told in told(), face in 0usize..6, aside in -1.0..1.0f64, delay in delay(),
     ) {
         let room = Volume::aabb(DVec3::splat(-11.0), DVec3::splat(11.0));
         let arena = ArenaInfo { floor_z_m: -11.0, ..arena(room, 3.0, 6.0) };
         let out = [DVec3::X, DVec3::Y, DVec3::Z][face / 2] * [1.0, -1.0][face % 2];
         let mut vehicle = Vehicle::new(-out * 10.0, 6.0);
         vehicle.response = truth;
+        let mut late = Late::new(delay, &vehicle);
         let start = vehicle.motion(time(0));
         let mut guard = Guard::new(&arena, &start, told.response(truth), time(0), 7);
         let (mut fastest_mps, mut nearest_m) = (0.0f64, f64::INFINITY);
         for tick in 1..1500 {
             let v_mps = out * 3.0 + out.any_orthonormal_vector() * aside;
             guard.handle_setpoint(time(tick), velocity(v_mps)).unwrap();
-            let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+            let (output, mode) = guard.tick(time(tick), &late.motion(tick, &vehicle));
             prop_assert_eq!(mode, GuardMode::Following);
             vehicle.fly(output_velocity(output));
             fastest_mps = fastest_mps.max(vehicle.v_mps.length());
@@ -334,11 +356,13 @@ proptest! {
         known in any::<bool>(),
         no_fly in no_fly(),
         asked in prop::collection::vec((setpoint(), 1usize..90), 1..10),
+        delay in delay(),
     ) {
         let mut arena = arena(geofence, 3.0, 6.0);
         arena.no_fly = no_fly.iter().copied().collect();
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 6.0);
         vehicle.response = truth;
+        let mut late = Late::new(delay, &vehicle);
         let told = known.then_some(truth);
         let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), told, time(0), 7);
         let mut tick = 0;
@@ -346,7 +370,7 @@ proptest! {
             for _ in 0..ticks {
                 tick += 1;
                 let _ = guard.handle_setpoint(time(tick), setpoint.clone());
-                let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
+                let (output, mode) = guard.tick(time(tick), &late.motion(tick, &vehicle));
                 let GuardOutput::Guided(_) = output else {
                     let silent = matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(_)));
                     prop_assert!(silent, "{mode:?}");
@@ -546,6 +570,25 @@ fn a_stale_pose_holds_then_lands() {
         }
         if tick == 101 {
             assert_eq!(output_velocity(output), DVec3::ZERO);
+        }
+    }
+}
+
+/// What its source always delays and leaves out is no reason to hold, and no more.
+#[test]
+fn a_pose_may_be_as_late_as_its_source_is() {
+    let PoseAges { hold_after_s, land_after_s } = arena(room(), 3.0, 4.0).pose_ages;
+    for allowance_s in [0.0, 0.1, 0.3] {
+        let mut guard = guard();
+        let late = VehicleMotion { allowance_s, ..at_rest(1) };
+        for tick in 1..=130 {
+            guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
+            let overdue_s = time(tick).seconds_since(time(1)) - allowance_s;
+            let (_, mode) = guard.tick(time(tick), &late);
+            let follows = mode == GuardMode::Following;
+            let lands = matches!(mode, GuardMode::Landing(LandReason::PoseLost(_)));
+            assert_eq!(follows, overdue_s <= hold_after_s, "{overdue_s} {mode:?}");
+            assert_eq!(lands, overdue_s > land_after_s, "{overdue_s} {mode:?}");
         }
     }
 }

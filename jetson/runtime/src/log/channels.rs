@@ -122,7 +122,8 @@ impl Channel {
         match self {
             Self::Motion => {
                 let properties = json!({"stamp_ns": number, "v_world_mps": vector,
-                    "omega_body_radps": vector, "age_ms": number});
+                    "omega_body_radps": vector, "position_sigma_m": vector,
+                    "rotation_sigma_rad": vector, "age_ms": number});
                 ("vizflyt.Motion", properties)
             }
             Self::Requested => ("vizflyt.Setpoint", json!({"seq": number, "setpoint": {}})),

@@ -373,6 +373,8 @@ impl<D: Disk> LogWriter<D> {
             "stamp_ns": stamp.as_ns(),
             "v_world_mps": twist.linear_mps.to_array(),
             "omega_body_radps": twist.angular_radps.to_array(),
+            "position_sigma_m": sample.position_sigma_m.to_array(),
+            "rotation_sigma_rad": sample.rotation_sigma_rad.to_array(),
             "age_ms": at.seconds_since(stamp) * 1e3
         });
         self.sinks.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())

@@ -101,7 +101,11 @@ impl Detector {
     /// they are small.
     pub fn look(&mut self, image: &Gray, region: &Region, camera: &Intrinsics) -> Vec<Detection> {
         let Some((x, y, width, height)) = region.cut(image) else { return Vec::new() };
-        let small = region.tag_edge_px.is_some_and(|edge| edge < self.settings.enlarge_below_px);
+        // A large part full of tags, as a carried camera sees, takes long to enlarge, and can do without some of them.
+        let is_large = 4 * width * height > (image.width_px() * image.height_px()) as usize;
+        let share = if is_large { LARGE_PART_SHARE } else { 1.0 };
+        let small =
+            region.tag_edge_px.is_some_and(|edge| edge < share * self.settings.enlarge_below_px);
         let shift = DVec2::new(x as f64, y as f64);
         let mut raw = if small {
             let mut raw = self.library.detect(2 * width, 2 * height, 1.0, |pixels| {
@@ -195,6 +199,8 @@ fn enlarge(
     }
 }
 
+/// In more than a quarter of the image only tags smaller than this share of what is enlarged elsewhere are enlarged.
+const LARGE_PART_SHARE: f64 = 0.6;
 /// Half a cell of white around eight cells, as seen from the middle, and a little more for the perspective.
 const RIM: f64 = 1.15;
 /// Tags smaller than this cannot be distinguished from noise: a cell of 36h11 has one pixel then. [px]

@@ -8,7 +8,8 @@ use super::LocateSettings;
 use crate::camera::TagCamera;
 use crate::file::{self, FileError, check_number, invalid};
 use crate::layout::TagLayout;
-use crate::simulated::Sensor;
+use crate::print::{Pad, PrintError};
+use crate::simulated::{Sensor, over_mat};
 
 /// What is located, by what. Paths are relative to the file.
 ///
@@ -40,6 +41,10 @@ pub struct LocateConfig {
     /// The vehicle never leans further than this. [deg]
     #[serde(default = "default_tilt")]
     pub most_tilt_deg: f64,
+    /// How far the layouts may be off that a survey has written, one standard deviation an axis; what
+    /// `tags survey mat` prints as sigma, or more for a mat that is longer than it is seen at once.
+    #[serde(default = "default_survey")]
+    pub survey_sigma_mm: f64,
     /// How simulated cameras (`source = "simulated"`) take images.
     #[serde(default)]
     pub simulated: SensorConfig,
@@ -57,16 +62,25 @@ pub struct SensorConfig {
     pub blur_px: f64,
     /// Standard deviation of the sensor's noise, in grey levels of 255.
     pub noise: f64,
+    /// The distance at which the lens is focused.
+    pub focus_m: f64,
+    /// How wide its opening is; 0 is a pinhole, which is sharp everywhere.
+    pub aperture_mm: f64,
 }
 
 impl Default for SensorConfig {
     fn default() -> Self {
-        let Sensor { rate_hz, exposure_s, blur_px, noise, .. } = Sensor::default();
-        Self { rate_hz, exposure_ms: exposure_s * 1e3, blur_px, noise }
+        Self::of(&Sensor::default())
     }
 }
 
 impl SensorConfig {
+    fn of(sensor: &Sensor) -> Self {
+        let Sensor { rate_hz, exposure_s, blur_px, noise, focus_m, aperture_m, .. } = *sensor;
+        let (exposure_ms, aperture_mm) = (exposure_s * 1e3, aperture_m * 1e3);
+        Self { rate_hz, exposure_ms, blur_px, noise, focus_m, aperture_mm }
+    }
+
     /// Returns the sensor of one of `count` cameras, which are exposed in turn.
     pub fn sensor(&self, index: usize, count: usize) -> Sensor {
         Sensor {
@@ -75,6 +89,8 @@ impl SensorConfig {
             exposure_s: self.exposure_ms * 1e-3,
             blur_px: self.blur_px,
             noise: self.noise,
+            focus_m: self.focus_m,
+            aperture_m: self.aperture_mm * 1e-3,
             ..Sensor::default()
         }
     }
@@ -93,6 +109,17 @@ pub struct LocateSetup {
     pub settings: LocateSettings,
     /// How simulated cameras take images.
     pub simulated: SensorConfig,
+    /// What simulated cameras truly are, and what they see, where that is other than stated above.
+    pub truth: Option<SimulatedTruth>,
+}
+
+/// A simulated lab as it is, beside what its files say.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimulatedTruth {
+    /// The cameras.
+    pub cameras: Vec<TagCamera>,
+    /// The tags.
+    pub layouts: Vec<TagLayout>,
 }
 
 impl LocateConfig {
@@ -116,6 +143,7 @@ impl LocateConfig {
         }
         check_number("corner_sigma_px", config.corner_sigma_px, "px", 0.01..=10.0)?;
         check_number("most_rms_px", config.most_rms_px, "px", 0.1..=100.0)?;
+        check_number("survey_sigma_mm", config.survey_sigma_mm, "mm", 0.0..=100.0)?;
         check_number("most_tilt_deg", config.most_tilt_deg, "deg", 5.0..=180.0)?;
         let sensor = &config.simulated;
         check_number("simulated.rate_hz", sensor.rate_hz, "Hz", 1.0..=240.0)?;
@@ -123,6 +151,8 @@ impl LocateConfig {
         check_number("simulated.exposure_ms", sensor.exposure_ms, "ms", 0.0..=most_ms)?;
         check_number("simulated.blur_px", sensor.blur_px, "px", 0.0..=20.0)?;
         check_number("simulated.noise", sensor.noise, "grey levels", 0.0..=100.0)?;
+        check_number("simulated.focus_m", sensor.focus_m, "m", 0.01..=1e3)?;
+        check_number("simulated.aperture_mm", sensor.aperture_mm, "mm", 0.0..=100.0)?;
         Ok(config)
     }
 }
@@ -145,9 +175,11 @@ impl LocateSetup {
                 corner_sigma_px: config.corner_sigma_px,
                 most_rms_px: config.most_rms_px,
                 most_tilt_rad: config.most_tilt_deg.to_radians(),
+                floor_m: config.survey_sigma_mm * 1e-3,
                 ..LocateSettings::default()
             },
             simulated: config.simulated,
+            truth: None,
         })
     }
 
@@ -160,7 +192,32 @@ impl LocateSetup {
             layouts: vec![crate::simulated::cube()],
             settings: LocateSettings::default(),
             simulated: SensorConfig::default(),
+            truth: None,
         }
+    }
+
+    /// Returns the simulated lab in which the vehicle carries a webcam over a mat, with errors of survey and mount of
+    /// this seed; or why there is no such mat.
+    ///
+    /// # Errors
+    /// [`PrintError`] for pads that the mat's family has not tags enough for.
+    pub fn simulated_over_mat(pads: Vec<Pad>, seed: u64, object: &str) -> Result<Self, PrintError> {
+        let layout = over_mat::floor(pads).print()?.layout;
+        let camera = TagCamera { source: Some(SIMULATED.into()), ..over_mat::camera() };
+        Ok(Self {
+            object: object.into(),
+            settings: LocateSettings {
+                floor_m: over_mat::SURVEY_SIGMA_M,
+                ..LocateSettings::default()
+            },
+            simulated: SensorConfig::of(&over_mat::sensor()),
+            truth: Some(SimulatedTruth {
+                cameras: vec![over_mat::as_mounted(&camera, seed)],
+                layouts: vec![over_mat::as_laid(&layout, seed)],
+            }),
+            cameras: vec![camera],
+            layouts: vec![layout],
+        })
     }
 }
 
@@ -174,6 +231,10 @@ fn default_sigma() -> f64 {
 
 fn default_rms() -> f64 {
     LocateSettings::default().most_rms_px
+}
+
+fn default_survey() -> f64 {
+    LocateSettings::default().floor_m * 1e3
 }
 
 fn default_tilt() -> f64 {

@@ -14,14 +14,18 @@
 //! Of clocks only differences can be known. A stamp is written after the exposure, never before: the camera that is
 //! least late is taken to be right.
 
-use std::fmt::Write as _;
+mod finding;
+mod normal;
+
+pub use finding::Finding;
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Frame, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
 use crate::bundle::matrix::Symmetric;
-use crate::solve::{CornerRow, Motion, Sighting, corner_rows, invert6};
+use crate::solve::{CornerRow, Motion, Sighting, corner_rows};
+use normal::{Normal, eliminate, times, unknowns};
 
 /// What is known to be wrong with a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -41,77 +45,6 @@ impl Correction {
     pub(super) fn apply<A: Frame, B: Frame>(&self, pose: &Pose<A, B>) -> Pose<A, B> {
         let turn = DQuat::from_scaled_axis(self.turned_rad);
         Pose::new(pose.translation_m + self.moved_m, (pose.rotation * turn).normalize())
-    }
-}
-
-/// What is wrong, as people should know it.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Finding {
-    /// A camera's images are stamped late; corrected. [s]
-    Late {
-        /// Index of the camera.
-        camera: usize,
-        /// How much. [s]
-        late_s: f64,
-    },
-    /// A camera reads its rows one after the other; corrected. [s]
-    RollingShutter {
-        /// Index of the camera.
-        camera: usize,
-        /// From the first row to the last. [s]
-        readout_s: f64,
-    },
-    /// A camera is not where its file has it.
-    Moved {
-        /// Index of the camera; of several, one of which was moved, all.
-        cameras: Vec<usize>,
-        /// How far. [m]
-        moved_m: f64,
-        /// And how far turned. [rad]
-        turned_rad: f64,
-    },
-    /// Tags are of another size than their layout says.
-    Scale {
-        /// Their true size in units of the layout's.
-        scale: f64,
-    },
-}
-
-impl Finding {
-    /// Returns it in words, with what to do.
-    pub fn words(&self, names: &[&str]) -> String {
-        let name = |camera: &usize| names.get(*camera).copied().unwrap_or("?");
-        match self {
-            Self::Late { camera, late_s } => {
-                let late_ms = 1e3 * late_s;
-                format!(
-                    "{} stamps images {late_ms:.1} ms late (corrected): latency_ms in its file",
-                    name(camera)
-                )
-            }
-            Self::RollingShutter { camera, readout_s } => {
-                format!(
-                    "{} reads its rows over {:.1} ms (corrected)",
-                    name(camera),
-                    1e3 * readout_s
-                )
-            }
-            Self::Moved { cameras, moved_m, turned_rad } => {
-                let mut text = cameras.iter().map(name).collect::<Vec<_>>().join(" or ");
-                // Writing to a string does not fail.
-                let _ = write!(
-                    text,
-                    " camera moved by {:.1} cm and {:.1} degrees: survey again",
-                    1e2 * moved_m,
-                    turned_rad.to_degrees()
-                );
-                text
-            }
-            Self::Scale { scale } => format!(
-                "the tags have {:.1} % of their layout's size: print at 100 %, or again with --bar-mm",
-                1e2 * scale
-            ),
-        }
     }
 }
 
@@ -159,42 +92,29 @@ pub(super) struct Monitor {
     on_time: usize,
 }
 
-/// Normal equations of what lasts, the poses eliminated.
-#[derive(Clone, Debug)]
-struct Normal {
-    matrix: Symmetric,
-    right: Vec<f64>,
-    square: f64,
-    count: f64,
-}
-
 impl Monitor {
-    /// Makes a monitor of cameras whose places are known as well as this, one standard deviation an axis. [m]
-    pub(super) fn new(sigmas_m: &[f64]) -> Self {
-        let cameras = sigmas_m.len();
+    /// Makes a monitor of cameras whose places are known as well as this, one standard deviation an axis [m] and about one
+    /// [rad]; of tags that are as large as they say, or not.
+    pub(super) fn new(sigmas: &[(f64, f64)], is_measure: bool) -> Self {
+        let cameras = sigmas.len();
         let size = EACH * cameras + 1;
-        let floor = |i: usize| match (kind(i, size), sigmas_m.get(i / EACH)) {
-            (PLACE, Some(sigma_m)) => *sigma_m,
-            (TURN, Some(sigma_m)) => sigma_m / ARM_M,
+        let floor = |i: usize| match (kind(i, size), sigmas.get(i / EACH)) {
+            (PLACE, Some((sigma_m, _))) => *sigma_m,
+            (TURN, Some((_, sigma_rad))) => *sigma_rad,
             (kind, _) => FLOORS[kind],
         };
+        let first = |kind| if is_measure && kind == EACH { 0.0 } else { FIRST[kind] };
         let floors: Vec<f64> = (0..size).map(|i| floor(i).powi(2)).collect();
         let prior: Vec<f64> =
-            (0..size).map(|i| floors[i].max(FIRST[kind(i, size)].powi(2))).collect();
+            (0..size).map(|i| floors[i].max(first(kind(i, size)).powi(2))).collect();
         let mut covariance = Symmetric::zero(size);
         for (i, variance) in prior.iter().enumerate() {
             covariance.add(i, i, *variance);
         }
-        let empty = Normal {
-            matrix: Symmetric::zero(size),
-            right: vec![0.0; size],
-            square: 0.0,
-            count: 0.0,
-        };
         Self {
             cameras,
-            long: empty.clone(),
-            short: empty,
+            long: Normal::empty(size),
+            short: Normal::empty(size),
             learnt: None,
             judged: None,
             wrong: vec![0.0; size],
@@ -229,12 +149,7 @@ impl Monitor {
         let moves = (motion.v_world_mps.length() / MOVES_MPS).min(1.0);
         self.long.keep((-dt_s * moves / LONG_S).exp());
         self.short.keep((-dt_s / SHORT_S).exp());
-        let mut added = Normal {
-            matrix: Symmetric::zero(self.wrong.len()),
-            right: vec![0.0; self.wrong.len()],
-            square: 0.0,
-            count: 0.0,
-        };
+        let mut added = Normal::empty(self.wrong.len());
         if added.add_set(set, &self.wrong) {
             self.long.add(&added);
             self.short.add(&added);
@@ -430,152 +345,6 @@ impl Monitor {
     }
 }
 
-impl Normal {
-    fn keep(&mut self, share: f64) {
-        self.matrix.scale(share);
-        self.right.iter_mut().for_each(|x| *x *= share);
-        self.square *= share;
-        self.count *= share;
-    }
-
-    fn add(&mut self, other: &Self) {
-        self.matrix.add_all(&other.matrix);
-        self.right.iter_mut().zip(&other.right).for_each(|(x, y)| *x += y);
-        self.square += other.square;
-        self.count += other.count;
-    }
-
-    /// Adds a set of images, its pose eliminated; `false` if that is not determined.
-    fn add_set(&mut self, set: &Linear, wrong: &[f64]) -> bool {
-        let size = wrong.len();
-        let cameras = size / EACH;
-        // Sets that fit badly count as badly: half their corners are within 1.18 sigma.
-        let mut off: Vec<f64> =
-            set.rows.iter().map(|(_, sigma_px, row)| row.off_px.length() / sigma_px).collect();
-        if off.is_empty() {
-            return false;
-        }
-        let middle = off.len() / 2;
-        let (_, median, _) = off.select_nth_unstable_by(middle, f64::total_cmp);
-        let noise = (*median / 1.18).max(1.0);
-        let weigh = |sigma_px: f64, off_px: f64| {
-            let sigma_px = noise * sigma_px;
-            SHARED_IMAGES / (1.0 + (off_px / (4.0 * sigma_px)).powi(2)) / (sigma_px * sigma_px)
-        };
-        let Some((inverse, across)) = eliminate(set, size, weigh) else { return false };
-        let mut pose_right = [0.0; 6];
-        for (camera, sigma_px, row) in &set.rows {
-            let weight = weigh(*sigma_px, row.off_px.length());
-            let unknowns = unknowns(*camera, row, cameras);
-            for axis in 0..2 {
-                let value = unknowns.iter().map(|(at, by)| by[axis] * wrong[*at]).sum::<f64>()
-                    - row.off_px[axis];
-                for (sum, by) in pose_right.iter_mut().zip(row.by_pose[axis]) {
-                    *sum += weight * by * value;
-                }
-                for (i, (at, by_row)) in unknowns.iter().enumerate() {
-                    self.right[*at] += weight * by_row[axis] * value;
-                    for (column, by_column) in &unknowns[..=i] {
-                        self.matrix.add(*at, *column, weight * by_row[axis] * by_column[axis]);
-                    }
-                }
-                self.square += weight * value * value;
-            }
-            self.count += 2.0 * SHARED_IMAGES;
-        }
-        let solved = times(&inverse, &pose_right);
-        self.square -= dot(&solved, &pose_right);
-        for (i, column) in across.iter().enumerate() {
-            if column.iter().all(|x| *x == 0.0) {
-                continue;
-            }
-            self.right[i] -= dot(column, &solved);
-            let through = times(&inverse, column);
-            for (j, other) in across[..=i].iter().enumerate() {
-                self.matrix.add(i, j, -dot(&through, other));
-            }
-        }
-        true
-    }
-
-    /// Returns what is wrong under a prior, and its covariance.
-    fn solve(&self, prior: &[f64], on_time: usize) -> Option<(Vec<f64>, Symmetric)> {
-        let mut matrix = self.matrix.clone();
-        for (i, variance) in prior.iter().enumerate() {
-            matrix.add(i, i, 1.0 / variance);
-        }
-        let at = EACH * on_time + LATE;
-        matrix.add(at, at, RIGHT_S.powi(-2));
-        matrix.invert().then(|| {
-            let product = (0..prior.len())
-                .map(|i| {
-                    (0..prior.len()).map(|j| matrix.at(i.max(j), i.min(j)) * self.right[j]).sum()
-                })
-                .collect();
-            (product, matrix)
-        })
-    }
-
-    /// Returns the sum of squares that is left.
-    fn cost(&self, wrong: &[f64]) -> f64 {
-        let mut cost = self.square;
-        for (i, x) in wrong.iter().enumerate() {
-            let by_row: f64 =
-                (0..wrong.len()).map(|j| self.matrix.at(i.max(j), i.min(j)) * wrong[j]).sum();
-            cost += x * (by_row - 2.0 * self.right[i]);
-        }
-        cost
-    }
-}
-
-/// Returns which unknowns a corner depends on, sorted, and how.
-fn unknowns(camera: usize, row: &CornerRow, cameras: usize) -> [(usize, glam::DVec2); EACH + 1] {
-    let at = EACH * camera;
-    std::array::from_fn(|i| match i {
-        // An image stamped late was exposed earlier.
-        LATE => (at + LATE, row.by_lag),
-        READOUT => (at + READOUT, -row.by_lag * row.row_share),
-        EACH => (EACH * cameras, row.by_scale),
-        _ => (at + i, glam::DVec2::new(row.by_camera[0][i - PLACE], row.by_camera[1][i - PLACE])),
-    })
-}
-
-/// Returns the inverse of a set's normal equations in its pose, and the block between it and what lasts.
-#[allow(clippy::type_complexity, reason = "used here alone")]
-fn eliminate(
-    set: &Linear,
-    size: usize,
-    weigh: impl Fn(f64, f64) -> f64,
-) -> Option<([[f64; 6]; 6], Vec<[f64; 6]>)> {
-    let mut matrix = [[0.0; 6]; 6];
-    let mut across = vec![[0.0; 6]; size];
-    for (camera, sigma_px, row) in &set.rows {
-        let weight = weigh(*sigma_px, row.off_px.length());
-        for axis in 0..2 {
-            let by_pose = row.by_pose[axis];
-            for a in 0..6 {
-                for b in 0..=a {
-                    matrix[a][b] += weight * by_pose[a] * by_pose[b];
-                }
-            }
-            for (at, by) in unknowns(*camera, row, size / EACH) {
-                for (sum, by_pose) in across[at].iter_mut().zip(by_pose) {
-                    *sum += weight * by[axis] * by_pose;
-                }
-            }
-        }
-    }
-    Some((invert6(&matrix)?, across))
-}
-
-fn times(matrix: &[[f64; 6]; 6], x: &[f64; 6]) -> [f64; 6] {
-    std::array::from_fn(|i| dot(&matrix[i], x))
-}
-
-fn dot(a: &[f64; 6], b: &[f64; 6]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
 /// Returns what an unknown is: one of a camera's, or [`EACH`] for the scale.
 fn kind(i: usize, size: usize) -> usize {
     match i % EACH {
@@ -597,14 +366,8 @@ const TURN: usize = 5;
 const FLOORS: [f64; EACH + 1] = [2e-4, 5e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-4];
 /// And how far before anything was seen.
 const FIRST: [f64; EACH + 1] = [1e-2, 1e-2, 2e-3, 0.0, 0.0, 7e-4, 0.0, 0.0, 7e-3];
-/// What turns a camera turns it about something so far away. [m]
-const ARM_M: f64 = 3.0;
 /// And how far at most: clocks by half a second, a readout by an image's interval, a camera by what still sees.
 const CEILINGS: [f64; EACH + 1] = [0.5, 0.05, 0.5, 0.0, 0.0, 0.2, 0.0, 0.0, 0.2];
-/// The clock that is right. [s]
-const RIGHT_S: f64 = 1e-6;
-/// Each image is in its own set and in the next of each other camera, and what is off in it lasts for some.
-const SHARED_IMAGES: f64 = 0.1;
 /// Tags of the room are seen 3 times a second over [`LONG_S`], always with the same error of survey and lens: all
 /// together count as one.
 const ANCHOR_SIGMAS: f64 = 8.0;

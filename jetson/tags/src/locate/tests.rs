@@ -1,6 +1,7 @@
 use super::*;
-use crate::simulated::{Sensor, SimulatedCamera, Truth, belly_camera, cube, mat, webcams};
-use glam::DQuat;
+use crate::print::Floor;
+use crate::simulated::{Sensor, SimulatedCamera, Truth, cube, over_mat, webcams};
+use glam::{DQuat, DVec2};
 
 fn at(ms: u64) -> HostTime {
     HostTime::from_ns(3_000_000_000 + ms * 1_000_000)
@@ -34,13 +35,13 @@ fn invalid_setups_are_refused_by_name() {
         let error = error.expect(part).to_string();
         assert!(error.contains(part), "{error:?} lacks {part:?}");
     };
-    let floor = mat(DVec2::ZERO, DVec2::ONE);
+    let floor = over_mat::floor(Vec::new()).print().unwrap().layout;
     check(Vec::new(), &[cube()], "0 cameras");
     check(webcams(1), &[], "0 layouts");
     check(webcams(2), std::slice::from_ref(&floor), "add the layout of the cube");
-    check(vec![belly_camera()], &[cube()], "add the surveyed layout");
+    check(vec![over_mat::camera()], &[cube()], "add the surveyed layout");
     check(webcams(1), &[cube(), cube()], "tag36h11 is in two layouts");
-    let unmounted = TagCamera { mounting: Mounting::Unknown, ..belly_camera() };
+    let unmounted = TagCamera { mounting: Mounting::Unknown, ..over_mat::camera() };
     check(vec![unmounted], &[floor], "\"belly\" has neither");
 }
 
@@ -222,7 +223,8 @@ fn what_is_wrong_with_the_lab_is_found_named_and_corrected() {
     };
     check(webcams(2), None, 0.0, &[]);
     check(webcams(2), None, 0.03, &["east stamps images"]);
-    let floor = mat(DVec2::new(4.5, -1.0), DVec2::new(6.5, 1.0));
+    let floor = Floor { size_m: DVec2::splat(2.0), ..over_mat::floor(Vec::new()) };
+    let floor = floor.print().unwrap().layout;
     check(moved(0), Some(&floor), 0.0, &["west camera moved by 2."]);
     check(moved(1), Some(&floor), 0.0, &["east camera moved by 2."]);
 }

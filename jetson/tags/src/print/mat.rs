@@ -5,7 +5,9 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Pose, World};
 
 use super::sheet::{FOOT_MM, MARGIN_MM, Sheet};
-use super::{Paper, PrintError, Printed, check_ids, check_positive, check_rim, scale};
+use super::{
+    Paper, PrintError, Printed, check_ids, check_middle, check_positive, check_rim, scale,
+};
 use crate::family::TagFamily;
 use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
 
@@ -106,10 +108,7 @@ impl Mat {
             let advice = "give 1 or more";
             return Err(PrintError::Invalid { name: "columns, rows", value: 0.0, advice });
         }
-        if !(self.middle_m.is_finite() && self.middle_m.abs().max_element() <= 900.0) {
-            let (name, value) = ("middle_m", self.middle_m.length());
-            return Err(PrintError::Invalid { name, value, advice: "give metres within the room" });
-        }
+        check_middle(self.middle_m)?;
         let count = u64::from(self.columns) * u64::from(self.rows);
         check_ids(self.family, self.first_id, count)?;
         check_rim(self.family, "the distance from tag to tag", self.tag_mm, self.pitch_mm)?;

@@ -1,6 +1,6 @@
 use super::*;
-use crate::layout::LayoutFrame;
-use glam::DVec3;
+use crate::layout::{LayoutFrame, Tag};
+use glam::{DVec2, DVec3};
 
 fn cube() -> Cube {
     Cube {
@@ -171,6 +171,46 @@ fn a_mat_is_sized_by_the_hall() {
     check([30.0, 20.0, 8.0], 200.0, Paper::A3);
     let none = DVec3::new(f64::NAN, 4.0, 3.0);
     assert!(Mat::for_hall(none, TagFamily::Tag36h11, 100, DVec3::ZERO, BAR_MM).is_err());
+}
+
+#[test]
+fn a_floor_has_large_tags_apart_and_small_ones_where_the_vehicle_stands() {
+    let pad = Pad { middle_m: DVec2::new(-0.4, 0.1), size_m: Pad::SIZE_M };
+    let floor = Floor {
+        family: TagFamily::Tag36h11,
+        first_id: 100,
+        size_m: DVec2::new(3.0, 2.5),
+        middle_m: DVec3::ZERO,
+        pads: vec![pad],
+        bar_mm: 99.0,
+    };
+    let printed = floor.print().unwrap();
+    printed.layout.validate().unwrap();
+    let tags = &printed.layout.tags;
+    let ids: Vec<u32> = tags.iter().map(|tag| tag.id).collect();
+    assert_eq!(ids, (100..100 + tags.len() as u32).collect::<Vec<_>>());
+    let (large, small): (Vec<&Tag>, Vec<&Tag>) = tags.iter().partition(|tag| tag.size_m > 0.1);
+    // Two of six by five lie where the pad does; that is two sheets of five by seven.
+    assert_eq!((large.len(), small.len(), printed.sheets.len()), (28, 70, 30));
+    // The printer shrinks what is printed, not what a tape measures.
+    assert!((large[0].size_m - 0.198).abs() < 1e-12);
+    assert!((large[0].position_m - DVec3::new(-1.25, -1.0, 0.0)).length() < 1e-12);
+    let middle_m = small.iter().map(|tag| tag.position_m).sum::<DVec3>() / 70.0;
+    assert!((middle_m - pad.middle_m.extend(0.0)).length() < 1e-12);
+    assert!((small[1].position_m.x - small[0].position_m.x - 0.053 * 0.99).abs() < 1e-12);
+    // No paper on another.
+    for (i, tag) in tags.iter().enumerate() {
+        for other in &tags[..i] {
+            let gap_m = (tag.position_m - other.position_m).abs().max_element();
+            let needed_m = 0.625 * (tag.size_m + other.size_m);
+            assert!(gap_m >= needed_m - 1e-9, "tags {} and {}", tag.id, other.id);
+        }
+    }
+    assert_eq!((floor.pads()[0].first_id, floor.pads()[0].columns), (128, 10));
+    let error = Floor { size_m: DVec2::new(30.0, 20.0), ..floor.clone() }.print().unwrap_err();
+    assert!(error.to_string().contains("too many"), "{error}");
+    let error = Floor { size_m: DVec2::new(30.0, 0.2), ..floor }.print().unwrap_err().to_string();
+    assert!(error.contains("fly_over = 0.2"), "{error}");
 }
 
 #[test]

@@ -5,6 +5,8 @@ use glam::DVec2;
 /// Places of samples about a pixel's middle.
 pub(super) struct Pattern {
     pub(super) offsets_px: Vec<DVec2>,
+    /// When in the exposure each sample is taken, from 0 to 1.
+    pub(super) instants: Vec<f64>,
     /// No sample is further away along an axis. [px]
     pub(super) reach_px: f64,
 }
@@ -19,23 +21,14 @@ impl Pattern {
         let rank = ranks(samples, 2);
         let offsets_px =
             (0..samples).map(|i| DVec2::new(quantiles[i], quantiles[rank[i]])).collect();
-        Self { offsets_px, reach_px: quantiles[samples - 1] }
+        let instants = (0..samples).map(|i| instant(i, samples)).collect();
+        Self { offsets_px, instants, reach_px: quantiles[samples - 1] }
     }
 }
 
 /// Returns when in the exposure a sample is taken, from 0 to 1.
-pub(super) fn instant(sample: usize, samples: usize) -> f64 {
+fn instant(sample: usize, samples: usize) -> f64 {
     (ranks(samples, 3)[sample] as f64 + 0.5) / samples as f64
-}
-
-/// Returns the first sample in time.
-pub(super) fn earliest(samples: usize) -> usize {
-    ranks(samples, 3).iter().position(|&rank| rank == 0).unwrap_or(0)
-}
-
-/// Returns the last sample in time.
-pub(super) fn latest(samples: usize) -> usize {
-    ranks(samples, 3).iter().position(|&rank| rank == samples - 1).unwrap_or(0)
 }
 
 /// Returns 0..samples in the order of their digits read backwards.
@@ -145,9 +138,8 @@ mod tests {
     #[test]
     fn every_instant_comes_once() {
         let mut instants: Vec<f64> = (0..16).map(|i| instant(i, 16)).collect();
-        assert_eq!(instants[earliest(16)], 0.5 / 16.0);
-        assert_eq!(instants[latest(16)], 15.5 / 16.0);
         instants.sort_by(f64::total_cmp);
+        assert_eq!((instants[0], instants[15]), (0.5 / 16.0, 15.5 / 16.0));
         assert!(instants.windows(2).all(|w| (w[1] - w[0] - 1.0 / 16.0).abs() < 1e-12));
     }
 }

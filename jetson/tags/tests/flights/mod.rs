@@ -1,11 +1,12 @@
 //! Flights with known truth through the simulated lab, and how well they are located.
 
-use glam::{DQuat, DVec3, EulerRot};
+use glam::{DQuat, DVec2, DVec3, EulerRot};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::layout::TagLayout;
-use vizflyt_tags::locate::{LocateSettings, Locator, StampedImage};
+use vizflyt_tags::locate::{LocateSettings, LocateSetup, Locator, StampedImage};
+use vizflyt_tags::print::Pad;
 use vizflyt_tags::simulated::{Sensor, SimulatedCamera, Truth};
 
 /// A path, by the way flown on it. [m -> m, world]
@@ -48,6 +49,15 @@ pub(crate) fn pose_on(path: impl Fn(f64) -> DVec3, speed_mps: f64, t_s: f64) -> 
     Pose::new(at(t_s), DQuat::from_rotation_arc(DVec3::Z, thrust) * yaw)
 }
 
+/// Where the vehicle of the simulated room takes off and lands.
+pub(crate) fn pads() -> Vec<Pad> {
+    let landing_m = DVec2::new(1.2, 0.35);
+    vec![
+        Pad { middle_m: DVec2::new(0.9, 0.0), size_m: Pad::SIZE_M },
+        Pad { middle_m: DVec2::new(10.0, 0.0), size_m: landing_m },
+    ]
+}
+
 /// How well a flight was located.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Figures {
@@ -59,6 +69,8 @@ pub(crate) struct Figures {
     pub(crate) errors_rad: Vec<f64>,
     /// Errors in units of their predicted standard deviations: squared, of six numbers.
     pub(crate) squared_sigmas: f64,
+    /// Likewise, of the position's three alone.
+    pub(crate) squared_sigmas_m: f64,
     /// Why sets gave no pose.
     pub(crate) unlocated: Vec<String>,
     /// Pixels looked at, of all.
@@ -92,6 +104,12 @@ impl Figures {
     pub(crate) fn consistency(&self) -> f64 {
         self.squared_sigmas / (6 * self.errors_m.len()) as f64
     }
+
+    /// Returns the same of the position alone.
+    #[allow(dead_code, reason = "the bench prints that of the whole pose")]
+    pub(crate) fn position_consistency(&self) -> f64 {
+        self.squared_sigmas_m / (3 * self.errors_m.len()) as f64
+    }
 }
 
 fn rms(values: &[f64]) -> f64 {
@@ -116,16 +134,44 @@ pub(crate) fn fly(
     locate(simulated.collect(), layouts, seconds, pose_at)
 }
 
+/// Flies with a webcam under the vehicle over the hall's mat, which has pads, with what a survey and a ruler leave wrong
+/// by this seed; images are drawn by `before`.
+pub(crate) fn fly_over_mat(
+    pads: Vec<Pad>,
+    seed: u64,
+    before: impl Fn(TagCamera, Sensor) -> SimulatedCamera,
+    seconds: f64,
+    pose_at: impl Fn(f64) -> Pose<World, Body>,
+) -> Figures {
+    let lab =
+        LocateSetup::simulated_over_mat(pads, seed, "vizflyt").expect("there are tags enough");
+    let locator = Locator::new(lab.cameras, &lab.layouts, lab.settings).expect("the lab is sound");
+    let truth = lab.truth.expect("it is simulated");
+    let sensor = lab.simulated.sensor(0, 1);
+    let cameras = truth.cameras.into_iter().map(|camera| before(camera, sensor)).collect();
+    run(locator, cameras, &truth.layouts, seconds, pose_at)
+}
+
 /// Flies before cameras and locates.
 pub(crate) fn locate(
-    mut simulated: Vec<SimulatedCamera>,
+    simulated: Vec<SimulatedCamera>,
     layouts: &[TagLayout],
     seconds: f64,
     pose_at: impl Fn(f64) -> Pose<World, Body>,
 ) -> Figures {
     let cameras = simulated.iter().map(|camera| camera.camera().clone()).collect();
-    let mut locator =
+    let locator =
         Locator::new(cameras, layouts, LocateSettings::default()).expect("the lab is sound");
+    run(locator, simulated, layouts, seconds, pose_at)
+}
+
+fn run(
+    mut locator: Locator,
+    mut simulated: Vec<SimulatedCamera>,
+    layouts: &[TagLayout],
+    seconds: f64,
+    pose_at: impl Fn(f64) -> Pose<World, Body>,
+) -> Figures {
     let mut figures = Figures::default();
     let mut truth = Truth::default();
     let start = HostTime::from_ns(5_000_000_000);
@@ -160,8 +206,10 @@ pub(crate) fn locate(
                 let turn = (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis();
                 figures.errors_m.push(off.length());
                 figures.errors_rad.push(turn.length());
-                figures.squared_sigmas += (off / located.position_sigma_m).length_squared()
-                    + (turn / located.rotation_sigma_rad).length_squared();
+                let square_m = (off / located.position_sigma_m).length_squared();
+                figures.squared_sigmas_m += square_m;
+                figures.squared_sigmas +=
+                    square_m + (turn / located.rotation_sigma_rad).length_squared();
             }
             Err(why) => figures.unlocated.push(format!("{t_s:.2} s: {why:?}")),
         }

@@ -11,14 +11,22 @@ use vizflyt_tags::simulated::{Background, Sensor, SimulatedCamera};
 
 /// Returns the cameras in the hall, spread over the interval as free webcams are.
 pub(crate) fn seen_by(cameras: Vec<TagCamera>) -> Vec<SimulatedCamera> {
-    let hall = Arc::new(Mutex::new(CpuRenderer::new(&generate(SceneKind::Room, 7).splats)));
     let count = cameras.len() as f64;
-    let seen = cameras.into_iter().enumerate().map(|(i, camera)| {
-        let sensor = Sensor { phase: i as f64 / count, ..Sensor::default() };
+    let before = before();
+    let seen = cameras
+        .into_iter()
+        .enumerate()
+        .map(|(i, camera)| before(camera, Sensor { phase: i as f64 / count, ..Sensor::default() }));
+    seen.collect()
+}
+
+/// Returns what puts a camera into the hall.
+pub(crate) fn before() -> impl Fn(TagCamera, Sensor) -> SimulatedCamera {
+    let hall = Arc::new(Mutex::new(CpuRenderer::new(&generate(SceneKind::Room, 7).splats)));
+    move |camera, sensor| {
         let behind = background(hall.clone(), camera.intrinsics);
         SimulatedCamera::before(camera, sensor, behind)
-    });
-    seen.collect()
+    }
 }
 
 /// Renders for one lens; again only where the camera has moved.

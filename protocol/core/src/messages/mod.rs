@@ -35,7 +35,8 @@ pub use pairing::{Grant, MAX_GRANTED, PairingProof, PairingReply, PairingRequest
 pub use plugin::{FromPlugin, ToPlugin};
 pub use session::{
     ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, Hello, ImuReading, Limits,
-    MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ReceivedEvents, ToRuntime, ToServer, Welcome,
+    MAX_ALLOWANCE_S, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ReceivedEvents, ToRuntime,
+    ToServer, Welcome,
 };
 pub use setpoint::{Axes, InvalidSetpoint, Setpoint, YawTarget};
 pub use telemetry::{FlightPhase, ImageStats, OutcomeKind, Telemetry, VehicleState};

@@ -165,14 +165,28 @@ pub struct PoseSample {
     pub position_sigma_m: Vec3,
     /// How far the attitude may be off, about each axis; 0 is not known. [rad, body]
     pub rotation_sigma_rad: Vec3,
+    /// How much older it may grow than [`PoseAges`] say: by the delay that its source always has, and by the period of
+    /// a slow one. Within 0 and [`MAX_ALLOWANCE_S`]. [s]
+    pub allowance_s: f32,
 }
+
+/// No delay or period of a source makes ages of a pose count more than so much later. [s]
+pub const MAX_ALLOWANCE_S: f32 = 0.3;
 
 impl PoseSample {
     /// Makes the sample of a vehicle that stands still, of unknown uncertainty.
     pub const fn still(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
         let twist = Twist { linear_mps: DVec3::ZERO, angular_radps: DVec3::ZERO };
         let (position_sigma_m, rotation_sigma_rad) = (Vec3::ZERO, Vec3::ZERO);
-        Self { stamp, world_from_body, twist, resets: 0, position_sigma_m, rotation_sigma_rad }
+        Self {
+            stamp,
+            world_from_body,
+            twist,
+            resets: 0,
+            position_sigma_m,
+            rotation_sigma_rad,
+            allowance_s: 0.0,
+        }
     }
 
     /// Whether every number in it is one to work with.
@@ -183,10 +197,12 @@ impl PoseSample {
             && angular_radps.is_finite()
             && self.position_sigma_m.is_finite()
             && self.rotation_sigma_rad.is_finite()
+            && (0.0..=MAX_ALLOWANCE_S).contains(&self.allowance_s)
     }
 }
 
-/// Ages of the newest pose from which a flight does not go on as it was.
+/// Ages of the newest pose, less its [`allowance_s`](PoseSample::allowance_s), from which a flight does not go on as
+/// it was.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseAges {
     /// The guard holds. [s]
@@ -194,6 +210,18 @@ pub struct PoseAges {
     /// The guard lands. [s]
     pub land_after_s: f64,
 }
+
+impl PoseAges {
+    /// Returns the [`allowance_s`](PoseSample::allowance_s) of poses that come so late, one each `interval_s`: their delay,
+    /// and until a slow source has left out one and is late with the next. [s]
+    pub fn allowance_s(&self, delay_s: f64, interval_s: f64) -> f64 {
+        let slow_s = (MISSED_POSES * interval_s - self.hold_after_s).max(0.0);
+        (delay_s.max(0.0) + slow_s).min(f64::from(MAX_ALLOWANCE_S))
+    }
+}
+
+/// Intervals that pass while one pose is left out and the next is late.
+const MISSED_POSES: f64 = 2.5;
 
 impl Default for PoseAges {
     /// At 5 m/s 0.15 s are 0.75 m flown blind, and 30 packets of a 200 Hz mocap missed; after 0.5 s

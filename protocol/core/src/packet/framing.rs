@@ -258,6 +258,7 @@ mod tests {
             resets: 3,
             position_sigma_m: Vec3::splat(4.4),
             rotation_sigma_rad: Vec3::splat(5.5),
+            allowance_s: 0.2,
         };
         // Far below the smallest packet of QUIC, 1200 bytes.
         let datagram = encode_body(&Datagram::Pose(pose), &mut buffer);

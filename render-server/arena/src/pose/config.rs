@@ -59,8 +59,8 @@ impl Default for PoseConfig {
             position_sigma_m: 0.000_6,
             rotation_sigma_deg: 0.15,
             stamp_sigma_s: 0.000_5,
-            // One good measurement in 10^8 is further off, if noise is Gaussian.
-            gate_sigmas: 6.0,
+            // One good measurement in 3,000 is further off, in place or attitude, if noise is Gaussian.
+            gate_sigmas: 4.5,
             flip_believed_after_s: 1.0,
         }
     }

@@ -9,7 +9,7 @@
 //! Inertial readings are measurements here, of acceleration and angular velocity, not inputs of the
 //! motion model. So one filter serves with and without an IMU, and nothing is switched when the
 //! autopilot falls silent: without readings the model alone holds, an acceleration that dies away
-//! (Singer, 1970) and a constant rate of turn.
+//! (Singer, 1970) and a constant rate of turn, whose noise is learnt from how far poses are off.
 //!
 //! Budget: 3 us for a pose, a step and two readings of three numbers. The covariance (`covariance.rs`) is 28 blocks of
 //! 3 x 3 (2 KB). `cargo bench -p vizflyt-arena --bench pose` measures it.
@@ -38,6 +38,10 @@ const ACCEL_BIAS_DENSITY: f64 = 1e-5;
 const GYRO_BIAS_SIGMA_RADPS: f64 = 0.02;
 /// Bias of an accelerometer, and what a body frame turned by a degree looks like. [m/s^2]
 const ACCEL_BIAS_SIGMA_MPS2: f64 = 0.3;
+/// How much of how hard the vehicle manoeuvres is learnt from one pose: half in three, where noise does not hide it.
+const LEARNS: f64 = 0.2;
+/// A vehicle that hovers still sways: by a tenth of what the hardest flight does.
+const LEAST_SHARE: f64 = 0.01;
 /// What is not known of the motion when the first pose comes: any flight there is.
 const FIRST_SPEED_MPS: f64 = 10.0;
 const FIRST_TURN_RADPS: f64 = 5.0;
@@ -59,6 +63,11 @@ pub(super) struct Estimate {
     gyro_bias_radps: DVec3,
     accel_bias_mps2: DVec3,
     covariance: Covariance,
+    /// How hard the vehicle manoeuvres at present: what share of the motion model's noise, which is that of the hardest flight,
+    /// it takes to explain the latest poses; of places and of attitudes. 1 with an IMU, which says itself what happens.
+    /// [share of a variance]
+    pushes: f64,
+    turns: f64,
 }
 
 /// The innovation of a reading: its difference from the expected one.
@@ -99,6 +108,8 @@ impl Estimate {
             gyro_bias_radps: DVec3::ZERO,
             accel_bias_mps2: DVec3::ZERO,
             covariance,
+            pushes: 1.0,
+            turns: 1.0,
         }
     }
 
@@ -154,7 +165,8 @@ impl Estimate {
         self.rotation = (self.rotation * turn).normalize();
         self.covariance.advance(dt_s, &decay, &DMat3::from_quat(turn.conjugate()));
         // White jerk, and white angular acceleration, over the step.
-        let jerk = 2.0 * ACCELERATION_SIGMA_MPS2.powi(2) / ACCELERATION_LASTS_S;
+        let jerk = self.pushes * 2.0 * ACCELERATION_SIGMA_MPS2.powi(2) / ACCELERATION_LASTS_S;
+        let turn = self.turns * TURN_DENSITY;
         let dt2 = dt_s * dt_s;
         let dt3 = dt2 * dt_s;
         for (i, j, variance) in [
@@ -164,9 +176,9 @@ impl Estimate {
             (V, V, jerk * dt3 / 3.0),
             (V, A, jerk * dt2 / 2.0),
             (A, A, jerk * dt_s),
-            (R, R, TURN_DENSITY * dt3 / 3.0),
-            (R, W, TURN_DENSITY * dt2 / 2.0),
-            (W, W, TURN_DENSITY * dt_s),
+            (R, R, turn * dt3 / 3.0),
+            (R, W, turn * dt2 / 2.0),
+            (W, W, turn * dt_s),
             (GYRO_BIAS, GYRO_BIAS, GYRO_BIAS_DENSITY * dt_s),
             (ACCEL_BIAS, ACCEL_BIAS, ACCEL_BIAS_DENSITY * dt_s),
         ] {
@@ -186,12 +198,14 @@ impl Estimate {
 
     /// Takes in a position. [m, world]
     pub(super) fn read_position(&mut self, p_world_m: DVec3, variance_m2: DMat3) {
-        self.read(&self.position_reading(p_world_m, variance_m2));
+        let reading = self.position_reading(p_world_m, variance_m2);
+        self.pushes = self.read(&reading, self.pushes);
     }
 
     /// Takes in an attitude. [rad, body]
     pub(super) fn read_attitude(&mut self, rotation: DQuat, variance_rad2: DMat3) {
-        self.read(&self.attitude_reading(rotation, variance_rad2));
+        let reading = self.attitude_reading(rotation, variance_rad2);
+        self.turns = self.read(&reading, self.turns);
     }
 
     /// Takes in a gyroscope's reading unless it is further off than `most_sigmas`; returns whether
@@ -202,6 +216,7 @@ impl Estimate {
         sigma_radps: f64,
         most_sigmas: f64,
     ) -> bool {
+        self.turns = 1.0;
         self.read_within(
             &Reading {
                 residual: gyro_radps - self.omega_body_radps - self.gyro_bias_radps,
@@ -219,6 +234,7 @@ impl Estimate {
         sigma_mps2: f64,
         most_sigmas: f64,
     ) -> bool {
+        self.pushes = 1.0;
         let to_body = DMat3::from_quat(self.rotation.conjugate());
         let felt_mps2 = to_body * (self.a_world_mps2 + GRAVITY_MPS2);
         self.read_within(
@@ -235,16 +251,20 @@ impl Estimate {
         )
     }
 
+    /// Expects from now on what the hardest flight does, however calm this one was.
+    pub(super) fn expect_manoeuvre(&mut self) {
+        (self.pushes, self.turns) = (1.0, 1.0);
+        self.covariance.add(A, A, ACCELERATION_SIGMA_MPS2.powi(2));
+        self.covariance.add(W, W, TURN_DENSITY * ACCELERATION_LASTS_S);
+    }
+
     /// Inflates the covariance for a manoeuvre.
     pub(super) fn inflate_covariance(&mut self, manoeuvre: &Manoeuvre) {
+        self.expect_manoeuvre();
         let Manoeuvre { distance_m, angle_rad, dt_s } = *manoeuvre;
-        for (block, sigma) in [
-            (P, distance_m),
-            (V, distance_m / dt_s),
-            (A, ACCELERATION_SIGMA_MPS2),
-            (R, angle_rad),
-            (W, angle_rad / dt_s),
-        ] {
+        for (block, sigma) in
+            [(P, distance_m), (V, distance_m / dt_s), (R, angle_rad), (W, angle_rad / dt_s)]
+        {
             self.covariance.add(block, block, sigma * sigma);
         }
     }
@@ -285,9 +305,19 @@ impl Estimate {
         within
     }
 
-    fn read<const N: usize>(&mut self, reading: &Reading<N>) {
-        let inverse = self.covariance.spread(reading).inverse();
+    /// Takes in a reading of a pose; returns how hard the vehicle manoeuvres by that, which was `share` before: a step up
+    /// the gradient of the reading's likelihood, so that readings are as far off as is expected of them (Mehra, 1972,
+    /// "Approaches to adaptive filtering").
+    fn read<const N: usize>(&mut self, reading: &Reading<N>, share: f64) -> f64 {
+        let spread = self.covariance.spread(reading);
+        let inverse = spread.inverse();
+        // Less what a stamp that is off makes of speed, which is not along every axis: that it may be is no sign of calm.
+        let own = 3.0 * diagonal(&reading.variance).min_element();
+        let by_motion = diagonal(&(spread - reading.variance)).element_sum();
+        let surprise = reading.residual.length_squared() / (by_motion + own);
+        let counts = by_motion / (by_motion + own);
         self.correct(reading, &inverse);
+        (share * (1.0 + LEARNS * counts * (surprise - 1.0))).clamp(LEAST_SHARE, 1.0)
     }
 
     fn correct<const N: usize>(&mut self, reading: &Reading<N>, inverse: &DMat3) {
@@ -300,6 +330,10 @@ impl Estimate {
         self.gyro_bias_radps += error[GYRO_BIAS];
         self.accel_bias_mps2 += error[ACCEL_BIAS];
     }
+}
+
+fn diagonal(m: &DMat3) -> DVec3 {
+    DVec3::new(m.x_axis.x, m.y_axis.y, m.z_axis.z)
 }
 
 /// Returns the same rotation the short way round.

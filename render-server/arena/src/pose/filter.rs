@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, Twist, World};
-use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::messages::{PoseAges, PoseSample};
 use vizflyt_protocol::time::ServerTime;
 
 use super::covariance::squares;
@@ -60,6 +60,8 @@ enum GateResult {
     Fits {
         sigmas: f64,
     },
+    /// The vehicle, calm before, began to manoeuvre at this time, as hard as vehicles do.
+    Begins(ServerTime),
     /// A motion that the model did not foresee.
     Manoeuvre(Manoeuvre),
     /// The pose changed for another reason than motion.
@@ -169,6 +171,11 @@ impl PoseFilter {
                 self.put(stamp, &pose, self.variances(&sigma, &prior, noise), None);
                 Ok(sigmas)
             }
+            GateResult::Begins(since) => {
+                self.history.change(since, Estimate::expect_manoeuvre);
+                self.put(stamp, &pose, self.variances(&sigma, &prior, noise), None);
+                Ok(self.config.gate_sigmas)
+            }
             GateResult::Manoeuvre(manoeuvre) => {
                 self.put(stamp, &pose, self.variances(&sigma, &prior, noise), Some(manoeuvre));
                 Ok(self.config.gate_sigmas)
@@ -234,46 +241,37 @@ impl PoseFilter {
             noise_m: sigma.position_m.max_element() * noise.sqrt(),
             noise_rad: sigma.rotation_rad.max_element() * noise.sqrt(),
         };
-        // The longer nothing is accepted, the more would fit: what several poses have claimed goes on being a claim
-        // as long as it is nearer than what was expected.
-        let denied = self.sources[index]
-            .pending(&surprise)
-            .is_some_and(|claim| claim.count >= 2 && claim.explains(&surprise));
-        self.sources[index].add_innovation(sigmas);
         let trusted = self.sources.iter().enumerate().find(|(other, source)| {
             let age_s = source.accepted_at.map(|at| stamp.seconds_since(at).abs());
             *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
         });
         let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
-        let newest = self.newest.map_or(stamp, |newest| newest.stamp);
-        let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
-        let far = distance_m > DOUBT_M.max(DOUBT_SIGMAS * surprise.noise_m)
-            || angle_rad > DOUBT_RAD.max(DOUBT_SIGMAS * surprise.noise_rad);
-        // A doubt must not cost the pose.
-        let interval_s = 1.0 / self.sources[index].rate_hz(stamp).max(1.0);
-        let matters = far
-            && dt_s <= (DOUBT_UNTIL * self.config.hold_after_s).max(DOUBT_INTERVALS * interval_s);
-        let sure = match trusted {
-            None if matters && self.sources[index].is_known() => {
-                self.sources[index].sure_within(gate)
-            }
-            _ => gate,
-        };
-        if sigmas <= sure && !denied {
+        // The longer nothing is accepted, the more would fit: what several poses have claimed is a jump as long as it is
+        // nearer than what was expected.
+        let jumped = trusted.is_none()
+            && self.sources[index]
+                .pending(&surprise)
+                .is_some_and(|claim| claim.count >= 2 && claim.explains(&surprise));
+        if sigmas <= gate && !jumped {
             return GateResult::Fits { sigmas };
         }
         if let Some((other, _)) = trusted {
             let other = other as u8;
             return GateResult::Rejected(Rejected::Disagree { other, distance_m, angle_rad });
         }
+        let newest = self.newest.map_or(stamp, |newest| newest.stamp);
+        let dt_s = stamp.seconds_since(newest).abs().max(MIN_DT_S);
+        let began = self.manoeuvre_began(index, measured, sigma);
+        let is_small = distance_m <= HARMLESS_M && angle_rad <= HARMLESS_RAD;
+        if let Some(since) = began.filter(|_| is_small && !jumped) {
+            return GateResult::Begins(since);
+        }
         let speed_mps = distance_m / dt_s;
         // A gyroscope would have measured a turn.
         let measured_turn = self.imu_is_fresh(stamp) && angle_rad > MEASURABLE_RAD;
         let flips = attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS);
         let leaps = place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS;
-        let kind = if sigmas <= gate {
-            ClaimKind::Doubtful
-        } else if leaps {
+        let kind = if leaps {
             ClaimKind::Leap
         } else if flips {
             ClaimKind::Flip
@@ -285,21 +283,21 @@ impl PoseFilter {
             return GateResult::Fits { sigmas: sigmas.min(gate) };
         }
         let (claim, moves) = self.sources[index].claim(&surprise, kind);
-        // Two poses are enough where they follow each other so closely that outliers could hardly look like a motion.
-        let close = claim.lasted_s() <= CLOSE_S / 2.0;
-        let enough = if close || sigmas <= gate { 2 } else { CONFIRMED };
-        if moves && claim.count >= enough {
-            return if sigmas <= gate {
-                GateResult::Fits { sigmas }
-            } else {
-                GateResult::Manoeuvre(Manoeuvre { distance_m, angle_rad, dt_s })
+        // Two poses are enough where they follow each other so closely, or lead as little away as flight does, that outliers
+        // could hardly look like a motion.
+        let close =
+            claim.lasted_s() <= CLOSE_S / 2.0 || began.is_some() && claim.grows_to(&surprise);
+        let enough = if close { 2 } else { CONFIRMED };
+        if moves && claim.count >= enough || is_small && claim.count >= 2 {
+            return match began {
+                Some(since) => GateResult::Begins(since),
+                None => GateResult::Manoeuvre(Manoeuvre { distance_m, angle_rad, dt_s }),
             };
         }
         let lasted_s = claim.lasted_s();
         let stays = claim.count >= JUMP_CONFIRMED && lasted_s >= JUMP_LASTS_S
-            || claim.count >= CONFIRMED && lasted_s >= JUMP_LASTS_LONG_S;
+            || claim.count >= CONFIRMED && (lasted_s >= JUMP_LASTS_LONG_S || sigmas <= gate);
         match claim.kind {
-            ClaimKind::Doubtful if claim.count >= CONFIRMED => GateResult::Fits { sigmas },
             ClaimKind::Shift | ClaimKind::Leap if stays => {
                 GateResult::Reset { distance_m, angle_rad }
             }
@@ -311,10 +309,29 @@ impl PoseFilter {
                 GateResult::Rejected(Rejected::Jump { distance_m, speed_mps })
             }
             ClaimKind::Leap => GateResult::Rejected(Rejected::Jump { distance_m, speed_mps }),
-            ClaimKind::Shift | ClaimKind::Doubtful => {
-                GateResult::Rejected(Rejected::Outlier(sigmas))
-            }
+            ClaimKind::Shift => GateResult::Rejected(Rejected::Outlier(sigmas)),
         }
+    }
+
+    /// Returns since when the vehicle would have to manoeuvre for this pose to be within the gate of the hardest flight;
+    /// `None` if it is beyond that too.
+    fn manoeuvre_began(
+        &mut self,
+        index: usize,
+        measured: &Measured,
+        sigma: &PoseSigma,
+    ) -> Option<ServerTime> {
+        let Measured { stamp, world_from_body: pose, .. } = *measured;
+        let accepted_at = self.sources[index].accepted_at.unwrap_or(stamp);
+        let since = stamp.plus_seconds(-MANOEUVRE_SEEN_S).min(accepted_at);
+        let imu = &mut self.imu;
+        let fuse = |estimate: &mut Estimate, record: &Record| imu.fuse(estimate, record);
+        let prior = self.history.at_after(stamp, since, Estimate::expect_manoeuvre, fuse)?;
+        let (variance_m2, variance_rad2) =
+            self.variances(sigma, &prior, self.sources[index].noise_factor());
+        let place = prior.position_innovation(pose.translation_m, variance_m2);
+        let attitude = prior.attitude_innovation(pose.rotation, variance_rad2);
+        (place.sigmas.max(attitude.sigmas) <= self.config.gate_sigmas).then_some(since)
     }
 
     /// Forgets what led here and begins with this pose.
@@ -416,19 +433,17 @@ impl PoseFilter {
     pub fn poll_timeout(&self) -> Option<ServerTime> {
         let newest = self.newest.filter(|_| !self.lost)?;
         // A nanosecond later: the sum is rounded.
-        Some(newest.stamp.plus_seconds(self.patience_s(newest.stamp)).plus_ns(1))
+        let lost_s = self.config.hold_after_s + f64::from(newest.allowance_s);
+        Some(newest.stamp.plus_seconds(lost_s).plus_ns(1))
     }
 
-    /// Returns for how long a missing pose is no lost one: as configured, but at least until a slow source has left out
-    /// one and is late with the next. [s]
-    fn patience_s(&self, now: ServerTime) -> f64 {
-        let rate_hz = self.sources.iter().map(|source| source.rate_hz(now)).fold(0.0, f64::max);
+    /// Returns how much older than configured a pose may grow before it is lost, by the source that is missed first. [s]
+    fn allowance_s(&self, now: ServerTime) -> f64 {
         let PoseConfig { hold_after_s, land_after_s, .. } = self.config;
-        if rate_hz > 0.0 {
-            (MISSED_POSES / rate_hz).clamp(hold_after_s, land_after_s)
-        } else {
-            hold_after_s
-        }
+        let ages = PoseAges { hold_after_s, land_after_s };
+        let timings = self.sources.iter().filter_map(|source| source.timing(now));
+        let of_each = timings.map(|(delay_s, interval_s)| ages.allowance_s(delay_s, interval_s));
+        of_each.reduce(f64::min).unwrap_or(0.0)
     }
 
     /// Returns a change of the source once. Call until there is none.
@@ -492,6 +507,7 @@ impl PoseFilter {
             resets: self.resets,
             position_sigma_m: sigma.position_m.as_vec3(),
             rotation_sigma_rad: sigma.rotation_rad.as_vec3(),
+            allowance_s: self.allowance_s(stamp) as f32,
         }
     }
 }
@@ -519,8 +535,6 @@ impl Imu {
     }
 }
 
-/// Intervals that pass while one pose is left out and the next is late.
-const MISSED_POSES: f64 = 2.5;
 /// Positions beyond this are no room's. [m]
 const FURTHEST_M: f64 = 1e4;
 /// After such a pause nothing of the former motion holds. [s]
@@ -543,15 +557,12 @@ const JUMP_LASTS_S: f64 = 0.015;
 const JUMP_LASTS_LONG_S: f64 = 0.095;
 /// One or two measurements off are outliers, a third one that goes on is a motion.
 const CONFIRMED: u32 = 3;
-/// What is closer to the expected is accepted without doubt: less than half of what an outlier must be to do harm, and
-/// what a start at 4 m/s^2 is off at 10 Hz. [m], [rad]
-const DOUBT_M: f64 = 0.02;
-const DOUBT_RAD: f64 = 0.1;
-/// Share of `hold_after_s` for which doubtful measurements are left out, and intervals of a slow source.
-const DOUBT_UNTIL: f64 = 0.7;
-const DOUBT_INTERVALS: f64 = 2.2;
-/// And so is what the source's noise explains. [standard deviations]
-const DOUBT_SIGMAS: f64 = 5.0;
+/// After so long a filter that expects a calm flight has noticed any other: a hard start is 3 cm off by then. [s]
+const MANOEUVRE_SEEN_S: f64 = 0.1;
+/// What is closer to the expected is taken for the beginning of a manoeuvre at once, and never for a jump: an outlier of
+/// that size does little harm. [m], [rad]
+const HARMLESS_M: f64 = 0.03;
+const HARMLESS_RAD: f64 = 0.1;
 /// Over two intervals; in so short a time a motion is so short that two outliers seldom look like one. [s]
 const CLOSE_S: f64 = 0.03;
 /// Noise of a flight controller's gyroscope with the motors running. [rad/s]

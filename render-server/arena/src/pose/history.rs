@@ -94,6 +94,37 @@ impl History {
         Some(estimate)
     }
 
+    /// Returns what would have been known just before `stamp`, up to which all is settled, had `change` come about at
+    /// `since`.
+    pub(super) fn at_after(
+        &self,
+        stamp: ServerTime,
+        since: ServerTime,
+        change: impl FnOnce(&mut Estimate),
+        mut fuse: impl FnMut(&mut Estimate, &Record),
+    ) -> Option<Estimate> {
+        let first = self.place(since).max(1) - 1;
+        let mut estimate = *self.estimates.get(first)?;
+        change(&mut estimate);
+        let mut newest = self.records.get(first)?.stamp;
+        for record in self.records.range(first + 1..self.place(stamp).max(first + 1)) {
+            estimate.advance(record.stamp.seconds_since(newest));
+            newest = record.stamp;
+            fuse(&mut estimate, record);
+        }
+        estimate.advance(stamp.seconds_since(newest));
+        Some(estimate)
+    }
+
+    /// Changes what was known at `since`, and so all that is known after it.
+    pub(super) fn change(&mut self, since: ServerTime, change: impl FnOnce(&mut Estimate)) {
+        let first = self.place(since).max(1) - 1;
+        self.estimates.truncate(first + 1);
+        if let Some(estimate) = self.estimates.get_mut(first) {
+            change(estimate);
+        }
+    }
+
     /// Puts a reading where it belongs, behind those of the same time; the history must reach there. What is known
     /// after it waits for [`Self::settle`].
     pub(super) fn put(

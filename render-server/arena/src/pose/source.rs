@@ -30,8 +30,6 @@ pub(super) struct Claim {
 /// What is wrong with them; the worst of them counts.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub(super) enum ClaimKind {
-    /// Within the gate, but so far off that an outlier is as likely as a manoeuvre.
-    Doubtful,
     /// Beyond the gate, as far as a manoeuvre may lead.
     Shift,
     /// Further than vehicles fly in the time.
@@ -93,8 +91,6 @@ struct Noise {
     /// as stated and nobody manoeuvres; of places and of attitudes.
     places: Window,
     attitudes: Window,
-    /// Innovations of the filter. [standard deviations]
-    innovations: Window,
 }
 
 /// From one measurement to the next.
@@ -219,12 +215,12 @@ impl Source {
     /// leave the expected path together, each further than the one before.
     pub(super) fn claim(&mut self, surprise: &Surprise, kind: ClaimKind) -> (Claim, bool) {
         let Surprise { stamp, pose, off_m, off_rad, .. } = *surprise;
-        // What was only doubted says nothing of what is beyond the gate.
-        let former = self
-            .claim
-            .filter(|former| former.kind > ClaimKind::Doubtful || kind == ClaimKind::Doubtful);
-        let accepted_at = self.accepted_at.unwrap_or(stamp);
-        let moves = former.filter(|former| former.leads_to(surprise, accepted_at));
+        let former = self.claim;
+        let before_s = former.map_or(0.0, |former| {
+            former.since.seconds_since(self.accepted_at.unwrap_or(stamp)).max(0.0)
+        });
+        let pauses = before_s > PAUSE_S.max(PAUSE_INTERVALS / self.rate_hz(stamp).max(1.0));
+        let moves = former.filter(|former| former.leads_to(surprise, before_s, pauses));
         let claim = match moves.or(former.filter(|former| former.is_made_by(surprise))) {
             Some(former) => Claim {
                 kind: if kind > former.kind { kind } else { former.kind },
@@ -278,11 +274,6 @@ impl Source {
         !was_known && self.noise.is_known() && self.noise.factor() > 1.0
     }
 
-    /// Takes note of how far a measurement is from what was expected. [standard deviations]
-    pub(super) fn add_innovation(&mut self, sigmas: f64) {
-        self.noise.innovations.push(sigmas);
-    }
-
     /// Returns what this source's variances are to be multiplied by: 1 as long as its measurements
     /// scatter as their sigmas state.
     pub(super) fn noise_factor(&self) -> f64 {
@@ -294,18 +285,15 @@ impl Source {
         self.noise.is_known()
     }
 
-    /// Returns how many standard deviations are no surprise by what came lately, at most a share of the gate: a source whose
-    /// poses are always close to what is expected is doubted sooner.
-    pub(super) fn sure_within(&self, gate: f64) -> f64 {
-        let usual = self.noise.innovations.median() * SURPRISING;
-        let sure = usual.clamp(LEAST_SURPRISE, gate * MOST_SURE);
-        // Outliers come in pairs, and after one more would fit.
-        if self.claim.is_some() { sure * AFTER_OUTLIER } else { sure }
-    }
-
     /// Returns how often measurements come, accepted or not. [Hz]
     pub(super) fn rate_hz(&self, now: ServerTime) -> f64 {
         self.latency.rate_hz(now)
+    }
+
+    /// Returns how late its measurements usually come, and their interval, while any come. [s]
+    pub(super) fn timing(&self, now: ServerTime) -> Option<(f64, f64)> {
+        let rate_hz = self.latency.rate_hz(now);
+        (rate_hz > 0.0).then(|| (self.latency.value(), 1.0 / rate_hz))
     }
 
     pub(super) fn reject(&mut self, reason: &Rejected) {
@@ -349,13 +337,13 @@ impl Claim {
             && angle_rad(turned).min(angle_rad(turned * turning)) <= fits_rad
     }
 
-    /// Whether the way from its first pose to this one, flown backwards, leads to the expected path between the last
-    /// accepted pose and the first that was not: a bump or a hard stop does, an outlier does not.
-    fn leads_to(&self, surprise: &Surprise, accepted_at: ServerTime) -> bool {
+    /// Whether the way from its first pose to this one, flown backwards, leads to the expected path in the `before_s`
+    /// between the last accepted pose and the first that was not: a bump or a hard stop does, an outlier does not.
+    /// `pauses`: whether the source was silent in between.
+    fn leads_to(&self, surprise: &Surprise, before_s: f64, pauses: bool) -> bool {
         let dt_s = surprise.stamp.seconds_since(self.since);
-        let before_s = self.since.seconds_since(accepted_at).max(0.0);
         // What was flown in a pause of the source nobody knows.
-        let unseen_m = if before_s > PAUSE_S { UNSEEN_MPS * before_s } else { 0.0 };
+        let unseen_m = if pauses { UNSEEN_MPS * before_s } else { 0.0 };
         let leads = |first: DVec3, now: DVec3, noise: f64, most: f64| {
             let way = now - first;
             let along = first.dot(way) / way.length_squared().max(f64::MIN_POSITIVE);
@@ -363,17 +351,20 @@ impl Claim {
             way.length() <= most * dt_s && miss.length() <= ASTRAY * first.length() + noise
         };
         let Surprise { off_m, off_rad, noise_m, noise_rad, .. } = *surprise;
-        // From within the noise every way leads back.
-        let is_beyond_noise = if self.is_turned {
-            self.first_off_rad.length() > FITS_SIGMAS * noise_rad
-        } else {
-            self.first_off_m.length() > FITS_SIGMAS * noise_m
-        };
         dt_s > 0.0
-            && is_beyond_noise
             && surprise.stamp.seconds_since(self.newest) <= CLAIM_LASTS_S
             && leads(self.first_off_m, off_m, FITS_SIGMAS * noise_m + unseen_m, MAX_MANOEUVRE_MPS)
             && leads(self.first_off_rad, off_rad, FITS_SIGMAS * noise_rad, MAX_TURN_RADPS)
+    }
+
+    /// Whether the pose is about as far beyond the first as that was beyond the expected.
+    pub(super) fn grows_to(&self, surprise: &Surprise) -> bool {
+        let Surprise { off_m, off_rad, .. } = surprise;
+        if self.is_turned {
+            off_rad.length() >= GROWS * self.first_off_rad.length()
+        } else {
+            off_m.length() >= GROWS * self.first_off_m.length()
+        }
     }
 
     /// Whether it explains the pose better than what was expected.
@@ -406,14 +397,6 @@ const MEDIAN_SQUARE: f64 = 2.37;
 /// What a hovering vehicle does anyway. [m/s^2], [rad/s^2]
 const USUAL_MPS2: f64 = 1.0;
 const USUAL_RADPS2: f64 = 2.0;
-/// So many times the usual innovation is a surprise.
-const SURPRISING: f64 = 4.0;
-/// And less than this is none: what the filter itself expects of every other pose. [standard deviations]
-const LEAST_SURPRISE: f64 = 1.5;
-/// After a measurement that did not fit, less is one.
-const AFTER_OUTLIER: f64 = 0.5;
-/// But this share of the gate is one.
-const MOST_SURE: f64 = 0.5;
 /// Beyond this a source scatters by more than it states, and not by chance. [sigma^2]
 const NOISY_SQUARE: f64 = 1.8;
 /// Ten times the sigma: what is worse still is no localization.
@@ -450,6 +433,11 @@ const FITS_RADPS: f64 = 4.0;
 const CLOSER: f64 = 0.5;
 /// How far beside the expected path a manoeuvre may seem to begin, of its first deviation: 11 degrees.
 const ASTRAY: f64 = 0.2;
-/// Eight missing frames at 100 Hz, a vehicle may have stopped or turned in. [s], [m/s]
+/// A motion that began since the last accepted pose has led at least twice as far an interval later; less a fifth for noise.
+const GROWS: f64 = 1.6;
+/// Eight missing frames at 100 Hz, a vehicle may have stopped or turned in. [s]
 const PAUSE_S: f64 = 0.08;
+/// And of a slow source at least so many intervals.
+const PAUSE_INTERVALS: f64 = 2.5;
+/// Speed by which that may have changed. [m/s]
 const UNSEEN_MPS: f64 = 3.0;

@@ -2,9 +2,6 @@ use glam::DQuat;
 use proptest::prelude::*;
 
 use super::*;
-use vizflyt_protocol::messages::PoseSample;
-
-mod outliers;
 
 fn at(seconds: f64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000).plus_seconds(seconds)
@@ -206,6 +203,44 @@ fn lost_pose_has_a_reason() {
     let mut filter = flying(0.0);
     for i in 1..1000 {
         filter.handle_pose(&measured(1.0 + 0.005 * f64::from(i), DVec3::ZERO)).unwrap();
+    }
+}
+
+/// A source that is always late, or slow, is no lost one; it is lost as long after its next pose was due as a quick one.
+#[test]
+fn delay_and_rate_of_a_source_are_allowed_for() {
+    for (rate_hz, delay_s, allowed_s) in [
+        (100.0, 0.0, 0.0..0.001),
+        (100.0, 0.1, 0.099..0.101),
+        (30.0, 0.1, 0.099..0.101),
+        // Two and a half of its intervals are 0.25 s, and some are double.
+        (10.0, 0.0, 0.099..0.16),
+        (10.0, 0.1, 0.199..0.26),
+        // Nobody flies on what is older.
+        (10.0, 0.45, 0.299..0.301),
+    ] {
+        let mut filter = PoseFilter::default();
+        let mut newest = at(0.0);
+        for i in 0..60 {
+            let t = f64::from(i) / rate_hz;
+            filter.handle_timeout(at(t + delay_s));
+            // Every seventh is missing.
+            if i % 7 == 5 {
+                continue;
+            }
+            let late = Measured { arrival: at(t + delay_s), ..measured(t, DVec3::Z) };
+            filter.handle_pose(&late).unwrap();
+            newest = at(t);
+            let is_lost = matches!(filter.poll_change(), Some(PoseChange::Lost(..)));
+            assert!(!is_lost, "{rate_hz} Hz, {delay_s} s late, pose {i}");
+        }
+        let allowance_s = f64::from(filter.newest().unwrap().allowance_s);
+        assert!(allowed_s.contains(&allowance_s), "{rate_hz} Hz, {delay_s} s: {allowance_s}");
+        let lost_s = PoseConfig::default().hold_after_s + allowance_s;
+        filter.handle_timeout(newest.plus_seconds(lost_s - 1e-3));
+        assert_eq!(filter.poll_change(), None);
+        filter.handle_timeout(newest.plus_seconds(lost_s + 1e-3));
+        assert!(matches!(filter.poll_change(), Some(PoseChange::Lost(..))));
     }
 }
 

@@ -1,7 +1,7 @@
 //! Where the vehicles are: drivers of localization systems, and the thread that fuses and judges.
 //!
 //! ```text
-//! in   packets of Vicon, NatNet, JSON, MAVLink; IMU readings of the autopilots
+//! in   packets of Vicon, NatNet, JSON, MAVLink, VRPN; IMU readings of the autopilots
 //! out  each vehicle's newest pose, its quality, the drivers' counters;
 //!      to `flights`: the referee's events, track and samples
 //!      to `render`: the newest motions of all vehicles
@@ -9,6 +9,7 @@
 //! Imports `flights`, and `scene` for the file that names the sources.
 
 pub mod drivers;
+mod margin;
 pub mod newest;
 pub mod settings;
 pub mod thread;

@@ -19,6 +19,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::Localization;
 use super::drivers::{Measurement, PoseSource, SourceCounters};
+use super::margin::MarginWatch;
 use super::newest::{Localized, NewestPoses, publish};
 use crate::clock;
 use crate::flights::Flights;
@@ -75,7 +76,7 @@ impl PoseThread {
             }
             if Instant::now() >= quality_due {
                 quality_due = Instant::now() + QUALITY_EVERY;
-                self.publish_quality();
+                self.publish_quality(&mut watches);
             }
         }
     }
@@ -197,14 +198,21 @@ impl PoseThread {
         *lock(&self.localization.counters) = all;
     }
 
-    /// Publishes how good each vehicle's localization is.
-    fn publish_quality(&self) {
-        for (vehicle, referee) in self.localization.vehicles.iter().zip(&self.referees) {
-            let mut quality = referee.quality(clock::now());
+    /// Publishes how good each vehicle's localization is; tells of sources that leave no margin.
+    fn publish_quality(&self, watches: &mut [VehicleWatch]) {
+        let vehicles = self.localization.vehicles.iter().zip(&self.referees);
+        let flights = self.flights.vehicles.iter().zip(watches);
+        for ((vehicle, referee), (flight, watch)) in vehicles.zip(flights) {
+            let now = clock::now();
+            let mut quality = referee.quality(now);
             for source in &mut quality.sources {
                 let name = self.localization.source_names.get(usize::from(source.source));
                 if let Some(name) = name {
                     source.name.clone_from(name);
+                }
+                if let Some(text) = watch.margins.judge(now, source, &flight.arena.pose_ages) {
+                    warn!("{}: {text}", flight.name);
+                    flight.note(&text);
                 }
             }
             *lock(&vehicle.quality) = quality;
@@ -219,6 +227,7 @@ struct VehicleWatch {
     /// Index of the first event that its referee has not seen.
     event: u64,
     rejected: u64,
+    margins: MarginWatch,
     warned: Option<(Instant, std::mem::Discriminant<Rejected>)>,
 }
 

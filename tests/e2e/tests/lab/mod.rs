@@ -126,6 +126,9 @@ struct Aside {
     vehicle: Arc<Mutex<Option<SocketAddr>>>,
 }
 
+/// Where poses come from, unless a test says otherwise; the last table of arena.toml.
+pub(crate) const LOCALIZATION: &str =
+    "\n[[localization]]\ndriver = \"vicon\"\naddress = \"127.0.0.1:0\"\n";
 /// Anything here ends within this, however loaded the machine is.
 const PATIENCE: Duration = Duration::from_mins(2);
 
@@ -176,6 +179,11 @@ impl Drop for Process {
 impl Lab {
     /// Starts a server of a room for these vehicles.
     pub(crate) fn open(vehicles: usize) -> Self {
+        Self::open_with(vehicles, LOCALIZATION)
+    }
+
+    /// Starts a server of a room for these vehicles, with more tables of its arena.toml.
+    pub(crate) fn open_with(vehicles: usize, tables: &str) -> Self {
         // A fence that is soon reached: the flights are short.
         Self::open_in(vehicles, |folder| {
             let arena = folder.join("arena.toml");
@@ -184,7 +192,7 @@ impl Lab {
                 .replace("max_m = [11.0,", "max_m = [2.6,")
                 .replace("[goal]\nposition_m = [10.0,", "[goal]\nposition_m = [2.3,")
                 .replace("radius_m = 0.6", "radius_m = 0.01");
-            fs::write(&arena, text).unwrap();
+            fs::write(&arena, text + tables).unwrap();
         })
     }
 
@@ -206,7 +214,8 @@ impl Lab {
         let text = text
             .replace("width_px = 320", "width_px = 96")
             .replace("height_px = 240", "height_px = 72");
-        fs::write(&arena, text).unwrap();
+        let source = if text.contains("[[localization]]") { "" } else { LOCALIZATION };
+        fs::write(&arena, text + source).unwrap();
 
         let keys = KeysFolder::open(Some(&at("server"))).unwrap();
         let fingerprint = Identity::load_or_create(&keys, Owner::Server).unwrap().fingerprint();
@@ -219,7 +228,7 @@ impl Lab {
             Paired::add(&keys, client).unwrap();
         }
         let mut args = words("serve --json --lifeline --quic=127.0.0.1:0 --http=127.0.0.1:0");
-        args.extend(words("--vicon=127.0.0.1:0 --renderer=cpu --max-rate=20"));
+        args.extend(words("--renderer=cpu --max-rate=20"));
         args.push(arena.to_str().unwrap().to_owned());
         args.push(format!("--keys={}", at("server").display()));
         args.push("--leaderboard=none".into());

@@ -1,12 +1,13 @@
 //! The check by hand: poses of a vehicle that somebody carries in, the setting to change out. Sans-IO.
 //!
 //! ```text
-//! it stands -> lift it -> push it forward -> turn it left -> raise its nose
+//! it stands -> lift it -> push it forward -> turn it left -> raise its nose -> (raise its left side)
 //! ```
 //! A motion is over when the vehicle rests again; how far it went does not matter, so that wrong units
 //! are no hindrance. The poses at rest are converted back to the stream's own values, and every setting
-//! that there is (units, axes, nose, order of angles) is tried on it: the smallest change under which
-//! all motions look as they were done is the answer.
+//! that there is (units, axes, body, quaternion, order of angles) is tried on it; where the nose points in
+//! the object follows from the push. The smallest change under which all motions look as they were done
+//! is the answer. The last motion is asked for only where several changes of the same size would do.
 
 use std::collections::VecDeque;
 use std::f64::consts::FRAC_PI_2;
@@ -14,7 +15,7 @@ use std::f64::consts::FRAC_PI_2;
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
 use vizflyt_server::poses::settings::{
-    Axes, Driver, Euler, LocalizationConfig, Nose, Units, UpAxis,
+    Axes, BodyAxes, Driver, Euler, LocalizationConfig, Nose, Offset, Quaternion, Units, UpAxis,
 };
 
 use super::description::direction;
@@ -30,8 +31,10 @@ pub(super) enum Step {
     Push,
     /// turns it left by a quarter,
     Turn,
-    /// and raises its nose.
+    /// and raises its nose;
     Nose,
+    /// its left side only if that was not enough to tell settings apart.
+    Roll,
     /// All was seen.
     Done,
 }
@@ -47,17 +50,11 @@ impl Step {
             }
             Self::Turn => "turn it to the left by a quarter turn, on the spot; hold still",
             Self::Nose => "raise its nose by some 30 degrees; hold still",
+            Self::Roll => {
+                "one more, as several settings would explain that: level it, and raise its left side by \
+                 some 30 degrees; hold still"
+            }
             Self::Done => "that is all",
-        }
-    }
-
-    fn next(self) -> Self {
-        match self {
-            Self::Stand => Self::Lift,
-            Self::Lift => Self::Push,
-            Self::Push => Self::Turn,
-            Self::Turn => Self::Nose,
-            Self::Nose | Self::Done => Self::Done,
         }
     }
 }
@@ -67,9 +64,14 @@ impl Step {
 pub(super) struct Diagnosis {
     /// The faults, in sentences; empty if there are none.
     pub(super) faults: Vec<String>,
-    /// Settings to change: key and value. Empty, too, if none would help.
-    pub(super) change: Vec<(&'static str, String)>,
+    /// Settings to change. Empty, too, if none would help.
+    pub(super) change: Change,
+    /// Other changes of the same size that would explain all that was seen as well.
+    pub(super) others: Vec<Change>,
 }
+
+/// Settings to change: key and value.
+pub(super) type Change = Vec<(&'static str, String)>;
 
 /// Follows the motions.
 #[derive(Debug)]
@@ -111,7 +113,14 @@ impl Check {
         }
         self.rests.push(rest);
         self.window.clear();
-        self.step = self.step.next();
+        self.step = match self.step {
+            Step::Stand => Step::Lift,
+            Step::Lift => Step::Push,
+            Step::Push => Step::Turn,
+            Step::Turn => Step::Nose,
+            Step::Nose if !self.diagnosis().others.is_empty() => Step::Roll,
+            Step::Nose | Step::Roll | Step::Done => Step::Done,
+        };
         true
     }
 
@@ -157,7 +166,7 @@ impl Check {
             // The lift has shown how much a motion is.
             Step::Push => moved > 0.3 * self.lifted(),
             Step::Turn => turned_rad > MIN_TURN_RAD,
-            Step::Nose => turned_rad > MIN_NOSE_RAD,
+            Step::Nose | Step::Roll => turned_rad > MIN_NOSE_RAD,
         }
     }
 
@@ -195,30 +204,79 @@ impl Check {
         if faults.is_empty() {
             return Diagnosis::default();
         }
-        let best = self
-            .trials()
-            .filter(|trial| self::faults(&self.under(trial)).is_empty())
-            .min_by(|a, b| self.cost(a).total_cmp(&self.cost(b)));
-        Diagnosis { faults, change: best.map_or_else(Vec::new, |trial| self.change_to(&trial)) }
+        let mut fitting: Vec<_> = self.trials().flat_map(|trial| self.fit(&trial)).collect();
+        fitting.sort_by(|a, b| self.cost(a).total_cmp(&self.cost(b)));
+        let Some(&best) = fitting.first() else {
+            return Diagnosis { faults, ..Default::default() };
+        };
+        let change = self.change_to(&best);
+        let mut told = vec![best];
+        for trial in fitting {
+            let is_as_small = self.change_to(&trial).len() == change.len();
+            // Orders of angles that differ by less than hands show are told apart by what vendors use.
+            let is_usual = USUAL_EULERS.contains(&trial.euler) || trial.euler == best.euler;
+            if is_as_small && is_usual && told.iter().all(|other| !self.is_same(other, &trial)) {
+                told.push(trial);
+            }
+        }
+        let others = told[1..].iter().map(|trial| self.change_to(trial)).collect();
+        Diagnosis { faults, change, others }
     }
 
-    /// Returns every combination of settings.
+    /// Returns every combination of settings but for the nose.
     fn trials(&self) -> impl Iterator<Item = Trial> {
-        let vicon = self.config.driver == Driver::Vicon;
-        let eulers = if vicon { &Euler::ALL[..] } else { &Euler::ALL[..1] };
-        Units::ALL.into_iter().flat_map(move |units| {
-            Axes::all().flat_map(move |axes| {
-                Nose::ALL.into_iter().flat_map(move |nose| {
-                    eulers.iter().map(move |&euler| Trial { units, axes, nose, euler })
+        let driver = self.config.driver;
+        let eulers = if driver == Driver::Vicon { &Euler::ALL[..] } else { &Euler::ALL[..1] };
+        let quaternions = &Quaternion::ALL[..if driver.has_quaternions() { 4 } else { 1 }];
+        let laid = Axes::all().flat_map(|axes| {
+            // A mirror has no body by name.
+            let bodies = &BodyAxes::ALL[..if axes.is_mirror() { 1 } else { 3 }];
+            bodies.iter().map(move |&body| (axes, body))
+        });
+        laid.flat_map(move |(axes, body)| {
+            quaternions.iter().flat_map(move |&quaternion| {
+                eulers.iter().flat_map(move |&euler| {
+                    Units::ALL.into_iter().map(move |units| Trial {
+                        units,
+                        axes,
+                        body,
+                        quaternion,
+                        nose: Nose::default(),
+                        euler,
+                    })
                 })
             })
         })
+    }
+
+    /// Returns a combination with every nose, named or as the push shows it, under which all looks as it was
+    /// done.
+    fn fit(&self, trial: &Trial) -> Vec<Trial> {
+        let rests = self.under(trial);
+        // With the nose along x: the rest of it turns nothing but the body about its own up.
+        if !stands_and_rises(&rests) {
+            return Vec::new();
+        }
+        let [_, lifted, pushed, ..] = &*rests else { return Vec::new() };
+        let (ahead_world, body) = push(lifted, pushed);
+        let ahead = body.conjugate() * ahead_world;
+        let seen = Nose::from_deg(ahead.y.atan2(ahead.x).to_degrees().round());
+        let mut noses = vec![self.config.nose];
+        noses.extend(Nose::NAMED.into_iter().filter(|nose| *nose != self.config.nose));
+        // A hand pushes no straighter: what has a name is meant.
+        if noses.iter().all(|nose| apart_deg(*nose, seen) > STRAIGHT_DEG) {
+            noses.push(seen);
+        }
+        let turned = noses.into_iter().map(|nose| Trial { nose, ..*trial });
+        turned.filter(|trial| faults(&self.under(trial)).is_empty()).collect()
     }
 
     fn now(&self) -> Trial {
         Trial {
             units: self.config.units.unwrap_or(self.config.driver.usual_units()),
             axes: self.config.stream_axes(),
+            body: self.config.body,
+            quaternion: self.config.quaternion,
             nose: self.config.nose,
             euler: self.config.euler.unwrap_or_default(),
         }
@@ -226,22 +284,59 @@ impl Check {
 
     /// Returns the rests as other settings had made them.
     fn under(&self, trial: &Trial) -> Vec<Pose<World, Body>> {
-        let mut config = self.config.clone();
-        (config.units, config.up, config.axes) = (Some(trial.units), None, Some(trial.axes));
-        config.nose = trial.nose;
-        let (was, would) = (self.config.alignment(), config.alignment());
-        let reread = |rotation: DQuat| {
-            if self.config.driver == Driver::Vicon {
-                trial.euler.rotation(self.now().euler.angles(rotation))
-            } else {
-                rotation
-            }
-        };
+        let (was, would) = (self.config.alignment(), self.with(trial).alignment());
         let again = |pose: &Pose<World, Body>| {
             let (p_stream, rotation) = was.streamed(pose);
-            would.world_from_body(p_stream, reread(rotation))
+            would.world_from_body(p_stream, self.reread(trial, rotation))
         };
         self.rests.iter().map(again).collect()
+    }
+
+    /// Returns the settings with a trial's in their place.
+    fn with(&self, trial: &Trial) -> LocalizationConfig {
+        LocalizationConfig {
+            units: Some(trial.units),
+            up: None,
+            axes: Some(trial.axes),
+            body: trial.body,
+            quaternion: trial.quaternion,
+            nose: trial.nose,
+            ..self.config.clone()
+        }
+    }
+
+    /// Returns a streamed rotation with its angles in a trial's order.
+    fn reread(&self, trial: &Trial, rotation: DQuat) -> DQuat {
+        if self.config.driver == Driver::Vicon {
+            trial.euler.rotation(self.now().euler.angles(rotation))
+        } else {
+            rotation
+        }
+    }
+
+    /// Whether two trials make the same poses of any stream, but for which wall is called x, which nobody's
+    /// carrying shows, and for noses within a push of each other.
+    fn is_same(&self, a: &Trial, b: &Trial) -> bool {
+        let nose = if apart_deg(a.nose, b.nose) > STRAIGHT_DEG { b.nose } else { a.nose };
+        let b = Trial { nose, ..*b };
+        let poses = |trial: &Trial| {
+            let config = self.with(trial);
+            let config =
+                LocalizationConfig { offset: Offset::default(), pivot_m: DVec3::ZERO, ..config };
+            PROBES.map(|[x, y, z]| {
+                let axis = DVec3::new(x, y, z);
+                let rotation = self.reread(trial, DQuat::from_scaled_axis(axis));
+                config.alignment().world_from_body(axis, rotation)
+            })
+        };
+        let (a, b) = (poses(a), poses(&b));
+        let turn = (b[0].rotation * a[0].rotation.conjugate()).normalize();
+        turn.mul_vec3(DVec3::Z).z > 1.0 - SAME
+            && a.iter().zip(&b).all(|(a, b)| {
+                let off_m = (turn * a.translation_m - b.translation_m).length();
+                let agrees = (turn * a.rotation).dot(b.rotation).abs() > 1.0 - SAME;
+                agrees && off_m <= SAME * b.translation_m.length()
+            })
     }
 
     /// How much a trial changes: one for each setting, a little for what is less usual.
@@ -251,8 +346,16 @@ impl Check {
         if trial.units != now.units {
             cost += 1.0;
         }
+        if trial.quaternion != now.quaternion {
+            cost += 1.0 + 0.02 * trial.quaternion as u8 as f64;
+        }
+        if trial.body != now.body {
+            let usual = [BodyAxes::Flu, BodyAxes::Frd, BodyAxes::Stream];
+            let place = usual.iter().position(|body| *body == trial.body);
+            cost += 1.0 + 0.02 * place.unwrap_or(usual.len()) as f64;
+        }
         if trial.nose != now.nose {
-            cost += 1.0;
+            cost += 1.0 + if Nose::NAMED.contains(&trial.nose) { 0.0 } else { 0.1 };
         }
         if trial.axes != now.axes {
             let usual = [UpAxis::Z.axes(), UpAxis::Y.axes()].contains(&trial.axes);
@@ -261,15 +364,13 @@ impl Check {
                 + if trial.axes.is_mirror() { 0.2 } else { 0.0 };
         }
         if trial.euler != now.euler {
-            // Vendors use these; the others are tried as well.
-            let usual = [Euler::Xyz, Euler::Zyx, Euler::Vector];
-            let place = usual.iter().position(|euler| *euler == trial.euler);
-            cost += 1.0 + 0.05 * place.unwrap_or(usual.len()) as f64;
+            let place = USUAL_EULERS.iter().position(|euler| *euler == trial.euler);
+            cost += 1.0 + 0.05 * place.unwrap_or(USUAL_EULERS.len()) as f64;
         }
         cost
     }
 
-    fn change_to(&self, trial: &Trial) -> Vec<(&'static str, String)> {
+    fn change_to(&self, trial: &Trial) -> Change {
         let now = self.now();
         let mut change = Vec::new();
         if trial.units != now.units {
@@ -286,6 +387,12 @@ impl Check {
                 axes => ("axes", axes.to_string()),
             });
         }
+        if trial.body != now.body {
+            change.push(("body", trial.body.to_string()));
+        }
+        if trial.quaternion != now.quaternion {
+            change.push(("quaternion", trial.quaternion.to_string()));
+        }
         if trial.nose != now.nose {
             change.push(("nose", trial.nose.to_string()));
         }
@@ -301,13 +408,33 @@ impl Check {
 struct Trial {
     units: Units,
     axes: Axes,
+    body: BodyAxes,
+    quaternion: Quaternion,
     nose: Nose,
     euler: Euler,
 }
 
+/// Returns how far a vehicle was pushed, and its mean attitude on the way. [m, world]
+fn push(lifted: &Pose<World, Body>, pushed: &Pose<World, Body>) -> (DVec3, DQuat) {
+    let ahead = pushed.translation_m - lifted.translation_m;
+    (ahead, lifted.rotation.slerp(pushed.rotation, 0.5))
+}
+
+/// Returns the angle between two noses. [deg]
+fn apart_deg(a: Nose, b: Nose) -> f64 {
+    wrap_pi((a.deg() - b.deg()).to_radians()).abs().to_degrees()
+}
+
+/// Whether it stands with its up up, and was lifted upwards.
+fn stands_and_rises(rests: &[Pose<World, Body>]) -> bool {
+    let [stood, lifted, ..] = rests else { return false };
+    let lift = lifted.translation_m - stood.translation_m;
+    stood.rotate(DVec3::Z).z > NEARLY && lift.z > NEARLY * lift.length()
+}
+
 /// Returns what does not look as it was done.
 fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
-    let [stood, lifted, pushed, turned, raised] = rests else {
+    let [stood, lifted, pushed, turned, raised, rolled @ ..] = rests else {
         return vec!["not all was done".to_owned()];
     };
     let mut faults = Vec::new();
@@ -325,9 +452,9 @@ fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
     if !(HAND_M.0..HAND_M.1).contains(&lift.length()) {
         faults.push(format!("lifted by half a metre or so, it went {}", length(lift.length())));
     }
-    let push = pushed.translation_m - lifted.translation_m;
-    let nose = pushed.rotate(DVec3::X);
-    if !(push.dot(nose) > NEARLY * push.length()) {
+    let (push, body) = push(lifted, pushed);
+    let nose = body * DVec3::X;
+    if !(push.dot(nose) > STRAIGHT_DEG.to_radians().cos() * push.length()) {
         faults.push(format!(
             "pushed the way its nose points, it went along {}, while its nose points {}",
             direction(push),
@@ -350,6 +477,16 @@ fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
             nose_z.clamp(-1.0, 1.0).asin().to_degrees(),
             side_z.clamp(-1.0, 1.0).asin().to_degrees()
         ));
+    }
+    if let [rolled, ..] = rolled {
+        let (nose_z, side_z) = (rolled.rotate(DVec3::X).z, rolled.rotate(DVec3::Y).z);
+        if !(side_z > MIN_NOSE_RAD.sin() * 0.8 && nose_z.abs() < 0.5 * side_z) {
+            faults.push(format!(
+                "with its left side raised, that points {:.0} degrees up and its nose {:.0}",
+                side_z.clamp(-1.0, 1.0).asin().to_degrees(),
+                nose_z.clamp(-1.0, 1.0).asin().to_degrees()
+            ));
+        }
     }
     faults
 }
@@ -374,8 +511,17 @@ const MIN_NOSE_RAD: f64 = 0.21;
 const QUARTER_OFF_RAD: f64 = 0.61;
 /// Cosine of 30 degrees: so far a hand's motion may be off an axis.
 const NEARLY: f64 = 0.866;
-/// What "half a metre or so" may be. [m]
-const HAND_M: (f64, f64) = (0.12, 2.5);
+/// Vendors use these; the others are tried as well.
+const USUAL_EULERS: [Euler; 3] = [Euler::Xyz, Euler::Zyx, Euler::Vector];
+/// So straight does a hand push. [deg]
+const STRAIGHT_DEG: f64 = 15.0;
+/// Relative difference of what is the same.
+const SAME: f64 = 1e-6;
+/// Axes times angles, and places, by which combinations of settings are told apart; of no symmetry.
+const PROBES: [[f64; 3]; 4] =
+    [[0.3, -0.7, 1.1], [1.9, 0.2, -0.4], [-0.6, 1.3, 0.5], [0.1, 0.4, -2.3]];
+/// What "half a metre or so" may be; centimetres and millimetres are a factor of ten apart. [m]
+const HAND_M: (f64, f64) = (0.15, 1.5);
 
 #[cfg(test)]
 mod tests;

@@ -141,11 +141,14 @@ impl Sources {
         let (socket, shared) = listen(truth_at)?;
         let address = socket.local_addr().context("tags: the socket of the truth")?;
         spawn_listener(socket, Arc::clone(&shared), setup.object.clone(), Arc::clone(stop));
-        for (index, camera) in setup.cameras.iter().enumerate() {
-            let sensor = setup.simulated.sensor(index, setup.cameras.len());
+        let as_stated = (&setup.cameras, &setup.layouts);
+        let (cameras, layouts) =
+            setup.truth.as_ref().map_or(as_stated, |truth| (&truth.cameras, &truth.layouts));
+        for (index, camera) in cameras.iter().enumerate() {
+            let sensor = setup.simulated.sensor(index, cameras.len());
             let camera = SimulatedCamera::new(camera.clone(), sensor);
             let (shared, mailbox) = (Arc::clone(&shared), Arc::clone(&self.mailbox));
-            let (layouts, stop) = (setup.layouts.clone(), Arc::clone(stop));
+            let (layouts, stop) = (layouts.clone(), Arc::clone(stop));
             std::thread::spawn(move || {
                 draw(index, camera, &layouts, &shared, &mailbox, &stop);
             });

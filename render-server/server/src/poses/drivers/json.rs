@@ -9,10 +9,12 @@
 //! CLOCK_MONOTONIC (`"clock": "server"`), or of any clock of the sender's (`"sender"`, also if
 //! nothing is given), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
 //! rhythm; without either, a pose is as old as its arrival. `quality` is what `vizflyt tags locate` saw:
-//! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. What else the object
-//! holds is ignored.
+//! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. `notes` are sentences for people,
+//! `["left camera moved by 2.4 cm: survey again"]`, in each packet for as long as they are true: the page shows each once.
+//! What else the object holds is ignored.
 
 use std::borrow::Cow;
+use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use glam::{DQuat, DVec3};
@@ -56,6 +58,9 @@ pub struct PosePacket<'a> {
     /// What the pose rests on, if that is tags.
     #[serde(default, deserialize_with = "tags_if_any")]
     pub quality: Option<TagsSeen>,
+    /// What its sender has to tell people.
+    #[serde(borrow, default)]
+    pub notes: Vec<Cow<'a, str>>,
 }
 
 /// Reads the `quality` of `vizflyt tags locate`; what another program means by `quality` is its own affair.
@@ -146,6 +151,7 @@ pub struct JsonStream {
     clocks: Vec<SenderClock>,
     /// What the newest pose of each vehicle rests on.
     tags: Vec<Option<TagsSeen>>,
+    notes: Notes,
     warned_of_clock: bool,
 }
 
@@ -155,7 +161,7 @@ impl JsonStream {
         let names = VehicleNames::new(config, source, vehicles);
         let clocks = vec![SenderClock::default(); names.len()];
         let tags = vec![None; names.len()];
-        Self { names, clocks, tags, warned_of_clock: false }
+        Self { names, clocks, tags, notes: Notes::default(), warned_of_clock: false }
     }
 
     fn stamp(&mut self, vehicle: usize, packet: &PosePacket<'_>, now: ServerTime) -> ServerTime {
@@ -221,6 +227,11 @@ impl PoseStream for JsonStream {
             self.names.others(std::iter::once(&*packet.object), advice);
             return &[];
         };
+        for note in &packet.notes {
+            if let Some(note) = self.notes.news(note, now) {
+                self.names.warn(format!("{}: {note}", packet.object));
+            }
+        }
         let order = packet.seq.map(|seq| self.names.is_next(vehicle, seq as u32, now));
         match order {
             Some(FrameOrder::Old) => return &[],
@@ -262,6 +273,49 @@ impl PoseStream for JsonStream {
     }
 }
 
+/// Which notes of senders people know already.
+#[derive(Debug, Default)]
+struct Notes {
+    /// Without its numbers, and when it came last.
+    told: VecDeque<(String, ServerTime)>,
+    told_at: Option<ServerTime>,
+}
+
+impl Notes {
+    /// Returns a note as it is to be shown, unless it was not long ago but for its numbers.
+    fn news(&mut self, note: &str, now: ServerTime) -> Option<String> {
+        let printable = note.chars().filter(|c| !c.is_control()).take(MAX_NOTE);
+        let note: String = printable.collect();
+        let stem: String = note.chars().filter(|c| !(c.is_ascii_digit() || *c == '.')).collect();
+        if let Some((_, last)) = self.told.iter_mut().find(|(told, _)| *told == stem) {
+            let is_known = now.seconds_since(*last) < FORGOTTEN_S;
+            *last = now;
+            if is_known {
+                return None;
+            }
+        } else {
+            // Whoever can send poses must not flood the page.
+            if self.told_at.is_some_and(|at| now.seconds_since(at) < NOTES_APART_S) {
+                return None;
+            }
+            if self.told.len() == MAX_NOTES {
+                self.told.pop_front();
+            }
+            self.told.push_back((stem, now));
+        }
+        self.told_at = Some(now);
+        Some(note)
+    }
+}
+
+/// Longest note. [characters]
+const MAX_NOTE: usize = 160;
+/// So many are remembered.
+const MAX_NOTES: usize = 16;
+/// One that has not come for so long is news again. [s]
+const FORGOTTEN_S: f64 = 30.0;
+/// New ones are this far apart; others wait for a later packet. [s]
+const NOTES_APART_S: f64 = 0.5;
 /// The default sender.
 const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
 /// No lab is a thousand kilometres wide, not in millimetres either.

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! datagrams -> udp (socket, arrival stamp) -> vicon, natnet, json, mavlink (bytes -> objects)
+//! bytes ----> vrpn::connection (TCP, arrival stamp) -> vrpn
 //!           -> vehicle_names (which vehicle's; into the world frame; counters; what is odd)
 //!           -> frame_clock, sender_clock (stamp without the network's jitter)
 //!           -> Measurements -> multi_source (where there are several) -> pose thread
@@ -19,6 +20,7 @@ mod source;
 pub mod udp;
 mod vehicle_names;
 pub mod vicon;
+pub mod vrpn;
 
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs};
 
@@ -31,14 +33,25 @@ use self::natnet::{COMMAND_PORT, Motive, NatnetStream};
 pub use self::source::{Measurement, PoseSource, SourceCounters, TagsSeen};
 use self::udp::UdpPort;
 use self::vicon::ViconStream;
+use self::vrpn::VrpnStream;
+use self::vrpn::connection::VrpnPoses;
 use crate::poses::settings::{Driver, LocalizationConfig};
 
 /// A source whose address is taken, and which waits for the names of the vehicles.
 #[derive(Debug)]
 pub struct Opened {
     config: LocalizationConfig,
-    port: UdpPort,
-    motive: Motive,
+    port: Port,
+}
+
+/// Where a driver's stream arrives, or is fetched.
+#[derive(Debug)]
+enum Port {
+    Vicon(UdpPort),
+    Natnet(UdpPort, Motive),
+    Json(UdpPort),
+    Mavlink(UdpPort),
+    Vrpn(SocketAddr),
 }
 
 /// Takes the addresses of sources, in their order.
@@ -70,28 +83,26 @@ impl Opened {
     fn open(config: &LocalizationConfig) -> Result<Self> {
         let driver = config.driver;
         let mut config = config.clone();
-        if driver == Driver::Natnet && !config.address().contains(':') {
-            config.address = Some(format!("{}:{COMMAND_PORT}", config.address()));
+        let usual_port = match driver {
+            Driver::Natnet => Some(COMMAND_PORT),
+            Driver::Vrpn => Some(vrpn::PORT),
+            Driver::Vicon | Driver::Json | Driver::Mavlink => None,
+        };
+        if let Some(port) = usual_port.filter(|_| !config.address().contains(':')) {
+            config.address = Some(format!("{}:{port}", config.address()));
         }
         let at = address(&config)?;
-        let (port, motive) = match (driver, at) {
-            (Driver::Vicon | Driver::Json | Driver::Mavlink, _) => {
-                (UdpPort::bind(driver, at)?, Motive::Multicast)
+        let port = match driver {
+            Driver::Vicon => Port::Vicon(UdpPort::bind(driver, at)?),
+            Driver::Json => Port::Json(UdpPort::bind(driver, at)?),
+            Driver::Mavlink => Port::Mavlink(UdpPort::bind(driver, at)?),
+            Driver::Natnet => {
+                let (port, motive) = open_natnet(&config, at)?;
+                Port::Natnet(port, motive)
             }
-            (Driver::Natnet, SocketAddr::V4(group)) if group.ip().is_multicast() => {
-                let interface = config.interface.unwrap_or(Ipv4Addr::UNSPECIFIED);
-                let port = UdpPort::join(driver, *group.ip(), group.port(), interface)?;
-                (port, Motive::Multicast)
-            }
-            (Driver::Natnet, server) => {
-                let any: SocketAddr = match server {
-                    SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
-                    SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
-                };
-                (UdpPort::bind(driver, any)?, Motive::Unicast(server))
-            }
+            Driver::Vrpn => Port::Vrpn(at),
         };
-        Ok(Self { config, port, motive })
+        Ok(Self { config, port })
     }
 
     /// Returns who sends.
@@ -101,28 +112,57 @@ impl Opened {
 
     /// Returns where its stream must be sent, if it arrives at a socket of ours unasked.
     pub fn socket(&self) -> Option<SocketAddr> {
-        (self.motive == Motive::Multicast).then_some(self.port.address())
+        match &self.port {
+            Port::Vicon(port)
+            | Port::Json(port)
+            | Port::Mavlink(port)
+            | Port::Natnet(port, Motive::Multicast) => Some(port.address()),
+            Port::Natnet(_, Motive::Unicast(_)) | Port::Vrpn(_) => None,
+        }
     }
 
     /// Returns where it arrives or is asked for, for people.
     pub fn address(&self) -> String {
-        match self.motive {
-            Motive::Multicast => self.port.address().to_string(),
-            Motive::Unicast(server) => server.to_string(),
+        match &self.port {
+            Port::Natnet(_, Motive::Unicast(server)) | Port::Vrpn(server) => *server,
+            Port::Vicon(port)
+            | Port::Json(port)
+            | Port::Mavlink(port)
+            | Port::Natnet(port, Motive::Multicast) => port.address(),
         }
+        .to_string()
     }
 
     fn track(self, source: u8, vehicles: &[&str]) -> Box<dyn PoseSource> {
-        let Self { config, port, motive } = self;
-        match config.driver {
-            Driver::Json => Box::new(port.with(JsonStream::new(&config, source, vehicles))),
-            Driver::Natnet => {
-                Box::new(port.with(NatnetStream::new(&config, source, vehicles, motive)))
+        let config = &self.config;
+        match self.port {
+            Port::Vicon(port) => Box::new(port.with(ViconStream::new(config, source, vehicles))),
+            Port::Natnet(port, motive) => {
+                Box::new(port.with(NatnetStream::new(config, source, vehicles, motive)))
             }
-            Driver::Mavlink => Box::new(port.with(MavlinkStream::new(&config, source, vehicles))),
-            Driver::Vicon => Box::new(port.with(ViconStream::new(&config, source, vehicles))),
+            Port::Json(port) => Box::new(port.with(JsonStream::new(config, source, vehicles))),
+            Port::Mavlink(port) => {
+                Box::new(port.with(MavlinkStream::new(config, source, vehicles)))
+            }
+            Port::Vrpn(server) => {
+                Box::new(VrpnPoses::new(server, VrpnStream::new(config, source, vehicles)))
+            }
         }
     }
+}
+
+/// Joins Motive's multicast group, or makes a socket from which it is asked to stream to us alone.
+fn open_natnet(config: &LocalizationConfig, at: SocketAddr) -> Result<(UdpPort, Motive)> {
+    let any: SocketAddr = match at {
+        SocketAddr::V4(group) if group.ip().is_multicast() => {
+            let interface = config.interface.unwrap_or(Ipv4Addr::UNSPECIFIED);
+            let port = UdpPort::join(Driver::Natnet, *group.ip(), group.port(), interface)?;
+            return Ok((port, Motive::Multicast));
+        }
+        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+    };
+    Ok((UdpPort::bind(Driver::Natnet, any)?, Motive::Unicast(at)))
 }
 
 /// Returns a source's address, HOST:PORT, resolved.
@@ -130,4 +170,24 @@ fn address(config: &LocalizationConfig) -> Result<SocketAddr> {
     let (driver, text) = (config.driver, config.address());
     let advice = || format!("{driver}: '{text}' is no HOST:PORT, as {}", driver.usual_address());
     text.to_socket_addrs().with_context(advice)?.next().with_context(advice)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_asked_has_a_usual_port_and_no_socket() {
+        for (pose, address) in [
+            ("natnet:10.0.0.5", "10.0.0.5:1510"),
+            ("vrpn:10.0.0.5", "10.0.0.5:3883"),
+            ("vrpn:10.0.0.5:4000", "10.0.0.5:4000"),
+            ("vrpn", "127.0.0.1:3883"),
+        ] {
+            let opened = open(&[LocalizationConfig::parse(pose).unwrap()]).unwrap();
+            assert_eq!((opened[0].address().as_str(), opened[0].socket()), (address, None));
+        }
+        let opened = open(&[LocalizationConfig::parse("json:127.0.0.1:0").unwrap()]).unwrap();
+        assert_eq!(opened[0].socket().unwrap().to_string(), opened[0].address());
+    }
 }

@@ -174,13 +174,12 @@ impl VehicleNames {
         let alignment = &self.alignment;
         let sigma = sigma.map(|sigma| {
             let turn = DMat3::from_rotation_z(alignment.offset.yaw_deg.to_radians());
-            let body = DMat3::from_quat(alignment.nose.object_from_body().conjugate());
             PoseSigma {
                 position_m: spread(
                     turn * alignment.axes.matrix(),
                     sigma.position_m * alignment.unit_m,
                 ),
-                rotation_rad: spread(body * alignment.axes.matrix(), sigma.rotation_rad),
+                rotation_rad: spread(alignment.body_from_object(), sigma.rotation_rad),
             }
         });
         self.objects[vehicle].counters.poses += 1;

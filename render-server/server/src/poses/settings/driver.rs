@@ -19,6 +19,8 @@ pub enum Driver {
     Json,
     /// An autopilot's own estimate over MAVLink.
     Mavlink,
+    /// Any server of the Virtual-Reality Peripheral Network, over TCP.
+    Vrpn,
 }
 
 /// What is known of a driver without its code.
@@ -32,7 +34,7 @@ struct Entry {
 }
 
 /// One line for each driver.
-const REGISTRY: [Entry; 4] = [
+const REGISTRY: [Entry; 5] = [
     Entry {
         driver: Driver::Vicon,
         name: "vicon",
@@ -65,6 +67,14 @@ const REGISTRY: [Entry; 4] = [
         usual_units: Units::Metres,
         own_keys: &[],
     },
+    Entry {
+        driver: Driver::Vrpn,
+        name: "vrpn",
+        // A server is asked: one on this computer.
+        usual_address: "127.0.0.1:3883",
+        usual_units: Units::Metres,
+        own_keys: &[("sensor", "only VRPN's trackers have sensors")],
+    },
 ];
 
 impl Driver {
@@ -88,7 +98,7 @@ impl Driver {
         self.entry().name
     }
 
-    /// Returns the address at which its stream usually arrives.
+    /// Returns the address at which its stream usually arrives, or is asked for.
     pub fn usual_address(self) -> &'static str {
         self.entry().usual_address
     }
@@ -96,6 +106,11 @@ impl Driver {
     /// Returns the length unit that it has unless somebody changed it.
     pub fn usual_units(self) -> Units {
         self.entry().usual_units
+    }
+
+    /// Whether its attitudes come as quaternions whose order is the sender's affair: MAVLink's is the standard's.
+    pub fn has_quaternions(self) -> bool {
+        !matches!(self, Self::Vicon | Self::Mavlink)
     }
 
     /// Returns why a key of `[[localization]]` is refused for this driver; `None` if it is not.

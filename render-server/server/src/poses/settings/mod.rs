@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! stream's position * units -> axes -> offset ----------------> position  [m, world]
-//! stream's rotation (euler) -> axes on both sides -> nose -----> attitude  (body to world)
+//! stream's rotation (euler, quaternion) -> axes, body -> nose --> attitude  (body to world)
 //! ```
 //! Each setting is something a person can see in the room, so that `vizflyt doctor localization`
 //! can name the one to change.
@@ -46,7 +46,13 @@ pub struct LocalizationConfig {
     /// Vicon: the order in which its three angles turn about the fixed axes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub euler: Option<Euler>,
-    /// Which of the object's axes points along the vehicle's nose; x by default.
+    /// NatNet, JSON: how the four numbers of a quaternion are meant.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub quaternion: Quaternion,
+    /// How the object's own axes are laid; as the stream's by default.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub body: BodyAxes,
+    /// Where the vehicle's nose points in the object's level axes; along x by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub nose: Nose,
     /// Where the stream's origin is in the world, and how it is turned there.
@@ -65,6 +71,9 @@ pub struct LocalizationConfig {
     /// NatNet by multicast: our address in the network that it comes from, where there are several.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub interface: Option<Ipv4Addr>,
+    /// VRPN: which sensor of a tracker the vehicle is; 0 by default.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<u16>,
 }
 
 /// A length unit.
@@ -207,7 +216,7 @@ macro_rules! as_text {
         }
     )*};
 }
-as_text!(Axes, Euler, Nose);
+as_text!(Axes, Euler, Quaternion);
 
 /// How three angles about x, y and z make a rotation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -298,38 +307,141 @@ impl FromStr for Euler {
     }
 }
 
-/// Which of the object's level axes points along the vehicle's nose.
+/// How a quaternion's four numbers are meant. Its reader takes them as x, y, z, w of the rotation of the
+/// object's axes into the stream's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Nose {
-    /// `x`: the object's axes are the body's.
+pub enum Quaternion {
+    /// `xyzw`: just so.
     #[default]
-    PlusX,
-    /// `y`
-    PlusY,
-    /// `-x`
-    MinusX,
-    /// `-y`
-    MinusY,
+    Xyzw,
+    /// `wxyz`: w comes first, as Eigen's constructor, MAVLink and PX4 have it.
+    Wxyz,
+    /// `xyzw-inverse`: the conjugate, the stream's axes into the object's.
+    XyzwInverse,
+    /// `wxyz-inverse`: both.
+    WxyzInverse,
 }
 
-impl Nose {
-    /// Every one, counter-clockwise.
-    pub const ALL: [Self; 4] = [Self::PlusX, Self::PlusY, Self::MinusX, Self::MinusY];
+impl Quaternion {
+    /// Every way.
+    pub const ALL: [Self; 4] = [Self::Xyzw, Self::Wxyz, Self::XyzwInverse, Self::WxyzInverse];
 
     /// Returns the name by which it is chosen.
     pub fn name(self) -> &'static str {
-        ["x", "y", "-x", "-y"][self as usize]
+        ["xyzw", "wxyz", "xyzw-inverse", "wxyz-inverse"][self as usize]
     }
 
-    /// Returns the rotation of body axes into the object's.
+    /// Returns the rotation that is meant by four numbers as they came, taken as x, y, z, w.
+    ///
+    /// ```
+    /// use glam::DQuat;
+    /// use vizflyt_server::poses::settings::Quaternion;
+    /// // A half turn about z is (0, 0, 1, 0), written with w first (0, 0, 0, 1).
+    /// let came = DQuat::from_xyzw(0.0, 0.0, 0.0, 1.0);
+    /// assert_eq!(Quaternion::Wxyz.rotation(came), DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0));
+    /// ```
+    pub fn rotation(self, came: DQuat) -> DQuat {
+        let [a, b, c, d] = came.to_array();
+        match self {
+            Self::Xyzw => came,
+            Self::Wxyz => DQuat::from_xyzw(b, c, d, a),
+            Self::XyzwInverse => came.conjugate(),
+            Self::WxyzInverse => DQuat::from_xyzw(-b, -c, -d, a),
+        }
+    }
+
+    /// Returns the four numbers as they come for a rotation: the way back.
+    pub fn streamed(self, rotation: DQuat) -> DQuat {
+        let meant = match self {
+            Self::Xyzw | Self::Wxyz => rotation,
+            Self::XyzwInverse | Self::WxyzInverse => rotation.conjugate(),
+        };
+        match self {
+            Self::Xyzw | Self::XyzwInverse => meant,
+            Self::Wxyz | Self::WxyzInverse => DQuat::from_xyzw(meant.w, meant.x, meant.y, meant.z),
+        }
+    }
+}
+
+impl fmt::Display for Quaternion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Quaternion {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|quaternion| quaternion.name() == text);
+        found.ok_or_else(|| format!("'{text}': write {}", Self::ALL.map(Self::name).join(", ")))
+    }
+}
+
+/// How the object's own axes are laid in the vehicle, before `nose` turns them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BodyAxes {
+    /// As the stream's lie in the room while it stands: that axis up that points up there, as a motion capture
+    /// lays an object's axes when it is made.
+    #[default]
+    Stream,
+    /// x forward, y left, z up, whatever the stream's axes.
+    Flu,
+    /// x forward, y right, z down, as autopilots have it, whatever the stream's axes.
+    Frd,
+}
+
+impl BodyAxes {
+    /// Every way.
+    pub const ALL: [Self; 3] = [Self::Stream, Self::Flu, Self::Frd];
+}
+
+impl fmt::Display for BodyAxes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Stream => "stream",
+            Self::Flu => "flu",
+            Self::Frd => "frd",
+        })
+    }
+}
+
+/// Where the vehicle's nose points in the object's level axes: counter-clockwise from their x, seen from above.
+/// `x`, `y`, `-x` and `-y` are 0, 90, 180 and -90 degrees.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Nose {
+    deg: f64,
+}
+
+impl Nose {
+    /// Those with a name, counter-clockwise from x.
+    pub const NAMED: [Self; 4] =
+        [Self { deg: 0.0 }, Self { deg: 90.0 }, Self { deg: 180.0 }, Self { deg: -90.0 }];
+
+    /// Makes one from its angle. [deg]
+    pub fn from_deg(deg: f64) -> Self {
+        Self { deg }
+    }
+
+    /// Returns its angle. [deg]
+    pub fn deg(self) -> f64 {
+        self.deg
+    }
+
+    /// Returns the rotation of body axes into the object's level ones.
     pub fn object_from_body(self) -> DQuat {
-        DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2 * f64::from(self as u8))
+        DQuat::from_rotation_z(self.deg.to_radians())
     }
 }
 
 impl fmt::Display for Nose {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+        let named = Self::NAMED.iter().position(|nose| nose == self);
+        match named {
+            Some(index) => f.write_str(["x", "y", "-x", "-y"][index]),
+            None => write!(f, "{}", self.deg),
+        }
     }
 }
 
@@ -337,8 +449,48 @@ impl FromStr for Nose {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let found = Self::ALL.into_iter().find(|nose| nose.name() == text);
-        found.ok_or_else(|| format!("'{text}': write x, y, -x or -y"))
+        let named = Self::NAMED.into_iter().find(|nose| nose.to_string() == text);
+        let read = || text.parse().ok().map(Self::from_deg);
+        named.or_else(read).ok_or_else(|| format!("'{text}': {NOSE_IS}"))
+    }
+}
+
+impl Serialize for Nose {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if Self::NAMED.contains(self) {
+            serializer.collect_str(self)
+        } else {
+            serializer.serialize_f64(self.deg)
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Nose {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(NoseVisitor)
+    }
+}
+
+/// Reads a name or a number.
+struct NoseVisitor;
+
+impl serde::de::Visitor<'_> for NoseVisitor {
+    type Value = Nose;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("x, y, -x, -y or degrees from the object's x")
+    }
+
+    fn visit_str<E: serde::de::Error>(self, text: &str) -> Result<Nose, E> {
+        text.parse().map_err(E::custom)
+    }
+
+    fn visit_f64<E: serde::de::Error>(self, deg: f64) -> Result<Nose, E> {
+        Ok(Nose::from_deg(deg))
+    }
+
+    fn visit_i64<E: serde::de::Error>(self, deg: i64) -> Result<Nose, E> {
+        Ok(Nose::from_deg(deg as f64))
     }
 }
 
@@ -359,6 +511,10 @@ pub struct Alignment {
     pub unit_m: f64,
     /// The stream's axes.
     pub axes: Axes,
+    /// How its quaternions are meant.
+    pub quaternion: Quaternion,
+    /// The object's axes.
+    pub body: BodyAxes,
     /// The object's nose.
     pub nose: Nose,
     /// The stream's origin.
@@ -385,8 +541,12 @@ impl Alignment {
         let turn = DQuat::from_rotation_z(self.offset.yaw_deg.to_radians());
         let axes = self.axes.matrix();
         let p_m = turn * (axes * (p_stream * self.unit_m)) + self.offset.position_m;
-        let rotation = (turn * conjugated(axes, stream_from_object) * self.nose.object_from_body())
-            .normalize();
+        let stream_from_object = self.quaternion.rotation(stream_from_object);
+        let world_from_level = match self.object_from_flu() {
+            None => conjugated(axes, stream_from_object),
+            Some(laid) => DQuat::from_mat3(&axes) * stream_from_object * laid,
+        };
+        let rotation = (turn * world_from_level * self.nose.object_from_body()).normalize();
         Pose::new(p_m - rotation * self.pivot_m, rotation)
     }
 
@@ -396,7 +556,30 @@ impl Alignment {
         let back = self.axes.matrix().transpose();
         let p_m = pose.translation_m + pose.rotation * self.pivot_m - self.offset.position_m;
         let rotation = turn * pose.rotation * self.nose.object_from_body().conjugate();
-        (back * (turn * p_m) / self.unit_m, conjugated(back, rotation))
+        let rotation = match self.object_from_flu() {
+            None => conjugated(back, rotation),
+            Some(laid) => DQuat::from_mat3(&back) * rotation * laid.conjugate(),
+        };
+        (back * (turn * p_m) / self.unit_m, self.quaternion.streamed(rotation))
+    }
+
+    /// Returns the matrix that takes vectors along the object's own axes to the body's.
+    pub fn body_from_object(&self) -> DMat3 {
+        let laid = match self.object_from_flu() {
+            None => self.axes.matrix(),
+            Some(laid) => DMat3::from_quat(laid.conjugate()),
+        };
+        DMat3::from_quat(self.nose.object_from_body().conjugate()) * laid
+    }
+
+    /// Returns the rotation of forward, left and up into the object's own axes where these are laid by name;
+    /// `None` if as the stream's.
+    fn object_from_flu(&self) -> Option<DQuat> {
+        match self.body {
+            BodyAxes::Stream => None,
+            BodyAxes::Flu => Some(DQuat::IDENTITY),
+            BodyAxes::Frd => Some(DQuat::from_rotation_x(std::f64::consts::PI)),
+        }
     }
 }
 
@@ -417,12 +600,15 @@ impl LocalizationConfig {
             up: None,
             axes: None,
             euler: None,
+            quaternion: Quaternion::default(),
+            body: BodyAxes::default(),
             nose: Nose::default(),
             offset: Offset::default(),
             pivot_m: DVec3::ZERO,
             latency_ms: 0.0,
             objects: BTreeMap::new(),
             interface: None,
+            sensor: None,
         }
     }
 
@@ -485,6 +671,8 @@ impl LocalizationConfig {
         Alignment {
             unit_m: self.units.unwrap_or(self.driver.usual_units()).metres(),
             axes: self.stream_axes(),
+            quaternion: self.quaternion,
+            body: self.body,
             nose: self.nose,
             offset: self.offset,
             pivot_m: self.pivot_m,
@@ -504,12 +692,22 @@ impl LocalizationConfig {
         let own = [
             ("euler", self.euler.map(|euler| euler.to_string())),
             ("interface", self.interface.map(|address| address.to_string())),
+            ("sensor", self.sensor.map(|sensor| sensor.to_string())),
         ];
         for (name, value) in own {
             if let (Some(value), Some(advice)) = (value, self.driver.refuses(name)) {
                 return Err(invalid(format!("{key}.{name}"), value, advice));
             }
         }
+        if !self.driver.has_quaternions() && !is_default(&self.quaternion) {
+            let advice = format!("{} has no quaternions whose order could differ", self.driver);
+            return Err(invalid(format!("{key}.quaternion"), self.quaternion, advice));
+        }
+        if self.body != BodyAxes::Stream && self.stream_axes().is_mirror() {
+            let advice = "a mirrored stream has no such axes: leave `body` out, or mend `axes`";
+            return Err(invalid(format!("{key}.body"), self.body, advice));
+        }
+        check_number(&format!("{key}.nose"), self.nose.deg(), "degrees", -360.0..=360.0)?;
         check_position(&format!("{key}.offset.position_m"), self.offset.position_m)?;
         check_position(&format!("{key}.pivot_m"), self.pivot_m)?;
         check_number(&format!("{key}.latency_ms"), self.latency_ms, "ms", 0.0..=500.0)?;
@@ -590,6 +788,8 @@ pub fn of_arena(path: &Path) -> Result<Vec<LocalizationConfig>> {
     read_all(&text).with_context(|| format!("{} is wrong", path.display()))
 }
 
+/// What a nose may be.
+const NOSE_IS: &str = "write x, y, -x, -y or degrees from the object's x";
 /// Sources of one server at most.
 pub const MAX_SOURCES: usize = 8;
 

@@ -44,7 +44,7 @@ fn command_line_and_file_are_equivalent() {
 
 #[test]
 fn reports_invalid_settings_by_name() {
-    check("vicom:1.2.3.4", "drivers are vicon, natnet, json, mavlink");
+    check("vicom:1.2.3.4", "drivers are vicon, natnet, json, mavlink, vrpn");
     check("json,units=yd", "unknown variant `yd`");
     check("json,units", "write KEY=VALUE");
     check("json,units,pivot_m=[0,0,0]", "'units': write KEY=VALUE");
@@ -60,9 +60,66 @@ fn reports_invalid_settings_by_name() {
     check("json,euler=zyx", "only Vicon streams angles");
     check("vicon,euler=xyx", "write xyz, xzy,");
     check("json,interface=1.2.3.4", "only NatNet comes by multicast");
-    check("json,nose=z", "write x, y, -x or -y");
+    check("natnet,sensor=1", "only VRPN's trackers have sensors");
+    check("vrpn,sensor=-1", "expected u16");
+    check("json,nose=z", "'z': write x, y, -x, -y or degrees from the object's x");
+    check("json,nose=400", "nose");
+    check("json,nose=nan", "nose");
+    check("json,nose=[1]", "x, y, -x, -y or degrees");
+    check("json,quaternion=zyxw", "write xyzw, wxyz, xyzw-inverse, wxyz-inverse");
+    check("vicon,quaternion=wxyz", "vicon has no quaternions whose order could differ");
+    check("mavlink,quaternion=wxyz", "mavlink has no quaternions");
+    check("json,body=ned", "unknown variant `ned`");
+    check("json,axes=x-yz,body=frd", "a mirrored stream has no such axes");
     check("json,offset.yaw_deg=1000", "give a number from -360 to 360");
     check("json,colour=red", "colour");
+}
+
+#[test]
+fn a_nose_is_a_name_or_an_angle() {
+    for (text, deg, again) in [
+        ("x", 0.0, "x"),
+        ("-y", -90.0, "-y"),
+        ("45", 45.0, "45"),
+        ("-30.5", -30.5, "-30.5"),
+        ("90", 90.0, "y"),
+    ] {
+        let found = LocalizationConfig::parse(&format!("json,nose={text}")).unwrap();
+        assert_eq!((found.nose.deg(), found.nose.to_string().as_str()), (deg, again));
+        let file = toml::to_string(&found).unwrap();
+        assert_eq!(toml::from_str::<LocalizationConfig>(&file).unwrap(), found, "{file}");
+    }
+    let quoted: LocalizationConfig = toml::from_str("driver = \"json\"\nnose = \"45\"").unwrap();
+    assert_eq!(quoted.nose.deg(), 45.0);
+}
+
+/// The words of COORDINATES.md: an autopilot's frames, and w first.
+#[test]
+fn an_autopilots_attitude_is_read_by_its_axes() {
+    let read = |text: &str, p: [f64; 3], came: [f64; 4]| {
+        let config = LocalizationConfig::parse(text).unwrap();
+        config.alignment().world_from_body(DVec3::from(p), DQuat::from_array(came))
+    };
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let is = |pose: &Pose<World, Body>, nose: DVec3, up: DVec3| {
+        let off = (pose.rotate(DVec3::X) - nose).length() + (pose.rotate(DVec3::Z) - up).length();
+        assert!(off < 1e-9, "nose {}, up {}", pose.rotate(DVec3::X), pose.rotate(DVec3::Z));
+    };
+    // Level, its nose north: no turn from NED to FRD.
+    let pose = read("json,axes=yx-z,body=frd", [2.0, 1.0, -3.0], [0.0, 0.0, 0.0, 1.0]);
+    is(&pose, DVec3::Y, DVec3::Z);
+    assert!((pose.translation_m - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-12);
+    // A quarter to the right from there is one about down: its nose east.
+    is(&read("json,axes=yx-z,body=frd", [0.0; 3], [0.0, 0.0, half, half]), DVec3::X, DVec3::Z);
+    // FRD in ENU: level and its nose east is a half turn about x.
+    is(&read("json,body=frd", [0.0; 3], [1.0, 0.0, 0.0, 0.0]), DVec3::X, DVec3::Z);
+    // A quarter to the left about z, w first; and its conjugate.
+    is(&read("json,quaternion=wxyz", [0.0; 3], [half, 0.0, 0.0, half]), DVec3::Y, DVec3::Z);
+    let inverse = "json,quaternion=xyzw-inverse";
+    is(&read(inverse, [0.0; 3], [0.0, 0.0, -half, half]), DVec3::Y, DVec3::Z);
+    // The object's x is 45 degrees to the right of the nose.
+    let nose = DVec3::new(half, half, 0.0);
+    is(&read("json,nose=45", [0.0; 3], [0.0, 0.0, 0.0, 1.0]), nose, DVec3::Z);
 }
 
 #[test]
@@ -83,15 +140,21 @@ fn rotation() -> impl Strategy<Value = DQuat> {
 }
 
 fn alignment() -> impl Strategy<Value = Alignment> {
-    (0usize..48, 0usize..4, -180.0..180.0f64, 0usize..3).prop_map(|(axes, nose, yaw_deg, unit)| {
-        Alignment {
-            unit_m: Units::ALL[unit].metres(),
-            axes: Axes::all().nth(axes).unwrap(),
-            nose: Nose::ALL[nose],
-            offset: Offset { position_m: DVec3::new(1.0, -2.0, 0.5), yaw_deg },
-            pivot_m: DVec3::new(0.02, 0.0, 0.05),
-        }
-    })
+    let laid = (0usize..48, 0usize..3, 0usize..4);
+    (laid, -180.0..180.0f64, -180.0..180.0f64, 0usize..3).prop_map(
+        |((axes, body, quaternion), nose_deg, yaw_deg, unit)| {
+            let axes = Axes::all().nth(axes).unwrap();
+            Alignment {
+                unit_m: Units::ALL[unit].metres(),
+                axes,
+                quaternion: Quaternion::ALL[quaternion],
+                body: if axes.is_mirror() { BodyAxes::Stream } else { BodyAxes::ALL[body] },
+                nose: Nose::from_deg(nose_deg),
+                offset: Offset { position_m: DVec3::new(1.0, -2.0, 0.5), yaw_deg },
+                pivot_m: DVec3::new(0.02, 0.0, 0.05),
+            }
+        },
+    )
 }
 
 proptest! {
@@ -117,13 +180,13 @@ proptest! {
     /// of turns is right in a mirror too.
     #[test]
     fn points_of_the_object_are_carried_along(a in alignment(), q in rotation(), v in prop::array::uniform3(-1.0..1.0f64)) {
-        let a = Alignment { unit_m: 1.0, nose: Nose::PlusX, pivot_m: DVec3::ZERO, ..a };
+        let a = Alignment { unit_m: 1.0, pivot_m: DVec3::ZERO, ..a };
         // A vector of the object, as the stream's axes have it, and as the world's do.
         let v = DVec3::from(v);
         let turn = DQuat::from_rotation_z(a.offset.yaw_deg.to_radians());
         let in_world = turn * (a.axes.matrix() * (q * v));
-        let pose = a.world_from_body(DVec3::ZERO, q);
-        prop_assert!((pose.rotate(a.axes.matrix() * v) - in_world).length() < 1e-9);
+        let pose = a.world_from_body(DVec3::ZERO, a.quaternion.streamed(q));
+        prop_assert!((pose.rotate(a.body_from_object() * v) - in_world).length() < 1e-9);
     }
 
     #[test]

@@ -1,3 +1,5 @@
+mod setups;
+
 use std::fmt::Write;
 
 use super::*;
@@ -7,7 +9,8 @@ fn config(text: &str) -> LocalizationConfig {
     LocalizationConfig::parse(text).unwrap()
 }
 
-/// What a person does, at 50 Hz: (up [m], ahead [m], left [rad], nose up [rad]) and how long it is held.
+/// What a person does, at 50 Hz: (up [m], ahead [m], left [rad], nose up [rad]), the last with its left side raised
+/// instead.
 fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body>)> {
     let held = [
         (0.0, 0.0, 0.0, 0.0),
@@ -15,6 +18,7 @@ fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body
         (0.47, 0.6, -0.08, 0.05),
         (0.5, 0.63, 1.45, 0.03),
         (0.48, 0.6, 1.5, 0.5),
+        (0.5, 0.6, 1.52, 0.04),
     ];
     let mut poses = Vec::new();
     let mut before = held[0];
@@ -30,7 +34,8 @@ fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body
                 + shake * jitter;
             let rotation = start.rotation
                 * DQuat::from_rotation_z(mix(before.2, now.2))
-                * DQuat::from_rotation_y(-mix(before.3, now.3));
+                * DQuat::from_rotation_y(-mix(before.3, now.3))
+                * DQuat::from_rotation_x(if index == 5 { 0.5 * share } else { 0.0 });
             let at_s = index as f64 * 2.4 + f64::from(tick) * 0.02;
             poses.push((at_s, Pose::new(p, rotation)));
         }
@@ -145,7 +150,7 @@ proptest! {
     fn the_change_makes_it_right(axes in 0usize..48, nose in 0usize..4, unit in 0usize..3, yaw_rad in -3.0..3.0f64) {
         let mut stream = config("json");
         stream.axes = Axes::all().nth(axes);
-        stream.nose = Nose::ALL[nose];
+        stream.nose = Nose::NAMED[nose];
         stream.units = Some(Units::ALL[unit]);
         let first = diagnosis(&stream, &config("json"), yaw_rad);
         let mut text = "json".to_owned();

@@ -24,6 +24,37 @@ fn only(stream: &mut JsonStream, now: ServerTime, text: &str) -> Option<Measurem
 }
 
 #[test]
+fn notes_of_the_sender_are_told_once() {
+    let mut stream = stream("");
+    let mut told = Vec::new();
+    let mut send = |ms, notes: &str| {
+        only(&mut stream, at(ms), &packet(&format!(r#","notes":{notes}"#))).unwrap();
+        told.extend(std::iter::from_fn(|| stream.next_warning()).map(|text| (ms, text)));
+    };
+    let moved = |cm| format!("left camera moved by {cm} cm: survey again");
+    for i in 0..100 {
+        let moved = moved(f64::from(i as u32) / 10.0);
+        send(
+            i * 20,
+            &if i < 50 {
+                format!(r#"["{moved}"]"#)
+            } else {
+                format!(r#"["{moved}","dark\u0007"]"#)
+            },
+        );
+    }
+    // Gone for a minute, it is news again; a flood is not.
+    send(62_000, &format!(r#"["{}"]"#, moved(9.0)));
+    for (i, word) in ["a", "b", "c", "d"].iter().enumerate() {
+        send(62_010 + i as u64, &format!(r#"["{}"]"#, word.repeat(500)));
+    }
+    let [(0, first), (1000, dark), (62_000, again)] = &told[..] else { panic!("{told:?}") };
+    assert_eq!(first, "vizflyt: left camera moved by 0 cm: survey again");
+    assert_eq!(dark, "vizflyt: dark");
+    assert_eq!(again, "vizflyt: left camera moved by 9 cm: survey again");
+}
+
+#[test]
 fn the_packet_of_the_guide_is_read() {
     let text = r#"{"vizflyt_pose":1,"object":"wasp","seq":12,"stamp_ns":1000000000,"clock":"server",
         "position_m":[1.0,2.0,0.5],"rotation_xyzw":[0,0,0.7071,0.7071],"position_sigma_m":[0.1,0.2,0.3],

@@ -1,0 +1,64 @@
+//! Tags of the room in the image of a camera in the room: whether it is still where it was.
+
+use vizflyt_protocol::geometry::Pose;
+
+use super::monitor::Linear;
+use super::region::{self, Expected};
+use super::{Locator, StampedImage};
+use crate::camera::Mounting;
+use crate::layout::LayoutFrame;
+use crate::solve::{Geometry, Motion, Sighting};
+
+impl Locator {
+    /// Looks now and then whether tags of the room are still where a camera in the room had them.
+    pub(super) fn look_at_room(&mut self, view: &StampedImage) {
+        let wrong = self.monitor.correction(view.camera);
+        let station = &mut self.stations[view.camera];
+        let Mounting::World(world_from_cam) = station.camera.mounting else { return };
+        let due = station.room_seen.is_none_or(|at| view.stamp.seconds_since(at) > ROOM_S);
+        if !due || !self.tags.values().any(|(frame, _)| *frame == LayoutFrame::World) {
+            return;
+        }
+        station.room_seen = Some(view.stamp);
+        let room = self.tags.values().filter(|(frame, _)| *frame == LayoutFrame::World);
+        let room = room.map(|(_, tag)| tag);
+        let Expected::Within(region) =
+            region::expect(&station.camera, room, &Pose::IDENTITY, ROOM_UNCERTAINTY_M)
+        else {
+            return;
+        };
+        let found = self.detector.look(view.image, &region, &station.camera.intrinsics);
+        // A vehicle that stays where it is, and is the camera's stand.
+        let at = wrong.apply(&world_from_cam);
+        let body_from_cam = Pose::new(at.translation_m, at.rotation);
+        let sightings: Vec<Sighting> = found
+            .iter()
+            .filter_map(|seen| {
+                let (frame, tag) = self.tags.get(&(seen.family, seen.id))?;
+                (*frame == LayoutFrame::World).then(|| Sighting {
+                    camera: &station.camera.intrinsics,
+                    sight: Geometry::InsideOut {
+                        body_from_cam,
+                        world_from_tag: tag.frame_from_tag(),
+                    },
+                    size_m: tag.size_m,
+                    corners_px: seen.corners_px,
+                    sigma_px: self.settings.corner_sigma_px,
+                    lag_s: 0.0,
+                    readout_s: 0.0,
+                })
+            })
+            .collect();
+        let cameras = vec![view.camera; sightings.len()];
+        let motion = Motion::default();
+        let pose = Pose::IDENTITY;
+        if let Some(set) = Linear::at(&sightings, &cameras, &motion, &pose, self.middle_m) {
+            self.monitor.anchor(view.camera, &set);
+        }
+    }
+}
+
+/// How often tags of the room are looked at. [s]
+const ROOM_S: f64 = 0.3;
+/// They are looked for so far from where they were. [m]
+const ROOM_UNCERTAINTY_M: f64 = 0.1;

@@ -1,0 +1,166 @@
+//! A mat to fly over with a camera under the vehicle: large tags all over it, which are seen from aloft, and pads of
+//! small ones where the vehicle stands, whose camera then is a hand above them.
+//!
+//! Large tags come one on a sheet, and sheets lie apart: their places are measured with a tape. Pads are joined edge to
+//! edge, and no large tag is where one lies.
+
+use glam::{DQuat, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Pose, World};
+
+use super::sheet::{FOOT_MM, MARGIN_MM, Sheet};
+use super::{Mat, Paper, PrintError, Printed, check_ids, check_middle, scale};
+use crate::family::TagFamily;
+use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
+
+/// Where the vehicle takes off or lands.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pad {
+    /// Its middle. [m, world]
+    pub middle_m: DVec2,
+    /// How far it reaches at least, east and north. [m]
+    pub size_m: DVec2,
+}
+
+impl Pad {
+    /// Two sheets side by side: for a vehicle that a person puts down.
+    pub const SIZE_M: DVec2 = DVec2::new(0.5, 0.35);
+}
+
+/// A mat with tags of two sizes, for A3.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Floor {
+    /// Which tags.
+    pub family: TagFamily,
+    /// Id of the first large tag, in the south-west; large ones count east, then north, then the pads' small ones.
+    pub first_id: u32,
+    /// Where it is flown, east and north. [m]
+    pub size_m: DVec2,
+    /// Middle of that. [m, world]
+    pub middle_m: DVec3,
+    /// Where the vehicle stands.
+    pub pads: Vec<Pad>,
+    /// What the printed scale bar measures. [mm]
+    pub bar_mm: f64,
+}
+
+impl Floor {
+    /// Returns its sheets, those of the large tags first, and its layout.
+    ///
+    /// # Errors
+    /// [`PrintError`] for what does not fit or makes no sense.
+    pub fn print(&self) -> Result<Printed, PrintError> {
+        let (least_m, most_m) = (self.size_m.min_element(), self.size_m.max_element());
+        if !(least_m >= LARGE_PITCH_M && most_m <= MOST_M) {
+            let advice = "give length and width in metres, 0.5 to 50 each: 11x4.5";
+            return Err(PrintError::Invalid { name: "fly_over", value: least_m, advice });
+        }
+        check_middle(self.middle_m)?;
+        let scale = scale(self.bar_mm)?;
+        let large = self.large_m();
+        check_ids(self.family, self.first_id, large.len() as u64)?;
+        let mut sheets = Vec::new();
+        let mut tags = Vec::new();
+        for (id, at_m) in (self.first_id..).zip(large) {
+            sheets.push(self.large_sheet(id, at_m));
+            let pose: Pose<World, Square> =
+                Pose::new(at_m.extend(self.middle_m.z), DQuat::IDENTITY);
+            tags.push(Tag::new(self.family, id, 1e-3 * LARGE_MM * scale, pose));
+        }
+        for pad in &self.pads {
+            let first_id = self.first_id + tags.len() as u32;
+            let printed = self.pad(pad, first_id).print()?;
+            sheets.extend(printed.sheets);
+            tags.extend(printed.layout.tags);
+        }
+        Ok(Printed { sheets, layout: TagLayout { frame: LayoutFrame::World, tags } })
+    }
+
+    /// Returns the pads as the mats they are, each with the ids that it has here.
+    pub fn pads(&self) -> Vec<Mat> {
+        let mut first_id = self.first_id + self.large_m().len() as u32;
+        let mats = self.pads.iter().map(|pad| {
+            let mat = self.pad(pad, first_id);
+            first_id += mat.columns * mat.rows;
+            mat
+        });
+        mats.collect()
+    }
+
+    fn pad(&self, pad: &Pad, first_id: u32) -> Mat {
+        // Whole sheets: a part of one is as much work.
+        let [across, up] = sheet_tags();
+        let sheets = (pad.size_m * 1e3 / SMALL_PITCH_MM / DVec2::new(across.into(), up.into()))
+            .round()
+            .clamp(DVec2::ONE, DVec2::splat(1e3));
+        Mat {
+            family: self.family,
+            first_id,
+            columns: across * sheets.x as u32,
+            rows: up * sheets.y as u32,
+            pitch_mm: SMALL_PITCH_MM,
+            tag_mm: SMALL_MM,
+            middle_m: pad.middle_m.extend(self.middle_m.z),
+            paper: Paper::A3,
+            bar_mm: self.bar_mm,
+        }
+    }
+
+    /// Returns where the large tags lie: in rows and columns about the middle, none where a pad is. [m, world]
+    fn large_m(&self) -> Vec<DVec2> {
+        let count = (self.size_m / LARGE_PITCH_M + 1e-9).floor();
+        let pads: Vec<(DVec2, DVec2)> = self
+            .pads
+            .iter()
+            .map(|pad| {
+                let mat = self.pad(pad, 0);
+                let cells = DVec2::new(mat.columns.into(), mat.rows.into());
+                (pad.middle_m, cells * SMALL_PITCH_MM * 5e-4)
+            })
+            .collect();
+        let mut places = Vec::new();
+        for row in 0..count.y as u32 {
+            for column in 0..count.x as u32 {
+                let cell = DVec2::new(column.into(), row.into()) - (count - 1.0) / 2.0;
+                let at_m = self.middle_m.truncate() + cell * LARGE_PITCH_M;
+                let covers = |&(middle_m, half_m): &(DVec2, DVec2)| {
+                    let gap_m = (at_m - middle_m).abs() - half_m - 5e-4 * LARGE_PAPER_MM;
+                    gap_m.max_element() < 0.0
+                };
+                if !pads.iter().any(covers) {
+                    places.push(at_m);
+                }
+            }
+        }
+        places
+    }
+
+    fn large_sheet(&self, id: u32, at_m: DVec2) -> Sheet {
+        let place = format!("tag {id}: {:.3} m east, {:.3} m north", at_m.x, at_m.y);
+        let mut sheet = Sheet::new(Paper::A3, &place);
+        let [left, low] = [MARGIN_MM, MARGIN_MM + FOOT_MM];
+        let middle = [left + LARGE_PAPER_MM / 2.0, low + LARGE_PAPER_MM / 2.0];
+        sheet.tag(self.family, id, middle, LARGE_MM);
+        sheet.crop_marks([left, low, LARGE_PAPER_MM, LARGE_PAPER_MM]);
+        let text = format!("{} {id}; cut along the marks; this edge is north", self.family);
+        sheet.text([left + 8.0, low + LARGE_PAPER_MM + 1.5], 2.4, &text);
+        sheet
+    }
+}
+
+/// Returns how many small tags a sheet has side by side, and above one another.
+fn sheet_tags() -> [u32; 2] {
+    Paper::A3.room_mm().map(|room_mm| (room_mm / SMALL_PITCH_MM) as u32)
+}
+
+/// Edge of a large tag: 20 px from 2.7 m above for a lens of 100 degrees at 640 px. [mm]
+const LARGE_MM: f64 = 200.0;
+/// With its white rim. [mm]
+const LARGE_PAPER_MM: f64 = 255.0;
+/// From large tag to large tag: from 0.4 m on such a lens always sees one. [m]
+const LARGE_PITCH_M: f64 = 0.5;
+/// Edge of a small tag: from 60 mm on such a lens sees one, wherever it stands and however it is turned. [mm]
+const SMALL_MM: f64 = 42.0;
+/// From small tag to small tag. [mm]
+const SMALL_PITCH_MM: f64 = 53.0;
+/// More is a slip. [m]
+const MOST_M: f64 = 50.0;
