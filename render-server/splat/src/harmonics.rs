@@ -4,11 +4,11 @@
 //! Evaluation", JCGT 2013, with the Condon-Shortley phase).
 
 /// `1 / (2 sqrt(pi))`.
-pub(crate) const C0: f64 = 0.28209479177387814;
+pub const C0: f64 = 0.28209479177387814;
 /// `sqrt(3 / (4 pi))`.
-pub(crate) const C1: f64 = 0.4886025119029199;
+pub const C1: f64 = 0.4886025119029199;
 /// Degree 2.
-pub(crate) const C2: [f64; 5] = [
+pub const C2: [f64; 5] = [
     1.0925484305920792,
     -1.0925484305920792,
     0.31539156525252005,
@@ -16,7 +16,7 @@ pub(crate) const C2: [f64; 5] = [
     0.5462742152960396,
 ];
 /// Degree 3.
-pub(crate) const C3: [f64; 7] = [
+pub const C3: [f64; 7] = [
     -0.5900435899266435,
     2.890611442640554,
     -0.4570457994644658,
@@ -28,7 +28,7 @@ pub(crate) const C3: [f64; 7] = [
 
 /// Returns the linear RGB of harmonics (coefficient by coefficient, RGB within) seen along a unit
 /// direction from the camera to the splat; not below 0.
-pub(crate) fn colour(sh: &[f32], direction: [f64; 3]) -> [f64; 3] {
+pub fn colour(sh: &[f32], direction: [f64; 3]) -> [f64; 3] {
     let basis = basis(direction);
     let mut rgb = [0.5; 3];
     for (weights, value) in sh.chunks_exact(3).zip(basis) {
@@ -40,7 +40,7 @@ pub(crate) fn colour(sh: &[f32], direction: [f64; 3]) -> [f64; 3] {
 }
 
 /// Returns the 16 basis functions for a unit direction.
-pub(crate) fn basis([x, y, z]: [f64; 3]) -> [f64; 16] {
+pub fn basis([x, y, z]: [f64; 3]) -> [f64; 16] {
     let (xx, yy, zz, xy, yz, xz) = (x * x, y * y, z * z, x * y, y * z, x * z);
     [
         C0,

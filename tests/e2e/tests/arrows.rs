@@ -21,6 +21,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-c", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
+    ("vizflyt-twin", &["vizflyt-protocol", "vizflyt-splat"]),
     (
         "vizflyt-server",
         &[
@@ -54,6 +55,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-splat",
             "vizflyt-arena",
             "vizflyt-scenes",
+            "vizflyt-twin",
             "vizflyt-server",
             "vizflyt-runtime",
             "vizflyt-guardian",
@@ -76,6 +78,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-trust",
             "vizflyt-splat",
             "vizflyt-arena",
+            "vizflyt-twin",
             "vizflyt-server",
             "vizflyt-runtime",
             "vizflyt-guardian",

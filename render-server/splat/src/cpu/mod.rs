@@ -16,7 +16,7 @@ mod lens;
 mod merge;
 mod project;
 mod scene;
-mod simd;
+pub mod simd;
 mod sort;
 
 use std::borrow::Cow;

@@ -10,11 +10,11 @@ use super::{EXP2, Kernel, Simd};
 
 /// Proof that the processor has AVX2, FMA and F16C (and BMI, POPCNT and LZCNT, which came with them).
 #[derive(Clone, Copy, Debug)]
-pub(in crate::cpu) struct Avx2(());
+pub struct Avx2(());
 
 impl Avx2 {
     /// Returns the proof if the processor and the operating system support the set.
-    pub(in crate::cpu) fn detect() -> Option<Self> {
+    pub fn detect() -> Option<Self> {
         let found = is_x86_feature_detected!("avx2")
             && is_x86_feature_detected!("fma")
             && is_x86_feature_detected!("f16c")
@@ -30,11 +30,11 @@ const LANES: usize = 8;
 
 /// Made only by methods of [`Avx2`], so it too is proof.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct F32x8(__m256);
+pub struct F32x8(__m256);
 
 /// All bits of a lane set or none; made only by methods of [`Avx2`].
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct Mask8(__m256);
+pub struct Mask8(__m256);
 
 macro_rules! operators {
     ($($name:ident $method:ident $intrinsic:ident;)*) => {$(
@@ -159,6 +159,14 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn negative(self, a: F32x8) -> F32x8 {
         F32x8(proven!(_mm256_or_ps(a.0, _mm256_set1_ps(-0.0))))
+    }
+
+    #[inline(always)]
+    fn sum(self, a: F32x8) -> f32 {
+        let halves =
+            proven!(_mm_add_ps(_mm256_castps256_ps128(a.0), _mm256_extractf128_ps::<1>(a.0)));
+        let pairs = proven!(_mm_add_ps(halves, _mm_movehl_ps(halves, halves)));
+        proven!(_mm_cvtss_f32(_mm_add_ss(pairs, _mm_shuffle_ps::<1>(pairs, pairs))))
     }
 
     #[inline(always)]

@@ -10,11 +10,11 @@ use super::{EXP2, Kernel, Simd};
 
 /// Proof that the processor has AVX-512 F, VL, BW and DQ, and all that [`super::Avx2`] proves.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::cpu) struct Avx512(());
+pub struct Avx512(());
 
 impl Avx512 {
     /// Returns the proof if the processor and the operating system support the set.
-    pub(in crate::cpu) fn detect() -> Option<Self> {
+    pub fn detect() -> Option<Self> {
         let found = is_x86_feature_detected!("avx512f")
             && is_x86_feature_detected!("avx512vl")
             && is_x86_feature_detected!("avx512bw")
@@ -27,11 +27,11 @@ const LANES: usize = 16;
 
 /// Made only by methods of [`Avx512`], so it too is proof.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct F32x16(__m512);
+pub struct F32x16(__m512);
 
 /// One bit per lane.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct Mask16(__mmask16);
+pub struct Mask16(__mmask16);
 
 macro_rules! operators {
     ($($name:ident $method:ident $intrinsic:ident;)*) => {$(
@@ -153,6 +153,11 @@ impl Simd for Avx512 {
     #[inline(always)]
     fn negative(self, a: F32x16) -> F32x16 {
         F32x16(proven!(_mm512_or_ps(a.0, _mm512_set1_ps(-0.0))))
+    }
+
+    #[inline(always)]
+    fn sum(self, a: F32x16) -> f32 {
+        proven!(_mm512_reduce_add_ps(a.0))
     }
 
     #[inline(always)]

@@ -17,15 +17,15 @@ mod tests;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
 #[cfg(target_arch = "x86_64")]
-pub(super) use avx2::Avx2;
+pub use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
-pub(super) use avx512::Avx512;
+pub use avx512::Avx512;
 #[cfg(target_arch = "aarch64")]
-pub(super) use neon::Neon;
-pub(super) use portable::Portable;
+pub use neon::Neon;
+pub use portable::Portable;
 
 /// Operations on one vector of f32. Comparisons with NaN are false.
-pub(super) trait Simd: Copy + Send + Sync + 'static {
+pub trait Simd: Copy + Send + Sync + 'static {
     /// [`Self::LANES`] numbers.
     type F: Copy
         + Add<Output = Self::F>
@@ -41,6 +41,7 @@ pub(super) trait Simd: Copy + Send + Sync + 'static {
     /// Runs a kernel, compiled for this instruction set.
     fn run<K: Kernel>(self, kernel: K) -> K::Output;
 
+    /// Returns a vector of one value.
     fn splat(self, value: f32) -> Self::F;
     /// Loads the first lanes' worth of `values`.
     fn load(self, values: &[f32]) -> Self::F;
@@ -57,11 +58,15 @@ pub(super) trait Simd: Copy + Send + Sync + 'static {
     fn min(self, a: Self::F, b: Self::F) -> Self::F;
     /// Returns the greater; `b` where `a` is NaN.
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
+    /// Returns the square root.
     fn sqrt(self, a: Self::F) -> Self::F;
     /// Returns `2^a` within 3e-6 relative for `a` in -126 to 127; anything, but no trap, beyond.
     fn exp2(self, a: Self::F) -> Self::F;
     /// Returns `-|a|`.
     fn negative(self, a: Self::F) -> Self::F;
+
+    /// Returns the sum of all lanes.
+    fn sum(self, a: Self::F) -> f32;
 
     /// Returns where `a < b`.
     fn lt(self, a: Self::F, b: Self::F) -> Self::M;
@@ -80,7 +85,7 @@ pub(super) trait Simd: Copy + Send + Sync + 'static {
 
 /// A piece of a pass, to be compiled for each instruction set. `run` is marked
 /// `#[inline(always)]`, and so is what it calls: only then does it take on the set's instructions.
-pub(super) trait Kernel {
+pub trait Kernel {
     /// What it returns.
     type Output;
     /// Does the work.
@@ -94,19 +99,23 @@ const EXP2: [f32; 5] = [0.999_999_3, 0.693_121_8, 0.240_247_45, 0.055_917_86, 0.
 
 /// The instruction sets this build can dispatch to.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum InstructionSet {
+pub enum InstructionSet {
+    /// Sixteen lanes.
     #[cfg(target_arch = "x86_64")]
     Avx512(Avx512),
+    /// Eight lanes.
     #[cfg(target_arch = "x86_64")]
     Avx2(Avx2),
+    /// Twice four lanes.
     #[cfg(target_arch = "aarch64")]
     Neon(Neon),
+    /// Arrays of eight.
     Portable(Portable),
 }
 
 impl InstructionSet {
     /// Returns every set this processor has, fastest first; never empty.
-    pub(super) fn available() -> Vec<Self> {
+    pub fn available() -> Vec<Self> {
         #[cfg(target_arch = "x86_64")]
         let wide = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
         #[cfg(target_arch = "aarch64")]
@@ -116,8 +125,21 @@ impl InstructionSet {
         wide.into_iter().flatten().chain([Self::Portable(Portable)]).collect()
     }
 
+    /// Runs a kernel, compiled for this set.
+    pub fn run<K: Kernel>(self, kernel: K) -> K::Output {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(simd) => simd.run(kernel),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(simd) => simd.run(kernel),
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(simd) => simd.run(kernel),
+            Self::Portable(simd) => simd.run(kernel),
+        }
+    }
+
     /// Returns the name for reports.
-    pub(super) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(_) => "cpu avx512",

@@ -3,11 +3,11 @@
 #![allow(unsafe_code, reason = "SIMD intrinsics, after detection of the instruction set")]
 
 use std::arch::aarch64::{
-    float32x4_t, uint32x4_t, vaddq_f32, vaddq_u32, vaddvq_u32, vandq_u32, vbslq_f32, vcltq_f32,
-    vdivq_f32, vdupq_n_f32, vdupq_n_u32, vfmaq_f32, vfmsq_f32, vget_high_u16, vget_low_u16,
-    vld1q_f32, vld1q_u16, vld1q_u32, vmaxnmq_f32, vmaxvq_u32, vminnmq_f32, vmovl_u16, vmulq_f32,
-    vorrq_u32, vreinterpretq_f32_u32, vreinterpretq_u32_f32, vshlq_n_u32, vsqrtq_f32, vst1q_f32,
-    vsubq_f32,
+    float32x4_t, uint32x4_t, vaddq_f32, vaddq_u32, vaddvq_f32, vaddvq_u32, vandq_u32, vbslq_f32,
+    vcltq_f32, vdivq_f32, vdupq_n_f32, vdupq_n_u32, vfmaq_f32, vfmsq_f32, vget_high_u16,
+    vget_low_u16, vld1q_f32, vld1q_u16, vld1q_u32, vmaxnmq_f32, vmaxvq_u32, vminnmq_f32, vmovl_u16,
+    vmulq_f32, vorrq_u32, vreinterpretq_f32_u32, vreinterpretq_u32_f32, vshlq_n_u32, vsqrtq_f32,
+    vst1q_f32, vsubq_f32,
 };
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
@@ -15,16 +15,16 @@ use super::{EXP2, Kernel, Simd};
 
 /// The set itself needs no detection: it is part of the architecture.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::cpu) struct Neon;
+pub struct Neon;
 
 const LANES: usize = 8;
 
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct F32x8([float32x4_t; 2]);
+pub struct F32x8([float32x4_t; 2]);
 
 /// All bits of a lane set or none.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct Mask8([uint32x4_t; 2]);
+pub struct Mask8([uint32x4_t; 2]);
 
 /// Calls an intrinsic.
 macro_rules! neon {
@@ -172,6 +172,11 @@ impl Simd for Neon {
         F32x8(a.0.map(|a| {
             neon!(vreinterpretq_f32_u32(vorrq_u32(vreinterpretq_u32_f32(a), vdupq_n_u32(1 << 31))))
         }))
+    }
+
+    #[inline(always)]
+    fn sum(self, a: F32x8) -> f32 {
+        neon!(vaddvq_f32(vaddq_f32(a.0[0], a.0[1])))
     }
 
     #[inline(always)]

@@ -7,16 +7,16 @@ use super::{EXP2, Kernel, Simd};
 
 /// Needs nothing.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::cpu) struct Portable;
+pub struct Portable;
 
 const LANES: usize = 8;
 
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct F32x8([f32; LANES]);
+pub struct F32x8([f32; LANES]);
 
 /// All bits of a lane set or none: what vector comparisons give.
 #[derive(Clone, Copy)]
-pub(in crate::cpu) struct Mask8([u32; LANES]);
+pub struct Mask8([u32; LANES]);
 
 #[inline(always)]
 fn map2(a: F32x8, b: F32x8, f: impl Fn(f32, f32) -> f32) -> F32x8 {
@@ -139,6 +139,12 @@ impl Simd for Portable {
     #[inline(always)]
     fn negative(self, a: F32x8) -> F32x8 {
         F32x8(a.0.map(|x| -x.abs()))
+    }
+
+    #[inline(always)]
+    fn sum(self, a: F32x8) -> f32 {
+        let [a, b, c, d, e, f, g, h] = a.0;
+        ((a + e) + (c + g)) + ((b + f) + (d + h))
     }
 
     #[inline(always)]

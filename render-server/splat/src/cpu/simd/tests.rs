@@ -34,6 +34,8 @@ impl Kernel for Check {
         check("sqrt", s.sqrt(va * va), &|i| (a[i] * a[i]).sqrt(), 1e-7);
         check("exp2", s.exp2(va), &|i| a[i].exp2(), 4e-6);
         check("negative", s.negative(va), &|i| -a[i].abs(), 0.0);
+        let sum: f32 = a[..S::LANES].iter().sum();
+        assert!((s.sum(va) - sum).abs() < 1e-4, "sum: {} for {sum}", s.sum(va));
         check(
             "select",
             s.select(s.lt(va, vb), va, vc),

@@ -1,0 +1,168 @@
+//! What is trained: Gaussians in the form that an optimiser may change freely, one row of numbers
+//! each.
+//!
+//! A row holds mean [3, units of the dataset], natural logarithms of the scales [3], rotation [4,
+//! xyzw, of any length but 0], logit of the opacity, and the harmonics (coefficient by coefficient,
+//! RGB within), as Kerbl et al. 2023 parametrise them. Rows make moments of the optimiser, copies and
+//! checkpoints the same three lines.
+
+use glam::{Quat, Vec3};
+use vizflyt_splat::Splats;
+
+/// Where a row's numbers are.
+pub mod column {
+    /// Mean, 3.
+    pub const MEAN: usize = 0;
+    /// Logarithms of the scales, 3.
+    pub const LOG_SCALE: usize = 3;
+    /// Rotation, 4.
+    pub const ROTATION: usize = 6;
+    /// Logit of the opacity.
+    pub const LOGIT: usize = 10;
+    /// Harmonics, to the end.
+    pub const SH: usize = 11;
+}
+
+/// Rows of parameters, or of anything that has as many.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gaussians {
+    /// Degree of the harmonics, 0 to 3.
+    pub degree: u8,
+    /// Row by row, [`Self::stride`] numbers each.
+    pub values: Vec<f32>,
+}
+
+impl Gaussians {
+    /// Returns none, of a degree.
+    pub fn new(degree: u8) -> Self {
+        assert!(degree <= 3, "harmonics go to degree 3");
+        Self { degree, values: Vec::new() }
+    }
+
+    /// Returns the numbers of a row: 14, 23, 38 or 59.
+    pub fn stride(&self) -> usize {
+        column::SH + 3 * coefficients(self.degree)
+    }
+
+    /// Returns the number of rows.
+    pub fn len(&self) -> usize {
+        self.values.len() / self.stride()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
+    /// Returns a row.
+    pub fn row(&self, i: usize) -> &[f32] {
+        let stride = self.stride();
+        &self.values[i * stride..(i + 1) * stride]
+    }
+
+    /// Returns a row to change.
+    pub fn row_mut(&mut self, i: usize) -> &mut [f32] {
+        let stride = self.stride();
+        &mut self.values[i * stride..(i + 1) * stride]
+    }
+
+    /// Returns as many rows of zeros.
+    pub fn zeros(&self) -> Self {
+        Self { degree: self.degree, values: vec![0.0; self.values.len()] }
+    }
+
+    /// Appends a Gaussian of an even colour. [units of the dataset; sRGB, 0 to 1]
+    pub fn push(&mut self, mean: Vec3, scales: Vec3, rotation: Quat, opacity: f32, rgb: [f32; 3]) {
+        let start = self.values.len();
+        self.values.extend(mean.to_array());
+        self.values.extend(scales.to_array().map(f32::ln));
+        self.values.extend(rotation.to_array());
+        self.values.push((opacity / (1.0 - opacity)).ln());
+        self.values.extend(rgb.map(|v| (v - 0.5) / vizflyt_splat::harmonics::C0 as f32));
+        self.values.resize(start + self.stride(), 0.0);
+    }
+
+    /// Returns the parameters of activated splats.
+    pub fn from_splats(splats: &Splats) -> Self {
+        let mut gaussians = Self::new(splats.sh_degree);
+        let numbers = 3 * splats.sh_coefficients();
+        for i in 0..splats.len() {
+            let opacity = splats.opacities[i].clamp(1e-6, 1.0 - 1e-6);
+            gaussians.values.extend(splats.means_m[i].to_array());
+            gaussians.values.extend(splats.scales_m[i].to_array().map(|s| s.max(1e-9).ln()));
+            gaussians.values.extend(splats.rotations[i].to_array());
+            gaussians.values.push((opacity / (1.0 - opacity)).ln());
+            gaussians.values.extend(&splats.sh[i * numbers..(i + 1) * numbers]);
+        }
+        gaussians
+    }
+
+    /// Returns what a renderer renders; rows that are not finite are left out.
+    pub fn to_splats(&self) -> Splats {
+        let mut splats = Splats { sh_degree: self.degree, ..Splats::default() };
+        for row in self.values.chunks_exact(self.stride()) {
+            let rotation = Quat::from_slice(&row[column::ROTATION..]).normalize();
+            if !(row.iter().all(|v| v.is_finite()) && rotation.is_finite()) {
+                continue;
+            }
+            splats.means_m.push(Vec3::from_slice(&row[column::MEAN..]));
+            let scale = |k: usize| row[column::LOG_SCALE + k].exp();
+            splats.scales_m.push(Vec3::new(scale(0), scale(1), scale(2)));
+            splats.rotations.push(rotation);
+            splats.opacities.push(sigmoid(row[column::LOGIT]));
+            splats.sh.extend(&row[column::SH..]);
+        }
+        splats
+    }
+}
+
+/// Returns the coefficients of a degree: 1, 4, 9 or 16.
+pub(crate) fn coefficients(degree: u8) -> usize {
+    (usize::from(degree) + 1).pow(2)
+}
+
+/// Returns the opacity of a logit.
+pub(crate) fn sigmoid(logit: f32) -> f32 {
+    1.0 / (1.0 + (-logit).exp())
+}
+
+/// Returns the inverse of [`sigmoid`].
+pub(crate) fn logit(opacity: f32) -> f32 {
+    (opacity / (1.0 - opacity)).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn splats_come_back_as_they_were() {
+        let splats = Splats {
+            means_m: vec![Vec3::new(1.0, -2.0, 3.0), Vec3::ZERO],
+            scales_m: vec![Vec3::new(0.1, 0.02, 0.5), Vec3::splat(0.3)],
+            rotations: vec![Quat::from_rotation_x(0.7), Quat::IDENTITY],
+            opacities: vec![0.3, 0.99],
+            sh_degree: 1,
+            sh: (0..24).map(|i| i as f32 / 24.0).collect(),
+        };
+        let back = Gaussians::from_splats(&splats).to_splats();
+        assert_eq!(back.len(), 2);
+        assert_eq!((&back.means_m, &back.sh), (&splats.means_m, &splats.sh));
+        for i in 0..2 {
+            assert!((back.scales_m[i] - splats.scales_m[i]).length() < 1e-6);
+            assert!((back.opacities[i] - splats.opacities[i]).abs() < 1e-6);
+            assert!(back.rotations[i].dot(splats.rotations[i]) > 1.0 - 1e-6);
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_is_left_out() {
+        let mut gaussians = Gaussians::new(0);
+        for _ in 0..3 {
+            gaussians.push(Vec3::ZERO, Vec3::ONE, Quat::IDENTITY, 0.5, [0.2; 3]);
+        }
+        gaussians.row_mut(1)[column::LOG_SCALE] = f32::NAN;
+        gaussians.row_mut(2)[column::ROTATION..column::LOGIT].fill(0.0);
+        assert_eq!(gaussians.to_splats().len(), 1);
+    }
+}
