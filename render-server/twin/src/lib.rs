@@ -1,17 +1,26 @@
 //! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor.
 
+pub mod adam;
 mod bin;
 mod blend;
+pub mod dataset;
 pub mod gaussians;
+pub mod loss;
+mod neighbours;
 pub mod planes;
 mod project;
 pub mod random;
 pub mod reference;
+mod relocate;
 mod render;
+mod ssim;
+pub mod train;
 mod view;
 
+pub use dataset::Dataset;
 pub use gaussians::Gaussians;
 pub use planes::Planes;
 pub use project::Style;
 pub use render::{Renderer, channel};
+pub use train::{Options, Trainer};
 pub use view::View;

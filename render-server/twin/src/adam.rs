@@ -1,0 +1,223 @@
+//! The optimiser: Adam (Kingma and Ba 2015) on the rows that an image shows.
+//!
+//! Rows that no pixel of the image saw keep their moments (as in Mallick et al. 2024, "Taming 3DGS"):
+//! their gradient is not zero, it is unknown.
+
+use rayon::prelude::*;
+use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
+
+use crate::gaussians::{Gaussians, coefficients, column, sigmoid};
+use crate::project::RowGradient;
+
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+/// Rows that one thread takes at a time.
+const CHUNK: usize = 1024;
+
+/// Steps of each group of columns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// Means. [units of the dataset]
+    pub mean: f32,
+    /// Logarithms of the scales.
+    pub log_scale: f32,
+    /// Rotations.
+    pub rotation: f32,
+    /// Logits.
+    pub logit: f32,
+    /// The constant harmonic.
+    pub sh: f32,
+    /// The other harmonics.
+    pub sh_rest: f32,
+}
+
+/// What every row pays, so that no haze and no needles are left; each as a mean over all rows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tolls {
+    /// Of the opacity.
+    pub opacity: f32,
+    /// Of the scales, in extents of the capture.
+    pub scale: f32,
+    /// Of the least scale, likewise: a surface is flat.
+    pub thickness: f32,
+    /// Of the logarithm of the greatest scale over the middle one, beyond [`MAX_RATIO`].
+    pub needle: f32,
+}
+
+/// Discs may be as oblong as this.
+const MAX_RATIO: f32 = 3.0;
+
+/// First and second moments of every row.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Moments {
+    /// Of the gradient.
+    pub first: Gaussians,
+    /// Of its square.
+    pub second: Gaussians,
+}
+
+impl Moments {
+    /// Returns those of rows that have not moved.
+    pub fn of(gaussians: &Gaussians) -> Self {
+        Self { first: gaussians.zeros(), second: gaussians.zeros() }
+    }
+}
+
+/// One step of all rows that were seen.
+pub(crate) struct Step<'a> {
+    /// Ascending, as many as gradients.
+    pub(crate) seen: &'a [u32],
+    pub(crate) gradients: &'a [RowGradient],
+    /// From 1.
+    pub(crate) number: u32,
+    pub(crate) rates: Rates,
+    pub(crate) tolls: Tolls,
+    /// Of the capture. [units of the dataset]
+    pub(crate) extent: f32,
+    /// Degree of the harmonics that count.
+    pub(crate) degree: u8,
+}
+
+impl Step<'_> {
+    /// Moves the rows.
+    pub(crate) fn apply(
+        &self,
+        instructions: InstructionSet,
+        gaussians: &mut Gaussians,
+        moments: &mut Moments,
+    ) {
+        let (stride, rows) = (gaussians.stride(), gaussians.len());
+        let len = CHUNK * stride;
+        gaussians
+            .values
+            .par_chunks_mut(len)
+            .zip(moments.first.values.par_chunks_mut(len))
+            .zip(moments.second.values.par_chunks_mut(len))
+            .enumerate()
+            .for_each(|(chunk, ((values, first), second))| {
+                let first_row = chunk * CHUNK;
+                let start = self.seen.partition_point(|&row| (row as usize) < first_row);
+                let end = self.seen.partition_point(|&row| (row as usize) < first_row + CHUNK);
+                instructions.run(Rows {
+                    step: self,
+                    stride,
+                    rows,
+                    seen: &self.seen[start..end],
+                    gradients: &self.gradients[start..end],
+                    first_row,
+                    values,
+                    first,
+                    second,
+                });
+            });
+    }
+
+    /// Returns the gradient of a row, tolls included, to the end of the degree that counts.
+    #[inline(always)]
+    fn gradient(&self, row: &[f32], by: &RowGradient, rows: usize) -> [f32; 59] {
+        let mut out = [0.0; 59];
+        out[..column::SH].copy_from_slice(&by.geometry);
+        for k in 0..coefficients(self.degree) {
+            for channel in 0..3 {
+                out[column::SH + 3 * k + channel] = by.basis[k] * by.rgb[channel];
+            }
+        }
+        let share = 1.0 / rows as f32;
+        let opacity = sigmoid(row[column::LOGIT]);
+        out[column::LOGIT] += self.tolls.opacity * share * opacity * (1.0 - opacity);
+        let logs: [f32; 3] = std::array::from_fn(|k| row[column::LOG_SCALE + k]);
+        let scales = logs.map(|log| log.exp() / self.extent);
+        let mut order = [0, 1, 2];
+        order.sort_unstable_by(|&a, &b| logs[a].total_cmp(&logs[b]));
+        let [least, middle, greatest] = order;
+        for k in 0..3 {
+            out[column::LOG_SCALE + k] += self.tolls.scale * share / 3.0 * scales[k];
+        }
+        out[column::LOG_SCALE + least] += self.tolls.thickness * share * scales[least];
+        if logs[greatest] - logs[middle] > MAX_RATIO.ln() {
+            out[column::LOG_SCALE + greatest] += self.tolls.needle * share;
+            out[column::LOG_SCALE + middle] -= self.tolls.needle * share;
+        }
+        out
+    }
+}
+
+/// A chunk of rows.
+struct Rows<'a> {
+    step: &'a Step<'a>,
+    stride: usize,
+    rows: usize,
+    seen: &'a [u32],
+    gradients: &'a [RowGradient],
+    first_row: usize,
+    values: &'a mut [f32],
+    first: &'a mut [f32],
+    second: &'a mut [f32],
+}
+
+impl Kernel for Rows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Rates { mean, log_scale, rotation, logit, sh, sh_rest } = self.step.rates;
+        let mut rates = [sh_rest; 59];
+        rates[column::MEAN..column::LOG_SCALE].fill(mean);
+        rates[column::LOG_SCALE..column::ROTATION].fill(log_scale);
+        rates[column::ROTATION..column::LOGIT].fill(rotation);
+        rates[column::LOGIT] = logit;
+        rates[column::SH..column::SH + 3].fill(sh);
+        let number = self.step.number as i32;
+        let bias1 = 1.0 / (1.0 - BETA1.powi(number));
+        let bias2 = 1.0 / (1.0 - BETA2.powi(number));
+        let counted = column::SH + 3 * coefficients(self.step.degree);
+        for (&row, by) in self.seen.iter().zip(self.gradients) {
+            let at = (row as usize - self.first_row) * self.stride;
+            let values = &mut self.values[at..at + counted];
+            let gradient = self.step.gradient(values, by, self.rows);
+            // A row that came out wrong somewhere stays where it is.
+            if !gradient.iter().sum::<f32>().is_finite() {
+                continue;
+            }
+            let (first, second) =
+                (&mut self.first[at..at + counted], &mut self.second[at..at + counted]);
+            for i in 0..counted {
+                first[i] = BETA1 * first[i] + (1.0 - BETA1) * gradient[i];
+                second[i] = BETA2 * second[i] + (1.0 - BETA2) * gradient[i] * gradient[i];
+                values[i] -= rates[i] * first[i] * bias1 / ((second[i] * bias2).sqrt() + EPSILON);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Quat, Vec3};
+
+    #[test]
+    fn steps_are_as_long_as_their_rates_and_go_downhill() {
+        let mut gaussians = Gaussians::new(0);
+        for _ in 0..3 {
+            gaussians.push(Vec3::ZERO, Vec3::splat(0.1), Quat::IDENTITY, 0.5, [0.5; 3]);
+        }
+        let before = gaussians.clone();
+        let mut moments = Moments::of(&gaussians);
+        let mut by = RowGradient::default();
+        by.geometry[column::MEAN] = 3.0;
+        by.geometry[column::LOGIT] = -0.01;
+        let rates =
+            Rates { mean: 0.1, log_scale: 0.2, rotation: 0.3, logit: 0.4, sh: 0.5, sh_rest: 0.6 };
+        let tolls = Tolls { opacity: 0.0, scale: 0.0, thickness: 0.0, needle: 0.0 };
+        let step =
+            Step { seen: &[1], gradients: &[by], number: 1, rates, tolls, extent: 1.0, degree: 0 };
+        step.apply(InstructionSet::available()[0], &mut gaussians, &mut moments);
+        assert_eq!(gaussians.row(0), before.row(0));
+        assert_eq!(gaussians.row(2), before.row(2));
+        // The first step of Adam is its rate, whatever the gradient's length.
+        assert!((gaussians.row(1)[column::MEAN] + 0.1).abs() < 1e-6);
+        assert!((gaussians.row(1)[column::LOGIT] - 0.4).abs() < 1e-6);
+        assert_eq!(gaussians.row(1)[column::LOG_SCALE], before.row(1)[column::LOG_SCALE]);
+    }
+}

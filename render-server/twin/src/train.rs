@@ -1,0 +1,316 @@
+//! The schedule of a training: which photo, which step sizes, when Gaussians move and multiply.
+//!
+//! One step: a photo that is not held out is drawn, rendered on a random background (so that no wall
+//! stays translucent), compared, and every Gaussian it shows moves once. The same dataset, options and
+//! kind of processor give the same twin, whatever the number of threads.
+
+mod start;
+
+use glam::Vec3;
+use vizflyt_splat::Splats;
+use vizflyt_splat::simd::InstructionSet;
+
+use crate::adam::{Moments, Rates, Step, Tolls};
+use crate::dataset::{Dataset, Photo};
+use crate::gaussians::Gaussians;
+use crate::loss::{Exposure, Loss, Parts, Weights};
+use crate::project::{RowGradient, Style};
+use crate::random::Random;
+use crate::relocate::{relocate, wander};
+use crate::render::Renderer;
+
+/// How to train.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Steps, one photo each.
+    pub steps: u32,
+    /// The most Gaussians.
+    pub splats: usize,
+    /// Degree of the harmonics, 0 to 3.
+    pub degree: u8,
+    /// Same seed, same twin.
+    pub seed: u64,
+    /// Every how many-th photo is held out to be judged by, from the first; 0: none is.
+    pub hold_out: usize,
+    /// Whether to train for a renderer that dims what is smaller than a pixel.
+    pub antialiased: bool,
+    /// Whether photos differ in brightness and colour.
+    pub exposure: bool,
+    /// What counts how much.
+    pub weights: Weights,
+    /// What every Gaussian pays.
+    pub tolls: Tolls,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            steps: 3000,
+            splats: 60_000,
+            degree: 2,
+            seed: 1,
+            hold_out: 8,
+            antialiased: false,
+            exposure: true,
+            weights: Weights { dssim: 0.2, depth: 0.2, spread: 0.02 },
+            tolls: Tolls { opacity: 0.01, scale: 0.01, thickness: 0.1, needle: 0.001 },
+        }
+    }
+}
+
+/// A training under way.
+#[derive(Debug)]
+pub struct Trainer<'a> {
+    dataset: &'a Dataset,
+    options: Options,
+    extent: f32,
+    gaussians: Gaussians,
+    moments: Moments,
+    exposures: Vec<ExposureState>,
+    renderer: Renderer,
+    loss: Loss,
+    gradients: Vec<RowGradient>,
+    seen: Vec<u32>,
+    /// Photos still to come before all are shuffled again.
+    queue: Vec<usize>,
+    random: Random,
+    step: u32,
+}
+
+/// A photo's exposure and its moments, gain then offset.
+#[derive(Clone, Copy, Debug, Default)]
+struct ExposureState {
+    exposure: Exposure,
+    first: [f32; 6],
+    second: [f32; 6],
+    steps: i32,
+}
+
+/// What held-out photos say.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Quality {
+    /// Photos held out.
+    pub photos: usize,
+    /// Mean peak signal-to-noise ratio. [dB]
+    pub psnr_db: f64,
+    /// Mean structural similarity, to 1.
+    pub ssim: f64,
+}
+
+impl<'a> Trainer<'a> {
+    /// Begins a training.
+    ///
+    /// # Panics
+    /// If the dataset has no photo, or all are held out.
+    pub fn new(dataset: &'a Dataset, options: Options) -> Self {
+        let extent = dataset.extent();
+        let gaussians = start::gaussians(dataset, &options, extent);
+        let trainer = Self {
+            dataset,
+            options,
+            extent,
+            moments: Moments::of(&gaussians),
+            gaussians,
+            exposures: vec![ExposureState::default(); dataset.photos.len()],
+            renderer: Renderer::default(),
+            loss: Loss::default(),
+            gradients: Vec::new(),
+            seen: Vec::new(),
+            queue: Vec::new(),
+            random: Random::stream(options.seed, 1),
+            step: 0,
+        };
+        assert!(trainer.trained().next().is_some(), "no photo to train with");
+        trainer
+    }
+
+    /// Returns the steps done.
+    pub fn steps(&self) -> u32 {
+        self.step
+    }
+
+    /// Returns what is trained.
+    pub fn gaussians(&self) -> &Gaussians {
+        &self.gaussians
+    }
+
+    /// Returns the twin as it is now; what nobody could see is left out.
+    pub fn splats(&self) -> Splats {
+        let mut splats = self.gaussians.to_splats();
+        let visible: Vec<bool> = splats.opacities.iter().map(|&o| o >= 1.0 / 255.0).collect();
+        let numbers = 3 * splats.sh_coefficients();
+        let keep = |i: usize| visible[i];
+        fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
+            let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
+            *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
+        }
+        retain(&mut splats.means_m, 1, keep);
+        retain(&mut splats.scales_m, 1, keep);
+        retain(&mut splats.rotations, 1, keep);
+        retain(&mut splats.opacities, 1, keep);
+        retain(&mut splats.sh, numbers, keep);
+        splats
+    }
+
+    /// Takes one step; returns the parts of the loss before it.
+    pub fn step(&mut self) -> Parts {
+        let photo = self.draw();
+        let Photo { view, target, .. } = &self.dataset.photos[photo];
+        let style = self.style();
+        let background = std::array::from_fn(|_| self.random.unit());
+        let exposure = self.exposures[photo].exposure;
+        let weights = self.options.weights;
+        let image = self.renderer.forward(&self.gaussians, view, style);
+        let (parts, by_exposure, by) = self.loss.of(image, target, &exposure, background, &weights);
+        self.seen.clear();
+        self.seen.extend(self.renderer.seen().map(|row| row as u32));
+        self.renderer.backward(&self.gaussians, view, style, by, &mut self.gradients);
+        self.step += 1;
+        let rates = self.rates();
+        let step = Step {
+            seen: &self.seen,
+            gradients: &self.gradients,
+            number: self.step,
+            rates,
+            tolls: self.options.tolls,
+            extent: self.extent,
+            degree: style.degree,
+        };
+        step.apply(InstructionSet::available()[0], &mut self.gaussians, &mut self.moments);
+        if self.options.exposure {
+            let rate = EXPOSURE_RATE * self.decay(0.1);
+            self.exposures[photo].apply(&by_exposure, rate);
+        }
+        if self.is_moving() {
+            let seed = self.options.seed ^ (u64::from(self.step) << 32);
+            wander(&mut self.gaussians, &self.seen, NOISE * rates.mean, seed);
+            if self.step.is_multiple_of(RELOCATE_EVERY) {
+                let grow = self.growth();
+                relocate(&mut self.gaussians, &mut self.moments, grow, &mut self.random);
+            }
+        }
+        parts
+    }
+
+    /// Returns how well held-out photos are rendered, each exposed as fits it best; `None` if none is
+    /// held out.
+    pub fn judge(&mut self) -> Option<Quality> {
+        let held_out: Vec<usize> =
+            (0..self.dataset.photos.len()).filter(|&i| self.is_held_out(i)).collect();
+        let (mut psnr_db, mut ssim) = (0.0, 0.0);
+        for &i in &held_out {
+            let Photo { view, target, .. } = &self.dataset.photos[i];
+            let style = Style { degree: self.options.degree, ..self.style() };
+            let image = self.renderer.forward(&self.gaussians, view, style);
+            let exposure = if self.options.exposure {
+                Exposure::fitting(image, target)
+            } else {
+                Exposure::default()
+            };
+            let (psnr, similarity) = self.loss.quality(image, target, &exposure);
+            psnr_db += psnr;
+            ssim += similarity;
+        }
+        let photos = held_out.len();
+        let share = 1.0 / photos as f64;
+        (photos > 0).then_some(Quality { photos, psnr_db: psnr_db * share, ssim: ssim * share })
+    }
+
+    fn is_held_out(&self, photo: usize) -> bool {
+        self.options.hold_out > 0 && photo.is_multiple_of(self.options.hold_out)
+    }
+
+    fn trained(&self) -> impl Iterator<Item = usize> + '_ {
+        (0..self.dataset.photos.len()).filter(|&i| !self.is_held_out(i))
+    }
+
+    /// Returns the next photo: each once in a random order, then all again.
+    fn draw(&mut self) -> usize {
+        if self.queue.is_empty() {
+            self.queue = self.trained().collect();
+            self.random.shuffle(&mut self.queue);
+        }
+        self.queue.pop().expect("some photo is trained with")
+    }
+
+    /// Returns the share of the steps that are done.
+    fn progress(&self) -> f32 {
+        self.step as f32 / self.options.steps.max(1) as f32
+    }
+
+    /// Returns a factor that falls from 1 to `end`, evenly by its logarithm.
+    fn decay(&self, end: f32) -> f32 {
+        end.powf(self.progress().min(1.0))
+    }
+
+    fn style(&self) -> Style {
+        let degree = (self.progress() * DEGREES_PER_TRAINING) as u8;
+        Style { degree: degree.min(self.options.degree), antialiased: self.options.antialiased }
+    }
+
+    fn rates(&self) -> Rates {
+        Rates {
+            mean: MEAN_RATE * self.extent * self.decay(0.01),
+            log_scale: 0.01 * self.decay(0.2),
+            rotation: 0.003 * self.decay(0.2),
+            logit: 0.05,
+            sh: 0.005 * self.decay(0.2),
+            sh_rest: 0.005 / 20.0,
+        }
+    }
+
+    /// Whether Gaussians still move house: not at first, when nothing is known, nor at the end, when
+    /// everything settles.
+    fn is_moving(&self) -> bool {
+        (0.02..0.85).contains(&self.progress())
+    }
+
+    /// Returns by how many to grow so that the budget is reached after [`GROWN`] of the steps.
+    fn growth(&self) -> usize {
+        let (count, budget) = (self.gaussians.len(), self.options.splats);
+        let left = (GROWN - self.progress()) * self.options.steps as f32 / RELOCATE_EVERY as f32;
+        let factor = (budget as f32 / count.max(1) as f32).powf(1.0 / left.max(1.0));
+        let wanted = (count as f32 * (factor.min(MAX_GROWTH) - 1.0)).ceil().max(0.0) as usize;
+        wanted.min(budget.saturating_sub(count))
+    }
+
+    /// Returns the middle of the cameras, for tests and reports. [units of the dataset]
+    pub fn middle(&self) -> Vec3 {
+        let sum: Vec3 = self.dataset.photos.iter().map(|photo| photo.view.position).sum();
+        sum / self.dataset.photos.len() as f32
+    }
+}
+
+impl ExposureState {
+    /// One step of Adam, pulled to no change at all, without which all photos could grow brighter.
+    fn apply(&mut self, by: &Exposure, rate: f32) {
+        self.steps += 1;
+        let (bias1, bias2) = (1.0 - 0.9f32.powi(self.steps), 1.0 - 0.999f32.powi(self.steps));
+        for i in 0..6 {
+            let (value, by, rest) = if i < 3 {
+                (&mut self.exposure.gain[i], by.gain[i], 1.0)
+            } else {
+                (&mut self.exposure.offset[i - 3], by.offset[i - 3], 0.0)
+            };
+            let gradient = by + EXPOSURE_PULL * (*value - rest);
+            self.first[i] = 0.9 * self.first[i] + 0.1 * gradient;
+            self.second[i] = 0.999 * self.second[i] + 0.001 * gradient * gradient;
+            *value -= rate * (self.first[i] / bias1) / ((self.second[i] / bias2).sqrt() + 1e-12);
+        }
+    }
+}
+
+/// Step of the means at first. [extents of the capture]
+const MEAN_RATE: f32 = 4e-4;
+/// Noise of the faint, in steps of the means (Kheradmand et al. 2024, their implementation).
+const NOISE: f32 = 5e5;
+const RELOCATE_EVERY: u32 = 50;
+/// Share of the steps after which the budget is reached.
+const GROWN: f32 = 0.5;
+/// At most this many times as many at once.
+const MAX_GROWTH: f32 = 1.5;
+/// Harmonics come degree by degree: the third after three fifths.
+const DEGREES_PER_TRAINING: f32 = 5.0;
+const EXPOSURE_RATE: f32 = 3e-3;
+/// How strongly exposures are held to no change.
+const EXPOSURE_PULL: f32 = 0.02;
