@@ -1,6 +1,7 @@
 //! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor.
 
 pub mod adam;
+pub mod align;
 mod bin;
 mod blend;
 pub mod dataset;
