@@ -11,7 +11,7 @@ use vizflyt_arena::config::line_of;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::poses::settings;
-use vizflyt_server::scene::{self, Up};
+use vizflyt_server::scene::{self, BareArgs};
 
 use crate::terminal::print_fmt;
 
@@ -94,7 +94,7 @@ fn check_file(path: &Path) -> Result<bool> {
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
-    let scene = scene::load(&file, Up::default(), None)?;
+    let scene = scene::load(&file, &BareArgs::default())?;
     let still = Arc::new(scene::bake(&scene.splats, &scene.arena));
     let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);
     let checked = check(&scene.arena, &obstacles);

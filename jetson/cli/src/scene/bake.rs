@@ -8,7 +8,7 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 use vizflyt_arena::BakeSpec;
-use vizflyt_server::scene::{BakeCache, Baked, Up, bake_with, load};
+use vizflyt_server::scene::{BakeCache, Baked, BareArgs, bake_with, load};
 
 use crate::terminal::print_line;
 
@@ -26,12 +26,8 @@ pub(crate) struct BakeArgs {
     /// Bakes even if it is kept from an earlier time
     #[arg(long)]
     force: bool,
-    /// Bare scene only: the scene's axis that points up
-    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
-    up: Up,
-    /// Bare scene only: metres per unit of the scene
-    #[arg(long, value_name = "METRES", value_parser = vizflyt_server::scene::parse_scale)]
-    scale: Option<f64>,
+    #[command(flatten)]
+    bare: BareArgs,
     /// Prints one JSON object
     #[arg(long)]
     json: bool,
@@ -66,7 +62,7 @@ struct Counts {
 
 /// Runs `vizflyt scene bake`.
 pub(crate) fn run(args: &BakeArgs) -> Result<()> {
-    let mut scene = load(&args.scene, args.up, args.scale)?;
+    let mut scene = load(&args.scene, &args.bare)?;
     if let Some(voxel_m) = args.voxel {
         scene.arena.occupancy.voxel_m = voxel_m;
         scene.arena.validate()?;

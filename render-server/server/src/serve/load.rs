@@ -33,7 +33,7 @@ pub(super) struct LoadedScene {
 /// # Errors
 /// A scene or an arena that cannot be used, no such renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
-    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, args.up, args.scale)?;
+    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, &args.bare)?;
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
         .iter()
