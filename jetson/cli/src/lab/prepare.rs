@@ -31,6 +31,7 @@ pub(crate) struct Stage {
     /// Whether it depends on the seed.
     is_generated: bool,
     /// Holds files that were made for this flight until it ends.
+    #[expect(dead_code, reason = "dropped with the stage, which removes them")]
     folder: Option<TempDir>,
 }
 

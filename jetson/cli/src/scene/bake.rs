@@ -4,11 +4,15 @@ use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
-use vizflyt_arena::BakeSpec;
-use vizflyt_server::scene::{BakeCache, Baked, BareArgs, bake_with, load};
+use tracing::warn;
+use vizflyt_arena::check::{Finding, check_start};
+use vizflyt_arena::{BakeSpec, Obstacles};
+use vizflyt_server::scene::{
+    BakeCache, Baked, BareArgs, bake_with, check_fit, is_in_an_arena, load,
+};
 
 use crate::terminal::print_line;
 
@@ -81,7 +85,26 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     } else {
         report.print();
     }
-    Ok(())
+    let solid = baked.field.occupied_voxels();
+    let mut findings = check_fit(&scene.splats, &scene.arena, &baked.field);
+    let is_given = is_in_an_arena(&args.scene);
+    if is_given {
+        findings.extend(check_start(&scene.arena, &Obstacles::from(baked.field)));
+    }
+    refuse(&findings, is_given || solid == 0)
+}
+
+/// Refuses what cannot be meant. An arena that was made up may be only a little off.
+fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
+    if !is_final {
+        findings.iter().for_each(|finding| warn!("{finding}"));
+        return Ok(());
+    }
+    if findings.is_empty() {
+        return Ok(());
+    }
+    let lines: Vec<_> = findings.iter().map(ToString::to_string).collect();
+    bail!("this cannot be meant:\n  {}", lines.join("\n  "))
 }
 
 impl Report {

@@ -122,9 +122,9 @@ fn neighbours(cell: usize) -> impl Iterator<Item = usize> {
 }
 
 /// Below it a splat is haze.
-pub const SOLID_OPACITY: f32 = 0.5;
+pub(super) const SOLID_OPACITY: f32 = 0.5;
 /// Share of the core's splats left out at either end.
-pub const EDGE: f64 = 0.02;
+const EDGE: f64 = 0.02;
 /// Of a room of 29 x 17 x 15 units this makes cells of 1.4: walls hold together, sky does not.
 const CELLS_PER_REACH: f32 = 6.0;
 /// Cells along the cube's side: what lies more than 12 times the reach away is no core.

@@ -12,6 +12,7 @@ mod bake;
 mod bare;
 mod choose;
 mod core;
+mod fit;
 mod objects;
 mod placement;
 
@@ -19,6 +20,7 @@ pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
 pub use bare::{BareArgs, default_arena, parse_scale, place};
 pub use choose::Scenes;
 pub use core::{bounds, core};
+pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
 pub use placement::{Placement, WorldFromScene};
 pub use vizflyt_arena::config::Up;
