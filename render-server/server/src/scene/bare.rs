@@ -5,7 +5,7 @@
 //! - up is scene -y (`--up`): structure from motion starts from an upright camera, y down;
 //! - the scene's core is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a
 //!   room or a garden as far as a hand-held camera sees it. The unit itself cannot be known;
-//! - the start is where the twin looks best (see `best_view`);
+//! - the start is where there is a floor and the twin looks best (see `best_view`);
 //! - the floor is the core's 2nd percentile of height; it becomes the world's z = 0, and the middle of
 //!   the core the origin.
 //!
@@ -27,6 +27,8 @@ use vizflyt_protocol::messages::Limits;
 use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use super::core::{SOLID_OPACITY, bounds, core};
+use super::fit::LEAST_FLOOR;
+use super::floor::floor_share;
 
 /// What a command line says of a scene without an arena.
 #[derive(Args, Clone, Copy, Debug, Default, PartialEq)]
@@ -62,14 +64,12 @@ impl BareArgs {
     /// Returns what of a scene's placement is a guess, for people; `None` if nothing is.
     pub(super) fn guessed(&self, scene: &SceneConfig) -> Option<String> {
         let up = scene.up.unwrap_or(Up::Z);
-        let unit = format!(
-            "{} m per unit, which makes it {CAPTURED_HEIGHT_M} m high",
-            scene.metres_per_unit
-        );
+        let unit =
+            format!("{} m per unit, for a height of {CAPTURED_HEIGHT_M} m", scene.metres_per_unit);
         match (self.up, self.scale) {
-            (None, None) => Some(format!("its {up} is up, and {unit}; --up and --scale")),
-            (None, Some(_)) => Some(format!("its {up} is up; --up")),
-            (Some(_), None) => Some(format!("{unit}; --scale")),
+            (None, None) => Some(format!("{up} is up, and {unit}; correct it by --up and --scale")),
+            (None, Some(_)) => Some(format!("{up} is up; correct it by --up")),
+            (Some(_), None) => Some(format!("{unit}; correct it by --scale")),
             (Some(_), Some(_)) => None,
         }
     }
@@ -121,7 +121,17 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
     let scene = scene.into();
     let [min, max] = bounds(core(splats, |mean| mean));
     let voxel_m = voxel_m(max - min)?;
-    let (spawn, yaw_rad) = best_view(splats, &Plan::of(splats, min, max).places());
+    let mut places = Plan::of(splats, min, max).places();
+    let min_opacity = Occupancy::default().min_opacity as f32;
+    let floors: Vec<bool> = places
+        .iter()
+        .map(|&place| floor_share(splats, place, min_opacity) >= LEAST_FLOOR)
+        .collect();
+    if floors.contains(&true) {
+        let mut floors = floors.into_iter();
+        places.retain(|_| floors.next() == Some(true));
+    }
+    let (spawn, yaw_rad) = best_view(splats, &places);
     let name = Path::new(&scene.file).file_stem();
     let name = name.map_or("scene".into(), |stem| stem.to_string_lossy());
     let name: String = name.chars().filter(char::is_ascii_graphic).take(32).collect();

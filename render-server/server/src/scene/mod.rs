@@ -13,6 +13,7 @@ mod bare;
 mod choose;
 mod core;
 mod fit;
+mod floor;
 mod objects;
 mod placement;
 
@@ -211,11 +212,7 @@ fn without_arena(path: &Path, bare: &BareArgs) -> Result<Scene> {
         arena.spawn.position_m
     );
     if let Some(guessed) = bare.guessed(&arena.scene) {
-        warn!(
-            "a guess of {}: {guessed} correct it, and `vizflyt arena new DIR --scene {}` keeps it",
-            path.display(),
-            path.display()
-        );
+        warn!("{} has no arena, so this is guessed: {guessed}", path.display());
     }
     Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene })
 }
