@@ -121,17 +121,8 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
     let scene = scene.into();
     let [min, max] = bounds(core(splats, |mean| mean));
     let voxel_m = voxel_m(max - min)?;
-    let mut places = Plan::of(splats, min, max).places();
-    let min_opacity = Occupancy::default().min_opacity as f32;
-    let floors: Vec<bool> = places
-        .iter()
-        .map(|&place| floor_share(splats, place, min_opacity) >= LEAST_FLOOR)
-        .collect();
-    if floors.contains(&true) {
-        let mut floors = floors.into_iter();
-        places.retain(|_| floors.next() == Some(true));
-    }
-    let (spawn, yaw_rad) = best_view(splats, &places);
+    let plan = Plan::of(splats, min - OUTSIDE_M, max + OUTSIDE_M);
+    let (spawn, yaw_rad) = best_view(splats, &with_room(with_floor(plan.places(), splats)));
     let name = Path::new(&scene.file).file_stem();
     let name = name.map_or("scene".into(), |stem| stem.to_string_lossy());
     let name: String = name.chars().filter(char::is_ascii_graphic).take(32).collect();
@@ -202,6 +193,21 @@ fn voxel_m(size_m: DVec3) -> Result<f64> {
 
 fn to_cm(p_m: DVec3) -> DVec3 {
     (p_m * 100.0).round() / 100.0
+}
+
+/// Returns those of the places that have a floor, if any has; else all.
+fn with_floor(places: Vec<(u32, DVec3)>, splats: &Splats) -> Vec<(u32, DVec3)> {
+    let min_opacity = Occupancy::default().min_opacity as f32;
+    let has_floor = |&(_, p_m): &_| floor_share(splats, p_m, min_opacity) >= LEAST_FLOOR;
+    let standing: Vec<_> = places.iter().copied().filter(has_floor).collect();
+    if standing.is_empty() { places } else { standing }
+}
+
+/// Returns those of the places with the fewest splats in the way. [m, world]
+fn with_room(places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
+    let least = places.iter().map(|place| place.0).min().unwrap_or(0);
+    let free = places.into_iter().filter(|place| place.0 <= least + FEW_SPLATS);
+    free.map(|place| place.1).collect()
 }
 
 /// Returns the place [m, world] and heading [rad] from which, at the height of the flight, the
@@ -292,11 +298,10 @@ impl Plan {
         Some(inside(y, self.cells[1])? * self.cells[0] + inside(x, self.cells[0])?)
     }
 
-    /// Returns places to stand on, free of splats as far as there are such. [m, world]
-    fn places(&self) -> Vec<DVec3> {
-        let extent = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
-        let low = DVec3::new(self.min.x, self.min.y, 0.0) - OUTSIDE_M;
-        let span = extent + 2.0 * OUTSIDE_M;
+    /// Returns places all over the plan, each with the splats in its way. [m, world]
+    fn places(&self) -> Vec<(u32, DVec3)> {
+        let span = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
+        let low = DVec3::new(self.min.x, self.min.y, 0.0);
         let step = (span.x.max(span.y) / PLACES_PER_SIDE).max(0.3);
         let mut places = Vec::new();
         for x in 0..=(span.x / step) as u32 {
@@ -305,9 +310,7 @@ impl Plan {
                 places.push((self.crowd(p), DVec3::new(p.x, p.y, 0.0)));
             }
         }
-        let least = places.iter().map(|place| place.0).min().unwrap_or(0);
-        places.retain(|place| place.0 <= least + FEW_SPLATS);
-        places.into_iter().map(|place| place.1).collect()
+        places
     }
 
     /// Returns the number of splats within a body's reach of the column at `p`.
