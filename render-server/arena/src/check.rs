@@ -63,6 +63,14 @@ pub fn check(config: &ArenaConfig, obstacles: &Obstacles) -> Checked {
     checker.checked
 }
 
+/// Checks where the vehicle starts, and its climb, alone: for places without a course.
+pub fn check_start(config: &ArenaConfig, obstacles: &Obstacles) -> Vec<Finding> {
+    let checked = Checked::default();
+    let mut checker = Checker { config, obstacles, body: BodyShape::of(config), checked };
+    checker.check_start();
+    checker.checked.findings
+}
+
 struct Checker<'a> {
     config: &'a ArenaConfig,
     obstacles: &'a Obstacles,

@@ -23,6 +23,7 @@ mod line;
 mod no_fly;
 mod object;
 mod rules;
+mod scene;
 pub(crate) mod validate;
 mod vehicle;
 
@@ -33,6 +34,7 @@ pub use line::line_of;
 pub use no_fly::NoFly;
 pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};
 pub use rules::RulesConfig;
+pub use scene::{METRES_PER_UNIT, SceneConfig, UnknownAxis, Up};
 pub use validate::{ConfigError, check_number, check_position, invalid};
 pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
@@ -42,8 +44,8 @@ pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 pub struct ArenaConfig {
     /// The arena's name; at most 32 bytes.
     pub name: String,
-    /// The splat scene, relative to the folder of `arena.toml`.
-    pub scene: String,
+    /// The splats that it is seen as, and their place in it.
+    pub scene: SceneConfig,
     /// Radius of the sphere that encloses the vehicle. [m]
     pub body_radius_m: f64,
     /// Height above the spawn to which the runtime climbs before the plugin flies. [m]
@@ -229,7 +231,7 @@ impl ArenaConfig {
 
     /// Returns where the scene file lies, given where `arena.toml` lies.
     pub fn scene_path(&self, arena_toml: &Path) -> PathBuf {
-        arena_toml.parent().unwrap_or(Path::new("")).join(&self.scene)
+        arena_toml.parent().unwrap_or(Path::new("")).join(&self.scene.file)
     }
 
     /// Returns the keep-in volume for the body's surface. [world]

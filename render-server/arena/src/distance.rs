@@ -58,6 +58,11 @@ impl DistanceField {
         self.codes.len()
     }
 
+    /// Returns the number of voxels that are part of an obstacle.
+    pub fn occupied_voxels(&self) -> usize {
+        self.codes.iter().filter(|&&code| f64::from(code) < CODE_ZERO).count()
+    }
+
     /// Returns the signed distance from a point to the nearest obstacle, the floor not counted:
     /// negative inside, at most [`Self::max_distance_m`]. Outside the grid nothing is known, and
     /// the nearest point of the grid answers. NaN for a point that is not a number. [m, world]

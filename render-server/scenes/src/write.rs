@@ -58,7 +58,7 @@ impl Generated {
         };
         fs::create_dir_all(dir).map_err(io_error(dir))?;
         let written = Written {
-            scene: dir.join(&self.arena.scene),
+            scene: dir.join(&self.arena.scene.file),
             arena: dir.join("arena.toml"),
             truth: dir.join("truth.json"),
             map: self.map_is_known.then(|| dir.join("map.json")),

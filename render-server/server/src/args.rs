@@ -11,7 +11,7 @@ use crate::authorization::parse_grant;
 use crate::flights::leaderboard::{Database, UnknownDatabase};
 use crate::poses::settings::{Driver, LocalizationConfig};
 use crate::render::RendererKind;
-use crate::scene::{Up, parse_scale};
+use crate::scene::BareArgs;
 use crate::stream::rate_control::Adaptation;
 use crate::stream::transport::Congestion;
 use crate::web::Login;
@@ -106,13 +106,9 @@ pub struct ServeArgs {
     #[arg(long, value_enum, default_value_t)]
     pub adapt: Adaptation,
 
-    /// Bare scene only: the scene's axis that points up
-    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
-    pub up: Up,
-
-    /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
-    #[arg(long, value_name = "METRES", value_parser = parse_scale)]
-    pub scale: Option<f64>,
+    /// How a scene without an arena is put into the world
+    #[command(flatten)]
+    pub bare: BareArgs,
 
     /// Vehicles are isolated from each other in the twin: they neither see nor touch each other
     #[arg(long)]
@@ -257,6 +253,7 @@ fn number(text: &str, least: f64, most: f64) -> Result<f64, String> {
 mod tests {
     use super::*;
     use clap::Parser;
+    use vizflyt_arena::config::Up;
     use vizflyt_protocol::messages::bounded;
 
     #[derive(Parser)]
@@ -274,7 +271,7 @@ mod tests {
     fn options_are_read_and_checked() {
         let args =
             parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
-        assert_eq!((args.up, args.scale), (Up::NegY, Some(0.2)));
+        assert_eq!(args.bare, BareArgs { up: Some(Up::NegY), scale: Some(0.2) });
         assert_eq!((args.congestion, args.adapt), (Congestion::Bbr, Adaptation::Auto));
         assert_eq!(parse("a.toml --adapt none").unwrap().adapt, Adaptation::None);
         assert_eq!(args.encode_options(), EncodeOptions::default());
@@ -285,7 +282,7 @@ mod tests {
             (ColorMode::Jpeg420, DepthMode::Small)
         );
         assert_eq!(options.depth_bound, DepthBound::new(0.002));
-        assert_eq!(parse("a.toml --up z").unwrap().up, Up::Z);
+        assert_eq!(parse("a.toml --up z").unwrap().bare.up, Some(Up::Z));
         assert_eq!(parse("a.toml --pair instructor").unwrap().pair, Some(Grant::Instructor));
         let team = Grant::Team { vehicles: ["ant", "bee"].map(bounded).into_iter().collect() };
         assert_eq!(parse("a.toml --pair team:ant,bee").unwrap().pair, Some(team));

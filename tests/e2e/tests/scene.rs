@@ -343,3 +343,138 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM).unwrap();
     assert!(child.wait().unwrap().success());
 }
+
+/// A room of 10 x 6 x 3 m in units of a quarter of a metre, y down: floor, ceiling, walls, and shelves along one.
+fn captured_room() -> Vec<u8> {
+    let mut rows: Vec<[f32; 14]> = Vec::new();
+    // Normal to z, y or x, by a quarter turn about x, or y.
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let turns = [[1.0, 0.0, 0.0, 0.0], [half, half, 0.0, 0.0], [half, 0.0, half, 0.0]];
+    let mut face = |turn: usize, corner: [f32; 3], u: [f32; 3], v: [f32; 3]| {
+        let length = |w: [f32; 3]| w.iter().map(|x| x * x).sum::<f32>().sqrt();
+        let (across, down) = ((length(u) / 0.4) as usize, (length(v) / 0.4) as usize);
+        for k in 0..across * down {
+            let (a, b) = ((k % across) as f32 / across as f32, (k / across) as f32 / down as f32);
+            let p: [f32; 3] = std::array::from_fn(|axis| corner[axis] + u[axis] * a + v[axis] * b);
+            let [w, x, y, z] = turns[turn];
+            let (wide, thin) = (0.4f32.ln(), 0.04f32.ln());
+            rows.push([p[0], p[1], p[2], 0.5, 0.5, 0.5, 3.0, wide, wide, thin, w, x, y, z]);
+        }
+    };
+    let (x, down, z) = ([40.0, 0.0, 0.0], [0.0, 12.0, 0.0], [0.0, 0.0, 24.0]);
+    face(1, [0.0, 12.0, 0.0], x, z);
+    face(1, [0.0, 0.0, 0.0], x, z);
+    face(0, [0.0, 0.0, 0.0], x, down);
+    face(0, [0.0, 0.0, 24.0], x, down);
+    face(2, [0.0, 0.0, 0.0], z, down);
+    face(2, [40.0, 0.0, 0.0], z, down);
+    for shelf in 1..=6 {
+        let height = 12.0 - 0.8 * shelf as f32;
+        face(1, [2.0, height, 18.0], [36.0, 0.0, 0.0], [0.0, 0.0, 4.0]);
+    }
+    let names =
+        "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
+    let mut bytes =
+        format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", rows.len());
+    for name in names.split(' ') {
+        bytes += &format!("property float {name}\n");
+    }
+    let mut bytes = (bytes + "end_header\n").into_bytes();
+    bytes.extend(rows.iter().flatten().flat_map(|value| value.to_le_bytes()));
+    bytes
+}
+
+/// From a capture to an arena that is checked, baked and rendered; and what is refused on the way.
+#[test]
+fn a_captured_room_gets_an_arena() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    fs::write(at("room.ply"), captured_room()).unwrap();
+    let new = |name: &str, more: &[&str]| {
+        good(&[&["arena", "new", &at(name), "--scene", &at("room.ply")], more].concat())
+    };
+    let printed = new("mine", &["--environment", "night"]);
+    assert!(printed.contains("-y is up, 0.25 m per unit"), "{printed}");
+    let text = fs::read_to_string(at("mine/arena.toml")).unwrap();
+    assert!(text.contains("[scene]\nfile = \"../room.ply\"\nup = \"-y\""), "{text}");
+    assert!(good(&["arena", "check", &at("mine")]).contains("can be flown"));
+    let baked: Value =
+        serde_json::from_str(&good(&["scene", "bake", &at("mine"), "--json"])).unwrap();
+    assert!(baked["occupied"].as_u64().unwrap() > 10_000, "{baked}");
+    check_refused(&["arena", "new", &at("mine"), "--scene", &at("room.ply")], &["already exists"]);
+    check_refused(&["arena", "new", &at("x"), "--scene", &at("mine")], &["is an arena already"]);
+
+    // Cameras of an arena are the world's: half a metre under the ceiling, looking down, it is 2.5 m.
+    let w2c = json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2.5], [0, 0, 0, 1]]);
+    let camera = json!({"fx": 40, "fy": 40, "cx": 8, "cy": 8, "w": 16, "h": 16, "w2c": w2c});
+    fs::write(at("down.json"), camera.to_string()).unwrap();
+    let out = at("out");
+    let render = |scene: &str| {
+        let fixed = ["--camera", &at("down.json"), "--format", "npy", "--out", &out];
+        good(&[&["scene", "render", scene], &fixed[..]].concat());
+        saved(&out, "depth_median.npy").values[8 * 16 + 8]
+    };
+    let depth_m = render(&at("mine"));
+    assert!((depth_m - 2.5).abs() < 0.05, "{depth_m} m to the floor");
+
+    // The same from a file that was placed for good.
+    let converted = at("upright.ply");
+    good(&["scene", "convert", &at("room.ply"), &converted, "--up", "-y", "--scale", "0.25"]);
+    let origin = text.lines().find(|line| line.starts_with("origin")).unwrap();
+    let upright = text.replace("up = \"-y\"\nmetres_per_unit = 0.25\n", "");
+    assert!(upright.contains(origin) && !upright.contains("metres_per_unit"));
+    fs::create_dir(at("placed")).unwrap();
+    fs::write(at("placed/arena.toml"), upright.replace("../room.ply", "../upright.ply")).unwrap();
+    assert!((render(&at("placed")) - depth_m).abs() < 1e-3);
+
+    // On its head, on its end, elsewhere, far too large, and not at all.
+    let refused = |name: &str, change: &dyn Fn(&str) -> String, expected: &str| {
+        fs::create_dir_all(at(name)).unwrap();
+        fs::write(at(&format!("{name}/arena.toml")), change(&text)).unwrap();
+        let checked = vizflyt_e2e::run(&["arena", "check", &at(name)]);
+        let printed = String::from_utf8_lossy(&checked.stdout).into_owned();
+        assert!(!checked.status.success() && printed.contains(expected), "{name}: {printed}");
+        check_refused(&["scene", "bake", &at(name)], &["cannot be meant", expected]);
+    };
+    for (up, expected) in [("y", "upside down"), ("x", "on its side"), ("-x", "on its side")] {
+        new(up, &["--up", up]);
+        let made = fs::read_to_string(at(&format!("{up}/arena.toml"))).unwrap();
+        refused(up, &|_| made.clone(), expected);
+    }
+    let set = |key: &'static str, value: &'static str| {
+        move |text: &str| {
+            let old = text.lines().find(|line| line.starts_with(key)).unwrap().to_owned();
+            text.replace(&old, &format!("{key} = {value}"))
+        }
+    };
+    refused("elsewhere", &set("origin", "[300, 0, 0]"), "100 % of the scene lies outside");
+    refused("no-floor", &set("origin", "[-3, 5, 1.4]"), "has no floor there");
+    // The short form says that it lies in the world already, and it does not: on its side.
+    let file = "[scene]\nfile = \"../room.ply\"\nup = \"-y\"\nmetres_per_unit = 0.25\n";
+    let short = |text: &str| {
+        let body = text.replace(file, "").replace(origin, "");
+        let start = body.lines().find(|line| line.starts_with("position_m")).unwrap();
+        let body = body.replacen(start, "position_m = [-1.0, -1.0, 0.0]", 1);
+        format!("scene = \"../room.ply\"\n{body}")
+    };
+    refused("short", &short, "spawn.position_m");
+
+    // Flags of a bare scene do not place an arena's.
+    for command in [&["scene", "bake"][..], &["scene", "view"]] {
+        let args = [command, &[&at("mine"), "--up", "z", "--scale", "2"]].concat();
+        check_refused(
+            &args,
+            &["--up and --scale are for a scene without an arena", "[scene] there"],
+        );
+    }
+    check_refused(&["demo", "--scene", &at("mine"), "--up", "z"], &["--up is for a scene without"]);
+    check_refused(
+        &["demo", "--scene", &at("mine"), "--environment", "fog"],
+        &["set [environment] in"],
+    );
+    check_refused(&["demo", "--scene", "race", "--scale", "2"], &["'race' is generated upright"]);
+    check_refused(
+        &["scene", "bake", &at("room.ply"), "--scale", "1000"],
+        &["24000 x 40000 x 12000 m", "9.2e13 voxels of 0.5 m", "GB", "give a smaller --scale"],
+    );
+}

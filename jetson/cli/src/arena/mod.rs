@@ -1,4 +1,6 @@
-//! `vizflyt arena`: looks at rooms and courses before anyone flies in them.
+//! `vizflyt arena`: makes rooms for captured scenes, looks at rooms and courses before anyone flies in them.
+
+mod new;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -11,11 +13,11 @@ use vizflyt_arena::config::line_of;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::poses::settings;
-use vizflyt_server::scene::{self, Up};
+use vizflyt_server::scene::{self, BareArgs};
 
 use crate::terminal::print_fmt;
 
-/// Looks at rooms and courses before anyone flies in them.
+/// Makes rooms for captured scenes; looks at rooms and courses before anyone flies in them.
 #[derive(Args, Debug)]
 pub(crate) struct ArenaArgs {
     #[command(subcommand)]
@@ -25,9 +27,10 @@ pub(crate) struct ArenaArgs {
 #[derive(Subcommand, Debug)]
 enum ArenaCommand {
     Check(CheckArgs),
+    New(new::NewArgs),
 }
 
-/// Reports whether a course can be flown: the start is free, gates fit the vehicle and the room, a way leads
+/// Reports whether a course can be flown: the scene lies in it as it is meant, the start is free, gates fit the vehicle and the room, a way leads
 /// through all of them, and nothing that moves bars it for good.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -51,7 +54,13 @@ struct CheckArgs {
 
 /// Runs `vizflyt arena`.
 pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
-    let ArenaCommand::Check(args) = &args.command;
+    match &args.command {
+        ArenaCommand::Check(args) => check_all(args),
+        ArenaCommand::New(args) => new::run(args).map(|()| ExitCode::SUCCESS),
+    }
+}
+
+fn check_all(args: &CheckArgs) -> Result<ExitCode> {
     let good = match (&args.project, &args.arena) {
         (Some(project), _) => {
             let project = CourseProject::named(project)?;
@@ -94,10 +103,13 @@ fn check_file(path: &Path) -> Result<bool> {
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
-    let scene = scene::load(&file, Up::default(), None)?;
+    let scene = scene::load(&file, &BareArgs::default())?;
     let still = Arc::new(scene::bake(&scene.splats, &scene.arena));
+    let mut findings = scene::check_fit(&scene.splats, &scene.arena, &still);
     let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);
-    let checked = check(&scene.arena, &obstacles);
+    let mut checked = check(&scene.arena, &obstacles);
+    findings.append(&mut checked.findings);
+    checked.findings = findings;
     for finding in &checked.findings {
         let line = line_of(&text, &finding.key).map_or_else(String::new, |line| format!(":{line}"));
         print_fmt!("{}{line}: {finding}", file.display());

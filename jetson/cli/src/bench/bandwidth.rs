@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
 use vizflyt_server::render::{RendererKind, choose};
-use vizflyt_server::scene::{Up, load, load_as_it_is};
+use vizflyt_server::scene::{BareArgs, load, load_as_it_is};
 use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
 
@@ -33,6 +33,8 @@ pub(super) struct BandwidthArgs {
     /// A view, as for `vizflyt scene render`; may be given several times
     #[arg(long = "camera", value_name = "CAM.json")]
     cameras: Vec<PathBuf>,
+    #[command(flatten)]
+    bare: BareArgs,
     /// Images of this size; may be given several times [default: 320x240, 640x480, 1280x720]
     #[arg(long, value_name = "WxH")]
     size: Vec<ImageSize>,
@@ -67,7 +69,7 @@ struct Row {
 /// Runs `vizflyt bench bandwidth`.
 pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
     let (splats, views) = if args.cameras.is_empty() {
-        let scene = load(&args.scene, Up::default(), None)?;
+        let scene = load(&args.scene, &args.bare)?;
         let spawn = scene.arena.spawn;
         let eye_m = spawn.position_m + DVec3::Z * scene.arena.takeoff_height_m;
         let view = |n: u32| {
@@ -83,6 +85,10 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
         };
         (scene.splats, (0..8).map(view).collect())
     } else {
+        ensure!(
+            args.bare == BareArgs::default(),
+            "--up and --scale do not apply with --camera: its cameras are in the frame of the scene's file"
+        );
         let views: Vec<_> =
             args.cameras.iter().map(|path| camera::read(path)).collect::<Result<_>>()?;
         (load_as_it_is(&args.scene)?.1.splats, views)

@@ -11,6 +11,7 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
+use vizflyt_server::scene::BareArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::terminal::print_line;
@@ -63,8 +64,13 @@ pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
 
 fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Result<ExitCode> {
     let runtime = &args.runtime;
-    if args.lab.scene.is_some() || args.lab.seed.is_some() || args.lab.project.is_some() {
-        bail!("--scene, --project and --seed are for the simulated lab; add --sim to fly there");
+    let lab = &args.lab;
+    let place = lab.scene.is_some() || lab.seed.is_some() || lab.project.is_some();
+    if place || lab.environment.is_some() || lab.bare != BareArgs::default() {
+        bail!(
+            "--scene, --project, --seed, --environment, --up and --scale are for the simulated lab; add \
+             --sim to fly there"
+        );
     }
     let limits = runtime.jetson.plugin.limits();
     let mut command = plugin.map_or(Ok(Vec::new()), |plugin| plugin.command(&limits))?;

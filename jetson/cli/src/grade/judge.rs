@@ -20,7 +20,7 @@ use vizflyt_protocol::messages::{Event, EventKind};
 use vizflyt_runtime::log::read::{LogReader, RecordedTrack};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::Level;
-use vizflyt_server::scene::{Up, bake_with, load, obstacles};
+use vizflyt_server::scene::{BareArgs, bake_with, load, obstacles};
 
 use crate::lab::{LabArgs, Stage};
 use crate::terminal::print_line;
@@ -30,7 +30,7 @@ pub(super) struct JudgeArgs {
     /// The flight's log
     #[arg(value_name = "FILE.mcap")]
     log: PathBuf,
-    /// The arena it was flown in: a scene folder, an arena.toml or a generated scene's name [default: forest]
+    /// The arena it was flown in: a scene folder, an arena.toml, a scene file or a generated scene's name [default: forest]
     #[arg(long, value_name = "SCENE")]
     scene: Option<String>,
     /// The project whose course it was; takes the place of --scene
@@ -45,6 +45,8 @@ pub(super) struct JudgeArgs {
     /// Its seed, of what is generated
     #[arg(long)]
     seed: Option<u64>,
+    #[command(flatten)]
+    bare: BareArgs,
     /// Prints the verdict as JSON
     #[arg(long)]
     json: bool,
@@ -69,10 +71,11 @@ pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
         level: args.level,
         variant: args.variant,
         seed: args.seed,
+        bare: args.bare,
         ..LabArgs::default()
     };
     let stage = Stage::prepare(&lab)?;
-    let scene = load(&stage.arena, Up::default(), None)?;
+    let scene = load(&stage.arena, &BareArgs::default())?;
     ensure!(
         scene.objects.is_empty(),
         "something moves in {}, and a log does not tell where it was: such a flight is judged by its server alone",

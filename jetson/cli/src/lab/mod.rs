@@ -36,6 +36,7 @@ use serde_json::{Value, json};
 use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
 use vizflyt_server::render::RendererKind;
+use vizflyt_server::scene::BareArgs;
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
@@ -70,6 +71,12 @@ pub(crate) struct LabArgs {
         "The project's light and fog: {} [default: day]", Variant::names()
     ))]
     pub variant: Option<Variant>,
+    #[arg(long, value_name = "NAME", conflicts_with = "project", help = format!(
+        "Light and fog of a generated scene or a scene file: {} [default: day]", Variant::names()
+    ))]
+    pub environment: Option<Variant>,
+    #[command(flatten)]
+    pub bare: BareArgs,
     /// Seed of the generated scene and of the simulator's noise [default: 7].
     #[arg(long)]
     pub seed: Option<u64>,

@@ -4,19 +4,19 @@ use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use glam::DVec3;
 use tempfile::TempDir;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_scenes::SceneKind;
-use vizflyt_server::scene::Up;
+use vizflyt_server::scene::BareArgs;
 use vizflyt_tags::print::Pad;
 
 use super::LabArgs;
 
 /// A scene on disk, ready to be served.
 pub(crate) struct Stage {
-    /// What `vizflyt serve` is given: an `arena.toml`, or a bare scene.
+    /// What `vizflyt serve` is given: an `arena.toml`.
     pub arena: PathBuf,
     /// True geometry, where the scene was generated.
     pub truth: Option<PathBuf>,
@@ -28,7 +28,10 @@ pub(crate) struct Stage {
     pub fence_m: (DVec3, DVec3),
     /// Where it takes off, and where the flight ends.
     pub pads: Vec<Pad>,
-    /// Holds generated files until the flight ends.
+    /// Whether it depends on the seed.
+    is_generated: bool,
+    /// Holds files that were made for this flight until it ends.
+    #[expect(dead_code, reason = "dropped with the stage, which removes them")]
     folder: Option<TempDir>,
 }
 
@@ -41,15 +44,17 @@ impl Stage {
             (None, Ok(kind)) => Some(vizflyt_scenes::generate(kind, seed)),
             (None, Err(_)) => None,
         };
-        if let Some(generated) = generated {
-            let folder = tempfile::Builder::new()
-                .prefix("vizflyt-lab-")
-                // What is true of it is not for others on this computer.
-                .permissions(Permissions::from_mode(0o700))
-                .tempdir()
-                .context("cannot make a folder for the generated scene")?;
+        if let Some(mut generated) = generated {
+            ensure!(
+                lab.bare == BareArgs::default(),
+                "--up and --scale are for a scene file: '{scene}' is generated upright and in metres"
+            );
+            if let Some(variant) = lab.environment {
+                generated.arena.environment = variant.environment();
+            }
+            let folder = folder()?;
             let written = generated.write(folder.path())?;
-            return Self::at(written.arena, Some(folder));
+            return Ok(Self { is_generated: true, ..Self::at(written.arena, Some(folder))? });
         }
         let path = Path::new(scene);
         if !path.exists() {
@@ -59,28 +64,41 @@ impl Stage {
                 SceneKind::names()
             );
         }
-        if path.join("arena.toml").is_file() {
-            return Self::at(path.join("arena.toml"), None);
+        let inside = path.join("arena.toml");
+        let is_toml = path.extension().is_some_and(|extension| extension == "toml");
+        if let Some(arena) = [inside, path.to_owned()].into_iter().find(|path| path.is_file())
+            && (is_toml || path.is_dir())
+        {
+            lab.bare.check_unused(&arena)?;
+            ensure!(
+                lab.environment.is_none(),
+                "--environment is for a generated scene or a scene file: set [environment] in {}",
+                arena.display()
+            );
+            return Self::at(arena, None);
         }
-        if path.extension().is_some_and(|extension| extension == "toml") {
-            return Self::at(path.to_owned(), None);
+        Self::around(path, lab)
+    }
+
+    /// Makes up an arena around a scene file, and writes it down: what is guessed is guessed once.
+    fn around(scene: &Path, lab: &LabArgs) -> Result<Self> {
+        let mut arena = vizflyt_server::scene::load(scene, &lab.bare)?.arena;
+        let file =
+            scene.canonicalize().with_context(|| format!("cannot resolve {}", scene.display()))?;
+        arena.scene.file = file.to_string_lossy().into_owned();
+        if let Some(variant) = lab.environment {
+            arena.environment = variant.environment();
         }
-        // A bare scene: the server turns it upright and assumes an arena around it.
-        let arena = vizflyt_server::scene::load(path, Up::default(), None)?.arena;
-        Ok(Self {
-            arena: path.to_owned(),
-            truth: None,
-            map: None,
-            spawn: spawn(&arena),
-            fence_m: fence_m(&arena),
-            pads: pads(&arena),
-            folder: None,
-        })
+        let folder = folder()?;
+        let path = folder.path().join("arena.toml");
+        std::fs::write(&path, arena.to_toml()?)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        Self::at(path, Some(folder))
     }
 
     /// Returns what the seed changed, to be printed behind its name.
     pub(crate) fn seeded(&self, seed: u64) -> String {
-        self.folder.as_ref().map_or(String::new(), |_| format!(", seed {seed}"))
+        if self.is_generated { format!(", seed {seed}") } else { String::new() }
     }
 
     fn at(arena: PathBuf, folder: Option<TempDir>) -> Result<Self> {
@@ -91,8 +109,17 @@ impl Stage {
         let truth = Some(arena.with_file_name("truth.json")).filter(|path| path.exists());
         let map = Some(arena.with_file_name("map.json")).filter(|path| path.exists());
         let (spawn, fence_m, pads) = (spawn(&config), fence_m(&config), pads(&config));
-        Ok(Self { arena, truth, map, spawn, fence_m, pads, folder })
+        Ok(Self { arena, truth, map, spawn, fence_m, pads, is_generated: false, folder })
     }
+}
+
+fn folder() -> Result<TempDir> {
+    tempfile::Builder::new()
+        .prefix("vizflyt-lab-")
+        // What is true of it is not for others on this computer.
+        .permissions(Permissions::from_mode(0o700))
+        .tempdir()
+        .context("cannot make a folder for the scene")
 }
 
 fn fence_m(arena: &ArenaConfig) -> (DVec3, DVec3) {

@@ -4,11 +4,15 @@ use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
-use vizflyt_arena::BakeSpec;
-use vizflyt_server::scene::{BakeCache, Baked, Up, bake_with, load};
+use tracing::warn;
+use vizflyt_arena::check::{Finding, check_start};
+use vizflyt_arena::{BakeSpec, Obstacles};
+use vizflyt_server::scene::{
+    BakeCache, Baked, BareArgs, bake_with, check_fit, is_in_an_arena, load,
+};
 
 use crate::terminal::print_line;
 
@@ -26,12 +30,8 @@ pub(crate) struct BakeArgs {
     /// Bakes even if it is kept from an earlier time
     #[arg(long)]
     force: bool,
-    /// Bare scene only: the scene's axis that points up
-    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
-    up: Up,
-    /// Bare scene only: metres per unit of the scene
-    #[arg(long, value_name = "METRES", value_parser = vizflyt_server::scene::parse_scale)]
-    scale: Option<f64>,
+    #[command(flatten)]
+    bare: BareArgs,
     /// Prints one JSON object
     #[arg(long)]
     json: bool,
@@ -66,7 +66,7 @@ struct Counts {
 
 /// Runs `vizflyt scene bake`.
 pub(crate) fn run(args: &BakeArgs) -> Result<()> {
-    let mut scene = load(&args.scene, args.up, args.scale)?;
+    let mut scene = load(&args.scene, &args.bare)?;
     if let Some(voxel_m) = args.voxel {
         scene.arena.occupancy.voxel_m = voxel_m;
         scene.arena.validate()?;
@@ -85,7 +85,26 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     } else {
         report.print();
     }
-    Ok(())
+    let solid = baked.field.occupied_voxels();
+    let mut findings = check_fit(&scene.splats, &scene.arena, &baked.field);
+    let is_given = is_in_an_arena(&args.scene);
+    if is_given {
+        findings.extend(check_start(&scene.arena, &Obstacles::from(baked.field)));
+    }
+    refuse(&findings, is_given || solid == 0)
+}
+
+/// Refuses what cannot be meant. An arena that was made up may be only a little off.
+fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
+    if !is_final {
+        findings.iter().for_each(|finding| warn!("{finding}"));
+        return Ok(());
+    }
+    if findings.is_empty() {
+        return Ok(());
+    }
+    let lines: Vec<_> = findings.iter().map(ToString::to_string).collect();
+    bail!("this cannot be meant:\n  {}", lines.join("\n  "))
 }
 
 impl Report {

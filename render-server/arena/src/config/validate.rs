@@ -186,13 +186,6 @@ impl ArenaConfig {
         vizflyt_toml::join_errors(checks, ConfigError::Several)
     }
 
-    fn check_scene(&self) -> Result<(), ConfigError> {
-        if self.scene.trim().is_empty() {
-            return Err(invalid("scene", "\"\"", "give the scene file, relative to this file"));
-        }
-        Ok(())
-    }
-
     fn check_fence_and_points(&self) -> Result<(), ConfigError> {
         let fence = &self.geofence;
         check_position("geofence.min_m", fence.min_m)?;

@@ -59,7 +59,7 @@ fn arena(site: &Site) -> ArenaConfig {
     let spawn_m = DVec3::new(SPAWN_X_M, 0.0, 0.0);
     ArenaConfig {
         name: "forest".to_owned(),
-        scene: "scene.ply".to_owned(),
+        scene: "scene.ply".into(),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         time_limit_s: 60.0,

@@ -232,7 +232,7 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
     let splats = painter.canvas.finish();
     let arena = ArenaConfig {
         name: name.to_owned(),
-        scene: "scene.ply".to_owned(),
+        scene: "scene.ply".into(),
         body_radius_m: 0.12,
         takeoff_height_m: 1.2,
         time_limit_s: 60.0,

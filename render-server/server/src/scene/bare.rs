@@ -3,58 +3,137 @@
 //! A capture has its own axes, unit and origin. What is assumed, and can be overruled on the
 //! command line:
 //! - up is scene -y (`--up`): structure from motion starts from an upright camera, y down;
-//! - the scene is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a room
-//!   or a garden as far as a hand-held camera sees it. The unit itself cannot be known;
-//! - the start is where the twin looks best (see `best_view`);
-//! - the floor is the 2nd percentile of height; it becomes the world's z = 0, and the middle of the
-//!   scene the origin.
+//! - the scene's core is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a
+//!   room or a garden as far as a hand-held camera sees it. The unit itself cannot be known;
+//! - the start is where there is a floor and the twin looks best (see `best_view`);
+//! - the floor is the core's 2nd percentile of height; it becomes the world's z = 0, and the middle of
+//!   the core the origin.
 //!
-//! Percentiles over splats of opacity 0.5 or more: floaters and sky would ruin minimum and maximum.
+//! All of it is said in an [`ArenaConfig`] that could have been written by hand; `vizflyt arena new` writes it.
 
 use std::path::Path;
 
-use glam::{DQuat, DVec3, Vec3};
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use glam::{DQuat, DVec3};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{
-    CameraConfig, EnvironmentConfig, Geofence, Occupancy, RulesConfig, Spawn,
+    CameraConfig, EnvironmentConfig, Geofence, METRES_PER_UNIT, Occupancy, RulesConfig,
+    SceneConfig, Spawn, Up,
 };
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::Limits;
 use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
-use super::orient::{Up, WorldFromScene};
+use super::core::{SOLID_OPACITY, bounds, core};
+use super::fit::LEAST_FLOOR;
+use super::floor::floor_share;
 
-/// Returns the similarity that puts a captured scene upright, to size, onto z = 0, its middle at
-/// the origin. `scale` is world metres per scene unit; `None` estimates it.
-pub fn align(splats: &Splats, up: Up, scale: Option<f64>) -> WorldFromScene {
-    let rotation = up.world_from_scene();
-    let turn = rotation.as_quat();
-    let bounds = Bounds::of(splats, |mean| turn * mean);
-    let height = bounds.max.z - bounds.min.z;
-    let scale = scale.unwrap_or(if height > 0.0 { CAPTURED_HEIGHT_M / height } else { 1.0 });
-    let middle = (bounds.min + bounds.max) / 2.0;
-    let base = DVec3::new(middle.x, middle.y, bounds.min.z);
-    WorldFromScene { scale, rotation, translation_m: -base * scale }
+/// What a command line says of a scene without an arena.
+#[derive(Args, Clone, Copy, Debug, Default, PartialEq)]
+pub struct BareArgs {
+    /// Scene without an arena.toml: the file's axis that points up: x, -x, y, -y, z or -z [default: -y]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
+    pub up: Option<Up>,
+
+    /// Scene without an arena.toml: metres per unit of the file [default: its core is taken to be 3 m high]
+    #[arg(long, value_name = "METRES", value_parser = parse_scale)]
+    pub scale: Option<f64>,
 }
 
-/// Returns an arena for a scene that already lies in the world (z up, metres): the fence around its
-/// robust bounds, the start on the floor where there is room and the view is best, one camera of
+impl BareArgs {
+    /// Refuses to turn or scale what an `arena.toml` places.
+    ///
+    /// # Errors
+    /// A flag that was given, with what to do instead.
+    pub fn check_unused(&self, arena_toml: &Path) -> Result<()> {
+        let flags = match (self.up, self.scale) {
+            (None, None) => return Ok(()),
+            (Some(_), None) => "--up is",
+            (None, Some(_)) => "--scale is",
+            (Some(_), Some(_)) => "--up and --scale are",
+        };
+        bail!(
+            "{flags} for a scene without an arena, and {} places its scene itself: set `up` and \
+             `metres_per_unit` under [scene] there",
+            arena_toml.display()
+        );
+    }
+
+    /// Returns what of a scene's placement is a guess, for people; `None` if nothing is.
+    pub(super) fn guessed(&self, scene: &SceneConfig) -> Option<String> {
+        let up = scene.up.unwrap_or(Up::Z);
+        let unit =
+            format!("{} m per unit, for a height of {CAPTURED_HEIGHT_M} m", scene.metres_per_unit);
+        match (self.up, self.scale) {
+            (None, None) => Some(format!("{up} is up, and {unit}; correct it by --up and --scale")),
+            (None, Some(_)) => Some(format!("{up} is up; correct it by --up")),
+            (Some(_), None) => Some(format!("{unit}; correct it by --scale")),
+            (Some(_), Some(_)) => None,
+        }
+    }
+}
+
+/// Parses metres per unit of a scene.
+///
+/// # Errors
+/// What is no number, or no scale that a scene has.
+pub fn parse_scale(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
+    if METRES_PER_UNIT.contains(&value) {
+        return Ok(value);
+    }
+    let (least, most) = METRES_PER_UNIT.into_inner();
+    Err(format!("{value} is outside {least} to {most}"))
+}
+
+/// Returns the placement that puts a captured scene upright, to size, onto z = 0, its middle at the
+/// origin. What `args` leave open is guessed.
+pub fn place(splats: &Splats, file: &str, args: &BareArgs) -> SceneConfig {
+    let up = args.up.unwrap_or_default();
+    let rotation = up.world_from_scene();
+    let turn = rotation.as_quat();
+    let [min, max] = bounds(core(splats, |mean| turn * mean));
+    let height = max.z - min.z;
+    let guess = if height > 0.0 { CAPTURED_HEIGHT_M / height } else { 1.0 };
+    let (least, most) = METRES_PER_UNIT.into_inner();
+    let metres_per_unit = args.scale.unwrap_or_else(|| to_digits(guess).clamp(least, most));
+    let middle = (min + max) / 2.0;
+    let base = DVec3::new(middle.x, middle.y, min.z);
+    // Written into arena.toml, and read by people: millimetres.
+    let origin_m = (-base * metres_per_unit * 1e3).round() / 1e3;
+    SceneConfig { up: Some(up), metres_per_unit, origin_m, ..SceneConfig::in_world(file) }
+}
+
+/// Returns a positive number to three digits: a guess is not better.
+fn to_digits(value: f64) -> f64 {
+    format!("{value:.2e}").parse().unwrap_or(value)
+}
+
+/// Returns an arena for a scene that already lies in the world (z up, metres), as `scene` placed it: the
+/// fence around its core, the start on the floor where there is room and the view is best, one camera of
 /// 320x240, no goal.
 ///
-/// `scene` is the value of the arena's `scene` key.
-pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
-    let bounds = Bounds::of(splats, |mean| mean);
-    let (spawn, yaw_rad) = best_view(splats, &Plan::of(splats, &bounds).places());
-    let name = scene.file_stem().map_or("scene".into(), |stem| stem.to_string_lossy());
+/// # Errors
+/// A scene too large to bake.
+pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<ArenaConfig> {
+    let scene = scene.into();
+    let [min, max] = bounds(core(splats, |mean| mean));
+    let voxel_m = voxel_m(max - min)?;
+    let plan = Plan::of(splats, min - OUTSIDE_M, max + OUTSIDE_M);
+    let (spawn, yaw_rad) = best_view(splats, &with_room(with_floor(plan.places(), splats)));
+    let name = Path::new(&scene.file).file_stem();
+    let name = name.map_or("scene".into(), |stem| stem.to_string_lossy());
+    let name: String = name.chars().filter(char::is_ascii_graphic).take(32).collect();
     // Something to fly in, however small the scene.
     let least = DVec3::new(1.0, 1.0, 0.0);
     let margin = OUTSIDE_M / 2.0;
-    let min_m = (bounds.min - margin).min(spawn - least);
-    let max_m = (bounds.max + margin).max(spawn + least);
-    ArenaConfig {
-        name: name.chars().filter(char::is_ascii_graphic).take(32).collect(),
-        scene: scene.to_string_lossy().into_owned(),
+    let min_m = (min - margin).min(spawn - least);
+    let max_m = (max + margin).max(spawn + least);
+    let arena = ArenaConfig {
+        name: if name.is_empty() { "scene".into() } else { name },
+        scene,
         body_radius_m: BODY_RADIUS_M,
         takeoff_height_m: TAKEOFF_HEIGHT_M,
         time_limit_s: 0.0,
@@ -63,13 +142,13 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         spawn: Spawn { position_m: spawn, yaw_deg: yaw_rad.to_degrees().round() },
         goal: None,
         geofence: Geofence {
-            min_m: DVec3::new(min_m.x, min_m.y, -0.5),
-            max_m: DVec3::new(max_m.x, max_m.y, max_m.z.max(TAKEOFF_HEIGHT_M + 1.0)),
+            min_m: to_cm(DVec3::new(min_m.x, min_m.y, -0.5)),
+            max_m: to_cm(DVec3::new(max_m.x, max_m.y, max_m.z.max(TAKEOFF_HEIGHT_M + 1.0))),
         },
         limits: Limits::new(2.0, 4.0),
         body: Vec::new(),
         no_fly: Vec::new(),
-        occupancy: Occupancy::default(),
+        occupancy: Occupancy { voxel_m, ..Occupancy::default() },
         environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
         vehicles: Vec::new(),
@@ -83,7 +162,52 @@ pub fn default_arena(splats: &Splats, scene: &Path) -> ArenaConfig {
         stages: Vec::new(),
         objects: Vec::new(),
         rules: RulesConfig::default(),
+    };
+    arena.validate().context("no arena can be made up for this scene")?;
+    Ok(arena)
+}
+
+/// Returns the side of the voxels that a scene of this size is baked into: as fine as the memory allows.
+///
+/// # Errors
+/// A scene too large for the coarsest.
+fn voxel_m(size_m: DVec3) -> Result<f64> {
+    let usual_m = Occupancy::default().voxel_m;
+    let volume_m3 = (size_m + 2.0 * OUTSIDE_M).max(DVec3::ONE).element_product();
+    let fitting_m = (volume_m3 / VOXELS).cbrt();
+    // Up to the next centimetre.
+    let voxel_m = if fitting_m <= usual_m { usual_m } else { (fitting_m * 100.0).ceil() / 100.0 };
+    if voxel_m <= COARSEST_M {
+        return Ok(voxel_m);
     }
+    let voxels = volume_m3 / COARSEST_M.powi(3);
+    bail!(
+        "the scene would be {:.0} x {:.0} x {:.0} m: its obstacles are {voxels:.1e} voxels of \
+         {COARSEST_M} m, {:.1e} GB, and {VOXELS:.0e} are the most; give a smaller --scale",
+        size_m.x,
+        size_m.y,
+        size_m.z,
+        voxels / 1e9
+    );
+}
+
+fn to_cm(p_m: DVec3) -> DVec3 {
+    (p_m * 100.0).round() / 100.0
+}
+
+/// Returns those of the places that have a floor, if any has; else all.
+fn with_floor(places: Vec<(u32, DVec3)>, splats: &Splats) -> Vec<(u32, DVec3)> {
+    let min_opacity = Occupancy::default().min_opacity as f32;
+    let has_floor = |&(_, p_m): &_| floor_share(splats, p_m, min_opacity) >= LEAST_FLOOR;
+    let standing: Vec<_> = places.iter().copied().filter(has_floor).collect();
+    if standing.is_empty() { places } else { standing }
+}
+
+/// Returns those of the places with the fewest splats in the way. [m, world]
+fn with_room(places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
+    let least = places.iter().map(|place| place.0).min().unwrap_or(0);
+    let free = places.into_iter().filter(|place| place.0 <= least + FEW_SPLATS);
+    free.map(|place| place.1).collect()
 }
 
 /// Returns the place [m, world] and heading [rad] from which, at the height of the flight, the
@@ -139,36 +263,6 @@ fn detail(image: &RgbdImage) -> f32 {
     (across + down) * share.powi(2)
 }
 
-/// Robust corners of a scene.
-struct Bounds {
-    min: DVec3,
-    max: DVec3,
-}
-
-impl Bounds {
-    fn of(splats: &Splats, place: impl Fn(Vec3) -> Vec3) -> Self {
-        let solid = |least: f32| -> Vec<Vec3> {
-            let means = splats.means_m.iter().zip(&splats.opacities);
-            means.filter(|(_, opacity)| **opacity >= least).map(|(mean, _)| place(*mean)).collect()
-        };
-        let mut points = solid(SOLID_OPACITY);
-        if points.is_empty() {
-            points = solid(0.0);
-        }
-        let mut corners = [[0.0f64; 3]; 2];
-        if !points.is_empty() {
-            for axis in 0..3 {
-                points.sort_unstable_by(|a, b| a[axis].total_cmp(&b[axis]));
-                for (corner, share) in corners.iter_mut().zip([EDGE, 1.0 - EDGE]) {
-                    let index = (share * (points.len() - 1) as f64).round() as usize;
-                    corner[axis] = f64::from(points[index][axis]);
-                }
-            }
-        }
-        Self { min: corners[0].into(), max: corners[1].into() }
-    }
-}
-
 /// How full each column of air is between the floor and above the flight.
 struct Plan {
     min: DVec3,
@@ -177,10 +271,10 @@ struct Plan {
 }
 
 impl Plan {
-    fn of(splats: &Splats, bounds: &Bounds) -> Self {
-        let span = (bounds.max - bounds.min) / CELL_M;
+    fn of(splats: &Splats, min: DVec3, max: DVec3) -> Self {
+        let span = (max - min) / CELL_M;
         let cells = [span.x, span.y].map(|cells| (cells.ceil() as usize).clamp(1, MAX_CELLS));
-        let mut plan = Self { min: bounds.min, cells, filled: vec![0; cells[0] * cells[1]] };
+        let mut plan = Self { min, cells, filled: vec![0; cells[0] * cells[1]] };
         for (mean, opacity) in splats.means_m.iter().zip(&splats.opacities) {
             let flown = (0.3..TAKEOFF_HEIGHT_M as f32 + 0.5).contains(&mean.z);
             if flown
@@ -204,11 +298,10 @@ impl Plan {
         Some(inside(y, self.cells[1])? * self.cells[0] + inside(x, self.cells[0])?)
     }
 
-    /// Returns places to stand on, free of splats as far as there are such. [m, world]
-    fn places(&self) -> Vec<DVec3> {
-        let extent = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
-        let low = DVec3::new(self.min.x, self.min.y, 0.0) - OUTSIDE_M;
-        let span = extent + 2.0 * OUTSIDE_M;
+    /// Returns places all over the plan, each with the splats in its way. [m, world]
+    fn places(&self) -> Vec<(u32, DVec3)> {
+        let span = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
+        let low = DVec3::new(self.min.x, self.min.y, 0.0);
         let step = (span.x.max(span.y) / PLACES_PER_SIDE).max(0.3);
         let mut places = Vec::new();
         for x in 0..=(span.x / step) as u32 {
@@ -217,9 +310,7 @@ impl Plan {
                 places.push((self.crowd(p), DVec3::new(p.x, p.y, 0.0)));
             }
         }
-        let least = places.iter().map(|place| place.0).min().unwrap_or(0);
-        places.retain(|place| place.0 <= least + FEW_SPLATS);
-        places.into_iter().map(|place| place.1).collect()
+        places
     }
 
     /// Returns the number of splats within a body's reach of the column at `p`.
@@ -237,10 +328,10 @@ impl Plan {
 
 /// A storey. [m]
 const CAPTURED_HEIGHT_M: f64 = 3.0;
-/// Share of splats left out at either end.
-const EDGE: f64 = 0.02;
-/// Below it a splat is haze.
-const SOLID_OPACITY: f32 = 0.5;
+/// Of an arena that is made up: 100 MB.
+const VOXELS: f64 = 1e8;
+/// Coarser ones leave no room to fly. [m]
+const COARSEST_M: f64 = 0.5;
 /// A palm-sized quadrotor of the course. [m]
 const BODY_RADIUS_M: f64 = 0.12;
 const TAKEOFF_HEIGHT_M: f64 = 1.2;
@@ -264,8 +355,9 @@ const MAX_CELLS: usize = 400;
 
 #[cfg(test)]
 mod tests {
+    use super::super::Placement;
     use super::*;
-    use glam::Quat;
+    use glam::{Quat, Vec3};
 
     /// A hollow box of points in scene units, y down, four times as large as life, with a post in
     /// its middle and haze above.
@@ -297,24 +389,51 @@ mod tests {
         }
     }
 
+    /// Places it as the command line says, and returns how.
+    fn put(splats: &mut Splats, args: BareArgs) -> SceneConfig {
+        let scene = place(splats, "rooms/kitchen.ply", &args);
+        Placement::of(&scene).apply(splats);
+        scene
+    }
+
     #[test]
     fn a_capture_is_put_upright_and_to_size() {
         let mut splats = captured();
-        let similarity = align(&splats, Up::NegY, None);
-        assert!((similarity.scale - 0.25).abs() < 0.01, "{similarity:?}");
-        similarity.apply(&mut splats);
-        let bounds = Bounds::of(&splats, |mean| mean);
-        assert!((bounds.max.z - 3.0).abs() < 0.01 && bounds.min.z.abs() < 0.01);
+        let scene = put(&mut splats, BareArgs::default());
+        assert!((scene.metres_per_unit - 0.25).abs() < 0.01, "{scene:?}");
+        let [min, max] = bounds(core(&splats, |mean| mean));
+        assert!((max.z - 3.0).abs() < 0.01 && min.z.abs() < 0.01);
         // Depth of the scene along x (its z, 16 units), width along y.
-        assert!((bounds.max.x - 2.0).abs() < 0.1 && (bounds.max.y - 3.0).abs() < 0.2);
-        assert_eq!(align(&captured(), Up::NegY, Some(0.5)).scale, 0.5);
+        assert!((max.x - 2.0).abs() < 0.1 && (max.y - 3.0).abs() < 0.2);
+        let half = BareArgs { scale: Some(0.5), ..BareArgs::default() };
+        assert_eq!(put(&mut captured(), half).metres_per_unit, 0.5);
+    }
+
+    /// 4 % of opaque sky, 300 units out, used to make the sky's height the scene's.
+    #[test]
+    fn sky_is_not_the_scenes_height() {
+        let mut with_sky = captured();
+        let sky = (0..280).map(|k| {
+            let angle = k as f32 * 2.4;
+            Vec3::new(angle.cos(), -0.5 - 0.001 * k as f32, angle.sin()).normalize() * 300.0
+        });
+        with_sky.means_m.extend(sky);
+        let count = with_sky.means_m.len();
+        with_sky.opacities.resize(count, 0.95);
+        with_sky.scales_m.resize(count, Vec3::splat(5.0));
+        with_sky.rotations.resize(count, Quat::IDENTITY);
+        with_sky.sh.resize(count * 3, 0.0);
+        let scene = put(&mut with_sky, BareArgs::default());
+        assert!((scene.metres_per_unit - 0.25).abs() < 0.01, "{scene:?}");
+        let arena = default_arena(&with_sky, scene).unwrap();
+        assert!((arena.geofence.max_m - arena.geofence.min_m).max_element() < 9.0, "{arena:?}");
     }
 
     #[test]
     fn the_start_is_clear_of_the_post_and_the_arena_is_valid() {
         let mut splats = captured();
-        align(&splats, Up::NegY, None).apply(&mut splats);
-        let arena = default_arena(&splats, Path::new("rooms/kitchen.ply"));
+        let scene = put(&mut splats, BareArgs::default());
+        let arena = default_arena(&splats, scene).unwrap();
         let spawn = arena.spawn.position_m;
         assert_eq!((arena.name.as_str(), spawn.z), ("kitchen", 0.0));
         let post = spawn.truncate().length();
@@ -328,7 +447,7 @@ mod tests {
     #[test]
     fn an_empty_or_flat_scene_still_has_an_arena() {
         for count in [0, 1, 5] {
-            let splats = Splats {
+            let mut splats = Splats {
                 means_m: vec![Vec3::ZERO; count],
                 scales_m: vec![Vec3::splat(0.1); count],
                 rotations: vec![Quat::IDENTITY; count],
@@ -336,9 +455,28 @@ mod tests {
                 sh_degree: 0,
                 sh: vec![0.0; count * 3],
             };
-            assert_eq!(align(&splats, Up::Z, None).scale, 1.0);
-            let arena = default_arena(&splats, Path::new("dot.ply"));
+            let scene = put(&mut splats, BareArgs { up: Some(Up::Z), scale: None });
+            assert_eq!(scene.metres_per_unit, 1.0);
+            let arena = default_arena(&splats, scene).unwrap();
             assert!(ArenaConfig::parse(&arena.to_toml().unwrap()).is_ok());
         }
+    }
+
+    /// Memory is not asked for before it is known how much.
+    #[test]
+    fn a_scene_too_large_to_bake_is_refused_with_the_figure() {
+        let at = |scale: f64| {
+            let mut splats = captured();
+            let scene = put(&mut splats, BareArgs { up: None, scale: Some(scale) });
+            default_arena(&splats, scene)
+        };
+        let error = format!("{:#}", at(100.0).unwrap_err());
+        assert!(error.contains("1600 x 2400 x 1200 m") && error.contains("e10 voxels"), "{error}");
+        assert!(error.contains("give a smaller --scale"), "{error}");
+        // A campus gets coarser voxels.
+        let coarse = at(10.0).unwrap().occupancy.voxel_m;
+        assert!((0.3..0.5).contains(&coarse), "{coarse}");
+        let fine = at(0.25).unwrap().occupancy.voxel_m;
+        assert_eq!(fine, Occupancy::default().voxel_m);
     }
 }

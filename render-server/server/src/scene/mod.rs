@@ -1,23 +1,30 @@
 //! From a path on the command line to everything the flight needs of the twin.
 //!
 //! ```text
-//! arena.toml -> ArenaConfig -> its scene file -> Splats --------> renderer
-//! scene file -> upright, to size -> ArenaConfig (made up)   \---> occupancy -> referee, map
+//! arena.toml --> ArenaConfig ------------> [scene]: file, placement -> Splats --> renderer
+//! scene file --> ArenaConfig (made up) -/                                  \---> occupancy -> referee, map
 //! ```
+//! Splats are placed here and nowhere else: whoever loads an arena sees its scene in the world.
 //! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
 //! Once, at the start; progress goes to the log.
 
 mod bake;
 mod bare;
 mod choose;
+mod core;
+mod fit;
+mod floor;
 mod objects;
-mod orient;
+mod placement;
 
 pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
-pub use bare::{align, default_arena};
+pub use bare::{BareArgs, default_arena, parse_scale, place};
 pub use choose::Scenes;
+pub use core::{bounds, core};
+pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
-pub use orient::{Up, WorldFromScene};
+pub use placement::{Placement, WorldFromScene};
+pub use vizflyt_arena::config::Up;
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -38,7 +45,8 @@ pub struct Scene {
     pub splats: Splats,
     /// What moves in it, in the arena's order. [m, object]
     pub objects: Vec<RigidObject>,
-    /// How the scene's file was turned, scaled and moved to become the twin.
+    /// From the frame that `CAM.json` files are in: the world itself in an arena; of a bare scene, its
+    /// file's frame.
     pub world_from_scene: WorldFromScene,
 }
 
@@ -48,23 +56,38 @@ enum Named {
     Scene(PathBuf),
 }
 
-/// Reads an arena with its scene, or a bare scene, which is then put upright and to size.
-pub fn load(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
+/// Reads an arena with its scene, or a bare scene, for which an arena is made up.
+///
+/// # Errors
+/// What cannot be read or used; `bare` for a scene that an arena places.
+pub fn load(path: &Path, bare: &BareArgs) -> Result<Scene> {
     match named(path)? {
-        Named::Arena(path) => with_arena(&path),
-        Named::Scene(path) => without_arena(&path, up, scale),
+        Named::Arena(path) => {
+            bare.check_unused(&path)?;
+            with_arena(&path)
+        }
+        Named::Scene(path) => without_arena(&path, bare),
     }
 }
 
-/// Reads a scene file as it is, neither turned nor scaled; of an arena, its scene file, which lies
-/// in the world already. Returns the file's path with what it holds.
+/// Reads the splats that `CAM.json` cameras look at: of an arena its scene, in the world; a scene file
+/// as it is, neither turned nor scaled. Returns the file's path with what it holds.
+///
+/// # Errors
+/// What cannot be read or used.
 pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
-    let scene = match named(path)? {
-        Named::Arena(path) => parse_arena(&path)?.1,
-        Named::Scene(path) => path,
-    };
-    let loaded = read(&scene)?;
-    Ok((scene, loaded))
+    match named(path)? {
+        Named::Arena(path) => {
+            let (arena, scene) = parse_arena(&path)?;
+            let mut loaded = read(&scene)?;
+            put(&arena, &mut loaded.splats)?;
+            Ok((scene, loaded))
+        }
+        Named::Scene(path) => {
+            let loaded = read(&path)?;
+            Ok((path, loaded))
+        }
+    }
 }
 
 /// Reads what moves in an arena, with those phases that its file leaves to the seed; of a bare scene,
@@ -139,7 +162,7 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
         bail!(
             "{} names the scene '{}', but there is no {}; generate it, or correct `scene`",
             path.display(),
-            arena.scene,
+            arena.scene.file,
             scene.display()
         );
     }
@@ -148,28 +171,49 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
 
 fn with_arena(path: &Path) -> Result<Scene> {
     let (arena, scene) = parse_arena(path)?;
-    let world_from_scene = WorldFromScene::IDENTITY;
     let objects = read_objects(&arena, path)?;
-    Ok(Scene { splats: read(&scene)?.splats, arena, objects, world_from_scene })
+    let mut splats = read(&scene)?.splats;
+    put(&arena, &mut splats)?;
+    Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY })
+}
+
+/// Puts splats, as their file has them, where an arena wants them.
+fn put(arena: &ArenaConfig, splats: &mut Splats) -> Result<()> {
+    let cropped = Placement::of(&arena.scene).apply(splats);
+    if cropped > 0 {
+        info!("{}: {cropped} splats lie outside scene.crop and are left out", arena.scene.file);
+    }
+    if splats.is_empty() {
+        bail!(
+            "all {cropped} splats of {} lie outside scene.crop; it is in metres of the world: correct \
+             it, or the scene's up, metres_per_unit and origin",
+            arena.scene.file
+        );
+    }
+    Ok(())
 }
 
 fn read_objects(arena: &ArenaConfig, arena_toml: &Path) -> Result<Vec<RigidObject>> {
     objects::read_all(arena, arena_toml, |path| Ok(read(path)?.splats))
 }
 
-fn without_arena(path: &Path, up: Up, scale: Option<f64>) -> Result<Scene> {
+fn without_arena(path: &Path, bare: &BareArgs) -> Result<Scene> {
     let mut splats = read(path)?.splats;
-    let world_from_scene = align(&splats, up, scale);
+    let file = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy();
+    let scene = place(&splats, &file, bare);
+    let world_from_scene = Placement::of(&scene).world_from_scene;
     world_from_scene.apply(&mut splats);
-    let file = path.file_name().map_or_else(|| path.to_owned(), PathBuf::from);
-    let arena = default_arena(&splats, &file);
+    let cannot = || format!("cannot use {} without an arena", path.display());
+    let arena = default_arena(&splats, scene).with_context(cannot)?;
+    let size_m = arena.geofence.max_m - arena.geofence.min_m;
     info!(
-        "{} has no arena: made one up, {:.3} m per unit{}, start at {}",
+        "{} has no arena: made one up of {size_m:.1} m, start at {}",
         path.display(),
-        world_from_scene.scale,
-        if scale.is_none() { " (a guess; set --scale and --up)" } else { "" },
         arena.spawn.position_m
     );
+    if let Some(guessed) = bare.guessed(&arena.scene) {
+        warn!("{} has no arena, so this is guessed: {guessed}", path.display());
+    }
     Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene })
 }
 
@@ -202,20 +246,6 @@ fn read(path: &Path) -> Result<Loaded> {
 /// Shorter loads need no progress.
 const LOG_PERIOD: Duration = Duration::from_secs(1);
 
-/// Parses metres per unit of a bare scene.
-///
-/// # Errors
-/// What is no number, or no scale that a scene has.
-pub fn parse_scale(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
-    let (least, most) = (1e-4, 1e4);
-    if (least..=most).contains(&value) {
-        Ok(value)
-    } else {
-        Err(format!("{value} is outside {least} to {most}"))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -223,7 +253,7 @@ mod tests {
     use vizflyt_splat::ply;
 
     fn check(path: &Path, expected: &str) {
-        let error = format!("{:#}", load(path, Up::default(), None).unwrap_err());
+        let error = format!("{:#}", load(path, &BareArgs::default()).unwrap_err());
         assert!(error.contains(expected), "'{error}' lacks '{expected}'");
     }
 
@@ -256,7 +286,7 @@ mod tests {
         let empty = Splats { sh_degree: 0, ..Splats::default() };
         ply::write(at("empty.ply"), &empty).unwrap();
         check(&at("empty.ply"), "empty.ply: no splats");
-        let arena = default_arena(&dot(), Path::new("gone.ply"));
+        let arena = default_arena(&dot(), "gone.ply").unwrap();
         std::fs::write(at("arena.toml"), arena.to_toml().unwrap()).unwrap();
         check(&at("arena.toml"), "names the scene 'gone.ply', but there is no");
     }
@@ -265,13 +295,14 @@ mod tests {
     fn an_arena_and_a_bare_scene_load() {
         let folder = tempfile::tempdir().unwrap();
         ply::write(folder.path().join("dot.ply"), &dot()).unwrap();
-        let arena = default_arena(&dot(), Path::new("dot.ply"));
+        let arena = default_arena(&dot(), "dot.ply").unwrap();
         std::fs::write(folder.path().join("arena.toml"), arena.to_toml().unwrap()).unwrap();
-        let scene = load(folder.path(), Up::default(), None).unwrap();
+        let scene = load(folder.path(), &BareArgs::default()).unwrap();
         assert_eq!(scene.arena, arena);
         // An arena's scene lies in the world already: it is not moved.
         assert!((scene.splats.means_m[0] - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-6);
-        let bare = load(&folder.path().join("dot.ply"), Up::Z, Some(1.0)).unwrap();
+        let z = BareArgs { up: Some(Up::Z), scale: Some(1.0) };
+        let bare = load(&folder.path().join("dot.ply"), &z).unwrap();
         assert!(bare.splats.means_m[0].length() < 1e-6, "its floor is z = 0");
     }
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use anyhow::Result;
+use tracing::warn;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
 use vizflyt_splat::{Chosen, Scene as RenderedScene};
 
@@ -33,13 +34,16 @@ pub(super) struct LoadedScene {
 /// # Errors
 /// A scene or an arena that cannot be used, no such renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
-    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, args.up, args.scale)?;
+    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, &args.bare)?;
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
         .iter()
         .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
         .collect();
     let field = Arc::new(scene::bake(&splats, &arena));
+    for finding in scene::check_fit(&splats, &arena, &field) {
+        warn!("{finding}");
+    }
     let top_view = TopView::render(&splats, &arena, &field);
     let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };

@@ -91,6 +91,26 @@ fn main() {
     );
     if let Some(path) = shots {
         vizflyt_splat::ply::write(&path, &splats).unwrap();
+        let mut renderer = vizflyt_splat::CpuRenderer::new(&splats);
+        let (w, h) = (320u32, 240u32);
+        let mut sheet = image::RgbImage::new(4 * w, 4 * h);
+        for (row, i) in [0usize, 16, 40, 56].into_iter().enumerate() {
+            let photo = &capture.photos[i];
+            let image = capture::render(&mut renderer, capture.intrinsics, photo.world_from_cam);
+            let mut rgb = Vec::new();
+            image.write_rgb8(&mut rgb);
+            let depth = capture::depth_m(&image);
+            for n in 0..(w * h) as usize {
+                let (x, y) = (n as u32 % w, n as u32 / w + row as u32 * h);
+                let of = |rgb: &[u8]| image::Rgb([rgb[3 * n], rgb[3 * n + 1], rgb[3 * n + 2]]);
+                let grey = |d: f32| image::Rgb([(d * 18.0).min(255.0) as u8; 3]);
+                sheet.put_pixel(x, y, of(&photo.rgb));
+                sheet.put_pixel(x + w, y, of(&rgb));
+                sheet.put_pixel(x + 2 * w, y, grey(photo.true_depth_m[n]));
+                sheet.put_pixel(x + 3 * w, y, grey(depth[n]));
+            }
+        }
+        sheet.save(format!("{path}.png")).unwrap();
     }
 }
 

@@ -1,9 +1,29 @@
 //! Photos with poses, and points: what training starts from.
+//!
+//! A folder is nerfstudio's (`transforms.json`) or COLMAP's (`sparse/0`, `images`). Its model is read
+//! first; then every photo once, several at a time: undistorted, made smaller, and kept as bytes. What
+//! all of them will take is known, and bounded, before the first is opened.
 
-use glam::Vec3;
+pub mod colmap;
+mod error;
+pub mod nerfstudio;
+mod photo;
+pub mod point_cloud;
+mod sparse;
 
-use crate::loss::Target;
+use std::path::{Path, PathBuf};
+
+use glam::{DVec2, Vec3};
+use rayon::prelude::*;
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+
+use self::error::read_file;
+use self::photo::Rgba;
+use crate::loss::{SeenPoint, Target};
 use crate::view::View;
+
+pub use error::DatasetError;
+pub use sparse::{SparseImage, SparseModel, SparsePoint};
 
 /// A capture whose poses are known. All lengths are in units of the dataset, in its own frame.
 #[derive(Clone, Debug, Default)]
@@ -44,3 +64,223 @@ impl Dataset {
         if reach > 1e-6 { reach } else { 1.0 }
     }
 }
+
+impl Dataset {
+    /// Reads a folder; photos become at most `width_px` wide.
+    ///
+    /// # Errors
+    /// [`DatasetError`] says which file is wrong, and what to do.
+    pub fn read(folder: &Path, width_px: Option<u32>) -> Result<Self, DatasetError> {
+        let transforms = folder.join("transforms.json");
+        let (plans, points) = if transforms.is_file() {
+            of_nerfstudio(folder, &transforms)?
+        } else if let Some(model) = colmap::find(folder) {
+            of_colmap(folder, &model)?
+        } else {
+            return Err(DatasetError::NotADataset(folder.to_owned()));
+        };
+        if plans.len() < 2 {
+            return Err(DatasetError::TooFew(folder.to_owned(), plans.len()));
+        }
+        check_memory(&plans, width_px)?;
+        let mut photos = plans
+            .par_iter()
+            .map(|plan| plan.load(width_px, &points))
+            .collect::<Result<Vec<_>, _>>()?;
+        photos.sort_by(|a, b| a.name.cmp(&b.name));
+        let points = points.into_iter().map(|(_, point)| point).collect();
+        let mut dataset = Self { photos, points };
+        let near = NEAR * dataset.extent();
+        for photo in &mut dataset.photos {
+            photo.view.near = near;
+        }
+        Ok(dataset)
+    }
+}
+
+/// A photo that is not read yet.
+struct Plan {
+    name: String,
+    image: PathBuf,
+    mask: Option<PathBuf>,
+    /// 16-bit PNG and what a step of it is.
+    depth: Option<(PathBuf, f32)>,
+    /// `Err` is a horizontal field of view that waits for the image's size.
+    intrinsics: Result<Intrinsics, f64>,
+    world_from_cam: Pose<World, Cam>,
+    /// Ids of points that it saw, for depth.
+    seen: Vec<u64>,
+}
+
+type Points = std::collections::BTreeMap<u64, Point>;
+
+fn of_colmap(folder: &Path, model: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {
+    let sparse = colmap::read(model)?;
+    // Beside the model where it stands alone.
+    let images = [folder.join("images"), model.join("images"), folder.to_owned()];
+    let images = images.iter().find(|path| path.is_dir()).unwrap_or(&images[0]);
+    let well_seen = |id: &u64| sparse.points.get(id).is_some_and(|p| p.track >= WELL_SEEN);
+    let plans = sparse.images.iter().map(|image| {
+        let mask = folder.join("masks").join(format!("{}.png", image.name));
+        Plan {
+            name: image.name.clone(),
+            image: images.join(&image.name),
+            mask: mask.is_file().then_some(mask),
+            depth: None,
+            intrinsics: Ok(image.intrinsics),
+            world_from_cam: image.world_from_cam,
+            seen: image.seen.iter().copied().filter(well_seen).collect(),
+        }
+    });
+    let points = sparse
+        .points
+        .iter()
+        .map(|(&id, point)| (id, Point { position: point.position.as_vec3(), rgb: point.rgb }));
+    Ok((plans.collect(), points.collect()))
+}
+
+fn of_nerfstudio(folder: &Path, file: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {
+    let bytes = read_file(file)?;
+    let damaged = |what: String| DatasetError::damaged(file, what);
+    let text = String::from_utf8(bytes).map_err(|_| damaged("not text in UTF-8".to_owned()))?;
+    let transforms = nerfstudio::parse(&text).map_err(|error| match error {
+        nerfstudio::TransformsError::Damaged(what) => damaged(what),
+        nerfstudio::TransformsError::Lens(model) => {
+            DatasetError::Lens { path: file.to_owned(), model }
+        }
+    })?;
+    let plans = transforms.frames.into_iter().map(|frame| {
+        let mut image = folder.join(&frame.file);
+        if image.extension().is_none() {
+            image.set_extension("png");
+        }
+        Plan {
+            name: frame.file,
+            image,
+            mask: frame.mask.map(|mask| folder.join(mask)),
+            depth: frame.depth.map(|depth| (folder.join(depth), frame.depth_step)),
+            intrinsics: frame.intrinsics,
+            world_from_cam: frame.world_from_cam,
+            seen: Vec::new(),
+        }
+    });
+    let mut points = Points::new();
+    if let Some(name) = transforms.points {
+        let path = folder.join(name);
+        let cloud = point_cloud::parse(&read_file(&path)?)
+            .map_err(|what| DatasetError::damaged(&path, what))?;
+        for (id, (position, rgb)) in (0..).zip(cloud) {
+            points.insert(id, Point { position: position.as_vec3(), rgb });
+        }
+    }
+    Ok((plans.collect(), points))
+}
+
+/// Checks that all photos fit into memory together.
+fn check_memory(plans: &[Plan], width_px: Option<u32>) -> Result<(), DatasetError> {
+    let bytes = |plan: &Plan| {
+        // Where the size waits for the image, the width alone bounds it.
+        let side = u64::from(width_px.unwrap_or(1920));
+        let pixels = plan
+            .intrinsics
+            .as_ref()
+            .map_or(side * side, |k| photo::pinhole(k, width_px).pixels() as u64);
+        pixels * if plan.depth.is_some() { 8 } else { 4 }
+    };
+    let needed: u64 = plans.iter().map(bytes).sum();
+    if needed > MAX_BYTES {
+        let (megabytes, limit) = (needed >> 20, MAX_BYTES >> 20);
+        return Err(DatasetError::TooLarge { images: plans.len(), megabytes, limit });
+    }
+    Ok(())
+}
+
+impl Plan {
+    fn load(&self, width_px: Option<u32>, points: &Points) -> Result<Photo, DatasetError> {
+        let mut image = photo::read(&self.image)?;
+        let size = (image.width, image.height);
+        let given = match self.intrinsics {
+            Ok(k) => k,
+            Err(angle) => {
+                let k = Intrinsics::from_horizontal_fov(size.0, size.1, angle);
+                k.validate().map_err(|e| DatasetError::damaged(&self.image, e.to_string()))?;
+                k
+            }
+        };
+        let shape = |path: &Path, found| DatasetError::Shape {
+            path: path.to_owned(),
+            found,
+            expected: (given.width_px, given.height_px),
+        };
+        let camera = photo::fitted(&given, size).ok_or_else(|| shape(&self.image, size))?;
+        if let Some(path) = &self.mask {
+            apply_mask(&mut image, &photo::read(path)?).map_err(|found| shape(path, found))?;
+        }
+        // By the camera that was given: photos and depths of other sizes become the same.
+        let pinhole = photo::pinhole(&given, width_px.map(|w| w.min(camera.width_px)));
+        let seen = photo::undistort(&image, &camera, &pinhole);
+        let view = View::new(&pinhole, &self.world_from_cam, 0.0);
+        let mask: Vec<u8> = seen.pixels.iter().map(|p| p[3]).collect();
+        let mut target = Target {
+            width: view.width,
+            height: view.height,
+            rgb: seen.pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).collect(),
+            mask: if mask.iter().all(|&m| m > 0) { Vec::new() } else { mask },
+            ..Target::default()
+        };
+        for id in &self.seen {
+            if let Some(([x, y], z)) = points.get(id).and_then(|p| view.project(p.position)) {
+                let inside =
+                    x >= 0.0 && y >= 0.0 && x < view.width as f32 && y < view.height as f32;
+                if inside && z.is_finite() {
+                    let pixel = (y as usize * view.width + x as usize) as u32;
+                    target.points.push(SeenPoint { pixel, z });
+                }
+            }
+        }
+        if let Some((path, step)) = &self.depth {
+            let (width, height, depth) = photo::read_depth(path)?;
+            let k = photo::fitted(&given, (width, height))
+                .ok_or_else(|| shape(path, (width, height)))?;
+            target.depth = undistorted_depth(&depth, &k, &pinhole, *step);
+        }
+        Ok(Photo { name: self.name.clone(), view, target })
+    }
+}
+
+/// Takes out what a mask has black; `Err` is a mask's size of another shape.
+fn apply_mask(image: &mut Rgba, mask: &Rgba) -> Result<(), (u32, u32)> {
+    let (width, height) = (image.width as usize, image.height as usize);
+    let (w, h) = (mask.width as usize, mask.height as usize);
+    if width.abs_diff(w * height / h) > 2 + width / h {
+        return Err((mask.width, mask.height));
+    }
+    for (i, pixel) in image.pixels.iter_mut().enumerate() {
+        let (x, y) = (i % width * w / width, i / width * h / height);
+        if mask.pixels[y * w + x][..3] == [0; 3] {
+            pixel[3] = 0;
+        }
+    }
+    Ok(())
+}
+
+/// Returns depths as a pinhole sees them, the nearest pixel's: between two surfaces there is none.
+fn undistorted_depth(depth: &[u16], k: &Intrinsics, pinhole: &Intrinsics, step: f32) -> Vec<f32> {
+    let place = photo::Resampler::new(k, pinhole);
+    let pixels = (0..pinhole.height_px).flat_map(|y| (0..pinhole.width_px).map(move |x| (x, y)));
+    let at = |(x, y): (u32, u32)| {
+        let at = place.at(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5))?;
+        let inside = at.x >= 0.0 && at.y >= 0.0;
+        let (u, v) = (at.x as u32, at.y as u32);
+        let inside = inside && u < k.width_px && v < k.height_px;
+        inside.then(|| f32::from(depth[(v * k.width_px + u) as usize]) * step)
+    };
+    pixels.map(|pixel| at(pixel).unwrap_or(0.0)).collect()
+}
+
+/// What is closer to a camera is not seen. [extents of the capture]
+const NEAR: f32 = 0.01;
+/// Points seen by fewer images say nothing of depth.
+const WELL_SEEN: usize = 3;
+/// Of all photos together.
+const MAX_BYTES: u64 = 4 << 30;

@@ -33,7 +33,7 @@ use vizflyt_splat::Chosen;
 use self::engine::{Engine, Picture, Request};
 use crate::lock::lock;
 use crate::render::{RendererInfo, RendererKind, choose};
-use crate::scene::{self, Scene, Up};
+use crate::scene::{self, BareArgs, Scene};
 use crate::stop::Stop;
 use crate::web::{self, origin};
 
@@ -61,13 +61,9 @@ pub struct ViewArgs {
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
 
-    /// Bare scene only: the scene's axis that points up
-    #[arg(long, value_enum, default_value_t, allow_hyphen_values = true)]
-    pub up: Up,
-
-    /// Bare scene only: metres per unit of the scene [default: the scene is taken to be 3 m high]
-    #[arg(long, value_name = "METRES", value_parser = scene::parse_scale)]
-    pub scale: Option<f64>,
+    /// How a scene without an arena is put into the world
+    #[command(flatten)]
+    pub bare: BareArgs,
 
     /// What the arena leaves to chance: where in their motion its objects begin
     #[arg(long, default_value_t = 7)]
@@ -140,8 +136,7 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
 }
 
 fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, splats, objects, world_from_scene } =
-        scene::load(&args.scene, args.up, args.scale)?;
+    let Scene { arena, splats, objects, world_from_scene } = scene::load(&args.scene, &args.bare)?;
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
     let Chosen { rasterizer, reason } = choose(twin, args.renderer)?;
     let moving = MovingObjects::new(&arena, args.seed);

@@ -1,54 +1,71 @@
-//! `world_from_scene`: turns, scales and moves a captured scene into the world, once at load.
+//! Puts a captured scene into the world, once at load: `[scene]` of `arena.toml`, the flags of a bare scene and
+//! of `scene convert` all end here.
 //!
 //! Means and scales are multiplied, rotations turned, and the spherical harmonics of degree 1 to 3
 //! turned with them, so that highlights stay where they were. The harmonics of a degree mix only
 //! among themselves; the mixing matrix follows from f(R d) = f'(d) at enough directions, which
 //! needs no closed form and holds for any sign convention of the basis.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DQuat, DVec3, Vec3};
+use vizflyt_arena::config::{Geofence, SceneConfig};
 use vizflyt_splat::Splats;
 
-/// Which axis of the scene points up.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum Up {
-    /// +x.
-    #[value(name = "x")]
-    X,
-    /// -x.
-    #[value(name = "-x")]
-    NegX,
-    /// +y: exports of game engines.
-    #[value(name = "y")]
-    Y,
-    /// -y: what COLMAP's first upright camera gives (y down, z forward).
-    #[default]
-    #[value(name = "-y")]
-    NegY,
-    /// +z: the world's own; exports of nerfstudio.
-    #[value(name = "z")]
-    Z,
-    /// -z.
-    #[value(name = "-z")]
-    NegZ,
+/// How a scene comes to lie in the world: moved there, then cropped.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// Turns, scales and moves it.
+    pub world_from_scene: WorldFromScene,
+    /// Splats whose centres lie outside are left out. [m, world]
+    pub crop: Option<Geofence>,
 }
 
-impl Up {
-    /// Returns the rotation that takes this axis to the world's +z; of y-up and y-down scenes the
-    /// usual forward axis becomes the world's +x.
-    pub fn world_from_scene(self) -> DQuat {
-        // Rows: the world's axes written in scene axes.
-        let rows = match self {
-            Self::Z => [DVec3::X, DVec3::Y, DVec3::Z],
-            Self::NegZ => [DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z],
-            // Camera axes: x right, y down, z forward.
-            Self::NegY => [DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y],
-            // Graphics axes: x right, y up, z backward.
-            Self::Y => [DVec3::NEG_Z, DVec3::NEG_X, DVec3::Y],
-            Self::X => [DVec3::Y, DVec3::Z, DVec3::X],
-            Self::NegX => [DVec3::Z, DVec3::Y, DVec3::NEG_X],
+impl Placement {
+    /// Leaves everything where it is.
+    pub const IDENTITY: Self = Self { world_from_scene: WorldFromScene::IDENTITY, crop: None };
+
+    /// Returns the placement that an arena's `[scene]` asks for.
+    pub fn of(scene: &SceneConfig) -> Self {
+        let world_from_scene = WorldFromScene {
+            scale: scene.metres_per_unit,
+            rotation: scene.rotation(),
+            translation_m: scene.origin_m,
         };
-        DQuat::from_mat3(&DMat3::from_cols(rows[0], rows[1], rows[2]).transpose())
+        Self { world_from_scene, crop: scene.crop }
     }
+
+    /// Moves the splats into the world and leaves out what is cropped; returns how many that were. Where
+    /// there is nothing to do, every bit stays.
+    pub fn apply(&self, splats: &mut Splats) -> usize {
+        self.world_from_scene.apply(splats);
+        self.crop.map_or(0, |crop| keep_within(splats, &crop))
+    }
+}
+
+/// Leaves out the splats whose centres lie outside a box; returns how many.
+fn keep_within(splats: &mut Splats, crop: &Geofence) -> usize {
+    let within = |mean: &Vec3| {
+        let p_m = mean.as_dvec3();
+        p_m.cmpge(crop.min_m).all() && p_m.cmple(crop.max_m).all()
+    };
+    let keep: Vec<bool> = splats.means_m.iter().map(within).collect();
+    let before = splats.len();
+    let numbers = splats.sh_coefficients() * 3;
+    retain(&mut splats.sh, &keep, numbers);
+    retain(&mut splats.means_m, &keep, 1);
+    retain(&mut splats.scales_m, &keep, 1);
+    retain(&mut splats.rotations, &keep, 1);
+    retain(&mut splats.opacities, &keep, 1);
+    before - splats.len()
+}
+
+/// Keeps the blocks of `width` values that are to be kept, in order.
+fn retain<T: Copy>(values: &mut Vec<T>, keep: &[bool], width: usize) {
+    let mut end = 0;
+    for (block, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
+        values.copy_within(block * width..(block + 1) * width, end);
+        end += width;
+    }
+    values.truncate(end);
 }
 
 /// A similarity: `p_world = scale * (rotation * p_scene) + translation`.
@@ -67,8 +84,11 @@ impl WorldFromScene {
     pub const IDENTITY: Self =
         Self { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
 
-    /// Moves every splat into the world.
+    /// Moves every splat into the world; where nothing is to be moved, every bit stays.
     pub fn apply(&self, splats: &mut Splats) {
+        if *self == Self::IDENTITY {
+            return;
+        }
         let rotation = self.rotation.as_quat();
         for mean in &mut splats.means_m {
             let p = self.rotation * mean.as_dvec3() * self.scale + self.translation_m;
@@ -87,7 +107,7 @@ impl WorldFromScene {
 /// Turns the harmonics of every splat; coefficient by coefficient, RGB within.
 fn turn_harmonics(sh: &mut [f32], degree: u8, rotation: DQuat) {
     let degree = usize::from(degree);
-    if degree == 0 {
+    if degree == 0 || rotation == DQuat::IDENTITY {
         return;
     }
     let mixes: Vec<_> = (1..=degree).map(|band| mixing_matrix(band, rotation)).collect();
@@ -182,17 +202,39 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
     use vizflyt_splat::{Atmosphere, Camera, render_reference};
 
-    const ALL: [Up; 6] = [Up::X, Up::NegX, Up::Y, Up::NegY, Up::Z, Up::NegZ];
+    #[test]
+    fn a_scene_in_the_world_keeps_every_bit() {
+        let mut placed = scene();
+        let placement = Placement::of(&"scene.ply".into());
+        assert_eq!((placement, placement.apply(&mut placed)), (Placement::IDENTITY, 0));
+        let bits = |splats: &Splats| {
+            let vectors = splats.means_m.iter().chain(&splats.scales_m).flat_map(Vec3::to_array);
+            let turns = splats.rotations.iter().flat_map(|q| q.to_array());
+            let rest = splats.opacities.iter().chain(&splats.sh).copied();
+            vectors.chain(turns).chain(rest).map(f32::to_bits).collect::<Vec<_>>()
+        };
+        assert!(bits(&placed) == bits(&scene()));
+    }
 
     #[test]
-    fn up_becomes_up_and_forward_stays_ahead() {
-        let axes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
-        for (up, axis) in ALL.into_iter().zip(axes) {
-            let turned = up.world_from_scene() * axis;
-            assert!((turned - DVec3::Z).length() < 1e-12, "{up:?}: {turned}");
+    fn what_lies_outside_the_crop_is_left_out_with_all_that_belongs_to_it() {
+        let config = SceneConfig {
+            metres_per_unit: 2.0,
+            crop: Some(Geofence { min_m: DVec3::splat(-1e3), max_m: DVec3::new(0.0, 1e3, 1e3) }),
+            ..SceneConfig::in_world("a.ply")
+        };
+        let (whole, mut cropped) = (scene(), scene());
+        let left_out = Placement::of(&config).apply(&mut cropped);
+        let kept: Vec<usize> = (0..whole.len()).filter(|&k| whole.means_m[k].x <= 0.0).collect();
+        assert!(kept.len() > 5 && left_out == whole.len() - kept.len() && left_out > 5);
+        assert_eq!(cropped.len(), kept.len());
+        for (k, &was) in kept.iter().enumerate() {
+            assert_eq!(cropped.means_m[k], whole.means_m[was] * 2.0);
+            assert_eq!(cropped.scales_m[k], whole.scales_m[was] * 2.0);
+            assert!(cropped.rotations[k].abs_diff_eq(whole.rotations[was], 1e-6));
+            assert_eq!(cropped.opacities[k], whole.opacities[was]);
+            assert_eq!(cropped.sh[48 * k..][..48], whole.sh[48 * was..][..48]);
         }
-        assert!((Up::NegY.world_from_scene() * DVec3::Z - DVec3::X).length() < 1e-12);
-        assert!((Up::Y.world_from_scene() * DVec3::NEG_Z - DVec3::X).length() < 1e-12);
     }
 
     fn scene() -> Splats {
@@ -209,7 +251,7 @@ mod tests {
             rotations: (0..count)
                 .map(|i| Quat::from_xyzw(noise(i), noise(i + 1), noise(i + 2), 1.0).normalize())
                 .collect(),
-            opacities: vec![0.7; count],
+            opacities: (0..count).map(|i| 0.5 + 0.01 * i as f32).collect(),
             sh_degree: 3,
             sh: (0..count * 48).map(|i| noise(i) * 0.3).collect(),
         }
