@@ -50,6 +50,19 @@ impl View {
         }
     }
 
+    /// Returns the pinhole.
+    pub fn intrinsics(&self) -> Intrinsics {
+        Intrinsics {
+            width_px: self.width as u32,
+            height_px: self.height as u32,
+            fx_px: f64::from(self.focal[0]),
+            fy_px: f64::from(self.focal[1]),
+            cx_px: f64::from(self.center[0]),
+            cy_px: f64::from(self.center[1]),
+            distortion: Distortion::None,
+        }
+    }
+
     /// Returns the point in the camera's axes: right, down, forward.
     pub fn in_cam(&self, p_world: Vec3) -> Vec3 {
         let d = p_world - self.position;

@@ -1,5 +1,6 @@
 //! `vizflyt scene`: makes, bakes, inspects and renders scenes.
 
+mod align;
 mod bake;
 pub(crate) mod camera;
 mod convert;
@@ -42,6 +43,7 @@ enum SceneCommand {
         #[arg(long)]
         force: bool,
     },
+    Align(align::AlignArgs),
     Bake(bake::BakeArgs),
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
@@ -55,6 +57,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Generate { kind, seed, output, force } => {
             generate(kind, seed, &output, force)?;
         }
+        SceneCommand::Align(args) => return align::run(&args),
         SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,

@@ -1,0 +1,143 @@
+//! `vizflyt scene align`: photos of a walk, taken by a phone's lens with a rolling shutter, whose poses are in a frame of
+//! no room; printed tags that stand in it; out comes where the scene lies.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use glam::{DQuat, DVec3};
+use serde_json::{Value, json};
+use vizflyt_arena::ArenaConfig;
+use vizflyt_e2e::vizflyt;
+
+/// Metres per unit of the capture.
+const SCALE: f64 = 0.37;
+const TRANSLATION_M: DVec3 = DVec3::new(0.8, -1.9, 0.6);
+
+fn world_from_scene() -> DQuat {
+    DQuat::from_scaled_axis(DVec3::new(1.3, -0.4, 0.9))
+}
+
+fn run(folder: &Path, args: &[&str]) -> (bool, String) {
+    let output = Command::new(vizflyt()).current_dir(folder).args(args).output().unwrap();
+    let text = [output.stdout, output.stderr].concat();
+    (output.status.success(), String::from_utf8_lossy(&text).into_owned())
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
+}
+
+/// Writes nerfstudio's `transforms.json` beside the photos: the true poses, seen from the capture's own frame.
+fn write_transforms(capture: &Path, shaken_m: f64) {
+    let truth: Value =
+        serde_json::from_slice(&fs::read(capture.join("truth.json")).unwrap()).unwrap();
+    let camera = &truth["camera"];
+    let lens = &camera["distortion"];
+    let back = world_from_scene().conjugate();
+    let frames: Vec<Value> = truth["images"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .enumerate()
+        .map(|(index, image)| {
+            let pose = &image["world_from_cam"];
+            let p_m = DVec3::from_slice(&numbers(&pose["position_m"]));
+            let q = DQuat::from_slice(&numbers(&pose["rotation_xyzw"]));
+            // A structure from motion is off by so much, each time elsewhere.
+            let phase = index as f64 * 2.4;
+            let off_m = DVec3::new(phase.sin(), phase.cos(), (1.7 * phase).sin()) * shaken_m;
+            let p = back * (p_m + off_m - TRANSLATION_M) / SCALE;
+            // OpenGL's camera: y up, z backwards.
+            let rotation = back * q * DQuat::from_rotation_x(std::f64::consts::PI);
+            let m = glam::DMat3::from_quat(rotation);
+            let row = |k: usize| json!([m.x_axis[k], m.y_axis[k], m.z_axis[k], p[k]]);
+            json!({"file_path": image["file"], "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]})
+        })
+        .collect();
+    let transforms = json!({
+        "camera_model": "OPENCV",
+        "w": camera["width_px"], "h": camera["height_px"],
+        "fl_x": camera["fx_px"], "fl_y": camera["fy_px"],
+        "cx": camera["cx_px"], "cy": camera["cy_px"],
+        "k1": lens["k1"], "k2": lens["k2"], "p1": lens["p1"], "p2": lens["p2"],
+        "frames": frames,
+    });
+    fs::write(capture.join("transforms.json"), transforms.to_string()).unwrap();
+}
+
+#[test]
+fn a_capture_with_tags_finds_its_place_in_the_room() {
+    let folder = tempfile::tempdir().unwrap();
+    let home = folder.path();
+    let (ok, said) = run(
+        home,
+        &[
+            "scene",
+            "generate",
+            "room",
+            "--seed",
+            "3",
+            "--tags",
+            "--capture",
+            "walk",
+            "--frames",
+            "40",
+            "-o",
+            "hall",
+        ],
+    );
+    assert!(ok, "{said}");
+    let capture = home.join("walk");
+    write_transforms(&capture, 0.01);
+    let arena = home.join("hall/arena.toml");
+    let before = fs::read_to_string(&arena).unwrap();
+    fs::write(&arena, format!("# Ours.\n{before}")).unwrap();
+
+    let align = ["scene", "align", "hall", "--tags", "walk/tags.toml", "--capture", "walk"];
+    let (ok, said) = run(home, &align);
+    println!("{said}");
+    assert!(ok && said.contains("\ngo  "), "{said}");
+    let text = fs::read_to_string(&arena).unwrap();
+    assert!(text.starts_with("# Ours.\n"), "{text}");
+    let scene = ArenaConfig::parse(&text).unwrap().scene;
+    let scale = scene.metres_per_unit / SCALE - 1.0;
+    let turn = scene.rotation() * world_from_scene().conjugate();
+    let tilt_deg = (turn * DVec3::Z).angle_between(DVec3::Z).to_degrees();
+    println!("scale {:.3} %, tilt {tilt_deg:.3} degrees", scale * 1e2);
+    // The bars of a metric twin: 0.3 % and 0.2 degrees.
+    assert!(scale.abs() < 0.003, "{scale}");
+    assert!(tilt_deg < 0.2, "{tilt_deg}");
+    let p_scene =
+        world_from_scene().conjugate() * (DVec3::new(3.0, 0.0, 1.0) - TRANSLATION_M) / SCALE;
+    let found_m = scene.rotation() * p_scene * scene.metres_per_unit + scene.origin_m;
+    assert!(found_m.distance(DVec3::new(3.0, 0.0, 1.0)) < 0.02, "{found_m}");
+
+    // Poses of a poor reconstruction: the place is not known, nothing is written, and it says why.
+    write_transforms(&capture, 0.25);
+    let (ok, said) = run(home, &align);
+    assert!(!ok, "{said}");
+    assert!(["NO GO", "contradict", "no tag of"].iter().any(|word| said.contains(word)), "{said}");
+    assert_eq!(fs::read_to_string(&arena).unwrap(), text);
+}
+
+#[test]
+fn what_cannot_be_aligned_is_explained() {
+    let folder = tempfile::tempdir().unwrap();
+    let home = folder.path();
+    fs::write(home.join("room.ply"), "ply\n").unwrap();
+    let floor =
+        ["--floor", "0,0,0", "--floor", "4,0,0", "--above", "0,0,1", "--length", "0,0,0:0,0,1=1"];
+    let align =
+        |arena: &str, more: &[&str]| run(home, &[&["scene", "align", arena], more].concat());
+    for (arena, more, word) in [
+        ("room.ply", &floor[..], "make one around the scene"),
+        ("nowhere", &floor[..], "no arena"),
+        ("nowhere", &[][..], "--tags"),
+        ("nowhere", &["--tags", "t.toml"][..], "--capture"),
+        ("nowhere", &["--floor", "0,0"][..], "no point"),
+    ] {
+        let (ok, said) = align(arena, more);
+        assert!(!ok && said.contains(word), "{arena} {more:?}: {said}");
+    }
+}
