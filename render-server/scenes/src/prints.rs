@@ -54,7 +54,10 @@ impl Board {
     /// Returns the corners of its post, which ends behind the board's middle.
     fn post(&self) -> Option<(DVec3, DVec3)> {
         self.stands.then(|| {
-            let top_m = self.front.world_from_print.transform_point(DVec3::NEG_Z * (THICK_M + POST_M / 2.0));
+            let top_m = self
+                .front
+                .world_from_print
+                .transform_point(DVec3::NEG_Z * (THICK_M + POST_M / 2.0));
             let half = DVec2::splat(POST_M / 2.0);
             ((top_m.truncate() - half).extend(0.0), (top_m.truncate() + half).extend(top_m.z))
         })
@@ -246,7 +249,8 @@ fn face(
 ) {
     let normal = right.cross(up);
     for (layer, depth_m) in [(0.0, 0.002), (0.5, 0.007)] {
-        let counts = (size_m / CELL_M).ceil().max(DVec2::ONE) + if size_m.min_element() > CELL_M { layer * 2.0 } else { 0.0 };
+        let counts = (size_m / CELL_M).ceil().max(DVec2::ONE)
+            + if size_m.min_element() > CELL_M { layer * 2.0 } else { 0.0 };
         let cell_m = size_m / counts;
         // So that patches end where the board does: two deviations inside it, for the outermost.
         for row in 0..counts.y as usize {

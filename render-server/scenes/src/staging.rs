@@ -42,7 +42,8 @@ pub fn film_set(
     seconds: f64,
     with_prints: bool,
 ) -> Result<FilmSet, NoWalk> {
-    let mut staging = Staging { asked: Some(Asked { seed, seconds, with_prints }), ..Staging::none() };
+    let mut staging =
+        Staging { asked: Some(Asked { seed, seconds, with_prints }), ..Staging::none() };
     let scene = match kind {
         SceneKind::Forest => forest::build_staged(seed, &mut staging),
         SceneKind::Race => hall::build_race(seed, &mut staging),

@@ -189,12 +189,12 @@ impl Grid {
 
     /// Returns the free cell nearest to a point, among those allowed.
     fn nearest(&self, p_m: DVec2, allowed: impl Fn(usize) -> bool) -> Option<usize> {
-        (0..self.costs.len())
-            .filter(|&cell| self.costs[cell].is_finite() && allowed(cell))
-            .min_by(|&a, &b| {
+        (0..self.costs.len()).filter(|&cell| self.costs[cell].is_finite() && allowed(cell)).min_by(
+            |&a, &b| {
                 let far = |cell| (self.middle_m(cell) - p_m).length_squared();
                 far(a).total_cmp(&far(b))
-            })
+            },
+        )
     }
 
     /// Searches from a cell, everywhere or until another is reached.

@@ -78,9 +78,8 @@ impl Sway {
     /// Returns the sway at a share of the walk.
     pub(super) fn at(&self, turn: f64) -> Swayed {
         let sum = |waves: &[Wave]| -> f64 {
-            let at = |wave: &Wave| {
-                wave.amplitude * libm::sin(TAU * (wave.periods * turn + wave.phase))
-            };
+            let at =
+                |wave: &Wave| wave.amplitude * libm::sin(TAU * (wave.periods * turn + wave.phase));
             waves.iter().map(at).sum()
         };
         Swayed {
