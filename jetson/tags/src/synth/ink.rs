@@ -79,3 +79,6 @@ pub const INK: f32 = 0.05;
 const SAME_M: f64 = 0.04;
 /// The same, of its distance.
 const SAME_SHARE: f64 = 0.01;
+
+#[cfg(test)]
+mod tests;

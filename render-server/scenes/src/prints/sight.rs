@@ -9,7 +9,7 @@ use crate::walk::Walk;
 
 /// The camera at one instant of a walk.
 pub(super) struct Glimpse {
-    world_from_cam: Pose<World, Cam>,
+    pub(super) world_from_cam: Pose<World, Cam>,
 }
 
 /// Returns glimpses at even intervals.

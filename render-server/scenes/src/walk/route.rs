@@ -28,31 +28,42 @@ pub(crate) struct Ground<'a> {
 /// `None` without free floor.
 pub(super) fn closed_way(ground: &Ground<'_>, wanted_m: f64) -> Option<Vec<DVec2>> {
     let grid = Grid::new(ground);
-    let around = |share: f64| {
-        let corners = rectangle(ground, share);
-        let way = grid.joined(&corners)?;
+    let around = |share: f64, shift: f64| {
+        let way = grid.joined(&rectangle(ground, share, shift))?;
         Some(smooth(&evenly(&way, SPACING_M)))
     };
-    let whole = around(1.0)?;
+    let whole = around(1.0, 0.0)?;
     let laps = libm::floor(wanted_m / length_m(&whole) + 0.35);
     if laps >= 1.0 {
         let laps = laps as usize;
         return Some((0..laps).flat_map(|_| whole.iter().copied()).collect());
     }
-    // A smaller rectangle, found by halving.
-    let (mut low, mut high) = (0.04, 1.0);
-    let mut best = None;
-    for _ in 0..7 {
-        let share = f64::midpoint(low, high);
-        let Some(way) = around(share) else { break };
-        if length_m(&way) > wanted_m {
-            high = share;
-        } else {
-            low = share;
-            best = Some(way);
+    // A smaller rectangle, found by halving; where its middle is in a wall it is a long way round, and another place is better.
+    let mut best: Option<Vec<DVec2>> = None;
+    let mut shortest = whole;
+    for shift in SHIFTS {
+        let (mut low, mut high) = (0.04, 1.0);
+        for _ in 0..7 {
+            let share = f64::midpoint(low, high);
+            let Some(way) = around(share, shift) else { break };
+            let found_m = length_m(&way);
+            if found_m > wanted_m {
+                high = share;
+                if found_m < length_m(&shortest) {
+                    shortest = way;
+                }
+            } else {
+                low = share;
+                if best.as_ref().is_none_or(|best| length_m(best) < found_m) {
+                    best = Some(way);
+                }
+            }
+        }
+        if best.as_ref().is_some_and(|best| length_m(best) > 0.8 * wanted_m) {
+            break;
         }
     }
-    best.or_else(|| around(low))
+    Some(best.unwrap_or(shortest))
 }
 
 /// Returns points at even distances along a closed way.
@@ -83,14 +94,17 @@ pub(super) fn length_m(way: &[DVec2]) -> f64 {
     (0..way.len()).map(|n| (way[(n + 1) % way.len()] - way[n]).length()).sum()
 }
 
-/// Corners, and points between them, of a rectangle within what is filmed, this share of its size.
-fn rectangle(ground: &Ground<'_>, share: f64) -> Vec<DVec2> {
+/// Corners, and points between them, of a rectangle within what is filmed: of this share of its length, and shifted by a share of
+/// what it is shorter.
+fn rectangle(ground: &Ground<'_>, share: f64, shift: f64) -> Vec<DVec2> {
     let [low, high] = ground.within_m;
     let middle = (low + high) / 2.0;
     let half = ((high - low) / 2.0 - ASIDE_M).max(DVec2::splat(0.5));
     // The long side first: a short walk in a long place sees all of its width.
     let long = half.max_element();
+    let whole = half;
     let half = half.min(DVec2::splat((long * share).max(0.25)));
+    let middle = middle + (whole - half) * shift;
     let mut points = Vec::new();
     let corners = [
         DVec2::new(-1.0, -1.0),
@@ -262,6 +276,8 @@ impl PartialOrd for Open {
 
 const NEIGHBOURS: [(isize, isize); 8] =
     [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
+/// Where a shorter rectangle is tried, until the way is nearly as long as wanted.
+const SHIFTS: [f64; 5] = [0.0, -0.4, 0.4, -0.8, 0.8];
 /// Side of a cell. [m]
 const CELL_M: f64 = 0.1;
 /// Heights at which a person must fit; a twig on the floor is stepped over. [m]

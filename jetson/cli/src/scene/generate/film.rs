@@ -239,9 +239,9 @@ const RATE_HZ: u32 = 30;
 const FOLDER_IMAGES: u32 = 80;
 /// Exposures must not overlap. [Hz]
 const MOST_HZ: f64 = 30.0;
-/// Blur of the optics, one standard deviation: what the renderer's own pixel filter has, so that ink is as sharp as splats are
-/// (a variance of 0.3 px^2). [px]
-const OPTICS_PX: f64 = 0.55;
+/// Blur of the ink, one standard deviation: with the pixel's box and the rows' interpolation some 0.6 px in all, as in a phone's
+/// video. [px]
+const OPTICS_PX: f64 = 0.3;
 /// Edge of a tag's black square, of the board's: 0.24 of 0.38 m.
 const TAG_SHARE: f64 = 0.24 / 0.38;
 /// Smaller images show no tag, larger ones take hours. [px]

@@ -138,3 +138,38 @@ impl ImageTruth {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The file as `docs/guides/capture.md` has it; a field that is added, renamed or dropped changes this.
+    const EXAMPLE: &str = include_str!("truth.example.json");
+
+    #[test]
+    fn the_documented_file_is_the_file() {
+        let truth: CaptureTruth = serde_json::from_str(EXAMPLE).unwrap();
+        assert_eq!(truth.version, 1);
+        let back = serde_json::to_value(&truth).unwrap();
+        let example: serde_json::Value = serde_json::from_str(EXAMPLE).unwrap();
+        assert_eq!(back, example, "a field is written otherwise than read");
+        let guide = include_str!("../../../../../docs/guides/capture.md");
+        assert!(guide.contains(EXAMPLE.trim()), "docs/guides/capture.md shows another file");
+    }
+
+    #[test]
+    fn a_field_that_is_absent_or_unknown_is_an_error() {
+        let read =
+            |text: &str| serde_json::from_str::<CaptureTruth>(text).map_err(|e| e.to_string());
+        for (from, to, part) in [
+            ("\"readout_s\": 0.022,", "", "readout_s"),
+            ("\"gain\"", "\"brightness\"", "brightness"),
+            ("\"stamp_ns\": 0,", "\"stamp_ns\": -1,", "-1"),
+        ] {
+            let text = EXAMPLE.replacen(from, to, 1);
+            assert_ne!(text, EXAMPLE, "{from} is not in the example");
+            let error = read(&text).unwrap_err();
+            assert!(error.contains(part), "{error}");
+        }
+    }
+}
