@@ -33,7 +33,7 @@ pub(super) fn closed_way(ground: &Ground<'_>, wanted_m: f64) -> Option<Vec<DVec2
         Some(smooth(&evenly(&way, SPACING_M)))
     };
     let whole = around(1.0, 0.0)?;
-    let laps = libm::floor(wanted_m / length_m(&whole) + 0.35);
+    let laps = libm::floor(wanted_m / length_m(&whole) + 0.2);
     if laps >= 1.0 {
         let laps = laps as usize;
         return Some((0..laps).flat_map(|_| whole.iter().copied()).collect());
