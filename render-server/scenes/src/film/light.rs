@@ -20,6 +20,7 @@ impl Tone {
     }
 
     /// Returns the linear light of a display colour; what is outside 0 to 1 is cut.
+    #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
     pub(super) fn linear(&self, shown: f32) -> f32 {
         let at = shown.max(0.0).min(1.0) * LINEAR as f32;
         let n = at as usize;
@@ -28,6 +29,7 @@ impl Tone {
     }
 
     /// Returns the display colour of linear light; what is outside 0 to 1 is cut, as a full sensor does.
+    #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
     pub(super) fn shown(&self, linear: f32) -> u8 {
         self.shown[(linear.max(0.0).min(1.0) * SHOWN as f32 + 0.5) as usize]
     }

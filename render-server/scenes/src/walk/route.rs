@@ -174,7 +174,7 @@ impl Grid {
 
     /// Returns the closed way by all of these points, each moved to where the first one's floor is.
     fn joined(&self, points: &[DVec2]) -> Option<Vec<DVec2>> {
-        let reachable = self.from_cell(self.nearest(points[0], |_| true)?, None);
+        let reachable = self.search(self.nearest(points[0], |_| true)?, None);
         let cells: Vec<usize> = points
             .iter()
             .filter_map(|&p| self.nearest(p, |cell| reachable.costs[cell].is_finite()))
@@ -183,7 +183,7 @@ impl Grid {
         for n in 0..cells.len() {
             let (from, to) = (cells[n], cells[(n + 1) % cells.len()]);
             // Backwards, so that it comes out in order.
-            let search = self.from_cell(to, Some(from));
+            let search = self.search(to, Some(from));
             let mut cell = from;
             while cell != to {
                 way.push(self.middle_m(cell));
@@ -212,7 +212,7 @@ impl Grid {
     }
 
     /// Searches from a cell, everywhere or until another is reached.
-    fn from_cell(&self, start: usize, until: Option<usize>) -> Search {
+    fn search(&self, start: usize, until: Option<usize>) -> Search {
         let mut search = Search {
             costs: vec![f64::INFINITY; self.costs.len()],
             before: vec![None; self.costs.len()],
