@@ -64,13 +64,14 @@ pub(crate) struct GenerateArgs {
 
 /// Runs `vizflyt scene generate`.
 pub(super) fn run(args: &GenerateArgs) -> Result<()> {
-    if let Some(output) = &args.output {
-        if output.join("arena.toml").exists() && !args.force {
-            bail!(
-                "{} already holds an arena.toml; give another folder, or --force to replace it",
-                output.display()
-            );
-        }
+    if let Some(output) = &args.output
+        && output.join("arena.toml").exists()
+        && !args.force
+    {
+        bail!(
+            "{} already holds an arena.toml; give another folder, or --force to replace it",
+            output.display()
+        );
     }
     let Some(capture) = &args.capture else {
         return write_scene(
