@@ -23,7 +23,7 @@ impl Phone {
     /// middle.
     ///
     /// A readout of 22 ms: of measured phones an iPhone 5 takes 22.6 ms at 720x480, 27 ms at 1080p; older ones about 30 ms
-    /// (Oth, Furgale, Kneip, Siegwart, CVPR 2013; tables of readout times with kalibr).
+    /// (table of rolling shutter parameters of consumer cameras, in a fork of kalibr, `doc/rolling-shutter-table.md`).
     pub fn draw(kind: SceneKind, seed: u64, width_px: u32, height_px: u32) -> Self {
         let mut rng = Rng::new(seed, 63);
         let fov_rad = rng.range(62.0, 68.0).to_radians();
