@@ -423,8 +423,39 @@ def inside_out(lab: Lab) -> None:
     assert not report["findings"], report
 
 
+class Server:
+    """A render server that takes poses by JSON packets."""
+
+    def __init__(self, lab: Lab) -> None:
+        make = [lab.vizflyt, "scene", "generate", "room", "--seed", "3", "-o", "hall"]
+        subprocess.run(make, cwd=lab.home, check=True, capture_output=True)
+        anywhere = "127.0.0.1:0"
+        command = [lab.vizflyt, "serve", "hall", "--pose", f"json:{anywhere}", "--keys", "keys", "--json"]
+        self.log = lab.home / "server.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [*command, "--quic", anywhere, "--http", anywhere],
+                cwd=lab.home,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        assert self.process.stdout
+        ready = json.loads(self.process.stdout.readline())
+        (source,) = ready["pose"]
+        self.poses = source["address"]
+
+    def end(self) -> str:
+        """Ends it; returns what it said."""
+        self.process.send_signal(signal.SIGINT)
+        self.process.communicate(timeout=30)
+        return self.log.read_text()
+
+
 def cameras_come_and_go(lab: Lab) -> None:
-    """A camera that hangs, repeats, goes dark and is unplugged is named, and is taken back; the other goes on."""
+    """A camera that hangs, repeats, goes dark and is unplugged is named, and is taken back; the other goes on. A render
+    server that gets the poses tells its people so."""
+    server = Server(lab)
     begin_ns = time.monotonic_ns() + 2 * 10**9
     faults = ["hang:1:1.7", "repeat:2.2:2.7", "dark:3.2:3.7", "end:4.2:4.3"]
     feed = f"{sys.executable} {pathlib.Path(__file__).with_name('feed.py')}"
@@ -433,7 +464,7 @@ def cameras_come_and_go(lab: Lab) -> None:
         for name in EYES
     ]
     lab.write_config("cube")
-    command = [lab.vizflyt, "tags", "locate", "lab.toml", "--poses", "--json", *sources]
+    command = [lab.vizflyt, "tags", "locate", "lab.toml", "--poses", "--json", "--to", server.poses, *sources]
     with subprocess.Popen(command, cwd=lab.home, stdout=subprocess.PIPE, text=True) as located:
         events, alone, both, after = [], 0, 0, 0
         for line in located.stdout:
@@ -454,7 +485,9 @@ def cameras_come_and_go(lab: Lab) -> None:
     while right and right[0] is not None:
         right.pop(0)
     right.pop(0)
+    log = server.end()
     for part in ("no image", "repeats an image", "sees nothing", "ended with"):
+        assert any("right" in line and part in line for line in log.splitlines()), (part, log)
         told = [index for index, fault in enumerate(right) if fault and part in fault]
         assert told and None in right[told[0] :], (part, events)
     assert alone > 0 and both > 0 and after > 0, (alone, both, after)

@@ -29,6 +29,9 @@ ARRIVED = 0.5
 MAX_LEAD_MPS = 1.6
 MAX_DT_S = 0.1
 BLIND_S = 0.3
+USUAL_GAP_S = 0.04
+GAP_FORGOTTEN_PER_S = 0.1
+BLIND_WAY_M = 0.2
 CLIMB_PER_S = 1.5
 CLIMB_MPS = 1.0
 LOOK_MPS = 0.3
@@ -88,6 +91,7 @@ class Avoid(vizflyt.Plugin):
         self.field = Field(info)
         self.setpoint_mps = np.zeros(2)
         self.last_s = None
+        self.longest_gap_s = 0.0
         self.seen_s = -math.inf
         self.finished = False
 
@@ -105,8 +109,12 @@ class Avoid(vizflyt.Plugin):
         if vehicle is None or vehicle.p_world_m is None or camera is None:
             return None
         now_s = vehicle.stamp_ns * 1e-9
-        dt_s = 0.0 if self.last_s is None else min(max(now_s - self.last_s, 0.0), MAX_DT_S)
+        gap_s = 0.0 if self.last_s is None else min(max(now_s - self.last_s, 0.0), BLIND_S)
+        dt_s = min(gap_s, MAX_DT_S)
         self.last_s = now_s
+        # A gap is forgotten over seconds: what starves once does so again.
+        self.longest_gap_s = max(gap_s, self.longest_gap_s - GAP_FORGOTTEN_PER_S * gap_s)
+        late_s = max(self.longest_gap_s - USUAL_GAP_S, 0.0)
 
         # See.
         p_m, v_mps = vehicle.p_world_m, vehicle.v_world_mps
@@ -133,8 +141,11 @@ class Avoid(vizflyt.Plugin):
             cruise_mps = min(CRUISE_MPS, CRUISE_SHARE * self.info.limits.max_speed_mps)
             stop_mps = math.sqrt(2.0 * BRAKE_MPS2 * distance_m)
             heading_rad = vehicle.yaw_rad
+            # Between two images the last answer stands: no further by it than this.
+            blind_mps = BLIND_WAY_M / late_s if late_s > 0.0 else math.inf
+            speed_mps = min(cruise_mps, stop_mps, blind_mps)
             wanted_mps = choose_velocity(
-                self.field, p_m[:2], v_mps[:2], setpoint_mps, heading_rad, min(cruise_mps, stop_mps)
+                self.field, p_m[:2], v_mps[:2], setpoint_mps, heading_rad, speed_mps, late_s
             )
         self.setpoint_mps = setpoint_mps + shortened(wanted_mps - setpoint_mps, SLEW_MPS2 * dt_s)
 
@@ -155,7 +166,7 @@ class View:
 
     def __init__(self, vehicle, camera):
         ahead_s = (camera.stamp_ns - vehicle.stamp_ns) * 1e-9
-        ahead_s = min(max(ahead_s, -MAX_DT_S), MAX_DT_S)
+        ahead_s = min(max(ahead_s, -BLIND_S), BLIND_S)
         self.depth_mm = camera.depth_mm  # (H, W) uint16, 0 is no return
         self.k = camera.intrinsics
         now = vehicle.world_from_body
@@ -405,7 +416,7 @@ def interpolate(values, origin_m, p_m):
     return low + fy * (c + fx * (d - c) - low)
 
 
-def choose_velocity(field, p_m, v_mps, setpoint_mps, heading_rad, max_speed_mps):
+def choose_velocity(field, p_m, v_mps, setpoint_mps, heading_rad, max_speed_mps, late_s=0.0):
     """Returns the velocity (2,) to ask for: every candidate is flown ahead in the mind for 1.5 s with
     the lag and acceleration of a real vehicle, and the best one wins (compare D. Fox et al., IEEE RAM
     4(1), 1997). [m/s, world]"""
@@ -420,7 +431,7 @@ def choose_velocity(field, p_m, v_mps, setpoint_mps, heading_rad, max_speed_mps)
     wanted = np.concatenate([np.zeros((1, 2)), ring.reshape(-1, 2)])
 
     count = len(wanted)
-    p = np.tile(p_m + v_mps * LATENCY_S, (count, 1))  # what is asked now acts a little later
+    p = np.tile(p_m + v_mps * (LATENCY_S + late_s), (count, 1))  # what is asked acts later
     v = np.tile(v_mps, (count, 1))
     asked = np.tile(setpoint_mps, (count, 1))
     start_m = field.to_go_at(p[:1])[0]

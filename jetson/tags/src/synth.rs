@@ -13,6 +13,7 @@
 //! Budget: 16 samples a pixel that shows an edge between cells, one where all is one colour, fewer where that is so
 //! over many pixels (`docs/BENCHMARKS.md`, "drawing").
 
+pub mod ink;
 mod pattern;
 mod rays;
 
@@ -227,8 +228,7 @@ impl Renderer {
                 entry.insert(cells)
             }
         };
-        // Half the paper's edge, in edges of the black square.
-        let paper = (f64::from(cells.across()) / 2.0 + PAPER_CELLS) / f64::from(cells.border());
+        let paper = paper_edge(cells);
         let Some([left, top, right, bottom]) = self.bounds(tag_from_slope, paper, pattern) else {
             return;
         };
@@ -357,6 +357,11 @@ impl Renderer {
         }
         image
     }
+}
+
+/// Returns half the paper's edge, in edges of the black square.
+fn paper_edge(cells: &Cells) -> f64 {
+    (f64::from(cells.across()) / 2.0 + PAPER_CELLS) / f64::from(cells.border())
 }
 
 /// Returns what takes a slope in `cam` to a place on the tag, in edges of its black square; the third

@@ -6,15 +6,22 @@
 //! same seed gives the same bytes on every machine: all randomness is hashed integers, all
 //! functions come from `libm`, and nothing depends on the order of threads.
 //!
+//! [`film_set`] also plans a [`walk`] through it, with boards for printed tags along it, and [`film`] makes of rendered
+//! images what a phone would have filmed on this walk.
+//!
 //! Called once per scene by the command line; takes well under two seconds.
 
 mod canvas;
+pub mod film;
 mod forest;
 mod hall;
+mod prints;
 pub mod projects;
 mod random;
 mod solids;
+mod staging;
 mod variant;
+pub mod walk;
 mod write;
 
 use core::fmt;
@@ -24,6 +31,10 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_splat::{RigidObject, Splats};
 
+use staging::Staging;
+
+pub use prints::Print;
+pub use staging::{FilmSet, film_set};
 pub use variant::{UnknownVariant, Variant};
 pub use write::{WriteError, Written};
 
@@ -114,9 +125,9 @@ pub struct Generated {
 pub fn generate(kind: SceneKind, seed: u64) -> Generated {
     match kind {
         SceneKind::Forest => forest::build(seed),
-        SceneKind::Race => hall::build_race(seed),
-        SceneKind::Room => hall::build_room(seed),
-        SceneKind::Moving => hall::build_moving(seed),
+        SceneKind::Race => hall::build_race(seed, &mut Staging::none()),
+        SceneKind::Room => hall::build_room(seed, &mut Staging::none()),
+        SceneKind::Moving => hall::build_moving(seed, &mut Staging::none()),
     }
 }
 

@@ -478,3 +478,116 @@ fn a_captured_room_gets_an_arena() {
         &["24000 x 40000 x 12000 m", "9.2e13 voxels of 0.5 m", "GB", "give a smaller --scale"],
     );
 }
+
+/// The files of a folder, by name.
+fn files_of(folder: &str) -> Vec<(String, Vec<u8>)> {
+    let mut files: Vec<(String, Vec<u8>)> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .map(|path| {
+            (path.file_name().unwrap().to_str().unwrap().to_owned(), fs::read(path).unwrap())
+        })
+        .collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn a_capture_is_images_with_their_truth_and_the_same_again() {
+    let home = tempfile::tempdir().unwrap();
+    let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let film = |kind: &str, name: &str, more: &[&str]| {
+        let mut args = vec!["scene", "generate", kind, "--seed", "3", "--tags", "--seconds", "20"];
+        let capture = at(name);
+        args.extend(["--frames", "4", "--size", "160x120", "--capture", &capture]);
+        args.extend(more);
+        good(&args)
+    };
+    let said = film("room", "a", &["-o", &at("room")]);
+    assert!(said.contains("boards along it") && said.contains("4 images"), "{said}");
+    film("room", "b", &[]);
+    let [a, b] = ["a", "b"].map(|name| files_of(&at(name)));
+    assert!(a == b, "the same seed gives the same capture");
+    let names: Vec<&str> = a.iter().map(|(name, _)| name.as_str()).collect();
+    let expected = [
+        "00000.jpg",
+        "00001.jpg",
+        "00002.jpg",
+        "00003.jpg",
+        "camera.toml",
+        "tags.toml",
+        "truth.json",
+    ];
+    assert_eq!(names, expected);
+    let truth: Value = serde_json::from_slice(&a[6].1).unwrap();
+    assert_eq!(truth["images"].as_array().unwrap().len(), 4);
+    assert_eq!(truth["images"][2]["file"], "00002.jpg");
+    assert_eq!(truth["camera"]["width_px"], 160);
+    // The scene beside it has the boards: more true solids than without.
+    let solids = |folder: &str| -> usize {
+        let text = fs::read(Path::new(folder).join("truth.json")).unwrap();
+        serde_json::from_slice::<Vec<Value>>(&text).unwrap().len()
+    };
+    good(&["scene", "generate", "room", "--seed", "3", "-o", &at("plain")]);
+    assert!(solids(&at("room")) > solids(&at("plain")) + 5);
+    // What moves stands still unless asked; either way each scene can be filmed.
+    for kind in ["race", "moving", "forest"] {
+        film(kind, kind, &["--moving"]);
+        let truth = fs::read(Path::new(&at(kind)).join("truth.json")).unwrap();
+        assert_eq!(serde_json::from_slice::<Value>(&truth).unwrap()["scene"]["moving"], true);
+    }
+    // Not over what is there.
+    let a = at("a");
+    let args = ["scene", "generate", "room", "--capture", &a];
+    check_refused(&args, &["truth.json is there already", "--force"]);
+}
+
+#[test]
+fn a_capture_that_cannot_be_made_says_why() {
+    let home = tempfile::tempdir().unwrap();
+    let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let refused = |more: &[&str], parts: &[&str]| {
+        let mut args = vec!["scene", "generate", "room"];
+        args.extend(more);
+        check_refused(&args, parts);
+    };
+    let (video, photo, folder) = (at("a.mp4"), at("a.jpg"), at("images"));
+    refused(&["--tags", "-o", &folder], &["--capture"]);
+    refused(&["--capture", &photo], &[".mp4, .mkv or .mov"]);
+    refused(&["--capture", &video, "--size", "161x120"], &["even sides"]);
+    refused(&["--capture", &folder, "--seconds", "1"], &["2 to 600 s"]);
+    refused(&["--capture", &folder, "--frames", "0"], &["at least 1"]);
+    refused(&["--capture", &video, "--seconds", "2", "--frames", "99"], &["60 images"]);
+    // Without ffmpeg on the path.
+    let output = Command::new(vizflyt())
+        .args(["scene", "generate", "room", "--seconds", "2", "--capture", &video])
+        .env("PATH", home.path())
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("apt-get install ffmpeg"), "{said}");
+    assert!(!Path::new(&video).exists() && fs::read_dir(home.path()).unwrap().count() == 0);
+}
+
+#[test]
+fn a_video_decodes_to_as_many_images_of_its_size() {
+    let home = tempfile::tempdir().unwrap();
+    let video = home.path().join("hall.mp4");
+    let capture = video.to_str().unwrap();
+    let args = ["--seconds", "2", "--frames", "20", "--size", "320x240", "--capture", capture];
+    good(&[&["scene", "generate", "room", "--seed", "3"][..], &args].concat());
+    // Decoded by ffmpeg to raw grey.
+    let raw = Command::new("ffmpeg")
+        .args(["-nostdin", "-v", "error", "-i", capture, "-f", "rawvideo", "-pix_fmt", "gray", "-"])
+        .output()
+        .expect("ffmpeg is installed");
+    assert_eq!(raw.stdout.len(), 20 * 320 * 240);
+    let mean =
+        raw.stdout.iter().map(|&grey| f64::from(grey)).sum::<f64>() / raw.stdout.len() as f64;
+    assert!((60.0..190.0).contains(&mean), "mean grey {mean}");
+    let truth = fs::read(home.path().join("hall.truth.json")).unwrap();
+    let truth: Value = serde_json::from_slice(&truth).unwrap();
+    assert_eq!(truth["images"].as_array().unwrap().len(), 20);
+    assert_eq!(truth["images"][1]["stamp_ns"], 33_333_333);
+    assert!(truth["tags"].as_array().unwrap().is_empty());
+}

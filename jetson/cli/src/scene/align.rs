@@ -274,6 +274,8 @@ const LENGTH_SHARE: f64 = 0.001;
 
 #[cfg(test)]
 mod tests {
+    use glam::DQuat;
+
     use super::*;
 
     const PLACE: Similarity = Similarity {

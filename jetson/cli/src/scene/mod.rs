@@ -4,18 +4,17 @@ mod align;
 mod bake;
 pub(crate) mod camera;
 mod convert;
+mod generate;
 mod inspect;
 mod npy;
 mod render;
 
-use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Result, bail};
+use anyhow::Result;
 use clap::{Args, Subcommand};
-use vizflyt_scenes::SceneKind;
 
-use crate::terminal::{open_browser, print_fmt, print_line};
+use crate::terminal::{open_browser, print_line};
 
 /// Makes, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
@@ -26,23 +25,7 @@ pub(crate) struct SceneArgs {
 
 #[derive(Subcommand, Debug)]
 enum SceneCommand {
-    /// Generates a scene with known geometry: scene.ply, arena.toml, truth.json.
-    #[command(after_help = "Example:
-  vizflyt scene generate forest --seed 7 -o my-forest
-  vizflyt demo --scene my-forest")]
-    Generate {
-        #[arg(help = format!("What to generate: {}", SceneKind::names()))]
-        kind: SceneKind,
-        /// Same seed, same scene.
-        #[arg(long, default_value_t = 7)]
-        seed: u64,
-        /// Folder to write to; made if absent.
-        #[arg(short, long, value_name = "DIR")]
-        output: PathBuf,
-        /// Replaces a scene that is already there.
-        #[arg(long)]
-        force: bool,
-    },
+    Generate(generate::GenerateArgs),
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
     Convert(convert::ConvertArgs),
@@ -54,10 +37,8 @@ enum SceneCommand {
 /// Runs `vizflyt scene`.
 pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
     match args.command {
-        SceneCommand::Generate { kind, seed, output, force } => {
-            generate(kind, seed, &output, force)?;
-        }
         SceneCommand::Align(args) => return align::run(&args),
+        SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
@@ -76,19 +57,4 @@ fn view(args: vizflyt_server::ViewArgs) -> Result<()> {
             open_browser(url);
         }
     })
-}
-
-fn generate(kind: SceneKind, seed: u64, output: &std::path::Path, force: bool) -> Result<()> {
-    if output.join("arena.toml").exists() && !force {
-        bail!(
-            "{} already holds an arena.toml; give another folder, or --force to replace it",
-            output.display()
-        );
-    }
-    let scene = vizflyt_scenes::generate(kind, seed);
-    let written = scene.write(output)?;
-    print_fmt!("{} splats     {}", scene.splats.len(), written.scene.display());
-    print_fmt!("arena             {}", written.arena.display());
-    print_fmt!("{} true solids   {}", scene.truth.len(), written.truth.display());
-    Ok(())
 }

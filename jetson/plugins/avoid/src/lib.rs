@@ -4,7 +4,7 @@
 //! 1. [`scan`]: depth pixels become obstacle points in the world frame; floor and sky do not;
 //! 2. [`memory`]: points of the last seconds stay, for what the camera no longer sees;
 //! 3. [`field`]: around the vehicle, how near is an obstacle, and how long is the way to the goal;
-//! 4. [`steer`]: of all velocities, the one that gets on best without coming near anything;
+//! 4. [`steer`]: of all velocities, the one that gets on best without coming near anything, none faster than [`pace`] allows;
 //! 5. here: height, heading and arrival; the velocity goes out as a [`Setpoint`].
 //!
 //! The nose turns to where the vehicle flies, so that the camera sees it. The whole takes about
@@ -15,6 +15,7 @@
 
 pub mod field;
 pub mod memory;
+pub mod pace;
 pub mod scan;
 pub mod steer;
 
@@ -26,6 +27,7 @@ use vizflyt_sdk::{
 
 use field::{Field, Surroundings};
 use memory::Memory;
+use pace::Pace;
 use scan::{Scan, View};
 use steer::Motion;
 
@@ -39,6 +41,7 @@ pub struct Avoid {
     /// Velocity asked for last, and when. [m/s, world]
     setpoint_mps: DVec2,
     last: Option<HostTime>,
+    pace: Pace,
     /// When the camera last showed something.
     seen: Option<HostTime>,
     finished: bool,
@@ -92,7 +95,9 @@ impl Avoid {
             return None;
         }
         let now = vehicle.stamp;
-        let dt_s = self.last.map_or(0.0, |last| now.seconds_since(last)).clamp(0.0, MAX_DT_S);
+        let gap_s = self.last.map_or(0.0, |last| now.seconds_since(last));
+        self.pace.add(gap_s);
+        let dt_s = gap_s.clamp(0.0, MAX_DT_S);
         self.last = Some(now);
 
         // See.
@@ -128,10 +133,13 @@ impl Avoid {
             // Before take-off nobody follows the setpoint: it must not run away from the vehicle.
             setpoint_mps: v_mps + (self.setpoint_mps - v_mps).clamp_length_max(MAX_LEAD_MPS),
             heading_rad: nose.to_angle(),
+            late_s: self.pace.late_s(),
         };
         let sighted = self.seen.is_some_and(|seen| now.seconds_since(seen) < BLIND_S);
         let wanted_mps = if sighted {
-            let cruise_mps = CRUISE_MPS.min(CRUISE_SHARE * arena.limits.max_speed_mps);
+            let cruise_mps = CRUISE_MPS
+                .min(CRUISE_SHARE * arena.limits.max_speed_mps)
+                .min(self.pace.limit_mps());
             let stop_mps = (2.0 * BRAKE_MPS2 * to_goal_m.length()).sqrt();
             steer::choose_velocity(&self.field, &motion, cruise_mps.min(stop_mps))
         } else {
@@ -154,7 +162,7 @@ impl Avoid {
 /// Returns the image with the pose its camera had: the vehicle's state is newer (or older) than
 /// the image by some milliseconds, over which it moved and turned at a steady rate.
 fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
-    let ahead_s = camera.shown.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
+    let ahead_s = camera.shown.seconds_since(vehicle.stamp).clamp(-BLIND_S, BLIND_S);
     let then: Pose<World, _> = Pose::new(
         vehicle.world_from_body.translation_m + vehicle.v_world_mps * ahead_s,
         vehicle.world_from_body.rotation

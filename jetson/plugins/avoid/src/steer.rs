@@ -23,6 +23,8 @@ pub struct Motion {
     pub setpoint_mps: DVec2,
     /// Where the camera looks: angle from world x. [rad, world]
     pub heading_rad: f64,
+    /// How much later than usual what is asked now may act. [s]
+    pub late_s: f64,
 }
 
 /// Returns the velocity to ask for, at most `max_speed_mps`, so that the vehicle gets on towards
@@ -57,7 +59,7 @@ fn sight_limit_mps(from_nose_rad: f64) -> f64 {
 /// Returns how good it is to ask for a velocity, as a speed towards the goal. [m/s]
 fn score(field: &Field, motion: &Motion, candidate_mps: DVec2) -> f64 {
     // What is asked now acts a little later.
-    let mut p_m = motion.p_m + motion.v_mps * LATENCY_S;
+    let mut p_m = motion.p_m + motion.v_mps * (LATENCY_S + motion.late_s);
     let mut v_mps = motion.v_mps;
     let mut setpoint_mps = motion.setpoint_mps;
     let start_m = field.to_go_m(p_m);

@@ -9,7 +9,7 @@ use vizflyt_scenes::SceneKind;
 use vizflyt_sdk::Volume;
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-use world::flight::{self, Conditions, Outcome, SLUGGISH, TYPICAL};
+use world::flight::{self, Conditions, Outcome, SLUGGISH, STARVED, TYPICAL};
 use world::{FLOOR, GOAL_M, START_M};
 
 /// Runs one flight per seed, on all processors.
@@ -69,6 +69,17 @@ fn at_least_18_of_20_generated_forests_are_crossed_at_2_mps() {
     let outcomes = on_seeds(20, fly_generated);
     assert!(good(&outcomes) >= 18, "{outcomes:#?}");
     assert!(outcomes.iter().all(|o| o.min_fence_m > 0.0), "{outcomes:#?}");
+}
+
+/// Slower than by images that come in time, and as safe.
+#[test]
+fn a_starved_server_costs_speed_and_no_touch() {
+    let outcomes = on_seeds(40, |seed| fly_forest(seed, 90, STARVED));
+    let touched = outcomes.iter().filter(|o| o.collided).count();
+    println!("{touched} touched");
+    assert!(touched <= 1, "{outcomes:#?}");
+    assert!(outcomes.iter().filter(|o| o.finished).count() >= 36, "{outcomes:#?}");
+    assert!(outcomes.iter().all(|o| o.max_speed_mps < 2.7), "{outcomes:#?}");
 }
 
 #[test]

@@ -22,32 +22,55 @@ use vizflyt_protocol::messages::Limits;
 use crate::Generated;
 use crate::canvas::Canvas;
 use crate::solids::Solids;
+use crate::staging::{Stage, Staging};
 use light::Light;
 use site::{FENCE_Y_M, SPAWN_X_M, Site};
 
 /// Returns the forest of a seed.
 pub(crate) fn build(seed: u64) -> Generated {
-    build_layers(seed, &[ground::paint_ground, bark::paint_wood, plants::paint_plants])
+    build_staged(seed, &mut Staging::none())
+}
+
+/// Returns the forest of a seed, made to be filmed.
+pub(crate) fn build_staged(seed: u64, staging: &mut Staging) -> Generated {
+    let layers = [ground::paint_ground, bark::paint_wood, plants::paint_plants];
+    build_layers(seed, &layers, staging)
 }
 
 /// Returns the forest without leaves, ferns and grass: what is solid only.
 #[cfg(test)]
 pub(crate) fn build_bare(seed: u64) -> Generated {
-    build_layers(seed, &[ground::paint_ground, bark::paint_wood])
+    build_layers(seed, &[ground::paint_ground, bark::paint_wood], &mut Staging::none())
 }
 
-fn build_layers(seed: u64, layers: &[fn(&mut Canvas, &Site, &Light)]) -> Generated {
+fn build_layers(
+    seed: u64,
+    layers: &[fn(&mut Canvas, &Site, &Light)],
+    staging: &mut Staging,
+) -> Generated {
     let site = Site::plan(seed);
-    let solids = Solids::new(site.truth());
+    let arena = arena(&site);
+    let mut truth = site.truth();
+    let stage = Stage {
+        fence: &arena.geofence,
+        // Outside of the fence the forest is painted coarsely.
+        around_m: -0.6,
+        walls: &[],
+        movers: &[],
+        fence_is_kept_free: false,
+    };
+    staging.put_up(&mut truth, &stage);
+    let solids = Solids::new(truth);
     let mut canvas = Canvas::default();
     let light = Light::new(&site, &solids);
     for layer in layers {
         layer(&mut canvas, &site, &light);
     }
     backdrop::paint_backdrop(&mut canvas, &site);
+    staging.paint(&mut canvas, &mut |p_m, normal, albedo| light.matt(p_m, normal, albedo));
     Generated {
         splats: canvas.finish(),
-        arena: arena(&site),
+        arena,
         truth: solids.into_volumes(),
         objects: Vec::new(),
         true_objects: Vec::new(),

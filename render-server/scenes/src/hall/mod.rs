@@ -29,6 +29,7 @@ use crate::canvas::{Canvas, paint};
 use crate::forest::front_camera;
 use crate::random::{Rng, fractal2, noise2};
 use crate::solids::Solids;
+use crate::staging::{Stage, Staging};
 use gap::GapWall;
 use gate::Gate;
 use light::HallLight;
@@ -58,28 +59,32 @@ pub(crate) struct Layout {
 }
 
 /// Returns the empty netted room of a seed.
-pub(crate) fn build_room(seed: u64) -> Generated {
+pub(crate) fn build_room(seed: u64, staging: &mut Staging) -> Generated {
     let goal = Goal { position_m: DVec3::new(10.0, 0.0, 1.2), radius_m: 0.6 };
-    build(seed, "room", &Course::default(), goal, 3.0)
+    build(seed, "room", &Course::default(), goal, 3.0, staging)
 }
 
 /// Returns the race of a seed: everything that stands in a course, one behind the other.
-pub(crate) fn build_race(seed: u64) -> Generated {
+pub(crate) fn build_race(seed: u64, staging: &mut Staging) -> Generated {
     let layout = Layout { windows: 3, gap: true, hand: true, ..Layout::default() };
-    build_course(seed, "race", layout)
+    build_staged(seed, "race", layout, staging)
 }
 
 /// Returns the net of a seed with things in it that move by themselves.
-pub(crate) fn build_moving(seed: u64) -> Generated {
+pub(crate) fn build_moving(seed: u64, staging: &mut Staging) -> Generated {
     let layout = Layout { door: true, pendulum: true, drone: true, ..Layout::default() };
-    build_course(seed, "moving", layout)
+    build_staged(seed, "moving", layout, staging)
 }
 
 /// Returns the net of a seed with a layout in it.
 pub(crate) fn build_course(seed: u64, name: &str, layout: Layout) -> Generated {
+    build_staged(seed, name, layout, &mut Staging::none())
+}
+
+fn build_staged(seed: u64, name: &str, layout: Layout, staging: &mut Staging) -> Generated {
     let course = Course::draw(seed, layout);
     let goal = Goal { position_m: DVec3::new(10.3, 0.0, 1.2), radius_m: 0.5 };
-    build(seed, name, &course, goal, 4.0)
+    build(seed, name, &course, goal, 4.0, staging)
 }
 
 /// What stands in the net.
@@ -198,10 +203,27 @@ const DOOR_M: f64 = 3.4;
 const PENDULUM_M: f64 = 5.9;
 const DRONE_M: f64 = 8.3;
 
-fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64) -> Generated {
+fn build(
+    seed: u64,
+    name: &str,
+    course: &Course,
+    goal: Goal,
+    max_speed_mps: f64,
+    staging: &mut Staging,
+) -> Generated {
     let shell = Shell::plan(seed);
     let mut truth = shell.truth();
     truth.extend(course.blocks().iter().map(Block::volume));
+    let geofence = Geofence { min_m: NET_MIN_M - DVec3::Z * 0.5, max_m: NET_MAX_M };
+    let stage = Stage {
+        fence: &geofence,
+        // Nets are lifted: one may walk out to the walls.
+        around_m: 3.0,
+        walls: &shell::walls(),
+        movers: &course.movers.keep_out(),
+        fence_is_kept_free: true,
+    };
+    staging.put_up(&mut truth, &stage);
     let solids = Solids::new(truth);
     let casters: Vec<Volume> =
         shell.casters().into_iter().chain(course.casters().iter().map(Block::volume)).collect();
@@ -228,6 +250,8 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         });
     }
     let made = course.movers.make(&mut painter);
+    let Painter { canvas, rng, light } = &mut painter;
+    staging.paint(canvas, &mut |p_m, normal, albedo| light.matt(p_m, normal, albedo, rng));
 
     let splats = painter.canvas.finish();
     let arena = ArenaConfig {
@@ -240,7 +264,7 @@ fn build(seed: u64, name: &str, course: &Course, goal: Goal, max_speed_mps: f64)
         attitude_rate: false,
         spawn: Spawn { position_m: spawn_m, yaw_deg: 0.0 },
         goal: Some(goal),
-        geofence: Geofence { min_m: NET_MIN_M - DVec3::Z * 0.5, max_m: NET_MAX_M },
+        geofence,
         limits: Limits::new(max_speed_mps, 6.0),
         body: Vec::new(),
         no_fly: Vec::new(),

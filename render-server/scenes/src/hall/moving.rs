@@ -135,6 +135,15 @@ impl Movers {
         });
     }
 
+    /// Returns upright columns about what moves, that nobody should walk into. [m, world]
+    pub(crate) fn keep_out(&self) -> Vec<Volume> {
+        let column = |mover: &Mover| {
+            let at = mover.position_m.truncate();
+            Volume::Capsule { a_m: at.extend(0.0), b_m: at.extend(2.5), radius_m: KEEP_OUT_M }
+        };
+        self.movers.iter().map(column).collect()
+    }
+
     /// Makes all of them; objects are numbered from 1.
     pub(crate) fn make(&self, painter: &mut Painter) -> Vec<GeneratedMover> {
         let numbered = self.movers.iter().zip(1..);
@@ -234,6 +243,9 @@ const HAND_AHEAD_M: f64 = 0.1;
 const BAND_M: f64 = 0.2;
 
 const _: () = assert!(NET_MIN_M.y == -NET_MAX_M.y);
+
+/// A person stays this far from the middle of what moves. [m]
+const KEEP_OUT_M: f64 = 0.8;
 
 #[cfg(test)]
 mod tests {

@@ -169,6 +169,17 @@ impl Shell {
     }
 }
 
+/// Returns the walls without windows: a point at the floor, the inward normal, and the reach to both sides. [m, world]
+pub(crate) fn walls() -> [(DVec3, DVec3, f64); 3] {
+    let middle = (HALL_MIN_M + HALL_MAX_M) / 2.0;
+    let half = (HALL_MAX_M - HALL_MIN_M) / 2.0 - 0.4;
+    [
+        (DVec3::new(middle.x, HALL_MIN_M.y, 0.0), DVec3::Y, half.x),
+        (DVec3::new(HALL_MIN_M.x, middle.y, 0.0), DVec3::X, half.y),
+        (DVec3::new(HALL_MAX_M.x, middle.y, 0.0), DVec3::NEG_X, half.y),
+    ]
+}
+
 /// Returns a level panel that looks up. [m, world]
 pub(crate) fn floor_panel(min: DVec2, max: DVec2) -> Panel {
     // At a grazing angle a pixel takes the depth of the nearest patch that covers it: two

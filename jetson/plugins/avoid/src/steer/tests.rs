@@ -24,7 +24,7 @@ fn field(points_m: &[DVec2]) -> Field {
 }
 
 fn moving(v_mps: DVec2) -> Motion {
-    Motion { p_m: DVec2::ZERO, v_mps, setpoint_mps: v_mps, heading_rad: 0.0 }
+    Motion { p_m: DVec2::ZERO, v_mps, setpoint_mps: v_mps, heading_rad: 0.0, late_s: 0.0 }
 }
 
 #[test]

@@ -59,6 +59,9 @@ pub(crate) const SLUGGISH: Conditions = Conditions {
     faults: Faults { noise: 0.02, holes: 0.1, blurred_edges: true, sky_mm: 60000 },
 };
 
+/// A server that gets a fifth of its processor: an image, then none for an eighth of a second, and poses no more often.
+pub(crate) const STARVED: Conditions = Conditions { image_period_s: 0.13, ..TYPICAL };
+
 /// How a flight ended, by the truth.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Outcome {

@@ -309,7 +309,7 @@ impl Notes {
 }
 
 /// Longest note. [characters]
-const MAX_NOTE: usize = 160;
+const MAX_NOTE: usize = 320;
 /// So many are remembered.
 const MAX_NOTES: usize = 16;
 /// One that has not come for so long is news again. [s]

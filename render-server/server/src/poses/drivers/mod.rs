@@ -1,7 +1,7 @@
 //! Sources of poses. A driver owns its socket; the parser beside it is sans-IO.
 //!
 //! ```text
-//! datagrams -> udp (socket, arrival stamp) -> vicon, natnet, json, mavlink (bytes -> objects)
+//! datagrams -> udp (socket), arrival (the kernel's stamp) -> vicon, natnet, json, mavlink (bytes -> objects)
 //! bytes ----> vrpn::connection (TCP, arrival stamp) -> vrpn
 //!           -> vehicle_names (which vehicle's; into the world frame; counters; what is odd)
 //!           -> frame_clock, sender_clock (stamp without the network's jitter)
@@ -10,6 +10,7 @@
 //! 30 to 300 Hz. The pose thread of [`crate::poses::thread`] owns the source and calls
 //! [`PoseSource::receive`]. Which sources there are: [`open`].
 
+mod arrival;
 pub mod frame_clock;
 pub mod json;
 pub mod mavlink;

@@ -8,6 +8,7 @@ use anyhow::{Context, Result};
 use socket2::{Domain, Protocol, Socket, Type};
 use vizflyt_protocol::time::ServerTime;
 
+use super::arrival::Arrivals;
 use super::source::{Measurement, PoseSource, SourceCounters};
 use crate::clock;
 use crate::poses::settings::Driver;
@@ -113,6 +114,7 @@ impl UdpPort {
     /// Gives what comes to a stream.
     pub fn with<S: PoseStream>(self, stream: S) -> UdpPoses<S> {
         UdpPoses {
+            arrivals: Arrivals::of(&self.socket),
             port: self,
             from: None,
             stream,
@@ -128,6 +130,7 @@ impl UdpPort {
 #[derive(Debug)]
 pub struct UdpPoses<S> {
     port: UdpPort,
+    arrivals: Arrivals,
     from: Option<SocketAddr>,
     stream: S,
     buffer: Box<[u8]>,
@@ -174,17 +177,15 @@ impl<S: PoseStream> PoseSource for UdpPoses<S> {
             return &[];
         }
         self.send(clock::now());
-        let received = self.port.socket.recv_from(&mut self.buffer[..]);
-        let now = clock::now();
         // Errors are the time-out, or an ICMP complaint about something else: both mean no pose.
-        let Ok((length, from)) = received else {
-            self.notice_silence(now);
+        let Ok(arrival) = self.arrivals.receive(&self.port.socket, &mut self.buffer) else {
+            self.notice_silence(clock::now());
             return &[];
         };
-        self.received_at = now;
-        self.from = Some(from);
+        self.received_at = arrival.at;
+        self.from = Some(arrival.from);
         self.silence_warned = false;
-        self.stream.handle_packet_from(now, from, &self.buffer[..length])
+        self.stream.handle_packet_from(arrival.at, arrival.from, &self.buffer[..arrival.length])
     }
 
     fn next_warning(&mut self) -> Option<String> {

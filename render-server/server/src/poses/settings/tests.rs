@@ -1,3 +1,6 @@
+use glam::DQuat;
+use vizflyt_protocol::geometry::{Body, Pose, World};
+
 use super::*;
 use proptest::prelude::*;
 

@@ -1,0 +1,64 @@
+//! Display colours and linear light, by tables (sRGB, IEC 61966-2-1).
+
+/// Both directions.
+#[derive(Debug)]
+pub(super) struct Tone {
+    /// Linear light of `n / LINEAR` of a display colour.
+    linear: Vec<f32>,
+    /// Display colour of `n / SHOWN` of linear light.
+    shown: Vec<u8>,
+}
+
+impl Tone {
+    pub(super) fn new() -> Self {
+        let linear = (0..=LINEAR + 1).map(|n| linear_from_display(n as f64 / LINEAR as f64) as f32);
+        let shown = (0..=SHOWN).map(|n| {
+            let shown = display_from_linear(n as f64 / SHOWN as f64);
+            (255.0 * shown + 0.5) as u8
+        });
+        Self { linear: linear.collect(), shown: shown.collect() }
+    }
+
+    /// Returns the linear light of a display colour; what is outside 0 to 1 is cut.
+    #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
+    pub(super) fn linear(&self, shown: f32) -> f32 {
+        let at = shown.max(0.0).min(1.0) * LINEAR as f32;
+        let n = at as usize;
+        let (low, high) = (self.linear[n], self.linear[n + 1]);
+        low + (high - low) * (at - n as f32)
+    }
+
+    /// Returns the display colour of linear light; what is outside 0 to 1 is cut, as a full sensor does.
+    #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
+    pub(super) fn shown(&self, linear: f32) -> u8 {
+        self.shown[(linear.max(0.0).min(1.0) * SHOWN as f32 + 0.5) as usize]
+    }
+}
+
+fn linear_from_display(v: f64) -> f64 {
+    if v <= 0.04045 { v / 12.92 } else { libm::pow((v + 0.055) / 1.055, 2.4) }
+}
+
+fn display_from_linear(v: f64) -> f64 {
+    if v <= 0.0031308 { 12.92 * v } else { 1.055 * libm::pow(v, 1.0 / 2.4) - 0.055 }
+}
+
+const LINEAR: usize = 4096;
+/// In the dark a display colour is a 12.92 * 255th of linear light: four entries.
+const SHOWN: usize = 16384;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn display_colours_come_back() {
+        let tone = Tone::new();
+        for byte in 0..=255u8 {
+            assert_eq!(tone.shown(tone.linear(f32::from(byte) / 255.0)), byte);
+        }
+        assert_eq!((tone.linear(-1.0), tone.linear(f32::NAN)), (0.0, 0.0));
+        assert!((tone.linear(7.0) - 1.0).abs() < 1e-6);
+        assert_eq!((tone.shown(9.0), tone.shown(f32::NAN)), (255, 0));
+    }
+}

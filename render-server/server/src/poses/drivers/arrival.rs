@@ -1,0 +1,120 @@
+//! When a datagram came to this computer, by the kernel's own stamp (`SO_TIMESTAMPNS`, socket(7)).
+//!
+//! A process that waits for a processor reads a tenth of a second's poses at one instant; the kernel has stamped each as
+//! it came. At 3.6 m/s a stamp that is 100 ms off is a place that is 0.36 m off.
+
+use std::io::IoSliceMut;
+use std::net::{SocketAddr, SocketAddrV4, SocketAddrV6, UdpSocket};
+use std::os::fd::AsRawFd;
+
+use nix::cmsg_space;
+use nix::sys::socket::{
+    ControlMessageOwned, MsgFlags, SockaddrStorage, recvmsg, setsockopt, sockopt,
+};
+use nix::sys::time::TimeSpec;
+use nix::time::{ClockId, clock_gettime};
+use vizflyt_protocol::time::ServerTime;
+
+use crate::clock;
+
+/// Receives datagrams with the instants at which they came.
+#[derive(Debug)]
+pub(super) struct Arrivals {
+    /// Where the kernel puts its stamp.
+    control: Vec<u8>,
+}
+
+/// A datagram's length, its sender, and when it came.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Arrival {
+    /// Bytes of the buffer that are the datagram's.
+    pub(super) length: usize,
+    /// Who sent it.
+    pub(super) from: SocketAddr,
+    /// When the kernel had it; when it was read, of a kernel that does not say. [server]
+    pub(super) at: ServerTime,
+}
+
+impl Arrivals {
+    /// Asks the kernel for stamps of what comes to `socket`. One that has none leaves the instant of reading.
+    pub(super) fn of(socket: &UdpSocket) -> Self {
+        let _ = setsockopt(socket, sockopt::ReceiveTimestampns, &true);
+        Self { control: cmsg_space!(TimeSpec) }
+    }
+
+    /// Waits for the next datagram, as long as the socket's time-out.
+    ///
+    /// # Errors
+    /// The socket's: its time-out, or an ICMP complaint.
+    pub(super) fn receive(
+        &mut self,
+        socket: &UdpSocket,
+        buffer: &mut [u8],
+    ) -> nix::Result<Arrival> {
+        let mut parts = [IoSliceMut::new(buffer)];
+        let message = recvmsg::<SockaddrStorage>(
+            socket.as_raw_fd(),
+            &mut parts,
+            Some(&mut self.control),
+            MsgFlags::empty(),
+        )?;
+        let now = clock::now();
+        let stamp = message.cmsgs()?.find_map(|part| match part {
+            ControlMessageOwned::ScmTimestampns(stamp) => Some(stamp),
+            _ => None,
+        });
+        let waited_s = stamp.map_or(0.0, waited_s);
+        let at = if waited_s < MAX_WAIT_S { now.plus_seconds(-waited_s) } else { now };
+        let from = message.address.as_ref().and_then(address).ok_or(nix::Error::EAFNOSUPPORT)?;
+        Ok(Arrival { length: message.bytes, from, at })
+    }
+}
+
+/// Returns how long ago `stamp` was on the wall clock, which is the kernel's for stamps. [s]
+fn waited_s(stamp: TimeSpec) -> f64 {
+    let Ok(wall) = clock_gettime(ClockId::CLOCK_REALTIME) else { return 0.0 };
+    let seconds = (wall.tv_sec() - stamp.tv_sec()) as f64;
+    (seconds + (wall.tv_nsec() - stamp.tv_nsec()) as f64 * 1e-9).max(0.0)
+}
+
+fn address(from: &SockaddrStorage) -> Option<SocketAddr> {
+    let v4 = from.as_sockaddr_in().map(|v4| SocketAddr::V4(SocketAddrV4::from(*v4)));
+    v4.or_else(|| from.as_sockaddr_in6().map(|v6| SocketAddr::V6(SocketAddrV6::from(*v6))))
+}
+
+/// What waited longer was stamped before somebody set the wall clock: the buffer holds 3 s of a stream. [s]
+const MAX_WAIT_S: f64 = 3.0;
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn what_waited_is_stamped_when_it_came() {
+        for local in ["127.0.0.1:0", "[::1]:0"] {
+            let socket = UdpSocket::bind(local).unwrap();
+            let mut arrivals = Arrivals::of(&socket);
+            let sender = UdpSocket::bind(local).unwrap();
+            let mut sent = Vec::new();
+            for byte in 0..3u8 {
+                let before = clock::now();
+                sender.send_to(&[byte; 5], socket.local_addr().unwrap()).unwrap();
+                sent.push((before, clock::now()));
+                std::thread::sleep(Duration::from_millis(40));
+            }
+            let mut buffer = [0; 64];
+            for (byte, (before, after)) in sent.into_iter().enumerate() {
+                let arrival = arrivals.receive(&socket, &mut buffer).unwrap();
+                assert_eq!(&buffer[..arrival.length], &[byte as u8; 5]);
+                assert_eq!(arrival.from, sender.local_addr().unwrap());
+                // The two clocks are read one after the other: a preemption between them counts.
+                assert!(arrival.at.seconds_since(before) > -5e-3, "{byte}");
+                assert!(arrival.at.seconds_since(after) < 5e-3, "{byte}");
+            }
+            socket.set_read_timeout(Some(Duration::from_millis(5))).unwrap();
+            assert_eq!(arrivals.receive(&socket, &mut buffer).unwrap_err(), nix::Error::EAGAIN);
+        }
+    }
+}
