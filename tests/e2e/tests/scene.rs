@@ -399,7 +399,7 @@ fn a_captured_room_gets_an_arena() {
     assert!(text.contains("[scene]\nfile = \"../room.ply\"\nup = \"-y\""), "{text}");
     assert!(good(&["arena", "check", &at("mine")]).contains("can be flown"));
     let baked: Value =
-        serde_json::from_str(&good(&["scene", "bake", &at("mine"), "--json"])).unwrap();
+        serde_json::from_str(&good(&["scene", "bake", &at("mine"), "--json", "--force"])).unwrap();
     assert!(baked["occupied"].as_u64().unwrap() > 10_000, "{baked}");
     check_refused(&["arena", "new", &at("mine"), "--scene", &at("room.ply")], &["already exists"]);
     check_refused(&["arena", "new", &at("x"), "--scene", &at("mine")], &["is an arena already"]);
@@ -461,7 +461,8 @@ fn a_captured_room_gets_an_arena() {
 
     // Flags of a bare scene do not place an arena's.
     for command in [&["scene", "bake"][..], &["scene", "view"]] {
-        let args = [command, &[&at("mine"), "--up", "z", "--scale", "2"]].concat();
+        let mine = at("mine");
+        let args = [command, &[mine.as_str(), "--up", "z", "--scale", "2"]].concat();
         check_refused(
             &args,
             &["--up and --scale are for a scene without an arena", "[scene] there"],

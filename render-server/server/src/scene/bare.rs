@@ -122,7 +122,8 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
     let [min, max] = bounds(core(splats, |mean| mean));
     let voxel_m = voxel_m(max - min)?;
     let plan = Plan::of(splats, min - OUTSIDE_M, max + OUTSIDE_M);
-    let (spawn, yaw_rad) = best_view(splats, &with_room(with_floor(plan.places(), splats)));
+    let (spawn, yaw_rad) =
+        best_view(splats, &with_room(with_floor(plan.places(), splats, (min, max))));
     let name = Path::new(&scene.file).file_stem();
     let name = name.map_or("scene".into(), |stem| stem.to_string_lossy());
     let name: String = name.chars().filter(char::is_ascii_graphic).take(32).collect();
@@ -195,19 +196,32 @@ fn to_cm(p_m: DVec3) -> DVec3 {
     (p_m * 100.0).round() / 100.0
 }
 
-/// Returns those of the places that have a floor, if any has; else all.
-fn with_floor(places: Vec<(u32, DVec3)>, splats: &Splats) -> Vec<(u32, DVec3)> {
+/// Returns those of the places within the core that have a floor, if any has; else all. Beyond the core a
+/// few huge splats are a floor too, and nothing is to be seen.
+fn with_floor(
+    places: Vec<(u32, DVec3)>,
+    splats: &Splats,
+    (min, max): (DVec3, DVec3),
+) -> Vec<(u32, DVec3)> {
     let min_opacity = Occupancy::default().min_opacity as f32;
-    let has_floor = |&(_, p_m): &_| floor_share(splats, p_m, min_opacity) >= LEAST_FLOOR;
+    let has_floor = |&(_, p_m): &(u32, DVec3)| {
+        let [p, low, high] = [p_m, min, max].map(DVec3::truncate);
+        let inside = p.cmpge(low).all() && p.cmple(high).all();
+        inside && floor_share(splats, p_m, min_opacity) >= LEAST_FLOOR
+    };
     let standing: Vec<_> = places.iter().copied().filter(has_floor).collect();
     if standing.is_empty() { places } else { standing }
 }
 
-/// Returns those of the places with the fewest splats in the way. [m, world]
-fn with_room(places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
-    let least = places.iter().map(|place| place.0).min().unwrap_or(0);
-    let free = places.into_iter().filter(|place| place.0 <= least + FEW_SPLATS);
-    free.map(|place| place.1).collect()
+/// Returns the quarter of the places with the fewest splats in the way, and all that are as good as the
+/// best. [m, world]
+fn with_room(mut places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
+    places.sort_by_key(|place| place.0);
+    let quarter = places.len().div_ceil(4);
+    let least = places.first().map_or(0, |place| place.0);
+    let free = places.into_iter().enumerate();
+    let free = free.filter(|(rank, place)| *rank < quarter || place.0 <= least + FEW_SPLATS);
+    free.map(|(_, place)| place.1).collect()
 }
 
 /// Returns the place [m, world] and heading [rad] from which, at the height of the flight, the
