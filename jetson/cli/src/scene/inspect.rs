@@ -185,13 +185,6 @@ fn warnings_of_file(loaded: &Loaded) -> Vec<String> {
             warnings.push(format!("{count} splats {what}; they are left out"));
         }
     }
-    if loaded.antialiased {
-        warnings.push(
-            "trained with anti-aliasing: rendered without, its smallest splats look a little too \
-             bright"
-                .to_owned(),
-        );
-    }
     // Trainers write normals that are all zero.
     let is_normal = |name: &&String| ["nx", "ny", "nz"].contains(&name.as_str());
     let names: Vec<_> = loaded.skipped_properties.iter().filter(|name| !is_normal(name)).collect();
@@ -291,6 +284,7 @@ mod tests {
             opacities: vec![0.9; count],
             sh_degree: 0,
             sh: vec![0.0; count * 3],
+            antialiased: false,
         }
     }
 

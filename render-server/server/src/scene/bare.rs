@@ -294,6 +294,7 @@ mod tests {
             opacities: (0..count).map(|k| if k < solid { 0.9 } else { 0.1 }).collect(),
             sh_degree: 0,
             sh: vec![0.0; count * 3],
+            antialiased: false,
         }
     }
 
@@ -335,6 +336,7 @@ mod tests {
                 opacities: vec![0.9; count],
                 sh_degree: 0,
                 sh: vec![0.0; count * 3],
+                antialiased: false,
             };
             assert_eq!(align(&splats, Up::Z, None).scale, 1.0);
             let arena = default_arena(&splats, Path::new("dot.ply"));

@@ -235,6 +235,7 @@ mod tests {
             opacities: vec![0.9],
             sh_degree: 0,
             sh: vec![0.5; 3],
+            antialiased: false,
         }
     }
 

@@ -212,6 +212,7 @@ mod tests {
             opacities: vec![0.7; count],
             sh_degree: 3,
             sh: (0..count * 48).map(|i| noise(i) * 0.3).collect(),
+            antialiased: false,
         }
     }
 

@@ -52,9 +52,6 @@ pub struct Loaded {
     pub splats: Splats,
     /// What was left out, by reason.
     pub dropped: DropCounts,
-    /// Whether the file states that the scene was trained with anti-aliasing (mip-splatting); rendered
-    /// without, its smallest splats look a little too bright.
-    pub antialiased: bool,
     /// Names of what the file holds of each splat and no splat needs, in file order.
     pub skipped_properties: Vec<String>,
     /// Names of PLY elements that hold no splats, in file order.
@@ -76,7 +73,6 @@ impl Loaded {
             format,
             splats,
             dropped,
-            antialiased: false,
             skipped_properties: Vec::new(),
             skipped_elements: Vec::new(),
         })
