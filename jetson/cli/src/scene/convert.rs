@@ -46,7 +46,13 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
     for skipped in loaded.skipped_properties.iter().chain(&loaded.skipped_elements) {
         print_fmt!("left out: {skipped}");
     }
-    match (args.variant, Format::of_name(&args.to)) {
+    let to = Format::of_name(&args.to);
+    if loaded.splats.antialiased && to.is_some_and(|format| !format.keeps_antialiased()) {
+        print_line(
+            "trained with anti-aliasing, which no file of this format says: render with --antialiased on",
+        );
+    }
+    match (args.variant, to) {
         (Some(variant), Some(format)) => {
             let bytes = format::encode_variant(format, variant, &loaded.splats)?;
             std::fs::write(&args.to, bytes)

@@ -7,12 +7,14 @@
 //! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
 //! Once, at the start; progress goes to the log.
 
+mod antialiased;
 mod bake;
 mod bare;
 mod choose;
 mod objects;
 mod orient;
 
+pub use antialiased::Antialiased;
 pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
 pub use bare::{align, default_arena};
 pub use choose::Scenes;

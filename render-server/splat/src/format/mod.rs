@@ -134,6 +134,11 @@ impl Format {
         }
     }
 
+    /// Whether its files say that a scene was trained with anti-aliasing.
+    pub fn keeps_antialiased(self) -> bool {
+        !matches!(self, Self::Splat | Self::Ksplat)
+    }
+
     /// Returns the variants that are written, the usual one first: versions of SPZ (2 is coarser,
     /// fewer readers know 4) and SOG, levels of compression of `.ksplat`; 0 where there is but one.
     pub fn variants(self) -> &'static [u32] {
