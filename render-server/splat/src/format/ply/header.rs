@@ -169,7 +169,8 @@ impl Header {
                         "ascii" => Format::Ascii,
                         _ => {
                             return Err(fail(format!(
-                                "format `{name}`; only binary_little_endian and ascii are read"
+                                "format `{name}`; only binary_little_endian and ascii are read: save it as one of \
+                                 them"
                             )));
                         }
                     });
