@@ -13,15 +13,19 @@ use crate::terminal::{print_fmt, print_line};
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt scene convert scene.spz scene.ply
-  vizflyt scene convert scene.ply scene.spz --variant 3")]
+  vizflyt scene convert scene.ply scene.spz --variant 3
+  vizflyt scene convert streamed/lod-meta.json coarse.ply --level 2")]
 pub(crate) struct ConvertArgs {
-    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat, .glb, .gltf, or the folder of a SOG
     from: PathBuf,
     /// The file to write; a `meta.json` becomes a SOG scene of separate files
     to: PathBuf,
     /// Version of SPZ, or level of KSPLAT, to write
     #[arg(long, value_name = "N")]
     variant: Option<u32>,
+    /// Level of a streamed scene (lod-meta.json) to read; 0 is the finest
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    level: u32,
 }
 
 /// Converts.
@@ -29,12 +33,16 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
     let start = Instant::now();
     let mut shown_s = 1;
     // Progress once a second.
-    let loaded = format::read_with_progress(&args.from, &mut |Progress { done, total }| {
+    let mut show = |Progress { done, total }: Progress| {
         if start.elapsed().as_secs() >= shown_s {
             shown_s += 1;
             print_line(format!("{} %", done * 100 / total));
         }
-    })?;
+    };
+    let loaded = match args.level {
+        0 => format::read_with_progress(&args.from, &mut show)?,
+        level => format::read_level(&args.from, level)?,
+    };
     print_fmt!(
         "{}: {} splats, degree {}, {} dropped, {:.0} ms",
         loaded.format,

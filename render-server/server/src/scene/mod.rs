@@ -113,15 +113,9 @@ fn named(path: &Path) -> Result<Named> {
         if inside.is_file() {
             return Ok(Named::Arena(inside));
         }
-        if path.join("meta.json").is_file() {
-            // An unpacked SOG.
+        // An unpacked SOG, or a streamed one.
+        if ["meta.json", "lod-meta.json"].iter().any(|name| path.join(name).is_file()) {
             return Ok(Named::Scene(path.to_owned()));
-        }
-        if path.join("lod-meta.json").is_file() {
-            bail!(
-                "{} is a streamed scene (lod-meta.json), which is not read; convert it to one .sog",
-                path.display()
-            );
         }
         bail!("{} is a folder without an arena.toml", path.display());
     }
@@ -249,7 +243,7 @@ mod tests {
         check(folder.path(), "is a folder without an arena.toml");
         std::fs::create_dir(at("streamed")).unwrap();
         std::fs::write(at("streamed/lod-meta.json"), "{}").unwrap();
-        check(&at("streamed"), "is a streamed scene (lod-meta.json)");
+        check(&at("streamed"), "SOG, lod-meta.json");
         std::fs::write(at("notes.txt"), "x").unwrap();
         check(&at("notes.txt"), "supported are");
         std::fs::write(at("bad.toml"), "name = 3").unwrap();
