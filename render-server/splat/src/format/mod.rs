@@ -170,7 +170,7 @@ impl Format {
         if name == sog::META || name == sog::LOD_META {
             return Some(Self::Sog);
         }
-        if name.ends_with(".gltf") {
+        if is_gltf_text(path) {
             return Some(Self::Gltf);
         }
         // The longest extension that fits: `.compressed.ply` is also a `.ply`.
@@ -268,9 +268,8 @@ pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
 /// If the vectors of `splats` differ in length.
 pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError> {
     let path = path.as_ref();
-    let is_written = |name: &str| !name.ends_with(".gltf") && name != sog::LOD_META;
-    let name = path.file_name().and_then(|name| name.to_str());
-    let format = Format::of_name(path).filter(|_| name.is_some_and(is_written));
+    let is_tree = path.file_name().is_some_and(|name| name == sog::LOD_META);
+    let format = Format::of_name(path).filter(|_| !is_tree && !is_gltf_text(path));
     let format = format.ok_or_else(|| FormatError::Unknown {
         what: format!("{} names no format to write", path.display()),
     })?;
@@ -398,6 +397,11 @@ fn not_downloaded(bytes: &[u8]) -> Option<&'static str> {
     } else {
         None
     }
+}
+
+/// Whether a name is that of glTF's JSON, whose buffers stand in other files.
+fn is_gltf_text(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gltf"))
 }
 
 /// Decodes a file; `folder` is where it lies, if that is known.

@@ -153,7 +153,7 @@ fn base64(text: &str) -> Option<Vec<u8>> {
             2 => 1,
             _ => return None,
         };
-        bytes.extend_from_slice(&full.to_be_bytes()[1..1 + length]);
+        bytes.extend_from_slice(&full.to_be_bytes()[1..=length]);
     }
     Some(bytes)
 }

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use serde::Deserialize;
 use serde::de::IgnoredAny;
+use serde_json::Value;
 
 /// The file.
 #[derive(Deserialize)]
@@ -71,7 +72,7 @@ pub(super) struct Splatting {
     pub(super) color_space: Option<String>,
     /// Extensions of the extension: compression, by name.
     #[serde(default)]
-    pub(super) extensions: HashMap<String, IgnoredAny>,
+    pub(super) extensions: HashMap<String, Value>,
     #[serde(default)]
     pub(super) extras: Extras,
 }
