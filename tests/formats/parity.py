@@ -101,6 +101,7 @@ LOSS = {
     'ksplat0': (1e-6, 1e-5, 1e-3, 1 / 255, COLOUR, 1e-6),
     'ksplat1': (5 / 65535, 2e-3, 3e-3, 1 / 255, COLOUR, 1e-3),
     'ksplat2': (5 / 65535, 2e-3, 3e-3, 1 / 255, COLOUR, 1.8 / 255),
+    'glb': (1e-6, 1e-5, 1e-3, 1e-6, 1e-6, 1e-5),
     # Two readers of one file.
     'same': (1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5),
 }
@@ -194,6 +195,8 @@ def tools(folder):
     yield name, 'spz2', range(4), None, reference, ''
     for version in (3, 4):
         yield name, f'spz{version}', range(4), splat_transform('--spz-version', version), reference, ''
+    # It writes glTF and does not read it.
+    yield name, 'glb', range(4), splat_transform(), None, ''
     yield name, 'splat', range(1), None, reference, ''
     for level in (0, 1, 2):
         yield name, f'ksplat{level}', range(3), None, reference, ''

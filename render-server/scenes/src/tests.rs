@@ -11,7 +11,8 @@ use crate::solids::{REACH_M, Solids};
 
 /// FNV-1a over every number of the splats and the truth.
 fn fingerprint(scene: &Generated) -> u64 {
-    let Splats { means_m, scales_m, rotations, opacities, sh_degree: _, sh } = &scene.splats;
+    let Splats { means_m, scales_m, rotations, opacities, sh_degree: _, sh, antialiased: _ } =
+        &scene.splats;
     let vectors = means_m.iter().chain(scales_m).flat_map(glam::Vec3::to_array);
     let objects = scene.objects.iter().flat_map(|object| &object.splats.means_m);
     let vectors = vectors.chain(objects.flat_map(glam::Vec3::to_array));
@@ -53,7 +54,8 @@ fn splats_are_valid_and_within_budget() {
     for kind in SceneKind::ALL {
         for seed in [0, 3, u64::MAX] {
             let scene = generate(kind, seed);
-            let Splats { means_m, scales_m, rotations, opacities, sh_degree, sh } = &scene.splats;
+            let Splats { means_m, scales_m, rotations, opacities, sh_degree, sh, antialiased: _ } =
+                &scene.splats;
             let count = means_m.len();
             assert!((50_000..=150_000).contains(&count), "{kind} {seed}: {count} splats");
             assert_eq!((scales_m.len(), rotations.len(), opacities.len()), (count, count, count));

@@ -10,8 +10,8 @@ use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 use crate::authorization::parse_grant;
 use crate::flights::leaderboard::{Database, UnknownDatabase};
 use crate::poses::settings::{Driver, LocalizationConfig};
-use crate::render::RendererKind;
-use crate::scene::BareArgs;
+use crate::render::{DetailKind, RendererKind};
+use crate::scene::{Antialiased, BareArgs};
 use crate::stream::rate_control::Adaptation;
 use crate::stream::transport::Congestion;
 use crate::web::Login;
@@ -75,6 +75,14 @@ pub struct ServeArgs {
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
+
+    /// How much of a large scene the processor draws; a graphics card draws all of it
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub detail: DetailKind,
+
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub antialiased: Antialiased,
 
     /// Draw at most this often [Hz]
     #[arg(long, value_name = "HZ", default_value_t = 120.0, value_parser = rate)]

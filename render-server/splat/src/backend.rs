@@ -60,15 +60,19 @@ pub enum NoRenderer {
 }
 
 /// Returns the renderer for a scene on this machine. One on a graphics card has the processor
-/// behind it ([`crate::FallbackRenderer`]): no image is missing when its device is lost. The processor
-/// renders large scenes in adaptive detail ([`Detail::suited_to`]).
+/// behind it ([`crate::FallbackRenderer`]): no image is missing when its device is lost. `detail` is what the processor
+/// renders; a graphics card renders every splat.
 ///
 /// # Errors
 /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
 /// find one.
-pub fn choose<'a>(scene: impl Into<Scene<'a>>, backend: Backend) -> Result<Chosen, NoRenderer> {
+pub fn choose<'a>(
+    scene: impl Into<Scene<'a>>,
+    backend: Backend,
+    detail: Detail,
+) -> Result<Chosen, NoRenderer> {
     let scene = scene.into();
-    let cpu = CpuRenderer::with_detail(scene, Detail::suited_to(&scene));
+    let cpu = CpuRenderer::with_detail(scene, detail);
     if backend == Backend::Cpu {
         return Ok(Chosen { rasterizer: Box::new(cpu), reason: "asked for".to_owned() });
     }

@@ -96,7 +96,8 @@ mod tests {
     #[test]
     fn a_quadrotor_is_within_its_body_and_well_formed() {
         let splats = boxes(&QUADROTOR);
-        let Splats { means_m, scales_m, rotations, opacities, sh_degree, sh } = &splats;
+        let Splats { means_m, scales_m, rotations, opacities, sh_degree, sh, antialiased: _ } =
+            &splats;
         assert!((500..5000).contains(&splats.len()), "{}", splats.len());
         assert_eq!((*sh_degree, sh.len()), (0, 3 * splats.len()));
         assert_eq!((scales_m.len(), opacities.len()), (splats.len(), splats.len()));

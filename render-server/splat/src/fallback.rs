@@ -106,6 +106,7 @@ mod tests {
             opacities: vec![0.9],
             sh_degree: 0,
             sh: vec![0.1, 0.2, 0.3],
+            antialiased: false,
         };
         let camera =
             Camera::new(Intrinsics::from_horizontal_fov(32, 24, 1.2), Pose::IDENTITY, 0.01);

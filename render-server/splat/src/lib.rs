@@ -18,6 +18,7 @@
 //!     opacities: vec![1.0],
 //!     sh_degree: 0,
 //!     sh: vec![0.0; 3],
+//!     antialiased: false,
 //! };
 //! let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 1.2);
 //! let camera = Camera::new(intrinsics, Pose::IDENTITY, 0.01);

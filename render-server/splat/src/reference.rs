@@ -131,7 +131,8 @@ fn project(
     let determinant = a * c - b * b;
 
     // alpha >= 1/255 where sigma <= ln(255 o); the bounding box of that ellipse.
-    let opacity = f64::from(splats.opacities[i]);
+    let opacity = f64::from(splats.opacities[i])
+        * if splats.antialiased { unblurred(&row_x, &row_y, determinant) } else { 1.0 };
     let reach = 2.0 * (opacity / ALPHA_MIN).ln();
     if !(determinant > 0.0 && reach >= 0.0) {
         return None;
@@ -159,6 +160,14 @@ fn project(
         opacity,
         rgb: DVec3::from(rgb),
     })
+}
+
+/// Returns by what an anti-aliased splat is dimmed, so that the pixel's blur adds nothing to what it covers: the square
+/// root of the covariance's determinant without the blur over that with it. (Yu et al. 2024,
+/// "Mip-Splatting", equation 10; the compensation of gsplat's `rasterize_mode="antialiased"`.)
+fn unblurred(row_x: &DVec3, row_y: &DVec3, determinant: f64) -> f64 {
+    // By Cauchy and Binet the sum of squared minors, which is never below 0.
+    (row_x.cross(*row_y).length_squared() / determinant).sqrt()
 }
 
 /// Blends splats, nearest first.

@@ -19,6 +19,9 @@ pub struct Splats {
     pub sh_degree: u8,
     /// Coefficients, splat by splat, coefficient by coefficient, RGB within; the constant first.
     pub sh: Vec<f32>,
+    /// Whether they were trained with anti-aliasing (mip-splatting; gsplat's `antialiased`, brush's `mip`): the
+    /// renderer then dims each by what the pixel's blur adds to its area. Read from the file where it says so.
+    pub antialiased: bool,
 }
 
 impl Splats {

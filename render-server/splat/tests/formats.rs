@@ -104,6 +104,40 @@ fn splat_transform_sog() {
 }
 
 #[test]
+fn splat_transform_glb() {
+    let exact = Loss {
+        log_scale: 1e-5,
+        rotation_rad: 1e-3,
+        opacity: 1e-6,
+        constant: 1e-6,
+        harmonic: 1e-5,
+        ..BYTES
+    };
+    check("splat-transform-glb-sh2.glb", Format::Gltf, 2, &exact);
+}
+
+#[test]
+fn splat_transform_streamed_sog() {
+    let folder = data("splat-transform-streamed-sh1");
+    // 128 splats of degree 1 at the finest level, 40 at the other, and 128 of degree 0 around them.
+    let finest = format::read(&folder).expect("a scene");
+    assert_eq!(finest, format::read(folder.join("lod-meta.json")).expect("a scene"));
+    assert_eq!((finest.splats.len(), finest.splats.sh_degree), (256, 1));
+    assert_eq!(format::read_level(&folder, 1).expect("a scene").splats.len(), 168);
+    // What the whole is made of is there one by one.
+    let chunk = format::read(folder.join("0_0/meta.json")).expect("a scene").splats;
+    assert_eq!(finest.splats.means_m[..128], chunk.means_m);
+    assert_eq!(finest.splats.sh[..128 * 12], chunk.sh);
+    let known = read("known-sh1.ply").splats;
+    for mean_m in &known.means_m {
+        let near = |other: &glam::Vec3| other.distance(*mean_m) < 5e-4;
+        assert!(finest.splats.means_m.iter().any(near), "{mean_m}");
+    }
+    let error = format::read_level(&folder, 2).unwrap_err().to_string();
+    assert!(error.contains("no level 2"), "{error}");
+}
+
+#[test]
 fn spz_of_every_container() {
     check("splat-transform-spz3-sh3.spz", Format::Spz, 3, &SPZ);
     check("splat-transform-spz4-sh1.spz", Format::Spz, 1, &SPZ);

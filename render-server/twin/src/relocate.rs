@@ -11,7 +11,7 @@ use crate::gaussians::{Gaussians, column, logit, sigmoid};
 use crate::random::Random;
 
 /// Fainter is dead.
-pub const DEAD_OPACITY: f32 = 0.005;
+pub(crate) const DEAD_OPACITY: f32 = 0.005;
 /// No Gaussian becomes more at once.
 const MAX_PARTS: usize = 51;
 

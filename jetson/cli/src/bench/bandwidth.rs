@@ -8,7 +8,7 @@ use glam::DVec3;
 use serde::Serialize;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
-use vizflyt_server::render::{RendererKind, choose};
+use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::{BareArgs, load, load_as_it_is};
 use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
@@ -93,7 +93,7 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
             args.cameras.iter().map(|path| camera::read(path)).collect::<Result<_>>()?;
         (load_as_it_is(&args.scene)?.1.splats, views)
     };
-    let Chosen { mut rasterizer, .. } = choose(&splats, args.renderer)?;
+    let Chosen { mut rasterizer, .. } = choose(&splats, args.renderer, DetailKind::default())?;
     let sizes = if args.size.is_empty() { USUAL_SIZES.to_vec() } else { args.size.clone() };
     let mut rows = Vec::new();
     for size in sizes {

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
-use vizflyt_server::render::{RendererKind, choose};
+use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
@@ -33,6 +33,9 @@ pub(super) struct RenderArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
+    /// How much of a large scene the processor renders; a graphics card renders all of it
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    detail: DetailKind,
     /// Images per camera that count; a few before them do not
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
@@ -99,7 +102,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         .collect::<Result<_>>()?;
     let (path, loaded) = load_as_it_is(&args.scene)?;
     let start = std::time::Instant::now();
-    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer)?;
+    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
     let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
     let splats = loaded.splats.len();
     drop(loaded);

@@ -35,8 +35,8 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
-use vizflyt_server::render::RendererKind;
-use vizflyt_server::scene::BareArgs;
+use vizflyt_server::render::{DetailKind, RendererKind};
+use vizflyt_server::scene::{Antialiased, BareArgs};
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
@@ -83,6 +83,12 @@ pub(crate) struct LabArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter.
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
+    /// How much of a large scene the processor renders; a graphics card renders all of it.
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub detail: DetailKind,
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says.
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub antialiased: Antialiased,
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
@@ -246,6 +252,8 @@ impl Show {
             "--vehicle=vizflyt".into(),
             format!("--http={page}").into(),
             format!("--renderer={}", lab.renderer).into(),
+            format!("--detail={}", lab.detail).into(),
+            format!("--antialiased={}", lab.antialiased).into(),
             self.log_level.clone(),
         ];
         let Some(server) = self.start(Role::Server, &serve)? else {

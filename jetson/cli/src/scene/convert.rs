@@ -17,9 +17,10 @@ use crate::terminal::{print_fmt, print_line};
 #[command(after_help = "Examples:
   vizflyt scene convert scene.spz scene.ply
   vizflyt scene convert scene.ply scene.spz --variant 3
-  vizflyt scene convert room.ply upright.ply --up -y --rotate 0,0,90 --scale 0.176")]
+  vizflyt scene convert room.ply upright.ply --up -y --rotate 0,0,90 --scale 0.176
+  vizflyt scene convert streamed/lod-meta.json coarse.ply --level 2")]
 pub(crate) struct ConvertArgs {
-    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat, .glb, .gltf, or the folder of a SOG
     from: PathBuf,
     /// The file to write; a `meta.json` becomes a SOG scene of separate files
     to: PathBuf,
@@ -35,6 +36,9 @@ pub(crate) struct ConvertArgs {
     /// Makes it larger by this factor: metres per unit make it metric
     #[arg(long, value_name = "FACTOR", value_parser = parse_scale)]
     scale: Option<f64>,
+    /// Level of a streamed scene (lod-meta.json) to read; 0 is the finest
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    level: u32,
 }
 
 impl ConvertArgs {
@@ -64,12 +68,16 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
     let start = Instant::now();
     let mut shown_s = 1;
     // Progress once a second.
-    let mut loaded = format::read_with_progress(&args.from, &mut |Progress { done, total }| {
+    let mut show = |Progress { done, total }: Progress| {
         if start.elapsed().as_secs() >= shown_s {
             shown_s += 1;
             print_line(format!("{} %", done * 100 / total));
         }
-    })?;
+    };
+    let mut loaded = match args.level {
+        0 => format::read_with_progress(&args.from, &mut show)?,
+        level => format::read_level(&args.from, level)?,
+    };
     print_fmt!(
         "{}: {} splats, degree {}, {} dropped, {:.0} ms",
         loaded.format,
@@ -82,7 +90,13 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<()> {
         print_fmt!("left out: {skipped}");
     }
     args.world_from_scene().apply(&mut loaded.splats);
-    match (args.variant, Format::of_name(&args.to)) {
+    let to = Format::of_name(&args.to);
+    if loaded.splats.antialiased && to.is_some_and(|format| !format.keeps_antialiased()) {
+        print_line(
+            "trained with anti-aliasing, which no file of this format says: render with --antialiased on",
+        );
+    }
+    match (args.variant, to) {
         (Some(variant), Some(format)) => {
             let bytes = format::encode_variant(format, variant, &loaded.splats)?;
             std::fs::write(&args.to, bytes)

@@ -34,6 +34,8 @@ struct Inspection {
     splats: usize,
     dropped: usize,
     sh_degree: u8,
+    /// Whether the file says that the scene was trained with anti-aliasing.
+    antialiased: bool,
     /// Decoded, as loaded. [MB]
     memory_mb: f64,
     /// Least and greatest centre. [scene]
@@ -97,6 +99,9 @@ pub(super) fn run(args: &InspectArgs) -> Result<()> {
     print_fmt!("file        {}: {}, {:.1} MB", found.file, found.format, found.file_mb);
     print_fmt!("splats      {}, {} left out", found.splats, found.dropped);
     print_fmt!("harmonics   degree {}", found.sh_degree);
+    if found.antialiased {
+        print_fmt!("trained     with anti-aliasing, and rendered so");
+    }
     print_fmt!("memory      {:.1} MB", found.memory_mb);
     print_fmt!("bounds      {}", corners(found.bounds));
     print_fmt!("core        {}", corners(found.core_bounds));
@@ -131,6 +136,7 @@ fn inspect(path: &Path, loaded: &Loaded) -> Inspection {
         splats: splats.len(),
         dropped: loaded.dropped.total(),
         sh_degree: splats.sh_degree,
+        antialiased: splats.antialiased,
         memory_mb: memory_bytes(splats) as f64 / 1e6,
         bounds: bounds.map(|corner| corner.to_array()),
         core_bounds: core_bounds.map(|corner| corner.to_array()),
@@ -184,13 +190,6 @@ fn warnings_of_file(loaded: &Loaded) -> Vec<String> {
         if count > 0 {
             warnings.push(format!("{count} splats {what}; they are left out"));
         }
-    }
-    if loaded.antialiased {
-        warnings.push(
-            "trained with anti-aliasing: rendered without, its smallest splats look a little too \
-             bright"
-                .to_owned(),
-        );
     }
     // Trainers write normals that are all zero.
     let is_normal = |name: &&String| ["nx", "ny", "nz"].contains(&name.as_str());
@@ -291,6 +290,7 @@ mod tests {
             opacities: vec![0.9; count],
             sh_degree: 0,
             sh: vec![0.0; count * 3],
+            antialiased: false,
         }
     }
 

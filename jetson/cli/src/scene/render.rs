@@ -8,8 +8,8 @@ use clap::{Args, ValueEnum};
 use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::atmosphere;
-use vizflyt_server::render::{RendererKind, choose};
-use vizflyt_server::scene::{is_in_an_arena, load_as_it_is, load_objects};
+use vizflyt_server::render::{DetailKind, RendererKind, choose};
+use vizflyt_server::scene::{Antialiased, is_in_an_arena, load_as_it_is, load_objects};
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
@@ -60,6 +60,12 @@ pub(crate) struct RenderArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
+    /// How much of a large scene the processor renders; adaptive is what it does in flight
+    #[arg(long, value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
+    detail: DetailKind,
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    antialiased: Antialiased,
 }
 
 #[derive(Clone, Copy, Debug, Default, ValueEnum)]
@@ -75,7 +81,8 @@ enum FileFormat {
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
     // Cameras first: a mistake in one is reported before the scene is loaded.
     let jobs = jobs(args)?;
-    let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let (scene, mut loaded) = load_as_it_is(&args.scene)?;
+    args.antialiased.apply(&mut loaded.splats);
     let environment = args.environment.environment();
     if environment.fog_visibility_m > 0.0 && !is_in_an_arena(&args.scene) {
         bail!(
@@ -88,11 +95,14 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let (objects, moving) = load_objects(&args.scene, args.seed)?;
     let start = Instant::now();
     let twin = Scene { splats: &loaded.splats, objects: &objects };
-    let Chosen { mut rasterizer, reason } = choose(twin, args.renderer)?;
+    let Chosen { mut rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
     print_fmt!("scene       {}: {} splats", scene.display(), loaded.splats.len());
     if !moving.is_empty() {
         let names: Vec<_> = moving.names().collect();
         print_fmt!("objects     {} at {} s", names.join(", "), args.at);
+    }
+    if loaded.splats.antialiased {
+        print_fmt!("            trained with anti-aliasing, rendered so");
     }
     print_fmt!("renderer    {} ({reason})", rasterizer.name());
     drop((loaded, objects));

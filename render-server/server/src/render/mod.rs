@@ -23,7 +23,7 @@ use vizflyt_arena::pose::Predict;
 use self::cameras::Cameras;
 use self::dynamic_objects::DynamicObjects;
 use self::environment::Environment;
-pub use self::renderer::{RendererInfo, RendererKind, choose};
+pub use self::renderer::{DetailKind, RendererInfo, RendererKind, choose};
 use crate::timing::StageDurations;
 
 /// What is rendered, and how.

@@ -1,16 +1,18 @@
-//! `--renderer`: which renderer is used, as the command line names it and as the page shows it.
+//! `--renderer` and `--detail`: which renderer is used, and how much of a scene it renders, as the command line names
+//! it and as the page shows it.
 
 use std::fmt;
 
 use anyhow::{Context, Result};
 use clap::ValueEnum;
 use serde::Serialize;
-use vizflyt_splat::{Backend, Chosen, Scene};
+use vizflyt_splat::{Backend, Chosen, Detail, Scene};
 
 /// Which renderer renders, for reports and the page.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct RendererInfo {
-    /// What it runs on: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`.
+    /// What it runs on: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`; and where that is so, that it renders in
+    /// adaptive detail.
     pub name: String,
     /// Why it is this one.
     pub reason: String,
@@ -49,10 +51,45 @@ impl fmt::Display for RendererKind {
     }
 }
 
+/// Values of `--detail`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum DetailKind {
+    /// Every splat.
+    Full,
+    /// The processor renders merged splats for what is small in the image, where the scene has a million and more.
+    #[default]
+    Adaptive,
+}
+
+impl DetailKind {
+    fn of(self, scene: &Scene<'_>) -> Detail {
+        match self {
+            Self::Full => Detail::Full,
+            Self::Adaptive => Detail::suited_to(scene),
+        }
+    }
+}
+
+/// As the command line spells it, for those who pass it on.
+impl fmt::Display for DetailKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Full => "full",
+            Self::Adaptive => "adaptive",
+        })
+    }
+}
+
 /// Returns the renderer of a scene, which it packs a copy of.
 ///
 /// # Errors
 /// If a graphics adapter was asked for and none can be used.
-pub fn choose<'a>(scene: impl Into<Scene<'a>>, kind: RendererKind) -> Result<Chosen> {
-    vizflyt_splat::choose(scene, kind.into()).with_context(|| format!("--renderer {kind}"))
+pub fn choose<'a>(
+    scene: impl Into<Scene<'a>>,
+    kind: RendererKind,
+    detail: DetailKind,
+) -> Result<Chosen> {
+    let scene = scene.into();
+    vizflyt_splat::choose(scene, kind.into(), detail.of(&scene))
+        .with_context(|| format!("--renderer {kind}"))
 }

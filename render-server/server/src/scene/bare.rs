@@ -400,6 +400,7 @@ mod tests {
             opacities: (0..count).map(|k| if k < solid { 0.9 } else { 0.1 }).collect(),
             sh_degree: 0,
             sh: vec![0.0; count * 3],
+            antialiased: false,
         }
     }
 
@@ -468,6 +469,7 @@ mod tests {
                 opacities: vec![0.9; count],
                 sh_degree: 0,
                 sh: vec![0.0; count * 3],
+                antialiased: false,
             };
             let scene = put(&mut splats, BareArgs { up: Some(Up::Z), scale: None });
             assert_eq!(scene.metres_per_unit, 1.0);

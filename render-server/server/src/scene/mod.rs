@@ -8,6 +8,7 @@
 //! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
 //! Once, at the start; progress goes to the log.
 
+mod antialiased;
 mod bake;
 mod bare;
 mod choose;
@@ -17,6 +18,7 @@ mod floor;
 mod objects;
 mod placement;
 
+pub use antialiased::Antialiased;
 pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
 pub use bare::{BareArgs, default_arena, parse_scale, place};
 pub use choose::Scenes;
@@ -134,15 +136,9 @@ fn named(path: &Path) -> Result<Named> {
         if inside.is_file() {
             return Ok(Named::Arena(inside));
         }
-        if path.join("meta.json").is_file() {
-            // An unpacked SOG.
+        // An unpacked SOG, or a streamed one.
+        if ["meta.json", "lod-meta.json"].iter().any(|name| path.join(name).is_file()) {
             return Ok(Named::Scene(path.to_owned()));
-        }
-        if path.join("lod-meta.json").is_file() {
-            bail!(
-                "{} is a streamed scene (lod-meta.json), which is not read; convert it to one .sog",
-                path.display()
-            );
         }
         bail!("{} is a folder without an arena.toml", path.display());
     }
@@ -265,6 +261,7 @@ mod tests {
             opacities: vec![0.9],
             sh_degree: 0,
             sh: vec![0.5; 3],
+            antialiased: false,
         }
     }
 
@@ -276,7 +273,7 @@ mod tests {
         check(folder.path(), "is a folder without an arena.toml");
         std::fs::create_dir(at("streamed")).unwrap();
         std::fs::write(at("streamed/lod-meta.json"), "{}").unwrap();
-        check(&at("streamed"), "is a streamed scene (lod-meta.json)");
+        check(&at("streamed"), "SOG, lod-meta.json");
         std::fs::write(at("notes.txt"), "x").unwrap();
         check(&at("notes.txt"), "supported are");
         std::fs::write(at("bad.toml"), "name = 3").unwrap();

@@ -254,6 +254,7 @@ mod tests {
             opacities: (0..count).map(|i| 0.5 + 0.01 * i as f32).collect(),
             sh_degree: 3,
             sh: (0..count * 48).map(|i| noise(i) * 0.3).collect(),
+            antialiased: false,
         }
     }
 

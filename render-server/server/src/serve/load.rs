@@ -34,7 +34,8 @@ pub(super) struct LoadedScene {
 /// # Errors
 /// A scene or an arena that cannot be used, no such renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
-    let Scene { arena, splats, mut objects, .. } = scene::load(&args.arena, &args.bare)?;
+    let Scene { arena, mut splats, mut objects, .. } = scene::load(&args.arena, &args.bare)?;
+    args.antialiased.apply(&mut splats);
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
         .iter()
@@ -48,7 +49,8 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };
     objects.extend(vehicle_models(together));
-    let renderer = choose(RenderedScene { splats: &splats, objects: &objects }, args.renderer)?;
+    let rendered = RenderedScene { splats: &splats, objects: &objects };
+    let renderer = choose(rendered, args.renderer, args.detail)?;
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
     // Pictures and referees count what moves from the same instant.

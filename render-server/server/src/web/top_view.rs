@@ -204,6 +204,7 @@ fn below(splats: &Splats, ceiling_m: f32) -> Splats {
         // Seen straight down from afar the constant term is the colour.
         sh_degree: 0,
         sh: kept.iter().flat_map(|&k| &splats.sh[k * per_splat..][..3]).copied().collect(),
+        antialiased: splats.antialiased,
     }
 }
 

@@ -50,6 +50,7 @@ pub fn write_arena(folder: &Path, more: &str) -> std::path::PathBuf {
         opacities: vec![0.98; count],
         sh_degree: 0,
         sh: (0..count * 3).map(|k| if k % 3 == 0 { 1.2 } else { 0.1 }).collect(),
+        antialiased: false,
     };
     ply::write(folder.join("scene.ply"), &splats).unwrap();
     let path = folder.join("arena.toml");

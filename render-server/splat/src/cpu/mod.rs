@@ -126,9 +126,13 @@ impl CpuRenderer {
 }
 
 impl Rasterizer for CpuRenderer {
-    /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`.
+    /// Returns `cpu avx512`, `cpu avx2`, `cpu neon` or `cpu portable`, and whether it is in adaptive detail.
     fn name(&self) -> Cow<'_, str> {
-        self.instructions.name().into()
+        let name = self.instructions.name();
+        match self.detail {
+            Detail::Full => name.into(),
+            Detail::Adaptive { .. } => format!("{name}, adaptive detail").into(),
+        }
     }
 
     fn render(

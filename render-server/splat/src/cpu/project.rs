@@ -104,16 +104,17 @@ pub(super) fn project<S: Simd>(
             let out = Region { splats, boxes, keys };
             let (part, view) = (&parts[part as usize], &views[part as usize]);
             let block = block as usize;
-            *count = if distorted {
-                simd.run(ProjectBlock::<true> { part, view, block, out })
-            } else {
-                simd.run(ProjectBlock::<false> { part, view, block, out })
+            *count = match (distorted, part.antialiased) {
+                (false, false) => simd.run(ProjectBlock::<false, false> { part, view, block, out }),
+                (true, false) => simd.run(ProjectBlock::<true, false> { part, view, block, out }),
+                (false, true) => simd.run(ProjectBlock::<false, true> { part, view, block, out }),
+                (true, true) => simd.run(ProjectBlock::<true, true> { part, view, block, out }),
             } as u32;
         });
 }
 
-/// One block, seen through a lens or a pinhole; returns how many splats survived.
-struct ProjectBlock<'a, const LENS: bool> {
+/// One block, seen through a lens or a pinhole, anti-aliased or classic; returns how many splats survived.
+struct ProjectBlock<'a, const LENS: bool, const ANTIALIASED: bool> {
     part: &'a Part,
     view: &'a ObjectView,
     block: usize,
@@ -127,7 +128,7 @@ struct Region<'a> {
     keys: &'a mut [u32],
 }
 
-impl<const LENS: bool> Kernel for ProjectBlock<'_, LENS> {
+impl<const LENS: bool, const ANTIALIASED: bool> Kernel for ProjectBlock<'_, LENS, ANTIALIASED> {
     type Output = usize;
 
     #[inline(always)]
@@ -142,7 +143,7 @@ impl<const LENS: bool> Kernel for ProjectBlock<'_, LENS> {
             let sh = &sh[group * sh_numbers..][..sh_numbers];
             for first in (0..GROUP).step_by(S::LANES) {
                 let (view, out) = (self.view, &mut self.out);
-                count = vector::<S, LENS>(s, view, geometry, sh, first, out, count);
+                count = vector::<S, LENS, ANTIALIASED>(s, view, geometry, sh, first, out, count);
             }
         }
         count
@@ -152,7 +153,7 @@ impl<const LENS: bool> Kernel for ProjectBlock<'_, LENS> {
 /// Projects the lanes from `first` of a group, appends survivors from slot `count` on, and returns
 /// the new count.
 #[inline(always)]
-fn vector<S: Simd, const LENS: bool>(
+fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
     s: S,
     view: &ObjectView,
     geometry: &[f32],
@@ -221,9 +222,16 @@ fn vector<S: Simd, const LENS: bool>(
         s.neg_mul_add(u[0], v[2], u[2] * v[0]),
     ];
     let blur2 = s.splat((BLUR_PX2 * BLUR_PX2) as f32);
-    let determinant = s.mul_add(blur, uu + vv, dot(s, minors, minors) + blur2);
+    let sharp = dot(s, minors, minors);
+    let determinant = s.mul_add(blur, uu + vv, sharp + blur2);
 
-    let level = columns.load(column::LEVEL);
+    let mut level = columns.load(column::LEVEL);
+    if ANTIALIASED {
+        // Dimmed by what the blur adds to its area; not at all where both overflow. A needle's logarithm of 0 is far
+        // below any level that is seen.
+        let ratio = s.min(sharp / determinant, s.splat(1.0));
+        level = s.mul_add(s.log2(ratio), s.splat(0.5), level);
+    }
     let reach2 = (level - s.splat(MIN_LEVEL)) * s.splat(EXTENT2);
     let extent_x = s.sqrt(reach2 * a);
     let extent_y = s.sqrt(reach2 * c);

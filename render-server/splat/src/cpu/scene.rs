@@ -69,6 +69,8 @@ pub(super) struct Part {
     pub(super) coefficients: usize,
     /// Splats kept.
     pub(super) len: usize,
+    /// [`Splats::antialiased`].
+    pub(super) antialiased: bool,
 }
 
 impl Part {
@@ -125,6 +127,15 @@ impl Part {
             Block { center_m, half_m, reach_m, error_m: 0.0 }
         };
         let blocks = order.par_chunks(BLOCK).map(block).collect();
-        Self { id, blocks, levels: vec![0], geometry, sh, coefficients, len: order.len() }
+        Self {
+            id,
+            blocks,
+            levels: vec![0],
+            geometry,
+            sh,
+            coefficients,
+            len: order.len(),
+            antialiased: splats.antialiased,
+        }
     }
 }

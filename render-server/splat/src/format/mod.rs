@@ -12,8 +12,9 @@
 //! | [`Format::CompressedPly`] | `.compressed.ply` | with and without colour bounds and harmonics | with | 0-3 | 11-10-11 bits in blocks of 256 |
 //! | [`Format::Splat`] | `.splat` | all | all | 0 | f32 |
 //! | [`Format::Spz`] | `.spz` | versions 1-4 | version 3 | 0-3 (4 reduced) | 24 bits, 1/4096 m |
-//! | [`Format::Sog`] | `.sog`, `meta.json` or its folder | versions 1, 2 | version 2 | 0-3 | 16 bits of the logarithm |
+//! | [`Format::Sog`] | `.sog`, `meta.json` or its folder; `lod-meta.json` or its folder | versions 1, 2; streamed, one level | version 2 | 0-3 | 16 bits of the logarithm |
 //! | [`Format::Ksplat`] | `.ksplat` | levels 0-2 | level 1 | 0-2 | f32, or 16 bits in 5 m |
+//! | [`Format::Gltf`] | `.glb`, `.gltf` | `KHR_gaussian_splatting`, not compressed | `.glb` | 0-3 | f32 |
 //!
 //! Hostile files cost at most a constant plus a multiple of their own size (`limit`), in time and
 //! memory. Budget: 1 M splats in a second on two cores, memory within twice the decoded size.
@@ -23,6 +24,7 @@ mod block;
 mod bytes;
 mod error;
 mod file;
+mod gltf;
 mod ksplat;
 mod limit;
 mod order;
@@ -39,6 +41,7 @@ use std::path::Path;
 pub use block::DropCounts;
 pub use error::FormatError;
 pub use progress::{Progress, Report};
+pub use sog::assemble_streamed;
 
 use crate::Splats;
 use progress::Meter;
@@ -52,9 +55,6 @@ pub struct Loaded {
     pub splats: Splats,
     /// What was left out, by reason.
     pub dropped: DropCounts,
-    /// Whether the file states that the scene was trained with anti-aliasing (mip-splatting); rendered
-    /// without, its smallest splats look a little too bright.
-    pub antialiased: bool,
     /// Names of what the file holds of each splat and no splat needs, in file order.
     pub skipped_properties: Vec<String>,
     /// Names of PLY elements that hold no splats, in file order.
@@ -76,7 +76,6 @@ impl Loaded {
             format,
             splats,
             dropped,
-            antialiased: false,
             skipped_properties: Vec::new(),
             skipped_elements: Vec::new(),
         })
@@ -98,12 +97,21 @@ pub enum Format {
     Sog,
     /// GaussianSplats3D's.
     Ksplat,
+    /// Khronos's, with `KHR_gaussian_splatting`.
+    Gltf,
 }
 
 impl Format {
     /// Every format, the plainest first.
-    pub const ALL: [Self; 6] =
-        [Self::Ply, Self::CompressedPly, Self::Splat, Self::Spz, Self::Sog, Self::Ksplat];
+    pub const ALL: [Self; 7] = [
+        Self::Ply,
+        Self::CompressedPly,
+        Self::Splat,
+        Self::Spz,
+        Self::Sog,
+        Self::Ksplat,
+        Self::Gltf,
+    ];
 
     /// Returns the name people call it by.
     pub fn name(self) -> &'static str {
@@ -114,6 +122,7 @@ impl Format {
             Self::Spz => "SPZ",
             Self::Sog => "SOG",
             Self::Ksplat => ".ksplat",
+            Self::Gltf => "glTF",
         }
     }
 
@@ -126,6 +135,7 @@ impl Format {
             Self::Spz => "spz",
             Self::Sog => "sog",
             Self::Ksplat => "ksplat",
+            Self::Gltf => "glb",
         }
     }
 
@@ -134,15 +144,20 @@ impl Format {
         match self {
             Self::Splat => 0,
             Self::Ksplat => ksplat::MAX_SH_DEGREE,
-            Self::Ply | Self::CompressedPly | Self::Spz | Self::Sog => 3,
+            Self::Ply | Self::CompressedPly | Self::Spz | Self::Sog | Self::Gltf => 3,
         }
+    }
+
+    /// Whether its files say that a scene was trained with anti-aliasing.
+    pub fn keeps_antialiased(self) -> bool {
+        !matches!(self, Self::Splat | Self::Ksplat)
     }
 
     /// Returns the variants that are written, the usual one first: versions of SPZ (2 is coarser,
     /// fewer readers know 4) and SOG, levels of compression of `.ksplat`; 0 where there is but one.
     pub fn variants(self) -> &'static [u32] {
         match self {
-            Self::Ply | Self::CompressedPly | Self::Splat => &[0],
+            Self::Ply | Self::CompressedPly | Self::Splat | Self::Gltf => &[0],
             Self::Spz => &[3, 2, 4],
             Self::Sog => &[2],
             Self::Ksplat => &[1, 0, 2],
@@ -152,8 +167,11 @@ impl Format {
     /// Returns the format of a file's name.
     pub fn of_name(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.to_ascii_lowercase();
-        if name == sog::META {
+        if name == sog::META || name == sog::LOD_META {
             return Some(Self::Sog);
+        }
+        if is_gltf_text(path) {
+            return Some(Self::Gltf);
         }
         // The longest extension that fits: `.compressed.ply` is also a `.ply`.
         Self::ALL
@@ -176,6 +194,8 @@ impl Format {
             Some(Self::Spz)
         } else if bytes.starts_with(b"PK\x03\x04") {
             Some(Self::Sog)
+        } else if bytes.starts_with(gltf::MAGIC) {
+            Some(Self::Gltf)
         } else if ksplat::is_ksplat(bytes) {
             Some(Self::Ksplat)
         } else {
@@ -201,13 +221,21 @@ impl fmt::Display for Format {
 }
 
 /// Reads a scene file of any supported format, determined by its content, then by its name. A folder is
-/// read as SOG, as is a `meta.json`.
+/// read as SOG, as is a `meta.json`, or a `lod-meta.json`, of which the finest level is read.
 ///
 /// # Errors
 /// [`FormatError::Io`] with the path, [`FormatError::Unknown`] with what is supported, or whatever
 /// keeps the file from being a scene of its format.
 pub fn read(path: impl AsRef<Path>) -> Result<Loaded, FormatError> {
-    read_metered(path.as_ref(), &Meter::SILENT)
+    read_metered(path.as_ref(), 0, &Meter::SILENT)
+}
+
+/// [`read()`] of a coarser level of a streamed scene, 0 being the finest.
+///
+/// # Errors
+/// As [`read()`]; [`FormatError::Unsupported`] where the scene has no levels.
+pub fn read_level(path: impl AsRef<Path>, level: u32) -> Result<Loaded, FormatError> {
+    read_metered(path.as_ref(), level, &Meter::SILENT)
 }
 
 /// [`read()`], reporting its progress to `report`, so that a load of more than a second can show it.
@@ -216,7 +244,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Loaded, FormatError> {
 /// As [`read()`].
 pub fn read_with_progress(path: impl AsRef<Path>, report: Report) -> Result<Loaded, FormatError> {
     let meter = Meter::new(report);
-    let loaded = read_metered(path.as_ref(), &meter)?;
+    let loaded = read_metered(path.as_ref(), 0, &meter)?;
     meter.finish();
     Ok(loaded)
 }
@@ -226,7 +254,7 @@ pub fn read_with_progress(path: impl AsRef<Path>, report: Report) -> Result<Load
 /// # Errors
 /// As [`read()`], without the path.
 pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
-    decode(bytes, Format::of_content(bytes).unwrap_or(named), &Meter::SILENT)
+    decode(bytes, Format::of_content(bytes).unwrap_or(named), None, &Meter::SILENT)
 }
 
 /// Writes a scene in the format of the file's name; a `meta.json` becomes a SOG scene of
@@ -240,7 +268,9 @@ pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
 /// If the vectors of `splats` differ in length.
 pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError> {
     let path = path.as_ref();
-    let format = Format::of_name(path).ok_or_else(|| FormatError::Unknown {
+    let is_tree = path.file_name().is_some_and(|name| name == sog::LOD_META);
+    let format = Format::of_name(path).filter(|_| !is_tree && !is_gltf_text(path));
+    let format = format.ok_or_else(|| FormatError::Unknown {
         what: format!("{} names no format to write", path.display()),
     })?;
     let place = |path: &Path, bytes: &[u8]| {
@@ -296,23 +326,29 @@ pub fn encode_variant(
         Format::Spz => spz::encode(splats, variant),
         Format::Sog => sog::encode(splats)?,
         Format::Ksplat => ksplat::encode(splats, variant),
+        Format::Gltf => gltf::encode(splats),
     })
 }
 
-fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
+fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, FormatError> {
     let named = Format::of_name(path);
+    let is_tree = path.file_name().is_some_and(|name| name == sog::LOD_META);
+    if is_tree || path.join(sog::LOD_META).is_file() {
+        let folder = if is_tree { path.parent().unwrap_or(Path::new("")) } else { path };
+        return read_streamed(folder, level);
+    }
+    if level > 0 {
+        return Err(FormatError::Unsupported {
+            format: named.unwrap_or(Format::Ply),
+            what: format!("level {level} of a scene that has none"),
+            advice: "a streamed scene has levels, by its lod-meta.json",
+        });
+    }
     let is_meta = path.file_name().is_some_and(|name| name == sog::META);
     if is_meta || path.join(sog::META).is_file() {
         return sog::decode(sog::Files::from(path), meter);
     }
     let io = |cause| FormatError::Io { path: path.to_owned(), verb: "read", cause };
-    if path.file_name().is_some_and(|name| name == "lod-meta.json") {
-        return Err(FormatError::Unsupported {
-            format: Format::Sog,
-            what: "a streamed scene (lod-meta.json)".into(),
-            advice: "convert it to one .sog, or name the meta.json of one of its chunks",
-        });
-    }
     let bytes = file::map(path).map_err(io)?;
     if let Some(what) = not_downloaded(&bytes) {
         return Err(FormatError::Unknown { what: format!("{} is {what}", path.display()) });
@@ -323,7 +359,31 @@ fn read_metered(path: &Path, meter: &Meter) -> Result<Loaded, FormatError> {
             what: format!("{} starts with {start:?}, like no scene file", path.display()),
         }
     })?;
-    decode(&bytes, format, meter)
+    decode(&bytes, format, path.parent(), meter)
+}
+
+/// Reads a level of the streamed scene in a folder.
+fn read_streamed(folder: &Path, level: u32) -> Result<Loaded, FormatError> {
+    let path = folder.join(sog::LOD_META);
+    let io = |cause| FormatError::Io { path: path.clone(), verb: "read", cause };
+    let index = file::map(&path).map_err(io)?;
+    sog::assemble_streamed(&index, level, |name| {
+        // A scene names files in its own folder, not anywhere on this machine.
+        let inside = name.split('/').all(|part| !matches!(part, "" | "." | ".."));
+        if !inside || name.contains(['\\', ':', '\0']) {
+            return Err(FormatError::Invalid {
+                format: Format::Sog,
+                place: sog::LOD_META.into(),
+                reason: format!("{name:?} is no file in its folder"),
+            });
+        }
+        let chunk = folder.join(name);
+        if chunk.file_name().is_some_and(|name| name == sog::META) {
+            return sog::decode(sog::Files::from(chunk.as_path()), &Meter::SILENT);
+        }
+        let io = |cause| FormatError::Io { path: chunk.clone(), verb: "read", cause };
+        sog::decode(sog::Files::zip(&file::map(&chunk).map_err(io)?)?, &Meter::SILENT)
+    })
 }
 
 /// Returns what a file is that a download left in the scene's place.
@@ -339,13 +399,25 @@ fn not_downloaded(bytes: &[u8]) -> Option<&'static str> {
     }
 }
 
-fn decode(bytes: &[u8], format: Format, meter: &Meter) -> Result<Loaded, FormatError> {
+/// Whether a name is that of glTF's JSON, whose buffers stand in other files.
+fn is_gltf_text(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gltf"))
+}
+
+/// Decodes a file; `folder` is where it lies, if that is known.
+fn decode(
+    bytes: &[u8],
+    format: Format,
+    folder: Option<&Path>,
+    meter: &Meter,
+) -> Result<Loaded, FormatError> {
     match format {
         Format::Ply | Format::CompressedPly => Ok(ply::decode(bytes, meter)?),
         Format::Splat => splat::decode(bytes, meter),
         Format::Spz => spz::decode(bytes, meter),
         Format::Sog => sog::decode(sog::Files::zip(bytes)?, meter),
         Format::Ksplat => ksplat::decode(bytes, meter),
+        Format::Gltf => gltf::decode(bytes, folder, meter),
     }
 }
 

@@ -5,7 +5,9 @@ use proptest::prelude::*;
 
 use super::order::morton;
 use super::{Format, FormatError, Loaded, Progress};
-use super::{ksplat, parse, ply, read, read_with_progress, sog, splat, spz, write};
+use super::{
+    assemble_streamed, gltf, ksplat, parse, ply, read, read_with_progress, sog, splat, spz, write,
+};
 use crate::Splats;
 
 /// A writer, the order it writes in, and what it may lose.
@@ -61,7 +63,7 @@ const KSPLAT: Loss = Loss {
     harmonic: 1e-3,
 };
 
-const FORMAT_CASES: [FormatCase; 10] = [
+const FORMAT_CASES: [FormatCase; 11] = [
     FormatCase {
         name: "PLY",
         format: Format::Ply,
@@ -171,6 +173,21 @@ const FORMAT_CASES: [FormatCase; 10] = [
         sorted: by_cube,
         loss: Loss { harmonic: 1.0 / 255.0 * 1.01, ..KSPLAT },
     },
+    FormatCase {
+        name: "glTF",
+        format: Format::Gltf,
+        encode: gltf::encode,
+        sorted: as_is,
+        loss: Loss {
+            mean_m: |_| 0.0,
+            log_scale: 0.0,
+            rotation_rad: 1e-6,
+            opacity: 0.0,
+            constant: 0.0,
+            // Turned and turned back.
+            harmonic: 1e-6,
+        },
+    },
 ];
 
 /// The order of `.ksplat`'s cubes of 5 m; the tests' scenes fill none of them.
@@ -189,8 +206,9 @@ fn scene() -> impl Strategy<Value = Splats> {
         0.0..=1.0f32,
         prop::collection::vec(-1.0..1.0f32, 48),
     );
-    (0..=3u8, prop::collection::vec(splat, 1..40)).prop_map(|(sh_degree, rows)| {
-        let mut splats = Splats { sh_degree, ..Splats::default() };
+    let rows = prop::collection::vec(splat, 1..40);
+    (0..=3u8, any::<bool>(), rows).prop_map(|(sh_degree, antialiased, rows)| {
+        let mut splats = Splats { sh_degree, antialiased, ..Splats::default() };
         let numbers = splats.sh_coefficients() * 3;
         for (mean_m, log_scale, q, opacity, sh) in rows {
             let q = Quat::from_array(q);
@@ -271,6 +289,8 @@ proptest! {
             prop_assert_eq!(loaded.format, case.format);
             prop_assert_eq!(loaded.dropped.total(), 0);
             check_close(case, &splats, &loaded.splats);
+            let kept = splats.antialiased && case.format.keeps_antialiased();
+            prop_assert_eq!(loaded.splats.antialiased, kept, "{}", case.name);
         }
     }
 
@@ -291,7 +311,7 @@ proptest! {
     #[test]
     fn any_bytes_are_an_error_or_a_sound_scene(bytes in prop::collection::vec(any::<u8>(), 0..6000)) {
         for format in Format::ALL {
-            if let Ok(loaded) = super::decode(&bytes, format, &super::Meter::SILENT) {
+            if let Ok(loaded) = super::decode(&bytes, format, None, &super::Meter::SILENT) {
                 check_sound(&loaded);
             }
         }
@@ -308,7 +328,7 @@ fn a_file_cut_anywhere_is_an_error() {
             if case.format == Format::Splat && length % 32 == 0 && length > 0 {
                 continue;
             }
-            let result = super::decode(&bytes[..length], case.format, &super::Meter::SILENT);
+            let result = super::decode(&bytes[..length], case.format, None, &super::Meter::SILENT);
             assert!(result.is_err(), "{}: {length} of {} bytes", case.name, bytes.len());
         }
         assert!(parse(&bytes, case.format).is_ok());
@@ -366,9 +386,12 @@ fn unknown_files_are_refused_with_the_list_of_formats() {
             assert!(error.contains(part), "{error:?} lacks {part:?}");
         }
     };
-    check("a.glb", b"glTF\x02\0\0\0", &["a.glb starts with \"glTF", "PLY (.ply)", ".ksplat"]);
+    check("a.glb", b"glTF\x02\0\0\0", &["glTF: truncated"]);
+    check("a.obj", b"o thing\n", &["a.obj starts with \"o thing", "PLY (.ply)", "glTF (.glb)"]);
+    check("a.gltf", b"{}", &["a glTF file without KHR_gaussian_splatting"]);
     check("a.usdz", b"PK\x05\x06", &["like no scene file"]);
-    check("lod-meta.json", b"{}", &["streamed", "convert"]);
+    check("lod-meta.json", b"{}", &["SOG, lod-meta.json", "lodLevels"]);
+    std::fs::remove_file(folder.path().join("lod-meta.json")).unwrap();
     check("a.splat", b"", &["no splats"]);
     let pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n";
     check("b.splat", pointer, &["b.splat is a pointer of Git LFS", "git lfs pull"]);
@@ -596,4 +619,249 @@ fn sog_version_1_is_read_between_its_bounds() {
     assert!(splats.rotations[3].y > 0.999);
     assert_eq!(splats.sh[..3], [-1.0, 0.4, 3.0]);
     near(splats.opacities[3], 1.0 / (1.0 + (-4f32).exp()));
+}
+
+/// The JSON of a glTF scene of two splats in a buffer of its own, as another's software may write it: quantised, in a node
+/// within a node.
+fn gltf_of_two(change: impl FnOnce(&mut serde_json::Value)) -> Vec<u8> {
+    let mut bytes: Vec<u8> = Vec::new();
+    for v in [1.0f32, 2.0, 3.0, -1.0, 0.5, 0.25] {
+        bytes.extend(v.to_le_bytes());
+    }
+    // Rotations: none, and half a turn about x, of 16 bits; scales and opacities of bytes.
+    for v in [0i16, 0, 0, 32767, -32767, 0, 0, 0] {
+        bytes.extend(v.to_le_bytes());
+    }
+    bytes.extend([255, 51, 0, 0, 255, 255, 51, 0]);
+    bytes.extend([255, 0, 51, 0]);
+    for v in [0.1f32, 0.2, 0.3, 0.4, 0.5, 0.6] {
+        bytes.extend(v.to_le_bytes());
+    }
+    let uri = format!("data:application/octet-stream;base64,{}", base64(&bytes));
+    let view = |at: usize, length: usize| serde_json::json!({ "buffer": 0, "byteOffset": at, "byteLength": length });
+    let own = |name: &str| format!("KHR_gaussian_splatting:{name}");
+    let mut root = serde_json::json!({
+        "asset": { "version": "2.0" },
+        "scenes": [{ "nodes": [1] }],
+        "nodes": [
+            { "mesh": 0, "translation": [0.0, 0.0, 10.0], "scale": [2.0, 2.0, 2.0] },
+            // A quarter of a turn about y.
+            { "children": [0], "rotation": [0.0, 0.707_106_781_186_547_5, 0.0, 0.707_106_781_186_547_5] },
+        ],
+        "buffers": [{ "byteLength": bytes.len(), "uri": uri }],
+        "bufferViews": [view(0, 24), view(24, 16), { "buffer": 0, "byteOffset": 40, "byteLength": 8, "byteStride": 4 }, { "buffer": 0, "byteOffset": 48, "byteLength": 4, "byteStride": 2 }, view(52, 24)],
+        "accessors": [
+            { "bufferView": 0, "componentType": 5126, "count": 2, "type": "VEC3" },
+            { "bufferView": 1, "componentType": 5122, "normalized": true, "count": 2, "type": "VEC4" },
+            { "bufferView": 2, "componentType": 5121, "normalized": true, "count": 2, "type": "VEC3" },
+            { "bufferView": 3, "componentType": 5121, "normalized": true, "count": 2, "type": "SCALAR" },
+            { "bufferView": 4, "componentType": 5126, "count": 2, "type": "VEC3" },
+        ],
+        "meshes": [{ "primitives": [{
+            "mode": 0,
+            "attributes": {
+                "POSITION": 0, own("ROTATION"): 1, own("SCALE"): 2, own("OPACITY"): 3,
+                own("SH_DEGREE_0_COEF_0"): 4,
+            },
+            "extensions": { "KHR_gaussian_splatting": { "kernel": "ellipse", "colorSpace": "srgb_rec709_display" } },
+        }] }],
+    });
+    change(&mut root);
+    root.to_string().into_bytes()
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let group = |three: &[u8]| -> String {
+        let word = three.iter().fold(0u32, |word, &byte| word << 8 | u32::from(byte))
+            << (8 * (3 - three.len()));
+        (0..=three.len())
+            .map(|k| char::from(SYMBOLS[(word >> (18 - 6 * k) & 63) as usize]))
+            .collect()
+    };
+    bytes.chunks(3).map(group).collect()
+}
+
+#[test]
+fn a_gltf_scene_is_where_its_nodes_have_it() {
+    let splats = parse(&gltf_of_two(|_| ()), Format::Gltf).unwrap().splats;
+    // Twice as large and 10 along z, then about y: (x, y, z) to (z, y, -x); then x and y change sign.
+    let expected = [Vec3::new(-16.0, -4.0, -2.0), Vec3::new(-10.5, -1.0, 2.0)];
+    for (mean_m, expected) in splats.means_m.iter().zip(expected) {
+        assert!(mean_m.distance(expected) < 1e-5, "{mean_m} for {expected}");
+    }
+    assert!(
+        (splats.scales_m[0] - Vec3::new(2.0, 0.4, 0.0)).length() < 1e-6,
+        "{}",
+        splats.scales_m[0]
+    );
+    // What lay along x lies along -z, and then along -z still.
+    let along = splats.rotations[0] * Vec3::X;
+    assert!((along - Vec3::NEG_Z).length() < 1e-3, "{along}");
+    assert!((splats.opacities[1] - 0.2).abs() < 1e-6);
+    assert_eq!(splats.sh, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
+}
+
+fn splatting(root: &mut serde_json::Value) -> &mut serde_json::Value {
+    &mut root["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+}
+
+#[test]
+fn what_gltf_has_and_is_not_read_is_named() {
+    let check = |change: fn(&mut serde_json::Value), part: &str| {
+        let error = parse(&gltf_of_two(change), Format::Gltf).unwrap_err().to_string();
+        assert!(error.contains(part), "{error:?} lacks {part:?}");
+    };
+    check(
+        |v| v["extensionsRequired"] = serde_json::json!(["EXT_meshopt_compression"]),
+        "EXT_meshopt_compression",
+    );
+    check(|v| splatting(v)["kernel"] = "cube".into(), "kernel \"cube\"");
+    check(|v| splatting(v)["colorSpace"] = "lin_rec709_display".into(), "colour space");
+    check(|v| splatting(v)["extensions"] = serde_json::json!({ "X_spz": {} }), "extension X_spz");
+    check(
+        |v| v["nodes"][0]["scale"] = serde_json::json!([1.0, 2.0, 1.0]),
+        "scales axes differently",
+    );
+    check(|v| v["nodes"][0]["scale"] = serde_json::json!([-1.0, 1.0, 1.0]), "mirrors");
+    check(|v| v["nodes"][0]["children"] = serde_json::json!([1]), "too many nodes");
+    check(|v| v["accessors"][0]["count"] = 3.into(), "36 bytes from byte 0 on");
+    check(|v| v["accessors"][0]["count"] = u64::MAX.into(), "bytes from byte 0 on");
+    check(|v| v["accessors"][0]["bufferView"] = 99.into(), "no such bufferView");
+    check(|v| v["accessors"][1]["type"] = "VEC3".into(), "type VEC3 instead of VEC4");
+    check(|v| v["accessors"][3]["count"] = 1.into(), "different lengths");
+    check(|v| v["buffers"][0]["byteLength"] = 1_000_000.into(), "truncated");
+    check(|v| v["buffers"][0]["uri"] = "../../etc/passwd".into(), "no plain file name");
+    check(|v| v["buffers"][0]["uri"] = "beside.bin".into(), "save it as .glb");
+    check(|v| drop(v.as_object_mut().unwrap().remove("meshes")), "no such mesh");
+}
+
+#[test]
+fn a_gltf_scene_with_its_buffer_beside_it_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let glb = gltf::encode(&some());
+    let json_bytes = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+    let mut root: serde_json::Value = serde_json::from_slice(&glb[20..20 + json_bytes]).unwrap();
+    root["buffers"][0]["uri"] = "scene.bin".into();
+    std::fs::write(folder.path().join("scene.bin"), &glb[28 + json_bytes..]).unwrap();
+    std::fs::write(folder.path().join("scene.gltf"), root.to_string()).unwrap();
+    let loaded = read(folder.path().join("scene.gltf")).unwrap();
+    assert_eq!(loaded, parse(&glb, Format::Gltf).unwrap());
+    // It is not written: half of it would stand in another file.
+    let error = write(folder.path().join("out.gltf"), &some()).unwrap_err().to_string();
+    assert!(error.contains("names no format to write"), "{error}");
+}
+
+#[test]
+fn plys_say_by_comment_how_they_were_trained() {
+    let check = |comments: &str, expected: bool| {
+        let text = String::from_utf8_lossy(&ply::encode(&some())).into_owned();
+        let start = text.find("element").unwrap();
+        let mut bytes = ply::encode(&some());
+        bytes.splice(start..start, comments.bytes());
+        assert_eq!(parse(&bytes, Format::Ply).unwrap().splats.antialiased, expected, "{comments}");
+    };
+    check("", false);
+    check("comment Exported from Brush\ncomment SplatRenderMode: mip\n", true);
+    check("comment SplatRenderMode: default\n", false);
+    check("comment splatrendermode:  MIP \n", true);
+    check("comment antialiased 1\n", true);
+    check("comment antialiased 0\n", false);
+    check("comment antialiased maybe\ncomment not antialiased 1\n", false);
+    check("comment antialiased 1\ncomment SplatRenderMode: default\n", false);
+}
+
+/// A tree of two parts at two levels, in chunks of which one holds both parts.
+fn tree(change: impl FnOnce(&mut serde_json::Value)) -> Vec<u8> {
+    let run = |file: usize, offset: usize, count: usize| serde_json::json!({ "file": file, "offset": offset, "count": count });
+    let mut root = serde_json::json!({
+        "version": 1, "lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"],
+        "tree": { "children": [
+            { "lods": { "0": run(0, 0, 3), "1": run(1, 0, 1) } },
+            { "lods": { "0": run(0, 3, 4) } },
+        ] },
+    });
+    change(&mut root);
+    root.to_string().into_bytes()
+}
+
+fn streamed(index: &[u8], level: u32) -> Result<Loaded, FormatError> {
+    assemble_streamed(index, level, |name| match name {
+        "0_0/meta.json" => Ok(parse(&ply::encode(&some()), Format::Ply)?),
+        "1_0/meta.json" => Ok(parse(&splat::encode(&some()), Format::Splat)?),
+        _ => Err(FormatError::Unknown { what: name.to_owned() }),
+    })
+}
+
+#[test]
+fn a_level_of_a_streamed_scene_is_put_together() {
+    let finest = streamed(&tree(|_| ()), 0).unwrap().splats;
+    let known = parse(&ply::encode(&some()), Format::Ply).unwrap().splats;
+    assert_eq!(finest, known);
+    // What has no second level stays as fine as it is; harmonics that a chunk lacks are none.
+    let coarse = streamed(&tree(|_| ()), 1).unwrap().splats;
+    assert_eq!((coarse.len(), coarse.sh_degree), (5, 2));
+    assert_eq!(coarse.means_m[..4], known.means_m[3..]);
+    assert!(coarse.sh[4 * 27 + 3..].iter().all(|&v| v == 0.0));
+    let around = streamed(&tree(|v| v["environment"] = "1_0/meta.json".into()), 0).unwrap();
+    assert_eq!(around.splats.len(), 14);
+    let check = |change: fn(&mut serde_json::Value), level: u32, part: &str| {
+        let error = streamed(&tree(change), level).unwrap_err().to_string();
+        assert!(error.contains(part), "{error:?} lacks {part:?}");
+    };
+    check(|_| (), 2, "no level 2; there are 0 to 1");
+    check(|v| v["version"] = 2.into(), 0, "version 2");
+    check(|v| v["tree"]["children"][0]["lods"]["0"]["file"] = 7.into(), 0, "no file 7");
+    check(|v| v["tree"]["children"][0]["lods"]["0"]["offset"] = 6.into(), 0, "3 splats from 6 on");
+    check(|v| v["tree"]["children"][0]["lods"]["0"]["offset"] = u64::MAX.into(), 0, "which has 7");
+    check(
+        |v| v["tree"]["children"][0]["lods"]["0"]["count"] = u64::MAX.into(),
+        0,
+        "number of splats",
+    );
+    check(|v| v["filenames"][0] = "elsewhere".into(), 0, "elsewhere");
+    check(|v| v["tree"] = serde_json::json!({}), 0, "no splats");
+}
+
+#[test]
+fn a_streamed_scene_names_files_in_its_folder_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["../0_0/meta.json", "/etc/passwd", "a/../../b", "a\\b", "c:b", ""] {
+        let index = tree(|v| v["filenames"][0] = name.into());
+        std::fs::write(folder.path().join("lod-meta.json"), index).unwrap();
+        let error = read(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("is no file in its folder"), "{name}: {error}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(300))]
+
+    #[test]
+    fn a_damaged_tree_is_an_error_or_a_sound_scene(
+        damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), level in 0..3u32,
+    ) {
+        let mut index = tree(|v| v["environment"] = "1_0/meta.json".into());
+        for (at, byte) in damage {
+            let at = at.index(index.len());
+            index[at] = byte;
+        }
+        if let Ok(loaded) = streamed(&index, level) {
+            check_sound(&loaded);
+        }
+    }
+
+    #[test]
+    fn a_damaged_gltf_is_an_error_or_a_sound_scene(
+        damage in prop::collection::vec((any::<prop::sample::Index>(), b' '..b'~'), 1..4),
+    ) {
+        let mut bytes = gltf_of_two(|_| ());
+        for (at, byte) in damage {
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+        }
+        if let Ok(loaded) = parse(&bytes, Format::Gltf) {
+            check_sound(&loaded);
+        }
+    }
 }

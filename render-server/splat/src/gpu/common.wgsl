@@ -30,7 +30,7 @@ struct View {
     slopes: vec4<f32>,
     /// The lens's first four coefficients, in the order of OpenCV.
     lens: vec4<f32>,
-    /// Its fifth; the greatest slope it images; near plane [m].
+    /// Its fifth; the greatest slope it images; near plane [m]; 1 if the part is anti-aliased.
     more: vec4<f32>,
     /// What is seen of it through the air.
     background: vec4<f32>,

@@ -386,13 +386,15 @@ impl GpuRenderer {
                 &camera.world_from_cam,
                 place,
                 self.scene.ids[0],
+                self.scene.antialiased[0],
             ));
-            for (placement, &id) in pending.placements.iter().zip(&self.scene.ids[1..]) {
+            let parts = self.scene.ids[1..].iter().zip(&self.scene.antialiased[1..]);
+            for (placement, (&id, &antialiased)) in pending.placements.iter().zip(parts) {
                 views.push(match placement {
                     Some(world_from_object) => {
                         // An object that moves is one that stands still before a moving camera.
                         let object_from_cam = world_from_object.inverse() * camera.world_from_cam;
-                        GpuView::new(camera, &lens, &object_from_cam, place, id)
+                        GpuView::new(camera, &lens, &object_from_cam, place, id, antialiased)
                     }
                     None => GpuView::absent(),
                 });

@@ -213,9 +213,15 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     let b = dot(u, v);
     let c = vv + BLUR;
     let minors = cross(u, v);
-    let determinant = dot(minors, minors) + (BLUR * (uu + vv) + BLUR * BLUR);
+    let sharp = dot(minors, minors);
+    let determinant = sharp + (BLUR * (uu + vv) + BLUR * BLUR);
 
-    let level = number(first, 12u, lane);
+    var level = number(first, 12u, lane);
+    if views[view].more.w != 0.0 {
+        // Dimmed by what the blur adds to its area; not at all where that is beyond f32.
+        let ratio = select(1.0, sharp / determinant, determinant < 1e36);
+        level += 0.5 * log2(max(ratio, 1e-30));
+    }
     let reach2 = (level - MIN_LEVEL) * EXTENT2;
     let extent = sqrt(reach2 * vec2(a, c));
     // Whether some pixel centre is within the ellipse's box.

@@ -33,6 +33,8 @@ pub(super) struct GpuScene {
     pub(super) block_count: u32,
     /// Ids of the parts: what stands still, then the objects.
     pub(super) ids: Vec<u16>,
+    /// [`Splats::antialiased`] of the parts.
+    pub(super) antialiased: Vec<bool>,
     /// Splats kept.
     pub(super) len: usize,
 }
@@ -113,6 +115,7 @@ impl GpuScene {
             chunks,
             block_count: pending.len() as u32,
             ids: std::iter::once(0).chain(scene.objects.iter().map(|object| object.id)).collect(),
+            antialiased: parts.iter().map(|splats| splats.antialiased).collect(),
             len: orders.iter().map(Vec::len).sum(),
         })
     }

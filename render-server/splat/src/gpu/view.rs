@@ -88,6 +88,7 @@ impl GpuView {
         part_from_cam: &Pose<F, Cam>,
         place: ImageOffset,
         id: u16,
+        antialiased: bool,
     ) -> Self {
         let k = &camera.intrinsics;
         let rotation = DMat3::from_quat(part_from_cam.rotation.normalize()).transpose();
@@ -109,7 +110,7 @@ impl GpuView {
             focal: [k.fx_px, k.fy_px, k.cx_px, k.cy_px].map(|v| v as f32),
             slopes: [low.x, low.y, high.x, high.y].map(|v| v as f32),
             lens: [c[0], c[1], c[2], c[3]],
-            more: [c[4], reach, camera.near_m, 0.0],
+            more: [c[4], reach, camera.near_m, f32::from(u8::from(antialiased))],
             background: [r, g, b, 0.0],
             light: [light[0], light[1], light[2], fog_per_m * std::f32::consts::LOG2_E],
             fog: [fog[0], fog[1], fog[2], 0.0],

@@ -6,7 +6,8 @@
 ORACLE.py is an independent module with `load_ply(path)` and `render(splats, camera)` as
 tests/images/oracle.rs describes them; numpy is all it needs. Writes sh0 to sh3: .ply (INRIA
 layout), and for cameras a and b of each: _a.json (camera), _a.npz (rgb, alpha, depth, depth_median;
-float32, rounded). The same numbers on every machine.
+float32, rounded); of camera a also what is seen where the scene was
+trained with anti-aliasing: _a_antialiased.npz. The same numbers on every machine.
 """
 import importlib.util
 import json
@@ -68,6 +69,25 @@ def rounded(name, v):
     return (np.round(v * 4096) / 4096).astype('<f4')
 
 
+def antialiased(project, blur=0.3):
+    """The oracle's projection, each opacity times the square root of the determinants' ratio without
+    and with the pixel's blur, at least 0: gsplat's rasterize_mode="antialiased"."""
+    def compensated(splats, cam, *args, **kwargs):
+        p = project(splats, cam, *args, **kwargs)
+        a, b, c = p['conic'].T                    # the inverse of the blurred covariance
+        blurred = 1 / (a * c - b * b)
+        xx, xy, yy = c * blurred - blur, -b * blurred, a * blurred - blur
+        return dict(p, op=p['op'] * np.sqrt(np.maximum((xx * yy - xy * xy) / blurred, 0)))
+    return compensated
+
+
+def save(view, image):
+    np.savez_compressed(view.with_suffix('.npz'),
+                        **{k: rounded(k, image[k]) for k in ('rgb', 'alpha', 'depth', 'depth_median')})
+    print(view.name, 'visible', image['n_visible'], 'mean alpha %.3f' % image['alpha'].mean(),
+          'splats per pixel %.1f' % image['n_contrib'].mean())
+
+
 def main():
     spec = importlib.util.spec_from_file_location('oracle', sys.argv[1])
     oracle = importlib.util.module_from_spec(spec)
@@ -82,10 +102,11 @@ def main():
             view = here / f'sh{degree}_{which}'
             view.with_suffix('.json').write_text(json.dumps(cam) + '\n')
             image = oracle.render(splats, cam)
-            np.savez_compressed(view.with_suffix('.npz'),
-                                **{k: rounded(k, image[k]) for k in ('rgb', 'alpha', 'depth', 'depth_median')})
-            print(view.name, 'visible', image['n_visible'], 'mean alpha %.3f' % image['alpha'].mean(),
-                  'splats per pixel %.1f' % image['n_contrib'].mean())
+            save(view, image)
+            if which == 'a':
+                project, oracle.project = oracle.project, antialiased(oracle.project)
+                save(view.with_name(view.name + '_antialiased'), oracle.render(splats, cam))
+                oracle.project = project
 
 
 main()

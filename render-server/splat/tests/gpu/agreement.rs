@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, ply};
+use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, Splats, ply};
 
 use crate::{both, compare, twins};
 
@@ -84,6 +84,31 @@ fn light_and_fog_agree() {
 }
 
 #[test]
+fn antialiased_twins_and_objects_agree() {
+    let small = |mut splats: Splats, antialiased: bool| {
+        splats.scales_m.iter_mut().for_each(|scale_m| *scale_m *= 0.15);
+        Splats { antialiased, ..splats }
+    };
+    let ball = |antialiased: bool| small(twins::ball(9000, 0.35, 0), antialiased);
+    let objects = [(7, false), (8, true)]
+        .map(|(id, antialiased)| RigidObject { id, splats: ball(antialiased) });
+    let at = |x: f64| Some(Pose::new(DVec3::new(x, 0.0, 1.2), DQuat::IDENTITY));
+    let placements = [at(-0.4), at(0.4)];
+    let cameras = [twins::camera(97, 61, 70.0), twins::camera(160, 120, 110.0)];
+    let render = |antialiased: bool| {
+        let splats = small(twins::cloud(4000, 1, 23), antialiased);
+        let scene = Scene { splats: &splats, objects: &objects };
+        check(&format!("antialiased {antialiased}"), scene, &placements, &cameras);
+        both(scene, &placements, &cameras)
+    };
+    let (Some((_, with)), Some((_, without))) = (render(true), render(false)) else { return };
+    assert!(compare::psnr_db(&with[0].rgb, &without[0].rgb) < 45.0);
+    // Of objects of equal splats, the dimmed one hides less.
+    let seen = |id: u16| without[0].ids.iter().filter(|&&seen| seen == id).count();
+    assert!(seen(8) > 50 && seen(8) < seen(7), "{} and {}", seen(8), seen(7));
+}
+
+#[test]
 fn both_lens_models_agree() {
     let splats = twins::cloud(4000, 0, 11);
     let lenses = [
@@ -151,6 +176,8 @@ fn captured_scenes_agree() {
             })
             .into();
         check(scene, &splats, &[], &cameras);
+        let antialiased = Splats { antialiased: true, ..splats };
+        check(&format!("{scene}, antialiased"), &antialiased, &[], &cameras);
     }
 }
 

@@ -2,8 +2,8 @@
 
 use vizflyt_splat::gpu::{Budget, GpuRenderer};
 use vizflyt_splat::{
-    Backend, Camera, CpuRenderer, FallbackRenderer, NoRenderer, Rasterizer, RenderError, RgbdImage,
-    RigidObject, Scene, choose,
+    Backend, Camera, CpuRenderer, Detail, FallbackRenderer, NoRenderer, Rasterizer, RenderError,
+    RgbdImage, RigidObject, Scene, choose,
 };
 
 use crate::agreement::assert_alike;
@@ -137,7 +137,7 @@ fn choice_has_a_reason() {
     let camera = [twins::camera(60, 40, 80.0)];
     let expected = render_all(&mut CpuRenderer::new(&splats), &camera);
     let check = |backend: Backend| {
-        let mut chosen = choose(&splats, backend).expect("a renderer");
+        let mut chosen = choose(&splats, backend, Detail::Full).expect("a renderer");
         println!("{backend:?}: {} because {}", chosen.rasterizer.name(), chosen.reason);
         let image = render_all(&mut *chosen.rasterizer, &camera);
         assert_alike(&format!("{backend:?}"), &image[0], &expected[0]);
@@ -149,7 +149,7 @@ fn choice_has_a_reason() {
     match adapter() {
         None => {
             assert!(name.starts_with("cpu ") && reason.contains("no graphics adapter"), "{reason}");
-            let refused = choose(&splats, Backend::Gpu).map(|chosen| chosen.reason);
+            let refused = choose(&splats, Backend::Gpu, Detail::Full).map(|chosen| chosen.reason);
             assert!(matches!(refused, Err(NoRenderer::Gpu(_))), "{refused:?}");
         }
         Some(adapter) => {

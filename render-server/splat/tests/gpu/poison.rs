@@ -29,6 +29,7 @@ fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
         opacities: vec![opacity],
         sh_degree: 0,
         sh: vec![0.5, -0.5, 1.0],
+        antialiased: false,
     }
 }
 
@@ -57,12 +58,15 @@ fn extreme_scales_and_opacities_stay_clean_and_agree() {
         for other in [scale, 0.01] {
             for opacity in [0.0, 1e-30, 1.0 / 255.0, 0.5, 1.0] {
                 let splats = one(Vec3::new(0.1, 0.0, 2.0), Vec3::new(scale, other, scale), opacity);
+                let antialiased = Splats { antialiased: true, ..splats.clone() };
                 let camera = looking_ahead(32, 24, 70.0);
-                let image = renderer.render_one(&splats, &camera);
-                let expected = render_reference(&splats, &[], &camera).expect("a valid camera");
-                let middle = 12 * 32 + 17;
-                let off = (image.alpha[middle] - expected.alpha[middle]).abs();
-                assert!(off < 0.02, "scale {scale} {other}, opacity {opacity}: {off}");
+                for splats in [splats, antialiased] {
+                    let image = renderer.render_one(&splats, &camera);
+                    let expected = render_reference(&splats, &[], &camera).expect("a valid camera");
+                    let middle = 12 * 32 + 17;
+                    let off = (image.alpha[middle] - expected.alpha[middle]).abs();
+                    assert!(off < 0.02, "scale {scale} {other}, opacity {opacity}: {off}");
+                }
             }
         }
     }

@@ -16,8 +16,9 @@ pub(crate) fn splats(count: std::ops::Range<usize>) -> impl Strategy<Value = Spl
         0.0..=1.0f32,
         prop::collection::vec(-0.8..0.8f32, 48),
     );
-    (0..=3u8, prop::collection::vec(splat, count)).prop_map(|(sh_degree, rows)| {
-        let mut splats = Splats { sh_degree, ..Splats::default() };
+    let rows = prop::collection::vec(splat, count);
+    (0..=3u8, any::<bool>(), rows).prop_map(|(sh_degree, antialiased, rows)| {
+        let mut splats = Splats { sh_degree, antialiased, ..Splats::default() };
         let numbers = splats.sh_coefficients() * 3;
         for (mean, log_scale, q, opacity, sh) in rows {
             splats.means_m.push(mean.into());
@@ -177,6 +178,7 @@ fn by_the_reach() -> (Splats, Camera) {
         opacities: vec![0.30605033],
         sh_degree: 0,
         sh: vec![0.0; 3],
+        antialiased: false,
     };
     let lens = Distortion::BrownConrady {
         k1: -0.2768923729305929,

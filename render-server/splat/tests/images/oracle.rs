@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
-use vizflyt_splat::{Atmosphere, Camera, RgbdImage, Scene, Splats, ply};
+use vizflyt_splat::{Atmosphere, Camera, RgbdImage, Scene, Splats, ply, render_reference};
 
 use crate::renderers::{self, Make};
 use crate::{compare, npz};
@@ -98,6 +98,21 @@ fn check_scene(make: Make<'_>, splats: &Splats, cases: &[(PathBuf, PathBuf)]) {
     }
 }
 
+/// Generated scenes of every degree, as if they had been trained with anti-aliasing.
+pub(crate) fn check_antialiased_scenes(make: Make<'_>) {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+    for degree in 0..=3 {
+        let loaded = ply::read(data.join(format!("sh{degree}.ply"))).expect("a scene");
+        let splats = Splats { antialiased: true, ..loaded.splats };
+        let view = |end: &str| data.join(format!("sh{degree}_a{end}"));
+        check_scene(make, &splats, &[(view(".json"), view("_antialiased.npz"))]);
+        // It is not the classic image.
+        let expected = |end: &str| oracle_image(&view(end), &camera(&view(".json")));
+        let d = compare::difference(&expected(".npz"), &expected("_antialiased.npz"));
+        assert!(d.rgb_db < 40.0 && d.alpha_db < 40.0, "degree {degree}: {d:?}");
+    }
+}
+
 /// Generated scenes of every degree.
 pub(crate) fn check_generated_scenes(make: Make<'_>) {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
@@ -139,6 +154,32 @@ pub(crate) fn check_captured_scenes(make: Make<'_>) {
 #[test]
 fn generated_scenes_of_every_degree_match_the_oracle() {
     check_generated_scenes(&renderers::every);
+}
+
+#[test]
+fn antialiased_scenes_match_the_oracle() {
+    check_antialiased_scenes(&renderers::every);
+}
+
+/// The plain renderer is what [`check_antialiased_scenes`] holds against the oracle; here every other one against it.
+#[test]
+fn antialiased_captured_scenes_match_the_plain_renderer() {
+    let shared = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes");
+    for scene in ["room", "flowers_lod2"] {
+        let file = shared.join(scene).with_extension("ply");
+        if !file.exists() {
+            println!("skipped: {scene} with anti-aliasing, for lack of {}", file.display());
+            continue;
+        }
+        let splats = Splats { antialiased: true, ..ply::read(&file).expect("a scene").splats };
+        let camera = camera(&shared.join(format!("ref/{scene}_p0_320x240.json")));
+        let expected = render_reference(&splats, &[], &camera).expect("a valid camera");
+        for mut renderer in renderers::cpus(Scene::from(&splats)) {
+            let mut image = [RgbdImage::default()];
+            renderer.render(&[], &[camera], &mut image).expect("a valid camera");
+            check(&format!("{scene}, antialiased"), &renderer.name(), &image[0], &expected);
+        }
+    }
 }
 
 #[test]

@@ -18,6 +18,7 @@ fn one(mean_m: Vec3, scale_m: Vec3, opacity: f32) -> Splats {
         opacities: vec![opacity],
         sh_degree: 0,
         sh: vec![0.5, -0.5, 1.0],
+        antialiased: false,
     }
 }
 
@@ -76,9 +77,13 @@ pub(crate) fn check_scales_and_opacities(make: Make<'_>) {
             for opacity in [0.0, 1e-30, 1.0 / 255.0, 0.5, 1.0] {
                 let scale_m = Vec3::new(scale, other, scale);
                 let splats = one(Vec3::new(0.1, 0.0, 2.0), scale_m, opacity);
-                for camera in &cameras {
-                    let expected = render_all(&renderers::reference, &splats, camera);
-                    for (name, image) in render_all(make, &splats, camera) {
+                let antialiased = Splats { antialiased: true, ..splats.clone() };
+                let each = [splats, antialiased];
+                for (camera, splats) in
+                    cameras.iter().flat_map(|c| each.iter().map(move |s| (c, s)))
+                {
+                    let expected = render_all(&renderers::reference, splats, camera);
+                    for (name, image) in render_all(make, splats, camera) {
                         let middle = 12 * 32 + 17;
                         let off = (image.alpha[middle] - expected[0].1.alpha[middle]).abs();
                         assert!(off < 0.02, "{name}: {scale_m}, opacity {opacity}: {off}");

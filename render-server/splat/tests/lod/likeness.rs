@@ -15,6 +15,8 @@ pub(crate) struct Likeness {
     pub(crate) median_off: f64,
     /// Share whose expected depth is.
     pub(crate) expected_off: f64,
+    /// Share of the pixels of which a channel is off by more than 8 of 255.
+    pub(crate) rgb_off: f64,
     /// Share of the opaque pixels (alpha > 0.95) that lost more than 0.1 of alpha: holes.
     pub(crate) holes: f64,
 }
@@ -30,6 +32,13 @@ impl Likeness {
             alpha_db: psnr_db(&image.alpha, &truth.alpha),
             median_off: off(&image.depth_median_m, &truth.depth_median_m),
             expected_off: off(&image.depth_expected_m, &truth.depth_expected_m),
+            rgb_off: share(0..truth.alpha.len(), |i| {
+                let channels = i * 3..i * 3 + 3;
+                channels.into_iter().any(|k| {
+                    (image.rgb[k].clamp(0.0, 1.0) - truth.rgb[k].clamp(0.0, 1.0)).abs()
+                        > 8.0 / 255.0
+                })
+            }),
             holes: share((0..truth.alpha.len()).filter(|&i| truth.alpha[i] > 0.95), |i| {
                 truth.alpha[i] - image.alpha[i] > 0.1
             }),
@@ -41,8 +50,9 @@ impl fmt::Display for Likeness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "RGB {:.1} dB, alpha {:.1} dB, depth off > 1 %: median {:.2} %, expected {:.2} %, holes {:.3} %",
+            "RGB {:.1} dB, off > 8/255 {:.2} %, alpha {:.1} dB, depth off > 1 %: median {:.2} %, expected {:.2} %, holes {:.3} %",
             self.rgb_db,
+            self.rgb_off * 100.0,
             self.alpha_db,
             self.median_off * 100.0,
             self.expected_off * 100.0,

@@ -16,6 +16,7 @@ fn scene(opacity: f32) -> (Splats, BakeSpec) {
         opacities: vec![opacity; n],
         sh_degree: 0,
         sh: vec![0.5; 3 * n],
+        antialiased: false,
     };
     let grid = Grid::covering(DVec3::ZERO, DVec3::splat(2.0), 0.05);
     (splats, BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 })

@@ -178,6 +178,7 @@ mod tests {
             opacities: vec![1.0],
             sh_degree: 0,
             sh: vec![1.0; 3],
+            antialiased: false,
         }
     }
 

@@ -32,8 +32,8 @@ use vizflyt_splat::Chosen;
 
 use self::engine::{Engine, Picture, Request};
 use crate::lock::lock;
-use crate::render::{RendererInfo, RendererKind, choose};
-use crate::scene::{self, BareArgs, Scene};
+use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
+use crate::scene::{self, Antialiased, BareArgs, Scene};
 use crate::stop::Stop;
 use crate::web::{self, origin};
 
@@ -60,6 +60,14 @@ pub struct ViewArgs {
     /// What draws: a graphics card if one answers, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
+
+    /// How much of a large scene the processor draws; a graphics card draws all of it
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub detail: DetailKind,
+
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
+    pub antialiased: Antialiased,
 
     /// How a scene without an arena is put into the world
     #[command(flatten)]
@@ -136,9 +144,11 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
 }
 
 fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, splats, objects, world_from_scene } = scene::load(&args.scene, &args.bare)?;
+    let Scene { arena, mut splats, objects, world_from_scene } =
+        scene::load(&args.scene, &args.bare)?;
+    args.antialiased.apply(&mut splats);
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
-    let Chosen { rasterizer, reason } = choose(twin, args.renderer)?;
+    let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
     let moving = MovingObjects::new(&arena, args.seed);
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;

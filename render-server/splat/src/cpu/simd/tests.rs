@@ -33,6 +33,11 @@ impl Kernel for Check {
         check("max", s.max(va, vb), &|i| a[i].max(b[i]), 0.0);
         check("sqrt", s.sqrt(va * va), &|i| (a[i] * a[i]).sqrt(), 1e-7);
         check("exp2", s.exp2(va), &|i| a[i].exp2(), 4e-6);
+        let above_2 = va * va + s.splat(2.0);
+        check("log2", s.log2(above_2), &|i| (a[i] * a[i] + 2.0).log2(), 1e-6);
+        let tiny = above_2 * s.splat(1e-20);
+        check("log2 of little", s.log2(tiny), &|i| ((a[i] * a[i] + 2.0) * 1e-20).log2(), 1e-6);
+        check("log2 of 0", s.log2(s.splat(0.0)), &|_| -127.0, 0.0);
         check("negative", s.negative(va), &|i| -a[i].abs(), 0.0);
         let sum: f32 = a[..S::LANES].iter().sum();
         assert!((s.sum(va) - sum).abs() < 1e-4, "sum: {} for {sum}", s.sum(va));

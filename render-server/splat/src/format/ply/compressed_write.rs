@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::PlyError;
 use super::compressed::{BOUNDS, CHUNK, COLOUR_BOUNDS, PACKED};
+use super::header::ANTIALIASED;
 use crate::Splats;
 use crate::format::activate::{colour_of_harmonic, log_scale};
 use crate::format::order::morton;
@@ -42,8 +43,10 @@ pub fn encode_compressed(splats: &Splats) -> Vec<u8> {
     let bounds = BOUNDS.iter().chain(&COLOUR_BOUNDS).map(|name| property("float", name));
     let packed = PACKED.iter().map(|name| property("uint", name));
     let harmonics = (0..rest).map(|i| property("uchar", &format!("f_rest_{i}")));
+    let comment = if splats.antialiased { ANTIALIASED } else { "" };
+    let chunks = count.div_ceil(CHUNK);
     let mut header =
-        format!("ply\nformat binary_little_endian 1.0\nelement chunk {}\n", count.div_ceil(CHUNK));
+        format!("ply\nformat binary_little_endian 1.0\n{comment}element chunk {chunks}\n");
     header.extend(bounds);
     header.extend(["element vertex ", &count.to_string(), "\n"]);
     header.extend(packed);

@@ -130,6 +130,8 @@ pub(super) struct Header {
     pub(super) format: Format,
     /// In file order; exactly one is named [`VERTEX`].
     pub(super) elements: Vec<Element>,
+    /// Whether a comment says that the scene was trained with anti-aliasing.
+    pub(super) antialiased: bool,
     /// Where the rows start. [byte]
     pub(super) body: usize,
 }
@@ -143,6 +145,7 @@ impl Header {
             return Err(PlyError::NotPly { found: String::from_utf8_lossy(start).into() });
         }
         let mut format = None;
+        let mut antialiased = false;
         let mut elements: Vec<Element> = Vec::new();
         loop {
             let Some((offset, line)) = lines.next() else {
@@ -154,7 +157,11 @@ impl Header {
             let fail = |reason: String| PlyError::Header { offset, reason };
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
-                [] | ["comment" | "obj_info", ..] => {}
+                ["comment", ref comment @ ..] => {
+                    // The last one counts, as for brush and splat-transform.
+                    antialiased = says_antialiased(comment).unwrap_or(antialiased);
+                }
+                [] | ["obj_info", ..] => {}
                 ["end_header"] => break,
                 ["format", name, _version] => {
                     format = Some(match name {
@@ -162,7 +169,8 @@ impl Header {
                         "ascii" => Format::Ascii,
                         _ => {
                             return Err(fail(format!(
-                                "format `{name}`; only binary_little_endian and ascii are read"
+                                "format `{name}`; only binary_little_endian and ascii are read: save it as one of \
+                                 them"
                             )));
                         }
                     });
@@ -210,7 +218,7 @@ impl Header {
                 reason: format!("the file has no element `{VERTEX}`"),
             });
         }
-        Ok(Self { format, elements, body: lines.offset })
+        Ok(Self { format, elements, antialiased, body: lines.offset })
     }
 
     /// Returns the element whose rows are splats.
@@ -218,6 +226,29 @@ impl Header {
         // `parse` has refused files without one.
         &self.elements[self.elements.iter().position(|e| e.name == VERTEX).unwrap_or(0)]
     }
+}
+
+/// The line by which brush says so, and this program.
+pub(super) const ANTIALIASED: &str = "comment SplatRenderMode: mip\n";
+
+/// Returns what the words of a comment say about anti-aliasing, if anything.
+fn says_antialiased(comment: &[&str]) -> Option<bool> {
+    let [key, value] = comment else { return None };
+    let is = |word: &str, expected: &str| word.eq_ignore_ascii_case(expected);
+    if is(key, "SplatRenderMode:") {
+        if is(value, "mip") {
+            return Some(true);
+        }
+        return is(value, "default").then_some(false);
+    }
+    if is(key, "antialiased") {
+        return match *value {
+            "1" => Some(true),
+            "0" => Some(false),
+            _ => None,
+        };
+    }
+    None
 }
 
 /// Lines of text with their offsets; ends at the first line that is not finished or not UTF-8.

@@ -17,6 +17,9 @@
 //! | `scale_0..2` | natural logarithm of the standard deviation |
 //! | `rot_0..3` | quaternion wxyz, of any length |
 //!
+//! Of the comments on top, those count that say that the scene was trained with anti-aliasing: brush's
+//! `SplatRenderMode: mip`, which is written too, and PostShot's `antialiased 1`.
+//!
 //! Axes are those of the training, by custom x right, y down, z ahead of the first camera (RDF).
 //!
 //! Budget: 1 M splats of degree 3 are 248 MB; decoding is bound by memory and `exp`.
@@ -66,7 +69,7 @@ pub fn parse(bytes: &[u8]) -> Result<Loaded, PlyError> {
 pub(super) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, PlyError> {
     let header = header::Header::parse(bytes)?;
     meter.expect(header.vertex().count);
-    let (format, (splats, dropped), used, skipped_properties);
+    let (format, (mut splats, dropped), used, skipped_properties);
     if compressed::is_compressed(&header) {
         format = Format::CompressedPly;
         used = &compressed::ELEMENTS[..];
@@ -89,8 +92,8 @@ pub(super) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, PlyError> {
     }
     let elements = header.elements.iter().map(|element| element.name.clone());
     let skipped_elements = elements.filter(|name| !used.contains(&name.as_str())).collect();
-    let antialiased = false;
-    Ok(Loaded { format, splats, dropped, antialiased, skipped_properties, skipped_elements })
+    splats.antialiased = header.antialiased;
+    Ok(Loaded { format, splats, dropped, skipped_properties, skipped_elements })
 }
 
 #[cfg(test)]

@@ -13,6 +13,7 @@ fn two() -> Splats {
         opacities: vec![0.25, 0.75],
         sh_degree: 1,
         sh: (0..24).map(|i| i as f32 * 0.125 - 1.0).collect(),
+        antialiased: false,
     }
 }
 

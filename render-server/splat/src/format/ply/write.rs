@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::PlyError;
+use super::header::ANTIALIASED;
 use crate::Splats;
 use crate::format::activate::{log_scale, logit};
 use crate::format::{assert_whole, file};
@@ -42,8 +43,9 @@ pub fn encode(splats: &Splats) -> Vec<u8> {
     names.extend((0..4).map(|i| format!("rot_{i}")));
     let properties: String =
         names.iter().flat_map(|name| ["property float ", name, "\n"]).collect();
+    let comment = if splats.antialiased { ANTIALIASED } else { "" };
     let header = format!(
-        "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+        "ply\nformat binary_little_endian 1.0\n{comment}element vertex {count}\n{properties}end_header\n"
     );
 
     let mut bytes = Vec::with_capacity(header.len() + count * names.len() * 4);

@@ -94,7 +94,8 @@ impl Meta {
         let [colour_file] = files(meta.sh0.files, "sh0")?;
         Ok(Self {
             count: usize::try_from(count).map_err(|_| invalid(META, "`count` is too large"))?,
-            antialiased: meta.antialias.unwrap_or(false),
+            antialiased: meta.antialias.unwrap_or(false)
+                || meta.model.is_some_and(|model| model == "antialiased"),
             mean_min: meta.means.mins,
             mean_max: meta.means.maxs,
             mean_files: files(meta.means.files, "means")?,
@@ -113,7 +114,10 @@ impl Meta {
 struct Json {
     version: Option<u32>,
     count: Option<u64>,
+    /// Of early writers.
     antialias: Option<bool>,
+    /// `default`, `antialiased` or `2dgs`.
+    model: Option<String>,
     means: JsonMeans,
     scales: JsonChannels,
     quats: JsonFiles,

@@ -21,11 +21,14 @@ mod files;
 mod meta;
 mod palette;
 mod read;
+mod streamed;
 mod texture;
 mod write;
 
 pub(super) use files::{Files, META};
 pub(super) use read::decode;
+pub(super) use streamed::LOD_META;
+pub use streamed::assemble_streamed;
 pub(super) use write::{encode, parts};
 
 use super::{Format, FormatError};

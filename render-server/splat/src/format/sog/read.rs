@@ -113,7 +113,7 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
         }
     });
     let mut loaded = Loaded::whole(Format::Sog, count, splats, dropped)?;
-    loaded.antialiased = meta.antialiased;
+    loaded.splats.antialiased = meta.antialiased;
     Ok(loaded)
 }
 

@@ -162,6 +162,10 @@ pub(in crate::format) fn parts(splats: &Splats) -> Result<Vec<Part>, FormatError
         "quats": { "files": ["quats.webp"] },
         "sh0": { "codebook": colours.to_vec(), "files": ["sh0.webp"] },
     });
+    if splats.antialiased {
+        meta["antialias"] = true.into();
+        meta["model"] = "antialiased".into();
+    }
     if let Some((_, values, entries, _)) = &harmonics {
         meta["shN"] = json!({
             "count": entries,

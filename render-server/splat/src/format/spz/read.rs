@@ -47,7 +47,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
         if bytes.starts_with(&GZIP_MAGIC) { inflate(bytes, meter)? } else { unpack(bytes, meter)? };
     let (splats, dropped) = decode_attributes(&header, &attributes, meter);
     let mut loaded = Loaded::whole(Format::Spz, header.count, splats, dropped)?;
-    loaded.antialiased = header.flags & FLAG_ANTIALIASED != 0;
+    loaded.splats.antialiased = header.flags & FLAG_ANTIALIASED != 0;
     if header.sh_degree > 3 {
         loaded.skipped_properties.push("harmonics of degree 4".into());
     }

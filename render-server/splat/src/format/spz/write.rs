@@ -6,7 +6,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
-use super::{COLOUR_SCALE, HARMONIC_SIGNS, MAGIC};
+use super::{COLOUR_SCALE, FLAG_ANTIALIASED, HARMONIC_SIGNS, MAGIC};
 use crate::Splats;
 use crate::format::activate::log_scale;
 use crate::format::assert_whole;
@@ -70,7 +70,8 @@ pub(in crate::format) fn encode(splats: &Splats, version: u32) -> Vec<u8> {
     for word in [MAGIC, version, count as u32] {
         header.extend_from_slice(&word.to_le_bytes());
     }
-    header.extend([splats.sh_degree, fractional_bits, 0, 0]);
+    let flags = if splats.antialiased { FLAG_ANTIALIASED } else { 0 };
+    header.extend([splats.sh_degree, fractional_bits, flags, 0]);
     if version < 4 {
         let mut stream = GzEncoder::new(Vec::new(), Compression::default());
         let mut parts = std::iter::once(&header).chain(&attributes);
