@@ -71,6 +71,8 @@ pub struct Trainer<'a> {
     loss: Loss,
     gradients: Vec<RowGradient>,
     seen: Vec<u32>,
+    /// Error seen through each Gaussian since they last moved house.
+    errors: Vec<f32>,
     /// Photos still to come before all are shuffled again.
     queue: Vec<usize>,
     random: Random,
@@ -110,6 +112,7 @@ impl<'a> Trainer<'a> {
             options,
             extent,
             moments: Moments::of(&gaussians),
+            errors: vec![0.0; gaussians.len()],
             gaussians,
             exposures: vec![ExposureState::default(); dataset.photos.len()],
             renderer: Renderer::default(),
@@ -165,6 +168,9 @@ impl<'a> Trainer<'a> {
         self.seen.clear();
         self.seen.extend(self.renderer.seen().map(|row| row as u32));
         self.renderer.backward(&self.gaussians, view, style, by, &mut self.gradients);
+        for (&row, by) in self.seen.iter().zip(&self.gradients) {
+            self.errors[row as usize] += by.error;
+        }
         self.step += 1;
         let rates = self.rates();
         let step = Step {
@@ -186,7 +192,8 @@ impl<'a> Trainer<'a> {
             wander(&mut self.gaussians, &self.seen, NOISE * rates.mean, seed);
             if self.step.is_multiple_of(RELOCATE_EVERY) {
                 let grow = self.growth();
-                relocate(&mut self.gaussians, &mut self.moments, grow, &mut self.random);
+                let (gaussians, moments) = (&mut self.gaussians, &mut self.moments);
+                relocate(gaussians, moments, &mut self.errors, grow, &mut self.random);
             }
         }
         parts
