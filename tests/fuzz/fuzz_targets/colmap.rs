@@ -11,7 +11,9 @@ fn cameras() -> Cameras {
 fn check_images(images: &[SparseImage], bytes: usize) {
     assert!(images.len() <= bytes);
     for image in images {
-        assert!(image.world_from_cam.translation_m.is_finite() && image.intrinsics.validate().is_ok());
+        assert!(
+            image.world_from_cam.translation_m.is_finite() && image.intrinsics.validate().is_ok()
+        );
     }
 }
 

@@ -9,7 +9,9 @@ fuzz_target!(|bytes: &[u8]| {
             Ok(transforms) => {
                 for frame in &transforms.frames {
                     assert!(frame.world_from_cam.translation_m.is_finite());
-                    assert!(frame.intrinsics.is_err() || frame.intrinsics.unwrap().validate().is_ok());
+                    assert!(
+                        frame.intrinsics.is_err() || frame.intrinsics.unwrap().validate().is_ok()
+                    );
                 }
             }
             Err(error) => assert!(!error.to_string().is_empty()),
