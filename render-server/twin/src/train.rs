@@ -6,7 +6,6 @@
 
 mod start;
 
-use glam::Vec3;
 use vizflyt_splat::Splats;
 use vizflyt_splat::simd::InstructionSet;
 
@@ -52,7 +51,7 @@ impl Default for Options {
             hold_out: 8,
             antialiased: false,
             exposure: true,
-            weights: Weights { dssim: 0.2, depth: 0.2, spread: 0.02 },
+            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02 },
             tolls: Tolls { opacity: 0.01, scale: 0.01, thickness: 0.1, needle: 0.001 },
         }
     }
@@ -279,12 +278,6 @@ impl<'a> Trainer<'a> {
         let factor = (budget as f32 / count.max(1) as f32).powf(1.0 / left.max(1.0));
         let wanted = (count as f32 * (factor.min(MAX_GROWTH) - 1.0)).ceil().max(0.0) as usize;
         wanted.min(budget.saturating_sub(count))
-    }
-
-    /// Returns the middle of the cameras, for tests and reports. [units of the dataset]
-    pub fn middle(&self) -> Vec3 {
-        let sum: Vec3 = self.dataset.photos.iter().map(|photo| photo.view.position).sum();
-        sum / self.dataset.photos.len() as f32
     }
 }
 
