@@ -19,6 +19,8 @@ use crate::project::{Flat, FlatGradient, MIN_LEVEL};
 
 /// Channels of an image.
 pub(crate) const CHANNELS: usize = 6;
+/// Channels of its derivative: one more, how wrong a pixel is.
+pub(crate) const BY_CHANNELS: usize = 7;
 const PIXELS: usize = TILE * TILE;
 const BLOCK_WIDTH: usize = 8;
 /// Of eight lanes: as many as a mask has bits.
@@ -26,12 +28,14 @@ const MAX_BLOCKS: usize = PIXELS / 8;
 const BATCH: usize = 64;
 
 /// What a tile's pixels add up for one Gaussian: `sum G`, `G u`, `G dy`, `G u^2`, `G u dy`, `G dy^2`
-/// with `G` the derivative by its level (without ln 2), then the derivatives by colour and z.
-pub(crate) type PairSums = [f32; 10];
+/// with `G` the derivative by its level (without ln 2), then the derivatives by colour and z,
+/// then the error seen through it.
+pub(crate) type PairSums = [f32; SUMS];
+pub(crate) const SUMS: usize = 11;
 
 /// Returns the gradient of a flat Gaussian from the sums of its tiles.
 pub(crate) fn flat_gradient(flat: &Flat, sums: &PairSums) -> FlatGradient {
-    let [g, gu, gy, guu, guy, gyy, red, green, blue, z] = *sums;
+    let [g, gu, gy, guu, guy, gyy, red, green, blue, z, _] = *sums;
     let ln2 = std::f32::consts::LN_2;
     let [fall_x, fall_y] = flat.falloff;
     let by_x = 2.0 * fall_x * gu * ln2;
@@ -317,7 +321,7 @@ impl Kernel for Backward<'_> {
         let (lane_x, lane_y) = lanes(s);
         let mut batch = Batch::new();
         // The derivative by each channel, transmittance, and what is still to come.
-        let mut by = [[0.0; PIXELS]; CHANNELS];
+        let mut by = [[0.0; PIXELS]; BY_CHANNELS];
         let mut image = [[0.0; PIXELS]; CHANNELS];
         let mut rest = [0.0; PIXELS];
         let mut transmittance = [1.0; PIXELS];
@@ -326,12 +330,15 @@ impl Kernel for Backward<'_> {
             let tile = self.band * tiles_x + tile_x;
             let range = self.bins.starts[tile] as usize..self.bins.starts[tile + 1] as usize;
             let origin = [(tile_x * TILE) as f32, (self.band * TILE) as f32];
-            for channel in 0..CHANNELS {
+            for channel in 0..BY_CHANNELS {
                 let plane = channel * TILE * self.stride..(channel + 1) * TILE * self.stride;
-                let (from_image, from_by) = (&self.image[plane.clone()], &self.by[plane]);
+                let from_by = &self.by[plane.clone()];
+                let from_image = self.image.get(plane);
                 for_rows(S::LANES, self.stride, tile_x, |to, from| {
-                    image[channel][to..to + BLOCK_WIDTH]
-                        .copy_from_slice(&from_image[from..from + BLOCK_WIDTH]);
+                    if let Some(from_image) = from_image {
+                        image[channel][to..to + BLOCK_WIDTH]
+                            .copy_from_slice(&from_image[from..from + BLOCK_WIDTH]);
+                    }
                     by[channel][to..to + BLOCK_WIDTH]
                         .copy_from_slice(&from_by[from..from + BLOCK_WIDTH]);
                 });
@@ -344,12 +351,12 @@ impl Kernel for Backward<'_> {
             let out = &mut self.out[range.start - band_start..range.end - band_start];
             for (list, out) in self.bins.entries[range].chunks(BATCH).zip(out.chunks_mut(BATCH)) {
                 if live == 0 {
-                    out.fill([0.0; 10]);
+                    out.fill([0.0; SUMS]);
                     continue;
                 }
                 batch.load(s, self.flats, list, origin);
                 for (i, out) in out.iter_mut().enumerate() {
-                    let mut sums = [s.splat(0.0); 10];
+                    let mut sums = [s.splat(0.0); SUMS];
                     let mut bits = batch.masks[i % BATCH] & live;
                     while bits != 0 {
                         let block = bits.trailing_zeros() as usize % blocks;
@@ -391,11 +398,11 @@ fn backward_block<S: Simd>(
     i: usize,
     x: S::F,
     y: S::F,
-    by: &[[f32; PIXELS]; CHANNELS],
+    by: &[[f32; PIXELS]; BY_CHANNELS],
     at: usize,
     rest: &mut [f32],
     through: &mut [f32],
-    sums: &mut [S::F; 10],
+    sums: &mut [S::F; SUMS],
 ) -> bool {
     let one = s.splat(1.0);
     let dy = y - s.splat(batch.mean_y[i]);
@@ -435,6 +442,8 @@ fn backward_block<S: Simd>(
     sums[7] = s.mul_add(weight, green, sums[7]);
     sums[8] = s.mul_add(weight, blue, sums[8]);
     sums[9] = s.mul_add(weight, s.mul_add(second + second, z, first), sums[9]);
+
+    sums[10] = s.mul_add(weight, load(6), sums[10]);
 
     s.store(behind, rest);
     s.store(s.select(live, after, s.negative(transmittance)), through);

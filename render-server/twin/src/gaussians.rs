@@ -144,6 +144,7 @@ mod tests {
             opacities: vec![0.3, 0.99],
             sh_degree: 1,
             sh: (0..24).map(|i| i as f32 / 24.0).collect(),
+            antialiased: false,
         };
         let back = Gaussians::from_splats(&splats).to_splats();
         assert_eq!(back.len(), 2);

@@ -164,8 +164,8 @@ impl Loss {
         let Self { shown, truth, maps, by_shown, by, .. } = self;
         ssim::derivative(self.instructions, shown, truth, maps, by_shown);
 
-        by.resize(channel::COUNT, width, height);
-        let (len, shown_len) = (by.band_len(), shown.band_len());
+        by.resize(channel::BY_COUNT, width, height);
+        let (len, shown_len, image_len) = (by.band_len(), shown.band_len(), image.band_len());
         let stride = by.stride;
         let l1_step = ((1.0 - f64::from(weights.dssim)) / numbers) as f32;
         let ssim_step = (-f64::from(weights.dssim) / numbers) as f32;
@@ -177,7 +177,7 @@ impl Loss {
             .zip(shown.values.par_chunks(shown_len))
             .zip(truth.values.par_chunks(shown_len))
             .zip(by_shown.values.par_chunks(shown_len))
-            .zip(image.values.par_chunks(len))
+            .zip(image.values.par_chunks(image_len))
             .enumerate()
             .with_max_len(1)
             .map(|(band, ((((by, shown), truth), by_ssim), image))| {
@@ -198,6 +198,7 @@ impl Loss {
                         by[c * plane + at] = exposure.gain[c] * step;
                         by[channel::TRANSMITTANCE * plane + at] +=
                             exposure.gain[c] * step * background[c];
+                        by[channel::ERROR * plane + at] += off.abs();
                         sums[0] += f64::from(off.abs());
                         sums[2 + c] += f64::from(step * bare);
                         sums[5 + c] += f64::from(step);

@@ -67,6 +67,8 @@ pub(crate) struct RowGradient {
     pub(crate) geometry: [f32; column::SH],
     pub(crate) basis: [f32; 16],
     pub(crate) rgb: [f32; 3],
+    /// The error of the image that is seen through it; no derivative, but where more are needed.
+    pub(crate) error: f32,
 }
 
 /// What both directions compute.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 
 use crate::bin::Bins;
-use crate::blend::{Backward, CHANNELS, Forward, PairSums, flat_gradient};
+use crate::blend::{BY_CHANNELS, Backward, CHANNELS, Forward, PairSums, SUMS, flat_gradient};
 use crate::gaussians::Gaussians;
 use crate::planes::Planes;
 use crate::project::{Flat, RowGradient, Style};
@@ -24,6 +24,10 @@ pub mod channel {
     pub const TRANSMITTANCE: usize = 5;
     /// How many there are.
     pub const COUNT: usize = super::CHANNELS;
+    /// Of the derivative alone: how wrong a pixel is.
+    pub const ERROR: usize = COUNT;
+    /// How many a derivative has.
+    pub const BY_COUNT: usize = super::BY_CHANNELS;
 }
 
 /// Renders Gaussians and takes derivatives back to them; keeps its buffers from image to image.
@@ -113,9 +117,9 @@ impl Renderer {
         out: &mut Vec<RowGradient>,
     ) {
         let instructions = self.instructions;
-        assert_eq!((by.channels, by.width, by.height), (CHANNELS, view.width, view.height));
+        assert_eq!((by.channels, by.width, by.height), (BY_CHANNELS, view.width, view.height));
         let (flats, bins) = (&self.flats[..], &self.bins);
-        self.pairs.resize(bins.entries.len(), [0.0; 10]);
+        self.pairs.resize(bins.entries.len(), [0.0; SUMS]);
         let (len, stride) = (self.image.band_len(), self.image.stride);
         // Each band's pairs stand next to each other.
         let mut bands = Vec::with_capacity(self.image.bands());
@@ -130,7 +134,7 @@ impl Renderer {
         bands
             .into_par_iter()
             .zip(self.image.values.par_chunks(len))
-            .zip(by.values.par_chunks(len))
+            .zip(by.values.par_chunks(by.band_len()))
             .enumerate()
             .with_max_len(1)
             .for_each(|(band, ((out, image), by))| {
@@ -199,16 +203,17 @@ impl Kernel for Unproject<'_> {
         for (i, (flat, out)) in self.flats.iter().zip(self.out).enumerate() {
             let i = self.first + i;
             let places = self.bins.firsts[i] as usize..self.bins.firsts[i + 1] as usize;
-            let mut sums = [0.0; 10];
+            let mut sums = [0.0; SUMS];
             for &place in &self.bins.places[places] {
                 let pair = &self.pairs[place as usize];
-                for k in 0..10 {
+                for k in 0..SUMS {
                     sums[k] += pair[k];
                 }
             }
             let by = flat_gradient(flat, &sums);
             *out =
                 Flat::backward(self.gaussians.row(flat.index as usize), self.view, self.style, &by);
+            out.error = sums[SUMS - 1];
         }
     }
 }

@@ -6,7 +6,6 @@
 
 mod start;
 
-use glam::Vec3;
 use vizflyt_splat::Splats;
 use vizflyt_splat::simd::InstructionSet;
 
@@ -52,7 +51,7 @@ impl Default for Options {
             hold_out: 8,
             antialiased: false,
             exposure: true,
-            weights: Weights { dssim: 0.2, depth: 0.2, spread: 0.02 },
+            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02 },
             tolls: Tolls { opacity: 0.01, scale: 0.01, thickness: 0.1, needle: 0.001 },
         }
     }
@@ -71,6 +70,8 @@ pub struct Trainer<'a> {
     loss: Loss,
     gradients: Vec<RowGradient>,
     seen: Vec<u32>,
+    /// Error seen through each Gaussian since they last moved house.
+    errors: Vec<f32>,
     /// Photos still to come before all are shuffled again.
     queue: Vec<usize>,
     random: Random,
@@ -110,6 +111,7 @@ impl<'a> Trainer<'a> {
             options,
             extent,
             moments: Moments::of(&gaussians),
+            errors: vec![0.0; gaussians.len()],
             gaussians,
             exposures: vec![ExposureState::default(); dataset.photos.len()],
             renderer: Renderer::default(),
@@ -165,6 +167,9 @@ impl<'a> Trainer<'a> {
         self.seen.clear();
         self.seen.extend(self.renderer.seen().map(|row| row as u32));
         self.renderer.backward(&self.gaussians, view, style, by, &mut self.gradients);
+        for (&row, by) in self.seen.iter().zip(&self.gradients) {
+            self.errors[row as usize] += by.error;
+        }
         self.step += 1;
         let rates = self.rates();
         let step = Step {
@@ -186,7 +191,8 @@ impl<'a> Trainer<'a> {
             wander(&mut self.gaussians, &self.seen, NOISE * rates.mean, seed);
             if self.step.is_multiple_of(RELOCATE_EVERY) {
                 let grow = self.growth();
-                relocate(&mut self.gaussians, &mut self.moments, grow, &mut self.random);
+                let (gaussians, moments) = (&mut self.gaussians, &mut self.moments);
+                relocate(gaussians, moments, &mut self.errors, grow, &mut self.random);
             }
         }
         parts
@@ -272,12 +278,6 @@ impl<'a> Trainer<'a> {
         let factor = (budget as f32 / count.max(1) as f32).powf(1.0 / left.max(1.0));
         let wanted = (count as f32 * (factor.min(MAX_GROWTH) - 1.0)).ceil().max(0.0) as usize;
         wanted.min(budget.saturating_sub(count))
-    }
-
-    /// Returns the middle of the cameras, for tests and reports. [units of the dataset]
-    pub fn middle(&self) -> Vec3 {
-        let sum: Vec3 = self.dataset.photos.iter().map(|photo| photo.view.position).sum();
-        sum / self.dataset.photos.len() as f32
     }
 }
 

@@ -1,4 +1,4 @@
-//! `vizflyt scene`: makes, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, trains, bakes, inspects and renders scenes.
 
 mod align;
 mod bake;
@@ -8,6 +8,7 @@ mod generate;
 mod inspect;
 mod npy;
 mod render;
+mod train;
 
 use std::process::ExitCode;
 
@@ -16,7 +17,7 @@ use clap::{Args, Subcommand};
 
 use crate::terminal::{open_browser, print_line};
 
-/// Makes, bakes, inspects and renders scenes.
+/// Makes, trains, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -31,6 +32,7 @@ enum SceneCommand {
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
+    Train(train::TrainArgs),
     View(vizflyt_server::ViewArgs),
 }
 
@@ -43,6 +45,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
+        SceneCommand::Train(args) => train::run(&args)?,
         SceneCommand::View(args) => view(args)?,
     }
     Ok(ExitCode::SUCCESS)

@@ -150,6 +150,7 @@ mod tests {
     fn splats(means_m: Vec<Vec3>) -> Splats {
         let count = means_m.len();
         Splats {
+            antialiased: false,
             means_m,
             scales_m: vec![Vec3::splat(0.1); count],
             rotations: vec![Quat::IDENTITY; count],

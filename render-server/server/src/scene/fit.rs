@@ -165,6 +165,7 @@ mod tests {
         }
         let count = means_m.len();
         Splats {
+            antialiased: false,
             means_m,
             scales_m: vec![Vec3::new(0.1, 0.1, 0.01); count],
             rotations,

@@ -99,6 +99,7 @@ mod tests {
         let on_line = |k: usize| k as f32 * 0.1 - 1.0;
         let places = (0..441).map(|k| (on_line(k % 21), on_line(k / 21)));
         Splats {
+            antialiased: false,
             means_m: places.map(|(x, y)| Vec3::new(x, y, height_m(x, y))).collect(),
             scales_m: vec![Vec3::new(0.1, 0.1, 0.005); 441],
             rotations: vec![rotation; 441],

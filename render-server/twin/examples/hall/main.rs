@@ -1,123 +1,137 @@
 //! Captures a generated room, rebuilds it from the photos, and says how far the twin is from the truth.
+//!
+//! ```text
+//! cargo run --release -p vizflyt-twin --example hall
+//! cargo run --release -p vizflyt-twin --example hall -- steps=1000 splats=40000 folder=hall sheet=hall.png
+//! ```
+//! `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
+//! the depths of both. Other keys are those of [`Options`].
 
 mod capture;
+mod folder;
 mod judge;
 
-use std::time::Instant;
+use std::error::Error;
+use std::path::PathBuf;
 
 use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_twin::dataset::{Dataset, Photo, Point};
-use vizflyt_twin::loss::{SeenPoint, Target};
-use vizflyt_twin::{Options, Trainer, View};
+use vizflyt_splat::CpuRenderer;
+use vizflyt_twin::{Dataset, Options, Trainer};
 
-fn main() {
-    let mut options = Options { degree: 1, ..Options::default() };
-    let mut shots = None;
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut options = Options::default();
+    let (mut kept, mut sheet) = (None, None);
     for arg in std::env::args().skip(1) {
-        let (key, value) = arg.split_once('=').expect("key=value");
-        let number = || value.parse::<f32>().expect("a number");
+        let (key, value) = arg.split_once('=').ok_or("options are KEY=VALUE")?;
+        let number = || value.parse::<f32>();
         match key {
-            "steps" => options.steps = number() as u32,
-            "splats" => options.splats = number() as usize,
-            "degree" => options.degree = number() as u8,
-            "dssim" => options.weights.dssim = number(),
-            "depth" => options.weights.depth = number(),
-            "spread" => options.weights.spread = number(),
-            "opacity" => options.tolls.opacity = number(),
-            "scale" => options.tolls.scale = number(),
-            "thickness" => options.tolls.thickness = number(),
-            "needle" => options.tolls.needle = number(),
-            "exposure" => options.exposure = number() > 0.0,
-            "shots" => shots = Some(value.to_owned()),
-            _ => panic!("unknown {key}"),
+            "steps" => options.steps = value.parse()?,
+            "splats" => options.splats = value.parse()?,
+            "degree" => options.degree = value.parse()?,
+            "seed" => options.seed = value.parse()?,
+            "dssim" => options.weights.dssim = number()?,
+            "depth" => options.weights.depth = number()?,
+            "spread" => options.weights.spread = number()?,
+            "opacity" => options.tolls.opacity = number()?,
+            "scale" => options.tolls.scale = number()?,
+            "thickness" => options.tolls.thickness = number()?,
+            "needle" => options.tolls.needle = number()?,
+            "antialiased" => options.antialiased = number()? > 0.0,
+            "folder" => kept = Some(PathBuf::from(value)),
+            "sheet" => sheet = Some(PathBuf::from(value)),
+            _ => return Err(format!("no option is called '{key}'").into()),
         }
     }
     let scene = generate(SceneKind::Room, 3);
     let capture = capture::capture(&scene.splats, 1);
-    let observed: usize = capture.points.iter().map(|p| p.seen.len()).sum();
+    let scratch = tempfile::tempdir()?;
+    let folder = kept.as_deref().unwrap_or(scratch.path());
+    folder::write(&capture, folder)?;
+    let dataset = Dataset::read(folder, None)?;
     println!(
-        "{} splats, {} points seen {observed} times",
+        "capture      {} photos of {} splats, {} points",
+        dataset.photos.len(),
         scene.splats.len(),
-        capture.points.len()
+        dataset.points.len()
     );
-    let mut dataset = Dataset::default();
-    for (i, photo) in capture.photos.iter().enumerate() {
-        let view = View::new(&capture.intrinsics, &photo.world_from_cam, 0.05);
-        let mut target = Target {
-            width: view.width,
-            height: view.height,
-            rgb: photo.rgb.clone(),
-            ..Target::default()
-        };
-        for point in &capture.points {
-            for &(j, [x, y]) in &point.seen {
-                if j == i
-                    && let Some((_, z)) = view.project(point.p_world_m)
-                {
-                    target.points.push(SeenPoint {
-                        pixel: (y as usize * view.width + x as usize) as u32,
-                        z,
-                    });
-                }
-            }
-        }
-        dataset.photos.push(Photo { name: i.to_string(), view, target });
-    }
-    dataset.points =
-        capture.points.iter().map(|p| Point { position: p.p_world_m, rgb: p.rgb }).collect();
-    let start = Instant::now();
-    let cpu = cpu_s();
+
+    let start_s = cpu_s();
     let mut trainer = Trainer::new(&dataset, options);
-    for i in 1..=options.steps {
+    while trainer.steps() < options.steps {
         let parts = trainer.step();
-        if i % 500 == 0 || i == 100 {
+        if trainer.steps() % 500 == 0 {
             println!(
-                "{i:5} {parts:?} {} gaussians, {:.1} cpu-ms/step, {:.1} s",
+                "step {:7} L1 {:.4}, SSIM {:.3}, depth {:.4}, spread {:.4}, {} splats, {:.1} CPU-ms a step",
+                trainer.steps(),
+                parts.l1,
+                parts.ssim,
+                parts.depth,
+                parts.spread,
                 trainer.gaussians().len(),
-                (cpu_s() - cpu) * 1e3 / f64::from(i),
-                start.elapsed().as_secs_f64()
+                (cpu_s() - start_s) * 1e3 / f64::from(trainer.steps())
             );
         }
     }
-    println!("{:?}", trainer.judge());
+    let took_s = cpu_s() - start_s;
+    let quality = trainer.judge().ok_or("no photo was held out")?;
     let splats = trainer.splats();
+    let only = |i: usize| i.is_multiple_of(options.hold_out);
+    let verdict = judge::judge(&splats, &scene.splats, &scene.arena, &capture, only);
+    println!("processor    {took_s:.0} s for {} steps, {} splats", options.steps, splats.len());
+    println!("held out     PSNR {:.2} dB, SSIM {:.3}", quality.psnr_db, quality.ssim);
     println!(
-        "held out {:?}",
-        judge::judge(&splats, &scene.splats, &scene.arena, &capture, |i| i % 8 == 0)
+        "depth        median error {:.2} %, {:.1} % of pixels within 10 %",
+        verdict.depth_median * 100.0,
+        verdict.within_tenth * 100.0
     );
     println!(
-        "all      {:?}",
-        judge::judge(&splats, &scene.splats, &scene.arena, &capture, |_| true)
+        "obstacles    {:.2} times the true voxels, {:.1} % of them further than two voxels from a true one",
+        verdict.occupied,
+        verdict.made_up * 100.0
     );
-    if let Some(path) = shots {
-        vizflyt_splat::ply::write(&path, &splats).unwrap();
-        let mut renderer = vizflyt_splat::CpuRenderer::new(&splats);
-        let (w, h) = (320u32, 240u32);
-        let mut sheet = image::RgbImage::new(4 * w, 4 * h);
-        for (row, i) in [0usize, 16, 40, 56].into_iter().enumerate() {
-            let photo = &capture.photos[i];
-            let image = capture::render(&mut renderer, capture.intrinsics, photo.world_from_cam);
-            let mut rgb = Vec::new();
-            image.write_rgb8(&mut rgb);
-            let depth = capture::depth_m(&image);
-            for n in 0..(w * h) as usize {
-                let (x, y) = (n as u32 % w, n as u32 / w + row as u32 * h);
-                let of = |rgb: &[u8]| image::Rgb([rgb[3 * n], rgb[3 * n + 1], rgb[3 * n + 2]]);
-                let grey = |d: f32| image::Rgb([(d * 18.0).min(255.0) as u8; 3]);
-                sheet.put_pixel(x, y, of(&photo.rgb));
-                sheet.put_pixel(x + w, y, of(&rgb));
-                sheet.put_pixel(x + 2 * w, y, grey(photo.true_depth_m[n]));
-                sheet.put_pixel(x + 3 * w, y, grey(depth[n]));
-            }
-        }
-        sheet.save(format!("{path}.png")).unwrap();
+    if let Some(path) = sheet {
+        draw(&splats, &capture, &path)?;
     }
+    Ok(())
 }
 
-/// Returns the processor time of this process. [s]
+/// Writes truth and twin next to each other, colour and depth, of some held-out photos.
+fn draw(
+    splats: &vizflyt_splat::Splats,
+    capture: &capture::Capture,
+    path: &std::path::Path,
+) -> Result<(), Box<dyn Error>> {
+    let mut renderer = CpuRenderer::new(splats);
+    let (width, height) = (capture.intrinsics.width_px, capture.intrinsics.height_px);
+    let shown = [0usize, 16, 40, 56];
+    let mut sheet = image::RgbImage::new(4 * width, shown.len() as u32 * height);
+    for (row, i) in (0..).zip(shown) {
+        let photo = &capture.photos[i];
+        let image = capture::render(&mut renderer, capture.intrinsics, photo.world_from_cam);
+        let mut rgb = Vec::new();
+        image.write_rgb8(&mut rgb);
+        let depth_m = capture::depth_m(&image);
+        for n in 0..capture.intrinsics.pixels() {
+            let (x, y) = (n as u32 % width, n as u32 / width + row * height);
+            let colour = |rgb: &[u8]| image::Rgb([rgb[3 * n], rgb[3 * n + 1], rgb[3 * n + 2]]);
+            let grey = |depth_m: f32| image::Rgb([(depth_m * 18.0).min(255.0) as u8; 3]);
+            sheet.put_pixel(x, y, colour(&photo.rgb));
+            sheet.put_pixel(x + width, y, colour(&rgb));
+            sheet.put_pixel(x + 2 * width, y, grey(photo.true_depth_m[n]));
+            sheet.put_pixel(x + 3 * width, y, grey(depth_m[n]));
+        }
+    }
+    sheet.save(path)?;
+    Ok(())
+}
+
+/// Returns the processor time of this process, 0 where the system does not say. [s]
 fn cpu_s() -> f64 {
+    /// Linux's `USER_HZ`.
+    const TICKS_PER_S: f64 = 100.0;
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // Fields 14 and 15; the name before them may hold spaces.
     let fields: Vec<&str> = stat.rsplit(") ").next().unwrap_or("").split(' ').collect();
     let ticks = |i: usize| fields.get(i).and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
+    (ticks(11) + ticks(12)) / TICKS_PER_S
 }

@@ -53,7 +53,7 @@ fn rows(gaussians: &Gaussians) -> Vec<f64> {
 fn weights(view: &View, seed: u64) -> (Vec<[f64; channel::COUNT]>, Planes) {
     let mut random = Random::new(seed);
     let mut by = Planes::default();
-    by.resize(channel::COUNT, view.width, view.height);
+    by.resize(channel::BY_COUNT, view.width, view.height);
     let mut weights = Vec::new();
     for y in 0..view.height {
         for x in 0..view.width {

@@ -1,0 +1,227 @@
+//! `vizflyt scene train`: a scene from photos with known poses.
+
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::Serialize;
+use vizflyt_splat::format::{self, Format};
+use vizflyt_twin::train::Quality;
+use vizflyt_twin::{Dataset, Options, Trainer};
+
+use crate::terminal::print_fmt;
+
+/// Trains a scene from photos with known poses, on the processor.
+#[derive(Args, Debug)]
+#[command(after_help = "DATASET is a folder of one of these kinds:
+  COLMAP      sparse/0 with cameras, images, points3D (.bin or .txt), and images/; masks/NAME.png may
+              black out what shall not count. Lenses: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
+              OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE
+  nerfstudio  transforms.json, with masks, depth images and a PLY of points where it names them
+Images are PNG or JPEG. The scene keeps the dataset's frame and unit of length.
+
+Examples:
+  vizflyt scene train my-hall -o my-hall.ply
+  vizflyt scene train my-hall -o my-hall.ply --width 640 --steps 7000 --splats 200000 --report my-hall.json
+  vizflyt scene view my-hall.ply")]
+pub(crate) struct TrainArgs {
+    /// Folder with the photos and their poses
+    dataset: PathBuf,
+    /// Scene file to write; its name decides on the format: .ply, .spz, .sog, ...
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Replaces a file that is already there
+    #[arg(long)]
+    force: bool,
+    /// Steps, one photo each
+    #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    steps: u32,
+    /// The most splats
+    #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = splats)]
+    splats: usize,
+    /// Width that wider photos are made smaller to [px]
+    #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
+    width: u32,
+    /// Degree of the harmonics: how colours may change with the direction of view
+    #[arg(long, default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh_degree: u8,
+    /// Same dataset, same options, same seed: the same scene on the same kind of processor
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Holds every N-th photo out of training, to judge by; 0 holds none out
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    hold_out: usize,
+    /// Photos have one brightness and colour: do not solve for each one's
+    #[arg(long)]
+    no_exposure: bool,
+    /// Trains for a renderer that dims splats smaller than a pixel (mip-splatting)
+    #[arg(long)]
+    antialiased: bool,
+    /// Writes what was done and how good it is as JSON
+    #[arg(long, value_name = "FILE.json")]
+    report: Option<PathBuf>,
+}
+
+/// What `--report` holds.
+#[derive(Debug, Serialize)]
+struct Report {
+    dataset: String,
+    photos: usize,
+    points: usize,
+    width_px: usize,
+    height_px: usize,
+    steps: u32,
+    splats: usize,
+    seed: u64,
+    antialiased: bool,
+    seconds: f64,
+    /// Of photos that training did not see; absent if none was held out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    held_out: Option<Quality>,
+}
+
+fn splats(text: &str) -> Result<usize, String> {
+    let count: usize = text.parse().map_err(|_| format!("'{text}' is no whole number"))?;
+    if (1000..=20_000_000).contains(&count) {
+        return Ok(count);
+    }
+    Err(format!("{count} is outside 1000 to 20000000"))
+}
+
+/// Runs `vizflyt scene train`.
+pub(crate) fn run(args: &TrainArgs) -> Result<()> {
+    check_output(&args.output, args.force)?;
+    let start = Instant::now();
+    let dataset = Dataset::read(&args.dataset, Some(args.width))?;
+    let view = &dataset.photos[0].view;
+    print_fmt!(
+        "dataset      {} photos of {} x {} and others, {} points, read in {:.1} s",
+        dataset.photos.len(),
+        view.width,
+        view.height,
+        dataset.points.len(),
+        start.elapsed().as_secs_f64()
+    );
+    let observed: usize = dataset.photos.iter().map(|photo| photo.target.points.len()).sum();
+    if observed == 0 && dataset.photos.iter().all(|photo| photo.target.depth.is_empty()) {
+        print_fmt!(
+            "no depth     neither points seen by three photos nor depth images: surfaces will be off"
+        );
+    }
+    let options = Options {
+        steps: args.steps,
+        splats: args.splats,
+        degree: args.sh_degree,
+        seed: args.seed,
+        hold_out: if args.hold_out == 1 {
+            bail!("--hold-out 1 leaves no photo to train with")
+        } else {
+            args.hold_out
+        },
+        antialiased: args.antialiased,
+        exposure: !args.no_exposure,
+        ..Options::default()
+    };
+    let mut trainer = Trainer::new(&dataset, options);
+    let mut progress = Progress::new(args.steps);
+    while trainer.steps() < args.steps {
+        let parts = trainer.step();
+        progress.show(trainer.steps(), trainer.gaussians().len(), parts.l1);
+    }
+    Progress::clear();
+    let held_out = trainer.judge();
+    let splats = trainer.splats();
+    format::write(&args.output, &splats)?;
+    let report = Report {
+        dataset: args.dataset.display().to_string(),
+        photos: dataset.photos.len(),
+        points: dataset.points.len(),
+        width_px: view.width,
+        height_px: view.height,
+        steps: args.steps,
+        splats: splats.len(),
+        seed: args.seed,
+        antialiased: args.antialiased,
+        seconds: start.elapsed().as_secs_f64(),
+        held_out,
+    };
+    print_fmt!("trained      {} steps in {:.0} s", report.steps, report.seconds);
+    if let Some(quality) = &report.held_out {
+        print_fmt!(
+            "held out     {} photos: PSNR {:.2} dB, SSIM {:.3}",
+            quality.photos,
+            quality.psnr_db,
+            quality.ssim
+        );
+    }
+    print_fmt!("scene        {} splats in {}", report.splats, args.output.display());
+    if let Some(path) = &args.report {
+        let text = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Refuses what would only fail after the training.
+fn check_output(output: &Path, force: bool) -> Result<()> {
+    if Format::of_name(output).is_none() {
+        bail!("{}: no format has this ending; try .ply", output.display());
+    }
+    if output.exists() && !force {
+        bail!("{} is already there; give another name, or --force to replace it", output.display());
+    }
+    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
+    if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+        bail!("the folder {} is not there; make it first", folder.display());
+    }
+    Ok(())
+}
+
+/// What is done and how long the rest takes, on standard error: a line that changes where people
+/// watch, else a line every half minute.
+#[derive(Debug)]
+struct Progress {
+    steps: u32,
+    start: Instant,
+    next: Duration,
+}
+
+impl Progress {
+    fn new(steps: u32) -> Self {
+        Self { steps, start: Instant::now(), next: Duration::ZERO }
+    }
+
+    fn show(&mut self, step: u32, splats: usize, error: f64) {
+        let elapsed = self.start.elapsed();
+        if elapsed < self.next {
+            return;
+        }
+        let mut stderr = std::io::stderr();
+        let watched = stderr.is_terminal();
+        self.next = elapsed + Duration::from_millis(if watched { 250 } else { 30_000 });
+        // Later steps render more splats: a little longer than so far.
+        let left_s = elapsed.as_secs_f64() / f64::from(step) * f64::from(self.steps - step) * 1.1;
+        let line = format!(
+            "step {step} of {}, {splats} splats, error {error:.4}, {}:{:02} left",
+            self.steps,
+            left_s as u64 / 60,
+            left_s as u64 % 60
+        );
+        // A terminal that is gone is no reason to stop.
+        let _ = if watched {
+            write!(stderr, "\r{line:<78}").and_then(|()| stderr.flush())
+        } else {
+            writeln!(stderr, "{line}")
+        };
+    }
+
+    fn clear() {
+        let mut stderr = std::io::stderr();
+        if stderr.is_terminal() {
+            let _ = write!(stderr, "\r{:<78}\r", "").and_then(|()| stderr.flush());
+        }
+    }
+}

@@ -1,0 +1,205 @@
+//! Folders to datasets, and datasets to twins: a room of a few splats, photographed, written as COLMAP and
+//! nerfstudio do, read, and trained.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use glam::{DQuat, DVec3, Quat, Vec3};
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+use vizflyt_splat::{Camera, Splats, render_reference};
+use vizflyt_twin::random::Random;
+use vizflyt_twin::{Dataset, Options, Trainer};
+
+const PHOTOS: usize = 6;
+
+fn intrinsics() -> Intrinsics {
+    Intrinsics::from_horizontal_fov(48, 36, 1.2)
+}
+
+/// Along a line, looking at a wall 3 units ahead.
+fn pose(i: usize) -> Pose<World, Cam> {
+    let x = 0.3 * (i as f64 - 2.5);
+    Pose::new(DVec3::new(x, 0.1 * (i % 2) as f64, 0.0), DQuat::from_rotation_y(-0.1 * x))
+}
+
+/// A wall of coloured discs.
+fn wall() -> Splats {
+    let mut random = Random::new(2);
+    let mut splats = Splats::default();
+    for n in 0..400 {
+        let (x, y) = ((n % 20) as f32 * 0.3 - 2.85, (n / 20) as f32 * 0.25 - 2.4);
+        splats.means_m.push(Vec3::new(x, y, 3.0));
+        splats.scales_m.push(Vec3::new(0.2, 0.2, 0.01));
+        splats.rotations.push(Quat::IDENTITY);
+        splats.opacities.push(0.95);
+        let side = f32::from((n / 3 + n / 60) % 2 == 0);
+        splats.sh.extend([side, 0.5 - side, 0.3 * random.unit()]);
+    }
+    splats
+}
+
+fn photograph(folder: &Path) {
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    let wall = wall();
+    for i in 0..PHOTOS {
+        let image =
+            render_reference(&wall, &[], &Camera::new(intrinsics(), pose(i), 0.05)).unwrap();
+        let mut rgb = Vec::new();
+        image.write_rgb8(&mut rgb);
+        let path = folder.join(format!("images/{i}.png"));
+        image::save_buffer(path, &rgb, 48, 36, image::ExtendedColorType::Rgb8).unwrap();
+        let mm: Vec<u8> =
+            image.depth_median_m.iter().flat_map(|d| ((d * 1e3) as u16).to_ne_bytes()).collect();
+        let path = folder.join(format!("images/{i}_depth.png"));
+        image::save_buffer(path, &mm, 48, 36, image::ExtendedColorType::L16).unwrap();
+    }
+}
+
+fn colmap(folder: &Path) {
+    photograph(folder);
+    let sparse = folder.join("sparse/0");
+    std::fs::create_dir_all(&sparse).unwrap();
+    let k = intrinsics();
+    let camera = format!("1 SIMPLE_PINHOLE 48 36 {} 24 18\n", k.fx_px);
+    std::fs::write(sparse.join("cameras.txt"), camera).unwrap();
+    let wall = wall();
+    let (mut images, mut points) = (String::new(), String::new());
+    for (i, p) in wall.means_m.iter().enumerate().step_by(7) {
+        writeln!(points, "{} {} {} {} 120 120 120 0.5 1 0 2 0 3 0", i + 1, p.x, p.y, p.z).unwrap();
+    }
+    for i in 0..PHOTOS {
+        let Pose { translation_m: t, rotation: q, .. } = pose(i).inverse();
+        writeln!(
+            images,
+            "{} {} {} {} {} {} {} {} 1 {i}.png",
+            i + 1,
+            q.w,
+            q.x,
+            q.y,
+            q.z,
+            t.x,
+            t.y,
+            t.z
+        )
+        .unwrap();
+        for (n, p) in wall.means_m.iter().enumerate().step_by(7) {
+            let p_cam = pose(i).inverse().transform_point(p.as_dvec3());
+            if let Some(at) = k.project(p_cam) {
+                write!(images, "{} {} {} ", at.x, at.y, n + 1).unwrap();
+            }
+        }
+        images.push('\n');
+    }
+    std::fs::write(sparse.join("images.txt"), images).unwrap();
+    std::fs::write(sparse.join("points3D.txt"), points).unwrap();
+}
+
+fn nerfstudio(folder: &Path) {
+    photograph(folder);
+    let k = intrinsics();
+    let frames: Vec<String> = (0..PHOTOS)
+        .map(|i| {
+            let Pose { translation_m: t, rotation, .. } = pose(i);
+            // OpenGL's camera: y up, z backward.
+            let [x, y, z] = [rotation * DVec3::X, rotation * -DVec3::Y, rotation * -DVec3::Z];
+            let row = |k: usize| format!("[{}, {}, {}, {}]", x[k], y[k], z[k], t[k]);
+            format!(
+                "{{\"file_path\": \"images/{i}.png\", \"depth_file_path\": \"images/{i}_depth.png\", \
+                 \"transform_matrix\": [{}, {}, {}, [0, 0, 0, 1]]}}",
+                row(0), row(1), row(2)
+            )
+        })
+        .collect();
+    let text = format!(
+        "{{\"camera_model\": \"PINHOLE\", \"fl_x\": {}, \"w\": 48, \"h\": 36, \"frames\": [{}]}}",
+        k.fx_px,
+        frames.join(", ")
+    );
+    std::fs::write(folder.join("transforms.json"), text).unwrap();
+}
+
+fn options() -> Options {
+    Options { steps: 150, splats: 1500, degree: 0, hold_out: 3, ..Options::default() }
+}
+
+fn train(dataset: &Dataset) -> (f64, Splats) {
+    let mut trainer = Trainer::new(dataset, options());
+    while trainer.steps() < options().steps {
+        trainer.step();
+    }
+    (trainer.judge().unwrap().psnr_db, trainer.splats())
+}
+
+#[test]
+fn a_wall_is_rebuilt_from_either_kind_of_folder() {
+    for write in [colmap as fn(&Path), nerfstudio] {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path());
+        let dataset = Dataset::read(folder.path(), None).unwrap();
+        assert_eq!(dataset.photos.len(), PHOTOS);
+        let before = Trainer::new(&dataset, options()).judge().unwrap().psnr_db;
+        let (after, splats) = train(&dataset);
+        assert!(after > before + 0.5 && after > 22.0, "{before:.1} dB, then {after:.1}");
+        // Where it is, not only how it looks.
+        let image =
+            render_reference(&splats, &[], &Camera::new(intrinsics(), pose(3), 0.05)).unwrap();
+        let mut errors: Vec<f32> =
+            image.depth_median_m.iter().map(|d| (d / 3.0 - 1.0).abs()).collect();
+        errors.sort_by(f32::total_cmp);
+        assert!(errors[errors.len() / 2] < 0.05, "{}", errors[errors.len() / 2]);
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_twin_on_any_number_of_threads() {
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path());
+    let dataset = Dataset::read(folder.path(), None).unwrap();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| train(&dataset))
+    };
+    let one = on(1);
+    assert!(one == on(4), "four threads train another twin");
+}
+
+#[test]
+fn photos_become_smaller_and_poses_stay() {
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path());
+    let whole = Dataset::read(folder.path(), None).unwrap();
+    let half = Dataset::read(folder.path(), Some(24)).unwrap();
+    let (a, b) = (&whole.photos[2].view, &half.photos[2].view);
+    assert_eq!((b.width, b.height, a.position), (24, 18, b.position));
+    let p = Vec3::new(0.2, -0.4, 3.0);
+    let (([u, v], _), ([x, y], _)) = (a.project(p).unwrap(), b.project(p).unwrap());
+    assert!((u / 2.0 - x).abs() < 1e-4 && (v / 2.0 - y).abs() < 1e-4);
+    assert!(!whole.photos[2].target.points.is_empty());
+}
+
+#[test]
+fn a_damaged_folder_is_refused_in_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |says: &str| {
+        let error = Dataset::read(folder.path(), None).unwrap_err().to_string();
+        assert!(error.contains(says), "{error}");
+    };
+    refused("transforms.json");
+    colmap(folder.path());
+    let image = folder.path().join("images/3.png");
+    let bytes = std::fs::read(&image).unwrap();
+    std::fs::write(&image, &bytes[..bytes.len() / 2]).unwrap();
+    refused("3.png");
+    std::fs::write(&image, "<html>not found</html>").unwrap();
+    refused("neither PNG nor JPEG");
+    std::fs::remove_file(&image).unwrap();
+    refused("cannot read");
+    image::save_buffer(&image, &[0; 300], 10, 10, image::ExtendedColorType::Rgb8).unwrap();
+    refused("another shape");
+    let sparse = folder.path().join("sparse/0");
+    std::fs::write(sparse.join("cameras.txt"), "1 FOV 48 36 30 30 24 18 0.9\n").unwrap();
+    refused("colmap image_undistorter");
+    std::fs::write(sparse.join("images.txt"), "").unwrap();
+    std::fs::write(sparse.join("cameras.txt"), "").unwrap();
+    refused("at least 2");
+}
