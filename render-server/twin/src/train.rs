@@ -51,7 +51,7 @@ impl Default for Options {
             hold_out: 8,
             antialiased: false,
             exposure: true,
-            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02 },
+            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02, bend: 0.1 },
             tolls: Tolls { opacity: 0.01, scale: 0.01, thickness: 0.1, needle: 0.001 },
         }
     }

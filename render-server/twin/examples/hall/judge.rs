@@ -49,6 +49,7 @@ pub(crate) fn judge(
     let (rebuilt, right) = (bake(splats), bake(truth));
     let size = spec.grid.size;
     let (mut count, mut made_up) = (0usize, 0usize);
+    let mut heights = [0usize; 12];
     for n in 0..spec.grid.voxels() {
         let voxel = [n / (size[1] * size[2]), n / size[2] % size[1], n % size[2]];
         if !rebuilt.is_occupied(voxel) {
@@ -62,7 +63,11 @@ pub(crate) fn judge(
                 && right.is_occupied(at.map(|v| v as usize))
         });
         made_up += usize::from(!near);
+        if !near {
+            heights[(voxel[2] * 12 / size[2]).min(11)] += 1;
+        }
     }
+    println!("{heights:?} of {} true {}", rebuilt.counts().occupied, right.counts().occupied);
     Verdict {
         depth_median: f64::from(errors[errors.len() / 2]),
         within_tenth: within,

@@ -32,6 +32,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             "dssim" => options.weights.dssim = number()?,
             "depth" => options.weights.depth = number()?,
             "spread" => options.weights.spread = number()?,
+            "bend" => options.weights.bend = number()?,
             "opacity" => options.tolls.opacity = number()?,
             "scale" => options.tolls.scale = number()?,
             "thickness" => options.tolls.thickness = number()?,
