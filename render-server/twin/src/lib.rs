@@ -14,6 +14,7 @@ pub mod random;
 pub mod reference;
 mod relocate;
 mod render;
+mod smooth;
 mod ssim;
 pub mod train;
 mod view;

@@ -9,7 +9,7 @@ use vizflyt_splat::simd::InstructionSet;
 
 use crate::planes::{Planes, TILE};
 use crate::render::channel;
-use crate::ssim;
+use crate::{smooth, ssim};
 
 /// A photo and what is known of the depths in it.
 #[derive(Clone, Debug, Default)]
@@ -46,6 +46,8 @@ pub struct Weights {
     pub depth: f32,
     /// Of the mean relative variance of depth along rays.
     pub spread: f32,
+    /// Of the mean bend of inverse depth from pixel to pixel.
+    pub bend: f32,
 }
 
 /// Brightness and colour of a photo against the others: `gain rgb + offset`, channel by channel.
@@ -105,6 +107,8 @@ pub struct Parts {
     pub depth: f64,
     /// Mean relative variance of depth along rays.
     pub spread: f64,
+    /// Mean bend of inverse depth, in shares of its mean.
+    pub bend: f64,
 }
 
 impl Parts {
@@ -115,6 +119,7 @@ impl Parts {
             + dssim * (1.0 - self.ssim)
             + f64::from(weights.depth) * self.depth
             + f64::from(weights.spread) * self.spread
+            + f64::from(weights.bend) * self.bend
     }
 }
 
@@ -126,6 +131,7 @@ pub struct Loss {
     truth: Planes,
     maps: Planes,
     by_shown: Planes,
+    inverse: Planes,
     /// The derivative by the image's channels.
     by: Planes,
 }
@@ -138,6 +144,7 @@ impl Default for Loss {
             truth: Planes::default(),
             maps: Planes::default(),
             by_shown: Planes::default(),
+            inverse: Planes::default(),
             by: Planes::default(),
         }
     }
@@ -161,7 +168,7 @@ impl Loss {
         self.expose(image, target, exposure, background);
         let numbers = (3 * width * height) as f64;
         let sum = ssim::similarity(self.instructions, &self.shown, &self.truth, &mut self.maps);
-        let Self { shown, truth, maps, by_shown, by, .. } = self;
+        let Self { shown, truth, maps, by_shown, inverse, by, .. } = self;
         ssim::derivative(self.instructions, shown, truth, maps, by_shown);
 
         by.resize(channel::BY_COUNT, width, height);
@@ -235,7 +242,11 @@ impl Loss {
             ssim: sum / numbers,
             depth: 0.0,
             spread: total[1] / (width * height) as f64,
+            bend: 0.0,
         };
+        if weights.bend > 0.0 {
+            parts.bend = smooth::add(image, truth, weights.bend, inverse, by);
+        }
         let counts = |i: usize, z: f32| z > 0.0 && target.mask.get(i) != Some(&0);
         if !target.depth.is_empty() {
             let pixels = (width * height) as f64;

@@ -40,7 +40,9 @@ fn search(points: &[Vec3], order: &[u32], axis: usize, p: Vec3, best: &mut [f32;
         }
     };
     if order.len() <= LEAF {
-        order.iter().for_each(|&i| note(i));
+        for &i in order {
+            note(i);
+        }
         return;
     }
     let middle = order.len() / 2;

@@ -1,7 +1,7 @@
 //! The plain truth of the passes: f64, one pixel after the other, no tiles. Derivatives are held
 //! against its finite differences.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
 use vizflyt_splat::harmonics;
 use vizflyt_splat::limits::{ALPHA_MAX, ALPHA_MIN, BLUR_PX2, TRANSMITTANCE_MIN};
 
@@ -62,7 +62,7 @@ struct Flat {
 impl Flat {
     fn of(row: &[f64], view: &View, style: Style) -> Option<Self> {
         let d = DVec3::from_slice(&row[column::MEAN..]) - view.position.as_dvec3();
-        let rows = view.rows.map(|row| row.as_dvec3());
+        let rows = view.rows.map(Vec3::as_dvec3);
         let z = rows[2].dot(d);
         if z <= f64::from(view.near) {
             return None;

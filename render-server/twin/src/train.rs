@@ -51,7 +51,7 @@ impl Default for Options {
             hold_out: 8,
             antialiased: false,
             exposure: true,
-            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02 },
+            weights: Weights { dssim: 0.2, depth: 0.5, spread: 0.02, bend: 0.1 },
             tolls: Tolls { opacity: 0.01, scale: 0.01, thickness: 0.1, needle: 0.001 },
         }
     }
@@ -142,10 +142,6 @@ impl<'a> Trainer<'a> {
         let visible: Vec<bool> = splats.opacities.iter().map(|&o| o >= 1.0 / 255.0).collect();
         let numbers = 3 * splats.sh_coefficients();
         let keep = |i: usize| visible[i];
-        fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
-            let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
-            *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
-        }
         retain(&mut splats.means_m, 1, keep);
         retain(&mut splats.scales_m, 1, keep);
         retain(&mut splats.rotations, 1, keep);
@@ -279,6 +275,12 @@ impl<'a> Trainer<'a> {
         let wanted = (count as f32 * (factor.min(MAX_GROWTH) - 1.0)).ceil().max(0.0) as usize;
         wanted.min(budget.saturating_sub(count))
     }
+}
+
+/// Keeps the items, `width` numbers each, that `keep` says.
+fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
+    let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
+    *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
 }
 
 impl ExposureState {

@@ -93,11 +93,14 @@ fn splats(text: &str) -> Result<usize, String> {
 /// Runs `vizflyt scene train`.
 pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     check_output(&args.output, args.force)?;
+    if args.hold_out == 1 {
+        bail!("--hold-out 1 leaves no photo to train with; give 0 to hold out none");
+    }
     let start = Instant::now();
     let dataset = Dataset::read(&args.dataset, Some(args.width))?;
     let view = &dataset.photos[0].view;
     print_fmt!(
-        "dataset      {} photos of {} x {} and others, {} points, read in {:.1} s",
+        "dataset      {} photos, the first {} x {}, {} points, read in {:.1} s",
         dataset.photos.len(),
         view.width,
         view.height,
@@ -115,11 +118,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         splats: args.splats,
         degree: args.sh_degree,
         seed: args.seed,
-        hold_out: if args.hold_out == 1 {
-            bail!("--hold-out 1 leaves no photo to train with")
-        } else {
-            args.hold_out
-        },
+        hold_out: args.hold_out,
         antialiased: args.antialiased,
         exposure: !args.no_exposure,
         ..Options::default()

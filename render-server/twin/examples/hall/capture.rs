@@ -46,7 +46,7 @@ fn pose(i: usize) -> Pose<World, Cam> {
     let position = DVec3::new(5.5 + 4.3 * t.cos(), 1.2 * t.sin(), 1.5 + 0.5 * (3.0 * t).sin());
     let ahead = (1.2 * t.cos()).atan2(-4.3 * t.sin());
     let yaw = ahead + 1.1 * (10.0 * t).sin();
-    let tilt = 0.1 + 0.45 * (7.0 * t).sin();
+    let tilt = 0.05 + 0.6 * (7.0 * t).sin();
     let world_from_body: Pose<World, Body> = Pose::new(position, DQuat::from_rotation_z(yaw));
     world_from_body * body_from_forward_cam(DVec3::ZERO, tilt)
 }

@@ -14,8 +14,9 @@ pub(crate) struct Verdict {
     pub(crate) within_tenth: f64,
     /// Occupied voxels over those baked from the true splats.
     pub(crate) occupied: f64,
-    /// Share of the occupied voxels with no true one within two voxels.
-    pub(crate) made_up: f64,
+    /// Occupied voxels within the fence, where vehicles fly, and those baked from the true splats.
+    pub(crate) within_fence: usize,
+    pub(crate) truly_within_fence: usize,
 }
 
 /// Judges; `only` says by which photos.
@@ -34,7 +35,7 @@ pub(crate) fn judge(
         errors.extend(pairs.filter(|(_, t)| **t > 0.0).map(|(d, t)| (d / t - 1.0).abs()));
     }
     errors.sort_by(f32::total_cmp);
-    let within = errors.partition_point(|&e| e <= 0.1) as f64 / errors.len() as f64;
+    let share = errors.partition_point(|&e| e <= 0.1) as f64 / errors.len() as f64;
 
     let spec = BakeSpec::of(arena);
     let bake = |splats: &Splats| {
@@ -47,26 +48,22 @@ pub(crate) fn judge(
         OccupancyGrid::bake(ellipsoids, &spec)
     };
     let (rebuilt, right) = (bake(splats), bake(truth));
-    let size = spec.grid.size;
-    let (mut count, mut made_up) = (0usize, 0usize);
-    for n in 0..spec.grid.voxels() {
-        let voxel = [n / (size[1] * size[2]), n / size[2] % size[1], n % size[2]];
-        if !rebuilt.is_occupied(voxel) {
-            continue;
-        }
-        count += 1;
-        let near = (0..125).any(|k| {
-            let at: [isize; 3] = [k / 25 - 2, k / 5 % 5 - 2, k % 5 - 2];
-            let at: [isize; 3] = std::array::from_fn(|a| voxel[a] as isize + at[a]);
-            (0..3).all(|a| at[a] >= 0 && (at[a] as usize) < size[a])
-                && right.is_occupied(at.map(|v| v as usize))
-        });
-        made_up += usize::from(!near);
-    }
+    let fence = &arena.geofence;
+    let within = |grid: &OccupancyGrid| {
+        let [across, deep, high] = spec.grid.size;
+        let voxels =
+            (0..across * deep * high).map(|n| [n / (deep * high), n / high % deep, n % high]);
+        let inside = |voxel: &[usize; 3]| {
+            let center_m = spec.grid.center_m(*voxel);
+            center_m.cmpge(fence.min_m).all() && center_m.cmple(fence.max_m).all()
+        };
+        voxels.filter(|voxel| grid.is_occupied(*voxel) && inside(voxel)).count()
+    };
     Verdict {
         depth_median: f64::from(errors[errors.len() / 2]),
-        within_tenth: within,
+        within_tenth: share,
         occupied: rebuilt.counts().occupied as f64 / right.counts().occupied as f64,
-        made_up: made_up as f64 / count.max(1) as f64,
+        within_fence: within(&rebuilt),
+        truly_within_fence: within(&right),
     }
 }

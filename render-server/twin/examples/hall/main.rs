@@ -32,6 +32,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             "dssim" => options.weights.dssim = number()?,
             "depth" => options.weights.depth = number()?,
             "spread" => options.weights.spread = number()?,
+            "bend" => options.weights.bend = number()?,
             "opacity" => options.tolls.opacity = number()?,
             "scale" => options.tolls.scale = number()?,
             "thickness" => options.tolls.thickness = number()?,
@@ -59,7 +60,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut trainer = Trainer::new(&dataset, options);
     while trainer.steps() < options.steps {
         let parts = trainer.step();
-        if trainer.steps() % 500 == 0 {
+        if trainer.steps().is_multiple_of(500) {
             println!(
                 "step {:7} L1 {:.4}, SSIM {:.3}, depth {:.4}, spread {:.4}, {} splats, {:.1} CPU-ms a step",
                 trainer.steps(),
@@ -85,9 +86,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         verdict.within_tenth * 100.0
     );
     println!(
-        "obstacles    {:.2} times the true voxels, {:.1} % of them further than two voxels from a true one",
-        verdict.occupied,
-        verdict.made_up * 100.0
+        "obstacles    {:.2} times the true voxels; within the fence {} where {} are true",
+        verdict.occupied, verdict.within_fence, verdict.truly_within_fence
     );
     if let Some(path) = sheet {
         draw(&splats, &capture, &path)?;

@@ -88,7 +88,7 @@ impl Dataset {
             .map(|plan| plan.load(width_px, &points))
             .collect::<Result<Vec<_>, _>>()?;
         photos.sort_by(|a, b| a.name.cmp(&b.name));
-        let points = points.into_iter().map(|(_, point)| point).collect();
+        let points = points.into_values().collect();
         let mut dataset = Self { photos, points };
         let near = NEAR * dataset.extent();
         for photo in &mut dataset.photos {

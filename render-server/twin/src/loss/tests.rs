@@ -41,7 +41,7 @@ fn target(random: &mut Random) -> Target {
     }
 }
 
-const WEIGHTS: Weights = Weights { dssim: 0.3, depth: 0.4, spread: 0.0 };
+const WEIGHTS: Weights = Weights { dssim: 0.3, depth: 0.4, spread: 0.0, bend: 0.0 };
 const BACKGROUND: [f32; 3] = [0.2, 0.9, 0.5];
 const EXPOSURE: Exposure = Exposure { gain: [1.1, 0.8, 0.95], offset: [0.05, -0.02, 0.1] };
 
@@ -129,4 +129,52 @@ fn the_same_image_has_no_loss() {
     let (parts, ..) = loss.of(&image, &target, &exposure, [0.0; 3], &WEIGHTS);
     assert!(parts.l1 < 1e-9 && (parts.ssim - 1.0).abs() < 1e-5, "{parts:?}");
     assert!(loss.quality(&image, &target, &exposure).0 > 90.0);
+}
+
+#[test]
+fn bends_have_the_derivative_of_finite_differences_and_planes_have_none() {
+    let mut random = Random::new(5);
+    let (mut image, truth) = (image(&mut random), {
+        let mut truth = Planes::default();
+        truth.resize(3, WIDTH, HEIGHT);
+        truth
+    });
+    let of = |image: &Planes| {
+        let (mut inverse, mut by) = (Planes::default(), Planes::default());
+        by.resize(channel::BY_COUNT, WIDTH, HEIGHT);
+        let bend = crate::smooth::add(image, &truth, 1.0, &mut inverse, &mut by);
+        (bend, by)
+    };
+    let (_, by) = of(&image);
+    let mean = |image: &Planes| {
+        let inverse = |i: usize| {
+            let (x, y) = (i % WIDTH, i / WIDTH);
+            (1.0 - image.at(channel::TRANSMITTANCE, x, y)) / image.at(channel::FIRST, x, y)
+        };
+        (0..WIDTH * HEIGHT).map(inverse).sum::<f32>()
+    };
+    for i in (0..WIDTH * HEIGHT).step_by(7) {
+        let (x, y) = (i % WIDTH, i / WIDTH);
+        for channel in [channel::FIRST, channel::TRANSMITTANCE] {
+            let here = image.at(channel, x, y);
+            // The mean that bends are shares of is held.
+            let whole = mean(&image);
+            let mut at = |value: f32| {
+                *image.at_mut(channel, x, y) = value;
+                of(&image).0 * f64::from(mean(&image) / whole)
+            };
+            let want = (at(here + 2e-3) - at(here - 2e-3)) / 4e-3;
+            at(here);
+            let got = f64::from(by.at(channel, x, y));
+            assert!((want - got).abs() < 0.03 * want.abs() + 1.5e-4, "{got} for {want}");
+        }
+    }
+    for y in 0..HEIGHT {
+        for x in 0..WIDTH {
+            let inverse = 0.2 + 0.01 * x as f32 + 0.02 * y as f32;
+            *image.at_mut(channel::TRANSMITTANCE, x, y) = 0.0;
+            *image.at_mut(channel::FIRST, x, y) = 1.0 / inverse;
+        }
+    }
+    assert!(of(&image).0 < 1e-6);
 }
