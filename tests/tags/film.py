@@ -1,6 +1,7 @@
-"""Reads a capture that `vizflyt scene generate --capture --tags` made, with pupil-apriltags and OpenCV alone: the encoded
-video has as many images as stated, of the stated size, and tags are where the truth puts them, row by row of the rolling
-shutter.
+"""Reads a capture that `vizflyt scene generate --capture --tags` made, with pupil-apriltags and OpenCV alone.
+
+The encoded video has as many images as stated, of the stated size, and tags are where the truth puts them, row by row
+of the rolling shutter.
 
 Usage: film.py VIZFLYT
 """
@@ -10,11 +11,10 @@ import pathlib
 import subprocess
 import sys
 import tempfile
-import tomllib
 
 import cv2
 import numpy as np
-from lab import rotation_of
+from lab import read_layout, rotation_of
 from pupil_apriltags import Detector
 
 SECONDS, FRAMES = 40, 420
@@ -64,9 +64,8 @@ def main() -> None:
             stdout=subprocess.DEVNULL,
         )
         truth = json.loads(film.with_suffix(".truth.json").read_text())
-        layout = tomllib.loads(film.with_suffix(".tags.toml").read_text())
-        assert layout["frame"] == "world"
-        assert [tag["id"] for tag in layout["tags"]] == [tag["id"] for tag in truth["tags"]]
+        layout = read_layout(film.with_suffix(".tags.toml"))
+        assert [tag.number for tag in layout] == [tag["id"] for tag in truth["tags"]]
         camera = truth["camera"]
         # ffmpeg decodes; OpenCV counts what it was given.
         video = cv2.VideoCapture(str(film))
@@ -87,17 +86,16 @@ def main() -> None:
             for tag in detector.detect(grey):
                 if tag.hamming > 0 or tag.decision_margin < 30:
                     continue
-                placed = next((known for known in layout["tags"] if known["id"] == tag.tag_id), None)
+                placed = next((known for known in layout if known.number == tag.tag_id), None)
                 if placed is None:
                     false += 1
                     continue
                 found += 1
                 seen.add(tag.tag_id)
-                half = placed["size_m"] / 2
-                turn = rotation_of(*placed["rotation_xyzw"])
+                half = placed.size_m / 2
                 # Low left first, counter-clockwise, as the detector lists them.
                 for (x, y), corner in zip([(-1, -1), (1, -1), (1, 1), (-1, 1)], tag.corners, strict=True):
-                    corner_m = np.array(placed["position_m"]) + turn @ np.array([x * half, y * half, 0.0])
+                    corner_m = placed.position_m + placed.rotation @ np.array([x * half, y * half, 0.0])
                     expected = corner_px(image, camera, corner_m)
                     assert expected is not None, f"tag {tag.tag_id} was found behind the camera"
                     off.append(corner - expected)
