@@ -145,12 +145,13 @@ mod tests {
         let rgb = vec![90; 3 * view.width * view.height];
         let target = Target { width: 320, height: 240, rgb, points, ..Target::default() };
         let photo = Photo { name: String::new(), view, target };
-        let below = |p: &&(Vec3, [f32; 3])| p.0.y / p.0.z > 0.62;
+        let below = |p: &&(Vec3, [f32; 3])| p.0.y / p.0.z > 0.38;
         let places = between_points(&photo);
         let floor: Vec<_> = places.iter().filter(below).collect();
         assert!(floor.len() > 10, "{} guesses", floor.len());
+        // At the depth of the nearest points they would lie as low as 2.4.
         for (p, _) in floor {
-            assert!((p.y - 1.5).abs() < 0.25, "{p}");
+            assert!((p.y - 1.5).abs() < 0.4, "{p}");
         }
     }
 }
