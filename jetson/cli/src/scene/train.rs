@@ -131,7 +131,8 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     }
     Progress::clear();
     let held_out = trainer.judge();
-    let splats = trainer.splats();
+    let mut splats = trainer.splats();
+    splats.antialiased = args.antialiased;
     format::write(&args.output, &splats)?;
     let report = Report {
         dataset: args.dataset.display().to_string(),
