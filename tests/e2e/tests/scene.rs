@@ -377,7 +377,9 @@ fn captured_room() -> Vec<u8> {
     let mut bytes =
         format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", rows.len());
     for name in names.split(' ') {
-        bytes += &format!("property float {name}\n");
+        bytes += "property float ";
+        bytes += name;
+        bytes.push('\n');
     }
     let mut bytes = (bytes + "end_header\n").into_bytes();
     bytes.extend(rows.iter().flatten().flat_map(|value| value.to_le_bytes()));

@@ -97,7 +97,9 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
 /// Refuses what cannot be meant. An arena that was made up may be only a little off.
 fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
     if !is_final {
-        findings.iter().for_each(|finding| warn!("{finding}"));
+        for finding in findings {
+            warn!("{finding}");
+        }
         return Ok(());
     }
     if findings.is_empty() {

@@ -15,7 +15,7 @@ pub(super) fn floor_share(splats: &Splats, place_m: DVec3, min_opacity: f32) -> 
     let cells: Vec<Vec2> = (0..per_side * per_side)
         .map(|k| DVec2::new(offset(k % per_side), offset(k / per_side)))
         .filter(|at| at.length() <= REACH_M)
-        .map(|at| at.as_vec2())
+        .map(glam::DVec2::as_vec2)
         .collect();
     // A bit for each step of height.
     let mut heights = vec![0_u16; cells.len()];

@@ -209,7 +209,7 @@ mod tests {
         assert_eq!((placement, placement.apply(&mut placed)), (Placement::IDENTITY, 0));
         let bits = |splats: &Splats| {
             let vectors = splats.means_m.iter().chain(&splats.scales_m).flat_map(Vec3::to_array);
-            let turns = splats.rotations.iter().flat_map(|q| q.to_array());
+            let turns = splats.rotations.iter().flat_map(Quat::to_array);
             let rest = splats.opacities.iter().chain(&splats.sh).copied();
             vectors.chain(turns).chain(rest).map(f32::to_bits).collect::<Vec<_>>()
         };

@@ -223,12 +223,13 @@ mod tests {
         }
     }
 
+    const ROOMS: usize = 500;
+
     #[test]
     fn sigmas_are_honest() {
         // 500 rooms whose points are off by 1 cm: what is wrong, in sigmas, squared, is 1 on the mean.
         let (mut tilt2, mut scale2, mut yaw2, mut outside) = (0.0, 0.0, 0.0, 0);
         let mut random = Random::new(5);
-        const ROOMS: usize = 500;
         for _ in 0..ROOMS {
             let truth = Similarity {
                 scale: 0.3,
