@@ -65,14 +65,15 @@ pub fn basis([x, y, z]: [f64; 3]) -> [f64; 16] {
 }
 
 /// A rotation of harmonics: those of a degree mix only among themselves, by a matrix per degree.
-pub(crate) struct Turn {
+#[derive(Clone, Debug)]
+pub struct Turn {
     /// Of degree 1 and on; none where nothing turns.
     mixes: Vec<[[f32; 7]; 7]>,
 }
 
 impl Turn {
     /// Returns what a rotation does to harmonics up to a degree.
-    pub(crate) fn new(rotation: DQuat, degree: u8) -> Self {
+    pub fn new(rotation: DQuat, degree: u8) -> Self {
         if rotation.w.abs() > 1.0 - 1e-15 {
             return Self { mixes: Vec::new() };
         }
@@ -80,7 +81,7 @@ impl Turn {
     }
 
     /// Turns the harmonics of one splat; coefficient by coefficient, RGB within.
-    pub(crate) fn apply(&self, sh: &mut [f32]) {
+    pub fn apply(&self, sh: &mut [f32]) {
         for (mix, band) in self.mixes.iter().zip(1..) {
             let width = 2 * band + 1;
             let coefficients = &mut sh[band * band * 3..][..width * 3];

@@ -2,13 +2,12 @@
 //! of `scene convert` all end here.
 //!
 //! Means and scales are multiplied, rotations turned, and the spherical harmonics of degree 1 to 3
-//! turned with them, so that highlights stay where they were. The harmonics of a degree mix only
-//! among themselves; the mixing matrix follows from f(R d) = f'(d) at enough directions, which
-//! needs no closed form and holds for any sign convention of the basis.
+//! turned with them, so that highlights stay where they were.
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::config::{Geofence, SceneConfig};
 use vizflyt_splat::Splats;
+use vizflyt_splat::harmonics::Turn;
 
 /// How a scene comes to lie in the world: moved there, then cropped.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -100,99 +99,13 @@ impl WorldFromScene {
         for axes in &mut splats.rotations {
             *axes = (rotation * *axes).normalize();
         }
-        turn_harmonics(&mut splats.sh, splats.sh_degree, self.rotation);
-    }
-}
-
-/// Turns the harmonics of every splat; coefficient by coefficient, RGB within.
-fn turn_harmonics(sh: &mut [f32], degree: u8, rotation: DQuat) {
-    let degree = usize::from(degree);
-    if degree == 0 || rotation == DQuat::IDENTITY {
-        return;
-    }
-    let mixes: Vec<_> = (1..=degree).map(|band| mixing_matrix(band, rotation)).collect();
-    for splat in sh.chunks_exact_mut((degree + 1).pow(2) * 3) {
-        for (mix, band) in mixes.iter().zip(1..) {
-            let width = 2 * band + 1;
-            let coefficients = &mut splat[band * band * 3..][..width * 3];
-            for channel in 0..3 {
-                let mut old = [0.0f32; 7];
-                for (value, rgb) in old.iter_mut().zip(coefficients.chunks_exact(3)) {
-                    *value = rgb[channel];
-                }
-                for (row, rgb) in mix.iter().zip(coefficients.chunks_exact_mut(3)) {
-                    rgb[channel] = row.iter().zip(&old[..width]).map(|(a, b)| a * b).sum();
-                }
-            }
+        let turn = Turn::new(self.rotation, splats.sh_degree);
+        let width = (usize::from(splats.sh_degree) + 1).pow(2) * 3;
+        for sh in splats.sh.chunks_exact_mut(width) {
+            turn.apply(sh);
         }
     }
 }
-
-/// Returns M with `c_world = M c_scene` for degree `band`: the least-squares solution of
-/// `sum_i c_world_i Y_i(R d) = sum_i c_scene_i Y_i(d)` over a sphere full of directions d, which is
-/// exact, because a degree's harmonics are closed under rotation.
-fn mixing_matrix(band: usize, rotation: DQuat) -> Vec<Vec<f32>> {
-    let width = 2 * band + 1;
-    // Normal equations: (A'^T A') M = A'^T A.
-    let mut system = vec![vec![0.0f64; 2 * width]; width];
-    for k in 0..DIRECTIONS {
-        // A Fibonacci sphere: even cover without two directions alike.
-        let z = 1.0 - (2.0 * k as f64 + 1.0) / DIRECTIONS as f64;
-        let angle = k as f64 * std::f64::consts::PI * (3.0 - 5.0f64.sqrt());
-        let r = (1.0 - z * z).sqrt();
-        let d = DVec3::new(r * angle.cos(), r * angle.sin(), z);
-        let (scene, world) = (harmonics(band, d), harmonics(band, rotation * d));
-        for i in 0..width {
-            for j in 0..width {
-                system[i][j] += world[i] * world[j];
-                system[i][width + j] += world[i] * scene[j];
-            }
-        }
-    }
-    // Gauss-Jordan; the left half is symmetric positive definite, so no pivoting is needed.
-    for i in 0..width {
-        let pivot = system[i][i];
-        system[i].iter_mut().for_each(|value| *value /= pivot);
-        let row = system[i].clone();
-        for (j, other) in system.iter_mut().enumerate().filter(|(j, _)| *j != i) {
-            debug_assert_ne!(j, i);
-            let factor = other[i];
-            other.iter_mut().zip(&row).for_each(|(a, b)| *a -= factor * b);
-        }
-    }
-    system.into_iter().map(|row| row[width..].iter().map(|&v| v as f32).collect()).collect()
-}
-
-/// Returns the basis functions of one degree in the order and signs of 3DGS files. Common factors
-/// of a degree cancel in [`mixing_matrix`]; relative ones do not.
-fn harmonics(band: usize, d: DVec3) -> [f64; 7] {
-    let DVec3 { x, y, z } = d;
-    let (xx, yy, zz) = (x * x, y * y, z * z);
-    match band {
-        1 => [-y, z, -x, 0.0, 0.0, 0.0, 0.0],
-        2 => [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2.0 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-            0.0,
-            0.0,
-        ],
-        _ => [
-            -0.5900435899266435 * y * (3.0 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4.0 * zz - xx - yy),
-            0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-            -0.4570457994644658 * x * (4.0 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3.0 * yy),
-        ],
-    }
-}
-
-/// Many more than the seven unknowns of a row.
-const DIRECTIONS: usize = 64;
 
 #[cfg(test)]
 mod tests {
