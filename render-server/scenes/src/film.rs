@@ -12,8 +12,6 @@
 //! ```
 //! A row is at most half a band's time and half an exposure from where its band was rendered, some 8 ms or 4 px: what opens behind
 //! edges in that time is filled from beside it. `film/tests.rs` holds this against every row rendered at each of its instants.
-//!
-//! Budget at 640x480 on two cores: 30 ms of rendering and 20 ms of developing an image (`docs/BENCHMARKS.md`).
 
 mod develop;
 mod light;

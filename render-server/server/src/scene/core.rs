@@ -5,7 +5,7 @@
 //! ```
 //! Extremes and percentiles are ruined by a few per cent of sky a hundred times further out. A median is
 //! not, nor is density: cells are a sixth of the median reach wide, one that holds its share of splats
-//! counts, and those that touch each other are one part. Budget: 0.2 s for 1 M splats on one core, 24 MB.
+//! counts, and those that touch each other are one part.
 
 use glam::{DVec3, IVec3, Vec3};
 use vizflyt_splat::Splats;

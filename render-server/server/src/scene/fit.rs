@@ -7,7 +7,7 @@
 //! What is certain: most of the scene lies outside the fence, nothing level lies under the start, nothing
 //! of it became an obstacle. What is likely, for a scene that `up` has turned: it is upside down (what
 //! stands in a room stands on its floor), or on its side (higher than long). A wall that became the floor of
-//! a room of about equal sides is not noticed. Budget: 0.3 s for 1 M splats on one core.
+//! a room of about equal sides is not noticed.
 
 use glam::DVec3;
 use vizflyt_arena::check::Finding;
