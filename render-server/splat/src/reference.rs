@@ -113,8 +113,8 @@ fn project(
     let mean_px = focal * k.distortion.distort(slope).0 + DVec2::new(k.cx_px, k.cy_px);
 
     // The linearisation blows up outside the image: take it at the nearest point just outside.
-    let at = slope.clamp(lens.slopes[0], lens.slopes[1]);
-    let (_, bend) = k.distortion.distort(at.clamp_length_max(lens.reach));
+    let at = slope.clamp(lens.slopes[0], lens.slopes[1]).clamp_length_max(lens.reach);
+    let (_, bend) = k.distortion.distort(at);
 
     let scale_m = splats.scales_m[i].as_dvec3().min(DVec3::splat(f64::from(MAX_SCALE_M)));
     let q = splats.rotations[i].as_dquat();

@@ -307,3 +307,35 @@ fn a_wall_is_where_it_stands() {
         assert!((1990..=2010).contains(&centre), "{kind:?}: {centre} mm");
     }
 }
+
+/// A splat within the lens's reach whose slope, clamped to what the image shows, is beyond it. Found by
+/// [`fast_equals_reference`]: the reference shortened it for the lens alone, and not for the pinhole.
+#[test]
+fn a_slope_clamped_beyond_the_reach_is_shortened() {
+    let splats = Splats {
+        means_m: vec![Vec3::new(-2.180_503_4, -2.445_525_4, 3.006_775_6)],
+        scales_m: vec![Vec3::ONE],
+        rotations: vec![Quat::IDENTITY],
+        opacities: vec![0.859_059],
+        sh: vec![-0.07, -0.04, 0.5],
+        ..Splats::default()
+    };
+    let intrinsics = Intrinsics {
+        width_px: 55,
+        height_px: 18,
+        fx_px: 19.157_670,
+        fy_px: 14.380_070,
+        cx_px: -21.799_552,
+        cy_px: 5.003_484,
+        distortion: Distortion::BrownConrady {
+            k1: -0.001_332_827_4,
+            k2: 0.165_174_56,
+            p1: 0.008_645_694,
+            p2: -0.007_483_336,
+            k3: -0.105_031_63,
+        },
+    };
+    let position = DVec3::new(-1.999_427_5, -0.948_017_58, 3.667_386_2);
+    let q = DQuat::from_xyzw(-0.163_841_51, 0.623_167_31, -0.734_391_65, 0.213_277_69).normalize();
+    check(&splats, &[Camera::new(intrinsics, Pose::new(position, q), 0.01)]);
+}
