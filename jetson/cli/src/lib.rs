@@ -17,6 +17,7 @@ mod demo;
 mod doctor;
 #[cfg(test)]
 mod endings;
+mod evaluate;
 mod fly;
 mod grade;
 mod lab;
@@ -94,6 +95,7 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Latency of images, stage by stage, and why images were skipped.
     Stats(stats::StatsArgs),
+    Evaluate(evaluate::EvaluateArgs),
     /// Feeds a flight's recorded images to a plugin and reports where its answers differ.
     Replay(replay::ReplayArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
@@ -178,6 +180,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Tags(args) => tags::run(&args),
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
         Command::Guardian { mavlink } => Ok(vizflyt_guardian::run(&mavlink)),

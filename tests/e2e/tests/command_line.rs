@@ -22,6 +22,7 @@ fn every_command_has_help() {
         "grade",
         "leaderboard",
         "arena",
+        "evaluate",
     ] {
         let output = run(&[command, "--help"]);
         assert!(output.status.success(), "{command}");
@@ -49,6 +50,26 @@ fn a_scene_is_the_same_for_the_same_seed() {
         &["scene", "generate", "race", "-o", again.to_str().unwrap()],
         &["already holds", "--force"],
     );
+}
+
+#[test]
+fn a_trajectory_that_cannot_be_evaluated_is_explained() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let truth = write("truth.tum", "0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n");
+    let later = write("later.tum", "100 0 0 0 0 0 0 1\n");
+    check_refused(&["evaluate", &truth, &later], &["within 0.01 s", "one clock"]);
+    let short = write("short.tum", "0 0 0 0\n");
+    check_refused(&["evaluate", &truth, &short], &["line 1", "4 numbers"]);
+    check_refused(&["evaluate", &truth, &truth, "--align", "se3"], &["cannot be aligned", "line"]);
+    check_refused(&["evaluate", &truth, &truth, "--delta", "3"], &["1m"]);
+    let output = run(&["evaluate", &truth, &truth, "--json"]);
+    let figures: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&figures["pairs"], &figures["ate_rmse_m"]), (&3.into(), &0.0.into()));
 }
 
 #[test]

@@ -301,7 +301,12 @@ pub struct RecordedPoses<R> {
 impl<R: Read> RecordedPoses<R> {
     /// Reads them from a log.
     pub fn new(reader: LogReader<R>) -> Self {
-        Self { reader, topic: Channel::Pose.topic("") }
+        Self::of_topic(reader, Channel::Pose.topic(""))
+    }
+
+    /// Reads those of another topic whose messages are poses.
+    pub fn of_topic(reader: LogReader<R>, topic: impl Into<String>) -> Self {
+        Self { reader, topic: topic.into() }
     }
 
     /// Returns the next pose; `None` at the end. What is no pose is left out.

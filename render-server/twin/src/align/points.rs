@@ -96,8 +96,11 @@ fn distance_m(similarity: &Similarity, pair: &Pair) -> f64 {
     similarity.transform_point(pair.scene).distance(pair.world_m)
 }
 
-/// Returns the similarity with the least squares.
-fn closest(pairs: &[Pair]) -> Result<Similarity, AlignError> {
+/// Returns the similarity with the least squares, by all of the pairs.
+///
+/// # Errors
+/// Too few, or on one line.
+pub fn closest(pairs: &[Pair]) -> Result<Similarity, AlignError> {
     if pairs.len() < NEEDED {
         return Err(AlignError::TooFew { given: pairs.len(), needed: NEEDED });
     }
