@@ -1,12 +1,14 @@
-//! `vizflyt scene`: makes, trains, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, captures, trains, bakes, inspects and renders scenes.
 
 mod align;
 mod bake;
+mod capture;
 pub(crate) mod camera;
 mod convert;
 mod generate;
 mod inspect;
 mod npy;
+mod progress;
 mod render;
 mod train;
 
@@ -29,6 +31,7 @@ enum SceneCommand {
     Generate(generate::GenerateArgs),
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
+    Capture(capture::CaptureArgs),
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
@@ -40,6 +43,7 @@ enum SceneCommand {
 pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
     match args.command {
         SceneCommand::Align(args) => return align::run(&args),
+        SceneCommand::Capture(args) => return capture::run(&args),
         SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
