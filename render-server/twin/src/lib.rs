@@ -1,6 +1,7 @@
 //! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor.
 
 pub mod adam;
+pub mod adjust;
 pub mod align;
 mod bin;
 mod blend;
@@ -17,6 +18,7 @@ mod render;
 mod smooth;
 mod ssim;
 pub mod train;
+pub mod verdict;
 mod view;
 
 pub use dataset::Dataset;

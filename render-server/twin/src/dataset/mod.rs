@@ -23,7 +23,7 @@ use crate::loss::{SeenPoint, Target};
 use crate::view::View;
 
 pub use error::DatasetError;
-pub use sparse::{SparseImage, SparseModel, SparsePoint};
+pub use sparse::{SparseImage, SparseModel, SparsePoint, SparseSighting};
 
 /// A capture whose poses are known. All lengths are in units of the dataset, in its own frame.
 #[derive(Clone, Debug, Default)]
@@ -129,7 +129,7 @@ fn of_colmap(folder: &Path, model: &Path) -> Result<(Vec<Plan>, Points), Dataset
             depth: None,
             intrinsics: Ok(image.intrinsics),
             world_from_cam: image.world_from_cam,
-            seen: image.seen.iter().copied().filter(well_seen).collect(),
+            seen: image.seen.iter().map(|seen| seen.point).filter(well_seen).collect(),
         }
     });
     let points = sparse
