@@ -3,12 +3,15 @@
 pub mod binary;
 mod lens;
 pub mod text;
+mod write;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use vizflyt_protocol::geometry::Intrinsics;
 
+pub use self::lens::parameters;
+pub use self::write::write;
 use super::error::{DatasetError, read_file};
 use super::sparse::SparseModel;
 
