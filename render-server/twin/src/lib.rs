@@ -4,6 +4,7 @@ pub mod adam;
 pub mod align;
 mod bin;
 mod blend;
+pub mod carve;
 pub mod dataset;
 pub mod gaussians;
 pub mod loss;
