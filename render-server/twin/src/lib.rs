@@ -5,6 +5,7 @@ pub mod adjust;
 pub mod align;
 mod bin;
 mod blend;
+pub mod carve;
 pub mod dataset;
 pub mod gaussians;
 pub mod loss;

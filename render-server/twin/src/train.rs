@@ -312,7 +312,7 @@ impl<'a> Trainer<'a> {
 }
 
 /// Keeps the items, `width` numbers each, that `keep` says.
-fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
+pub(crate) fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
     let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
     *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
 }
