@@ -20,6 +20,8 @@ pub(super) struct Seen {
     pub(super) tags: Vec<Print>,
     /// Of each picture, in their order.
     pub(super) pictures: Vec<Vec<Sighting>>,
+    /// Names of the pictures, in their order.
+    pub(super) names: Vec<String>,
 }
 
 /// A printed tag.
@@ -46,6 +48,12 @@ impl Sighting {
 }
 
 impl Seen {
+    /// Returns the tags in a picture, by its name.
+    pub(super) fn of(&self, name: &str) -> &[Sighting] {
+        let index = self.names.iter().position(|known| known == name);
+        index.and_then(|index| self.pictures.get(index)).map_or(&[], Vec::as_slice)
+    }
+
     /// Returns how many pictures show a tag.
     pub(super) fn with_tags(&self) -> usize {
         self.pictures.iter().filter(|tags| !tags.is_empty()).count()
@@ -56,7 +64,8 @@ impl Seen {
 pub(super) fn look(pictures: &Pictures, families: &[TagFamily], lens: &Intrinsics) -> Result<Seen> {
     let mut detector = Detector::new(families, DetectorSettings::default());
     let mut progress = Progress::new("");
-    let mut seen = Seen { tags: Vec::new(), pictures: Vec::new() };
+    let names = pictures.pictures.iter().map(|picture| picture.name.clone()).collect();
+    let mut seen = Seen { tags: Vec::new(), pictures: Vec::new(), names };
     let count = pictures.pictures.len();
     for (number, picture) in pictures.pictures.iter().enumerate() {
         progress.show(number as f64 / count as f64, || {

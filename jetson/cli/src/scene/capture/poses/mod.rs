@@ -12,7 +12,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::geometry::{Distortion, Intrinsics};
+use vizflyt_protocol::geometry::Intrinsics;
+use vizflyt_twin::dataset::colmap as colmap_files;
 
 use self::log::Phase;
 use self::tool::Tool;
@@ -76,7 +77,7 @@ fn models(folder: &Path) -> Result<Vec<Model>> {
         if !folder.is_dir() {
             break;
         }
-        let placed = vizflyt_twin::dataset::colmap::read(&folder)?.images.len();
+        let placed = colmap_files::read(&folder)?.images.len();
         models.push(Model { folder, placed });
     }
     models.sort_by_key(|model| std::cmp::Reverse(model.placed));
@@ -106,7 +107,7 @@ pub(super) fn find(
     let job = Job {
         images: &pictures.folder,
         count: pictures.pictures.len(),
-        lens: lens.map(parameters),
+        lens: lens.map(lens_text),
         pairs: &list,
         pair_count: pairs.len(),
         folder,
@@ -148,25 +149,9 @@ fn installed(python: Option<&Path>) -> Result<Box<dyn Finder>> {
     )
 }
 
-/// Returns COLMAP's name for a lens, and its parameters.
-fn parameters(k: &Intrinsics) -> (&'static str, String) {
-    let mut numbers = vec![k.fx_px, k.fy_px, k.cx_px, k.cy_px];
-    let model = match k.distortion {
-        Distortion::None => "PINHOLE",
-        Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
-            numbers.extend([k1, k2, p1, p2]);
-            if k3 == 0.0 {
-                "OPENCV"
-            } else {
-                numbers.extend([k3, 0.0, 0.0, 0.0]);
-                "FULL_OPENCV"
-            }
-        }
-        Distortion::KannalaBrandt { k1, k2, k3, k4 } => {
-            numbers.extend([k1, k2, k3, k4]);
-            "OPENCV_FISHEYE"
-        }
-    };
+/// Returns COLMAP's name for a lens, and its parameters as it reads them.
+fn lens_text(k: &Intrinsics) -> (&'static str, String) {
+    let (model, numbers) = colmap_files::parameters(k);
     (model, numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(","))
 }
 
@@ -210,29 +195,6 @@ impl Phases {
                 let of = self.count;
                 self.progress.show(share(done, of), || format!("placed {done} of {of} pictures"));
             }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_lens_is_told_as_colmap_has_it() {
-        let mut k = Intrinsics::from_horizontal_fov(640, 480, std::f64::consts::FRAC_PI_2);
-        let (model, numbers) = parameters(&k);
-        assert_eq!((model, numbers.split(',').count()), ("PINHOLE", 4));
-        for (distortion, expected, count) in [
-            (Distortion::BrownConrady { k1: 0.1, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 }, "OPENCV", 8),
-            (Distortion::BrownConrady { k1: 0.1, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.2 }, "FULL_OPENCV", 12),
-            (Distortion::KannalaBrandt { k1: 0.1, k2: 0.0, k3: 0.0, k4: 0.0 }, "OPENCV_FISHEYE", 8),
-        ] {
-            k.distortion = distortion;
-            let (model, numbers) = parameters(&k);
-            let numbers: Vec<f64> = numbers.split(',').map(|n| n.parse().unwrap()).collect();
-            assert_eq!((model, numbers.len()), (expected, count));
-            assert_eq!(numbers[4], 0.1);
         }
     }
 }

@@ -60,7 +60,7 @@ mod tests {
             of_video,
             pictures: (0..count).map(picture).collect(),
         };
-        let mut seen = Seen { tags: Vec::new(), pictures: vec![Vec::new(); count] };
+        let mut seen = Seen { tags: Vec::new(), pictures: vec![Vec::new(); count], names: Vec::new() };
         for &(picture, tag) in tags {
             seen.pictures[picture].push(Sighting { tag, corners_px: [[0.0; 2]; 4] });
         }
