@@ -119,7 +119,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 pub(super) fn inverse(m: &DMat3) -> Option<DMat3> {
     let determinant = m.determinant();
     let product = m.x_axis.x * m.y_axis.y * m.z_axis.z;
-    (determinant > 1e-12 * product && product > 0.0).then(|| m.inverse())
+    (determinant > 1e-9 * product && product > 0.0).then(|| m.inverse())
 }
 
 #[cfg(test)]

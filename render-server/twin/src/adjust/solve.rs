@@ -189,10 +189,9 @@ pub(super) fn solve(
         problem.noise = problem.noise_of(state);
     }
     rounds += iterate(&problem, state, known, 1e-8)?;
-    let factor = held(normal(&problem, state, 0.0), state, known)
-        .matrix
-        .factor()
-        .ok_or(AdjustError::Undetermined)?;
+    let Normal { mut matrix, .. } = held(normal(&problem, state, ALMOST_NONE), state, known);
+    matrix.damp(ALMOST_NONE);
+    let factor = matrix.factor().ok_or(AdjustError::Undetermined)?;
     Ok(Solved { noise: problem.noise, rounds, layout: problem.layout, factor })
 }
 
@@ -332,6 +331,8 @@ pub(super) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 const MAX_ROUNDS: usize = 60;
 /// Damping beyond which no step will help.
 const GIVE_UP: f64 = 1e8;
+/// Bounds what nothing determines, such as an image of few points; what is determined it does not touch.
+const ALMOST_NONE: f64 = 1e-8;
 /// What is behind its camera counts as. [px]
 const BEHIND_PX: f64 = 1e4;
 /// Where Cauchy's loss bends: of sigmas.

@@ -4,8 +4,14 @@
 //! cannot fake: how a hand can move between two images, tags that had no say, what a second model says, how many points
 //! hold the parts of a walk together, and what should be seen and is not.
 
+mod connected;
+mod continuity;
+mod doubled;
 mod metric;
 mod placed;
+mod second_model;
+mod tags;
+mod walk;
 mod words;
 
 use std::ops::Range;
@@ -101,6 +107,13 @@ pub fn judge(evidence: &Evidence<'_>) -> Verdict {
     let mut verdict = Verdict::default();
     placed::check(evidence, &mut verdict);
     metric::check(evidence, &mut verdict);
+    let walk = walk::Walk::new(evidence);
+    tags::check(&walk, &mut verdict);
+    continuity::check(&walk, &mut verdict);
+    let shared = connected::Shared::new(&walk);
+    connected::check(&walk, &shared, &mut verdict);
+    doubled::check(&walk, &shared, &mut verdict);
+    second_model::check(&walk, &mut verdict);
     verdict.findings.sort_by_key(|finding| (finding.severity, finding.check));
     verdict
 }

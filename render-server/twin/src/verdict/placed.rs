@@ -1,7 +1,6 @@
 //! Images without a place: where in the walk, and whether that is much.
 
 use std::collections::HashSet;
-use std::ops::Range;
 
 use super::{Check, Evidence, Finding, Severity, Verdict, words};
 
@@ -21,7 +20,7 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     if missing.is_empty() {
         return;
     }
-    let images = runs(&missing);
+    let images = words::runs(&missing);
     let severity = if share < LEAST_PLACED { Severity::Refused } else { Severity::Warning };
     let spans = words::spans(evidence.given, &images);
     verdict.findings.push(Finding {
@@ -33,18 +32,6 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
             .to_owned(),
         images,
     });
-}
-
-/// Returns runs of ascending numbers.
-pub(super) fn runs(ascending: &[usize]) -> Vec<Range<usize>> {
-    let mut runs: Vec<Range<usize>> = Vec::new();
-    for &index in ascending {
-        match runs.last_mut() {
-            Some(run) if run.end == index => run.end += 1,
-            _ => runs.push(index..index + 1),
-        }
-    }
-    runs
 }
 
 /// With one image in ten missing, whole parts of a room are.

@@ -4,6 +4,18 @@ use std::ops::Range;
 
 use super::Given;
 
+/// Returns runs of ascending numbers.
+pub(super) fn runs(ascending: &[usize]) -> Vec<Range<usize>> {
+    let mut runs: Vec<Range<usize>> = Vec::new();
+    for &index in ascending {
+        match runs.last_mut() {
+            Some(run) if run.end == index => run.end += 1,
+            _ => runs.push(index..index + 1),
+        }
+    }
+    runs
+}
+
 /// Returns runs of images with their times: "12 to 20 (7.4 s to 12.4 s), 31 (19.2 s)".
 pub(super) fn spans(given: &[Given], runs: &[Range<usize>]) -> String {
     let one = |run: &Range<usize>| {
@@ -14,12 +26,17 @@ pub(super) fn spans(given: &[Given], runs: &[Range<usize>]) -> String {
             format!("{} to {} ({:.1} s to {:.1} s)", first.name, last.name, first.at_s, last.at_s)
         }
     };
-    let mut words: Vec<String> = runs.iter().take(MANY).map(one).collect();
+    let mut longest: Vec<&Range<usize>> = runs.iter().collect();
+    longest.sort_by_key(|run| std::cmp::Reverse(run.len()));
+    longest.truncate(MANY);
+    longest.sort_by_key(|run| run.start);
+    let mut words: Vec<String> = longest.into_iter().map(one).collect();
     if runs.len() > MANY {
-        words.push(format!("and {} more", runs.len() - MANY));
+        let rest: usize = runs.iter().map(ExactSizeIterator::len).sum();
+        words.push(format!("and more, {rest} images in all"));
     }
     words.join(", ")
 }
 
 /// More than this nobody reads.
-const MANY: usize = 6;
+const MANY: usize = 5;
