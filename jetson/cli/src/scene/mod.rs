@@ -2,8 +2,8 @@
 
 mod align;
 mod bake;
-mod capture;
 pub(crate) mod camera;
+mod capture;
 mod convert;
 mod generate;
 mod inspect;

@@ -142,7 +142,9 @@ mod tests {
 
     #[test]
     fn the_floor_is_found_below_tables_and_beside_walls() {
-        for turn in [DQuat::IDENTITY, DQuat::from_xyzw(0.5, -0.5, 0.5, 0.5), DQuat::from_rotation_x(2.0)] {
+        for turn in
+            [DQuat::IDENTITY, DQuat::from_xyzw(0.5, -0.5, 0.5, 0.5), DQuat::from_rotation_x(2.0)]
+        {
             let (points, cameras) = hall(turn, 400);
             let level = find(&points, &cameras).unwrap();
             let off = level.up.angle_between(turn * DVec3::Z);

@@ -106,6 +106,19 @@ pub(super) struct FindingFact {
 }
 
 impl Metric {
+    /// Returns what a person is told in a line.
+    pub(super) fn summary(&self) -> String {
+        if !self.has_model {
+            return "not metric".to_owned();
+        }
+        let scale = self
+            .scale_bound
+            .map_or("guessed".to_owned(), |share| format!("to {:.2} %", 100.0 * share));
+        let tilt =
+            self.tilt_bound_deg.map_or("unknown".to_owned(), |deg| format!("to {deg:.2} degrees"));
+        format!("scale {scale} by {}; up {tilt} by {}", self.scale_from, self.up_from)
+    }
+
     /// Whether splats that are trained from it show the room as it is, however large.
     pub(super) fn is_fit_to_train(&self) -> bool {
         self.has_model && self.findings.iter().all(|f| !f.refused || f.of_metres)
@@ -150,7 +163,8 @@ pub(super) fn make(
     let first = capture(&model)
         .with_context(|| format!("the model in {}", poses.models[0].folder.display()))?;
     // A small one may be of other pictures altogether.
-    let others = poses.models[1..].iter().filter_map(|other| capture(&read(&other.folder).ok()?).ok());
+    let others =
+        poses.models[1..].iter().filter_map(|other| capture(&read(&other.folder).ok()?).ok());
     let others: Vec<Capture> = others.collect();
     let given: Vec<Given> = pictures
         .pictures

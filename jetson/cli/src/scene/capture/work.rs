@@ -17,12 +17,16 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::terminal::print_fmt;
+
 /// What is done, in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Stage {
     /// Sharp pictures of a video
     Images,
+    /// Printed tags in them
+    Tags,
     /// Where they were taken from
     Poses,
     /// The same in metres, and whether that is true
@@ -34,12 +38,10 @@ pub(super) enum Stage {
 }
 
 impl Stage {
-    pub(super) const ALL: [Self; 5] =
-        [Self::Images, Self::Poses, Self::Metric, Self::Train, Self::Finish];
-
     fn name(self) -> &'static str {
         match self {
             Self::Images => "images",
+            Self::Tags => "tags",
             Self::Poses => "poses",
             Self::Metric => "metric",
             Self::Train => "train",
@@ -109,6 +111,25 @@ impl Work {
         self.folder.join(stage.name())
     }
 
+    /// Whether a stage's result is kept, of whatever inputs, and will be looked at.
+    pub(super) fn has(&self, stage: Stage) -> bool {
+        self.from.is_none_or(|from| stage < from)
+            && self.folder.join(format!("{stage}.json")).is_file()
+    }
+
+    /// Returns the file that tells whether arena.toml was edited.
+    pub(super) fn mark(&self) -> PathBuf {
+        self.folder.join("arena.sha256")
+    }
+
+    /// Says what the last stage made, and how long that took.
+    pub(super) fn say(&self, made: &str) {
+        if let Some(StageTime { stage, seconds, kept }) = self.times.last() {
+            let took = if *kept { "kept".to_owned() } else { format!("{seconds:.0} s") };
+            print_fmt!("{:<11} {made} ({took})", stage.name());
+        }
+    }
+
     /// Returns how long each stage took that has come.
     pub(super) fn times(&self) -> &[StageTime] {
         &self.times
@@ -166,7 +187,8 @@ fn kept<T: DeserializeOwned>(file: &Path, key: &str) -> Option<Kept<T>> {
 }
 
 fn remove(path: &Path) -> Result<()> {
-    let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    let removed =
+        if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     match removed {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             Err(error).with_context(|| format!("cannot remove {}", path.display()))

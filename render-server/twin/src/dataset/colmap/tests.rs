@@ -136,7 +136,10 @@ proptest! {
 fn a_model_that_is_written_is_read_back() {
     let cameras = text::cameras(CAMERAS).unwrap();
     let images = text::images(IMAGES, &cameras).unwrap();
-    let points = HashMap::from([(7, SparsePoint { position: DVec3::new(1.5, -2.5, 1.0 / 3.0), rgb: [1, 2, 255], track: 1 })]);
+    let points = HashMap::from([(
+        7,
+        SparsePoint { position: DVec3::new(1.5, -2.5, 1.0 / 3.0), rgb: [1, 2, 255], track: 1 },
+    )]);
     let model = SparseModel { images, points };
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path().join("sparse/0");
@@ -144,7 +147,10 @@ fn a_model_that_is_written_is_read_back() {
     let back = read(&place).unwrap();
     assert_eq!(back.points, model.points);
     for (back, image) in back.images.iter().zip(&model.images) {
-        assert_eq!((&back.name, back.intrinsics, &back.seen), (&image.name, image.intrinsics, &image.seen));
+        assert_eq!(
+            (&back.name, back.intrinsics, &back.seen),
+            (&image.name, image.intrinsics, &image.seen)
+        );
         let off = back.world_from_cam.translation_m - image.world_from_cam.translation_m;
         assert!(off.length() < 1e-12, "{off}");
         assert!(back.world_from_cam.rotation.angle_between(image.world_from_cam.rotation) < 1e-7);

@@ -16,7 +16,9 @@ use crate::dataset::sparse::SparseModel;
 /// A file that cannot be written.
 pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
     let mut lenses: Vec<Intrinsics> = Vec::new();
-    let mut images = String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# X, Y, POINT3D_ID\n");
+    let mut images = String::from(
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# X, Y, POINT3D_ID\n",
+    );
     // By point: which image saw it, and as its how many-th.
     let mut tracks: BTreeMap<u64, String> = BTreeMap::new();
     for (number, image) in (1..).zip(&model.images) {
@@ -28,7 +30,11 @@ pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
         let cam_from_world = image.world_from_cam.inverse();
         let ([x, y, z, w], t) = (cam_from_world.rotation.to_array(), cam_from_world.translation_m);
         // Writing to a string does not fail.
-        let _ = writeln!(images, "{number} {w} {x} {y} {z} {} {} {} {camera} {}", t.x, t.y, t.z, image.name);
+        let _ = writeln!(
+            images,
+            "{number} {w} {x} {y} {z} {} {} {} {camera} {}",
+            t.x, t.y, t.z, image.name
+        );
         for (index, seen) in image.seen.iter().enumerate() {
             let _ = write!(images, "{} {} {} ", seen.pixel.x, seen.pixel.y, seen.point);
             let _ = write!(tracks.entry(seen.point).or_default(), " {number} {index}");
@@ -44,7 +50,8 @@ pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
         }
         cameras.push('\n');
     }
-    let mut points = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK as IMAGE_ID, POINT2D_INDEX\n");
+    let mut points =
+        String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK as IMAGE_ID, POINT2D_INDEX\n");
     let sorted: BTreeMap<_, _> = model.points.iter().collect();
     for (id, point) in sorted {
         let (p, [r, g, b]) = (point.position, point.rgb);
@@ -57,7 +64,8 @@ pub fn write(folder: &Path, model: &SparseModel) -> Result<(), DatasetError> {
         move |cause| DatasetError::Io { path, cause }
     };
     std::fs::create_dir_all(folder).map_err(io(folder))?;
-    for (name, text) in [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)] {
+    for (name, text) in [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
+    {
         let path = folder.join(name);
         std::fs::write(&path, text).map_err(io(&path))?;
     }

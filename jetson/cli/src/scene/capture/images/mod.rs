@@ -31,7 +31,10 @@ impl Source {
             return photos::folder(path).map(Self::Folder);
         }
         if !path.is_file() {
-            bail!("{} is neither a video nor a folder of photos; is the name right?", path.display());
+            bail!(
+                "{} is neither a video nor a folder of photos; is the name right?",
+                path.display()
+            );
         }
         Ok(Self::Video(path.to_owned()))
     }
@@ -79,7 +82,7 @@ impl Pictures {
 /// What to take of a video.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Choice {
-    /// So many pictures; `None`: four a second, within [`FRAMES`].
+    /// So many pictures; `None`: three a second, within [`FRAMES`].
     pub(super) frames: Option<usize>,
     /// Wider ones are made smaller. [px]
     pub(super) width_px: u32,
@@ -102,5 +105,5 @@ pub(super) fn clock(at_s: f64) -> String {
     format!("{}:{:02}", whole_s / 60, whole_s % 60)
 }
 
-/// Fewer do not overlap on a walk, more take long: 200 pictures of 640x480 take two minutes on two cores.
+/// Fewer do not overlap on a walk, more take long: 150 pictures of 640x480 take two minutes on two cores.
 const FRAMES: std::ops::RangeInclusive<usize> = 80..=300;

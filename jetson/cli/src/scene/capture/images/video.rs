@@ -196,7 +196,8 @@ mod tests {
     #[test]
     fn the_length_is_the_pictures_own_or_the_files() {
         let of = |text: &str| duration_s(text.as_bytes());
-        let stream = r#"{"programs":[],"streams":[{"duration":"50.000000"}],"format":{"duration":"50.1"}}"#;
+        let stream =
+            r#"{"programs":[],"streams":[{"duration":"50.000000"}],"format":{"duration":"50.1"}}"#;
         assert_eq!(of(stream), Some(50.0));
         assert_eq!(of(r#"{"streams":[{}],"format":{"duration":"7.5"}}"#), Some(7.5));
         for none in [

@@ -68,9 +68,10 @@ impl Ground {
         };
         let upright = DQuat::from_rotation_arc(up, DVec3::Z);
         // The first picture looks along x, from above the origin.
-        let ahead = adjusted.world_from_cam.first().map_or(DVec3::X, |pose| {
-            upright * (pose.rotation * DVec3::Z)
-        });
+        let ahead = adjusted
+            .world_from_cam
+            .first()
+            .map_or(DVec3::X, |pose| upright * (pose.rotation * DVec3::Z));
         let rotation = DQuat::from_rotation_z(-ahead.y.atan2(ahead.x)) * upright;
         let start = cameras.first().map_or(DVec3::ZERO, |held| rotation * held.position);
         let floor = level.map_or(hand_height - HAND_M / scale, |level| level.height);
@@ -111,7 +112,8 @@ fn tape(capture: &Capture, adjusted: &Adjusted, seen: &Seen, length: Length) -> 
                 }
             }
         }
-        let corners: Option<Vec<DVec3>> = rays.iter().map(|rays| Some(meet(rays)?.position)).collect();
+        let corners: Option<Vec<DVec3>> =
+            rays.iter().map(|rays| Some(meet(rays)?.position)).collect();
         corners.map(|corners| corners.into_iter().sum::<DVec3>() / 4.0)
     };
     let [a, b] = [middle(length.ids[0])?, middle(length.ids[1])?];

@@ -20,7 +20,8 @@ impl Colmap {
     /// Asks the program for its version; `None` if it is not installed.
     pub(super) fn open(program: &Path) -> Result<Option<Self>> {
         let Some(help) = ask(Command::new(program).arg("help")) else { return Ok(None) };
-        let options = ask(Command::new(program).args(["feature_extractor", "-h"])).unwrap_or_default();
+        let options =
+            ask(Command::new(program).args(["feature_extractor", "-h"])).unwrap_or_default();
         let name = version(&help).unwrap_or_else(|| "COLMAP".to_owned());
         let is_new = options.contains("FeatureExtraction.use_gpu");
         let prefix = if is_new { "Feature" } else { "Sift" };
@@ -84,7 +85,8 @@ mod tests {
 
     #[test]
     fn the_version_is_in_the_first_line() {
-        let help = "COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n  (Commit Unknown)\n";
+        let help =
+            "COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n  (Commit Unknown)\n";
         assert_eq!(version(help).as_deref(), Some("COLMAP 3.8"));
         assert_eq!(version("colmap: command not found"), None);
     }

@@ -17,7 +17,9 @@ pub(super) fn phase(line: &str) -> Option<Phase> {
         let [done, of] = share(rest)?;
         return Some(Phase::Features { done, of });
     }
-    if let Some(rest) = after(line, "Matching block [").or_else(|| after(line, "Processing block [")) {
+    if let Some(rest) =
+        after(line, "Matching block [").or_else(|| after(line, "Processing block ["))
+    {
         let [done, of] = share(rest)?;
         return Some(Phase::Matching { done, of });
     }
@@ -34,9 +36,11 @@ pub(super) fn error(log: &str) -> Option<&str> {
         let glog = glog && line[1..].starts_with(|c: char| c.is_ascii_digit());
         glog || line.contains("Error") || line.contains("ERROR")
     };
-    let line = log.lines().rev().find(is_error).or_else(|| {
-        log.lines().rev().find(|line| !line.trim().is_empty())
-    })?;
+    let line = log
+        .lines()
+        .rev()
+        .find(is_error)
+        .or_else(|| log.lines().rev().find(|line| !line.trim().is_empty()))?;
     // "E20261123 23:16:54.7 1405 feature.cc:445] text"
     Some(line.split_once("] ").map_or(line, |(_, text)| text).trim())
 }
@@ -84,7 +88,8 @@ mod tests {
 
     #[test]
     fn the_error_is_found_among_the_rest() {
-        let log = "I2026 1 a.cc:1] fine\nE2026 2 b.cc:2] Cannot open the database\nI2026 3 c.cc:3] bye\n";
+        let log =
+            "I2026 1 a.cc:1] fine\nE2026 2 b.cc:2] Cannot open the database\nI2026 3 c.cc:3] bye\n";
         assert_eq!(error(log), Some("Cannot open the database"));
         assert_eq!(error("what\nis this\n\n"), Some("is this"));
         assert_eq!(error(""), None);

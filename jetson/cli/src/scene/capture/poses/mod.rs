@@ -126,12 +126,21 @@ pub(super) fn find(
     Ok(Poses { tool: finder.name().to_owned(), models })
 }
 
+/// Checks that poses can be found here at all.
+///
+/// # Errors
+/// Nothing that finds poses is installed: what to install.
+pub(super) fn check_installed(python: Option<&Path>) -> Result<()> {
+    installed(python).map(drop)
+}
+
 /// Returns what is installed: pycolmap first, which `pip` brings in its newest version.
 fn installed(python: Option<&Path>) -> Result<Box<dyn Finder>> {
     if let Some(python) = python {
         return Ok(Box::new(pycolmap::Pycolmap::open(python)?));
     }
-    let in_environment = std::env::var_os("VIRTUAL_ENV").map(|venv| Path::new(&venv).join("bin/python"));
+    let in_environment =
+        std::env::var_os("VIRTUAL_ENV").map(|venv| Path::new(&venv).join("bin/python"));
     let pythons = in_environment.into_iter().chain([PathBuf::from("python3")]);
     for python in pythons {
         if let Ok(found) = pycolmap::Pycolmap::open(&python) {
@@ -181,7 +190,8 @@ impl Phases {
         let share = |done: usize, of: usize| done as f64 / of.max(1) as f64;
         match phase {
             Phase::Features { done, of } => {
-                self.progress.show(share(done, of), || format!("features of picture {done} of {of}"));
+                self.progress
+                    .show(share(done, of), || format!("features of picture {done} of {of}"));
             }
             Phase::Matching { done, of } => {
                 // A block that is begun is not done.

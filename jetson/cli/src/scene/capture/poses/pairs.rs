@@ -36,7 +36,7 @@ fn share_a_tag(seen: &Seen, a: usize, b: usize) -> bool {
     a.iter().any(|tag| b.iter().any(|other| tag.tag == other.tag))
 }
 
-/// Pictures of a video before and after, at [`super::super::images`]'s four a second: two and a half seconds.
+/// Pictures of a video before and after, at three a second: three seconds.
 const WINDOW: usize = 10;
 /// So many photos are compared each with each: 11,175 pairs, some minutes.
 const ALL_PAIRS: usize = 150;
@@ -48,19 +48,16 @@ mod tests {
     use crate::scene::capture::prints::Sighting;
 
     fn check(count: usize, of_video: bool, tags: &[(usize, usize)]) -> Vec<[usize; 2]> {
-        let picture = |i: usize| Picture {
-            name: format!("{i}.jpg"),
-            at_s: i as f64,
-            blur: 0.0,
-            grey: 0.0,
-        };
+        let picture =
+            |i: usize| Picture { name: format!("{i}.jpg"), at_s: i as f64, blur: 0.0, grey: 0.0 };
         let pictures = Pictures {
             folder: "images".into(),
             size_px: [640, 480],
             of_video,
             pictures: (0..count).map(picture).collect(),
         };
-        let mut seen = Seen { tags: Vec::new(), pictures: vec![Vec::new(); count], names: Vec::new() };
+        let mut seen =
+            Seen { tags: Vec::new(), pictures: vec![Vec::new(); count], names: Vec::new() };
         for &(picture, tag) in tags {
             seen.pictures[picture].push(Sighting { tag, corners_px: [[0.0; 2]; 4] });
         }

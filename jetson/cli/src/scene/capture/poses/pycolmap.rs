@@ -20,7 +20,8 @@ impl Pycolmap {
     /// # Errors
     /// It has none.
     pub(super) fn open(python: &Path) -> Result<Self> {
-        let version = ask(Command::new(python).args(["-c", "import pycolmap; print(pycolmap.__version__)"]));
+        let version =
+            ask(Command::new(python).args(["-c", "import pycolmap; print(pycolmap.__version__)"]));
         let version = version.with_context(|| {
             format!(
                 "{} has no pycolmap: {} -m pip install pycolmap",

@@ -31,7 +31,8 @@ impl Tool<'_> {
             let twin = writer.try_clone().context("cannot make a pipe")?;
             command.stdin(Stdio::null()).stdout(twin).stderr(writer).spawn()
         };
-        let mut child = Ended(child.map_err(|error| anyhow!("cannot start {}: {error}", self.name))?);
+        let mut child =
+            Ended(child.map_err(|error| anyhow!("cannot start {}: {error}", self.name))?);
         // The command holds the writing ends too.
         command.stdout(Stdio::null()).stderr(Stdio::null());
         let mut reader = BufReader::new(reader);
@@ -43,7 +44,9 @@ impl Tool<'_> {
                 Ok(0) => break,
                 Ok(_) => {}
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
-                Err(error) => return Err(error).with_context(|| format!("cannot read from {}", self.name)),
+                Err(error) => {
+                    return Err(error).with_context(|| format!("cannot read from {}", self.name));
+                }
             }
             // A log that cannot be written is no reason to stop.
             let _ = file.write_all(&line);
@@ -59,7 +62,11 @@ impl Tool<'_> {
         let status = child.0.wait().with_context(|| format!("cannot wait for {}", self.name))?;
         if !status.success() {
             let said = log::error(&tail).unwrap_or("it says nothing").to_owned();
-            bail!("{} failed ({status}): {said}\nall that it said is in {}", self.name, self.log.display());
+            bail!(
+                "{} failed ({status}): {said}\nall that it said is in {}",
+                self.name,
+                self.log.display()
+            );
         }
         Ok(())
     }
