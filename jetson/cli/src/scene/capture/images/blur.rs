@@ -15,13 +15,15 @@ pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
         return 1.0;
     }
     let mut small = Vec::with_capacity(small_width * small_height);
-    for y in 0..small_height {
-        for x in 0..small_width {
-            let rows = (0..by).map(|row| (y * by + row) * width + x * by);
-            let sum: u32 =
-                rows.flat_map(|at| &grey[at..at + by]).map(|&value| u32::from(value)).sum();
-            small.push(sum as f32 / (by * by) as f32);
+    let mut sums = vec![0u32; small_width];
+    for rows in grey.chunks_exact(by * width).take(small_height) {
+        sums.fill(0);
+        for row in rows.chunks_exact(width) {
+            for (sum, square) in sums.iter_mut().zip(row.chunks_exact(by)) {
+                *sum += square.iter().map(|&value| u32::from(value)).sum::<u32>();
+            }
         }
+        small.extend(sums.iter().map(|&sum| sum as f32 / (by * by) as f32));
     }
     let across = along(small_width, small_height, |x, y| small[y * small_width + x]);
     let down = along(small_height, small_width, |y, x| small[y * small_width + x]);
@@ -36,15 +38,16 @@ fn along(length: usize, lines: usize, at: impl Fn(usize, usize) -> f32) -> f64 {
         for (x, value) in line.iter_mut().enumerate() {
             *value = at(x, number);
         }
-        let blurred = |x: usize| line[x - REACH..=x + REACH].iter().sum::<f32>();
-        let mut before = blurred(REACH) / (2 * REACH + 1) as f32;
-        for x in REACH + 1..length - REACH {
-            let now = blurred(x) / (2 * REACH + 1) as f32;
-            let difference = (line[x] - line[x - 1]).abs();
-            sharp += f64::from(difference);
-            lost += f64::from((difference - (now - before).abs()).max(0.0));
-            before = now;
-        }
+        // The mean over the window changes by what comes in less what goes out.
+        let pairs = line.windows(2 * REACH + 2).map(|window| {
+            let difference = (window[REACH + 1] - window[REACH]).abs();
+            let blurred = (window[2 * REACH + 1] - window[0]).abs() / (2 * REACH + 1) as f32;
+            (difference, (difference - blurred).max(0.0))
+        });
+        let (of_sharp, of_lost) =
+            pairs.fold((0.0f32, 0.0f32), |(s, l), pair| (s + pair.0, l + pair.1));
+        sharp += f64::from(of_sharp);
+        lost += f64::from(of_lost);
     }
     if sharp > 0.0 { (sharp - lost) / sharp } else { 1.0 }
 }
