@@ -3,6 +3,7 @@
 mod align;
 mod bake;
 pub(crate) mod camera;
+mod carve;
 mod convert;
 mod generate;
 mod inspect;
@@ -29,6 +30,7 @@ enum SceneCommand {
     Generate(generate::GenerateArgs),
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
+    Carve(carve::CarveArgs),
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
@@ -42,6 +44,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Align(args) => return align::run(&args),
         SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
+        SceneCommand::Carve(args) => carve::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,

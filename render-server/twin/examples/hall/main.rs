@@ -4,7 +4,7 @@
 //! cargo run --release -p vizflyt-twin --example hall
 //! cargo run --release -p vizflyt-twin --example hall -- steps=1000 splats=40000 folder=hall sheet=hall.png
 //! ```
-//! `scene` judges and carves what was trained before, instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
+//! `race=SEED` takes a race hall on a usual walk of `seconds` instead of the room. `scene` judges and carves what was trained before, instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
 //! the depths of both. Other keys are those of [`Options`].
 
 mod capture;
@@ -14,14 +14,15 @@ mod judge;
 use std::error::Error;
 use std::path::PathBuf;
 
-use vizflyt_scenes::{SceneKind, generate};
+use vizflyt_scenes::{SceneKind, film_set, generate};
 use vizflyt_splat::{CpuRenderer, Splats};
 use vizflyt_twin::carve::CarveCounts;
 use vizflyt_twin::{Dataset, Options, Trainer};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut options = Options::default();
-    let (mut kept, mut sheet, mut trained) = (None, None, None);
+    let (mut kept, mut sheet, mut trained, mut race) = (None, None, None, None);
+    let (mut photos, mut seconds) = (80, 50.0);
     for arg in std::env::args().skip(1) {
         let (key, value) = arg.split_once('=').ok_or("options are KEY=VALUE")?;
         let number = || value.parse::<f32>();
@@ -40,13 +41,22 @@ fn main() -> Result<(), Box<dyn Error>> {
             "needle" => options.tolls.needle = number()?,
             "antialiased" => options.antialiased = number()? > 0.0,
             "scene" => trained = Some(PathBuf::from(value)),
+            "race" => race = Some(value.parse()?),
+            "photos" => photos = value.parse()?,
+            "seconds" => seconds = value.parse()?,
             "folder" => kept = Some(PathBuf::from(value)),
             "sheet" => sheet = Some(PathBuf::from(value)),
             _ => return Err(format!("no option is called '{key}'").into()),
         }
     }
-    let scene = generate(SceneKind::Room, 3);
-    let capture = capture::capture(&scene.splats, 1);
+    let (scene, poses) = match race {
+        Some(seed) => {
+            let set = film_set(SceneKind::Race, seed, seconds, false)?;
+            (set.scene, capture::walked(&set.walk, photos))
+        }
+        None => (generate(SceneKind::Room, 3), capture::looped(photos)),
+    };
+    let capture = capture::capture(&scene.splats, &poses, 1);
     let scratch = tempfile::tempdir()?;
     let folder = kept.as_deref().unwrap_or(scratch.path());
     folder::write(&capture, folder)?;
