@@ -4,6 +4,7 @@ mod align;
 mod bake;
 pub(crate) mod camera;
 mod capture;
+mod carve;
 mod convert;
 mod generate;
 mod inspect;
@@ -32,6 +33,7 @@ enum SceneCommand {
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
     Capture(capture::CaptureArgs),
+    Carve(carve::CarveArgs),
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
@@ -46,6 +48,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Capture(args) => return capture::run(&args),
         SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
+        SceneCommand::Carve(args) => carve::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,

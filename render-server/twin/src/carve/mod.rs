@@ -3,7 +3,8 @@
 //! ```text
 //! Dataset (poses, points) + trained Splats
 //!   depths   how far each photo looks, held against the points that structure from motion saw there
-//!   votes    splats that many photos look through, or that hang on the capture's own way -> pruned
+//!   votes    splats that many photos look through, that hang on the capture's own way, or that
+//!            nobody sees -> pruned
 //!   rays     voxels that several photos looked through                                    -> Seen
 //!   path     voxels in which the camera itself has been                                   -> Seen
 //! ```
@@ -14,6 +15,7 @@
 mod depths;
 mod path;
 mod rays;
+mod visible;
 mod votes;
 mod voxels;
 
@@ -71,6 +73,8 @@ pub struct CarveCounts {
     pub looked_through: usize,
     /// Splats pruned as the camera itself was there.
     pub on_path: usize,
+    /// Splats pruned as no photo shows them.
+    pub hidden: usize,
     /// Points of structure from motion before which something hid them, and how many there are.
     pub hidden_points: usize,
     /// See [`Self::hidden_points`].
@@ -107,15 +111,18 @@ pub fn carve(
         counts.looked_through += through.iter().filter(|through| **through).count();
         counts.on_path += through.iter().zip(&on_path).filter(|(t, p)| !**t && **p).count();
         let stays: Vec<bool> = through.iter().zip(&on_path).map(|(t, p)| !t && !p).collect();
-        let mut of_left = stays.iter();
-        for kept in kept.iter_mut().filter(|kept| **kept) {
-            *kept = *of_left.next().unwrap_or(&true);
-        }
+        mark_pruned(&mut kept, &stays);
         if stays.iter().all(|stays| *stays) {
             break;
         }
         keep(&mut left, &stays);
     }
+    // What hid it may be gone by now.
+    let shown: Vec<bool> =
+        visible::pixels(dataset, &left).iter().map(|pixels| *pixels >= LEAST_PIXELS).collect();
+    counts.hidden = shown.iter().filter(|shown| !**shown).count();
+    mark_pruned(&mut kept, &shown);
+    keep(&mut left, &shown);
     let depths = Depths::render(dataset, &left, options.depth_error);
     (counts.hidden_points, counts.points) = (depths.hidden_points, depths.points);
     let mut seen = rays::seen(dataset, &depths, world_from_dataset, voxels, options.photos);
@@ -123,6 +130,13 @@ pub fn carve(
     counts.seen = seen.count();
     counts.seconds = start.elapsed().as_secs_f64();
     Carved { splats: left, kept, seen, counts }
+}
+
+/// Takes from those kept so far the ones that do not stay.
+fn mark_pruned(kept: &mut [bool], stays: &[bool]) {
+    for (kept, stays) in kept.iter_mut().filter(|kept| **kept).zip(stays) {
+        *kept = *stays;
+    }
 }
 
 /// Leaves out the splats that do not stay.
@@ -135,5 +149,7 @@ fn keep(splats: &mut Splats, stays: &[bool]) {
     retain(&mut splats.sh, numbers, |i| stays[i]);
 }
 
+/// Of all photos together, of one splat: less is behind something in each. [px]
+const LEAST_PIXELS: f32 = 1.0;
 /// Behind a floater may be another.
 const ROUNDS: usize = 3;

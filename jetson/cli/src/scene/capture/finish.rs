@@ -7,9 +7,13 @@ use anyhow::{Context, Result};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::check::check_start;
-use vizflyt_arena::config::Spawn;
-use vizflyt_arena::{ArenaConfig, BakeSpec, Obstacles};
-use vizflyt_server::scene::{BakeCache, bake_with, bounds, check_fit, core, default_arena};
+use vizflyt_arena::config::{Spawn, Unseen};
+use vizflyt_arena::seen::ScenePlace;
+use vizflyt_arena::{ArenaConfig, BakeSpec, Obstacles, SeenSpace};
+use vizflyt_server::scene::{
+    BakeCache, Seen as SeenPlace, bake_with, bounds, check_fit, core, default_arena, scene_hash,
+    seen_path,
+};
 use vizflyt_splat::{Splats, format};
 use vizflyt_twin::Dataset;
 use vizflyt_twin::align::Similarity;
@@ -61,8 +65,20 @@ pub(super) fn finish(
     let [min_m, max_m] = fence(&carved.seen, floor_m, &ways);
     arena.geofence.min_m = min_m;
     arena.geofence.max_m = max_m;
+    let path = folder.join("scene.ply");
+    format::write(&path, &carved.splats)?;
     let spec = BakeSpec::of(&arena);
-    let baked = bake_with(&carved.splats, &spec, BakeCache::of_user().as_ref(), &|_| ());
+    let grid = spec.grid;
+    let voxels = Voxels { min_m: grid.min_m, side_m: grid.voxel_m, size: grid.size };
+    let seen = carve(dataset, &carved.splats, &IDENTITY, voxels, &CarveOptions::default()).seen;
+    let hash = scene_hash(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let place = ScenePlace::of(&arena.scene);
+    let space = SeenSpace::new(grid, place, hash, seen.bits);
+    std::fs::write(seen_path(&path), space.to_bytes()).context("cannot write scene.ply.seen")?;
+    arena.occupancy.unseen = Unseen::Solid;
+    let seen = SeenPlace { space, place };
+    let cache = BakeCache::of_user();
+    let baked = bake_with(&carved.splats, &spec, Some(&seen), cache.as_ref(), &|_| ());
     let solid_voxels = baked.field.occupied_voxels();
     let on_way = ways.iter().filter(|p| baked.field.obstacle_distance_m(**p) < 0.0).count();
     let fit = check_fit(&carved.splats, &arena, &baked.field);
@@ -86,7 +102,6 @@ pub(super) fn finish(
         findings.extend(against.iter().map(ToString::to_string));
     }
     arena.validate().context("no arena fits around the capture")?;
-    format::write(&folder.join("scene.ply"), &carved.splats)?;
     let text = format!("{HEAD}{}", arena.to_toml()?);
     ArenaConfig::parse(&text).context("the arena would not be read again")?;
     std::fs::write(folder.join("arena.toml"), text).context("cannot write arena.toml")?;

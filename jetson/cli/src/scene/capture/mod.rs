@@ -41,7 +41,7 @@ use crate::terminal::print_fmt;
 /// Makes a twin that can be flown from a video of a room, or from photos of it.
 #[derive(Args, Debug)]
 #[command(after_help = "What comes out, in the folder of -o:
-  scene.ply      the twin, in metres, z up
+  scene.ply      the twin, in metres, z up; beside it scene.ply.seen: where photos looked, all else is solid
   arena.toml     a fence around what was seen, a start on the walk; only if the capture can be trusted
   report.html    the walk from above, what was found, photos beside what they are rendered as
   capture.json   the same for programs: scale and its bound, residuals, times
@@ -246,7 +246,9 @@ fn make(
     }
     record.finished = Some(finished);
     let files = work.folder(Stage::Finish);
-    copy(&files.join("scene.ply"), &args.output.join("scene.ply"))?;
+    for name in ["scene.ply", "scene.ply.seen"] {
+        copy(&files.join(name), &args.output.join(name))?;
+    }
     if fit_to_fly || args.force {
         write_arena(&args.output, work)?;
     } else {
